@@ -90,7 +90,8 @@ def test_rows_that_cant_be_drawn_are_left_out(tmp_path, caplog):
     ("arguments", "said"),
     [
         (["in.ply", "a.obj", "--gaussians"], "OUT: expected the name of a .ply,"),
-        (["in.ply", "a.splat"], "OUT: expected the name of a .ply,"),
+        (["in.ply", "a.splat"], " or .obj file, got 'a.splat'"),
+        (["text", "a.glb"], "IN: expected the name of a .ply,"),
         (["none.ply", "a.glb"], "'none.ply' does not exist; near names"),
         (["in.ply", "nowhere/a.glb"], "OUT: there is no folder 'nowhere'"),
         (["in.ply", "in.ply"], "OUT is IN"),
@@ -118,7 +119,8 @@ def test_errors_are_found_before_anything_is_written(
 ):
     monkeypatch.chdir(tmp_path)
     write_cloud("empty.ply", StoredCloud(ball(0)))
-    (tmp_path / "text.ply").write_text("hello")
+    for name in ("text", "text.ply"):
+        (tmp_path / name).write_text("hello")
     before = sorted(tmp_path.iterdir())
     assert main(arguments) == 2
     error = capsys.readouterr().err

@@ -1,10 +1,17 @@
 """What a format can't hold is said, with how many Gaussians it concerns."""
 
+import re
+
+import numpy as np
 import pytest
 
 from tests.helpers.object_clouds import ball
 from threestudio_gaussiandreamer.convert.losses import losses
-from threestudio_gaussiandreamer.formats.gaussian_files import StoredCloud
+from threestudio_gaussiandreamer.formats.gaussian_files import (
+    StoredCloud,
+    read_cloud,
+    write_cloud,
+)
 
 
 def said(cloud, suffix, version=3, **more):
@@ -20,6 +27,25 @@ def test_exact_formats_lose_nothing(suffix):
 def test_rounding_is_reported(suffix):
     assert "rounded" in said(ball(9), suffix) and "harmonics" not in said(ball(9), suffix)
     assert "of 9 Gaussians" not in said(ball(9, 1), suffix)
+
+
+@pytest.mark.parametrize("offset", [0, 1e4, 5e5, 1e6])
+def test_positions_of_spz_are_rounded_as_it_says(offset, tmp_path):
+    cloud = ball(500)
+    cloud.log_scales[:] = -4
+    cloud = cloud._replace(means=(cloud.means.astype(np.float64) + offset).astype(np.float32))
+    text = said(cloud, ".spz")
+    if not offset:
+        assert "positions are rounded to 1/32 of the median size" in text
+        return
+    rounding = re.search(r"rounded to (\S+), (\S+) of the median size", text)
+    step, share = map(float, rounding.groups())
+    assert f"reach {np.abs(cloud.means).max():g} from the origin" in text
+    assert share == pytest.approx(step / np.exp(-4), rel=0.05)
+    write_cloud(str(tmp_path / "a.spz"), StoredCloud(cloud, "-y"))
+    found = np.sort(read_cloud(str(tmp_path / "a.spz")).gaussians.means, axis=None)
+    differences = np.unique(np.diff(found.astype(np.float64)))
+    assert differences[differences > 0].min() == pytest.approx(step, rel=1e-4)
 
 
 def test_values_beyond_the_range_of_spz_are_counted():

@@ -106,6 +106,10 @@ def test_rewards_of_views(tmp_path, monkeypatch):
         (["{}", "--metrics", "imagereward", "--imagereward", "no"], "ImageReward.pt is missing"),
         (["{}", "--metrics", "judge", "--judge", "none.safetensors"], "none.safetensors"),
         (["{}", "--metrics", "judge", "--size", "0", "--judge", "{judge}"], "--size 0"),
+        (
+            ["{}", "--metrics", "judge", "--size", "64", "--judge", "{judge}"],
+            "--size has no",
+        ),
         (["{}/no", "--metrics", "judge", "--judge", "{judge}"], "no folder"),
         (["{}/configs", "--metrics", "judge", "--judge", "{judge}"], "holds no finished run"),
         (["{}", "--metrics", "judge", "--judge", "{judge}", "--output", "{judge}"], "--output"),

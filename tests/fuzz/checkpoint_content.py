@@ -16,7 +16,7 @@ from torch import Tensor
 
 from tests.helpers.checkpoints import whole_checkpoint
 from threestudio_gaussiandreamer.core.checkpoint_file import load_checkpoint, save_file
-from threestudio_gaussiandreamer.launch.run import lightning_errors
+from threestudio_gaussiandreamer.launch.stage_errors import lightning_errors
 from threestudio_gaussiandreamer.launch.training_state import check_training_state
 from threestudio_gaussiandreamer.training.geometry import GaussianCloud
 from threestudio_gaussiandreamer.training.system import GaussianDreamerSystem

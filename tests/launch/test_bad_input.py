@@ -9,6 +9,7 @@ from threestudio_gaussiandreamer import host, register_parts
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.core.option_types import check_types
 from threestudio_gaussiandreamer.launch.config_check import check_part
+from threestudio_gaussiandreamer.launch.part_kinds import check_kind
 
 register_parts()
 
@@ -49,6 +50,7 @@ register_parts()
             "system.material_type is empty: name a registered part, such as 'no-material'",
         ),
         ("system.guidance_type=''", "system.guidance_type is empty"),
+        ("system.guidance_type=exact-scores", "system.guidance_type: unknown part 'exact-scores'"),
         # a registered part of another kind
         (
             "system.geometry.prior_type=ply-exporter",
@@ -263,6 +265,17 @@ class Outer:
     pair: tuple[float, float] = (0.0, 1.0)
     inner: Inner = dataclasses.field(default_factory=Inner)
     whatever: object = None
+
+
+def test_a_guidance_that_can_not_be_called_is_refused():
+    register_parts()
+
+    @host.register("test-uncallable-guidance")
+    class Uncallable(host.BaseObject):
+        pass
+
+    with pytest.raises(UserError, match="system.guidance_type: .* has no __call__"):
+        check_kind("system.guidance_type", "test-uncallable-guidance", Uncallable)
 
 
 def test_types_that_fit_are_taken():

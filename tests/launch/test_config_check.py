@@ -29,6 +29,9 @@ class OptionlessPart:
 class FooGuidance(BaseObject):
     LOSSES = ("foo",)
 
+    def __call__(self, rgb):
+        return {"loss_foo": rgb.sum()}
+
 
 # -- the check -------------------------------------------------------------------------------------
 

@@ -73,6 +73,27 @@ def test_validation_test_and_export_of_a_checkpoint_write_under_its_step(launch,
     )
 
 
+def test_an_export_into_a_new_folder_writes_a_record_too(launch, trained):
+    code, _, _ = launch("--export", f"resume={trained}/ckpts/last.ckpt", "tag=other")
+    (other,) = Path("outputs").glob("*/other*")
+    assert code == 0 and other != trained
+    assert load_config(other / "configs/parsed.yaml").tag == "other"
+    assert "--export" in (other / "cmd.txt").read_text() and not (other / "code").exists()
+
+
+def test_the_record_is_there_before_the_cloud(launch, monkeypatch):
+    """A run that is stopped in its prior can be looked at, and started again."""
+    found = []
+
+    def prior(system):
+        found.extend(files(only_run()))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(tiny_parts.TinySystem, "configure_optimizers", prior)
+    assert launch("--train")[0] == 130
+    assert {"configs/parsed.yaml", "cmd.txt"} <= set(found)
+
+
 def test_export_with_video_renders_the_test_views(launch, trained):
     for path in (trained / "save").glob("it6-test*"):
         path.rename(trained / path.name)

@@ -110,6 +110,16 @@ class TestValidation:
             validated(cloud, "x").colors, cloud.colors.clip(0, 1).astype(np.float32)
         )
 
+    @pytest.mark.parametrize("factor, shift, said", [(255, 0, "0 to 2"), (2, -1, "-1 to 1")])
+    def test_colours_of_another_range_are_refused(self, factor, shift, said):
+        dark = self.cloud()
+        dark = dark._replace(colors=0.5 * dark.colors.clip(0, 1))
+        dark.colors[0], dark.colors[1] = 0, 1
+        validated(dark, "x")
+        other = dark._replace(colors=factor * dark.colors + shift)
+        with pytest.raises(UserError, match=rf"x gave colours from {said}.*; expected \[0, 1\]"):
+            validated(other, "x")
+
     def test_the_call_checks(self):
         prior = Given({})
         prior.cloud = self.cloud(bad=range(10))

@@ -150,7 +150,7 @@ def test_a_count_above_what_is_there_changes_nothing(source, tmp_path):
         (["--psnr", "-3"], "--psnr: expected a number above 0"),
         (["--within", "0", "--quality", "35"], "--within: expected a loss from 0.001 to 30 dB, "),
         (["--within", "5000", "--quality", "35"], "--within: expected a loss"),
-        (["--within", "0.1"], "--within: give the option quality too, the PSNR of the unpruned"),
+        (["--within", "0.1"], "--within: give quality (--quality) too, the PSNR of the"),
         (["--count", "9", "--quality", "35"], "--quality: has no effect without the budget within"),
         (["--within", "0.1", "--quality", "nan"], "--quality: expected a finite number"),
     ],

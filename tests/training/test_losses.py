@@ -9,6 +9,7 @@ from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.training.losses import (
     REGULARISERS,
     loggable,
+    total,
     total_variation,
     weighted_losses,
 )
@@ -38,6 +39,13 @@ def test_each_regulariser_is_weighted_and_computed_only_where_it_has_a_weight():
     assert float(losses["sparsity"]) == pytest.approx(3 * math.sqrt(0.26))
     assert float(losses["opaque"]) == pytest.approx(3 * math.log(2))
     assert set(weighted_losses(guided, {}, {"sds": 1.0, "tv": 0.0})) == {"sds"}
+
+
+def test_losses_without_a_gradient_are_named():
+    with_one = torch.ones(2, requires_grad=True).sum()
+    assert total({"sds": with_one, "off": torch.tensor(0.0)}, "x").requires_grad
+    with pytest.raises(UserError, match="loss_sds, loss_off of my-guidance has no gradient"):
+        total({"sds": with_one.detach(), "off": torch.tensor(0.0)}, "my-guidance")
 
 
 def test_numbers_of_a_guidance_are_logged_but_not_its_error_to_the_truth():

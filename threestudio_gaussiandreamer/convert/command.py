@@ -21,6 +21,7 @@ from ..core.memory import size_text
 from ..core.options import check_options, in_range
 from ..formats.gaussian_files import (
     FORMATS,
+    WRITTEN,
     StoredCloud,
     read_cloud,
     require_format,
@@ -120,7 +121,8 @@ def run(args: argparse.Namespace) -> None:
         UserError: an option is invalid, a file can't be read or written, or it holds no Gaussians.
     """
     mesh = to_mesh.writes_mesh(args)
-    suffix = suffix_of(args.output) if mesh else require_format(args.output, "OUT")
+    formats = WRITTEN if args.gaussians else (*WRITTEN, ".obj")
+    suffix = suffix_of(args.output) if mesh else require_format(args.output, "OUT", formats)
     _check_options(args, suffix, mesh)
     source = existing_file(args.source, "file of Gaussians or checkpoint")
     require_other_file(args.output, source)
@@ -164,7 +166,7 @@ def _read(source: Path, args: argparse.Namespace) -> StoredCloud:
     Raises:
         UserError: it can't be read, or holds no Gaussians that can be drawn.
     """
-    stored = read_any(source, args.up)
+    stored = read_any(source, args.up, "IN")
     if not len(stored.gaussians.means):
         raise UserError(f"{args.source} holds no Gaussians that can be drawn: nothing is written")
     if args.antialiased is not None:

@@ -7,12 +7,19 @@ import numpy as np
 from ..formats.compressed_ply import MAX_STORED_LOG, SH_REACH
 from ..formats.gaussian_files import StoredCloud
 from ..formats.sog import palette_size
-from ..formats.spz import COLOR_REACH, MIN_LOG_SCALE, SPZ_UP, out_of_range
+from ..formats.spz import (
+    COLOR_REACH,
+    MIN_LOG_SCALE,
+    SPZ_UP,
+    STEPS_PER_SIZE,
+    out_of_range,
+    position_step,
+)
 from ..formats.spz_container import ZSTD_VERSION
+from ..gaussians.gaussians import Gaussians
 
 ROUNDING = {
-    ".spz": "positions are rounded to 1/32 of the median size, scales to 6 %, opacities and "
-    "colours to 8 bits, rotations to 10",
+    ".spz": "scales are rounded to 6 %, opacities and colours to 8 bits, rotations to 10",
     ".compressed.ply": "positions and scales are rounded to 10 or 11 bits in chunks of 256, "
     "opacities and colours to 8 bits, rotations to 10",
     ".sog": "positions are rounded to 16 bits, scales and colours to 256 values each, opacities "
@@ -54,12 +61,24 @@ def _counted(rows: np.ndarray, what: str) -> Iterator[str]:
 
 def _of_spz(cloud: StoredCloud) -> Iterator[str]:
     gaussians = cloud.in_axes(SPZ_UP).gaussians
+    yield _rounded_positions(gaussians)
     yield from _counted(out_of_range(gaussians), "are farther away or larger than it holds")
     small = gaussians.log_scales < MIN_LOG_SCALE - 1 / 32
     yield from _counted(small, "are smaller than e^-10 along an axis, and become that large")
     beyond = np.abs(gaussians.sh[:, 0]) > COLOR_REACH
     yield from _counted(beyond, "have colours beyond -0.44 to 1.44, which are clipped")
     yield from _counted(np.abs(gaussians.sh[:, 1:]) > 1, "have harmonics beyond 1, clipped")
+
+
+def _rounded_positions(gaussians: Gaussians) -> str:
+    step, size = position_step(gaussians), np.exp(np.median(gaussians.log_scales.mean(axis=1)))
+    if step <= size / STEPS_PER_SIZE:
+        return f"positions are rounded to 1/{STEPS_PER_SIZE} of the median size"
+    reach = np.abs(gaussians.means).max()
+    return (
+        f"positions are rounded to {step:g}, {step / size:.2g} of the median size, since they "
+        f"reach {reach:g} from the origin"
+    )
 
 
 def _of_compressed_ply(cloud: StoredCloud) -> Iterator[str]:

@@ -320,7 +320,7 @@ def _siblings(path: Path) -> str:
         if path.parent.is_dir()
         else []
     )
-    return f"; in the same folder there are {', '.join(others)}" if others else ""
+    return f"; others in this folder, not checked: {', '.join(others)}" if others else ""
 
 
 def _reason(error: Exception) -> str:

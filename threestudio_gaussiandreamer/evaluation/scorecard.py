@@ -27,9 +27,10 @@ from ..core.command import run_command
 from ..core.errors import UserError, unknown
 from ..core.files import atomic_file, json_text, output_folder
 from ..core.options import shown
-from ..models.bundled import NAME
+from ..models.bundled import CLIP, NAME, model_part
 from ..training.camera_options import MAX_SIDE
 from .asset_metrics import METRICS, Asset, Metric
+from .clip_similarity import Protocol
 from .image_reward import SOURCES
 from .intervals import Estimate, bootstrap, paired, per_prompt
 from .results import Result, find_result, read_result
@@ -53,7 +54,12 @@ def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
     )
     add("--imagereward", help="folder with ImageReward.pt and vocab.txt, for imagereward, quality")
     add("--judge", default=NAME, help="model of judge and janus: a file, or toybox (bundled)")
-    add("--size", type=int, default=1024, help="width and height of the pictures for CLIP, pixels")
+    add(
+        "--size",
+        type=int,
+        help=f"width and height of the pictures for clip, directions and imagereward, pixels "
+        f"(default: {Protocol().size})",
+    )
     add("--output", default="evaluation", help="folder for scorecard.csv and scorecard.json")
     return parser.parse_args(argv)
 
@@ -93,11 +99,20 @@ def open_metrics(args: argparse.Namespace) -> list[Metric]:
             raise unknown("metric", name, METRICS)
     if not names:
         raise UserError(f"--metrics is empty: expected some of {', '.join(METRICS)}")
-    if not 1 <= args.size <= MAX_SIDE:
+    if args.size is not None and not 1 <= args.size <= MAX_SIDE:
         raise UserError(f"--size {shown(args.size)}: expected 1 to {MAX_SIDE} pixels")
     for name in names:
         require_models(name, args)
+    if args.size is not None and not any(has_size(name, args.clip) for name in names):
+        raise UserError("--size has no effect on these metrics, whose pictures have their own size")
+    args.size = Protocol().size if args.size is None else args.size
     return [METRICS[name](args) for name in names]
+
+
+def has_size(name: str, clip: Optional[str]) -> bool:
+    """Return whether ``--size`` is that of a metric's pictures; the toybox's CLIP has its own."""
+    of_any_clip = name in ("clip", "directions") and model_part(clip, CLIP) == clip
+    return of_any_clip or name == "imagereward"
 
 
 NOT_LOCAL = {

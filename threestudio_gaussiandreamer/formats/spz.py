@@ -130,9 +130,14 @@ def spz_bytes(
     return pack(header, [np.ascontiguousarray(block).tobytes() for block in blocks], comment)
 
 
+def position_step(gaussians: Gaussians) -> float:
+    """Return the difference of neighbouring positions in a file of these Gaussians."""
+    return 2.0 ** -_fractional_bits(gaussians)
+
+
 def out_of_range(gaussians: Gaussians) -> Bool[np.ndarray, " N"]:
     """Return which Gaussians have a position or a scale above the format's range."""
-    reach = MAX_FIXED * 2.0 ** -_fractional_bits(gaussians)
+    reach = MAX_FIXED * position_step(gaussians)
     far = (np.abs(gaussians.means) > reach).any(axis=1)
     return far | (gaussians.log_scales > MAX_LOG_SCALE + 1 / 32).any(axis=1)
 

@@ -131,8 +131,8 @@ def require_renderable(cloud: Gaussians, radius: float) -> None:
     """Raise UserError if the radius of a cloud exceeds ``MAX_RADIUS``."""
     if not radius <= MAX_RADIUS:
         raise UserError(
-            f"the Gaussians reach {radius:g} units from their centre, further than "
-            f"{MAX_RADIUS:g}, which float32 can't render: the largest scale is "
+            f"the Gaussians reach further than {MAX_RADIUS:g} units from their centre, which "
+            f"float32 can't render: the largest scale is "
             f"{float(cloud.log_scales.amax().exp()):g}; rescale them or remove the largest"
         )
 

@@ -32,7 +32,7 @@ def call_guidance(
     passes the prompt as the second positional argument, so that argument may have any name.
 
     Raises:
-        UserError: the guidance returns no dict, or a ``loss_*`` that isn't a single number.
+        UserError: the guidance returns no dict, or a ``loss_*`` that isn't a single finite number.
     """
     call = guidance.forward if isinstance(guidance, nn.Module) else guidance.__call__
     arguments = inspect.signature(call).parameters
@@ -47,7 +47,10 @@ def call_guidance(
         given[second.name] = given.pop("prompt_utils")
     if not any(argument.kind is argument.VAR_KEYWORD for argument in arguments.values()):
         given = {name: value for name, value in given.items() if name in arguments}
-    return _checked(guidance(rgb, **given), type(guidance).__name__, rgb.device)
+    out = _checked(guidance(rgb, **given), type(guidance).__name__, rgb.device)
+    if not isinstance(guidance, ScoreDistillation):
+        _require_finite(out, type(guidance).__name__)
+    return out
 
 
 def _checked(out: Any, name: str, device: torch.device) -> dict[str, Any]:
@@ -71,6 +74,13 @@ def _checked(out: Any, name: str, device: torch.device) -> dict[str, Any]:
                 "as from .mean()"
             )
     return out | {key: loss.reshape(()) for key, loss in losses.items()}
+
+
+def _require_finite(out: Mapping[str, Any], name: str) -> None:
+    """Raise UserError for a loss that isn't finite; on a GPU, looking would wait for it."""
+    for key, loss in out.items():
+        if key.startswith("loss_") and loss.device.type == "cpu" and not loss.isfinite():
+            raise UserError(f"{name} returned {key} = {loss.item()}: expected a finite number")
 
 
 @contextmanager

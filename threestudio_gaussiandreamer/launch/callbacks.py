@@ -41,8 +41,8 @@ class Stopped(BaseException):
 
 
 class RunRecord(pl.Callback):
-    """Write ``configs/raw.yaml``, ``configs/parsed.yaml``, ``code/`` and ``cmd.txt`` when training
-    starts.
+    """Write ``configs/raw.yaml``, ``configs/parsed.yaml``, ``code/`` and ``cmd.txt`` when the first
+    stage starts, before the prior.
 
     Args:
         folder: the run's folder.
@@ -62,9 +62,11 @@ class RunRecord(pl.Callback):
     ) -> None:
         self.folder, self.cfg, self.sources, self.command = folder, cfg, sources, command
         self.records_code = records_code
+        self._is_written = False
 
-    def on_fit_start(self, trainer: Any, pl_module: Any) -> None:
-        if trainer.is_global_zero:
+    def setup(self, trainer: Any, pl_module: Any, stage: str) -> None:
+        if trainer.is_global_zero and not self._is_written:
+            self._is_written = True
             self.save_configs()
             if self.records_code:
                 self.save_code()

@@ -11,7 +11,7 @@ import os
 import types
 import typing
 from collections.abc import Collection, Mapping
-from typing import Any, Optional
+from typing import Any
 
 import torch
 from omegaconf import DictConfig, OmegaConf
@@ -19,23 +19,10 @@ from omegaconf.errors import OmegaConfBaseException
 
 from ..core.errors import UserError, unknown
 from ..core.options import check_options, require_representable, shown
-from ..guidance.base import ScoreDistillation
-from ..guidance.variants import Variant
-from ..host import (
-    BaseBackground,
-    BaseGeometry,
-    BaseMaterial,
-    Exporter,
-    Rasterizer,
-    find,
-    names,
-    pl,
-    validate_schedule,
-)
+from ..host import find, pl, validate_schedule
 from ..host.typed_config import parse_structured
-from ..priors.base import Prior
-from ..prompts.prompt_processors import TextEncoderPromptProcessor
 from .live_viewer import ViewerConfig
+from .part_kinds import check_kind, find_part
 from .section_checks import check_sections
 
 MisconfigurationException = pl.utilities.exceptions.MisconfigurationException
@@ -67,24 +54,6 @@ AT_LEAST = {
 # 1.0 for all batches and 1 for one; None: the key isn't given
 DEFAULTS_ONLY = {"limit_train_batches": ("None", "1.0"), "overfit_batches": ("None", "0", "0.0")}
 CLUSTER = {"MASTER_ADDR", "SLURM_NTASKS"}
-KINDS: dict[str, type] = {
-    "data": pl.LightningDataModule,
-    "system": pl.LightningModule,
-    "geometry": BaseGeometry,
-    "material": BaseMaterial,
-    "background": BaseBackground,
-    "renderer": Rasterizer,
-    "exporter": Exporter,
-    "prior": Prior,
-    "guidance": ScoreDistillation,
-    "variant": Variant,
-    "prompt_processor": TextEncoderPromptProcessor,
-}
-"""The base class of each kind of part, by the name of its section.
-
-Parts of other packages may have other base classes; a part is refused only if it derives from the
-base class of a different kind.
-"""
 LONGEST_NAME = 200
 """Longest name of a checkpoint, bytes; file systems allow 255, of which numbers and suffixes need
 some.
@@ -126,12 +95,15 @@ def check_config(cfg: Any) -> None:
 
 def check_part(path: str, type_name: Any, values: Any) -> None:
     """Check one section against the part ``type_name``, and the sections of its own parts."""
-    part = _find(f"{path}_type", type_name)
-    _check_kind(f"{path}_type", type_name, part)
+    part = find_part(f"{path}_type", type_name)
+    check_kind(f"{path}_type", type_name, part)
     config_class = getattr(part, "Config", None)
     if config_class is None:
         return
     _check_keys(path, values, config_class)
+    for key in values:  # before the part's own checks, whose messages don't name the key
+        if key.removesuffix("_type") in values.keys() - {key} and values.get(key):
+            find_part(f"{path}.{key}", values[key])
     typed = _typed(path, values, config_class)
     for key in typed:
         section = key.removesuffix("_type")
@@ -148,36 +120,6 @@ def check_part(path: str, type_name: Any, values: Any) -> None:
 
 def _default(config_class: type, key: str) -> Any:
     return next(field.default for field in dataclasses.fields(config_class) if field.name == key)
-
-
-def _find(path: str, type_name: Any) -> type:
-    if not type_name:
-        hint = ""
-        if path == "data_type":
-            hint = " (an overlay needs the configuration that it changes before it)"
-        raise UserError(f"{path} is empty: name a registered part{hint}")
-    try:
-        return find(type_name)
-    except UserError as error:
-        raise UserError(f"{path}: {error}") from error
-
-
-def _check_kind(path: str, type_name: str, part: Any) -> None:
-    """Raise UserError if the part of a section is known to be of another kind."""
-    kind = path.rpartition(".")[2].removesuffix("_type")
-    found = _kind_of(part)
-    if kind not in KINDS or found in (None, kind):
-        return
-    choices = [name for name in names() if _kind_of(find(name)) == kind]
-    raise UserError(
-        f"{path} is {type_name!r}, a part of the kind {found}; expected one of the kind {kind}: "
-        f"choose from {', '.join(choices)}"
-    )
-
-
-def _kind_of(part: Any) -> Optional[str]:
-    kinds = (kind for kind, base in KINDS.items() if isinstance(part, type))
-    return next((kind for kind in kinds if issubclass(part, KINDS[kind])), None)
 
 
 def _check_keys(path: str, values: Any, config_class: type) -> None:

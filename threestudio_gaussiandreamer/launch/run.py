@@ -5,16 +5,14 @@ cmd.txt}``"""
 
 import argparse
 import contextlib
-import errno
-import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import Any, Optional
 
 from ..core.checkpoint_file import load_checkpoint
-from ..core.errors import UserError, raised_in
+from ..core.errors import UserError
 from ..core.logs import get_rank
 from ..host import find, info, pl, warn
 from ..host.typed_config import parse_structured
@@ -30,27 +28,18 @@ from .callbacks import (
     Stopped,
 )
 from .checkpoints import AtomicCheckpointIO
-from .config_check import MisconfigurationException, build, plain
-from .ddp import environment_plugins, is_lost_process, planned_processes, trainer_options
+from .config_check import build, plain
+from .ddp import environment_plugins, planned_processes, trainer_options
 from .folder_lock import RunFolder, claim, claim_new, require_writable, set_run_aside
 from .live_viewer import LiveViewer, ViewerConfig
 from .run_folder import SIZES, changes_since, renumber, resume_command
+from .stage_errors import lightning_errors, write_errors
 from .training_state import check_training_state
 
-# errors of the file system that end a run with a message instead of a traceback
-WRITE_ERRORS = (
-    *(errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM),
-    *(errno.ENOTDIR, errno.EISDIR, errno.EEXIST, errno.ENAMETOOLONG),
-)
 # Lightning refuses a checkpoint without the first key; without the others it would resume at step 0
 # or with a new optimiser
 LIGHTNINGS_KEY = "pytorch-lightning_version"
 TRAINING_KEYS = (LIGHTNINGS_KEY, "loops", "optimizer_states")
-# parts of the messages of torch and Lightning about a state that doesn't match
-MISMATCHES = (
-    *("loading state_dict", "loaded state dict"),
-    *("optimizer_states", "restore training state"),
-)
 
 
 class Run:
@@ -244,7 +233,8 @@ class Run:
         required = {
             "accelerator": "gpu" if self.n_gpus else "cpu",
             "logger": self.build_loggers() if training else False,
-            "callbacks": callbacks + (self.training_callbacks(checkpoint_io) if training else []),
+            "callbacks": callbacks
+            + (self.training_callbacks(checkpoint_io) if training else self.records()),
             "plugins": [checkpoint_io, *environment_plugins(processes)],
             "inference_mode": False,
             "default_root_dir": str(self.folder),
@@ -260,6 +250,14 @@ class Run:
         ]
         return loggers + list(self.system.get_loggers())
 
+    def record(self, with_code: bool) -> RunRecord:
+        return RunRecord(self.folder, self.cfg, self.sources, self.command, with_code)
+
+    def records(self) -> list:
+        """Return what records a stage other than training, unless the folder has a run's record."""
+        has_one = (self.folder / "configs/parsed.yaml").is_file()
+        return [] if has_one else [self.record(with_code=False)]
+
     def training_callbacks(self, checkpoint_io: AtomicCheckpointIO) -> list:
         # without the version counter a resumed run overwrites last.ckpt instead of adding
         # last-v1.ckpt
@@ -269,7 +267,7 @@ class Run:
             pl.callbacks.ModelCheckpoint(dirpath=str(self.last.parent), **checkpointing),
             LearningRates(logging_interval="step"),
             LastNumbers(),
-            RunRecord(self.folder, self.cfg, self.sources, self.command, self.records_code),
+            self.record(self.records_code),
             last,
         ]
         if self.view is not None:
@@ -313,85 +311,3 @@ class Run:
         if training and self.trainer.global_step and self.last.is_file() and not get_rank():
             with contextlib.suppress(OSError):  # of a closed pipe, which would hide the first error
                 print(f"to resume: {resume_command(self.folder, self.args.gpu)}", flush=True)
-
-
-@contextlib.contextmanager
-def lightning_errors(checkpoint: Optional[str], changes: Sequence[str] = ()) -> Iterator[None]:
-    """Convert exceptions that Lightning raises in this context.
-
-    Args:
-        changes: what may explain a mismatch, in place of torch's message.
-
-    Raises:
-        UserError: the checkpoint's parameters or optimiser don't match the configuration, or the
-            trainer's options are incompatible with the system or with each other, or another
-            process of the run has ended.
-        KeyboardInterrupt: Ctrl-C outside of training, which Lightning converts to SystemExit(1).
-    """
-    try:
-        yield
-    except SystemExit as stop:
-        if isinstance(stop.__context__, KeyboardInterrupt):
-            raise KeyboardInterrupt from None
-        raise
-    except MisconfigurationException as error:
-        raise UserError(f"trainer: {error}") from error
-    except (RuntimeError, ValueError, KeyError) as error:
-        if is_lost_process(error):
-            raise UserError(
-                "another process of this run has ended, so this one stops; the same command with "
-                f"resume=auto goes on from the last checkpoint ({str(error).strip()})"
-            ) from error
-        if isinstance(error, ValueError) and raised_in(error, pl.__name__):
-            raise UserError(f"trainer: {str(error).strip()}") from error
-        if (
-            checkpoint is None
-            or isinstance(error, UserError)
-            or not (is_mismatch(error) or raised_in(error, pl.__name__))
-        ):
-            raise
-        raise UserError(
-            f"the checkpoint {checkpoint} was made by another configuration: "
-            f"{'; '.join(changes) or str(error).strip()}"
-        ) from error
-
-
-@contextlib.contextmanager
-def write_errors(folder: Path) -> Iterator[None]:
-    """Convert OSErrors of this context, and of the loggers' threads, to one message.
-
-    Args:
-        folder: of the run's results, for messages.
-
-    Raises:
-        UserError: the disk is full, access is denied, or a path exists as something else.
-    """
-
-    def said(error: OSError) -> str:
-        return (
-            f"cannot write {error.filename or f'the results in {folder}'}: "
-            f"{error.strerror}; make room, or choose another exp_root_dir"
-        )
-
-    def in_a_thread(failure: Any) -> None:
-        # only a warning, since the logger raises the error again when it next writes
-        warn(said(failure.exc_value)) if _is_write_error(failure.exc_value) else earlier(failure)
-
-    earlier, threading.excepthook = threading.excepthook, in_a_thread
-    try:
-        yield
-    except OSError as error:
-        if not _is_write_error(error):
-            raise
-        raise UserError(said(error)) from error
-    finally:
-        threading.excepthook = earlier
-
-
-def _is_write_error(error: Optional[BaseException]) -> bool:
-    return isinstance(error, OSError) and error.errno in WRITE_ERRORS
-
-
-def is_mismatch(error: Exception) -> bool:
-    """Return whether this is an error of torch or Lightning about a state that doesn't match."""
-    return any(part in str(error) for part in MISMATCHES)

@@ -205,7 +205,8 @@ def validated(cloud: PointCloud, name: str) -> PointCloud:
 
     Raises:
         UserError: it isn't a PointCloud, there are no points, points and colours aren't both
-            (P, 3), or more than 5 % of the rows are not finite.
+            (P, 3), more than 5 % of the rows are not finite, or most colours are far outside [0,
+            1], as those from 0 to 255 are.
     """
     if not isinstance(cloud, PointCloud):
         raise UserError(f"{name}.generate returned {type(cloud).__name__}; expected a PointCloud")
@@ -220,12 +221,22 @@ def validated(cloud: PointCloud, name: str) -> PointCloud:
     finite = np.isfinite(points).all(axis=1) & np.isfinite(colors).all(axis=1)
     if bad := int((~finite).sum()):
         report_non_finite(bad, len(points), name)
+    require_unit_range(colors[finite], name)
     cloud = without_rows(cloud._replace(points=points, colors=colors.clip(0.0, 1.0)), finite)
     return (
         cloud
         if cloud.normals is None
         else cloud._replace(normals=np.nan_to_num(np.asarray(cloud.normals, np.float32)))
     )
+
+
+def require_unit_range(colors: Float[np.ndarray, "P 3"], name: str) -> None:
+    """Raise UserError if most colours are far outside [0, 1]; a model's may be slightly outside."""
+    outside = (colors < -0.25) | (colors > 2)
+    if outside.any(axis=1).mean() > 0.5:
+        raise UserError(
+            f"{name} gave colours from {colors.min():g} to {colors.max():g}; expected [0, 1]"
+        )
 
 
 def report_non_finite(bad: int, count: int, name: str) -> None:

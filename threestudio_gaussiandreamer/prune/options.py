@@ -56,8 +56,8 @@ class PruneOptions:
             raise UserError(f"{given[1]}: give one budget only; {given[0]} is set too")
         if cfg.quality is None and given == ["within"]:
             raise UserError(
-                "within: give the option quality too, the PSNR of the unpruned cloud to the ground "
-                "truth in dB, such as 35"
+                "within: give quality (--quality) too, the PSNR of the unpruned cloud to the "
+                "ground truth in dB, such as 35"
             )
         if cfg.quality is not None and given != ["within"]:
             raise UserError("quality: has no effect without the budget within")

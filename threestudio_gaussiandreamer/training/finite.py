@@ -60,9 +60,9 @@ def require_finite(tensors: Named, step: int) -> None:
     raise NonFiniteParameters(
         f"step {step}: {int((~values.isfinite()).sum())} of the {values.numel()} numbers of {name} "
         "are NaN or infinite: the run stops, and nothing of this state is saved or exported. "
-        "Usual causes are an optimiser without a positive eps (system.optimizer.args), weights of "
-        "losses that overflow float32 (system.loss) and too large learning rates "
-        "(system.geometry.lr_*)"
+        "Usual causes are a guidance that returns NaN, an optimiser without a positive eps "
+        "(system.optimizer.args), weights of losses that overflow float32 (system.loss) and too "
+        "large learning rates (system.geometry.lr_*)"
     )
 
 

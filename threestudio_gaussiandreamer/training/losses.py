@@ -14,6 +14,7 @@ proportion to height x width.
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Optional
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -37,6 +38,25 @@ def weighted_losses(
     check_weights(weights, raw)
     raw |= {name: call(out) for name, call in REGULARISERS.items() if weights.get(name)}
     return {name: value * weights[name] for name, value in raw.items()}
+
+
+def total(losses: Mapping[str, Tensor], guidance: str) -> Float[Tensor, ""]:
+    """Return the sum of the weighted losses.
+
+    Args:
+        guidance: its name, for the message.
+
+    Raises:
+        UserError: the sum has no gradient.
+    """
+    loss = torch.stack(list(losses.values())).sum()
+    if not loss.requires_grad:
+        names = ", ".join(f"loss_{name}" for name in losses)
+        raise UserError(
+            f"{names} of {guidance} has no gradient: compute it from the renders, without detach() "
+            "or torch.no_grad()"
+        )
+    return loss
 
 
 def weight_schedules(options: Mapping[str, Any]) -> dict[str, Schedule]:

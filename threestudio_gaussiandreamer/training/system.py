@@ -61,7 +61,7 @@ from .finite import CHECK_EVERY, optimizer_tensors, require_finite, warn_if_invi
 from .held_out import EvaluationConfig, HeldOut, Measurements
 from .image_targets import ImageTargets, ImageTargetsConfig, check_image_targets
 from .loss_scale import LossScale
-from .losses import check_losses, loggable, logged_names, weight_schedules, weighted_losses
+from .losses import check_losses, loggable, logged_names, total, weight_schedules, weighted_losses
 from .optimizer import check_optimizer, make_optimizer
 from .pages import discard_turntable, save_first_cloud, turntable_name, write_turntable
 from .pictures import rgb_panel, save_pictures
@@ -246,7 +246,7 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         self.density.before_backward(out, step)
         guided = self.supervise(out, batch)
         losses = self.losses(guided, out)
-        self.manual_backward(torch.stack(list(losses.values())).sum())
+        self.manual_backward(total(losses, self.cfg.guidance_type))
         average_gradients(p for group in optimizer.param_groups for p in group["params"])
         self.image_targets.hold_shapes(optimizer, step)
         loss_scale = self.loss_scale.value(self.trainer)
@@ -317,7 +317,7 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         numbers, loss = loggable(guided, losses), sum(losses.values()).detach()
         shown = {"loss": loss, "gaussians": len(self.geometry)}
         if "error_to_truth" in guided:
-            shown["dB"] = psnr_of_error(torch.tensor(guided["error_to_truth"]))
+            shown["dB"] = psnr_of_error(torch.tensor(guided["error_to_truth"], dtype=torch.float64))
         elif (truth := true_views(self.guidance, batch, out)) is not None:
             shown["dB"] = psnr(out["comp_rgb"].detach(), truth)
         self.step_log.write(self.trainer, numbers | shown, shown)

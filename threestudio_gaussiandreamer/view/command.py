@@ -178,18 +178,19 @@ def run_folder(folder: Path, args: argparse.Namespace) -> None:
     print(write_index(folder))
 
 
-def read_any(source: Path, up: Optional[str] = None) -> StoredCloud:
+def read_any(source: Path, up: Optional[str] = None, option: str = "PATH") -> StoredCloud:
     """Read the Gaussians of a file or checkpoint, without those that can't be drawn.
 
     Args:
         up: overrides the up axis that the file states.
+        option: names the argument in messages.
 
     Raises:
         UserError: the file is none of Gaussians, or damaged.
     """
     if source.suffix in CHECKPOINT_ENDINGS:
         return StoredCloud(drawable(from_checkpoint(source), str(source)), up or WORLD_UP)
-    require_format(source.name, "PATH", READ)
+    require_format(source.name, option, READ)
     return read_cloud(str(source), up=up)
 
 

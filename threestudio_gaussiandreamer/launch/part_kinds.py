@@ -1,0 +1,77 @@
+"""Which kind of part the key of a section names."""
+
+from typing import Any, Optional
+
+from ..core.errors import UserError
+from ..guidance.base import ScoreDistillation
+from ..guidance.variants import Variant
+from ..host import (
+    BaseBackground,
+    BaseGeometry,
+    BaseMaterial,
+    Exporter,
+    Rasterizer,
+    find,
+    names,
+    pl,
+)
+from ..priors.base import Prior
+from ..prompts.prompt_processors import TextEncoderPromptProcessor
+
+KINDS: dict[str, type] = {
+    "data": pl.LightningDataModule,
+    "system": pl.LightningModule,
+    "geometry": BaseGeometry,
+    "material": BaseMaterial,
+    "background": BaseBackground,
+    "renderer": Rasterizer,
+    "exporter": Exporter,
+    "prior": Prior,
+    "guidance": ScoreDistillation,
+    "variant": Variant,
+    "prompt_processor": TextEncoderPromptProcessor,
+}
+"""The base class of each kind of part, by the name of its section.
+
+Parts of other packages may have other base classes; a part is refused only if it derives from the
+base class of a different kind.
+"""
+
+
+def find_part(path: str, type_name: Any) -> type:
+    """Return the part that the key ``path`` names; the message of an error names the key too."""
+    if not type_name:
+        hint = ""
+        if path == "data_type":
+            hint = " (an overlay needs the configuration that it changes before it)"
+        raise UserError(f"{path} is empty: name a registered part{hint}")
+    try:
+        return find(type_name)
+    except UserError as error:
+        raise UserError(f"{path}: {error}") from error
+
+
+def check_kind(path: str, type_name: str, part: Any) -> None:
+    """Raise UserError if the part of a section is known to be of another kind, or can't be one."""
+    kind = path.rpartition(".")[2].removesuffix("_type")
+    found = _kind_of(part)
+    if kind == "guidance" and found is None:
+        _require_call(path, type_name, part)
+    if kind not in KINDS or found in (None, kind):
+        return
+    choices = [name for name in names() if _kind_of(find(name)) == kind]
+    raise UserError(
+        f"{path} is {type_name!r}, a part of the kind {found}; expected one of the kind {kind}: "
+        f"choose from {', '.join(choices)}"
+    )
+
+
+def _require_call(path: str, type_name: str, part: Any) -> None:
+    """Raise UserError for a guidance that can't be called."""
+    if not any("__call__" in vars(base) for base in getattr(part, "__mro__", ())):
+        raise UserError(f"{path}: {type_name} has no __call__, which returns the losses of a step")
+
+
+def _kind_of(part: Any) -> Optional[str]:
+    kinds = (kind for kind, base in KINDS.items() if isinstance(part, type))
+    return next((kind for kind in kinds if issubclass(part, KINDS[kind])), None)
