@@ -40,7 +40,7 @@ def test_positions_of_spz_are_rounded_as_it_says(offset, tmp_path):
         return
     rounding = re.search(r"rounded to (\S+), (\S+) of the median size", text)
     step, share = map(float, rounding.groups())
-    assert f"reach {np.abs(cloud.means).max():g} from the origin" in text
+    assert f"positions up to {np.abs(cloud.means).max():g} are rounded" in text
     assert share == pytest.approx(step / np.exp(-4), rel=0.05)
     write_cloud(str(tmp_path / "a.spz"), StoredCloud(cloud, "-y"))
     found = np.sort(read_cloud(str(tmp_path / "a.spz")).gaussians.means, axis=None)

@@ -75,10 +75,7 @@ def _rounded_positions(gaussians: Gaussians) -> str:
     if step <= size / STEPS_PER_SIZE:
         return f"positions are rounded to 1/{STEPS_PER_SIZE} of the median size"
     reach = np.abs(gaussians.means).max()
-    return (
-        f"positions are rounded to {step:g}, {step / size:.2g} of the median size, since they "
-        f"reach {reach:g} from the origin"
-    )
+    return f"positions up to {reach:g} are rounded to {step:g}, {step / size:.2g} of the median size"
 
 
 def _of_compressed_ply(cloud: StoredCloud) -> Iterator[str]:

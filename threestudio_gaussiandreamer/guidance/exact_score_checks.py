@@ -7,7 +7,7 @@ from .base import variant_class
 from .variants.base import require_unset
 
 MAX_MODE_BYTES = 2**31
-"""Memory of a bank in the pixels' space, for each item."""
+"""Largest memory of a bank in the space of pixels, for each item."""
 OF_LATENTS = ("latent_size", "latent_channels", "color_matrix")
 OF_BANK = ("bank_views", "bank_includes_view", "bank_elevation_range", "bank_distance_range")
 OF_BANK += ("bank_fovy_range",)
