@@ -162,7 +162,7 @@ def test_a_missing_file_lists_what_is_there(tmp_path):
     save_file(tmp_path / "last.ckpt", content())
     with pytest.raises(
         UserError,
-        match="there is no checkpoint .*lst.ckpt; in the same folder there are .*last.ckpt",
+        match="there is no checkpoint .*lst.ckpt; others in this folder, not checked: .*last.ckpt",
     ):
         load_file(tmp_path / "lst.ckpt")
 
