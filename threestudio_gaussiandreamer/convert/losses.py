@@ -74,8 +74,8 @@ def _rounded_positions(gaussians: Gaussians) -> str:
     step, size = position_step(gaussians), np.exp(np.median(gaussians.log_scales.mean(axis=1)))
     if step <= size / STEPS_PER_SIZE:
         return f"positions are rounded to 1/{STEPS_PER_SIZE} of the median size"
-    reach = np.abs(gaussians.means).max()
-    return f"positions up to {reach:g} are rounded to {step:g}, {step / size:.2g} of the median size"
+    reach, share = np.abs(gaussians.means).max(), step / size
+    return f"positions up to {reach:g} are rounded to {step:g}, {share:.2g} of the median size"
 
 
 def _of_compressed_ply(cloud: StoredCloud) -> Iterator[str]:
