@@ -34,6 +34,7 @@ from ..formats.spz_container import VERSIONS, require_version
 from ..gaussians.axes import AXES, VIEWER_UP
 from ..gaussians.gaussians import finite
 from ..gaussians.sh import COEFFICIENTS, MAX_DEGREE
+from ..meshes.write import WRITERS
 from ..view.command import read_any
 from . import to_mesh
 from .check import VIEWS, round_trip
@@ -121,7 +122,7 @@ def run(args: argparse.Namespace) -> None:
         UserError: an option is invalid, a file can't be read or written, or it holds no Gaussians.
     """
     mesh = to_mesh.writes_mesh(args)
-    formats = WRITTEN if args.gaussians else (*WRITTEN, ".obj")
+    formats = WRITTEN if args.gaussians else tuple(dict.fromkeys((*WRITTEN, *WRITERS)))
     suffix = suffix_of(args.output) if mesh else require_format(args.output, "OUT", formats)
     _check_options(args, suffix, mesh)
     source = existing_file(args.source, "file of Gaussians or checkpoint")

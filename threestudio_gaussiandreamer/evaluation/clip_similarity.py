@@ -80,6 +80,11 @@ class Protocol(NamedTuple):
         )
 
 
+def has_own_cameras(clip: Optional[str]) -> bool:
+    """Return whether a CLIP, as given to :func:`open_clip`, is the toybox's."""
+    return bool(clip) and model_part(clip, CLIP) != clip
+
+
 def protocol_for(clip: Optional[str], **options: Any) -> Protocol:
     """Return the paper's protocol; for the toybox's CLIP with the cameras of its training, since
     the paper's distance makes objects smaller than it has ever seen them.
@@ -88,7 +93,7 @@ def protocol_for(clip: Optional[str], **options: Any) -> Protocol:
         clip: as given to :func:`open_clip`; None for the paper's.
         options: replace the paper's.
     """
-    if clip and model_part(clip, CLIP) != clip:
+    if has_own_cameras(clip):
         cameras = {"radius": sum(DISTANCE) / 2, "fovy_deg": FOVY_DEG, "size": SIZE}
         options = {**options, **cameras}
     return Protocol(**options)

@@ -27,10 +27,10 @@ from ..core.command import run_command
 from ..core.errors import UserError, unknown
 from ..core.files import atomic_file, json_text, output_folder
 from ..core.options import shown
-from ..models.bundled import CLIP, NAME, model_part
+from ..models.bundled import NAME
 from ..training.camera_options import MAX_SIDE
 from .asset_metrics import METRICS, Asset, Metric
-from .clip_similarity import Protocol
+from .clip_similarity import Protocol, has_own_cameras
 from .image_reward import SOURCES
 from .intervals import Estimate, bootstrap, paired, per_prompt
 from .results import Result, find_result, read_result
@@ -111,8 +111,7 @@ def open_metrics(args: argparse.Namespace) -> list[Metric]:
 
 def has_size(name: str, clip: Optional[str]) -> bool:
     """Return whether ``--size`` is that of a metric's pictures; the toybox's CLIP has its own."""
-    of_any_clip = name in ("clip", "directions") and model_part(clip, CLIP) == clip
-    return of_any_clip or name == "imagereward"
+    return name == "imagereward" or name in ("clip", "directions") and not has_own_cameras(clip)
 
 
 NOT_LOCAL = {

@@ -177,7 +177,7 @@ class ScoreDistillation(ScoreModel):
         """Whether ``predict`` returns the unconditional score too: for classifier-free guidance, or
         since the variant needs it.
         """
-        return self.options.guidance_scale != 1 or self.variant.NEEDS_UNCONDITIONAL
+        return is_guided(self.options, self.variant)
 
     def update_step(self, epoch: int, global_step: int, on_load_weights: bool = False) -> None:
         """Evaluate the schedules at this step."""
@@ -316,6 +316,11 @@ class ScoreDistillation(ScoreModel):
                 f"step {step}: the score of {count} of {len(bad)} items isn't finite; "
                 "they are left out"
             )
+
+
+def is_guided(cfg: Any, variant: Variant | type[Variant]) -> bool:
+    """Return whether these options, with this variant, need the unconditional score too."""
+    return cfg.guidance_scale != 1 or variant.NEEDS_UNCONDITIONAL
 
 
 def variant_class(cfg: Any) -> type[Variant]:

@@ -3,7 +3,7 @@
 from typing import Any
 
 from ..core.errors import UserError
-from .base import variant_class
+from .base import is_guided, variant_class
 from .variants.base import require_unset
 
 MAX_MODE_BYTES = 2**31
@@ -31,8 +31,7 @@ def require_used(guidance: type, cfg: Any) -> None:
 
 def check_render_size(cfg: Any, height: int, width: int) -> None:
     """Check that renders of this size can be compared, see :func:`picture_size`."""
-    guided = cfg.guidance_scale != 1 or variant_class(cfg).NEEDS_UNCONDITIONAL
-    picture_size(cfg, guided, height, width)
+    picture_size(cfg, is_guided(cfg, variant_class(cfg)), height, width)
 
 
 def picture_size(cfg: Any, guided: bool, height: int, width: int) -> tuple[int, int]:

@@ -102,7 +102,7 @@ def check_part(path: str, type_name: Any, values: Any) -> None:
         return
     _check_keys(path, values, config_class)
     for key in values:  # before the part's own checks, whose messages don't name the key
-        if key.removesuffix("_type") in values.keys() - {key} and values.get(key):
+        if key.endswith("_type") and key.removesuffix("_type") in values and values.get(key):
             find_part(f"{path}.{key}", values[key])
     typed = _typed(path, values, config_class)
     for key in typed:
