@@ -47,6 +47,16 @@ def test_the_way_there_and_back_is_exact_where_the_format_is(source, tmp_path):
     assert_close(ball(60, 1), read.in_axes("z").gaussians, sh=1e-6, means=1e-6)
 
 
+def test_a_check_that_cannot_be_made_writes_nothing(tmp_path, capsys):
+    cloud = ball(60)
+    far = cloud._replace(means=cloud.means * np.float32(1e30))
+    write_cloud(str(tmp_path / "far.ply"), StoredCloud(far, "z", None))
+    options = [str(tmp_path / "far.ply"), str(tmp_path / "out.ply")]
+    assert main([*options, "--check", "--size", "64"]) == 2
+    assert "error:" in capsys.readouterr().err and not (tmp_path / "out.ply").exists()
+    assert main(options) == 0
+
+
 def test_what_is_lost_and_the_decibels_are_printed(source, tmp_path, capsys):
     assert main([str(source), str(tmp_path / "a.spz"), "--check", "--size", "64"]) == 0
     said = capsys.readouterr().out

@@ -289,6 +289,7 @@ def test_the_report_replaces_a_link_and_holds_paths_that_are_no_utf8(clip, plys,
         (["{ply}", "--clip", "x", "--prompt", "a", "--drawn", "121"], "--drawn 121"),
         (["{ply}", "--clip", "x", "--prompt", "a", "--size", "0"], "--size"),
         (["{ply}", "--clip", "x", "--prompt", "a", "--fovy", "180"], "--fovy"),
+        (["{ply}", "--clip", "toybox", "--prompt", "a", "--fovy", "60"], "--fovy has no effect"),
         (
             ["{ply}", "--clip", "x", "--prompt", "a", "--size", "100000"],
             "--size 100000: expected 1",

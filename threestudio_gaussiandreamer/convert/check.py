@@ -3,10 +3,12 @@
 from typing import NamedTuple
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from ..formats.gaussian_files import StoredCloud
 from ..gaussians.axes import WORLD_UP, rotation_between
-from ..gaussians.views import EPS2D, render_all, views_around
+from ..gaussians.views import Views, render_all, views_around
 from ..metrics import psnr
 
 VIEWS = 8
@@ -21,24 +23,41 @@ class RoundTrip(NamedTuple):
     """Of the worst view, dB."""
 
 
+class Reference(NamedTuple):
+    """A cloud before a round trip, and its renders."""
+
+    up: str
+    """The axis of the cloud that is up."""
+    views: Views
+    images: Float[Tensor, "V H W 3"]
+
+
 @torch.no_grad()
-def round_trip(
-    before: StoredCloud, after: StoredCloud, size: int, eps2d: float = EPS2D
-) -> RoundTrip:
-    """Render both clouds from ``VIEWS`` directions around the first one and compare the images.
+def reference(before: StoredCloud, size: int) -> Reference:
+    """Render a cloud from ``VIEWS`` directions around it, with or without antialiasing as it was
+    trained.
 
     Args:
         size: width and height of the images, pixels.
-        eps2d: screen-space dilation, square pixels; both are drawn with or without antialiasing as
-            the first one was trained.
 
     Raises:
         UserError: the cloud is too large to be rendered.
     """
-    clouds = [stored.in_axes(before.up).gaussians.tensors() for stored in (before, after)]
+    cloud = before.gaussians.tensors()
     to_z_up = torch.from_numpy(rotation_between(before.up, WORLD_UP))
-    views = views_around(clouds[0], VIEWS, size, to_z_up=to_z_up)
-    views = views._replace(eps2d=eps2d, antialias=before.antialiased)
-    truth, found = (render_all(cloud, views) for cloud in clouds)
-    worst = min(float(psnr(*pair)) for pair in zip(found, truth, strict=True))
-    return RoundTrip(float(psnr(found, truth)), worst)
+    views = views_around(cloud, VIEWS, size, to_z_up=to_z_up)
+    views = views._replace(antialias=before.antialiased)
+    return Reference(before.up, views, render_all(cloud, views))
+
+
+@torch.no_grad()
+def compare(truth: Reference, after: StoredCloud) -> RoundTrip:
+    """Render the cloud after the round trip likewise, and compare the images."""
+    found = render_all(after.in_axes(truth.up).gaussians.tensors(), truth.views)
+    worst = min(float(psnr(*pair)) for pair in zip(found, truth.images, strict=True))
+    return RoundTrip(float(psnr(found, truth.images)), worst)
+
+
+def round_trip(before: StoredCloud, after: StoredCloud, size: int) -> RoundTrip:
+    """Compare two clouds by :func:`reference` and :func:`compare`."""
+    return compare(reference(before, size), after)

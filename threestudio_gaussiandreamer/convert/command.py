@@ -37,7 +37,7 @@ from ..gaussians.sh import COEFFICIENTS, MAX_DEGREE
 from ..meshes.write import WRITERS
 from ..view.command import read_any
 from . import to_mesh
-from .check import VIEWS, round_trip
+from .check import VIEWS, compare, reference
 from .losses import losses
 
 SIZE = 256
@@ -131,16 +131,23 @@ def run(args: argparse.Namespace) -> None:
     if mesh:
         to_mesh.write_mesh(args, stored)
         return
+    size = args.size or SIZE
+    # before anything is written, since it refuses clouds that can't be rendered
+    truth = reference(stored, size) if args.check else None
     write_cloud(args.output, stored, suffix, spz_version=args.spz_version)
-    count, size = len(stored.gaussians.means), os.path.getsize(args.output)
+    count, written = len(stored.gaussians.means), os.path.getsize(args.output)
     print(
         f"{args.output}: {count:,} Gaussians of degree {stored.gaussians.sh_degree}, "
-        f"{size_text(size)}, {size / count:.1f} bytes each"
+        f"{size_text(written)}, {written / count:.1f} bytes each"
     )
     for loss in losses(stored, suffix, args.spz_version):
         print(f"lost: {loss}")
-    if args.check:
-        print(_checked(args, stored, suffix))
+    if truth:
+        found = compare(truth, read_cloud(args.output))
+        print(
+            f"check: {found.mean:.1f} dB in {VIEWS} views of {size} x {size} pixels, "
+            f"{found.worst:.1f} dB in the worst one"
+        )
 
 
 def _check_options(args: argparse.Namespace, suffix: str, mesh: bool) -> None:
@@ -179,12 +186,3 @@ def _read(source: Path, args: argparse.Namespace) -> StoredCloud:
         stored = from_producer(stored, args.producer)
     stored = stored.in_axes(args.up_out or VIEWER_UP)
     return stored._replace(gaussians=finite(stored.gaussians, args.source))
-
-
-def _checked(args: argparse.Namespace, stored: StoredCloud, suffix: str) -> str:
-    size = args.size or SIZE
-    found = round_trip(stored, read_cloud(args.output), size)
-    return (
-        f"check: {found.mean:.1f} dB in {VIEWS} views of {size} x {size} pixels, "
-        f"{found.worst:.1f} dB in the worst one"
-    )

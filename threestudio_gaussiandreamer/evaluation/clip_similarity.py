@@ -276,9 +276,13 @@ def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
         "--views", type=int, default=defaults.views, help="number of views on the circle"
     )
     parser.add_argument("--drawn", type=int, default=defaults.drawn, help="views drawn per seed")
-    parser.add_argument("--size", type=int, default=defaults.size, help="width and height, pixels")
     parser.add_argument(
-        "--fovy", type=float, default=defaults.fovy_deg, help="vertical field of view, degrees"
+        "--size", type=int, help=f"width and height, pixels (default: {defaults.size})"
+    )
+    parser.add_argument(
+        "--fovy",
+        type=float,
+        help=f"vertical field of view, degrees (default: {defaults.fovy_deg:g})",
     )
     parser.add_argument(
         "--t3bench",
@@ -302,24 +306,29 @@ def protocol_of(args: argparse.Namespace) -> Protocol:
     """Check the options and return them as a :class:`Protocol`.
 
     Raises:
-        UserError: a number is out of range.
+        UserError: a number is out of range, or has no effect with the toybox's CLIP.
     """
+    for option, value in (("--size", args.size), ("--fovy", args.fovy)):
+        if value is not None and has_own_cameras(args.clip):
+            raise UserError(f"{option} has no effect with --clip {args.clip}")
     if not 1 <= args.drawn <= args.views:
         raise UserError(f"--drawn {args.drawn}: expected 1 to {args.views}, the number of views")
-    for option, size in (("--size", args.size), ("--t3bench-size", args.t3bench_size)):
-        if not 1 <= size <= MAX_SIDE:
-            raise UserError(f"{option} {shown(size)}: expected 1 to {MAX_SIDE} pixels")
+    size = Protocol().size if args.size is None else args.size
+    fovy = Protocol().fovy_deg if args.fovy is None else args.fovy
+    for option, pixels in (("--size", size), ("--t3bench-size", args.t3bench_size)):
+        if not 1 <= pixels <= MAX_SIDE:
+            raise UserError(f"{option} {shown(pixels)}: expected 1 to {MAX_SIDE} pixels")
     if args.views > MAX_VIEWS:
         raise UserError(f"--views {shown(args.views)}: expected at most {MAX_VIEWS}")
-    if not 0 < args.fovy < 180:
-        raise UserError(f"--fovy {args.fovy}: expected degrees between 0 and 180")
+    if not 0 < fovy < 180:
+        raise UserError(f"--fovy {fovy}: expected degrees between 0 and 180")
     return protocol_for(
         args.clip,
         seeds=tuple(args.seeds),
         views=args.views,
         drawn=args.drawn,
-        fovy_deg=args.fovy,
-        size=args.size,
+        fovy_deg=fovy,
+        size=size,
     )
 
 
