@@ -194,7 +194,7 @@ def test_denormals_of_the_process_are_not_flushed(isa):
 
 
 def test_more_memory_than_there_is_is_a_named_error():
-    """2.6e9 pairs of Gaussian and tile: beyond 32 bits, and beyond the memory of any machine."""
+    """At least 2.6e9 pairs of Gaussian and tile: beyond 32 bits and the memory of any machine."""
     cloud, camera = (
         random_cloud(40_000).to(torch.float32)._replace(scales=torch.full((40_000, 3), 1e3)),
         cameras(1, 8192, 8192, dtype=torch.float32),

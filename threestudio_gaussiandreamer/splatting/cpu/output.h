@@ -76,8 +76,9 @@ SPLAT_FN RunPixels read_run(const Layers<const float>& in, int64_t at, int pixel
 // Calls visit(row, run, at, pixels) for the runs of a tile's output: `at` is the first pixel, `pixels` <= LANES lie inside.
 template <int DOWNSAMPLE, class T, class Visit>
 SPLAT_FN void for_each_run(const Layers<T>& layers, const TileFrame& frame, Visit visit) {
-  const int left = frame.left / DOWNSAMPLE, top = frame.top / DOWNSAMPLE, side = TILE / DOWNSAMPLE;
-  const int rows = std::min(side, layers.height - top), columns = std::min(side, layers.width - left);
+  const int left = frame.left / DOWNSAMPLE, top = frame.top / DOWNSAMPLE;
+  const int rows = std::min(TILE_HEIGHT / DOWNSAMPLE, layers.height - top);
+  const int columns = std::min(TILE_WIDTH / DOWNSAMPLE, layers.width - left);
   for (int row = 0; row < rows; row++)
     for (int x = 0; x < columns; x += LANES)
       visit(row, x / LANES, int64_t(top + row) * layers.width + left + x, std::min(LANES, columns - x));
@@ -97,8 +98,9 @@ inline void write_tile_as(const Layers<float>& out, Vec3<float> background, cons
 // Asks for the cache lines of a tile's part of an array with `width` pixels of CHANNELS floats per row.
 template <int CHANNELS, bool WRITE, class T>
 SPLAT_FN void prefetch_rows(T* p, const TileFrame& frame, int downsample, int width, int height) {
-  const int left = frame.left / downsample, top = frame.top / downsample, side = TILE / downsample;
-  const int rows = std::min(side, height - top), floats = CHANNELS * std::min(side, width - left);
+  const int left = frame.left / downsample, top = frame.top / downsample;
+  const int rows = std::min(TILE_HEIGHT / downsample, height - top);
+  const int floats = CHANNELS * std::min(TILE_WIDTH / downsample, width - left);
   for (int row = 0; p && row < rows; row++)
     for (int x = 0; x < floats; x += 16) __builtin_prefetch(p + (int64_t(top + row) * width + left) * CHANNELS + x, WRITE);
 }

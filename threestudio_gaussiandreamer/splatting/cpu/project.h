@@ -23,15 +23,15 @@ SPLAT_FN Vec3<Floats> load_colors(const Scene& scene, int view, Group group) {
   return load_vec3(scene.colors + 3 * (offset + group.first), group.count);
 }
 
-// Tiles along one axis of the pixels whose centres lie within centre +- extent, a little more to be safe.
+// Tiles, SIDE pixels each, along one axis of the pixels whose centres lie within centre +- extent, a little more to be safe.
 struct TileRange {
   Ints first, last;
 };
 
-SPLAT_FN TileRange tile_range(Floats centre, Floats extent, float size) {
+template <int SIDE> SPLAT_FN TileRange tile_range(Floats centre, Floats extent, float size) {
   const Floats zero = {}, end = zero + (size - 1.0f), reach = extent + 1e-3f;
-  return {__builtin_convertvector(clamp(centre - reach + 0.5f, zero, end) * (1.0f / TILE), Ints),
-          __builtin_convertvector(clamp(centre + reach - 0.5f, zero, end) * (1.0f / TILE), Ints)};
+  return {__builtin_convertvector(clamp(centre - reach + 0.5f, zero, end) * (1.0f / SIDE), Ints),
+          __builtin_convertvector(clamp(centre + reach - 0.5f, zero, end) * (1.0f / SIDE), Ints)};
 }
 
 inline Ellipse<float> ellipse_of(const Splat& s) {
@@ -40,10 +40,11 @@ inline Ellipse<float> ellipse_of(const Splat& s) {
 
 // Columns [first, last] of tiles cut down to those that the ellipse meets in one row of tiles, with a safety margin.
 inline TileSpan cut_span(const Ellipse<float>& ellipse, int row, int first, int last) {
-  const float top = row * TILE + 0.5f;
-  const Span<float> x = row_span(ellipse, top, top + (TILE - 1));
-  const float low = clamp(x.low - 0.501f, 0.0f, float(last * TILE)), high = clamp(x.high - 0.499f, -1.0f, float(last * TILE));
-  const int begin = std::max(first, int(std::ceil(low)) / TILE), end = high < 0 ? begin : int(high) / TILE + 1;
+  const float top = row * TILE_HEIGHT + 0.5f;
+  const Span<float> x = row_span(ellipse, top, top + (TILE_HEIGHT - 1));
+  const float end_x = float(last * TILE_WIDTH);
+  const float low = clamp(x.low - 0.501f, 0.0f, end_x), high = clamp(x.high - 0.499f, -1.0f, end_x);
+  const int begin = std::max(first, int(std::ceil(low)) / TILE_WIDTH), end = high < 0 ? begin : int(high) / TILE_WIDTH + 1;
   return {uint16_t(begin), uint16_t(std::max(begin, std::min(end, last + 1)))};
 }
 
@@ -92,8 +93,8 @@ SPLAT_FN void store_screen(const ForwardCall& call, int view, Group group, const
 
 // Stores the tiles and the depth of the visible lanes, and counts them by tile where one thread sees all of them.
 inline void list_lanes(View& view, Slice& slice, Group group, const Projection<Floats>& p, const Reach<Floats>& reach, Ints visible) {
-  const TileRange x = tile_range(p.screen.mean.x, reach.extent.x, view.camera.size.x);
-  const TileRange y = tile_range(p.screen.mean.y, reach.extent.y, view.camera.size.y);
+  const TileRange x = tile_range<TILE_WIDTH>(p.screen.mean.x, reach.extent.x, view.camera.size.x);
+  const TileRange y = tile_range<TILE_HEIGHT>(p.screen.mean.y, reach.extent.y, view.camera.size.y);
   uint64_t* keys = view.keys.data() + group.first / SLICE * SLICE;
   for (int l = 0; l < group.count; l++) {
     const int64_t gaussian = group.first + l;

@@ -17,8 +17,8 @@ struct TileFrame {
 };
 
 inline TileFrame frame_of(const View& view, int tile) {
-  const int left = tile % view.tiles_x * TILE, top = tile / view.tiles_x * TILE;
-  const bool inside = left + TILE <= view.camera.size.x && top + TILE <= view.camera.size.y;
+  const int left = tile % view.tiles_x * TILE_WIDTH, top = tile / view.tiles_x * TILE_HEIGHT;
+  const bool inside = left + TILE_WIDTH <= view.camera.size.x && top + TILE_HEIGHT <= view.camera.size.y;
   return {left, top, view.tile_begin[tile], view.tile_begin[tile + 1], inside};
 }
 

@@ -12,10 +12,13 @@
 
 namespace splat {
 
+// Pixels. Every splat of a tile is tested against all of its rows of blocks. In lower tiles these are fewer, but more splats are
+// in several tiles: with 8 lanes the first counts more, with 16 it wasn't measured.
+constexpr int TILE_WIDTH = 32, TILE_HEIGHT = LANES == 16 ? 32 : 16, TILE_PIXELS = TILE_WIDTH * TILE_HEIGHT;
 // A block has as many pixels as there are lanes: 4 columns, and 4, 2 or 1 rows.
-constexpr int TILE = 32, TILE_PIXELS = TILE * TILE;
 constexpr int BLOCK_WIDTH = 4, BLOCK_HEIGHT = LANES / BLOCK_WIDTH;
-constexpr int BLOCKS_PER_ROW = TILE / BLOCK_WIDTH, BLOCK_ROWS = TILE / BLOCK_HEIGHT, BLOCKS = BLOCKS_PER_ROW * BLOCK_ROWS;
+constexpr int BLOCKS_PER_ROW = TILE_WIDTH / BLOCK_WIDTH, BLOCK_ROWS = TILE_HEIGHT / BLOCK_HEIGHT;
+constexpr int BLOCKS = BLOCKS_PER_ROW * BLOCK_ROWS;
 constexpr int CHUNK = 512;    // splats of a tile that are blended at a time
 constexpr int PREFETCH = 32;  // splats ahead
 
@@ -47,7 +50,7 @@ struct Intersection {
   int32_t gaussian, slot;
 };
 
-constexpr int KEPT_PAIRS = 512 / LANES;  // of splats and blocks, per splat of a chunk; the lists of chunks with more aren't kept
+constexpr int KEPT_PAIRS = BLOCKS / 2;  // of splats and blocks, per splat of a chunk; the lists of chunks with more aren't kept
 
 // The splats of a chunk that are blended into each block: block after block, front to back, each list filled up to whole
 // vectors. A splat is the position of its first float among the chunk's, each of which has ROW floats.
@@ -84,7 +87,7 @@ struct View {
 
   // Allocates everything whose size doesn't depend on the positions of the Gaussians.
   void prepare(const Scene& scene, int view) {
-    index = view, tiles_x = (scene.width + TILE - 1) / TILE, tiles_y = (scene.height + TILE - 1) / TILE;
+    index = view, tiles_x = (scene.width + TILE_WIDTH - 1) / TILE_WIDTH, tiles_y = (scene.height + TILE_HEIGHT - 1) / TILE_HEIGHT;
     slices.resize((scene.gaussians + SLICE - 1) / SLICE);
     const size_t padded = slices.size() * SLICE;
     splats.reserve(padded), keys.reserve(padded), spare_keys.reserve(padded), coverages.reserve(padded + slices.size());
