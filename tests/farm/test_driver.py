@@ -1,11 +1,13 @@
 """The driver's decisions, with workers that return at once and a stand-in for Ray."""
 
 import io
+import json
 from types import SimpleNamespace
 
 import pytest
 
 from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.farm import driver
 from threestudio_gaussiandreamer.farm.assets import Job, Recipe, Source
 from threestudio_gaussiandreamer.farm.board import Beat
 from threestudio_gaussiandreamer.farm.display import Display
@@ -115,6 +117,25 @@ def test_a_step_collects_all_outcomes_and_looks_after_workers_now_and_then(path)
     bench.driver.look_due = 0.0
     bench.driver.look_after_workers()
     assert bench.reads == 2
+
+
+def test_the_ledger_has_the_seconds_of_every_attempt(path, monkeypatch):
+    clock = iter(range(1000))
+    monkeypatch.setattr(driver.time, "monotonic", lambda: float(next(clock)))
+
+    def answers(job):
+        if job.saves_memory:
+            return finished(job)
+        return {"state": NO_MEMORY if job.row == ROWS[0] else FAILED, "error": job.row.name}
+
+    bench = Bench(path, answers)
+    bench.driver.run()
+    bench.ledger.close()
+    lines = [json.loads(text) for text in path.read_text().splitlines()]
+    spent = [line.get("worker_seconds") for line in lines if line["name"] == ROWS[0].name]
+    assert spent[0] is None and spent[1] > 0 and spent[2] is None and spent[3] > 0
+    assert Ledger(path).worker_seconds(ROWS[0]) == spent[1] + spent[3]
+    assert Ledger(path).worker_seconds(ROWS[1]) > 0
 
 
 def test_every_asset_is_made_once(path):

@@ -41,6 +41,19 @@ def test_the_table_has_a_row_per_asset_and_its_cost(tmp_path, ledger):
     assert rows[1]["cost"] == "" and rows[2]["command"] == "launch 'a b'"
 
 
+def test_the_cost_has_all_attempts_and_the_failures(tmp_path, ledger):
+    ledger.append([line(ROWS[1], RUNNING, worker_seconds=18.0)])
+    ledger.append([line(ROWS[1], FINISHED, seconds=36.0, worker_seconds=54.0)])
+    ledger.append([line(ROWS[2], FAILED, error="none", worker_seconds=108.0)])
+    ledger.close()
+    again = Ledger(ledger.path)  # as read from the disk
+    first = report.write_report(Place(tmp_path), ROWS, again, price=100.0).read_text()
+    rows = read(tmp_path / "report/table.csv")
+    assert [row["worker_seconds"] for row in rows] == ["36.0", "72.0", "108.0", "36.0", ""]
+    assert [row["cost"] for row in rows] == ["1.0", "2.0", "3.0", "1.0", ""]
+    assert "<td>4 min 12 s</td>" in first and "7, 2.333 per finished asset" in first
+
+
 def test_parquet_has_the_same_rows(tmp_path, ledger, monkeypatch):
     parquet = pytest.importorskip("pyarrow.parquet")
     monkeypatch.setattr(report, "BATCH", 2)

@@ -4,14 +4,14 @@ workers that hang."""
 import time
 from collections import deque
 from collections.abc import Iterator
-from typing import Any, Optional
+from typing import Any, NamedTuple, Optional
 
 from ..core.errors import UserError
 from .assets import Job, repeat_command
 from .board import Beat
 from .display import Display
 from .ledger import FAILED, FINISHED, RUNNING, Ledger
-from .worker import BLOCKED, NO_MEMORY, STOPPED, Setting
+from .worker import BLOCKED, NO_MEMORY, Setting
 
 POLL = 0.5
 """Seconds between two reads of the board, and longest wait for an outcome."""
@@ -19,6 +19,15 @@ SECONDS_TO_STOP = 60
 """How long workers may take to write their checkpoints when the farm is stopped."""
 SAME_ERRORS = 3
 """The farm ends if its first assets, this many, all fail with the same message."""
+
+
+class Running(NamedTuple):
+    """An asset that a worker has."""
+
+    worker: int
+    job: Job
+    began: float
+    """When the worker got it, seconds of the monotonic clock."""
 
 
 class Driver:
@@ -48,7 +57,7 @@ class Driver:
         self.jobs, self.ledger = jobs, ledger
         self.hang, self.display = hang, display
         self.idle = deque(range(len(workers)))
-        self.running: dict[Any, tuple[int, Job]] = {}
+        self.running: dict[Any, Running] = {}
         self.again: deque[Job] = deque()
         self.killed: dict[int, Beat] = {}
         self.errors: list[str] = []
@@ -94,7 +103,7 @@ class Driver:
         """Restart hung workers, and draw the display."""
         beats = self.read_board()
         self.restart_hung(beats)
-        names = {worker: job.row.name for worker, job in self.running.values()}
+        names = {worker: job.row.name for worker, job, _ in self.running.values()}
         self.display.draw(beats, names)
 
     def fill(self) -> None:
@@ -106,7 +115,7 @@ class Driver:
             self.ledger.append([self.line(job, RUNNING)])
             number = self.idle.popleft()
             handle = self.workers[number].make.remote(job, self.settings[number])
-            self.running[handle] = number, job
+            self.running[handle] = Running(number, job, time.monotonic())
 
     def stop(self) -> None:
         """Let all workers write a checkpoint and end."""
@@ -131,20 +140,27 @@ class Driver:
 
     def collect(self, handle: Any) -> None:
         """Note the outcome of an asset."""
-        number, job = self.running.pop(handle)
+        number, job, began = self.running.pop(handle)
         self.idle.append(number)
         outcome = self.outcome(handle)
-        state = outcome["state"]
+        state, spent = outcome["state"], round(time.monotonic() - began, 3)
         if state == FINISHED:
-            self.finish(job, outcome)
-        elif state == NO_MEMORY and self.recipe.low_memory and not job.saves_memory:
+            self.finish(job, outcome, spent)
+            return
+        if state == FAILED or state == NO_MEMORY and not self.can_save_memory(job):
+            self.fail(job, outcome["error"], spent)
+            return
+        self.ledger.append([self.line(job, RUNNING, worker_seconds=spent)])
+        if state == NO_MEMORY:
             self.display.note(job.row.name, "again with less memory", outcome["error"])
             self.again.append(job._replace(saves_memory=True))
             self.restart(number)
         elif state == BLOCKED:
             self.block(outcome["error"])
-        elif state != STOPPED:
-            self.fail(job, outcome["error"])
+
+    def can_save_memory(self, job: Job) -> bool:
+        """Return whether an asset can be made again in less memory."""
+        return bool(self.recipe.low_memory) and not job.saves_memory
 
     def outcome(self, handle: Any) -> dict[str, Any]:
         """Return what the worker returned, or what Ray says about its death."""
@@ -156,15 +172,16 @@ class Driver:
         except errors.RayError as error:
             return {"state": FAILED, "error": first_line(error)}
 
-    def finish(self, job: Job, outcome: dict[str, Any]) -> None:
+    def finish(self, job: Job, outcome: dict[str, Any], spent: float) -> None:
         outcome.pop("key")
-        self.ledger.append([self.line(job, **outcome)])
+        self.ledger.append([self.line(job, **outcome, worker_seconds=spent)])
         self.display.note(job.row.name, FINISHED, f"{outcome.get('seconds', 0):.1f} s")
 
-    def fail(self, job: Job, error: str) -> None:
+    def fail(self, job: Job, error: str, spent: float) -> None:
         """Note a failed asset; end the farm if the first assets all failed with one message."""
         command = repeat_command(self.recipe, job)
-        self.ledger.append([self.line(job, FAILED, error=error, command=command)])
+        more = {"error": error, "command": command, "worker_seconds": spent}
+        self.ledger.append([self.line(job, FAILED, **more)])
         self.display.note(job.row.name, FAILED, error)
         self.errors.append(error)
         finished = self.display.done + self.display.counts[FINISHED]
@@ -204,7 +221,7 @@ class Driver:
         """Restart workers that have finished no step for ``hang`` seconds; Ray calls
         :meth:`.worker.Worker.make` again with the same asset.
         """
-        for number, job in self.running.values():
+        for number, job, _ in self.running.values():
             beat, seconds = beats.get(number, (None, 0.0))
             hangs = beat is not None and beat.name == job.row.name and seconds > self.hang
             if hangs and self.killed.get(number) != beat:

@@ -1,7 +1,8 @@
 """The ledger of a farm: what is running, finished and failed, one JSON object per line.
 
 The file is only appended to, by one process, and a line is on the disk before the farm goes on.
-The last line of an asset counts. A process that was killed may leave half a line: it is skipped
+The last line of an asset counts, but ``worker_seconds``, which a line has when a worker is done with
+the asset, are added up. A process that was killed may leave half a line: it is skipped
 when the file is read, and the next line begins below it."""
 
 import json
@@ -29,11 +30,13 @@ class Entry(NamedTuple):
     """Index in :data:`STATES`."""
     key: str
     """:attr:`.rows.Row.key` of the row that the asset was made from."""
+    worker_seconds: float
+    """The sum of all lines' ``worker_seconds``."""
 
 
 class Ledger:
     """The ledger in a folder. Reading it builds an index of one :class:`Entry` per asset, about
-    250 bytes each; the lines stay on the disk.
+    280 bytes each; the lines stay on the disk.
 
     Args:
         path: the file; it may not exist yet.
@@ -63,9 +66,10 @@ class Ledger:
                 offset += len(content)
 
     def _note(self, line: dict[str, Any], offset: int) -> None:
-        self.index[name_number(line["name"])] = Entry(
-            offset, STATES.index(line["state"]), line["key"]
-        )
+        number = name_number(line["name"])
+        earlier = self.index[number].worker_seconds if number in self.index else 0.0
+        spent = earlier + line.get("worker_seconds", 0.0)
+        self.index[number] = Entry(offset, STATES.index(line["state"]), line["key"], spent)
 
     def state(self, row: Row) -> Optional[str]:
         """Return the last state of a row's asset; None if it was never begun.
@@ -93,6 +97,11 @@ class Ledger:
             self._reader = open(self.path, "rb")
         self._reader.seek(entry.offset)
         return parse_line(self._reader.readline())
+
+    def worker_seconds(self, row: Row) -> float:
+        """Return the seconds that workers have spent on a row's asset, in all attempts."""
+        entry = self.index.get(name_number(row.name))
+        return entry.worker_seconds if entry else 0.0
 
     def append(self, lines: Iterable[dict[str, Any]]) -> None:
         """Append lines, each with name, key and state, and flush them to the disk.

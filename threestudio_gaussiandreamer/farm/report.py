@@ -34,6 +34,7 @@ COLUMNS = {
     "seed": WHOLE,
     "state": TEXT,
     "seconds": NUMBER,
+    "worker_seconds": NUMBER,
     "steps": WHOLE,
     "gaussians": WHOLE,
     "megabytes": NUMBER,
@@ -69,7 +70,7 @@ class Totals:
     def counted(self, lines: Iterable[dict[str, Any]]) -> Iterator[dict[str, Any]]:
         for line in lines:
             self.states[line["state"]] += 1
-            self.seconds += line["seconds"] or 0.0
+            self.seconds += line["worker_seconds"] or 0.0
             self.cost += line["cost"] or 0.0
             if line["state"] == FAILED and len(self.failures) < MOST_FAILURES:
                 self.failures.append(line)
@@ -118,8 +119,11 @@ def table_lines(
         line["state"] = last.get("state", WAITING)
         if line["saves_memory"] is not None:
             line["saves_memory"] = "yes" if line["saves_memory"] else "no"
-        if price is not None and line["seconds"] is not None:
-            line["cost"] = round(line["seconds"] / 3600 * price, 6)
+        # the ledger lacks the last attempt's where the driver was killed
+        spent = round(max(ledger.worker_seconds(row), line["seconds"] or 0.0), 3) or None
+        line["worker_seconds"] = spent
+        if price is not None and spent is not None:
+            line["cost"] = round(spent / 3600 * price, 6)
         yield line
 
 
