@@ -121,6 +121,13 @@ def test_a_damaged_file_names_its_neighbours(tmp_path):
     assert newest_readable(tmp_path / "nothing") is None
 
 
+def test_each_damaged_file_of_a_folder_is_reported_by_itself(tmp_path, caplog):
+    for name in ("a", "b"):
+        (tmp_path / f"{name}.ckpt").write_bytes(b"no checkpoint at all")
+    assert newest_readable(tmp_path) is None
+    assert caplog.text.count("is cut short") == 2 and "not checked" not in caplog.text
+
+
 def test_the_newest_of_a_folder_is_the_one_with_most_steps(tmp_path):
     """Not by name or time: a copied folder doesn't preserve their order, and a kill may happen
     between two files of one save.

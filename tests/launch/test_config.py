@@ -221,6 +221,14 @@ def test_different_texts_name_different_folders():
     assert len({safe_name(text) for text in ("a/b", "a:b", "a_b", "A/b", "a\\b")}) == 5
 
 
+def test_a_name_that_cannot_be_a_folders_is_reported(folder, caplog):
+    load("name=a_b")
+    assert "can't be a folder's" not in caplog.text
+    cfg = load("name=a/b")
+    said = f"name is 'a/b', which can't be a folder's: the run is in {cfg.exp_dir}"
+    assert said in caplog.text
+
+
 def test_prompts_in_a_yaml_are_text_where_yaml_reads_a_number(folder):
     for written, meant in (
         ("1984", "1984"),

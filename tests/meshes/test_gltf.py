@@ -303,3 +303,10 @@ def changed(made, path, value):
 def test_damage_is_one_message(path, value, message, saved):
     with pytest.raises(UserError, match=message):
         read_gltf(saved(changed(textured_quad(FOUR, sampler=NEAREST), path, value)))
+
+
+@pytest.mark.parametrize("content", [b"<!doctype html>", b"broken", b""])
+def test_a_glb_of_something_else_is_named_as_such(tmp_path, content):
+    (tmp_path / "a.glb").write_bytes(content)
+    with pytest.raises(UserError, match="isn't a GLB file, which begins with glTF"):
+        load_mesh(tmp_path / "a.glb")

@@ -15,6 +15,8 @@ from threestudio_gaussiandreamer.training.density import (
 from threestudio_gaussiandreamer.training.geometry import GaussianCloud
 
 EACH_STEP = {"start": 0, "stop": 10, "every": 1}
+ROUNDS = {"enabled": True, "start": 1, "stop": 12, "every": 5}
+"""Of densification, at 5 and 10."""
 
 
 def control(count=10, **options):
@@ -102,8 +104,15 @@ def test_quality_is_measured_against_the_truth_or_between_renders(known):
         ({"budget": 2}, 0, 10, None),
         ({"budget": 1}, 7, 10, "2 rounds of pruning must reduce 10 Gaussians to 1"),
         ({"budget": 20}, 9, 10, None),
+        ({"densify": ROUNDS}, 0, 20, None),
+        ({"densify": ROUNDS}, 10, -1, None),
+        ({"densify": ROUNDS}, 0, 5, "1 of the 2 rounds of densification would come after step 5"),
+        ({"densify": ROUNDS | {"every": 50}}, 0, 20, "densification has no round"),
+        ({"densify": ROUNDS, "max_gaussians": 10}, 0, 20, "there are 10 Gaussians, the most"),
+        ({"densify": ROUNDS, "max_gaussians": 10}, 12, 20, None),
+        ({"budget": 5, "densify": ROUNDS}, 0, 5, "set system.geometry.prune.start"),
     ],
 )
-def test_a_schedule_that_cannot_meet_its_budget_is_described(options, step, end, said):
+def test_a_schedule_that_cannot_do_what_it_is_to_is_described(options, step, end, said):
     problem = control(**options).schedule_problem(step, end)
     assert problem is None if said is None else said in problem

@@ -137,7 +137,7 @@ def newest_readable(folder: str | os.PathLike) -> Optional[tuple[Path, int]]:
         try:
             return candidate, load_checkpoint(candidate)["global_step"]
         except UserError as error:
-            warn(str(error))
+            warn(str(error).removesuffix(_siblings(candidate)))  # they are checked here
     return None
 
 

@@ -262,43 +262,36 @@ def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
         prog=f"python -m {__package__}.clip_similarity",
         description="CLIP similarity, as in the paper.",
     )
-    parser.add_argument(
+    add = parser.add_argument
+    add(
         "results", nargs="+", metavar="RUN_FOLDER|PLY", help="a run's folder, or a PLY of Gaussians"
     )
-    parser.add_argument("--clip", help="CLIP folder in transformers' format, or toybox (bundled)")
-    parser.add_argument(
-        "--prompt", help="the text of all results; default: what each run was asked for"
-    )
-    parser.add_argument("--prompts-file", help="one prompt for each result, a line each")
-    parser.add_argument("--output", default="evaluation", help="folder for clip.json and clip.png")
-    parser.add_argument("--seeds", type=int, nargs="+", default=list(defaults.seeds))
-    parser.add_argument(
-        "--views", type=int, default=defaults.views, help="number of views on the circle"
-    )
-    parser.add_argument("--drawn", type=int, default=defaults.drawn, help="views drawn per seed")
-    parser.add_argument(
-        "--size", type=int, help=f"width and height, pixels (default: {defaults.size})"
-    )
-    parser.add_argument(
+    add("--clip", help="CLIP folder in transformers' format, or toybox (bundled)")
+    add("--prompt", help="the text of all results; default: what each run was asked for")
+    add("--prompts-file", help="one prompt for each result, a line each")
+    add("--output", default="evaluation", help="folder for clip.json and clip.png")
+    add("--seeds", type=int, nargs="+", default=list(defaults.seeds))
+    add("--views", type=int, default=defaults.views, help="number of views on the circle")
+    add("--drawn", type=int, default=defaults.drawn, help="views drawn per seed")
+    add("--size", type=int, help=f"width and height, pixels (default: {defaults.size})")
+    add(
         "--fovy",
         type=float,
         help=f"vertical field of view, degrees (default: {defaults.fovy_deg:g})",
     )
-    parser.add_argument(
+    add(
         "--t3bench",
         metavar="FOLDER",
         help="also write T3Bench's views of every result; see docs/evaluation.md",
     )
-    parser.add_argument(
+    add(
         "--t3bench-group",
         default="single",
         choices=["single", "surr", "multi"],
         help="the list of its prompts",
     )
-    parser.add_argument(
-        "--t3bench-method", default="gaussiandreamer", help="its name for what made the results"
-    )
-    parser.add_argument("--t3bench-size", type=int, default=512, help="size of its views, pixels")
+    add("--t3bench-method", default="gaussiandreamer", help="its name for what made the results")
+    add("--t3bench-size", type=int, default=512, help="size of its views, pixels")
     return parser.parse_args(argv)
 
 

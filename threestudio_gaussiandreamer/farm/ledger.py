@@ -1,9 +1,9 @@
 """The ledger of a farm: what is running, finished and failed, one JSON object per line.
 
 The file is only appended to, by one process, and a line is on the disk before the farm goes on.
-The last line of an asset counts, but ``worker_seconds``, which a line has when a worker is done with
-the asset, are added up. A process that was killed may leave half a line: it is skipped
-when the file is read, and the next line begins below it."""
+The last line of an asset counts, but ``worker_seconds``, which a line has when a worker is done
+with the asset, are added up. A process that was killed may leave half a line: it is skipped when
+the file is read, and the next line begins below it."""
 
 import json
 import os

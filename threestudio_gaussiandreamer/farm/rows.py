@@ -254,12 +254,20 @@ def _check_header(path: Path, header: list[str]) -> None:
 def _from_jsonl(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
     for number, text in _lines(path):
         try:
-            values = json.loads(text)
+            values = json.loads(text, object_pairs_hook=_named_once)
         except (ValueError, RecursionError) as error:
-            raise UserError(f"{path}, line {number} isn't JSON: {error}") from error
+            raise UserError(f"{path}, line {number} can't be read as JSON: {error}") from error
         if not isinstance(values, dict):
             raise UserError(f'{path}, line {number}: expected an object {{"prompt": "a fox"}}')
         yield number, values
+
+
+def _named_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    names = [name for name, _ in pairs]
+    for name in names:
+        if names.count(name) > 1:
+            raise ValueError(f"{name!r} is given twice")
+    return dict(pairs)
 
 
 FORMATS: dict[str, Callable[[Path], Iterator[tuple[int, dict[str, Any]]]]] = {

@@ -73,7 +73,10 @@ class Document:
         self.path, self.budget = path, Budget(path)
         self.side_files = SideFiles(path, self.budget)
         data = path.read_bytes()
-        text, self._chunk = _glb_chunks(data, path) if data[:4] == b"glTF" else (data, None)
+        is_glb = data[:4] == b"glTF"
+        if path.suffix.lower() == ".glb" and not is_glb and data.lstrip()[:1] != b"{":
+            self.fail(f"it isn't a GLB file, which begins with glTF, but with {data[:20]!r}")
+        text, self._chunk = _glb_chunks(data, path) if is_glb else (data, None)
         self.json = _parsed(text, path)
         self._buffers: dict[int, memoryview] = {}
         self._check_version()

@@ -35,6 +35,8 @@ from ..metrics import psnr
 from ..splatting import Rasterized
 from .density_options import AUTO, min_count, rounds_of
 
+SET_ROUNDS = "set system.geometry.{}.start, stop and every accordingly"
+
 
 class QualityResult(NamedTuple):
     """The quality of one batch of views if some of the Gaussians are removed."""
@@ -106,10 +108,32 @@ class DensityControl:
 
     def schedule_problem(self, step: int, max_steps: int) -> Optional[str]:
         """Describe why the rounds between ``step`` and ``max_steps`` (-1: unlimited) can't meet the
-        budget, or can meet it only by keeping less than ``prune.keep``. Return None if there is no
-        such problem.
+        budget, or can meet it only by keeping less than ``prune.keep``, and why densification can't
+        do what it is to. Return None if there is no such problem.
         """
         end = max_steps if max_steps > 0 else math.inf
+        problems = self._densification_problem(step, end), self._pruning_problem(step, end)
+        return "; ".join(filter(None, problems)) or None
+
+    def _densification_problem(self, step: int, end: float) -> Optional[str]:
+        if not self.options.densify.enabled:
+            return None
+        rounds, count = rounds_of(self.options.densify), len(self.cloud)
+        if not rounds:
+            return f"densification has no round: {SET_ROUNDS.format('densify')}"
+        if late := sum(round_ > end for round_ in rounds):
+            return (
+                f"{late} of the {len(rounds)} rounds of densification would come after step {end}, "
+                f"the last: {SET_ROUNDS.format('densify')}"
+            )
+        if rounds[-1] > step and count >= self.options.max_gaussians:
+            return (
+                f"densification can only replace what it drops: there are {count} Gaussians, the "
+                "most that system.geometry.max_gaussians allows"
+            )
+        return None
+
+    def _pruning_problem(self, step: int, end: float) -> Optional[str]:
         budget, rounds, count = self.options.budget, self.prune_rounds, len(self.cloud)
         if budget is None:
             return None
@@ -117,7 +141,7 @@ class DensityControl:
         if late:
             return (
                 f"{late} of the {len(rounds)} rounds of pruning would come after step {end}, the "
-                "last: set system.geometry.prune.start, stop and every accordingly"
+                f"last: {SET_ROUNDS.format('prune')}"
             )
         if budget == AUTO or count <= budget:
             return None
@@ -129,7 +153,7 @@ class DensityControl:
         if not remaining:
             return (
                 f"no round of pruning remains, so {count} Gaussians are kept instead of {budget}: "
-                "set system.geometry.prune.start, stop and every accordingly"
+                f"{SET_ROUNDS.format('prune')}"
             )
         share = self.kept_share(count, remaining[0])
         if share >= keep - 0.005:  # equal in the two decimals of the message
