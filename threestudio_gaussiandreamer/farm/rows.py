@@ -263,11 +263,12 @@ def _from_jsonl(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
 
 
 def _named_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    names = [name for name, _ in pairs]
-    for name in names:
-        if names.count(name) > 1:
+    found: dict[str, Any] = {}
+    for name, value in pairs:
+        if name in found:
             raise ValueError(f"{name!r} is given twice")
-    return dict(pairs)
+        found[name] = value
+    return found
 
 
 FORMATS: dict[str, Callable[[Path], Iterator[tuple[int, dict[str, Any]]]]] = {
