@@ -87,7 +87,7 @@ class Training:
 
 SCHEDULES = [f"system.geometry.{key}" for key in (
     "prior.num_points=180", "init_opacity=0.3", "budget=100", "densify.enabled=true",
-    "densify.start=10", "densify.stop=95", "densify.every=10", "densify.grad_threshold=1e-4",
-    "densify.min_opacity=0.2", "densify.absgrad=true", "prune.start=15", "prune.stop=95",
+    "densify.start=30", "densify.stop=95", "densify.every=10", "densify.grad_threshold=1e-4",
+    "densify.min_opacity=0.4", "densify.absgrad=true", "prune.start=15", "prune.stop=95",
     "prune.every=15",
 )]  # fmt: skip
