@@ -71,13 +71,16 @@ class Ledger:
         spent = earlier + line.get("worker_seconds", 0.0)
         self.index[number] = Entry(offset, STATES.index(line["state"]), line["key"], spent)
 
+    def _entry(self, row: Row) -> Optional[Entry]:
+        return self.index.get(name_number(row.name))
+
     def state(self, row: Row) -> Optional[str]:
         """Return the last state of a row's asset; None if it was never begun.
 
         Raises:
             UserError: the asset of this name was made from another row.
         """
-        entry = self.index.get(name_number(row.name))
+        entry = self._entry(row)
         if entry is None:
             return None
         if entry.key != row.key:
@@ -90,7 +93,7 @@ class Ledger:
 
     def last(self, row: Row) -> Optional[dict[str, Any]]:
         """Return the last line of a row's asset, read from the disk; None if there is none."""
-        entry = self.index.get(name_number(row.name))
+        entry = self._entry(row)
         if entry is None:
             return None
         if self._reader is None:
@@ -100,7 +103,7 @@ class Ledger:
 
     def worker_seconds(self, row: Row) -> float:
         """Return the seconds that workers have spent on a row's asset, in all attempts."""
-        entry = self.index.get(name_number(row.name))
+        entry = self._entry(row)
         return entry.worker_seconds if entry else 0.0
 
     def append(self, lines: Iterable[dict[str, Any]]) -> None:

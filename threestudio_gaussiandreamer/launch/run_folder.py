@@ -52,8 +52,9 @@ def name_folders(cfg: Any) -> None:
     """
     tag = safe_name(cfg.tag) if cfg.tag else ""
     cfg.exp_root_dir = escape(_home_expanded(cfg.exp_root_dir))
-    cfg.exp_dir = escape(os.path.join(cfg.exp_root_dir, safe_name(cfg.name)))
-    if safe_name(cfg.name) != cfg.name:
+    name = safe_name(cfg.name)
+    cfg.exp_dir = escape(os.path.join(cfg.exp_root_dir, name))
+    if name != cfg.name:
         warn(f"name is {cfg.name!r}, which can't be a folder's: the run is in {cfg.exp_dir}")
     cfg.new_folder = cfg.timestamp is None and cfg.use_timestamp and cfg.n_gpus == 1
     if cfg.new_folder:

@@ -121,11 +121,8 @@ class DensityControl:
         rounds, count = rounds_of(self.options.densify), len(self.cloud)
         if not rounds:
             return f"densification has no round: {SET_ROUNDS.format('densify')}"
-        if late := sum(round_ > end for round_ in rounds):
-            return (
-                f"{late} of the {len(rounds)} rounds of densification would come after step {end}, "
-                f"the last: {SET_ROUNDS.format('densify')}"
-            )
+        if late := late_rounds("densification", "densify", rounds, end):
+            return late
         if rounds[-1] > step and count >= self.options.max_gaussians:
             return (
                 f"densification can only replace what it drops: there are {count} Gaussians, the "
@@ -137,12 +134,8 @@ class DensityControl:
         budget, rounds, count = self.options.budget, self.prune_rounds, len(self.cloud)
         if budget is None:
             return None
-        late = sum(round_ > end for round_ in rounds)
-        if late:
-            return (
-                f"{late} of the {len(rounds)} rounds of pruning would come after step {end}, the "
-                f"last: {SET_ROUNDS.format('prune')}"
-            )
+        if late := late_rounds("pruning", "prune", rounds, end):
+            return late
         if budget == AUTO or count <= budget:
             return None
         return self._shortage([round_ for round_ in rounds if step < round_ <= end])
@@ -306,6 +299,17 @@ class DensityControl:
             top = importance.top_count(stats.contribution) if cfg.score == "contribution" else 0
             count, measured = smallest_passing_count(scores, max(count, top), check)
         return importance.keep_highest(values, scores, count, first), measured
+
+
+def late_rounds(what: str, option: str, rounds: range, end: float) -> Optional[str]:
+    """Describe how many rounds would come after the last step; return None if none would."""
+    late = sum(round_ > end for round_ in rounds)
+    if not late:
+        return None
+    return (
+        f"{late} of the {len(rounds)} rounds of {what} would come after step {end}, the last: "
+        f"{SET_ROUNDS.format(option)}"
+    )
 
 
 def smallest_passing_count(
