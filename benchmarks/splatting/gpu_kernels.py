@@ -186,13 +186,18 @@ def trimmed(value: Tensor, exact: Tensor) -> float:
 
 def compile_kernels(args: argparse.Namespace) -> dict[str, Any]:
     """Return the seconds from the first call to its image, in new processes: with an empty cache,
-    and with a filled one; and those of the comparison that precedes the first use.
+    with a filled one, and with one that lacks the verdict of the comparison that precedes the
+    first use; and those of the comparison itself.
     """
     with tempfile.TemporaryDirectory() as cache:
         environment = {"GAUSSIANDREAMER_CACHE": cache}
         first, later = (in_process("first_picture", args, environment) for _ in range(2))
+        for verdict in Path(cache).glob("proof-*"):
+            verdict.unlink()
+        again = in_process("first_picture", args, environment)
         compared = in_process("comparison", args, environment)
-    return {"first": first["seconds"], "later": later["seconds"], "comparison": compared}
+    seconds = {"first": first["seconds"], "later": later["seconds"], "compared": again["seconds"]}
+    return seconds | {"comparison": compared}
 
 
 def comparison(args: argparse.Namespace) -> dict[str, Any]:

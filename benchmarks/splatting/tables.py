@@ -130,6 +130,9 @@ def gpu() -> str:
         f"comparison at the first use (aim: {COMPARISON_AIM:g} s): plain torch, kernels; sum": (
             lambda run: _comparison(run["compile"]["comparison"])
         ),
+        "what it adds to the first image with a filled cache": lambda run: (
+            f"{run['compile']['compared'] - run['compile']['later']:.3f} s"
+        ),
     }
     for name in (*PRESETS, "gsplat"):
         rows[f"forward and backward, {name}"] = functools.partial(_bench, name)

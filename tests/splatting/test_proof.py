@@ -34,8 +34,8 @@ def other_constants(*arguments, eps2d: float = 0.4) -> None:
     settings.eps2d, settings.alpha_max = eps2d, 0.5
 
 
-def settings_of(arguments) -> stages._Settings:
-    (settings,) = (x for x in arguments if isinstance(x, stages._Settings))
+def settings_of(arguments) -> stages.Settings:
+    (settings,) = (x for x in arguments if isinstance(x, stages.Settings))
     return settings
 
 

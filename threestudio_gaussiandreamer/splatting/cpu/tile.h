@@ -61,6 +61,7 @@ SPLAT_FN Ints blocks_in_row(const Ellipse<Floats>& ellipse, int row) {
 }
 
 constexpr int MASK_WORDS = BLOCKS / 32;
+static_assert(BLOCKS_PER_ROW == 8 && BLOCKS % 32 == 0, "a word of the masks has four rows of eight blocks");
 
 // Bit 8 r + c is set when the splat touches block (r, c) of the tile; a word has four rows.
 SPLAT_FN void block_masks(const SplatLanes& s, Ints words[MASK_WORDS]) {

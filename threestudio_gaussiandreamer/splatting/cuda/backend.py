@@ -31,6 +31,7 @@ from . import driver
 from .memory import CapacityEstimate, halve_on_oom, round_up_capacity, too_large
 from .stages import (
     AsyncReadback,
+    Batch,
     BlendUpstream,
     Images,
     LaunchContext,
@@ -40,6 +41,8 @@ from .stages import (
     blend_backward,
     empty_gradients,
     list_intersections,
+    make_batch,
+    make_context,
     no_lists,
     project,
     project_backward,
@@ -60,7 +63,7 @@ def unavailable() -> Optional[str]:
 def rasterize(scene: Scene, options: RasterizeOptions) -> Rasterized:
     """Draw all views of a validated scene."""
     _check_count(*scene.shape)
-    context = LaunchContext(options, scene.tracked, driver.device(scene.means.device))
+    context = make_context(options, scene.tracked, driver.device(scene.means.device))
     return autograd.rasterize(CudaKernel(context), scene, options)
 
 
@@ -84,10 +87,11 @@ class CudaKernel(NamedTuple):
         if not len(scene.means):
             images = _background_alone(scene, self.context)
             return Drawn(*images[:3], *means2d.new_zeros(2, *scene.shape)), (images.alpha,), None
-        splats, radii, contribution = project(scene, means2d, self.context)
+        batch = make_batch(scene, self.context)
+        splats, radii, contribution = project(batch, means2d)
         totals = self.context.device.read_async(splats.ends[:, -1])
         images = _empty_images(scene, self.context)
-        lists = _draw(scene, splats, totals, images, contribution, self.context)
+        lists = _draw(batch, splats, totals, images, contribution)
         kept = (*splats, *lists, *images[3:]) if self.context.tracked else ()
         return Drawn(*images[:3], radii, contribution), (images.alpha, *kept), totals
 
@@ -106,8 +110,9 @@ class CudaKernel(NamedTuple):
         if kept:
             splats, lists = Splats(*kept[:5]), Lists(*kept[5:8])
             blended = BlendUpstream(*upstream, *kept[8:])
-            sums = _sums_of_rows(scene, splats, lists, state.values(), blended, self.context)
-            project_backward(scene, splats, sums, found, self.context)
+            batch = make_batch(scene, self.context)
+            sums = _sums_of_rows(batch, splats, lists, state.values(), blended)
+            project_backward(batch, splats, sums, found)
         viewmats = None if found.viewmats is None else viewmats_gradient(found.viewmats)
         background = (
             _background_gradient(upstream.image, alpha, scene) if wanted.background else None
@@ -117,41 +122,41 @@ class CudaKernel(NamedTuple):
 
 
 def _draw(
-    scene: Scene,
+    batch: Batch,
     splats: Splats,
     totals: AsyncReadback,
     images: Images,
     contribution: Tensor,
-    context: LaunchContext,
 ) -> Lists:
     """Fill the images; return the lists, which are incomplete if the capacity was too small.
 
     The capacity is estimated from earlier calls. If there is no memory for it, the views are halved
     until each part fits; a part's lists have the exact size, and are freed after it is rendered. A
     single view that doesn't fit is rendered without lists."""
-    views, gaussians = scene.shape
-    key = (scene.means.device, views, *scene.size)
+    views, gaussians = batch.scene.shape
+    key = (batch.scene.means.device, views, *batch.scene.size)
     estimate = _estimates.setdefault(key, CapacityEstimate(views))
 
     def draw(first: int, last: int) -> Lists:
-        part = (scene.of_views(first, last), splats.of_views(first, last))
+        part = (batch.of_views(first, last), splats.of_views(first, last))
         try:
             if last - first == views:
                 capacity = estimate.capacity(totals, gaussians)
             else:
                 capacity = round_up_capacity(sum(totals.values()[first:last]))
-            lists = list_intersections(*part, capacity, context)
+            lists = list_intersections(*part, capacity)
         except torch.cuda.OutOfMemoryError:
             if last - first > 1:
                 estimate.record_failure(gaussians)
                 raise
             _report_short_memory()
             lists = no_lists(*part)
-        blend(*part, lists, _of_views(images, first, last), contribution[first:last], context)
+        pictures = _of_views(images, first, last, views)
+        blend(*part, lists, pictures, contribution[first:last])
         return lists
 
     parts = halve_on_oom(draw, 0, views)
-    return parts[0] if len(parts) == 1 else no_lists(scene, splats)
+    return parts[0] if len(parts) == 1 else no_lists(batch, splats)
 
 
 @functools.cache
@@ -163,12 +168,11 @@ def _report_short_memory() -> None:
 
 
 def _sums_of_rows(
-    scene: Scene,
+    batch: Batch,
     splats: Splats,
     lists: Lists,
     totals: list[int],
     upstream: BlendUpstream,
-    context: LaunchContext,
 ) -> Tensor:
     """Run `blend_backward` on all views, or on fewer at a time if memory is short; lists that are
     incomplete are made again.
@@ -180,10 +184,10 @@ def _sums_of_rows(
 
     def sums(first: int, last: int) -> Tensor:
         total = sum(totals[first:last])
-        part = (scene.of_views(first, last), splats.of_views(first, last))
+        part = (batch.of_views(first, last), splats.of_views(first, last))
         whole = last - first == views and total <= lists.capacity
-        own = lists if whole else list_intersections(*part, round_up_capacity(total), context)
-        return blend_backward(*part, own, total, _of_views(upstream, first, last), context)
+        own = lists if whole else list_intersections(*part, round_up_capacity(total))
+        return blend_backward(*part, own, total, _of_views(upstream, first, last, views))
 
     try:
         parts = halve_on_oom(sums, 0, views)
@@ -195,8 +199,10 @@ def _sums_of_rows(
 # ---- tensors -------------------------------------------------------------------------------------
 
 
-def _of_views(tensors, first: int, last: int):
-    """Select some views of every tensor of a named tuple."""
+def _of_views(tensors, first: int, last: int, views: int):
+    """Select some of all views of every tensor of a named tuple."""
+    if last - first == views:
+        return tensors
     return type(tensors)(*(None if x is None else x[first:last] for x in tensors))
 
 

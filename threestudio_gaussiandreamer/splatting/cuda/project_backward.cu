@@ -5,6 +5,7 @@
 namespace splat {
 
 constexpr int THREADS = 128, CAMERA_SUMS = 12;  // d loss / d viewmat but for its last row
+constexpr int SUM_LANES = 4, RANKS = WARP / SUM_LANES;  // lanes that add the rows of one splat, a quad each; splats of a warp
 
 // What a backward pass fills.
 struct Gradients {
@@ -58,30 +59,58 @@ SPLAT_FN void store_screen(const Gradients& out, Index at, const Vec2<float>& me
   if (out.absgrad) out.absgrad[2 * at] = absolute.x, out.absgrad[2 * at + 1] = absolute.y;
 }
 
-}  // namespace splat
+// The rows of a rank of a view's order: [begin, end), of view * N + Gaussian `owner`. Empty, with owner -1, behind the last visible one.
+struct RowSpan {
+  Index begin, end, owner;
+};
 
-// Rows of the intersections to sums (B, N) of rows; those of invisible Gaussians stay as they are. One warp per rank: 8 rows at a
-// time, a quad per lane, so that a Gaussian that covers the screen takes no thread thousands of steps.
-extern "C" __global__ void __launch_bounds__(128, 8)
-sum_rows(splat::Scene scene, const int* depth_keys, const splat::Index* order, const int* counts, const splat::Index* ends,
-         const splat::Row* rows, splat::Row* sums) {
-  using namespace splat;
-  constexpr int LANES_PER_ROW = 4, ROWS = WARP / LANES_PER_ROW;
-  const int lane = threadIdx.x % WARP, quad = lane % LANES_PER_ROW;
-  const Index rank = (Index(blockIdx.x) * blockDim.x + threadIdx.x) / WARP, at = Index(blockIdx.y) * scene.gaussians + rank;
-  if (rank >= scene.gaussians) return;
-  const Index index = at - rank + order[at], end = ends[at];
-  if (depth_keys[index] == CULLED) return;
-  Quad sum = {};
-  if (quad < ROW_QUADS)
-    for (Index i = end - counts[at] + lane / LANES_PER_ROW; i < end; i += ROWS)
-      sum = sum + reinterpret_cast<const Quad*>(rows + i)[quad];
-  for (int step = LANES_PER_ROW; step < WARP; step *= 2) {
+SPLAT_FN RowSpan rows_of_rank(const Scene& scene, const int* depth_keys, const Index* order, const int* counts, const Index* ends,
+                              Index rank) {
+  if (rank >= scene.gaussians) return {0, 0, -1};
+  const Index first = Index(blockIdx.y) * scene.gaussians, at = first + rank, owner = first + order[at];
+  if (depth_keys[owner] == CULLED) return {0, 0, -1};
+  return {ends[at] - counts[at], ends[at], owner};
+}
+
+// The sum over the lanes of a warp with the same quad.
+SPLAT_FN Quad across_ranks(Quad sum) {
+  for (int step = SUM_LANES; step < WARP; step *= 2) {
     const float x = __shfl_xor_sync(FULL, sum.x, step), y = __shfl_xor_sync(FULL, sum.y, step);
     const float z = __shfl_xor_sync(FULL, sum.z, step), w = __shfl_xor_sync(FULL, sum.w, step);
     sum = sum + Quad{x, y, z, w};
   }
-  if (lane < ROW_QUADS) reinterpret_cast<Quad*>(sums + index)[quad] = sum;
+  return sum;
+}
+
+}  // namespace splat
+
+// Rows of the intersections to sums (B, N) of rows; those of invisible Gaussians stay as they are. SUM_LANES lanes per rank add its
+// first rows, a quad each. Then the whole warp adds the others of each of its ranks, so that a Gaussian that covers the screen takes
+// no thread thousands of steps.
+extern "C" __global__ void __launch_bounds__(128, 8)
+sum_rows(splat::Scene scene, const int* depth_keys, const splat::Index* order, const int* counts, const splat::Index* ends,
+         const splat::Row* rows, splat::Row* sums) {
+  using namespace splat;
+  constexpr int FIRST_ROWS = 4;
+  const int lane = threadIdx.x % WARP, quad = lane % SUM_LANES, own = lane / SUM_LANES;
+  const Index first_rank = (Index(blockIdx.x) * blockDim.x + threadIdx.x) / WARP * RANKS;
+  const auto sum_every = [&](int stride, Index begin, Index end) {
+    Quad sum = {};
+    if (quad < ROW_QUADS)
+#pragma unroll 4
+      for (Index i = begin; i < end; i += stride) sum = sum + reinterpret_cast<const Quad*>(rows + i)[quad];
+    return sum;
+  };
+  const RowSpan span = rows_of_rank(scene, depth_keys, order, counts, ends, first_rank + own);
+  Quad sum = sum_every(1, span.begin, minimum(span.end, span.begin + FIRST_ROWS));
+  const unsigned longer = __ballot_sync(FULL, span.end - span.begin > FIRST_ROWS);
+  for (int k = 0; k < RANKS; k++) {
+    if (!(longer >> (k * SUM_LANES) & 1)) continue;
+    const RowSpan others = rows_of_rank(scene, depth_keys, order, counts, ends, first_rank + k);
+    const Quad rest = across_ranks(sum_every(RANKS, others.begin + FIRST_ROWS + own, others.end));
+    if (k == own) sum = sum + rest;
+  }
+  if (span.owner >= 0 && quad < ROW_QUADS) reinterpret_cast<Quad*>(sums + span.owner)[quad] = sum;
 }
 
 extern "C" __global__ void __launch_bounds__(128, 3)

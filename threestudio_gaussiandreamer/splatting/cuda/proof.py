@@ -227,7 +227,9 @@ def _weighted_sum(image: Tensor) -> Tensor:
 
 
 def _scene(device: torch.device, dtype: torch.dtype) -> Scene:
-    """Return the scene: Gaussians of all sizes and opacities in front of two cameras."""
+    """Return the scene: Gaussians of all sizes and opacities in front of two cameras. The first
+    one covers all tiles, more than the first rows that ``sum_rows`` adds.
+    """
     generator = torch.Generator("cpu").manual_seed(0)
 
     def uniform(low: float, high: float, *shape: int) -> Tensor:
@@ -236,6 +238,7 @@ def _scene(device: torch.device, dtype: torch.dtype) -> Scene:
 
     means, quats = uniform(-0.7, 0.7, GAUSSIANS, 3), uniform(-1, 1, GAUSSIANS, 4)
     scales, opacities = uniform(0.01, 0.2, GAUSSIANS, 3), uniform(0.05, 0.99, GAUSSIANS)
+    scales[0], opacities[0] = 1.0, 0.3
     colors, background = uniform(0, 1, GAUSSIANS, 3), uniform(0, 1, len(ANGLES), 3)
     viewmats = torch.tensor([_viewmat(angle) for angle in ANGLES], device=device, dtype=dtype)
     focal = [[WIDTH, 0.0, WIDTH / 2], [0.0, WIDTH, HEIGHT / 2], [0.0, 0.0, 1.0]]

@@ -13,9 +13,10 @@ import torch
 from torch import Tensor
 
 from ..options import RasterizeOptions
-from ..scene import Scene, address
+from ..scene import Scene, SceneStruct, address
 
-TILE, BLEND_THREADS, THREADS, WARP = 16, 256, 128, 32
+TILE, BLEND_THREADS, THREADS = 16, 256, 128
+SUM_LANES = 4  # threads that add the rows of one splat
 SPLAT, ROW = 16, 12  # floats
 NOWHERE = 2**31 - 1  # the tile of an intersection that isn't used
 CAMERA_SUMS = 12
@@ -45,8 +46,41 @@ class LaunchContext(NamedTuple):
     """Options and device of a call; ``tracked`` tells whether a backward pass may follow."""
 
     options: RasterizeOptions
+    settings: "Settings"
     tracked: bool
     device: Device
+
+
+class Batch(NamedTuple):
+    """A scene, or some of its views, that kernels process together. Its struct is made once, since
+    that takes longer than a launch.
+    """
+
+    scene: Scene
+    struct: SceneStruct
+    context: LaunchContext
+
+    @property
+    def views(self) -> int:
+        return self.struct.views
+
+    def of_views(self, first: int, last: int) -> "Batch":
+        """Select the views ``first`` to ``last - 1``."""
+        if last - first == self.views:
+            return self
+        return make_batch(self.scene.of_views(first, last), self.context)
+
+    def launch(self, name: str, grid: tuple[int, int], threads: int, *arguments: Argument) -> None:
+        """Queue a kernel whose first parameter is the scene."""
+        self.context.device.launch(name, grid, threads, self.struct, *arguments)
+
+
+def make_context(options: RasterizeOptions, tracked: bool, device: Device) -> LaunchContext:
+    return LaunchContext(options, Settings.of(options), tracked, device)
+
+
+def make_batch(scene: Scene, context: LaunchContext) -> Batch:
+    return Batch(scene, scene.struct(), context)
 
 
 class Splats(NamedTuple):
@@ -60,6 +94,8 @@ class Splats(NamedTuple):
 
     def of_views(self, first: int, last: int) -> "Splats":
         """Select the views ``first`` to ``last - 1``; ``ends`` restarts at the first of them."""
+        if last - first == self.ends.shape[0]:
+            return self
         part = Splats(*(x[first:last] for x in self))
         return part._replace(ends=part.ends - self.ends[first - 1, -1]) if first else part
 
@@ -73,7 +109,7 @@ class Lists(NamedTuple):
 
     @property
     def capacity(self) -> int:
-        return len(self.owners)
+        return self.owners.shape[0]
 
 
 class Images(NamedTuple):
@@ -117,11 +153,11 @@ def tiles_per_view(scene: Scene) -> int:
     return -(-scene.width // TILE) * -(-scene.height // TILE)
 
 
-def project(scene: Scene, means2d: Tensor, context: LaunchContext) -> tuple[Splats, Tensor, Tensor]:
+def project(batch: Batch, means2d: Tensor) -> tuple[Splats, Tensor, Tensor]:
     """Run stages 1 to 3 and fill ``means2d``; also return radii (B, N) and contributions (B, N),
     which are still zero.
     """
-    launch, shape, new = context.device.launch, scene.shape, scene.means.new_empty
+    shape, new = batch.scene.shape, batch.scene.means.new_empty
     splats, depth_keys, radii, contribution = (
         new(*shape, SPLAT),
         new(shape, dtype=torch.int32),
@@ -129,95 +165,54 @@ def project(scene: Scene, means2d: Tensor, context: LaunchContext) -> tuple[Spla
         new(shape),
     )
     outputs = (splats, depth_keys, means2d.detach(), radii, contribution)
-    launch(
-        "project",
-        _per_gaussian(shape),
-        THREADS,
-        scene.struct(),
-        _settings(context.options),
-        *outputs,
-    )
+    grid = _per_gaussian(shape)
+    batch.launch("project", grid, THREADS, batch.context.settings, *outputs)
     order = depth_keys.sort(dim=1, stable=True).indices
     counts = torch.zeros_like(depth_keys)
-    launch("count_tiles", _per_gaussian(shape), THREADS, scene.struct(), splats, order, counts)
+    batch.launch("count_tiles", grid, THREADS, splats, order, counts)
     ends = counts.flatten().cumsum(0, dtype=torch.int64).view(shape)
     return Splats(splats, depth_keys, order, counts, ends), radii, contribution
 
 
-def list_intersections(
-    scene: Scene, splats: Splats, capacity: int, context: LaunchContext
-) -> Lists:
+def list_intersections(batch: Batch, splats: Splats, capacity: int) -> Lists:
     """Run stages 4 and 5. Intersections beyond the capacity are left out; `blend` detects that.
 
     Raises:
         torch.cuda.OutOfMemoryError: there is no memory for so many.
     """
-    launch, room, tiles = (
-        context.device.launch,
-        ctypes.c_int64(capacity),
-        len(splats.ends) * tiles_per_view(scene),
-    )
+    room, tiles = ctypes.c_int64(capacity), batch.views * tiles_per_view(batch.scene)
     tile_of = torch.full((capacity,), NOWHERE, dtype=torch.int32, device=splats.ends.device)
     owners = torch.empty_like(tile_of)
-    arguments = (scene.struct(), splats.splats, *splats[2:], room, tile_of, owners)
-    launch("list_tiles", _per_gaussian(scene.shape), THREADS, *arguments)
+    arguments = (splats.splats, *splats[2:], room, tile_of, owners)
+    batch.launch("list_tiles", _per_gaussian(batch.scene.shape), THREADS, *arguments)
     sorted_tiles, by_tile = tile_of.sort(stable=True)
     begins = splats.ends.new_empty(tiles + 1)
-    launch(
-        "find_tiles",
-        (tiles // THREADS + 1, 1),
-        THREADS,
-        sorted_tiles,
-        room,
-        ctypes.c_int(tiles),
-        begins,
-    )
+    grid, arguments = (tiles // THREADS + 1, 1), (sorted_tiles, room, ctypes.c_int(tiles), begins)
+    batch.context.device.launch("find_tiles", grid, THREADS, *arguments)
     return Lists(owners, by_tile, begins)
 
 
-def no_lists(scene: Scene, splats: Splats) -> Lists:
+def no_lists(batch: Batch, splats: Splats) -> Lists:
     """Return empty lists, with which `blend` tests every Gaussian in every tile."""
     empty = splats.ends.new_empty(0)
-    return Lists(
-        empty.int(), empty, splats.ends.new_zeros(len(splats.ends) * tiles_per_view(scene) + 1)
-    )
+    begins = splats.ends.new_zeros(batch.views * tiles_per_view(batch.scene) + 1)
+    return Lists(empty.int(), empty, begins)
 
 
 def blend(
-    scene: Scene,
-    splats: Splats,
-    lists: Lists,
-    pictures: Images,
-    contribution: Tensor,
-    context: LaunchContext,
+    batch: Batch, splats: Splats, lists: Lists, pictures: Images, contribution: Tensor
 ) -> None:
     """Run stage 6: fill the images, and raise the contributions.
 
     If the lists are incomplete, every splat is tested in every tile; the result is bitwise the
     same.
     """
-    arguments = (
-        _settings(context.options),
-        _lists(splats, lists),
-        _Images(*map(address, pictures)),
-        contribution,
-    )
-    context.device.launch(
-        "blend",
-        (tiles_per_view(scene), len(scene.viewmats)),
-        BLEND_THREADS,
-        scene.struct(),
-        *arguments,
-    )
+    arguments = (_lists(splats, lists), _Images(*map(address, pictures)), contribution)
+    batch.launch("blend", _per_tile(batch), BLEND_THREADS, batch.context.settings, *arguments)
 
 
 def blend_backward(
-    scene: Scene,
-    splats: Splats,
-    lists: Lists,
-    total: int,
-    upstream: BlendUpstream,
-    context: LaunchContext,
+    batch: Batch, splats: Splats, lists: Lists, total: int, upstream: BlendUpstream
 ) -> Tensor:
     """Run the adjoints of stages 6 to 4: return a row of sums for each splat (B, N, ROW); rows of
     invisible splats aren't set.
@@ -227,45 +222,21 @@ def blend_backward(
     Raises:
         torch.cuda.OutOfMemoryError: there is no memory for their rows.
     """
-    launch, shape = context.device.launch, scene.shape
-    rows, sums = scene.means.new_empty(max(total, 1), ROW), scene.means.new_empty(*shape, ROW)
+    shape, new, context = batch.scene.shape, batch.scene.means.new_empty, batch.context
+    rows, sums = new(max(total, 1), ROW), new(*shape, ROW)
     name = "blend_backward_absolute" if context.options.absgrad else "blend_backward"
-    arguments = (
-        _settings(context.options),
-        _lists(splats, lists),
-        _Upstream(*map(address, upstream)),
-        rows,
-    )
-    launch(name, (tiles_per_view(scene), shape[0]), BLEND_THREADS, scene.struct(), *arguments)
-    launch(
-        "sum_rows",
-        _per_gaussian((shape[0], shape[1] * WARP)),
-        THREADS,
-        scene.struct(),
-        *splats[1:],
-        rows,
-        sums,
-    )
+    arguments = (_lists(splats, lists), _Upstream(*map(address, upstream)), rows)
+    batch.launch(name, _per_tile(batch), BLEND_THREADS, context.settings, *arguments)
+    grid = _per_gaussian((shape[0], shape[1] * SUM_LANES))
+    batch.launch("sum_rows", grid, THREADS, *splats[1:], rows, sums)
     return sums
 
 
-def project_backward(
-    scene: Scene, splats: Splats, sums: Tensor, gradients: Gradients, context: LaunchContext
-) -> None:
+def project_backward(batch: Batch, splats: Splats, sums: Tensor, gradients: Gradients) -> None:
     """Run the adjoint of stage 1, which fills ``gradients``."""
-    arguments = (
-        _settings(context.options),
-        splats.depth_keys,
-        sums,
-        _Gradients(*map(address, gradients)),
-    )
-    context.device.launch(
-        "project_backward",
-        _per_gaussian((1, scene.shape[1])),
-        THREADS,
-        scene.struct(),
-        *arguments,
-    )
+    arguments = (splats.depth_keys, sums, _Gradients(*map(address, gradients)))
+    grid = _per_gaussian((1, batch.scene.shape[1]))
+    batch.launch("project_backward", grid, THREADS, batch.context.settings, *arguments)
 
 
 def empty_gradients(scene: Scene, absgrad: bool, viewmats: bool) -> Gradients:
@@ -288,15 +259,27 @@ def _per_gaussian(shape: tuple[int, int]) -> tuple[int, int]:
     return -(-shape[1] // THREADS), shape[0]
 
 
+def _per_tile(batch: Batch) -> tuple[int, int]:
+    """Return the grid for one block per view and tile."""
+    return tiles_per_view(batch.scene), batch.views
+
+
 # ---- structs of the kernels: *.h -----------------------------------------------------------------
 
 
-class _Settings(ctypes.Structure):
+class Settings(ctypes.Structure):
     _fields_ = [
         (name, ctypes.c_float)
         for name in ("near", "far", "eps2d", "log2_alpha_min", "alpha_max", "stop")
     ]
     _fields_ += [(name, ctypes.c_int) for name in ("antialias", "downsample")]
+
+    @classmethod
+    def of(cls, o: RasterizeOptions) -> "Settings":
+        log2_alpha_min = math.log2(o.kernel_alpha_min)
+        return cls(
+            o.near, o.far, o.eps2d, log2_alpha_min, o.alpha_max, o.stop, o.antialias, o.downsample
+        )
 
 
 class _Lists(ctypes.Structure):
@@ -317,13 +300,6 @@ class _Upstream(ctypes.Structure):
 
 class _Gradients(ctypes.Structure):
     _fields_ = [(name, ctypes.c_void_p) for name in Gradients._fields]
-
-
-def _settings(o: RasterizeOptions) -> _Settings:
-    log2_alpha_min = math.log2(o.kernel_alpha_min)
-    return _Settings(
-        o.near, o.far, o.eps2d, log2_alpha_min, o.alpha_max, o.stop, o.antialias, o.downsample
-    )
 
 
 def _lists(splats: Splats, lists: Lists) -> _Lists:
