@@ -12,6 +12,7 @@ from benchmarks.quality.tables import OBJECTS, last_rows
 RECORDED = ROOT / "benchmarks/results/tried.csv"
 AREAS = {
     "rasteriser": "rasteriser.md#what-makes-the-cpu-kernel-fast",
+    "CUDA": "cuda.md#measured-on-gpus",
     "training step": "step_time.md",
     "training": "results.md#changes-of-the-demo-that-were-tried",
     "pruning": "pruning.md#during-training-systemgeometrybudget",

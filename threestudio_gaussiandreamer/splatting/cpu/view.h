@@ -13,7 +13,7 @@
 namespace splat {
 
 // Pixels. Every splat of a tile is tested against all of its rows of blocks. In lower tiles these are fewer, but more splats are
-// in several tiles: with 8 lanes the first counts more, with 16 it wasn't measured.
+// in several tiles: with 8 lanes the first counts more, with 16 neither.
 constexpr int TILE_WIDTH = 32, TILE_HEIGHT = LANES == 16 ? 32 : 16, TILE_PIXELS = TILE_WIDTH * TILE_HEIGHT;
 // A block has as many pixels as there are lanes: 4 columns, and 4, 2 or 1 rows.
 constexpr int BLOCK_WIDTH = 4, BLOCK_HEIGHT = LANES / BLOCK_WIDTH;
