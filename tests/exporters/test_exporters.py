@@ -5,6 +5,7 @@ exported, upright.
 import importlib
 import pkgutil
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ import torch
 
 from threestudio_gaussiandreamer import exporters, register_parts
 from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.exporters.base import outputs_of
 from threestudio_gaussiandreamer.formats import ply
 from threestudio_gaussiandreamer.formats.gaussian_files import read_cloud, write_cloud
 from threestudio_gaussiandreamer.formats.obj import write_obj
@@ -22,6 +24,7 @@ from threestudio_gaussiandreamer.gaussians.sh import sh_to_colors
 from threestudio_gaussiandreamer.host import BaseGeometry, ExporterOutput, find, names
 from threestudio_gaussiandreamer.meshes.load import load_mesh
 from threestudio_gaussiandreamer.meshes.write import write_textured_mesh
+from threestudio_gaussiandreamer.training.export import saver
 
 register_parts()
 for module in pkgutil.iter_modules(exporters.__path__):
@@ -314,3 +317,20 @@ def test_a_version_that_cant_be_packed_is_found_before_the_run(monkeypatch):
     monkeypatch.setitem(sys.modules, "zstandard", None)
     with pytest.raises(UserError, match="pip install zstandard"):
         build("gaussiandreamer-exporter", formats=["spz"], options={"spz": {"version": 4}})
+
+
+@pytest.mark.parametrize("returned", [None, [{"save_name": "a.txt"}], "a.txt"])
+def test_an_exporter_must_return_outputs(returned):
+    class Broken:
+        def __call__(self):
+            return returned
+
+    with pytest.raises(UserError, match="Broken returned .*; expected a list of ExporterOutput"):
+        outputs_of(Broken())
+
+
+def test_an_unknown_save_type_names_those_that_the_system_has():
+    system = SimpleNamespace(save_json=str, save_file=repr)
+    assert saver(system, "json") is str
+    with pytest.raises(UserError, match="save_type of an exporter 'txt': choose from file, json"):
+        saver(system, "txt")

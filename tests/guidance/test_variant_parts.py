@@ -14,6 +14,7 @@ from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.core.options import positive
 from threestudio_gaussiandreamer.guidance.exact_score import ExactScoreGuidance
 from threestudio_gaussiandreamer.guidance.variants import Variant
+from threestudio_gaussiandreamer.guidance.variants.base import checked_error
 from threestudio_gaussiandreamer.host import find, names, register
 from threestudio_gaussiandreamer.launch.config_check import check_part
 
@@ -268,3 +269,23 @@ def test_timesteps_fall_from_the_largest_to_the_smallest(schedule):
         seen.append(int(t[0]))
     assert seen == sorted(seen, reverse=True)
     assert seen[0] >= 960 and seen[49] == 20 and seen[-1] == 20
+
+
+@pytest.mark.parametrize(
+    "returned",
+    [
+        torch.zeros(2, 3, 4, 5),
+        (torch.zeros(1, 3, 4, 5), torch.ones(2)),
+        (torch.zeros(2, 3, 4, 5), torch.ones(1)),
+        (torch.zeros(2, 3, 4, 5), 0.5),
+        None,
+    ],
+)
+def test_what_a_variant_returns_has_the_latents_shape(returned):
+    """Broadcast, an error of one item would train all others with it."""
+    latents = torch.zeros(2, 3, 4, 5)
+    right = (torch.zeros_like(latents), torch.ones(2))
+    variant = find("sds-variant")({})
+    assert checked_error(variant, right, latents) is right
+    with pytest.raises(UserError, match=r"SDS.error returned \(.*; expected the error and abar"):
+        checked_error(variant, returned, latents)

@@ -11,6 +11,7 @@ import pytest
 from tests.helpers import tiny_parts
 from tests.helpers.tiny_runs import files, only_run
 from threestudio_gaussiandreamer.core.checkpoint_file import load_checkpoint
+from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.launch import callbacks, experiment, run, run_folder
 from threestudio_gaussiandreamer.launch.config import load_config
 from threestudio_gaussiandreamer.launch.ddp import ReplicatedStrategy
@@ -148,6 +149,26 @@ def test_a_run_from_step_0_puts_earlier_results_aside(launch):
     assert (save / "prior/file").read_text() == "prior" and not (save / "it9-export").exists()
     assert launch("--train", *ONE_FOLDER, "resume=auto", "trainer.max_steps=9")[0] == 0
     assert not save.with_name("save-3").exists()
+
+
+@pytest.mark.parametrize("stage", ["preflight", "configure_optimizers"])
+def test_a_start_that_fails_leaves_the_earlier_run_in_its_place(launch, monkeypatch, stage):
+    """What ``preflight`` finds, such as a wrong path, leaves the record of the run too; the prior
+    runs in ``configure_optimizers``.
+    """
+    assert launch("--train", *ONE_FOLDER)[0] == 0
+    folder = Path("outputs/tiny/run")
+    record = (folder / "configs/parsed.yaml").read_text()
+
+    def fail(_: object) -> None:
+        raise UserError("none.glb does not exist")
+
+    monkeypatch.setattr(tiny_parts.TinySystem, stage, fail, raising=False)
+    code, out, err = launch("--train", *ONE_FOLDER, "seed=5")
+    assert code and "none.glb does not exist" in out + err
+    assert (folder / "ckpts/last.ckpt").is_file() and not (folder / "ckpts-2").exists()
+    if stage == "preflight":
+        assert (folder / "configs/parsed.yaml").read_text() == record
 
 
 def test_a_run_may_start_from_the_weights_of_the_checkpoints_that_it_puts_aside(launch):

@@ -150,6 +150,9 @@ class TestValidation:
             validated(PointCloud(points=np.zeros((0, 3)), colors=np.zeros((0, 3))), "x")
         with pytest.raises(UserError, match=r"colours \(4, 3\)"):
             validated(PointCloud(points=np.zeros((5, 3)), colors=np.zeros((4, 3))), "x")
+        with pytest.raises(UserError, match=r"x gave normals \(4, 3\); expected \(5, 3\)"):
+            zeros = np.zeros((5, 3))
+            validated(PointCloud(points=zeros, colors=zeros, normals=zeros[:4]), "x")
 
 
 class TestMesh:

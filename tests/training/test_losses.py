@@ -8,6 +8,7 @@ import torch
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.training.losses import (
     REGULARISERS,
+    check_losses,
     loggable,
     total,
     total_variation,
@@ -63,3 +64,25 @@ def test_a_weight_without_a_loss_is_named():
 def test_a_weight_of_0_without_a_loss_is_accepted():
     losses = weighted_losses({"loss_foo": torch.tensor(2.0)}, {}, {"foo": 1.0, "sds": 0.0})
     assert {name: float(value) for name, value in losses.items()} == {"foo": 2.0}
+
+
+def test_a_guidance_without_losses_is_told_what_it_returned():
+    with pytest.raises(UserError, match="no loss_\\*, such as loss_sds: it returned grad_norm"):
+        weighted_losses({"grad_norm": 1.0}, {}, {"sds": 1.0})
+
+
+def test_weights_of_zero_alone_are_refused():
+    class Guidance:
+        LOSSES = ("sds",)
+
+    with pytest.raises(UserError, match="system.loss: every weight is 0"):
+        check_losses(Guidance, {"lambda_sds": 0, "lambda_tv": None})
+    check_losses(Guidance, {"lambda_sds": 0, "lambda_tv": 1.0})
+
+
+def test_losses_declared_by_a_string_are_refused():
+    class Guidance:
+        LOSSES = "sds"
+
+    with pytest.raises(UserError, match=r"Guidance.LOSSES is a string: write \('sds',\), a tuple"):
+        check_losses(Guidance, {"lambda_sds": 1.0})

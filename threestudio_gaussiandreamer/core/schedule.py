@@ -9,7 +9,8 @@ configurations.
                                             ...
 ==========================================  ========================================================
 
-Integer end steps count optimiser steps, fractional ones (``10.0``) epochs.
+Integer end steps count optimiser steps, those written as ``10.0`` epochs. Random cameras are one
+endless epoch, in threestudio too, so that with them a schedule in epochs stays at its first value.
 """
 
 import math
@@ -138,5 +139,10 @@ def _in_epochs(ends: list[float], name: str) -> bool:
     if any(fractional) and not all(fractional):
         raise UserError(
             f"{name} mixes integer end steps (optimiser steps) and fractional ones (epochs): {ends}"
+        )
+    if broken := [end for end in ends if end != int(end)]:
+        raise UserError(
+            f"{name}: the end step {broken[0]:g} is no whole number of steps or epochs; expected "
+            f"{FORMS}"
         )
     return all(fractional)

@@ -83,6 +83,23 @@ class FileExporter(Exporter):
         return read_gaussians(self.geometry) if self.shared is None else self.shared
 
 
+def outputs_of(exporter: Exporter) -> list[ExporterOutput]:
+    """Call an exporter.
+
+    Raises:
+        UserError: it returns something else than a list of ExporterOutput.
+    """
+    found = exporter()
+    if not isinstance(found, (list, tuple)) or not all(
+        isinstance(x, ExporterOutput) for x in found
+    ):
+        raise UserError(
+            f"{type(exporter).__name__} returned {type(found).__name__}; expected a list of "
+            "ExporterOutput"
+        )
+    return list(found)
+
+
 def read_gaussians(geometry: BaseGeometry) -> Gaussians:
     """Read the Gaussians of a geometry as float32 arrays. Those with values that aren't finite are
     skipped with a warning.

@@ -29,7 +29,7 @@ from ..host import (
     parse_structured,
     register,
 )
-from .base import UP, FileExporter, read_gaussians
+from .base import UP, FileExporter, outputs_of, read_gaussians
 
 SUFFIX = "-exporter"
 
@@ -92,7 +92,7 @@ class BundleExporter(Exporter):
         shared = read_gaussians(self.geometry) if readers else None
         for exporter in readers:
             exporter.shared = shared
-        return [output for exporter in self.exporters for output in exporter()]
+        return [output for exporter in self.exporters for output in outputs_of(exporter)]
 
 
 def options_of(name: str, cfg: Any) -> Any:

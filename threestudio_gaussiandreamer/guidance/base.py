@@ -60,7 +60,7 @@ from .reuse import Error, KeptPrediction
 from .score_model import GUIDANCE_SCALE, ScoreModel
 from .score_pictures import score_pictures
 from .variants import Variant
-from .variants.base import require_unset
+from .variants.base import checked_error, require_unset
 
 __all__ = ["GUIDANCE_SCALE", "NonFiniteScore", "ScoreDistillation"]
 
@@ -256,7 +256,8 @@ class ScoreDistillation(ScoreModel):
         """Compute the variant's error; also return whether it is that of a new prediction."""
 
         def predict() -> Error:
-            return self.variant.error(self, latents, condition, batch)
+            found = self.variant.error(self, latents, condition, batch)
+            return checked_error(self.variant, found, latents)
 
         if guidance_eval:
             return predict(), True

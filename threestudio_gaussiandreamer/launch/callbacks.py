@@ -17,9 +17,10 @@ import torch
 from ..core.files import atomic_file
 from ..core.host_copies import flush_reads
 from ..core.signals import interrupt, restore_handlers, set_handlers
-from ..host import pl, warn
+from ..host import info, pl, warn
 from .checkpoints import AtomicCheckpointIO
 from .config import dump_config
+from .folder_lock import set_run_aside
 
 SECONDS_BETWEEN = 60.0
 """Shortest time between two checkpoints, seconds: a crash loses about as much training."""
@@ -118,6 +119,20 @@ def write_copy(path: Path, content: bytes) -> None:
     """Write a file atomically: whatever has its name, such as a link or a FIFO, is replaced."""
     with atomic_file(path, durable=False) as file:
         file.write(content)
+
+
+class EarlierRunAside(pl.Callback):
+    """Rename checkpoints and results of an earlier run in the folder when the prior's cloud is
+    there, so that a start that fails leaves them in their place. Parts may read weights from there
+    when they are built.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def on_fit_start(self, trainer: Any, pl_module: Any) -> None:
+        for earlier in set_run_aside(self.folder):
+            info(f"starting at step 0: files of an earlier run are now in {earlier}")
 
 
 class ProgressBar(pl.callbacks.TQDMProgressBar):

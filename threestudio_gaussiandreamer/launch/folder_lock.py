@@ -24,6 +24,8 @@ from ..core.errors import UserError
 
 SUBFOLDERS = ("ckpts", "configs", "code", "save", "tb_logs", "csv_logs")
 FILES = ("ckpts/last.ckpt", "configs/parsed.yaml", "cmd.txt")
+RESULTS = {"ckpts": "*.ckpt", "save": "it*"}
+"""Folders that a training fills, and the files of which each run has its own."""
 LONGEST_RESULT = 200
 """Upper bound of the length of paths that a run writes below its folder, bytes."""
 LOCK_FILE = ".lock"
@@ -134,11 +136,15 @@ def set_run_aside(folder: Path) -> list[Path]:
     Returns:
         the new paths.
     """
-    checkpoints = set_aside(folder / "ckpts", "*.ckpt")
-    results = set_aside(folder / "save", "it*")
+    checkpoints, results = (set_aside(folder / name, files) for name, files in RESULTS.items())
     if results and (results / "prior").is_dir():
         shutil.copytree(results / "prior", folder / "save" / "prior")
     return [path for path in (checkpoints, results) if path]
+
+
+def has_results(folder: Path) -> bool:
+    """Return whether :func:`set_run_aside` would rename anything."""
+    return any(any((folder / name).glob(files)) for name, files in RESULTS.items())
 
 
 def set_aside(path: Path, content: str) -> Optional[Path]:

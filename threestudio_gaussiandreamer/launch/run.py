@@ -19,6 +19,7 @@ from ..host.typed_config import parse_structured
 from ..view.live import LiveView, serve_until_stopped
 from ..view.run_index import note_time, write_index
 from .callbacks import (
+    EarlierRunAside,
     LastCheckpoint,
     LastNumbers,
     LearningRates,
@@ -30,7 +31,7 @@ from .callbacks import (
 from .checkpoints import AtomicCheckpointIO
 from .config_check import build, plain
 from .ddp import environment_plugins, planned_processes, trainer_options
-from .folder_lock import RunFolder, claim, claim_new, require_writable, set_run_aside
+from .folder_lock import RunFolder, claim, claim_new, has_results, require_writable
 from .live_viewer import LiveViewer, ViewerConfig
 from .run_folder import SIZES, changes_since, renumber, resume_command
 from .stage_errors import lightning_errors, write_errors
@@ -131,11 +132,14 @@ class Run:
         if checkpoint is not None and self.args.stage != "train":
             self.system.set_resume_status(*checkpoint)
         self.system.set_save_dir(str(self.folder / "save"))
+        if self.starts_anew and has_results(self.folder) and hasattr(self.system, "preflight"):
+            self.system.preflight()  # before the record of the earlier run is replaced
         self.trainer = self.build_trainer()
-        # after the parts, which may read weights from there
-        if self.args.stage == "train" and self.cfg.resume is None and not get_rank():
-            for earlier in set_run_aside(self.folder):
-                info(f"starting at step 0: files of an earlier run are now in {earlier}")
+
+    @property
+    def starts_anew(self) -> bool:
+        """Whether this process begins a training, in a folder that may have an earlier one."""
+        return self.args.stage == "train" and self.cfg.resume is None and not get_rank()
 
     def read_resume(self) -> Optional[tuple[int, int]]:
         """Return the epoch and step of the checkpoint to resume from; None without one. The file is
@@ -263,7 +267,8 @@ class Run:
         # last-v1.ckpt
         checkpointing = {"enable_version_counter": False, **plain(self.cfg.checkpoint)}
         last = LastCheckpoint(self.last, checkpoint_io)
-        callbacks = [
+        callbacks = [EarlierRunAside(self.folder)] if self.starts_anew else []
+        callbacks += [
             pl.callbacks.ModelCheckpoint(dirpath=str(self.last.parent), **checkpointing),
             LearningRates(logging_interval="step"),
             LastNumbers(),

@@ -204,9 +204,9 @@ def validated(cloud: PointCloud, name: str) -> PointCloud:
     1].
 
     Raises:
-        UserError: it isn't a PointCloud, there are no points, points and colours aren't both
-            (P, 3), more than 5 % of the rows are not finite, or most colours are far outside [0,
-            1], as those from 0 to 255 are.
+        UserError: it isn't a PointCloud, there are no points, points, colours and normals aren't
+            all (P, 3), more than 5 % of the rows are not finite, or most colours are far outside
+            [0, 1], as those from 0 to 255 are.
     """
     if not isinstance(cloud, PointCloud):
         raise UserError(f"{name}.generate returned {type(cloud).__name__}; expected a PointCloud")
@@ -216,6 +216,9 @@ def validated(cloud: PointCloud, name: str) -> PointCloud:
             f"{name} gave points {points.shape} and colours {colors.shape}; expected "
             "(P, 3) for both"
         )
+    if cloud.normals is not None and np.shape(cloud.normals) != points.shape:
+        got = np.shape(cloud.normals)
+        raise UserError(f"{name} gave normals {got}; expected {points.shape}, as the points")
     if not len(points):
         raise UserError(f"{name} gave no points: its source is empty")
     finite = np.isfinite(points).all(axis=1) & np.isfinite(colors).all(axis=1)

@@ -2,10 +2,12 @@
 to ``system.prune``.
 """
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Optional
 
-from ..exporters.base import Drawing, FileExporter, read_gaussians
+from ..core.errors import unknown
+from ..exporters.base import Drawing, FileExporter, outputs_of, read_gaussians
 from ..formats.gaussian_files import StoredCloud, write_cloud
 from ..formats.obj import write_obj
 from ..formats.ply import write_points
@@ -107,10 +109,22 @@ def export_cloud(
     for part in (exporter, *getattr(exporter, "exporters", ())):
         if isinstance(part, FileExporter):
             part.drawing = drawing(system)
-    for out in exporter():
+    for out in outputs_of(exporter):
         noted = {"pruned_to": pruned_to} if out.save_type in CLOUDS else {}
-        save = getattr(system, f"save_{out.save_type}")
-        save(f"{folder}/{out.save_name}", **noted, **out.params)
+        saver(system, out.save_type)(f"{folder}/{out.save_name}", **noted, **out.params)
+
+
+def saver(system: Any, save_type: str) -> Callable[..., Any]:
+    """Return the system's ``save_<save_type>``.
+
+    Raises:
+        UserError: it has none.
+    """
+    found = getattr(system, f"save_{save_type}", None)
+    if found is None:
+        known = [name.removeprefix("save_") for name in dir(system) if name.startswith("save_")]
+        raise unknown("save_type of an exporter", save_type, known)
+    return found
 
 
 def export_pruned(system: Any) -> None:

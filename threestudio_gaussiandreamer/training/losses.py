@@ -32,9 +32,12 @@ def weighted_losses(
         out: the renderer's outputs; the regularisers use ``opacity`` and ``comp_rgb``.
 
     Raises:
-        UserError: there is a weight without a loss, or a loss without a weight.
+        UserError: there is no loss, a weight without a loss, or a loss without a weight.
     """
     raw = {k.removeprefix("loss_"): v for k, v in guided.items() if k.startswith("loss_")}
+    if not raw:
+        found = ", ".join(guided) or "nothing"
+        raise UserError(f"the guidance returned no loss_*, such as loss_sds: it returned {found}")
     check_weights(weights, raw)
     raw |= {name: call(out) for name, call in REGULARISERS.items() if weights.get(name)}
     return {name: value * weights[name] for name, value in raw.items()}
@@ -105,7 +108,8 @@ def check_losses(guidance: type, options: Mapping[str, Any]) -> None:
     """Check the keys of ``system.loss``, if the class of the guidance declares its losses.
 
     Raises:
-        UserError: a key isn't ``lambda_*``, or see :func:`check_weights`.
+        UserError: a key isn't ``lambda_*``, no weight is other than 0, the losses are declared by a
+            string, or see :func:`check_weights`.
     """
     for name in options:
         if not name.startswith("lambda_"):
@@ -113,7 +117,14 @@ def check_losses(guidance: type, options: Mapping[str, Any]) -> None:
                 f"unknown key 'system.loss.{name}': weights of losses are called "
                 "lambda_<loss>, such as lambda_sds"
             )
+    if options and all(map(_is_none_or_zero, options.values())):
+        raise UserError(
+            "system.loss: every weight is 0, so that nothing would be trained: give one, such as "
+            "system.loss.lambda_sds=1"
+        )
     known = getattr(guidance, "LOSSES", None)  # also of guidances that aren't ScoreDistillation
+    if isinstance(known, str):
+        raise UserError(f"{guidance.__name__}.LOSSES is a string: write ({known!r},), a tuple")
     if known is not None:
         check_weights({key.removeprefix("lambda_"): value for key, value in options.items()}, known)
 

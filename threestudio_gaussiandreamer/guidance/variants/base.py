@@ -131,3 +131,20 @@ class Variant(BaseObject, ABC):
                 f"the checkpoint has {len(state)} tensors of another variant of score "
                 "distillation: resume with the configuration that the run was started with"
             )
+
+
+def checked_error(variant: Variant, found: Any, latents: Float[Tensor, "B c h w"]) -> Error:
+    """Return what a variant's ``error`` returned.
+
+    Raises:
+        UserError: it isn't a pair of tensors of these shapes; others might be broadcast silently.
+    """
+    expected = (tuple(latents.shape), (len(latents),))
+    pair = found if isinstance(found, tuple) else (found,)
+    shapes = tuple(tuple(x.shape) if isinstance(x, Tensor) else type(x).__name__ for x in pair)
+    if shapes != expected:
+        raise UserError(
+            f"{type(variant).__name__}.error returned {shapes}; expected the error and abar, "
+            f"tensors of the shapes {expected}"
+        )
+    return found
