@@ -273,6 +273,7 @@ def test_total_variation_evens_out_colours_in_training(tmp_path, painted_box):
         "trainer.val_check_interval=15",
         "system.geometry.init_opacity=0.9",
         "system.loss.lambda_sds=0",
+        "system.loss.lambda_opaque=1",  # without any weight a run is refused; changes no colour
     ]
     spread = []
     for weight in (0, 1000):
