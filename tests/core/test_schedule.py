@@ -38,6 +38,7 @@ def test_schedule_by_step(value, step, expected):
 
 def test_a_fractional_end_counts_epochs():
     assert C([0, 0.0, 1.0, 10.0], epoch=5, global_step=9999) == 0.5
+    assert C([0, 0.0, 1.0, 10], epoch=5, global_step=2) == 0.2
 
 
 @pytest.mark.parametrize("value", [[0, 8e-4, 2e-5], [0, 0.98, 0.55, 0.5]])
@@ -47,7 +48,6 @@ def test_an_end_that_is_no_whole_number_is_refused(value):
         UserError, match="lr: the end step .* is no whole number of steps or epochs"
     ):
         validate_schedule(value, "lr")
-    assert C([0, 0.0, 1.0, 10], epoch=5, global_step=2) == 0.2
 
 
 def test_exponential_interpolation_is_the_geometric_mean_half_way():

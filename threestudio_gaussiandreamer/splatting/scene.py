@@ -40,7 +40,7 @@ class Scene(NamedTuple):
     @property
     def shape(self) -> tuple[int, int]:
         """Views and Gaussians."""
-        return self.viewmats.shape[0], self.means.shape[0]  # many times faster than len
+        return self.viewmats.shape[0], self.means.shape[0]  # faster than len
 
     @property
     def channels(self) -> int:

@@ -76,10 +76,12 @@ class Batch(NamedTuple):
 
 
 def make_context(options: RasterizeOptions, tracked: bool, device: Device) -> LaunchContext:
+    """Return the context of a call, whose settings all of its launches share."""
     return LaunchContext(options, Settings.of(options), tracked, device)
 
 
 def make_batch(scene: Scene, context: LaunchContext) -> Batch:
+    """Return a scene, whose tensors must outlive the batch, with its struct."""
     return Batch(scene, scene.struct(), context)
 
 
