@@ -92,3 +92,11 @@ def test_a_piecewise_schedule_is_numpys_interpolation(values, step):
     # exact up to the rounding of one multiplication
     assert C(knots, 0, step) == pytest.approx(np.interp(step, steps, values), abs=1e-12)
     assert C_max(knots) == max(values)
+
+
+def test_a_schedule_in_epochs_is_warned_of_once(caplog):
+    for _ in range(2):
+        validate_schedule([0, 8e-4, 2e-5, 500.0], "lr_in_epochs")
+    validate_schedule([0, 8e-4, 2e-5, 500], "lr_in_steps")
+    assert caplog.text.count("lr_in_epochs: its end steps have decimal points") == 1
+    assert "lr_in_steps" not in caplog.text

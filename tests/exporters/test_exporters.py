@@ -21,7 +21,15 @@ from threestudio_gaussiandreamer.formats.ply import read_comments
 from threestudio_gaussiandreamer.formats.spz import read_spz
 from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
 from threestudio_gaussiandreamer.gaussians.sh import sh_to_colors
-from threestudio_gaussiandreamer.host import BaseGeometry, ExporterOutput, find, names
+from threestudio_gaussiandreamer.host import (
+    BaseGeometry,
+    Exporter,
+    ExporterOutput,
+    find,
+    names,
+    register,
+)
+from threestudio_gaussiandreamer.launch.part_kinds import check_kind
 from threestudio_gaussiandreamer.meshes.load import load_mesh
 from threestudio_gaussiandreamer.meshes.write import write_textured_mesh
 from threestudio_gaussiandreamer.training.export import saver
@@ -334,3 +342,26 @@ def test_an_unknown_save_type_names_those_that_the_system_has():
     assert saver(system, "json") is str
     with pytest.raises(UserError, match="save_type of an exporter 'txt': choose from file, json"):
         saver(system, "txt")
+
+
+@register("test-uncallable-exporter")
+class Uncallable(Exporter):
+    pass
+
+
+@register("test-greedy-exporter")
+class Greedy(Exporter):
+    def __call__(self, everything):
+        return []
+
+
+@pytest.mark.parametrize(
+    ("part", "said"),
+    [(Uncallable, r"Uncallable has no __call__\(\)"), (Greedy, "Greedy has __call__.*called as")],
+)
+def test_an_exporter_that_cant_be_called_is_refused_before_the_run(part, said):
+    name = f"test-{part.__name__.lower()}"
+    with pytest.raises(UserError, match=f"system.exporter_type: {said}"):
+        check_kind("system.exporter_type", f"{name}-exporter", part)
+    with pytest.raises(UserError, match=said):
+        build("gaussiandreamer-exporter", formats=["ply", name])

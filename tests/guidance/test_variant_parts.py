@@ -289,3 +289,23 @@ def test_what_a_variant_returns_has_the_latents_shape(returned):
     assert checked_error(variant, right, latents) is right
     with pytest.raises(UserError, match=r"SDS.error returned \(.*; expected the error and abar"):
         checked_error(variant, returned, latents)
+
+
+@register("test-errorless-variant")
+class Errorless(Variant):
+    pass
+
+
+@register("test-other-error-variant")
+class OtherError(Variant):
+    def error(self, guidance, latents):
+        return latents
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [("errorless", "Errorless has no error"), ("other-error", "OtherError has error.*called as")],
+)
+def test_a_variant_without_the_method_error_is_refused_before_the_run(mesh_path, name, said):
+    with pytest.raises(UserError, match=rf"{said}.*\(guidance, latents, condition, batch\)"):
+        guidance(mesh_path, variant_type=f"test-{name}-variant")

@@ -316,6 +316,13 @@ def test_resume_auto_takes_the_newest_run_of_the_tag(folder):
     assert load("resume=auto").resume == cfg.trial_dir + "/ckpts/last-prev.ckpt"
 
 
+def test_resume_auto_names_the_checkpoints_of_an_earlier_run(folder, caplog):
+    save_file("outputs/tiny/run/ckpts-2/last.ckpt", {"epoch": 0, "global_step": 3})
+    with caplog.at_level("INFO"):
+        assert load("resume=auto", "use_timestamp=false", "tag=run").resume is None
+    assert "resume=outputs/tiny/run/ckpts-2/last.ckpt" in caplog.text
+
+
 def test_a_checkpoint_of_another_working_folder_is_continued_in_its_own(folder, monkeypatch):
     dump_config("parsed.yaml", load())
     first = load_config("parsed.yaml")

@@ -12,10 +12,11 @@ from tests.helpers import tiny_parts
 from tests.launch.config_cases import load
 from threestudio_gaussiandreamer import register_parts
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.host import BaseObject, register
+from threestudio_gaussiandreamer.host import BaseObject, find, register
 from threestudio_gaussiandreamer.launch.config import load_config
 from threestudio_gaussiandreamer.launch.config_check import check_config, check_part
 from threestudio_gaussiandreamer.launch.extensions import load_extensions
+from threestudio_gaussiandreamer.launch.part_kinds import require_dataclass
 
 
 @register("optionless-part")
@@ -252,3 +253,34 @@ def test_a_weight_of_0_or_null_removes_that_of_an_earlier_file(value):
     check_config(load_config(demo, cli_args=[f"system.loss.lambda_other={value}"]))
     with pytest.raises(UserError, match="leave it out: system.loss.lambda_other=0"):
         check_config(load_config(demo, cli_args=["system.loss.lambda_other=1"]))
+
+
+@register("test-undecorated-guidance")
+class Undecorated(BaseObject):
+    class Config(BaseObject.Config):
+        color: float = 0.5
+
+
+@register("test-plain-config-guidance")
+class PlainConfig(BaseObject):
+    class Config:
+        color = 0.5
+
+
+@register("test-inherited-config-guidance")
+class InheritedConfig(FooGuidance):
+    class Config(FooGuidance.Config):
+        """Adds no option."""
+
+
+def test_options_of_a_config_without_decorator_are_not_ignored():
+    for name in ("undecorated", "plain-config"):
+        with pytest.raises(UserError, match="guidance_type: .*Config is no dataclass: write @data"):
+            require_dataclass("guidance_type", find(f"test-{name}-guidance"))
+    require_dataclass("guidance_type", InheritedConfig)
+
+
+def test_an_endless_run_needs_its_own_number_for_checkpoints(folder):
+    with pytest.raises(UserError, match="checkpoint.every_n_train_steps is -1, as trainer.max_st"):
+        check_config(load("trainer.max_steps=-1"))
+    check_config(load("trainer.max_steps=-1", "checkpoint.every_n_train_steps=5"))

@@ -8,6 +8,7 @@ from threestudio_gaussiandreamer import register_parts
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.launch.config import load_config
 from threestudio_gaussiandreamer.launch.config_check import check_config
+from threestudio_gaussiandreamer.launch.section_checks import check_shared_views
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 PERP_NEG = "system.prompt_processor.use_perp_neg=true"
@@ -69,3 +70,22 @@ def test_contradictions_are_named(names, overrides, message):
 )
 def test_valid_combinations_pass(names, overrides):
     check(names, *overrides)
+
+
+@pytest.mark.parametrize(
+    ("batch", "processes", "message"),
+    [
+        ("4", 3, "data.batch_size is 4, no multiple of the 3 processes"),
+        ("[8,2]", 4, "data.batch_size is 2, fewer than the 4 processes"),
+    ],
+)
+def test_processes_that_cant_share_the_views_are_found_before_they_start(batch, processes, message):
+    overrides = [f"data.batch_size={batch}", f"trainer.devices={processes}"]
+    if "[" in batch:
+        overrides.append("data.resolution_milestones=[9]")
+    register_parts()
+    cfg = load_config(CONFIGS / "demo.yaml", cli_args=overrides)
+    with pytest.raises(UserError, match=message):
+        check_shared_views(cfg)
+    cfg.n_gpus = 2
+    check_shared_views(cfg)

@@ -7,6 +7,7 @@ import pkgutil
 
 import numpy as np
 import pytest
+import torch
 import trimesh
 
 from tests.helpers.prior_contract import PriorContract, assert_valid
@@ -15,7 +16,7 @@ from threestudio_gaussiandreamer import priors
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.gaussians.point_cloud import PointCloud
 from threestudio_gaussiandreamer.host import find, names
-from threestudio_gaussiandreamer.priors.base import Prior, validated
+from threestudio_gaussiandreamer.priors.base import Prior, points_of, validated
 
 for module in pkgutil.iter_modules(priors.__path__):
     importlib.import_module(f"{priors.__name__}.{module.name}")
@@ -135,7 +136,7 @@ class TestValidation:
     def test_anything_but_a_point_cloud_is_refused(self, returned, kind):
         prior = Given({})
         prior.cloud = returned
-        with pytest.raises(UserError, match=rf"Given.generate returned {kind}; .* a PointCloud"):
+        with pytest.raises(UserError, match=rf"Given returned {kind}; .* a PointCloud"):
             prior("")
 
     def test_a_prior_without_generate_is_refused_when_built(self):
@@ -144,6 +145,37 @@ class TestValidation:
 
         with pytest.raises(UserError, match=r"Unfinished has no generate\(prompt, generator\)"):
             Unfinished({})
+
+    def test_a_generate_with_other_arguments_is_refused_when_built(self):
+        class Old(Prior):
+            def generate(self, prompt):
+                return None
+
+        with pytest.raises(UserError, match=r"Old has generate.*called as generate\(prompt, gen"):
+            Old({})
+
+    def test_tensors_with_gradients_are_taken(self):
+        cloud = self.cloud()
+        tensors = PointCloud(
+            points=torch.tensor(cloud.points, requires_grad=True),
+            colors=torch.tensor(cloud.colors),
+            normals=torch.tensor(cloud.points, requires_grad=True),
+        )
+        taken = validated(tensors, "x")
+        np.testing.assert_array_equal(taken.points, validated(cloud, "x").points)
+        assert isinstance(taken.normals, np.ndarray)
+
+    @pytest.mark.parametrize("points", [[[0, 0, 0], [1, 1]], [["a", "b", "c"]], {}])
+    def test_what_is_no_array_is_refused(self, points):
+        with pytest.raises(UserError, match="x gave something else than arrays"):
+            validated(PointCloud(points=points, colors=np.zeros((2, 3))), "x")
+
+    def test_the_result_of_another_hosts_prior_is_checked_too(self):
+        cloud = self.cloud()
+        taken = points_of(lambda prompt: cloud, "a toy")
+        np.testing.assert_array_equal(taken.points, validated(cloud, "x").points)
+        with pytest.raises(UserError, match="function returned list; expected a PointCloud"):
+            points_of(lambda prompt: [], "a toy")
 
     def test_empty_and_misshapen_clouds_are_refused(self):
         with pytest.raises(UserError, match="no points"):

@@ -39,3 +39,12 @@ def test_a_report_that_cannot_be_written_leaves_the_earlier_one(source, tmp_path
             PruneOptions(size=48),
         )
     assert (tmp_path / "out.ply.json").read_text() == earlier
+
+
+def test_the_report_says_what_a_pruned_cloud_is_compared_with(source, tmp_path, capsys):
+    """Pruned once, a file is no longer the original."""
+    once, twice = (str(tmp_path / name) for name in ("once.ply", "twice.ply"))
+    run(source, once, "--psnr", "30")
+    assert "dB to the original, on the test views" in capsys.readouterr().out
+    run(once, twice, "--psnr", "25")
+    assert "dB to the input, which had been pruned before" in capsys.readouterr().out

@@ -94,6 +94,7 @@ def test_a_size_may_be_numpys():
         ({"quats": torch.zeros(6, 4, dtype=torch.int64)}, ["quats", "floating point", "int64"]),
         ({"scales": torch.zeros(6, 3, dtype=torch.float64)}, ["scales", "float64"]),
         ({"quats": torch.zeros(6, 4, device="meta")}, ["quats", "device", "meta"]),
+        ({"means": torch.zeros(6, 3, device="meta")}, ["means", "meta", "no values"]),
         ({"width": 0}, ["width", "at least 1", "0"]),
         ({"height": 8.0}, ["height", "8.0"]),
         ({"width": True}, ["width", "True"]),

@@ -10,6 +10,7 @@ import pytest
 import scipy.spatial
 import scipy.stats
 import torch
+import trimesh
 
 from tests.stability.initialisation_cases import (
     ball_mesh,
@@ -231,7 +232,7 @@ def test_a_few_bad_rows_are_counted_and_many_refused(source, what, tmp_path, mea
 
 
 @row("A2", "No colours")
-@pytest.mark.parametrize("source", ["mesh", "points"])
+@pytest.mark.parametrize("source", ["mesh", "points", "ply"])
 def test_without_colours_the_cloud_is_grey_with_a_message(source, tmp_path, measured, said):
     points, faces = ball_mesh()
     if source == "mesh":
@@ -240,8 +241,12 @@ def test_without_colours_the_cloud_is_grey_with_a_message(source, tmp_path, meas
             "prior": {"path": str(write_obj(tmp_path / "a.obj", points, faces))},
         }
     else:
-        np.savetxt(tmp_path / "a.xyz", points)
-        prior = {"prior_type": "point-cloud-prior", "prior": {"path": str(tmp_path / "a.xyz")}}
+        path = tmp_path / ("a.xyz" if source == "points" else "a.ply")
+        if source == "points":
+            np.savetxt(path, points)
+        else:
+            trimesh.PointCloud(points).export(path)
+        prior = {"prior_type": "point-cloud-prior", "prior": {"path": str(path)}}
     geometry = GaussianCloud({**prior, "grow": {"num_candidates": 20_000, "radius": 0.05}})
     geometry.initialize("a prompt")
     colors = geometry.colors(torch.zeros(1, 3)).detach()

@@ -42,6 +42,16 @@ def test_a_step_without_a_round_leaves_the_cloud():
     assert after_step(density) == DensityOutcome(10, 10, False, {}) and density.cloud.means is means
 
 
+def test_a_cloud_larger_than_max_gaussians_is_reported():
+    """That of a checkpoint; densification would reduce it."""
+    said = control(10, max_gaussians=5, budget=None).schedule_problem(3, 100)
+    assert "10 Gaussians, more than system.geometry.max_gaussians (5)" in said
+    assert control(10, max_gaussians=10, budget=None).schedule_problem(3, 100) is None
+    densified = control(10, max_gaussians=5, budget=None, densify=ROUNDS)
+    assert "the checkpoint has" not in densified.schedule_problem(3, 100)
+    assert "the checkpoint has" in densified.schedule_problem(11, 100)
+
+
 def test_a_round_says_how_many_it_left():
     assert after_step(control(budget=5)) == DensityOutcome(10, 8, True, {})
 

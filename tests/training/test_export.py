@@ -12,6 +12,7 @@ from threestudio_gaussiandreamer.exporters import mesh as mesh_exporter
 from threestudio_gaussiandreamer.formats.gaussian_files import read_cloud
 from threestudio_gaussiandreamer.formats.ply import read_gaussians
 from threestudio_gaussiandreamer.formats.spz import read_spz
+from threestudio_gaussiandreamer.host import Exporter, register
 
 
 def test_a_run_exports_the_pruned_cloud_too_and_so_does_export(tmp_path, painted_box):
@@ -124,6 +125,19 @@ def test_every_format_is_exported_and_says_that_it_was_trained_antialiased(tmp_p
     assert [cloud.antialiased for cloud in stored] == [True] * 5
     assert [len(cloud.gaussians.means) for cloud in stored] == [200] * 5
     assert "SplatRenderMode: mip" in (export / "gaussians.usda").read_text()
+
+
+def test_a_format_that_fails_leaves_the_others(tmp_path, painted_box, capsys):
+    @register("test-failing-exporter")
+    class Failing(Exporter):
+        def __call__(self):
+            return "nothing"
+
+    options = ["system.exporter.formats=[test-failing,ply,points]", "trainer.max_steps=1"]
+    assert launch(tmp_path, painted_box, *options, "trainer.val_check_interval=1") == 2
+    assert "Failing returned str; expected a list of ExporterOutput" in capsys.readouterr().err
+    export = run_folder(tmp_path) / "save" / "it1-export"
+    assert {path.name for path in export.iterdir()} >= {"gaussians.ply", "points.ply"}
 
 
 def test_a_mesh_is_exported_beside_the_cloud_as_the_run_draws(tmp_path, painted_box, monkeypatch):

@@ -7,7 +7,7 @@ these functions return their input unchanged.
 """
 
 from collections.abc import Callable, Iterable
-from typing import Any
+from typing import Any, Optional
 
 import torch
 import torch.distributed as dist
@@ -52,17 +52,20 @@ def draw_shared(count: int, draw: Callable[[int], Tensor]) -> Tensor:
     return draw(total)[own_rows(total)]
 
 
-def require_shareable(views: int, option: str, *, together: int = 1) -> None:
+def require_shareable(
+    views: int, option: str, *, together: int = 1, processes: Optional[int] = None
+) -> None:
     """Check that the processes can share the views of a step equally.
 
     Args:
         option: names the option in the message.
         together: so many consecutive views stay in one process.
+        processes: how many there will be; by default those that there are.
 
     Raises:
         UserError: there are fewer views than processes, or their number is no multiple.
     """
-    size = world_size()
+    size = processes or world_size()
     if views % (size * together):
         too_few = "fewer than" if views < size * together else "no multiple of"
         groups = f" in groups of {together}" if together > 1 else ""

@@ -15,7 +15,7 @@ from types import MappingProxyType, SimpleNamespace
 from typing import Any
 
 from .errors import UserError, unknown
-from .schedule import parse_schedule
+from .schedule import parse_schedule, validate_schedule
 
 RULE = "option"
 """The key of a field's rule in its metadata."""
@@ -92,8 +92,7 @@ def schedule(min: float = -FLOAT32_MAX, max: float = FLOAT32_MAX) -> Rule:
     """Accept numbers and schedules (``core/schedule.py``) with values from ``min`` to ``max``."""
 
     def check(path: str, value: Any) -> None:
-        values = parse_schedule(value, path).values
-        for number in values:
+        for number in parse_schedule(validate_schedule(value, path)).values:
             if not min <= number <= max:
                 bound = f"{min:g} or more" if number < min else f"{max:g} or less"
                 raise UserError(f"{path}: expected values of {bound}, got {number:g}")

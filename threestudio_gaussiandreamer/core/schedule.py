@@ -13,12 +13,15 @@ Integer end steps count optimiser steps, those written as ``10.0`` epochs. Rando
 endless epoch, in threestudio too, so that with them a schedule in epochs stays at its first value.
 """
 
+import functools
+import logging
 import math
 from numbers import Real
 from typing import Any, NamedTuple
 
 from .errors import UserError
 
+logger = logging.getLogger(__name__)
 FORMS = "a number, [v0, v1, end], [s0, v0, v1, s1] or [s0, v0, v1, s1, v2, s2, ...]"
 
 
@@ -58,10 +61,23 @@ def validate_schedule(value: Any, name: str = "the schedule", minimum: float = -
     Raises:
         UserError: it isn't; the message begins with ``name``.
     """
-    lowest = min(parse_schedule(value, name).values)
+    schedule = parse_schedule(value, name)
+    lowest = min(schedule.values)
     if lowest < minimum:
         raise UserError(f"{name}: expected values of {minimum:g} or more, got {lowest:g}")
+    if schedule.in_epochs:
+        _warn_of_epochs(name)
     return value
+
+
+@functools.cache
+def _warn_of_epochs(name: str) -> None:
+    """Warn once that a schedule counts epochs."""
+    logger.warning(
+        "%s: its end steps have decimal points and count epochs; random cameras are one endless "
+        "epoch, so that it stays at its first value: write whole numbers to count steps",
+        name,
+    )
 
 
 def parse_schedule(value: Any, name: str = "the schedule") -> Schedule:

@@ -17,6 +17,7 @@ from dataclasses import dataclass, field
 from typing import List, NamedTuple, Optional
 
 from ..core.errors import UserError
+from ..core.methods import find_method, require_method
 from ..core.options import check_options, one_of, rule
 from ..formats.gaussian_files import FORMATS, StoredCloud
 from ..gaussians.axes import AXES
@@ -81,6 +82,14 @@ class FileExporter(Exporter):
     def gaussians(self) -> Gaussians:
         """Return the Gaussians to export, in the world's axes; all values are finite."""
         return read_gaussians(self.geometry) if self.shared is None else self.shared
+
+
+def require_export(exporter: type) -> None:
+    """Raise UserError for a class of exporters that can't be called."""
+    # the host's only raises an error
+    if find_method(exporter, "__call__") is find_method(Exporter, "__call__"):
+        raise UserError(f"{exporter.__name__} has no __call__(), which returns the files to write")
+    require_method(exporter, "__call__")
 
 
 def outputs_of(exporter: Exporter) -> list[ExporterOutput]:

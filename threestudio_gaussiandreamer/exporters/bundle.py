@@ -29,7 +29,7 @@ from ..host import (
     parse_structured,
     register,
 )
-from .base import UP, FileExporter, outputs_of, read_gaussians
+from .base import UP, FileExporter, outputs_of, read_gaussians, require_export
 
 SUFFIX = "-exporter"
 
@@ -88,11 +88,15 @@ class BundleExporter(Exporter):
         ]
 
     def __call__(self) -> List[ExporterOutput]:
+        return [output for exporter in self.prepared() for output in outputs_of(exporter)]
+
+    def prepared(self) -> List[Exporter]:
+        """Return the exporters of the formats, after reading the Gaussians once for all of them."""
         readers = [exporter for exporter in self.exporters if isinstance(exporter, FileExporter)]
         shared = read_gaussians(self.geometry) if readers else None
         for exporter in readers:
             exporter.shared = shared
-        return [output for exporter in self.exporters for output in outputs_of(exporter)]
+        return self.exporters
 
 
 def options_of(name: str, cfg: Any) -> Any:
@@ -109,7 +113,9 @@ def _checked(name: str, options: Any) -> Any:
     """Parse and check the options of one format."""
     if not isinstance(options, Mapping):
         raise UserError(f"options.{name}: expected keys and values, got {options!r}")
-    config_class = find(name + SUFFIX).Config
+    exporter = find(name + SUFFIX)
+    require_export(exporter)
+    config_class = exporter.Config
     try:
         cfg = parse_structured(config_class, options)
     except UserError as error:

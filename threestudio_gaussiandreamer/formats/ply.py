@@ -287,7 +287,7 @@ def _read_colors(table: PlyTable) -> Float[np.ndarray, "N 3"]:
             return unit_colors(table[names], table.stored_type(names[0]), table.path)
     if all(name in table for name in SH_CONSTANT):
         return sh0_colors(table[SH_CONSTANT])
-    logger.info("%s has no colours: grey is used", table.path)
+    logger.warning("%s has no colours: grey is used", table.path)
     return np.full((table[MEANS].shape[0], 3), 0.5, np.float32)
 
 

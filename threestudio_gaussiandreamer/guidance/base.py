@@ -51,6 +51,7 @@ from torch import Tensor
 
 from ..core.errors import UserError, unknown
 from ..core.host_copies import DelayedReads
+from ..core.methods import require_method
 from ..core.options import at_least, checked_options, in_range, one_of, schedule
 from ..diffusion import sds
 from ..host import C, find, names, parse_structured, warn
@@ -337,6 +338,7 @@ def variant_class(cfg: Any) -> type[Variant]:
     if not _is_variant(found):
         known = [name for name in names() if _is_variant(find(name))]
         raise UserError(f"variant_type: {unknown('variant', cfg.variant_type, known)}")
+    require_method(found, "error", "guidance", "latents", "condition", "batch")
     return found
 
 

@@ -22,7 +22,7 @@ from ..core.options import check_options, require_representable, shown
 from ..host import find, pl, validate_schedule
 from ..host.typed_config import parse_structured
 from .live_viewer import ViewerConfig
-from .part_kinds import check_kind, find_part
+from .part_kinds import check_kind, find_part, require_dataclass
 from .section_checks import check_sections
 
 MisconfigurationException = pl.utilities.exceptions.MisconfigurationException
@@ -85,6 +85,11 @@ def check_config(cfg: Any) -> None:
     check_sections(cfg)
     _check_loggers(cfg.system.get("loggers"))
     _check_arguments("checkpoint", cfg.checkpoint, pl.callbacks.ModelCheckpoint)
+    if cfg.checkpoint.get("every_n_train_steps") == cfg.trainer.get("max_steps") == -1:
+        raise UserError(
+            "checkpoint.every_n_train_steps is -1, as trainer.max_steps, from which configurations "
+            "take it: for a run without an end, set it to a number of steps"
+        )
     _check_monitor(cfg)
     _check_file_name(build("checkpoint", pl.callbacks.ModelCheckpoint, plain(cfg.checkpoint)))
     options = {
@@ -100,6 +105,7 @@ def check_part(path: str, type_name: Any, values: Any) -> None:
     config_class = getattr(part, "Config", None)
     if config_class is None:
         return
+    require_dataclass(f"{path}_type", part)
     _check_keys(path, values, config_class)
     for key in values:  # before the part's own checks, whose messages don't name the key
         if key.endswith("_type") and key.removesuffix("_type") in values and values.get(key):

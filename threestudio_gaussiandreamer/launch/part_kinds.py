@@ -1,8 +1,11 @@
 """Which kind of part the key of a section names."""
 
+import inspect
 from typing import Any, Optional
 
 from ..core.errors import UserError
+from ..core.methods import find_method
+from ..exporters.base import require_export
 from ..guidance.base import ScoreDistillation
 from ..guidance.variants import Variant
 from ..host import (
@@ -55,8 +58,8 @@ def check_kind(path: str, type_name: str, part: Any) -> None:
     """Raise UserError if the part of a section is known to be of another kind, or can't be one."""
     kind = path.rpartition(".")[2].removesuffix("_type")
     found = _kind_of(part)
-    if kind == "guidance" and found is None:
-        _require_call(path, type_name, part)
+    if isinstance(part, type) and found in (None, kind):
+        _require_call(path, kind, part)
     if kind not in KINDS or found in (None, kind):
         return
     choices = [name for name in names() if _kind_of(find(name)) == kind]
@@ -66,10 +69,28 @@ def check_kind(path: str, type_name: str, part: Any) -> None:
     )
 
 
-def _require_call(path: str, type_name: str, part: Any) -> None:
-    """Raise UserError for a guidance that can't be called."""
-    if not any("__call__" in vars(base) for base in getattr(part, "__mro__", ())):
-        raise UserError(f"{path}: {type_name} has no __call__, which returns the losses of a step")
+def _require_call(path: str, kind: str, part: type) -> None:
+    """Raise UserError for a guidance or exporter that can't be called."""
+    if kind == "guidance" and find_method(part, "__call__") is None:
+        raise UserError(f"{path}: {part.__name__} has no __call__, which returns a step's losses")
+    if kind == "exporter":
+        try:
+            require_export(part)
+        except UserError as error:
+            raise UserError(f"{path}: {error}") from error
+
+
+def require_dataclass(path: str, part: Any) -> None:
+    """Raise UserError if a part's ``Config`` defines options without being a dataclass itself: a
+    subclass of a dataclass ignores them unless it has the decorator too.
+    """
+    config, bases = part.Config, getattr(part.Config, "__dataclass_fields__", None)
+    own = vars(config)
+    defined = inspect.get_annotations(config).keys() | (own.keys() & (bases or {}).keys())
+    if bases is None or ("__dataclass_fields__" not in own and defined):
+        raise UserError(
+            f"{path}: {part.__name__}.Config is no dataclass: write @dataclass above its class line"
+        )
 
 
 def _kind_of(part: Any) -> Optional[str]:

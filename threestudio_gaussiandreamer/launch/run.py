@@ -34,6 +34,7 @@ from .ddp import environment_plugins, planned_processes, trainer_options
 from .folder_lock import RunFolder, claim, claim_new, has_results, require_writable
 from .live_viewer import LiveViewer, ViewerConfig
 from .run_folder import SIZES, changes_since, renumber, resume_command
+from .section_checks import check_shared_views
 from .stage_errors import lightning_errors, write_errors
 from .training_state import check_training_state
 
@@ -119,6 +120,8 @@ class Run:
     def start(self) -> None:
         """Check the checkpoint and the folder, create the folder, build the parts and trainer."""
         checkpoint = self.read_resume()
+        if self.args.stage == "train":
+            check_shared_views(self.cfg)
         require_writable(self.folder)
         if self.viewer.enabled and self.args.stage == "train" and not get_rank():
             self.view = LiveView(self.viewer.host, self.viewer.port, self.cfg.tag or self.cfg.name)

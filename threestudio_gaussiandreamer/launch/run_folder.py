@@ -23,9 +23,15 @@ from .options import PROGRAM
 
 AUTO = "auto"
 """The value of ``resume`` that means the newest checkpoint."""
-SAME = {"system.prompt_processor.prompt": None, "seed": None}
+SAME = {
+    "system.prompt_processor.prompt": None,
+    "seed": None,
+    "system.guidance_type": None,
+    "system.guidance.mesh": None,
+    "system.guidance.pretrained_model_name_or_path": None,
+}
 """Options that a resumed run usually has in common with the one before; the values are the
-defaults, None for options that are always written."""
+defaults, None for options that are compared only where both runs give them."""
 SIZES = {"system.geometry.sh_degree": 0, "system.background.mode": "fixed"}
 """Options that decide which tensors a checkpoint has, and their sizes, and their defaults."""
 SLUG_BYTES = 64
@@ -107,7 +113,7 @@ def changes_since(cfg: Any, options: Mapping[str, Any] = SAME) -> list[str]:
     return [
         f"{name} was {old!r}, now it is {new!r}"
         for name, (old, new) in pairs.items()
-        if old not in (None, new)
+        if old not in (None, new) and new is not None
     ]
 
 
@@ -208,5 +214,15 @@ def _resume_newest(cfg: Any, tag: str) -> None:
             return
     info(
         f"resume=auto: no checkpoint of {os.path.join(cfg.exp_dir, tag)} to resume; "
-        "starting from the prior"
+        "starting from the prior" + _earlier_checkpoints(Path(cfg.trial_dir))
     )
+
+
+def _earlier_checkpoints(run: Path) -> str:
+    """Name the checkpoints of the last earlier run in a folder, see ``folder_lock.set_run_aside``;
+    an empty text if there are none."""
+    aside = [path for path in run.glob("ckpts-*") if any(path.glob("*.ckpt"))]
+    if not aside:
+        return ""
+    latest = max(aside, key=lambda path: path.stat().st_mtime)
+    return f" (an earlier run's are in {latest}: resume={latest / 'last.ckpt'})"

@@ -4,6 +4,7 @@ section is valid by itself.
 
 from typing import Any
 
+from ..core.distributed import require_shareable
 from ..core.errors import UserError
 from ..guidance.view_contrast import NOT_WITH_PERP_NEG
 from ..host import find, parse_structured
@@ -33,6 +34,17 @@ def check_sections(cfg: Any) -> None:
         _check_render_sizes(options, guidance, cfg)
     if "view_dependent_prompting" in guidance:
         _check_prompts(guidance, cfg.system)
+
+
+def check_shared_views(cfg: Any) -> None:
+    """Raise UserError if the processes that are to train can't share the views of a step."""
+    if cfg.data_type not in DATA:
+        return
+    data = parse_structured(find(cfg.data_type).Config, cfg.data)
+    for *_, views in sizes_of_stages(data):
+        require_shareable(
+            views, "data.batch_size", together=data.get("n_view", 1), processes=cfg.n_gpus
+        )
 
 
 def _check_view_groups(guidance: Any, data: Any) -> None:

@@ -15,14 +15,17 @@ Each prior has its own module: a registered subclass of :class:`Prior` that impl
 :meth:`~Prior.generate`."""
 
 import logging
+from abc import abstractmethod
 from dataclasses import dataclass, field
 from typing import Any, Optional
 
 import numpy as np
 from jaxtyping import Bool, Float
+from torch import Tensor
 
 from ..core.errors import UserError
 from ..core.memory import count_of
+from ..core.methods import require_method
 from ..core.options import (
     Rule,
     check_options,
@@ -143,10 +146,8 @@ class Prior(BaseObject):
 
     def configure(self) -> None:
         cls = type(self)
-        if cls.generate is Prior.generate and cls.__call__ is Prior.__call__:
-            raise UserError(
-                f"{cls.__name__} has no generate(prompt, generator), which gives a prior's points"
-            )
+        if cls.__call__ is Prior.__call__:
+            require_method(cls, "generate", "prompt", "generator")
         check_options(self.Config, self.cfg)
 
     def preflight(self) -> None:
@@ -175,13 +176,13 @@ class Prior(BaseObject):
         """Return the number of ground points, which are last in the cloud and aren't grown."""
         return int(self.cfg.ground_points) if self.cfg.ground else 0
 
+    @abstractmethod
     def generate(self, prompt: str, generator: np.random.Generator) -> PointCloud:
         """Return the object's points; :meth:`__call__` validates them.
 
         Args:
             generator: the only source of randomness.
         """
-        raise NotImplementedError(f"{type(self).__name__}.generate")
 
 
 # --------------------------------------------------------------------------------------------------
@@ -199,38 +200,55 @@ def chosen_colors(
     return np.tile(np.float32([GREY] * 3 if color == "grey" else list(color)), (count, 1))
 
 
+def points_of(prior: Any, prompt: str) -> PointCloud:
+    """Return ``prior(prompt)``, validated if the prior is another host's."""
+    cloud = prior(prompt)
+    return cloud if isinstance(prior, Prior) else validated(cloud, type(prior).__name__)
+
+
 def validated(cloud: PointCloud, name: str) -> PointCloud:
     """Return ``cloud`` as float32 without the rows that are not finite, its colours clipped to [0,
     1].
 
     Raises:
         UserError: it isn't a PointCloud, there are no points, points, colours and normals aren't
-            all (P, 3), more than 5 % of the rows are not finite, or most colours are far outside
-            [0, 1], as those from 0 to 255 are.
+            all arrays (P, 3), more than 5 % of the rows are not finite, or most colours are far
+            outside [0, 1], as those from 0 to 255 are.
     """
     if not isinstance(cloud, PointCloud):
-        raise UserError(f"{name}.generate returned {type(cloud).__name__}; expected a PointCloud")
-    points, colors = (np.asarray(values, np.float32) for values in (cloud.points, cloud.colors))
+        raise UserError(f"{name} returned {type(cloud).__name__}; expected a PointCloud")
+    points, colors = _as_array(cloud.points, name), _as_array(cloud.colors, name)
     if points.ndim != 2 or points.shape[1:] != (3,) or colors.shape != points.shape:
         raise UserError(
             f"{name} gave points {points.shape} and colours {colors.shape}; expected "
             "(P, 3) for both"
         )
-    if cloud.normals is not None and np.shape(cloud.normals) != points.shape:
-        got = np.shape(cloud.normals)
-        raise UserError(f"{name} gave normals {got}; expected {points.shape}, as the points")
+    normals = None if cloud.normals is None else _as_array(cloud.normals, name)
+    if normals is not None and normals.shape != points.shape:
+        raise UserError(
+            f"{name} gave normals {normals.shape}; expected {points.shape}, as the points"
+        )
     if not len(points):
         raise UserError(f"{name} gave no points: its source is empty")
     finite = np.isfinite(points).all(axis=1) & np.isfinite(colors).all(axis=1)
     if bad := int((~finite).sum()):
         report_non_finite(bad, len(points), name)
     require_unit_range(colors[finite], name)
-    cloud = without_rows(cloud._replace(points=points, colors=colors.clip(0.0, 1.0)), finite)
-    return (
-        cloud
-        if cloud.normals is None
-        else cloud._replace(normals=np.nan_to_num(np.asarray(cloud.normals, np.float32)))
-    )
+    if normals is not None:
+        normals = np.nan_to_num(normals)
+    cloud = cloud._replace(points=points, colors=colors.clip(0.0, 1.0), normals=normals)
+    return without_rows(cloud, finite)
+
+
+def _as_array(values: Any, name: str) -> Float[np.ndarray, "..."]:
+    if isinstance(values, Tensor):
+        values = values.detach().cpu()
+    try:
+        return np.asarray(values, np.float32)
+    except (TypeError, ValueError) as error:
+        raise UserError(
+            f"{name} gave something else than arrays of points, colours and normals: {error}"
+        ) from error
 
 
 def require_unit_range(colors: Float[np.ndarray, "P 3"], name: str) -> None:

@@ -14,6 +14,7 @@ from ..formats.array_files import read_arrays
 from ..formats.ply import write_points
 from ..gaussians.point_cloud import PointCloud
 from ..host import info, run_seed, warn
+from .base import points_of
 from .turntable import save_turntable
 
 
@@ -24,13 +25,13 @@ def cached_cloud(prior: Any, prompt: str, save_dir: Optional[str]) -> PointCloud
     ``points.ply`` and ``turntable.gif`` are written beside it, for inspection. If ``save_dir`` is
     None, nothing is read or written."""
     if save_dir is None:
-        return prior(prompt)
+        return points_of(prior, prompt)
     path, key = Path(save_dir) / "prior" / "points.npz", cache_key(prior, prompt)
     cloud = read_cache(path, key)
     if cloud is not None:
         info(f"the prior's points come from {path}")
         return cloud
-    cloud = prior(prompt)
+    cloud = points_of(prior, prompt)
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_file(path) as file:
         np.savez_compressed(

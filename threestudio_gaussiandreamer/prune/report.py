@@ -3,7 +3,7 @@
 import statistics
 import time
 from dataclasses import asdict
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Optional
 
 import torch
 from jaxtyping import Float, UInt8
@@ -57,20 +57,26 @@ def write_report(
     with atomic_file(f"{path}.json") as file:
         file.write(json_text(report | {"options": asdict(options)}, indent=2).encode())
     write_image(f"{path}.png", sheet([render_all(cloud, shown) for cloud in clouds]))
-    _print_report(path, report, before, after, suffix)
+    _print_report(path, report, before, after, suffix, result.before.pruned_to)
     return report
 
 
 def _print_report(
-    path: str, report: dict[str, Any], before: Cost, after: Cost, suffix: str
+    path: str,
+    report: dict[str, Any],
+    before: Cost,
+    after: Cost,
+    suffix: str,
+    pruned_to: Optional[float],
 ) -> None:
     for name, cost in (("before", before), ("after", after)):
         print(
             f"{name:7} {cost.gaussians:8d} Gaussians {cost.bytes / 1e6:8.2f} MB as {suffix} "
             f"{cost.ms_per_frame:8.2f} ms a frame"
         )
+    source = "the original" if pruned_to is None else "the input, which had been pruned before"
     print(
-        f"{report['psnr_on_unseen_views']:.2f} dB to the original, on the test views; "
+        f"{report['psnr_on_unseen_views']:.2f} dB to {source}, on the test views; "
         f"{path}.json, {path}.png"
     )
 

@@ -91,6 +91,8 @@ def check_tensors(tensors: dict[str, Tensor]) -> None:
                 f"{name} must be on the device of means ({tensors['means'].device}); got "
                 f"{tensor.device}."
             )
+        if tensor.is_meta:
+            raise UserError(f"{name} is on the device meta, and has no values to draw.")
 
 
 def check_shapes(tensors: dict[str, Tensor]) -> None:

@@ -112,8 +112,23 @@ class DensityControl:
         do what it is to. Return None if there is no such problem.
         """
         end = max_steps if max_steps > 0 else math.inf
-        problems = self._densification_problem(step, end), self._pruning_problem(step, end)
+        problems = (
+            self._limit_problem(step),
+            self._densification_problem(step, end),
+            self._pruning_problem(step, end),
+        )
         return "; ".join(filter(None, problems)) or None
+
+    def _limit_problem(self, step: int) -> Optional[str]:
+        """Describe a cloud, which can only be a checkpoint's, that stays larger than allowed."""
+        count, limit, densify = len(self.cloud), self.options.max_gaussians, self.options.densify
+        if count <= limit or (densify.enabled and max(rounds_of(densify), default=0) > step):
+            return None
+        return (
+            f"the checkpoint has {count} Gaussians, more than system.geometry.max_gaussians "
+            f"({limit}), which limits only the start and densification: for fewer, set "
+            "system.geometry.budget, or prune the result"
+        )
 
     def _densification_problem(self, step: int, end: float) -> Optional[str]:
         if not self.options.densify.enabled:

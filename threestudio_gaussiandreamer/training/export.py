@@ -8,13 +8,14 @@ from typing import Any, Optional
 
 from ..core.errors import unknown
 from ..exporters.base import Drawing, FileExporter, outputs_of, read_gaussians
+from ..exporters.bundle import BundleExporter
 from ..formats.gaussian_files import StoredCloud, write_cloud
 from ..formats.obj import write_obj
 from ..formats.ply import write_points
 from ..formats.spz import VERSION
 from ..gaussians.point_cloud import PointCloud
 from ..gaussians.surface import Surface
-from ..host import find
+from ..host import Exporter, find, warn
 from ..meshes.mesh import Mesh
 from ..meshes.write import write_textured_mesh
 from ..prune import PruneOptions, prune_to_budget, write_report
@@ -103,12 +104,28 @@ def export_cloud(
     Args:
         folder: below the system's folder of results.
         pruned_to: PSNR in dB, noted in files of Gaussians.
+
+    Raises:
+        Exception: the first error of an exporter, after the files of all others are written.
     """
     parts = {"geometry": geometry, "material": system.material, "background": system.background}
     exporter = find(system.cfg.exporter_type)(system.cfg.exporter, **parts)
     for part in (exporter, *getattr(exporter, "exporters", ())):
         if isinstance(part, FileExporter):
             part.drawing = drawing(system)
+    errors = []
+    for single in exporter.prepared() if isinstance(exporter, BundleExporter) else [exporter]:
+        try:
+            _write(system, single, folder, pruned_to)
+        except Exception as error:
+            errors.append(error)
+    for error in errors[1:]:
+        warn(str(error))
+    if errors:
+        raise errors[0]
+
+
+def _write(system: Any, exporter: Exporter, folder: str, pruned_to: Optional[float]) -> None:
     for out in outputs_of(exporter):
         noted = {"pruned_to": pruned_to} if out.save_type in CLOUDS else {}
         saver(system, out.save_type)(f"{folder}/{out.save_name}", **noted, **out.params)

@@ -53,6 +53,7 @@ from torch import Tensor, nn
 
 from ..core.errors import UserError
 from ..core.host_copies import DelayedReads
+from ..core.methods import require_method
 from ..core.nested import adopt_nested
 from ..core.options import (
     at_least,
@@ -213,8 +214,14 @@ class GaussianCloud(BaseGeometry):
     # -- start -------------------------------------------------------------------------------------
 
     def prior(self) -> Any:
-        """Build the prior of the configuration, without running it."""
-        return find(self.cfg.prior_type)(self.cfg.prior)
+        """Build the prior of the configuration, without running it.
+
+        Raises:
+            UserError: the part isn't called with a prompt.
+        """
+        part = find(self.cfg.prior_type)
+        require_method(part, "__call__", "prompt")
+        return part(self.cfg.prior)
 
     def initialize(self, prompt: str, make_cloud: Any = None) -> PointCloud:
         """Run the prior, grow and perturb its points, and start one Gaussian on each; returns the
