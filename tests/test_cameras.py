@@ -128,6 +128,18 @@ def test_the_inverse_of_a_camera_is_exact_and_an_invalid_one_affects_only_itself
     assert torch.equal(cameras.world_to_camera(c2w)[:1], whole)
 
 
+def test_cameras_for_the_rasteriser_have_gradients_after_a_call_without():
+    """Constants are kept from the first call."""
+    cameras._constant.cache_clear()
+    c2w = cameras.orbit_c2w(torch.tensor([10.0]), torch.tensor([20.0]), torch.tensor([2.0]))
+    with torch.inference_mode():
+        viewmats, Ks = cameras.to_opencv(c2w, torch.tensor([0.8]), 48, 64)
+    again = cameras.to_opencv(c2w.requires_grad_(), torch.tensor([0.8], requires_grad=True), 48, 64)
+    assert torch.equal(viewmats, again[0]) and torch.equal(Ks, again[1])
+    sum(x.sum() for x in again).backward()
+    assert c2w.grad.abs().sum() > 0
+
+
 def test_a_camera_at_the_centre_has_the_direction_of_one_in_front():
     up = torch.tensor([[0.0, 0.0, 1.0]])
     center = cameras.look_at(torch.zeros(1, 3), torch.zeros(1, 3), up)

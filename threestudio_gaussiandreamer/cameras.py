@@ -6,6 +6,7 @@ OpenGL: the columns of ``c2w`` are right, up, back. The rasteriser's cameras are
 ``viewmats`` map world to camera coordinates with x right, y down, z forward; ``Ks`` are in pixels,
 with pixel centres at +0.5. Images are (B, H, W, C) with row 0 at the top."""
 
+import functools
 import math
 from typing import Any, NamedTuple, Optional
 
@@ -117,21 +118,20 @@ def focal_length(fovy: Float[Tensor, " B"], height: int) -> Float[Tensor, " B"]:
 
 def intrinsics(fovy: Float[Tensor, " B"], height: int, width: int) -> Float[Tensor, "B 3 3"]:
     """Return pinhole matrices in pixels, with the principal point at the image's centre."""
-    Ks = torch.zeros(len(fovy), 3, 3, dtype=fovy.dtype, device=fovy.device)
-    Ks[:, 0, 0] = Ks[:, 1, 1] = focal_length(fovy, height)
-    Ks[:, 0, 2], Ks[:, 1, 2], Ks[:, 2, 2] = 0.5 * width, 0.5 * height, 1.0
-    return Ks
+    axes = _constant(((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 0.0)), fovy.dtype, fovy.device)
+    centre = ((0.0, 0.0, 0.5 * width), (0.0, 0.0, 0.5 * height), (0.0, 0.0, 1.0))
+    focal = focal_length(fovy, height)[:, None, None]
+    return torch.addcmul(_constant(centre, fovy.dtype, fovy.device), focal, axes)
 
 
 def to_opencv(
     c2w: Float[Tensor, "B 4 4"], fovy: Float[Tensor, " B"], height: int, width: int
 ) -> tuple[Float[Tensor, "B 4 4"], Float[Tensor, "B 3 3"]]:
-    """Convert the host's OpenGL cameras to ``(viewmats, Ks)``: flip the camera's y and z axes, then
-    invert the rigid motion.
+    """Convert the host's OpenGL cameras to ``(viewmats, Ks)``: invert the rigid motion, and flip
+    the camera's y and z axes.
     """
-    flipped = c2w.clone()
-    flipped[:, :, 1:3].neg_()
-    return world_to_camera(flipped), intrinsics(fovy, height, width)
+    flip = _constant(((1.0,), (-1.0,), (-1.0,), (1.0,)), c2w.dtype, c2w.device)
+    return world_to_camera(c2w) * flip, intrinsics(fovy, height, width)
 
 
 def world_to_camera(c2w: Float[Tensor, "B 4 4"]) -> Float[Tensor, "B 4 4"]:
@@ -141,11 +141,18 @@ def world_to_camera(c2w: Float[Tensor, "B 4 4"]) -> Float[Tensor, "B 4 4"]:
     other items of the batch correct.
     """
     rotation = c2w[:, :3, :3].transpose(1, 2)
-    inverse = torch.zeros_like(c2w)
-    inverse[:, :3, :3] = rotation
-    inverse[:, :3, 3:] = -rotation @ c2w[:, :3, 3:]
-    inverse[:, 3, 3] = 1.0
-    return inverse
+    translation = -torch.bmm(rotation, c2w[:, :3, 3:])
+    last = _constant(((0.0, 0.0, 0.0, 1.0),), c2w.dtype, c2w.device).expand(len(c2w), 1, 4)
+    return torch.cat([torch.cat([rotation, translation], 2), last], 1)
+
+
+@functools.lru_cache(maxsize=64)
+def _constant(
+    rows: tuple[tuple[float, ...], ...], dtype: torch.dtype, device: torch.device
+) -> Float[Tensor, "rows columns"]:
+    """Return a matrix, which isn't to be changed; each step needs the same ones."""
+    with torch.inference_mode(False):  # else it couldn't serve training later
+        return torch.tensor(rows, dtype=dtype, device=device)
 
 
 def ray_directions(

@@ -186,7 +186,7 @@ class ExactScoreGuidance(ScoreDistillation):
         if background.shape[1:3] != (1, 1):
             return None
         self._size = tuple(size)
-        pictures = self.truth.pictures(c2w, fovy, *size)
+        pictures = self.truth.pictures.planes(c2w, fovy, *size)
         _, abar = self.draw_timesteps(rgb)
         weight = sds.weight(self.options.weighting_strategy, abar).float()
         background, scale = background[:, 0, 0].contiguous(), (abar / (1 - abar)).sqrt().float()

@@ -2,9 +2,11 @@
 guidances have.
 """
 
+import functools
 import inspect
 import itertools
-from collections.abc import Iterator, Mapping
+import types
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
@@ -35,7 +37,7 @@ def call_guidance(
         UserError: the guidance returns no dict, or a ``loss_*`` that isn't a single finite number.
     """
     call = guidance.forward if isinstance(guidance, nn.Module) else guidance.__call__
-    arguments = inspect.signature(call).parameters
+    arguments = _parameters(call)
     given = {"prompt_utils": prompt_utils, **batch, **options}
     second = next(itertools.islice(arguments.values(), 1, None), None)
     if (
@@ -51,6 +53,18 @@ def call_guidance(
     if not isinstance(guidance, ScoreDistillation):
         _require_finite(out, type(guidance).__name__)
     return out
+
+
+def _parameters(call: Callable[..., Any]) -> Mapping[str, inspect.Parameter]:
+    """Return the parameters of a function or bound method."""
+    function = getattr(call, "__func__", None)
+    return inspect.signature(call).parameters if function is None else _of_method(function)
+
+
+@functools.lru_cache(maxsize=16)
+def _of_method(function: Callable[..., Any]) -> Mapping[str, inspect.Parameter]:
+    """Return the parameters of a function as a method of any object, which isn't kept."""
+    return inspect.signature(types.MethodType(function, object())).parameters
 
 
 def _checked(out: Any, name: str, device: torch.device) -> dict[str, Any]:

@@ -271,6 +271,12 @@ class TargetCache:
 
         In memory each channel is a plane, since compositing moves the channels to the front.
         """
+        return torch.stack(self.planes(c2w, fovy, height, width)).movedim(1, -1)
+
+    def planes(
+        self, c2w: Float[Tensor, "B 4 4"], fovy: Float[Tensor, " B"], height: int, width: int
+    ) -> list[UInt8[Tensor, "4 H W"]]:
+        """Return the cached pictures themselves, not to be changed, with their channels first."""
         cameras = _cameras(c2w, fovy)
         keys = [_key(camera, height, width) for camera in cameras]
         asked = dict(zip(keys, cameras, strict=True))
@@ -286,7 +292,7 @@ class TargetCache:
                 for key, image in zip(missing, images, strict=True)
             }
         self._remember(found)
-        return torch.stack([found[key] for key in keys]).movedim(1, -1)
+        return [found[key] for key in keys]
 
     def __len__(self) -> int:
         return len(self._pictures)

@@ -176,7 +176,13 @@ class GaussianCloud(BaseGeometry):
         """Compute standard deviations along the axes, world units; clamped where exp would over- or
         underflow float32.
         """
-        return self.log_scales.clamp(*LOG_SCALE_RANGE).exp()
+        logs, (low, high) = self.log_scales, LOG_SCALE_RANGE
+        # on a CPU looking is faster than the gradient of a clamp; on a GPU it would wait for it
+        if logs.device.type == "cpu" and logs.numel():
+            least, most = torch.aminmax(logs.detach())
+            if low <= least.item() and most.item() <= high:
+                return logs.exp()
+        return logs.clamp(low, high).exp()
 
     def opacities(self) -> Float[Tensor, " N"]:
         return torch.sigmoid(self.logit_opacities)

@@ -61,7 +61,7 @@ inline double known_gradient_of_row(const SplatKnownPictures& in, int64_t item, 
 inline void known_gradients(const SplatKnownPictures& in, const SplatKnownGradient& out) {
   parallel_for(in.items * in.height, in.threads, 8, [&](int64_t i) {
     const int64_t item = i / in.height, row = i % in.height, at = 3 * i * in.width;
-    const uint8_t* picture = in.picture + (4 * item * in.height + row) * in.width;
+    const uint8_t* picture = in.pictures[item] + row * in.width;
     out.squares[i] = known_gradient_of_row(in, item, in.render + at, picture, out.gradient + at);
   });
 }

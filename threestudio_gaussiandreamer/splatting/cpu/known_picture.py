@@ -2,7 +2,7 @@
 
 import ctypes
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Optional
 
 import torch
@@ -18,7 +18,7 @@ class _Pictures(ctypes.Structure):
     """``SplatKnownPictures`` of scene.h."""
 
     _fields_ = [
-        *((name, ctypes.c_void_p) for name in "render picture background scale weight".split()),
+        *((name, ctypes.c_void_p) for name in "render pictures background scale weight".split()),
         *((name, ctypes.c_int64) for name in "items height width".split()),
         ("threads", ctypes.c_int32),
         ("slope", ctypes.c_float),
@@ -38,7 +38,7 @@ def is_available(device: torch.device) -> bool:
 
 def known_gradient(
     render: Float[Tensor, "B H W 3"],
-    pictures: UInt8[Tensor, "B H W 4"],
+    pictures: Sequence[UInt8[Tensor, "4 H W"]],
     background: Float[Tensor, "B 3"],
     scale: Float[Tensor, " B"],
     weight: Float[Tensor, " B"],
@@ -48,7 +48,7 @@ def known_gradient(
     x = 2 render - 1, and x_1 the latent of a picture on the background.
 
     Args:
-        pictures: premultiplied, in memory a plane per channel.
+        pictures: one per render, premultiplied.
         scale: s, of the error of the latent.
         weight: w.
 
@@ -56,15 +56,16 @@ def known_gradient(
         the gradient, 2 g / B, bit for bit that of plain torch, and the sum of g^2 per item,
         float64; None where the library or the tensors aren't of the kind that it takes.
     """
-    planes = pictures.movedim(-1, 1)
     float32 = (render, background, scale, weight)
     taken = all(x.dtype == torch.float32 and x.is_contiguous() for x in float32)
-    if not (is_available(render.device) and taken and planes.is_contiguous()):
+    taken = taken and all(picture.is_contiguous() for picture in pictures)
+    if not (is_available(render.device) and taken):
         return None
     items, height, width, _ = render.shape
     gradient = torch.empty_like(render)
     squares = torch.empty(items, height, dtype=torch.float64)
-    inputs = map(address, (render, planes, background, scale, weight))
+    planes = (ctypes.c_void_p * items)(*map(address, pictures))
+    inputs = address(render), ctypes.addressof(planes), *map(address, (background, scale, weight))
     rest = (items, height, width, torch.get_num_threads(), 2 / max(items, 1))
     failed = _function()(_Pictures(*inputs, *rest), _Gradient(*map(address, (gradient, squares))))
     return None if failed else (gradient, squares.sum(1))  # out of memory
@@ -74,7 +75,7 @@ def known_gradient(
 def _function() -> Optional[Callable[..., int]]:
     """Return the function of the library; None if it isn't built, or older than the function."""
     try:
-        function = library().splat_render_gradients
+        function = library().splat_gradients_to_pictures
     except (OSError, UserError, AttributeError):
         return None
     function.argtypes = [ctypes.POINTER(_Pictures), ctypes.POINTER(_Gradient)]

@@ -137,7 +137,7 @@ void splat_release(SplatState* state) {
   if (state) splat::states().give(std::unique_ptr<SplatState>(state));
 }
 
-int64_t splat_render_gradients(const SplatKnownPictures* in, const SplatKnownGradient* out) {
+int64_t splat_gradients_to_pictures(const SplatKnownPictures* in, const SplatKnownGradient* out) {
   return splat::guarded([&] { splat::known_gradients(*in, *out); });
 }
 

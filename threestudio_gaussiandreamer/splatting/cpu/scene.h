@@ -38,7 +38,7 @@ struct SplatState;
 
 struct SplatKnownPictures {
   const float* render;      // (B, H, W, 3) in [0, 1]
-  const uint8_t* picture;   // (B, 4, H, W) premultiplied colour and coverage
+  const uint8_t* const* pictures;  // B times (4, H, W), premultiplied colour and coverage
   const float* background;  // (B, 3)
   const float* scale;       // (B) of the error of the latent
   const float* weight;      // (B) of the gradient
@@ -61,7 +61,7 @@ int64_t splat_backward(SplatState*, const splat::Scene*, const SplatSettings*, c
 void splat_release(SplatState*);  // null is ignored
 // Limits what a call may take; the memory of the machine or its container.
 void splat_set_memory(int64_t bytes);
-int64_t splat_render_gradients(const SplatKnownPictures*, const SplatKnownGradient*);
+int64_t splat_gradients_to_pictures(const SplatKnownPictures*, const SplatKnownGradient*);
 // The best build for this processor: "v4", "v3" or "base".
 const char* splat_best_isa();
 }
