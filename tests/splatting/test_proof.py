@@ -73,6 +73,7 @@ FAULTS = {
     "blend_backward_absolute": Fault("blend_backward_absolute", other_constants, draws=(ABSOLUTE,)),
     "sum_rows": Fault("sum_rows", after=lambda sums: sums.mul_(1.01)),
     "project_backward": Fault("project_backward", other_constants),
+    "sum_cameras": Fault("sum_cameras", after=lambda viewmats: viewmats.mul_(1.01)),
     "project, antialias": Fault("project", no_antialiasing, draws=(HALVED, ABSOLUTE)),
     "project_backward, antialias": Fault(
         "project_backward", no_antialiasing, draws=(HALVED, ABSOLUTE)

@@ -25,6 +25,7 @@ int shim_launch(const char* name, unsigned grid_x, unsigned grid_y, unsigned thr
   KERNEL(blend_backward_absolute);
   KERNEL(sum_rows);
   KERNEL(project_backward);
+  KERNEL(sum_cameras);
   KERNEL(faulty_barrier);
   KERNEL(faulty_race);
 #undef KERNEL

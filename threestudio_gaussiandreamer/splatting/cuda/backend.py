@@ -46,7 +46,7 @@ from .stages import (
     no_lists,
     project,
     project_backward,
-    viewmats_gradient,
+    sum_cameras,
 )
 
 MOST_SPLATS = 2**31 - 1  # views times Gaussians; kernels number them with 32 bits
@@ -107,13 +107,15 @@ class CudaKernel(NamedTuple):
         """Differentiate; waits for the numbers of intersections."""
         alpha, *kept = saved
         found = empty_gradients(scene, self.context.options.absgrad, wanted.viewmats)
+        viewmats = torch.zeros_like(scene.viewmats) if wanted.viewmats and not kept else None
         if kept:
             splats, lists = Splats(*kept[:5]), Lists(*kept[5:8])
             blended = BlendUpstream(*upstream, *kept[8:])
             batch = make_batch(scene, self.context)
             sums = _sums_of_rows(batch, splats, lists, state.values(), blended)
             project_backward(batch, splats, sums, found)
-        viewmats = None if found.viewmats is None else viewmats_gradient(found.viewmats)
+            if found.camera_parts is not None:
+                viewmats = sum_cameras(batch, found.camera_parts)
         background = (
             _background_gradient(upstream.image, alpha, scene) if wanted.background else None
         )

@@ -31,6 +31,7 @@ UNITS = {
     "blend_backward_absolute": "blend_backward",
     "sum_rows": "project_backward",
     "project_backward": "project_backward",
+    "sum_cameras": "project_backward",
 }
 LIBRARY = "nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1"
 VERSION_FILE = Path("/proc/driver/nvidia/version")

@@ -5,6 +5,7 @@
 namespace splat {
 
 constexpr int THREADS = 128, CAMERA_SUMS = 12;  // d loss / d viewmat but for its last row
+constexpr int CAMERA_ROWS = 32;  // threads per column of these that add up the blocks' parts
 constexpr int SUM_LANES = 4, RANKS = WARP / SUM_LANES;  // lanes that add the rows of one splat, a quad each; splats of a warp
 
 // What a backward pass fills.
@@ -12,7 +13,7 @@ struct Gradients {
   float *means, *quats, *scales, *opacities, *colors;  // as in Scene
   float* means2d;   // (B, N, 2)
   float* absgrad;   // (B, N, 2) or null: sum over pixels of the absolute value
-  float* viewmats;  // (blocks, B, 12) or null: each block's part
+  float* camera_parts;  // (blocks, B, 12) or null: each block's part in d loss / d viewmats
 };
 
 // One Gaussian's part in d loss / d viewmat but for its last row.
@@ -141,8 +142,25 @@ project_backward(splat::Scene scene, splat::Settings settings, const int* depth_
     drawn_anywhere |= drawn;
     if (exists) store_screen(out, at, d.mean2d, absolute);
     if (exists && scene.colors_per_view) store3(out.colors + 3 * at, d.color);
-    if (out.viewmats) sum_block(viewmat, out.viewmats + (Index(blockIdx.x) * scene.views + view) * CAMERA_SUMS);
+    if (out.camera_parts) sum_block(viewmat, out.camera_parts + (Index(blockIdx.x) * scene.views + view) * CAMERA_SUMS);
   }
   if (exists) store_world(out, i, g, rotation, world, drawn_anywhere);
   if (exists && !scene.colors_per_view) store3(out.colors + 3 * Index(i), world.color);
+}
+
+// The blocks' parts to d loss / d viewmats (B, 4, 4), with zeros in the last row; one block per view, in the y direction.
+extern "C" __global__ void __launch_bounds__(384)
+sum_cameras(splat::Scene scene, const float* parts, int blocks, float* viewmats) {
+  using namespace splat;
+  __shared__ double sums[CAMERA_ROWS][CAMERA_SUMS];
+  const int column = threadIdx.x % CAMERA_SUMS, row = threadIdx.x / CAMERA_SUMS;
+  double sum = 0;
+  for (Index block = row; block < blocks; block += CAMERA_ROWS) sum += parts[(block * scene.views + blockIdx.y) * CAMERA_SUMS + column];
+  sums[row][column] = sum;
+  __syncthreads();
+  if (threadIdx.x >= 16) return;
+  double total = 0;
+  if (threadIdx.x < CAMERA_SUMS)
+    for (int i = 0; i < CAMERA_ROWS; i++) total += sums[i][threadIdx.x];
+  viewmats[16 * Index(blockIdx.y) + threadIdx.x] = float(total);
 }

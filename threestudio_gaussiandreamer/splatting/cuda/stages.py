@@ -19,7 +19,7 @@ TILE, BLEND_THREADS, THREADS = 16, 256, 128
 SUM_LANES = 4  # threads that add the rows of one splat
 SPLAT, ROW = 16, 12  # floats
 NOWHERE = 2**31 - 1  # the tile of an intersection that isn't used
-CAMERA_SUMS = 12
+CAMERA_SUMS, CAMERA_THREADS = 12, 384
 
 Argument = Union[Tensor, ctypes.Structure, ctypes._SimpleCData]
 
@@ -148,7 +148,7 @@ class Gradients(NamedTuple):
     colors: Tensor
     means2d: Tensor
     absgrad: Optional[Tensor]
-    viewmats: Optional[Tensor]  # (blocks, B, CAMERA_SUMS), each block's part
+    camera_parts: Optional[Tensor]  # (blocks, B, CAMERA_SUMS), each block's part for the viewmats
 
 
 def tiles_per_view(scene: Scene) -> int:
@@ -250,10 +250,14 @@ def empty_gradients(scene: Scene, absgrad: bool, viewmats: bool) -> Gradients:
     return Gradients(*(torch.empty_like(x) for x in own), *screen, parts)
 
 
-def viewmats_gradient(parts: Tensor) -> Tensor:
-    """Sum the blocks' parts (blocks, B, CAMERA_SUMS) to (B, 4, 4); the last row's gradient is 0."""
-    rows = parts.sum(0, dtype=torch.float64).float().view(-1, 3, 4)
-    return torch.nn.functional.pad(rows, (0, 0, 0, 1))
+def sum_cameras(batch: Batch, parts: Tensor) -> Tensor:
+    """Sum the blocks' parts (blocks, B, CAMERA_SUMS), in double precision, to the gradient of the
+    viewmats (B, 4, 4); that of the last row is 0. Torch would launch four kernels.
+    """
+    viewmats = torch.empty_like(batch.scene.viewmats)
+    arguments = (parts, ctypes.c_int(len(parts)), viewmats)
+    batch.launch("sum_cameras", (1, batch.views), CAMERA_THREADS, *arguments)
+    return viewmats
 
 
 def _per_gaussian(shape: tuple[int, int]) -> tuple[int, int]:
