@@ -246,7 +246,7 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         self.density.before_backward(out, step)
         guided = self.supervise(out, batch)
         losses = self.losses(guided, out)
-        self.manual_backward(total(losses, self.cfg.guidance_type))
+        self.manual_backward(total(losses, self.options.guidance_type))
         average_gradients(p for group in optimizer.param_groups for p in group["params"])
         self.image_targets.hold_shapes(optimizer, step)
         loss_scale = self.loss_scale.value(self.trainer)
