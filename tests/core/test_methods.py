@@ -1,11 +1,16 @@
 """Methods that a user's part lacks, or that can't be called, are named with how they are called."""
 
+import functools
 from abc import abstractmethod
 
 import pytest
 
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.core.methods import find_method, require_method
+from threestudio_gaussiandreamer.core.methods import (
+    find_method,
+    require_class_method,
+    require_method,
+)
 
 
 class Base:
@@ -59,3 +64,35 @@ def test_other_arguments_are_refused(name, cause):
         UserError, match=rf"Part has {name}\(self, .*called as {name}\(a, b\): {cause}"
     ):
         require_method(Part, name, "a", "b")
+
+
+class Wrapped:
+    @functools.lru_cache  # noqa: B019
+    def cached(self, a, b):
+        """Do something."""
+
+    partly = functools.partialmethod(Part.three, c=1)
+    bound = functools.partial(max, 1)
+    number = 3
+
+    @property
+    def computed(self):
+        return lambda a, b: None
+
+
+@pytest.mark.parametrize("name", ["cached", "partly", "bound"])
+def test_methods_that_are_no_functions_are_accepted_if_they_can_be_called(name):
+    require_method(Wrapped, name, "a", "b")
+
+
+@pytest.mark.parametrize("name", ["number", "computed"])
+def test_what_is_no_method_is_refused(name):
+    with pytest.raises(UserError, match=rf"Wrapped has no {name}\(a, b\)"):
+        require_method(Wrapped, name, "a", "b")
+
+
+def test_a_method_of_instances_is_no_class_method():
+    for name in ("of_class", "static", "missing"):
+        require_class_method(Part, name)
+    with pytest.raises(UserError, match="Part.one needs @classmethod above it"):
+        require_class_method(Part, "one")

@@ -116,3 +116,19 @@ def test_checked_options_are_plain_attributes_with_parsed_schedules():
 def test_checked_options_refuse_what_check_options_refuses():
     with pytest.raises(UserError, match="^a.size"):
         checked_options(Options, Options(size=0), "a.")
+
+
+def test_a_check_may_raise_any_value_error():
+    """Not everybody knows of UserError."""
+
+    @dataclass
+    class Config:
+        low: int = 3
+        high: int = 2
+
+        @staticmethod
+        def check(cfg: Any) -> None:
+            raise ValueError("low: expected less than high")
+
+    with pytest.raises(UserError, match="part.low: expected less than high"):
+        check_options(Config, Config(), "part.")

@@ -317,10 +317,16 @@ def test_resume_auto_takes_the_newest_run_of_the_tag(folder):
 
 
 def test_resume_auto_names_the_checkpoints_of_an_earlier_run(folder, caplog):
-    save_file("outputs/tiny/run/ckpts-2/last.ckpt", {"epoch": 0, "global_step": 3})
+    save_file("outputs/tiny/run/ckpts-2/epoch=0-step=3.ckpt", {"epoch": 0, "global_step": 3})
     with caplog.at_level("INFO"):
         assert load("resume=auto", "use_timestamp=false", "tag=run").resume is None
-    assert "resume=outputs/tiny/run/ckpts-2/last.ckpt" in caplog.text
+    assert "resume=outputs/tiny/run/ckpts-2/epoch=0-step=3.ckpt" in caplog.text
+
+
+def test_paths_of_one_file_are_no_change(folder):
+    assert run_folder._is_same("my.glb", "./my.glb") and run_folder._is_same(3, 3)
+    assert run_folder._is_same("my.glb", str(Path("my.glb").absolute()))
+    assert not run_folder._is_same("my.glb", "other.glb") and not run_folder._is_same(3, "3")
 
 
 def test_a_checkpoint_of_another_working_folder_is_continued_in_its_own(folder, monkeypatch):

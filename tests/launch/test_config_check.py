@@ -12,11 +12,12 @@ from tests.helpers import tiny_parts
 from tests.launch.config_cases import load
 from threestudio_gaussiandreamer import register_parts
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.host import BaseObject, find, register
+from threestudio_gaussiandreamer.core.methods import require_dataclass
+from threestudio_gaussiandreamer.host import BaseBackground, BaseObject, find, register
 from threestudio_gaussiandreamer.launch.config import load_config
 from threestudio_gaussiandreamer.launch.config_check import check_config, check_part
 from threestudio_gaussiandreamer.launch.extensions import load_extensions
-from threestudio_gaussiandreamer.launch.part_kinds import require_dataclass
+from threestudio_gaussiandreamer.launch.part_kinds import check_kind
 
 
 @register("optionless-part")
@@ -275,12 +276,44 @@ class InheritedConfig(FooGuidance):
 
 def test_options_of_a_config_without_decorator_are_not_ignored():
     for name in ("undecorated", "plain-config"):
-        with pytest.raises(UserError, match="guidance_type: .*Config is no dataclass: write @data"):
-            require_dataclass("guidance_type", find(f"test-{name}-guidance"))
-    require_dataclass("guidance_type", InheritedConfig)
+        with pytest.raises(UserError, match="Config is no dataclass: write @data"):
+            require_dataclass(find(f"test-{name}-guidance"))
+    require_dataclass(InheritedConfig)
 
 
 def test_an_endless_run_needs_its_own_number_for_checkpoints(folder):
     with pytest.raises(UserError, match="checkpoint.every_n_train_steps is -1, as trainer.max_st"):
         check_config(load("trainer.max_steps=-1"))
     check_config(load("trainer.max_steps=-1", "checkpoint.every_n_train_steps=5"))
+
+
+def test_options_of_the_base_class_must_not_be_missing():
+    class Detached(FooGuidance):
+        @dataclass
+        class Config:
+            color: float = 0.5
+
+    class WithOption(BaseObject):
+        @dataclass
+        class Config(BaseObject.Config):
+            ground: bool = False
+
+    class Derived(WithOption):
+        Config = Detached.Config
+
+    require_dataclass(Detached)  # its base has no option
+    with pytest.raises(UserError, match="Config lacks ground: derive it from WithOption.Config"):
+        require_dataclass(Derived)
+
+
+def test_a_part_that_is_no_class_is_refused():
+    with pytest.raises(UserError, match="prior_type: f is a function; register a class"):
+        check_kind("system.geometry.prior_type", "f", lambda cfg: None)
+
+
+def test_a_background_without_forward_is_refused():
+    class Unfinished(BaseBackground):
+        pass
+
+    with pytest.raises(UserError, match=r"background_type: Unfinished has no forward\(dirs\)"):
+        check_kind("system.background_type", "unfinished", Unfinished)

@@ -165,7 +165,18 @@ class TestValidation:
         np.testing.assert_array_equal(taken.points, validated(cloud, "x").points)
         assert isinstance(taken.normals, np.ndarray)
 
-    @pytest.mark.parametrize("points", [[[0, 0, 0], [1, 1]], [["a", "b", "c"]], {}])
+    def test_half_precision_is_widened(self):
+        cloud = self.cloud()
+        half = {
+            name: torch.tensor(getattr(cloud, name)).bfloat16() for name in ("points", "colors")
+        }
+        np.testing.assert_allclose(
+            validated(PointCloud(**half), "x").points, cloud.points, rtol=0.01, atol=0.01
+        )
+
+    @pytest.mark.parametrize(
+        "points", [[[0, 0, 0], [1, 1]], [["a", "b", "c"]], {}, torch.zeros(2, 3, device="meta")]
+    )
     def test_what_is_no_array_is_refused(self, points):
         with pytest.raises(UserError, match="x gave something else than arrays"):
             validated(PointCloud(points=points, colors=np.zeros((2, 3))), "x")

@@ -12,7 +12,7 @@ from threestudio_gaussiandreamer.exporters import mesh as mesh_exporter
 from threestudio_gaussiandreamer.formats.gaussian_files import read_cloud
 from threestudio_gaussiandreamer.formats.ply import read_gaussians
 from threestudio_gaussiandreamer.formats.spz import read_spz
-from threestudio_gaussiandreamer.host import Exporter, register
+from threestudio_gaussiandreamer.host import Exporter, ExporterOutput, register
 
 
 def test_a_run_exports_the_pruned_cloud_too_and_so_does_export(tmp_path, painted_box):
@@ -127,17 +127,65 @@ def test_every_format_is_exported_and_says_that_it_was_trained_antialiased(tmp_p
     assert "SplatRenderMode: mip" in (export / "gaussians.usda").read_text()
 
 
-def test_a_format_that_fails_leaves_the_others(tmp_path, painted_box, capsys):
-    @register("test-failing-exporter")
-    class Failing(Exporter):
-        def __call__(self):
-            return "nothing"
+@register("test-raising-exporter")
+class Raising(Exporter):
+    def __call__(self):
+        raise RuntimeError("no memory for that")
 
-    options = ["system.exporter.formats=[test-failing,ply,points]", "trainer.max_steps=1"]
-    assert launch(tmp_path, painted_box, *options, "trainer.val_check_interval=1") == 2
-    assert "Failing returned str; expected a list of ExporterOutput" in capsys.readouterr().err
-    export = run_folder(tmp_path) / "save" / "it1-export"
-    assert {path.name for path in export.iterdir()} >= {"gaussians.ply", "points.ply"}
+
+@register("test-unbuildable-exporter")
+class Unbuildable(Raising):
+    def configure(self, *args, **kwargs):
+        raise RuntimeError("not installed")
+
+
+class Returning(Exporter):
+    """Returns one JSON file."""
+
+    name, params = "numbers.json", {"payload": 1}
+
+    def __call__(self):
+        return [ExporterOutput(self.name, "json", self.params)]
+
+
+@register("test-same-name-exporter")
+class SameName(Returning):
+    name = "Gaussians.ply"
+
+
+@register("test-page-name-exporter")
+class PageName(Returning):
+    name = "view.html"
+
+
+@register("test-wrong-params-exporter")
+class WrongParams(Returning):
+    params = {"data": 1}
+
+
+FAILING = ("raising", "unbuildable", "same-name", "page-name", "wrong-params")
+
+
+def test_formats_that_fail_leave_the_others(tmp_path, painted_box, capsys, caplog):
+    formats = ["ply", *(f"test-{name}" for name in FAILING), "points"]
+    options = [f"system.exporter.formats=[{','.join(formats)}]", "trainer.max_steps=1"]
+    options += ["trainer.val_check_interval=1", "system.prune.count=100"]
+    with pytest.raises(RuntimeError, match="no memory for that"):
+        launch(tmp_path, painted_box, *options)
+    said, export = caplog.text, run_folder(tmp_path) / "save" / "it1-export"
+    for name, reason in zip(FAILING, ("no memory", "not installed"), strict=False):
+        assert f"test-{name} failed: RuntimeError: {reason}" in said
+    assert "save_name 'Gaussians.ply': another file of the export" in said
+    assert "params of numbers.json" in said and "save_json takes (filename: str, payload" in said
+    wanted = {"gaussians.ply", "points.ply"}
+    for folder in (export, export / "pruned"):
+        assert {path.name for path in folder.iterdir()} >= wanted
+    assert (export / "view.html").read_text().startswith("<!")
+    last = run_folder(tmp_path) / "ckpts" / "last.ckpt"
+    shutil.rmtree(export)
+    with pytest.raises(RuntimeError, match="no memory for that"):
+        launch(tmp_path, painted_box, *options, f"resume={last}", stage="--export")
+    assert {path.name for path in export.iterdir()} >= wanted
 
 
 def test_a_mesh_is_exported_beside_the_cloud_as_the_run_draws(tmp_path, painted_box, monkeypatch):

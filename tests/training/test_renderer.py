@@ -1,9 +1,13 @@
 """What the renderer adds to the rasterizer's pictures."""
 
+from types import SimpleNamespace
+
+import pytest
 import torch
 
 from threestudio_gaussiandreamer import cameras
-from threestudio_gaussiandreamer.training.renderer import normals_from_depth
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.training.renderer import SplattingRenderer, normals_from_depth
 
 
 def plane(height: int, width: int) -> tuple[torch.Tensor, ...]:
@@ -39,3 +43,11 @@ def test_normals_have_gradients_where_the_surface_is_degenerate_too():
         return normals_from_depth(depth, torch.ones_like(depth), c2w.double(), fovy.double())
 
     assert torch.autograd.gradcheck(of, plane(4, 4)[0].double().requires_grad_())
+
+
+def test_a_background_of_another_shape_is_named():
+    out = SimpleNamespace(image=torch.zeros(2, 4, 5, 3), alpha=torch.zeros(2, 4, 5, 1))
+    renderer = SimpleNamespace(background=lambda dirs: torch.zeros(3))
+    c2w, fovy = torch.eye(4).expand(2, 4, 4), torch.ones(2)
+    with pytest.raises(UserError, match=r"returned colours \(3,\).*; expected \(2, 4, 5, 3\)"):
+        SplattingRenderer._composite(renderer, out, c2w, fovy, {})

@@ -14,9 +14,10 @@ import torch
 
 from tests.helpers.ply_files import write_raw_gaussians
 from tests.view.clouds import cloud
+from threestudio_gaussiandreamer.convert import command as convert
 from threestudio_gaussiandreamer.formats.gaussian_files import write_cloud
 from threestudio_gaussiandreamer.view import page
-from threestudio_gaussiandreamer.view.command import main
+from threestudio_gaussiandreamer.view.command import main, parse
 
 
 @pytest.fixture
@@ -126,6 +127,21 @@ def test_the_page_does_not_replace_its_cloud(source, tmp_path, capsys):
     for out in (source, alias):
         assert "OUT is PATH" in message(capsys, source, "--html", out)
     assert source.read_bytes() == before and alias.is_symlink()
+
+
+def test_a_page_does_not_replace_another_kind_of_file(source, tmp_path, capsys):
+    """As someone would who wants the pages of two clouds."""
+    other = tmp_path / "other.ply"
+    other.write_bytes(source.read_bytes())
+    assert "expected a name that ends in .html" in message(capsys, source, "--html", other)
+    assert other.read_bytes() == source.read_bytes()
+
+
+def test_an_axis_that_begins_with_a_hyphen_is_a_value():
+    assert parse(["a.ply", "--up", "-y", "--html"]).up == "-y"
+    assert parse(["a.ply", "--up=-y"]).up == "-y"
+    converted = convert.parse(["a.ply", "b.ply", "--up", "-y", "--up-out", "-y"])
+    assert (converted.up, converted.up_out) == ("-y", "-y")
 
 
 def test_a_cloud_of_any_unit_has_no_far_plane(tmp_path):

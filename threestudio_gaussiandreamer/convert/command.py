@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Optional
 
-from ..core.command import run_command
+from ..core.command import joined_values, run_command
 from ..core.errors import UserError
 from ..core.files import existing_file, require_other_file, require_writable
 from ..core.memory import size_text
@@ -112,7 +112,7 @@ def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
         meshes.add_argument(name, **settings)
     parser.add_argument("source", metavar="IN", help="a file of Gaussians, or a checkpoint")
     parser.add_argument("output", metavar="OUT", help="the file to write")
-    return parser.parse_args(argv)
+    return parser.parse_args(joined_values(argv, ["--up", "--up-out"], AXES))
 
 
 def run(args: argparse.Namespace) -> None:

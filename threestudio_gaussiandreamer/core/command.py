@@ -7,7 +7,7 @@ import os
 import signal
 import sys
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from typing import Any, Optional
 
 from .errors import Terminated, UserError
@@ -44,6 +44,24 @@ def run_command(
         except Exception as error:
             return exit_code(error)
     return 0
+
+
+def joined_values(
+    argv: Optional[Sequence[str]], options: Sequence[str], values: Collection[str]
+) -> list[str]:
+    """Join each of these options to the value behind it by ``=``, where argparse would take a value
+    that begins with a hyphen for an option.
+
+    Args:
+        argv: None means the arguments of this process.
+    """
+    joined: list[str] = []
+    for word in sys.argv[1:] if argv is None else argv:
+        if joined and joined[-1] in options and word in values:
+            joined[-1] += f"={word}"
+        else:
+            joined.append(word)
+    return joined
 
 
 def run_main(module: str) -> int:

@@ -1,4 +1,4 @@
-"""Check that a user's part has the methods that are called."""
+"""Check that the class of a user's part has what is used of it."""
 
 import inspect
 from typing import Any
@@ -25,14 +25,47 @@ def require_method(owner: type, name: str, *parameters: str) -> None:
         UserError: there is none, it is abstract, or it takes other arguments.
     """
     call, found = f"{name}({', '.join(parameters)})", find_method(owner, name)
-    if found is None:
+    method = getattr(owner, name, None)
+    if found is None or not callable(method):
         raise UserError(f"{owner.__name__} has no {call}")
-    signature = inspect.signature(getattr(owner, name))
-    # class and static methods take no self here
-    arguments = ("self", *parameters) if inspect.isfunction(found) else parameters
+    # bound already, or an object that an instance doesn't bind, such as functools.partial
+    takes_no_self = isinstance(found, (classmethod, staticmethod)) or not hasattr(found, "__get__")
     try:
-        signature.bind(*arguments)
+        signature = inspect.signature(method)
+    except ValueError:  # of some builtin functions
+        return
+    try:
+        signature.bind(*(parameters if takes_no_self else ("self", *parameters)))
     except TypeError as error:
         raise UserError(
             f"{owner.__name__} has {name}{signature}, which is called as {call}: {error}"
         ) from error
+
+
+def require_class_method(owner: type, name: str) -> None:
+    """Raise UserError if a class has a method of this name that needs an instance."""
+    if inspect.isfunction(find_method(owner, name)):
+        raise UserError(f"{owner.__name__}.{name} needs @classmethod above it")
+
+
+def require_dataclass(owner: Any) -> None:
+    """Check the options of a part, ``Config``.
+
+    Raises:
+        UserError: it isn't a dataclass, lacks the decorator, without which options that a subclass
+            adds are ignored, or isn't derived from that of the part's base class.
+    """
+    config, bases = owner.Config, getattr(owner.Config, "__dataclass_fields__", None)
+    own = vars(config)
+    defined = inspect.get_annotations(config).keys() | (own.keys() & (bases or {}).keys())
+    if bases is None or ("__dataclass_fields__" not in own and defined):
+        raise UserError(
+            f"{owner.__name__}.Config is no dataclass: write @dataclass above its class line"
+        )
+    for base in owner.__mro__:
+        missing = getattr(getattr(base, "Config", None), "__dataclass_fields__", {}).keys() - bases
+        if missing:
+            raise UserError(
+                f"{owner.__name__}.Config lacks {', '.join(sorted(missing))}: derive it from "
+                f"{base.__name__}.Config"
+            )

@@ -222,7 +222,7 @@ def check_options(config_class: type, cfg: Any, prefix: str = "") -> None:
     if hasattr(config_class, "check"):
         try:
             config_class.check(cfg)
-        except UserError as error:
+        except ValueError as error:  # UserError is one
             names = {option.name for option in dataclasses.fields(config_class)}
             raise UserError(_located(str(error), prefix, names)) from error
 

@@ -13,7 +13,6 @@ Integer end steps count optimiser steps, those written as ``10.0`` epochs. Rando
 endless epoch, in threestudio too, so that with them a schedule in epochs stays at its first value.
 """
 
-import functools
 import logging
 import math
 from numbers import Real
@@ -66,13 +65,21 @@ def validate_schedule(value: Any, name: str = "the schedule", minimum: float = -
     if lowest < minimum:
         raise UserError(f"{name}: expected values of {minimum:g} or more, got {lowest:g}")
     if schedule.in_epochs:
-        _warn_of_epochs(name)
+        _warn_of_epochs(name, value)
     return value
 
 
-@functools.cache
-def _warn_of_epochs(name: str) -> None:
-    """Warn once that a schedule counts epochs."""
+_warned: set[tuple[str, str]] = set()
+
+
+def _warn_of_epochs(name: str, value: Any) -> None:
+    """Warn that a schedule counts epochs, once for the part and the launcher, which call the option
+    by its name and by its whole path.
+    """
+    key = name.rpartition(".")[2], str(value)
+    if key in _warned:
+        return
+    _warned.add(key)
     logger.warning(
         "%s: its end steps have decimal points and count epochs; random cameras are one endless "
         "epoch, so that it stays at its first value: write whole numbers to count steps",

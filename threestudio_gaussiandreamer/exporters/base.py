@@ -86,6 +86,8 @@ class FileExporter(Exporter):
 
 def require_export(exporter: type) -> None:
     """Raise UserError for a class of exporters that can't be called."""
+    if not isinstance(exporter, type):
+        raise UserError(f"an exporter is a {type(exporter).__name__}; register a class")
     # the host's only raises an error
     if find_method(exporter, "__call__") is find_method(Exporter, "__call__"):
         raise UserError(f"{exporter.__name__} has no __call__(), which returns the files to write")

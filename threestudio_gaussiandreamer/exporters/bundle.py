@@ -12,11 +12,13 @@ save_video    also render the turntable
 ============  ======================================================================================
 """
 
-from collections.abc import Iterable, Mapping
+import functools
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Dict, List, Optional
 
 from ..core.errors import UserError
+from ..core.methods import require_dataclass
 from ..core.options import check_options, each, one_of
 from ..host import (
     BaseBackground,
@@ -29,7 +31,7 @@ from ..host import (
     parse_structured,
     register,
 )
-from .base import UP, FileExporter, outputs_of, read_gaussians, require_export
+from .base import UP, Drawing, FileExporter, outputs_of, read_gaussians, require_export
 
 SUFFIX = "-exporter"
 
@@ -82,21 +84,25 @@ class BundleExporter(Exporter):
     ) -> None:
         super().configure(geometry, material, background)
         check_options(self.Config, self.cfg)
-        parts = dict(geometry=geometry, material=material, background=background)
-        self.exporters = [
-            find(name + SUFFIX)(options_of(name, self.cfg), **parts) for name in self.cfg.formats
-        ]
+        self.parts = dict(geometry=geometry, material=material, background=background)
+        self.drawing = Drawing()
 
     def __call__(self) -> List[ExporterOutput]:
-        return [output for exporter in self.prepared() for output in outputs_of(exporter)]
+        return [output for outputs in self.by_format().values() for output in outputs()]
 
-    def prepared(self) -> List[Exporter]:
-        """Return the exporters of the formats, after reading the Gaussians once for all of them."""
-        readers = [exporter for exporter in self.exporters if isinstance(exporter, FileExporter)]
-        shared = read_gaussians(self.geometry) if readers else None
-        for exporter in readers:
-            exporter.shared = shared
-        return self.exporters
+    def by_format(self) -> Dict[str, Callable[[], List[ExporterOutput]]]:
+        """Return a function for each format that builds and calls its exporter, so that one that
+        fails leaves the others. The Gaussians are read once for all of them.
+        """
+        shared = functools.cache(lambda: read_gaussians(self.geometry))
+
+        def outputs(name: str) -> List[ExporterOutput]:
+            exporter = find(name + SUFFIX)(options_of(name, self.cfg), **self.parts)
+            if isinstance(exporter, FileExporter):
+                exporter.shared, exporter.drawing = shared(), self.drawing
+            return outputs_of(exporter)
+
+        return {name: functools.partial(outputs, name) for name in self.cfg.formats}
 
 
 def options_of(name: str, cfg: Any) -> Any:
@@ -115,6 +121,7 @@ def _checked(name: str, options: Any) -> Any:
         raise UserError(f"options.{name}: expected keys and values, got {options!r}")
     exporter = find(name + SUFFIX)
     require_export(exporter)
+    require_dataclass(exporter)
     config_class = exporter.Config
     try:
         cfg = parse_structured(config_class, options)

@@ -1,8 +1,8 @@
 """One asset of a farm: the launcher's arguments that make it, its folder, and its result.
 
-``result.json`` is the last file that is written into an asset's folder: an asset is finished if
-and only if it is there. It holds the digest of the exported files, which a single run of the same
-arguments reproduces."""
+``result.json`` is the last file that is written into an asset's folder: a worker takes an asset for
+finished if and only if it is there. It holds the digest of the exported files, which a single run
+of the same arguments reproduces."""
 
 import hashlib
 import json

@@ -69,15 +69,14 @@ class _Bounded(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, colors: Tensor) -> Tensor:
-        bounded = colors.clamp(0, 1)
-        ctx.save_for_backward(bounded)
-        return bounded
+        ctx.save_for_backward(colors)
+        return colors.clamp(0, 1)
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> Tensor:
-        (bounded,) = ctx.saved_tensors
-        # descent leads out of the range at 1 where the gradient is negative, at 0 where it isn't
-        return gradient * (bounded != (gradient < 0))
+        (colors,) = ctx.saved_tensors
+        leaves = (colors >= 1) & (gradient < 0) | (colors <= 0) & (gradient > 0)
+        return torch.where(leaves, 0.0, gradient)
 
 
 def bounded_colors(colors: Float[Tensor, "*batch C"]) -> Float[Tensor, "*batch C"]:

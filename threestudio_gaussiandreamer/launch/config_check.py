@@ -18,11 +18,12 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from ..core.errors import UserError, unknown
+from ..core.methods import require_dataclass
 from ..core.options import check_options, require_representable, shown
 from ..host import find, pl, validate_schedule
 from ..host.typed_config import parse_structured
 from .live_viewer import ViewerConfig
-from .part_kinds import check_kind, find_part, require_dataclass
+from .part_kinds import check_kind, find_part
 from .section_checks import check_sections
 
 MisconfigurationException = pl.utilities.exceptions.MisconfigurationException
@@ -105,7 +106,10 @@ def check_part(path: str, type_name: Any, values: Any) -> None:
     config_class = getattr(part, "Config", None)
     if config_class is None:
         return
-    require_dataclass(f"{path}_type", part)
+    try:
+        require_dataclass(part)
+    except UserError as error:
+        raise UserError(f"{path}_type: {error}") from error
     _check_keys(path, values, config_class)
     for key in values:  # before the part's own checks, whose messages don't name the key
         if key.endswith("_type") and key.removesuffix("_type") in values and values.get(key):

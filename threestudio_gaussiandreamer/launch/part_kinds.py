@@ -1,6 +1,5 @@
 """Which kind of part the key of a section names."""
 
-import inspect
 from typing import Any, Optional
 
 from ..core.errors import UserError
@@ -56,9 +55,11 @@ def find_part(path: str, type_name: Any) -> type:
 
 def check_kind(path: str, type_name: str, part: Any) -> None:
     """Raise UserError if the part of a section is known to be of another kind, or can't be one."""
+    if not isinstance(part, type):
+        raise UserError(f"{path}: {type_name} is a {type(part).__name__}; register a class")
     kind = path.rpartition(".")[2].removesuffix("_type")
     found = _kind_of(part)
-    if isinstance(part, type) and found in (None, kind):
+    if found in (None, kind):
         _require_call(path, kind, part)
     if kind not in KINDS or found in (None, kind):
         return
@@ -70,27 +71,17 @@ def check_kind(path: str, type_name: str, part: Any) -> None:
 
 
 def _require_call(path: str, kind: str, part: type) -> None:
-    """Raise UserError for a guidance or exporter that can't be called."""
+    """Raise UserError for a guidance, exporter or background that can't be called."""
     if kind == "guidance" and find_method(part, "__call__") is None:
         raise UserError(f"{path}: {part.__name__} has no __call__, which returns a step's losses")
+    # the host's only raises an error
+    if kind == "background" and getattr(part, "forward", None) is BaseBackground.forward:
+        raise UserError(f"{path}: {part.__name__} has no forward(dirs), which returns colours")
     if kind == "exporter":
         try:
             require_export(part)
         except UserError as error:
             raise UserError(f"{path}: {error}") from error
-
-
-def require_dataclass(path: str, part: Any) -> None:
-    """Raise UserError if a part's ``Config`` defines options without being a dataclass itself: a
-    subclass of a dataclass ignores them unless it has the decorator too.
-    """
-    config, bases = part.Config, getattr(part.Config, "__dataclass_fields__", None)
-    own = vars(config)
-    defined = inspect.get_annotations(config).keys() | (own.keys() & (bases or {}).keys())
-    if bases is None or ("__dataclass_fields__" not in own and defined):
-        raise UserError(
-            f"{path}: {part.__name__}.Config is no dataclass: write @dataclass above its class line"
-        )
 
 
 def _kind_of(part: Any) -> Optional[str]:

@@ -113,8 +113,15 @@ def changes_since(cfg: Any, options: Mapping[str, Any] = SAME) -> list[str]:
     return [
         f"{name} was {old!r}, now it is {new!r}"
         for name, (old, new) in pairs.items()
-        if old not in (None, new) and new is not None
+        if None not in (old, new) and not _is_same(old, new)
     ]
+
+
+def _is_same(old: Any, new: Any) -> bool:
+    """Return whether two values are equal, or paths of the same file."""
+    if old == new or not (isinstance(old, str) and isinstance(new, str)):
+        return old == new
+    return os.path.realpath(os.path.expanduser(old)) == os.path.realpath(os.path.expanduser(new))
 
 
 def resume_command(folder: Path, gpu: Optional[str]) -> str:
@@ -219,10 +226,9 @@ def _resume_newest(cfg: Any, tag: str) -> None:
 
 
 def _earlier_checkpoints(run: Path) -> str:
-    """Name the checkpoints of the last earlier run in a folder, see ``folder_lock.set_run_aside``;
-    an empty text if there are none."""
-    aside = [path for path in run.glob("ckpts-*") if any(path.glob("*.ckpt"))]
-    if not aside:
-        return ""
-    latest = max(aside, key=lambda path: path.stat().st_mtime)
-    return f" (an earlier run's are in {latest}: resume={latest / 'last.ckpt'})"
+    """Name the last checkpoint of earlier runs in a folder, see ``folder_lock.set_run_aside``; an
+    empty text if there is none.
+    """
+    aside = run.glob("ckpts-*/*.ckpt")
+    latest = max(aside, key=lambda path: path.stat().st_mtime, default=None)
+    return f" (an earlier run's last one: {shlex.quote(f'resume={latest}')})" if latest else ""

@@ -125,6 +125,7 @@ def preflight_prior(prior: Any, keep_attributes: bool) -> None:
         UserError: a requirement, such as a file, is missing, or its options exclude that.
     """
     if hasattr(prior, "preflight"):
+        require_method(type(prior), "preflight")
         prior.preflight()
     if keep_attributes and hasattr(prior, "preflight_attributes"):
         prior.preflight_attributes()
@@ -241,11 +242,11 @@ def validated(cloud: PointCloud, name: str) -> PointCloud:
 
 
 def _as_array(values: Any, name: str) -> Float[np.ndarray, "..."]:
-    if isinstance(values, Tensor):
-        values = values.detach().cpu()
     try:
+        if isinstance(values, Tensor):
+            values = values.detach().float().cpu()
         return np.asarray(values, np.float32)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, RuntimeError) as error:
         raise UserError(
             f"{name} gave something else than arrays of points, colours and normals: {error}"
         ) from error

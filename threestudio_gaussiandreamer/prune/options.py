@@ -80,7 +80,7 @@ def budget_of(
         return Budget(count=parse_count(options.count, f"{where}count"))
     if options.bytes is not None:
         count = count_within(parse_bytes(options.bytes, f"{where}bytes"))
-        return Budget(count=parse_count(count, f"{where}bytes, in Gaussians,"))
+        return Budget(count=parse_count(count, f"{where}bytes: the number of Gaussians that fit"))
     if options.psnr is not None:
         psnr = parse_number(options.psnr, f"{where}psnr", "dB")
         if psnr <= 0:

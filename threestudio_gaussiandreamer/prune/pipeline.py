@@ -226,7 +226,7 @@ def _shrink(
     while (size := file_size(after, suffix)) > limit:
         count = len(after.gaussians.means)
         fewer = min(int(count * limit / size), count - 1)
-        budget = Budget(count=parse_count(fewer, f"{where}bytes, in Gaussians,"))
+        budget = Budget(count=parse_count(fewer, f"{where}bytes: the number of Gaussians that fit"))
         after, reached = _simplify(after, budget, options, suffix)
     return after, reached
 

@@ -2,12 +2,15 @@
 to ``system.prune``.
 """
 
-from collections.abc import Callable
+import functools
+import inspect
+import os
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Optional
 
-from ..core.errors import unknown
-from ..exporters.base import Drawing, FileExporter, outputs_of, read_gaussians
+from ..core.errors import UserError, unknown
+from ..exporters.base import RESERVED, Drawing, FileExporter, outputs_of, read_gaussians
 from ..exporters.bundle import BundleExporter
 from ..formats.gaussian_files import StoredCloud, write_cloud
 from ..formats.obj import write_obj
@@ -15,7 +18,7 @@ from ..formats.ply import write_points
 from ..formats.spz import VERSION
 from ..gaussians.point_cloud import PointCloud
 from ..gaussians.surface import Surface
-from ..host import Exporter, find, warn
+from ..host import ExporterOutput, find, warn
 from ..meshes.mesh import Mesh
 from ..meshes.write import write_textured_mesh
 from ..prune import PruneOptions, prune_to_budget, write_report
@@ -80,15 +83,33 @@ class GaussianSavers:
 
 
 def export(system: Any) -> None:
-    """Write what ``--export`` writes but for the video; a training run ends with it."""
-    export_cloud(system, system.geometry, export_folder(system))
-    export_companions(system)
+    """Write the files of the exporter, the page, and the pruned cloud; a training run ends with it,
+    and so does ``--export``, after the video.
+
+    Raises:
+        Exception: the first error of one of these, after all others are written.
+    """
+    folder = export_folder(system)
+    _call_each(
+        {
+            **writers(system, system.geometry, folder),
+            "the page": lambda: write_pages(system, folder),
+            "system.prune": lambda: export_pruned(system),
+        }
+    )
 
 
-def export_companions(system: Any) -> None:
-    """Write what accompanies the files of the exporter: the page, and the pruned cloud."""
-    write_pages(system, export_folder(system))
-    export_pruned(system)
+def _call_each(calls: Mapping[str, Callable[[], Any]]) -> None:
+    """Make all calls; name those that fail, and then raise the first error."""
+    errors: list[Exception] = []
+    for name, call in calls.items():
+        try:
+            call()
+        except Exception as error:
+            warn(f"{name} failed: {type(error).__name__}: {error}")
+            errors.append(error)
+    if errors:
+        raise errors[0]
 
 
 def export_folder(system: Any) -> str:
@@ -96,39 +117,61 @@ def export_folder(system: Any) -> str:
     return f"it{system.true_global_step}-export"
 
 
-def export_cloud(
+def writers(
     system: Any, geometry: Any, folder: str, pruned_to: Optional[float] = None
-) -> None:
-    """Write what the exporter of ``system`` makes of a geometry.
+) -> dict[str, Callable[[], None]]:
+    """Return a function for each format of the exporter of ``system`` that writes its files of a
+    geometry.
 
     Args:
         folder: below the system's folder of results.
         pruned_to: PSNR in dB, noted in files of Gaussians.
-
-    Raises:
-        Exception: the first error of an exporter, after the files of all others are written.
     """
     parts = {"geometry": geometry, "material": system.material, "background": system.background}
     exporter = find(system.cfg.exporter_type)(system.cfg.exporter, **parts)
-    for part in (exporter, *getattr(exporter, "exporters", ())):
-        if isinstance(part, FileExporter):
-            part.drawing = drawing(system)
-    errors = []
-    for single in exporter.prepared() if isinstance(exporter, BundleExporter) else [exporter]:
-        try:
-            _write(system, single, folder, pruned_to)
-        except Exception as error:
-            errors.append(error)
-    for error in errors[1:]:
-        warn(str(error))
-    if errors:
-        raise errors[0]
+    if isinstance(exporter, (FileExporter, BundleExporter)):
+        exporter.drawing = drawing(system)
+    single = {system.cfg.exporter_type: lambda: outputs_of(exporter)}
+    formats = exporter.by_format() if isinstance(exporter, BundleExporter) else single
+    names: set[str] = set()
+
+    def write(outputs: Callable[[], list[ExporterOutput]]) -> None:
+        for out in outputs():
+            require_new_name(out.save_name, names)
+            noted = {"pruned_to": pruned_to} if out.save_type in CLOUDS else {}
+            save(system, out, f"{folder}/{out.save_name}", noted)
+
+    return {name: functools.partial(write, outputs) for name, outputs in formats.items()}
 
 
-def _write(system: Any, exporter: Exporter, folder: str, pruned_to: Optional[float]) -> None:
-    for out in outputs_of(exporter):
-        noted = {"pruned_to": pruned_to} if out.save_type in CLOUDS else {}
-        saver(system, out.save_type)(f"{folder}/{out.save_name}", **noted, **out.params)
+def require_new_name(name: str, names: set[str]) -> None:
+    """Add the name of a file to those of an export.
+
+    Raises:
+        UserError: there is a file of this name, or a run writes one itself. Names that differ only
+            in case count as the same.
+    """
+    key = os.path.normpath(name).casefold()
+    if key in names or Path(key).parts[:1] in [(reserved,) for reserved in RESERVED]:
+        raise UserError(f"save_name {name!r}: another file of the export has this name")
+    names.add(key)
+
+
+def save(system: Any, out: ExporterOutput, path: str, noted: Mapping[str, Any]) -> None:
+    """Write one output of an exporter.
+
+    Raises:
+        UserError: the system can't save its type, or the type has other params.
+    """
+    write, params = saver(system, out.save_type), {**noted, **out.params}
+    try:
+        inspect.signature(write).bind(path, **params)
+    except TypeError as error:
+        raise UserError(
+            f"params of {out.save_name}: {error}; save_{out.save_type} takes "
+            f"{inspect.signature(write)}"
+        ) from error
+    write(path, **params)
 
 
 def saver(system: Any, save_type: str) -> Callable[..., Any]:
@@ -157,7 +200,7 @@ def export_pruned(system: Any) -> None:
     )
     geometry = find(system.cfg.geometry_type)(system.cfg.geometry)
     geometry.set_arrays(**result.after.gaussians._asdict())
-    export_cloud(system, geometry, folder, result.after.pruned_to)
+    _call_each(writers(system, geometry, folder, result.after.pruned_to))
     write_report(system.get_save_path(f"{folder}/report"), result, suffix, options)
 
 

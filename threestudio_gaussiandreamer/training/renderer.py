@@ -162,6 +162,11 @@ class SplattingRenderer(Rasterizer):
         if rays is None or rays.shape[1:3] != (height, width):
             rays = cameras.ray_directions(c2w, fovy, height, width)
         background = self.background(dirs=rays.to(out.image))
+        if background.shape != out.image.shape:
+            raise UserError(
+                f"{type(self.background).__name__} returned colours {tuple(background.shape)} for "
+                f"directions {tuple(rays.shape)}; expected {tuple(out.image.shape)}"
+            )
         return out.image + (1 - out.alpha) * background, background
 
 

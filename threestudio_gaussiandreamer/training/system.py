@@ -50,13 +50,12 @@ from ..guidance.foreign import (
 from ..guidance.known_truth import truth_of
 from ..host import BaseLift3DSystem, C, find, info, register, validate_schedule, warn
 from ..metrics import psnr, psnr_of_error
-from ..priors.base import preflight_prior
 from ..priors.cache import cached_cloud
 from ..prune import PruneOptions
 from .background import FlatBackground
 from .density import DensityControl, RenderedQuality
 from .events import StepLog, log_scores
-from .export import GaussianSavers, export, export_companions, exported_files
+from .export import GaussianSavers, export, exported_files
 from .finite import CHECK_EVERY, optimizer_tensors, require_finite, warn_if_invisible
 from .held_out import EvaluationConfig, HeldOut, Measurements
 from .image_targets import ImageTargets, ImageTargetsConfig, check_image_targets
@@ -65,6 +64,7 @@ from .losses import check_losses, loggable, logged_names, total, weight_schedule
 from .optimizer import check_optimizer, make_optimizer
 from .pages import discard_turntable, save_first_cloud, turntable_name, write_turntable
 from .pictures import rgb_panel, save_pictures
+from .preflight import preflight_parts
 from .truth import prefetch_truth, true_views
 
 GUIDANCE_LR = 1e-4
@@ -146,12 +146,7 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
 
     def preflight(self) -> None:
         """Check what prior, prompts and guidance need, such as files, before loading models."""
-        if not len(self.geometry):
-            preflight_prior(self.geometry.prior(), self.geometry.cfg.keep_attributes)
-        for name in ("prompt_processor", "guidance"):
-            part = find(self.cfg[f"{name}_type"])
-            if hasattr(part, "preflight"):
-                part.preflight(self.cfg[name])
+        preflight_parts(self.geometry, self.cfg)
 
     def prepare_guidance(self) -> None:
         """Build prompt processor and guidance. Called before the prior runs, so that missing
@@ -395,5 +390,6 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
 
     def on_predict_epoch_end(self) -> None:
         if self.writes_results:
-            super().on_predict_epoch_end()
-            export_companions(self)
+            if self.exporter.cfg.save_video:
+                self.on_test_epoch_end()
+            export(self)

@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Optional
 
-from ..core.command import run_command
+from ..core.command import joined_values, run_command
 from ..core.errors import UserError
 from ..core.files import existing_file, is_folder, require_other_file, require_writable
 from ..formats.gaussian_files import READ, StoredCloud, read_cloud, require_format
@@ -63,6 +63,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
     },
 }
 
+PAGE_SUFFIXES = (".html", ".htm")
 PAGE_OPTIONS = [name for name in OPTIONS if name not in ("--title", "--up")]
 
 
@@ -88,7 +89,7 @@ def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
     parser.add_argument("--port", type=int, default=8080, help="port to serve on (8080)")
     for name, settings in OPTIONS.items():
         parser.add_argument(name, **settings)
-    return parser.parse_args(argv)
+    return parser.parse_args(joined_values(argv, ["--up"], AXES))
 
 
 def run(args: argparse.Namespace) -> None:
@@ -108,6 +109,8 @@ def run(args: argparse.Namespace) -> None:
     out = Path(args.html) if args.html else source.with_suffix(".html")
     require_writable(out, "--html")
     require_other_file(out, source, "--html OUT is PATH")
+    if out.suffix.lower() not in PAGE_SUFFIXES:
+        raise UserError(f"--html {args.html}: expected a name that ends in {PAGE_SUFFIXES[0]}")
     write_cloud_page(source, out, args)
 
 

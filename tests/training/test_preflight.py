@@ -1,0 +1,52 @@
+"""What parts need from outside is checked with all of their options, before any long work."""
+
+from dataclasses import dataclass
+
+import pytest
+
+from threestudio_gaussiandreamer import register_parts
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.core.files import existing_file
+from threestudio_gaussiandreamer.host import BaseObject, register
+from threestudio_gaussiandreamer.training.geometry import GaussianCloud
+from threestudio_gaussiandreamer.training.preflight import preflight_parts
+
+register_parts()
+
+
+@register("test-weights-guidance")
+class WeightsGuidance(BaseObject):
+    @dataclass
+    class Config(BaseObject.Config):
+        weights: str = "missing.bin"
+
+    @classmethod
+    def preflight(cls, cfg):
+        existing_file(cfg.weights, "weights")
+
+
+@register("test-instance-preflight-guidance")
+class InstancePreflight(WeightsGuidance):
+    def preflight(self):
+        """Take no options."""
+
+
+def check(guidance, **prior):
+    options = {"prompt_processor_type": "plain-prompt-processor", "prompt_processor": {}}
+    cfg = options | {"guidance_type": guidance, "guidance": {}}
+    preflight_parts(GaussianCloud(prior), cfg)
+
+
+def test_a_guidance_gets_options_that_are_not_given():
+    with pytest.raises(UserError, match="weights 'missing.bin' does not exist"):
+        check("test-weights-guidance")
+
+
+def test_a_preflight_of_another_kind_is_named():
+    with pytest.raises(UserError, match="InstancePreflight.preflight needs @classmethod"):
+        check("test-instance-preflight-guidance")
+
+
+def test_the_prior_is_checked_first():
+    with pytest.raises(UserError, match="does not exist"):
+        check("test-weights-guidance", prior_type="mesh-prior", prior={"path": "no.glb"})
