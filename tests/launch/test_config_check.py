@@ -13,7 +13,7 @@ from tests.launch.config_cases import load
 from threestudio_gaussiandreamer import register_parts
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.core.methods import require_dataclass
-from threestudio_gaussiandreamer.host import BaseBackground, BaseObject, find, register
+from threestudio_gaussiandreamer.host import BaseBackground, BaseObject, register
 from threestudio_gaussiandreamer.launch.config import load_config
 from threestudio_gaussiandreamer.launch.config_check import check_config, check_part
 from threestudio_gaussiandreamer.launch.extensions import load_extensions
@@ -107,6 +107,7 @@ def test_a_strategy_whose_package_is_missing_is_refused(folder, monkeypatch, str
             "system_type: unknown part 'tiny-sistem': did you mean 'tiny-system'",
         ),
         ("data_type=", "data_type"),
+        ("system.geometry_type=[a,b]", "system.geometry_type is ['a', 'b']; expected the name"),
         ("data.veiws=3", "unknown key 'data.veiws'"),
         ("system.geometry=3", "system.geometry"),
         (
@@ -256,28 +257,25 @@ def test_a_weight_of_0_or_null_removes_that_of_an_earlier_file(value):
         check_config(load_config(demo, cli_args=["system.loss.lambda_other=1"]))
 
 
-@register("test-undecorated-guidance")
 class Undecorated(BaseObject):
     class Config(BaseObject.Config):
         color: float = 0.5
 
 
-@register("test-plain-config-guidance")
 class PlainConfig(BaseObject):
     class Config:
         color = 0.5
 
 
-@register("test-inherited-config-guidance")
 class InheritedConfig(FooGuidance):
     class Config(FooGuidance.Config):
         """Adds no option."""
 
 
 def test_options_of_a_config_without_decorator_are_not_ignored():
-    for name in ("undecorated", "plain-config"):
+    for part in (Undecorated, PlainConfig):
         with pytest.raises(UserError, match="Config is no dataclass: write @data"):
-            require_dataclass(find(f"test-{name}-guidance"))
+            require_dataclass(part)
     require_dataclass(InheritedConfig)
 
 

@@ -166,13 +166,13 @@ class WrongParams(Returning):
 FAILING = ("raising", "unbuildable", "same-name", "page-name", "wrong-params")
 
 
-def test_formats_that_fail_leave_the_others(tmp_path, painted_box, capsys, caplog):
+def test_formats_that_fail_leave_the_others(tmp_path, painted_box, capsys):
     formats = ["ply", *(f"test-{name}" for name in FAILING), "points"]
     options = [f"system.exporter.formats=[{','.join(formats)}]", "trainer.max_steps=1"]
     options += ["trainer.val_check_interval=1", "system.prune.count=100"]
     with pytest.raises(RuntimeError, match="no memory for that"):
         launch(tmp_path, painted_box, *options)
-    said, export = caplog.text, run_folder(tmp_path) / "save" / "it1-export"
+    said, export = capsys.readouterr().err, run_folder(tmp_path) / "save" / "it1-export"
     for name, reason in zip(FAILING, ("no memory", "not installed"), strict=False):
         assert f"test-{name} failed: RuntimeError: {reason}" in said
     assert "save_name 'Gaussians.ply': another file of the export" in said

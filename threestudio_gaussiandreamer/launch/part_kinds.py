@@ -47,6 +47,8 @@ def find_part(path: str, type_name: Any) -> type:
         if path == "data_type":
             hint = " (an overlay needs the configuration that it changes before it)"
         raise UserError(f"{path} is empty: name a registered part{hint}")
+    if not isinstance(type_name, str):
+        raise UserError(f"{path} is {type_name!r}; expected the name of a registered part")
     try:
         return find(type_name)
     except UserError as error:
