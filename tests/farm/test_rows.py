@@ -79,6 +79,7 @@ def test_prompts_that_begin_alike_have_different_names(tmp_path):
         ("a fox\na cat\na fox", ".txt", "lines 1 and 3 have the same name 'a_fox'"),
         ("a fox\na\x1b[0m", ".txt", "line 2: the prompt 'a\\x1b[0m' has a line break"),
         ("promt\na fox", ".csv", "unknown column 'promt': did you mean 'prompt'?"),
+        ("a fox\n???", ".txt", "line 2: '???' can't be a text"),
         ("prompt;seed\na fox;1", ".csv", "separated by commas, this file has semicolons"),
         ("prompt\tseed\na fox\t1", ".csv", "separated by commas, this file has tabs"),
         ("name,seed\na,1", ".csv", "with a column prompt"),

@@ -3,6 +3,7 @@
 import dataclasses
 
 import pytest
+import torch
 
 from tests.launch.bad_input_cases import assert_refused
 from threestudio_gaussiandreamer import host, register_parts
@@ -274,8 +275,27 @@ def test_a_guidance_that_can_not_be_called_is_refused():
     class Uncallable(host.BaseObject):
         pass
 
-    with pytest.raises(UserError, match="system.guidance_type: .* has no __call__"):
+    with pytest.raises(UserError, match=r"system.guidance_type: .* has no __call__\(rgb, ...\)"):
         check_kind("system.guidance_type", "test-uncallable-guidance", Uncallable)
+
+
+def test_a_guidance_that_takes_no_render_is_refused():
+    class NoArgument(host.BaseObject):
+        def __call__(self):
+            return {}
+
+    class NoForward(torch.nn.Module):
+        pass
+
+    class Threestudios(host.BaseObject):
+        def __call__(self, rgb, prompt_utils, elevation, *, azimuth, **kwargs):
+            return {}
+
+    with pytest.raises(UserError, match=r"called as __call__\(rgb, ...\): too many positional"):
+        check_kind("system.guidance_type", "no-argument", NoArgument)
+    with pytest.raises(UserError, match=r"NoForward has no forward\(rgb, ...\)"):
+        check_kind("system.guidance_type", "no-forward", NoForward)
+    check_kind("system.guidance_type", "threestudios", Threestudios)
 
 
 def test_types_that_fit_are_taken():

@@ -313,5 +313,5 @@ def test_a_background_without_forward_is_refused():
     class Unfinished(BaseBackground):
         pass
 
-    with pytest.raises(UserError, match=r"background_type: Unfinished has no forward\(dirs\)"):
+    with pytest.raises(UserError, match=r"background_type: Unfinished has no forward\(dirs, ...\)"):
         check_kind("system.background_type", "unfinished", Unfinished)

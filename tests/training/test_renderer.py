@@ -51,3 +51,11 @@ def test_a_background_of_another_shape_is_named():
     c2w, fovy = torch.eye(4).expand(2, 4, 4), torch.ones(2)
     with pytest.raises(UserError, match=r"returned colours \(3,\).*; expected \(2, 4, 5, 3\)"):
         SplattingRenderer._composite(renderer, out, c2w, fovy, {})
+
+
+def test_a_background_that_is_not_finite_is_named():
+    out = SimpleNamespace(image=torch.zeros(2, 4, 5, 3), alpha=torch.zeros(2, 4, 5, 1))
+    renderer = SimpleNamespace(background=lambda dirs: dirs / 0)
+    c2w, fovy = torch.eye(4).expand(2, 4, 4), torch.ones(2)
+    with pytest.raises(UserError, match="function returned colours that aren't finite"):
+        SplattingRenderer._composite(renderer, out, c2w, fovy, {})

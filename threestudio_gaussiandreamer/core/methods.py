@@ -15,16 +15,18 @@ def find_method(owner: type, name: str) -> Any:
     return None if getattr(found, "__isabstractmethod__", False) else found
 
 
-def require_method(owner: type, name: str, *parameters: str) -> None:
+def require_method(owner: type, name: str, *parameters: str, more: bool = False) -> None:
     """Check that the instances of a class have a method that takes some positional arguments.
 
     Args:
         parameters: names of the arguments, without ``self``.
+        more: the method may need further arguments.
 
     Raises:
         UserError: there is none, it is abstract, or it takes other arguments.
     """
-    call, found = f"{name}({', '.join(parameters)})", find_method(owner, name)
+    given = ", ".join([*parameters, *(["..."] if more else [])])
+    call, found = f"{name}({given})", find_method(owner, name)
     method = getattr(owner, name, None)
     if found is None or not callable(method):
         raise UserError(f"{owner.__name__} has no {call}")
@@ -34,8 +36,9 @@ def require_method(owner: type, name: str, *parameters: str) -> None:
         signature = inspect.signature(method)
     except ValueError:  # of some builtin functions
         return
+    bind = signature.bind_partial if more else signature.bind
     try:
-        signature.bind(*(parameters if takes_no_self else ("self", *parameters)))
+        bind(*(parameters if takes_no_self else ("self", *parameters)))
     except TypeError as error:
         raise UserError(
             f"{owner.__name__} has {name}{signature}, which is called as {call}: {error}"

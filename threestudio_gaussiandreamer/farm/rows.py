@@ -24,6 +24,7 @@ from typing import Any, NamedTuple, Optional
 
 from ..core.errors import UserError, unknown
 from ..core.files import existing_file
+from ..launch.config_source import require_no_marker
 from ..launch.run_folder import safe_name
 
 COLUMNS = ("prompt", "name", "seed", "config", "overrides")
@@ -120,7 +121,7 @@ def _prompt(value: Any) -> str:
         raise UserError(f"the prompt is {value!r}; expected a text, such as 'a fox'")
     if not value.isprintable():
         raise UserError(f"the prompt {value[:80]!r} has a line break or a control character")
-    return value.strip()
+    return require_no_marker(value.strip())
 
 
 def _seed(value: Any) -> Optional[int]:

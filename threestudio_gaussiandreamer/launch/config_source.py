@@ -230,12 +230,21 @@ def protect(text: str) -> str:
     Raises:
         UserError: the text is ``???``, OmegaConf's marker of a missing value.
     """
+    return require_no_marker(text).replace("${", PROTECTED)
+
+
+def require_no_marker(text: str) -> str:
+    """Return a text.
+
+    Raises:
+        UserError: it is ``???``, OmegaConf's marker of a missing value.
+    """
     if text == MISSING:
         raise UserError(
             f"{MISSING!r} can't be a text: in configurations it means that a value is missing; "
             "add a word"
         )
-    return text.replace("${", PROTECTED)
+    return text
 
 
 def _protect_escaped(text: str) -> str:

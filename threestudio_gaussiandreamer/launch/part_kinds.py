@@ -2,8 +2,10 @@
 
 from typing import Any, Optional
 
+from torch import nn
+
 from ..core.errors import UserError
-from ..core.methods import find_method
+from ..core.methods import find_method, require_method
 from ..exporters.base import require_export
 from ..guidance.base import ScoreDistillation
 from ..guidance.variants import Variant
@@ -40,6 +42,10 @@ base class of a different kind.
 """
 
 
+CALLS = {"guidance": "rgb", "background": "dirs"}
+"""The first argument of a call, of the kinds that other packages write without our base class."""
+
+
 def find_part(path: str, type_name: Any) -> type:
     """Return the part that the key ``path`` names; the message of an error names the key too."""
     if not type_name:
@@ -74,16 +80,18 @@ def check_kind(path: str, type_name: str, part: Any) -> None:
 
 def _require_call(path: str, kind: str, part: type) -> None:
     """Raise UserError for a guidance, exporter or background that can't be called."""
-    if kind == "guidance" and find_method(part, "__call__") is None:
-        raise UserError(f"{path}: {part.__name__} has no __call__, which returns a step's losses")
-    # the host's only raises an error
-    if kind == "background" and getattr(part, "forward", None) is BaseBackground.forward:
-        raise UserError(f"{path}: {part.__name__} has no forward(dirs), which returns colours")
-    if kind == "exporter":
-        try:
+    call = "forward" if issubclass(part, nn.Module) else "__call__"
+    # these only raise an error
+    missing = find_method(part, call) in (nn.Module.forward, BaseBackground.forward)
+    try:
+        if kind in CALLS and missing:
+            raise UserError(f"{part.__name__} has no {call}({CALLS[kind]}, ...)")
+        if kind in CALLS:
+            require_method(part, call, CALLS[kind], more=True)
+        if kind == "exporter":
             require_export(part)
-        except UserError as error:
-            raise UserError(f"{path}: {error}") from error
+    except UserError as error:
+        raise UserError(f"{path}: {error}") from error
 
 
 def _kind_of(part: Any) -> Optional[str]:

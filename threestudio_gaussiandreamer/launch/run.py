@@ -73,6 +73,7 @@ class Run:
         self.sources, self.command = sources, command
         self.claimed = RunFolder(Path(cfg.trial_dir))
         self.resumed_step = -1
+        self.has_trained = False
         self.size_changes: list[str] = []
         self.trainer: Any = None
         self.viewer = parse_structured(ViewerConfig, cfg.viewer)
@@ -108,6 +109,7 @@ class Run:
             print(f"stopped at step {stop.step}; to resume: {command}", flush=True)
             return 128 + stop.signum
         except BaseException:
+            self.report_training()
             self.discard_if_unused()
             self.print_resume_command()
             raise
@@ -200,6 +202,7 @@ class Run:
                 f"{self.cfg.trainer.max_steps}: nothing is left to train"
             )
         self.trainer.fit(self.system, datamodule=self.data, ckpt_path=self.cfg.resume)
+        self.has_trained = True
         self.trainer.test(self.system, datamodule=self.data)
 
     def validate(self) -> None:
@@ -211,11 +214,27 @@ class Run:
     def export(self) -> None:
         self.trainer.predict(self.system, datamodule=self.data, ckpt_path=self.cfg.resume)
 
+    @property
+    def has_index(self) -> bool:
+        """Whether this process writes ``index.html``."""
+        return self.trainer.is_global_zero and self.cfg.system.get("pages", True)
+
     def write_index(self, began: datetime, seconds: float) -> None:
         """Note how long the stage has taken, and write ``index.html``."""
-        if self.trainer.is_global_zero and self.cfg.system.get("pages", True):
+        if self.has_index:
             note_time(self.folder, self.args.stage, began, seconds)
             info(f"the run at a glance: {write_index(self.folder)}")
+
+    def report_training(self) -> None:
+        """Write the index and print the summary after an error in a finished training's turntable
+        or exports.
+        """
+        if not self.has_trained:
+            return
+        with contextlib.suppress(Exception):  # it would hide the first error
+            if self.has_index:
+                write_index(self.folder)
+            self.summarize()
 
     def summarize(self) -> None:
         """Print the system's summary, which lists its results."""

@@ -101,15 +101,18 @@ def export(system: Any) -> None:
 
 def _call_each(calls: Mapping[str, Callable[[], Any]]) -> None:
     """Make all calls; name those that fail, and then raise the first error."""
-    errors: list[Exception] = []
+    first: Optional[Exception] = None
     for name, call in calls.items():
         try:
             call()
         except Exception as error:
-            warn(f"{name} failed: {type(error).__name__}: {error}")
-            errors.append(error)
-    if errors:
-        raise errors[0]
+            if first is None:
+                first = error
+                warn(f"{name} failed; the other files are written before its error is shown")
+            else:
+                warn(f"{name} failed: {type(error).__name__}: {error}")
+    if first is not None:
+        raise first
 
 
 def export_folder(system: Any) -> str:

@@ -161,12 +161,15 @@ class SplattingRenderer(Rasterizer):
         rays = batch.get("rays_d")
         if rays is None or rays.shape[1:3] != (height, width):
             rays = cameras.ray_directions(c2w, fovy, height, width)
-        background = self.background(dirs=rays.to(out.image))
+        background = self.background(rays.to(out.image))
         if background.shape != out.image.shape:
             raise UserError(
                 f"{type(self.background).__name__} returned colours {tuple(background.shape)} for "
                 f"directions {tuple(rays.shape)}; expected {tuple(out.image.shape)}"
             )
+        # on a GPU, looking would wait for it
+        if background.device.type == "cpu" and not background.isfinite().all():
+            raise UserError(f"{type(self.background).__name__} returned colours that aren't finite")
         return out.image + (1 - out.alpha) * background, background
 
 
