@@ -7,6 +7,8 @@ import torch
 
 from threestudio_gaussiandreamer import cameras
 from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.host import find
+from threestudio_gaussiandreamer.training.background import FlatBackground
 from threestudio_gaussiandreamer.training.renderer import SplattingRenderer, normals_from_depth
 
 
@@ -43,6 +45,30 @@ def test_normals_have_gradients_where_the_surface_is_degenerate_too():
         return normals_from_depth(depth, torch.ones_like(depth), c2w.double(), fovy.double())
 
     assert torch.autograd.gradcheck(of, plane(4, 4)[0].double().requires_grad_())
+
+
+def test_depth_and_normals_are_computed_when_they_are_read():
+    """They have gradients even if they are first read where none are recorded."""
+    means = torch.zeros(1, 3, requires_grad=True)
+    geometry = SimpleNamespace(
+        means=means,
+        quats=torch.tensor([[1.0, 0, 0, 0]]),
+        scales=lambda: torch.full((1, 3), 0.3),
+        opacities=lambda: torch.full((1,), 0.9),
+        colors=lambda centers: torch.ones(1, 3),
+    )
+    renderer = find("gaussiandreamer-splatting")(
+        {}, geometry=geometry, material=None, background=FlatBackground({})
+    )
+    c2w = cameras.orbit_c2w(torch.tensor([10.0]), torch.tensor([30.0]), torch.tensor([2.5]))
+    out = renderer(c2w=c2w, fovy=torch.tensor([0.7]), height=16, width=16)
+    assert {"depth", "comp_normal"} <= out.keys() and len({**out}) == len(out)
+    with torch.no_grad():
+        depth = out["depth"]
+    assert out["depth"] is depth and abs(depth[0, 8, 8].item() - 2.5) < 0.1
+    for name in ("depth", "comp_normal"):
+        (gradient,) = torch.autograd.grad(out[name].sum(), means, retain_graph=True)
+        assert gradient.any()
 
 
 def test_a_background_of_another_shape_is_named():

@@ -16,7 +16,7 @@ budget: ``gaussians/importance.py``; the options: ``density_options.py``.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import cached_property
 from typing import Any, NamedTuple, Optional
 
@@ -362,13 +362,13 @@ class RenderedQuality:
     def __init__(
         self,
         control: DensityControl,
-        render: Callable[[], dict[str, Any]],
-        truth: Callable[[dict[str, Any]], Optional[Tensor]],
+        render: Callable[[], Mapping[str, Any]],
+        truth: Callable[[Mapping[str, Any]], Optional[Tensor]],
     ) -> None:
         self.control, self.render, self._truth = control, render, truth
 
     @cached_property
-    def whole(self) -> dict[str, Any]:
+    def whole(self) -> Mapping[str, Any]:
         """The renders with all Gaussians."""
         return self.render()
 

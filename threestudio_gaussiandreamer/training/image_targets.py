@@ -28,6 +28,7 @@ density control go on. A random background stays that of the stage's first step.
 train towards the same pictures, each with all views."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Optional
 
@@ -139,7 +140,7 @@ class ImageTargets(nn.Module):
     def guide(
         self,
         guidance: ScoreDistillation,
-        out: dict[str, Any],
+        out: Mapping[str, Any],
         prompt_utils: Any,
         batch: dict[str, Any],
     ) -> dict[str, Any]:

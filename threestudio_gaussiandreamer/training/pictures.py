@@ -39,7 +39,7 @@ def render_panels(out: Mapping[str, Any]) -> list[Panel]:
     visible = depth[alpha > 0.5]
     near, far = (float(visible.min()), float(visible.max()) + 1e-6) if len(visible) else (0.0, 1.0)
     panels = [rgb_panel(out["comp_rgb"][0]), _grey_panel(depth, (near, far), "jet")]
-    if "comp_normal" in out:
+    if "comp_normal" in out:  # other renderers may have none
         panels.append(rgb_panel(out["comp_normal"][0]))
     return [*panels, _grey_panel(alpha, (0, 1), None)]
 

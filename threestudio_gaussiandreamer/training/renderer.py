@@ -1,21 +1,21 @@
 """Renderer ``gaussiandreamer-splatting``: the host's batch in, the host's pictures out, our
 rasteriser between.
 
-=============  =====================================================================================
-option         meaning
-=============  =====================================================================================
-backend        ``auto`` (by where the cloud is and what is built), ``cpu``, ``cuda``, ``torch``,
-               ``reference``
-preset         ``fast`` | ``balanced`` | ``accurate``: the smallest alpha that is drawn, 1/255,
-               1/1024, 1/65536
-antialias      keep the energy of Gaussians smaller than a pixel
-eps2d          screen-space dilation in square pixels
-downsample     1, or 2: return the 2x2 box of the rendered size (the paper renders 1024^2 and guides
-               at 512^2)
-train_normals  normals in training too; otherwise only in validation, test and export
-=============  =====================================================================================
+==========  ========================================================================================
+option      meaning
+==========  ========================================================================================
+backend     ``auto`` (by where the cloud is and what is built), ``cpu``, ``cuda``, ``torch``,
+            ``reference``
+preset      ``fast`` | ``balanced`` | ``accurate``: the smallest alpha that is drawn, 1/255, 1/1024,
+            1/65536
+antialias   keep the energy of Gaussians smaller than a pixel
+eps2d       screen-space dilation in square pixels
+downsample  1, or 2: return the 2x2 box of the rendered size (the paper renders 1024^2 and guides at
+            512^2)
+==========  ========================================================================================
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Optional
 
@@ -27,6 +27,7 @@ from torch import Tensor
 from .. import cameras
 from ..core.devices import get_device
 from ..core.errors import UserError, unknown
+from ..core.lazy_mapping import LazyMapping
 from ..core.options import at_least, checked_options, in_range, one_of, positive, rule
 from ..host import Rasterizer, register
 from ..splatting import PRESETS, Rasterized, available_backends, rasterize
@@ -64,7 +65,6 @@ class SplattingRenderer(Rasterizer):
         near: float = field(default=0.01, metadata=positive())
         far: float = field(default=1e10, metadata=positive())
         downsample: int = field(default=1, metadata=in_range(1, 2))
-        train_normals: bool = False
 
         @staticmethod
         def check(cfg: Any) -> None:
@@ -79,7 +79,7 @@ class SplattingRenderer(Rasterizer):
 
     def forward(
         self, c2w: Tensor, fovy: Tensor, height: int, width: int, **batch: Any
-    ) -> dict[str, Any]:
+    ) -> LazyMapping:
         """Render B views, in float32 whatever the trainer's precision is: half precision would move
         cameras by thousandths.
 
@@ -92,7 +92,8 @@ class SplattingRenderer(Rasterizer):
             ``comp_rgb`` (B, H, W, 3), ``opacity`` and ``depth`` (B, H, W, 1), ``comp_normal``
             (B, H, W, 3) in [0, 1], ``comp_rgb_bg``, the background, (B, 1, 1, 3) or (B, H, W, 3),
             ``rasterized`` for density control, and ``gaussian_opacities`` (N,), which the removal
-            error is differentiated by.
+            error is differentiated by. ``depth`` and ``comp_normal`` are computed when they are
+            first read.
         """
         device = self.geometry.means.device
         with torch.autocast(device.type, enabled=False):
@@ -102,7 +103,7 @@ class SplattingRenderer(Rasterizer):
 
     def _render(
         self, c2w: Tensor, fovy: Tensor, height: int, width: int, batch: dict[str, Any]
-    ) -> dict[str, Any]:
+    ) -> LazyMapping:
         ours = isinstance(self.background, FlatBackground)
         flat = self.background.color(len(c2w)) if ours else None
         opacities = self.geometry.opacities()
@@ -110,18 +111,23 @@ class SplattingRenderer(Rasterizer):
         image, background = out.image, None if flat is None else flat[:, None, None]
         if background is None:
             image, background = self._composite(out, c2w, fovy, batch)
-        depth = out.depth / out.alpha.clamp_min(1e-6)
+
+        def depth() -> Tensor:
+            return out.depth / out.alpha.clamp_min(1e-6)
+
+        def normals() -> Tensor:
+            return normals_from_depth(depth(), out.alpha, c2w, fovy)
+
         pictures = {
             "comp_rgb": image,
             "opacity": out.alpha,
-            "depth": depth,
             "comp_rgb_bg": background,
             "rasterized": out,
             "gaussian_opacities": opacities,
         }
-        if self.options.train_normals or not self.training:
-            pictures["comp_normal"] = normals_from_depth(depth, out.alpha, c2w, fovy)
-        return pictures
+        later = {"depth": depth, "comp_normal": normals}
+        device = out.alpha.device.type
+        return LazyMapping(pictures, {k: postponed(call, device) for k, call in later.items()})
 
     def _rasterize(
         self,
@@ -171,6 +177,17 @@ class SplattingRenderer(Rasterizer):
         if background.device.type == "cpu" and not background.isfinite().all():
             raise UserError(f"{type(self.background).__name__} returned colours that aren't finite")
         return out.image + (1 - out.alpha) * background, background
+
+
+def postponed(compute: Callable[[], Tensor], device: str) -> Callable[[], Tensor]:
+    """Return a function that records gradients if they are recorded now, without autocast."""
+    records = torch.is_grad_enabled()
+
+    def computed() -> Tensor:
+        with torch.set_grad_enabled(records), torch.autocast(device, enabled=False):
+            return compute()
+
+    return computed
 
 
 def normals_from_depth(

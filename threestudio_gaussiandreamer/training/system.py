@@ -26,6 +26,7 @@ pages          write a page that shows the cloud in a browser, and more: see ``p
 """
 
 import contextlib
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Optional
@@ -229,7 +230,7 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
 
     # -- one step ----------------------------------------------------------------------------------
 
-    def forward(self, batch: dict[str, Any]) -> dict[str, Any]:
+    def forward(self, batch: dict[str, Any]) -> Mapping[str, Any]:
         return self.renderer(**batch)
 
     def training_step(self, batch: dict[str, Any], batch_idx: int) -> None:
@@ -273,19 +274,21 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         for part in [self.geometry, *([self.background] if own_background else [])]:
             part.set_learning_rates(optimizer, self.true_current_epoch, self.true_global_step)
 
-    def losses(self, guided: dict[str, Any], out: dict[str, Any]) -> dict[str, Tensor]:
+    def losses(self, guided: dict[str, Any], out: Mapping[str, Any]) -> dict[str, Tensor]:
         """Return the weighted losses of the guidance and the regularisers of the renders."""
         now = self.true_current_epoch, self.true_global_step
         weights = {name: C(weight, *now) for name, weight in self.loss_weights.items()}
         return weighted_losses(guided, out, self.image_targets.loss_weights(weights, now[1]))
 
-    def supervise(self, out: dict[str, Any], batch: dict[str, Any]) -> dict[str, Any]:
+    def supervise(self, out: Mapping[str, Any], batch: dict[str, Any]) -> dict[str, Any]:
         """Return the losses of this step's renders, and what is logged with them."""
         if not self.image_targets.is_active(self.global_step):
             return self.guide(out, batch)
         return self.image_targets.guide(self.guidance, out, self.prompt_utils, batch)
 
-    def guide(self, out: dict[str, Any], batch: dict[str, Any], **options: Any) -> dict[str, Any]:
+    def guide(
+        self, out: Mapping[str, Any], batch: dict[str, Any], **options: Any
+    ) -> dict[str, Any]:
         """Call the guidance with these renders, the whole batch, the renders' background, and the
         further outputs of the renderer that it names.
         """
@@ -298,7 +301,7 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
 
     def report(
         self,
-        out: dict[str, Any],
+        out: Mapping[str, Any],
         batch: dict[str, Any],
         guided: dict[str, Any],
         losses: dict[str, Tensor],

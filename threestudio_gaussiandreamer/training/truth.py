@@ -1,6 +1,7 @@
 """Ground-truth pictures of a run's views, for guidances that have them (``known_truth.py``)."""
 
 import math
+from collections.abc import Mapping
 from typing import Any, Optional
 
 from jaxtyping import Float
@@ -12,7 +13,7 @@ from .renderer import SplattingRenderer
 
 
 def true_views(
-    guidance: Any, batch: dict[str, Any], out: dict[str, Any]
+    guidance: Any, batch: dict[str, Any], out: Mapping[str, Any]
 ) -> Optional[Float[Tensor, "B H W 3"]]:
     """Render the ground truth of a batch, with the background and size of its renders ``out``; None
     if ``guidance`` has none.
