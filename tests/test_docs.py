@@ -119,6 +119,11 @@ PARTS = {
         "system.guidance.variant_type=front-first-variant",
         "system.guidance.variant.behind=0.2",
     ],
+    "custom/smooth_depth.py": ["system.loss.lambda_smooth_depth=1000"],
+    "custom/sky.py": [
+        "system.background_type=sky-background",
+        "system.optimizer.params.background.lr=0.01",
+    ],
 }
 
 

@@ -1,17 +1,26 @@
-"""The optimiser of ``system.optimizer``: ``{name, args}``, a class of ``torch.optim``."""
+"""The optimiser of ``system.optimizer``: ``{name, args}``, a class of ``torch.optim``, and
+``params``, the learning rates of other packages' parts: ``{background: {lr: 0.01}}``.
+"""
 
 import inspect
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Optional
 
 import torch
 
 from ..core.devices import get_device
 from ..core.errors import UserError, unknown
+from ..core.options import RULE, schedule
+from ..core.schedule import parse_schedule
+from ..host import C
+from .background import FlatBackground
 
 DEFAULTS = {"betas": (0.9, 0.99), "eps": 1e-15}
 """Arguments unless given, for optimisers that take them."""
 Groups = list[dict[str, Any]]
+PARTS = ("background", "material", "renderer")
+"""Parts that may have parameters, beside the geometry."""
+RATE = schedule(min=0)
 
 
 def make_optimizer(options: Any, groups: Groups) -> torch.optim.Optimizer:
@@ -32,8 +41,9 @@ def check_optimizer(options: Any, scheduler: Any = None) -> None:
             "system.geometry.lr_means"
         )
     for key in options:
-        if key not in ("name", "args"):
-            raise unknown("key system.optimizer.", key, ("name", "args"))
+        if key not in ("name", "args", "params"):
+            raise unknown("key system.optimizer.", key, ("name", "args", "params"))
+    _check_rates(options.get("params", {}))
     name, arguments = options.get("name", "Adam"), options.get("args", {})
     if not isinstance(getattr(torch.optim, str(name), None), type):
         known = [name for name, value in vars(torch.optim).items() if isinstance(value, type)]
@@ -51,6 +61,65 @@ def check_optimizer(options: Any, scheduler: Any = None) -> None:
         raise UserError(
             f"optimizer: {name} doesn't accept this: {wrong[0] if wrong else error}"
         ) from error
+
+
+def _check_rates(params: Any) -> None:
+    if not isinstance(params, Mapping):
+        raise UserError(f"optimizer.params: expected parts and their lr, got {params!r}")
+    for name, options in params.items():
+        if name == "geometry":
+            raise UserError("optimizer.params.geometry: its rates are system.geometry.lr_*")
+        if name not in PARTS:
+            raise unknown("key system.optimizer.params.", name, PARTS)
+        if not isinstance(options, Mapping) or set(options) != {"lr"}:
+            raise UserError(f"optimizer.params.{name}: expected {{lr: ...}}, got {options!r}")
+        RATE[RULE](f"optimizer.params.{name}.lr", options["lr"])
+
+
+class PartRates:
+    """Learning rates of the parts beside the geometry.
+
+    Args:
+        options: the section ``system.optimizer``.
+    """
+
+    def __init__(self, options: Any) -> None:
+        params = options.get("params", {})
+        self.rates = {name: parse_schedule(params[name]["lr"]) for name in params}
+
+    def groups(self, system: Any) -> Groups:
+        """Return the groups of our background, and of other packages' parts that have parameters.
+
+        Raises:
+            UserError: such a part has no learning rate, or there is a rate without such a part.
+        """
+        return [group for name in PARTS for group in self._groups_of(name, getattr(system, name))]
+
+    def _groups_of(self, name: str, part: Optional[torch.nn.Module]) -> Groups:
+        ours = isinstance(part, FlatBackground)
+        parameters = () if part is None or ours else part.parameters()
+        trained = [parameter for parameter in parameters if parameter.requires_grad]
+        if trained and name not in self.rates:
+            raise UserError(
+                f"{type(part).__name__} has parameters without a learning rate: set "
+                f"system.optimizer.params.{name}.lr; 0 leaves them as they are"
+            )
+        if name in self.rates and not trained:
+            hint = " for it: its rate is system.background.lr" if ours else " to train"
+            raise UserError(
+                f"system.optimizer.params.{name}: {type(part).__name__} has no parameters{hint}"
+            )
+        if ours:
+            return part.parameter_groups()
+        return [{"params": trained, "name": name, "lr": 0.0}] if trained else []
+
+    def set(self, system: Any, optimizer: torch.optim.Optimizer, epoch: int, step: int) -> None:
+        """Set the learning rates of the groups of :meth:`groups`."""
+        if isinstance(system.background, FlatBackground):
+            system.background.set_learning_rates(optimizer, epoch, step)
+        for group in optimizer.param_groups:
+            if group.get("name") in self.rates:
+                group["lr"] = C(self.rates[group["name"]], epoch, step)
 
 
 def _some_group() -> dict[str, Any]:

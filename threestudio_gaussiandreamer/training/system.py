@@ -13,7 +13,8 @@ option         meaning
 loss.lambda_*  weight of each loss, a number or a schedule: ``sds`` and every other ``loss_*`` of
                the guidance; ``sparsity`` mean sqrt(alpha^2 + 0.01); ``opaque`` entropy of alpha,
                which pushes it to 0 or 1; ``tv`` total variation, see ``losses.py``
-optimizer      name (a torch optimiser) and args; geometry and background have the learning rates
+optimizer      name (a torch optimiser) and args; geometry and background have the learning rates;
+               those of other packages' parts are params, such as ``{background: {lr: 0.01}}``
 evaluation     views, size (pixels), supersample, every (steps; 0: only at start and end): PSNR and
                SSIM on held-out views
 prune          options of a second, pruned export. Its budget is one of count; bytes (of the SPZ
@@ -53,7 +54,6 @@ from ..host import BaseLift3DSystem, C, find, info, register, validate_schedule,
 from ..metrics import psnr, psnr_of_error
 from ..priors.cache import cached_cloud
 from ..prune import PruneOptions
-from .background import FlatBackground
 from .density import DensityControl, RenderedQuality
 from .events import StepLog, log_scores
 from .export import GaussianSavers, export, exported_files
@@ -62,7 +62,7 @@ from .held_out import EvaluationConfig, HeldOut, Measurements
 from .image_targets import ImageTargets, ImageTargetsConfig, check_image_targets
 from .loss_scale import LossScale
 from .losses import check_losses, loggable, logged_names, total, weight_schedules, weighted_losses
-from .optimizer import check_optimizer, make_optimizer
+from .optimizer import PartRates, check_optimizer, make_optimizer
 from .pages import discard_turntable, save_first_cloud, turntable_name, write_turntable
 from .pictures import rgb_panel, save_pictures
 from .preflight import preflight_parts
@@ -125,6 +125,7 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
     def configure(self) -> None:
         self.options = checked_options(self.Config, self.cfg, "system.")
         self.loss_weights = weight_schedules(self.options.loss)
+        self.part_rates = PartRates(self.cfg.optimizer)
         super().configure()
         self.density = DensityControl(self.geometry)
         self.image_targets = ImageTargets(self.options.image_targets)
@@ -135,14 +136,12 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         self._learnt: Optional[dict[str, Tensor]] = None
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
+        of_parts = self.part_rates.groups(self)
         self.preflight()
         self.prepare_guidance()
         self.ensure_cloud()
-        own_background = isinstance(self.background, FlatBackground)
-        groups = self.geometry.parameter_groups() + (
-            self.background.parameter_groups() if own_background else []
-        )
-        groups += trainable_groups(self.guidance, GUIDANCE_LR)
+        of_guidance = trainable_groups(self.guidance, GUIDANCE_LR)
+        groups = self.geometry.parameter_groups() + of_parts + of_guidance
         return make_optimizer(self.cfg.optimizer, groups)
 
     def preflight(self) -> None:
@@ -270,9 +269,9 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
             info(f"step {self.global_step}: {outcome}")
 
     def set_learning_rates(self, optimizer: torch.optim.Optimizer) -> None:
-        own_background = isinstance(self.background, FlatBackground)
-        for part in [self.geometry, *([self.background] if own_background else [])]:
-            part.set_learning_rates(optimizer, self.true_current_epoch, self.true_global_step)
+        now = self.true_current_epoch, self.true_global_step
+        self.geometry.set_learning_rates(optimizer, *now)
+        self.part_rates.set(self, optimizer, *now)
 
     def losses(self, guided: dict[str, Any], out: Mapping[str, Any]) -> dict[str, Tensor]:
         """Return the weighted losses of the guidance and the regularisers of the renders."""

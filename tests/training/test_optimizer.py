@@ -1,0 +1,80 @@
+"""Parts of other packages train with the rates of ``system.optimizer.params``."""
+
+import pytest
+import torch
+
+from tests.training.runs import SMALL, launch, mocked_config, run_folder
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.launch.experiment import main
+from threestudio_gaussiandreamer.training.optimizer import check_optimizer
+
+COLOR = "background.env_color"
+
+
+def checkpoint(folder, name="last"):
+    return torch.load(run_folder(folder) / "ckpts" / f"{name}.ckpt", weights_only=False)
+
+
+@pytest.fixture
+def train(tmp_path, painted_box):
+    """Return a function that trains towards (0.9, 0.2, 0.1) on a learned background of the host."""
+    background = {"learned": True}
+    config = mocked_config(
+        tmp_path, painted_box, background_type="solid-color-background", background=background
+    )
+
+    def trained(folder, *options):
+        overrides = [f"exp_root_dir={folder}", *SMALL, *options]
+        return main(["--config", str(config), "--train", "--gpu", "cpu", *overrides])
+
+    return trained
+
+
+def test_the_colour_of_another_background_is_learned_and_resumed(train, tmp_path):
+    rate = "system.optimizer.params.background.lr=[0,0.02,0.05,4]"
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    assert train(whole, rate, "trainer.max_steps=4") == 0
+    assert train(parts, rate, "trainer.max_steps=2") == 0
+    last = run_folder(parts) / "ckpts" / "last.ckpt"
+    assert train(parts, rate, "trainer.max_steps=4", f"resume={last}") == 0
+    color = checkpoint(whole)["state_dict"][COLOR]
+    assert torch.equal(checkpoint(parts)["state_dict"][COLOR], color)
+    assert (color[1:] < 0.9).all()  # it was white
+    groups = checkpoint(whole)["optimizer_states"][0]["param_groups"]
+    rates = {group["name"]: group["lr"] for group in groups}
+    assert rates["background"] == pytest.approx(0.0425)  # that of step 3
+
+
+def test_parameters_without_a_rate_are_refused_before_the_prior(train, tmp_path, capsys):
+    assert train(tmp_path, "system.geometry.prior.path=missing.glb") == 2
+    said = capsys.readouterr().err
+    assert "SolidColorBackground has parameters without" in said and "params.background.lr" in said
+    rate = "system.optimizer.params.background.lr=0"
+    assert train(tmp_path, rate, "trainer.max_steps=1") == 0
+    assert (checkpoint(tmp_path)["state_dict"][COLOR] == 1).all()
+
+
+@pytest.mark.parametrize(
+    ("part", "hint"),
+    [("background", "for it: its rate is system.background.lr"), ("material", "to train")],
+)
+def test_a_rate_without_parameters_is_refused(tmp_path, painted_box, capsys, part, hint):
+    assert launch(tmp_path, painted_box, f"system.optimizer.params.{part}.lr=0.1") == 2
+    assert f"has no parameters {hint}" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("params", "message"),
+    [
+        (3, "optimizer.params: expected parts and their lr, got 3"),
+        ({"backgroud": {"lr": 1}}, "did you mean 'background'"),
+        ({"geometry": {"lr": 1}}, "its rates are system.geometry.lr_"),
+        ({"background": 0.1}, r"params.background: expected \{lr: ...\}, got 0.1"),
+        ({"background": {"lr": -1}}, "params.background.lr: expected values of 0 or more"),
+        ({"background": {"lr": "a"}}, "params.background.lr"),
+        ({"background": {"lr": 1, "eps": 1}}, r"expected \{lr: ...\}"),
+    ],
+)
+def test_wrong_rates_are_named(params, message):
+    with pytest.raises(UserError, match=message):
+        check_optimizer({"name": "Adam", "params": params})
