@@ -7,9 +7,11 @@ import pytest
 from threestudio_gaussiandreamer import register_parts
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.core.files import existing_file
-from threestudio_gaussiandreamer.host import BaseObject, register
+from threestudio_gaussiandreamer.host import BaseGeometry, BaseObject, Rasterizer, register
+from threestudio_gaussiandreamer.training import preflight
 from threestudio_gaussiandreamer.training.geometry import GaussianCloud
-from threestudio_gaussiandreamer.training.preflight import preflight_parts
+from threestudio_gaussiandreamer.training.preflight import check_parts, preflight_parts
+from threestudio_gaussiandreamer.training.renderer import SplattingRenderer
 
 register_parts()
 
@@ -29,6 +31,27 @@ class WeightsGuidance(BaseObject):
 class InstancePreflight(WeightsGuidance):
     def preflight(self):
         """Take no options."""
+
+
+class HostRenderer(Rasterizer):
+    """A renderer without our options and outputs."""
+
+
+@pytest.mark.parametrize(
+    ("name", "part", "base"),
+    [
+        ("geometry", BaseGeometry, "geometry.GaussianCloud"),
+        ("renderer", HostRenderer, "renderer.SplattingRenderer"),
+    ],
+)
+def test_parts_that_the_system_can_not_train_are_refused(name, part, base, monkeypatch):
+    parts = {"geometry": GaussianCloud, "renderer": SplattingRenderer, name: part}
+    monkeypatch.setattr(preflight, "find", parts.__getitem__)
+    cfg = {
+        f"{name}_type": name for name in ("geometry", "renderer", "guidance", "prompt_processor")
+    }
+    with pytest.raises(UserError, match=f"{name}_type is '{name}': .* derived from .*{base}"):
+        check_parts(cfg)
 
 
 def check(guidance, **prior):

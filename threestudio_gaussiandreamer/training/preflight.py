@@ -2,9 +2,34 @@
 
 from typing import Any
 
+from ..core.errors import UserError
 from ..core.methods import require_class_method
 from ..host import find, parse_structured
 from ..priors.base import preflight_prior
+from .geometry import GaussianCloud
+from .renderer import SplattingRenderer
+
+BASES = {"geometry": GaussianCloud, "renderer": SplattingRenderer}
+"""Classes whose methods, options or outputs the system uses beyond those of the host's."""
+
+
+def check_parts(cfg: Any) -> None:
+    """Check which parts the system's options name.
+
+    Raises:
+        UserError: a part is missing, or isn't derived from the class that the system needs.
+    """
+    for name in ("geometry", "renderer", "guidance", "prompt_processor"):
+        key = f"{name}_type"
+        if not cfg[key]:
+            raise UserError(f"{key} is empty: name a registered part")
+    for name, base in BASES.items():
+        key = f"{name}_type"
+        if not issubclass(find(cfg[key]), base):
+            raise UserError(
+                f"{key} is {cfg[key]!r}: gaussiandreamer-system needs a class that is derived from "
+                f"{base.__module__}.{base.__name__}"
+            )
 
 
 def preflight_parts(geometry: Any, cfg: Any) -> None:

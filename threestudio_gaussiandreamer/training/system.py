@@ -36,7 +36,6 @@ import torch
 from torch import Tensor
 
 from ..core.distributed import average_gradients, from_first, rank
-from ..core.errors import UserError
 from ..core.host_copies import flush_reads
 from ..core.nested import adopt_nested
 from ..core.options import checked_options
@@ -65,7 +64,7 @@ from .losses import check_losses, loggable, logged_names, total, weight_schedule
 from .optimizer import PartRates, check_optimizer, make_optimizer
 from .pages import discard_turntable, save_first_cloud, turntable_name, write_turntable
 from .pictures import rgb_panel, save_pictures
-from .preflight import preflight_parts
+from .preflight import check_parts, preflight_parts
 from .truth import prefetch_truth, true_views
 
 GUIDANCE_LR = 1e-4
@@ -87,9 +86,7 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
 
         @staticmethod
         def check(cfg: Any) -> None:
-            for name in ("geometry", "renderer", "guidance", "prompt_processor"):
-                if not cfg[f"{name}_type"]:
-                    raise UserError(f"{name}_type is empty: name a registered part")
+            check_parts(cfg)
             for name, weight in cfg.loss.items():
                 validate_schedule(weight, f"loss.{name}")
             check_losses(find(cfg.guidance_type), cfg.loss)
