@@ -15,6 +15,7 @@ import torch
 from tests.evaluation.clip_similarity_cases import blob, save
 from tests.helpers import tiny_3d_models as tiny
 from threestudio_gaussiandreamer import register_parts
+from threestudio_gaussiandreamer.core.checkpoint_file import save_file
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.evaluation import clip_similarity as module
 from threestudio_gaussiandreamer.evaluation import results
@@ -184,6 +185,25 @@ def test_a_runs_folder_brings_its_prompt_and_background(clip, tmp_path, monkeypa
     assert main(["outputs/demo/t", "--clip", clip, "--seeds", "3", "--size", "24"]) == 0
     found = written("evaluation")
     assert found["results"][0]["prompt"] == "a {b} ${c} fox" and found["std"] is None
+
+
+@pytest.mark.parametrize(
+    ("kind", "options", "state", "color"),
+    [
+        ("gaussiandreamer-background", {"mode": "learned"}, {"logit": torch.zeros(3)}, (0.5,) * 3),
+        ("solid-color-background", {"learned": True}, {"env_color": torch.ones(3)}, (1.0,) * 3),
+        ("solid-color-background", {}, {}, (1.0,) * 3),
+        ("own-background", {"color": [0.25, 0.5, 1.0]}, {}, (0.25, 0.5, 1.0)),
+    ],
+)
+def test_the_background_is_the_learned_one_or_named(tmp_path, capsys, kind, options, state, color):
+    system = {"background_type": kind, "background": options, "prompt_processor": {}}
+    (tmp_path / "configs").mkdir()
+    (tmp_path / "configs" / "parsed.yaml").write_text(json.dumps({"system": system}))
+    save(tmp_path / "save" / "it1-export" / "gaussians.ply", blob())
+    state_dict = {f"background.{name}": value for name, value in state.items()}
+    save_file(tmp_path / "ckpts" / "last.ckpt", {"state_dict": state_dict})
+    assert results.find_result(str(tmp_path)).background == color
 
 
 def test_a_prompt_of_a_library_is_compared_as_its_text(tmp_path):

@@ -23,6 +23,7 @@ def test_a_row_comes_after_the_farm_and_the_prompt_last():
 def test_the_command_that_repeats_an_asset_has_its_prompt_and_threads():
     words = shlex.split(assets.repeat_command(RECIPE, JOB))
     assert words[0] == "OMP_NUM_THREADS=2" and "row.yaml" in words
+    assert "launch.py" not in words  # this process wasn't started by it
     assert "system.prompt_processor.prompt=a fox's tail" in words
 
 

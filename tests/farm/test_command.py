@@ -166,6 +166,10 @@ def test_the_low_memory_configuration_is_used_where_it_is_valid():
     [
         (RECIPE._replace(sources=(Source("a.yaml", b"x: 2"),)), "its configurations is"),
         (RECIPE._replace(overrides=("y=3",)), 'its overrides is \\["y=2"\\], here \\["y=3"\\]'),
+        (
+            RECIPE._replace(overrides=("y=2", "z=3")),
+            r'its overrides is \[\], here \["z=3"\] \(without what is in both\)',
+        ),
         (RECIPE._replace(cores=2), "its cores is 1, here 2"),
         (RECIPE._replace(cpu=False), 'its device is "cpu", here "gpu"'),
     ],

@@ -60,7 +60,7 @@ register_parts()
         ),
         (
             "system.renderer_type=no-material",
-            "a part of the kind material; expected one of the kind renderer",
+            "gaussiandreamer-system needs gaussiandreamer-splatting, or a class that is derived",
         ),
         (
             "system.material_type=gaussiandreamer-cloud",

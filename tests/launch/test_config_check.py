@@ -17,7 +17,7 @@ from threestudio_gaussiandreamer.host import BaseBackground, BaseObject, registe
 from threestudio_gaussiandreamer.launch.config import load_config
 from threestudio_gaussiandreamer.launch.config_check import check_config, check_part
 from threestudio_gaussiandreamer.launch.extensions import load_extensions
-from threestudio_gaussiandreamer.launch.part_kinds import check_kind
+from threestudio_gaussiandreamer.launch.part_kinds import check_kind, find_part
 
 
 @register("optionless-part")
@@ -214,6 +214,19 @@ def test_a_broken_extension_is_an_error_with_file_line_and_cause(folder, source,
         UserError, match=f"the extension custom/broken.py can't be imported: .*{message}"
     ):
         load_extensions()
+
+
+@pytest.mark.parametrize("name", ["logging", "torch", "yaml"])
+def test_an_extension_with_the_name_of_a_module_is_refused(folder, name):
+    (folder / "custom" / name).mkdir(parents=True)
+    (folder / "custom" / name / "__init__.py").write_text("")
+    with pytest.raises(UserError, match=f"custom/{name} has the name of a module"):
+        load_extensions()
+
+
+def test_an_unknown_part_says_where_own_parts_are_looked_for(folder):
+    with pytest.raises(UserError, match="the folder custom in the working folder, which has none"):
+        find_part("system.guidance_type", "own-guidance")
 
 
 def test_another_part_forgets_the_options_that_only_the_earlier_one_has():

@@ -81,3 +81,14 @@ def test_a_held_colour_is_the_same_in_all_processes_until_the_next_step(monkeypa
         background.update_step(0, 10)
         colors.append(background.color(4))
     assert torch.equal(colors[0], colors[2]) and not torch.equal(colors[1], colors[3])
+
+
+def test_a_derived_background_with_colours_of_pixels_is_drawn():
+    class Derived(FlatBackground):
+        pass
+
+    class Gradient(FlatBackground):
+        def forward(self, dirs):
+            return dirs.abs()
+
+    assert FlatBackground.is_flat(Derived({})) and not FlatBackground.is_flat(Gradient({}))

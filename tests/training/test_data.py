@@ -2,11 +2,13 @@
 
 import itertools
 import math
+from dataclasses import dataclass
 
 import pytest
 import torch
 
 from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.training.camera_options import CameraConfig
 from threestudio_gaussiandreamer.training.data import GaussianDreamerDataModule
 
 KEYS = {
@@ -199,3 +201,14 @@ def test_a_batch_of_a_pool_is_that_of_its_cameras_to_the_bit():
         for name, value in row.items():
             same = torch.equal if isinstance(value, torch.Tensor) else lambda a, b: a == b
             assert same(value, batch[name]), name
+
+
+def test_a_derived_module_has_options_of_its_own():
+    @dataclass
+    class JitterConfig(CameraConfig):
+        jitter: float = 0.0
+
+    class Jitter(GaussianDreamerDataModule):
+        Config = JitterConfig
+
+    assert Jitter({"jitter": 0.5}).options.jitter == 0.5

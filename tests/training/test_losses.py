@@ -32,12 +32,13 @@ def test_total_variation_smooths_noise_and_leaves_flat_pictures_alone():
 
 def test_each_regulariser_is_weighted_and_computed_only_where_it_has_a_weight():
     out = {"opacity": torch.full((1, 4, 4, 1), 0.5), "comp_rgb": torch.rand(1, 4, 4, 3)}
+    out = {name: picture.requires_grad_() for name, picture in out.items()}
     guided = {"loss_sds": torch.tensor(2.0), "grad_norm": torch.tensor(1.0)}
     weights = {"sds": 0.5, **dict.fromkeys(REGULARISERS, 3.0)}
     losses = weighted_losses(guided, out, weights)
     assert float(losses.pop("sds")) == 1.0
     assert losses == {name: 3 * call(out) for name, call in REGULARISERS.items()}
-    assert float(losses["sparsity"]) == pytest.approx(3 * math.sqrt(0.26))
+    assert losses["sparsity"].item() == pytest.approx(3 * math.sqrt(0.26))
     assert float(losses["opaque"]) == pytest.approx(3 * math.log(2))
     assert set(weighted_losses(guided, {}, {"sds": 1.0, "tv": 0.0})) == {"sds"}
 
@@ -86,3 +87,25 @@ def test_losses_declared_by_a_string_are_refused():
 
     with pytest.raises(UserError, match=r"Guidance.LOSSES is a string: write \('sds',\), a tuple"):
         check_losses(Guidance, {"lambda_sds": 1.0})
+
+
+@pytest.mark.parametrize(
+    ("returned", "message"),
+    [
+        (lambda out: out["comp_rgb"], r"a tensor of shape \(1, 2, 2, 3\)"),
+        (lambda out: out["comp_rgb"].detach().mean(), r"a tensor of shape \(\) without a gradient"),
+        (lambda out: 0.5, "float"),
+        (lambda out: None, "NoneType"),
+    ],
+)
+def test_what_an_own_regulariser_returns_is_checked(monkeypatch, returned, message):
+    monkeypatch.setitem(REGULARISERS, "own", returned)
+    out = {"comp_rgb": torch.rand(1, 2, 2, 3, requires_grad=True)}
+    with pytest.raises(UserError, match=rf"REGULARISERS\['own'\] returned {message}"):
+        weighted_losses({"loss_sds": torch.ones(())}, out, {"sds": 1, "own": 2})
+
+
+def test_an_own_regulariser_has_another_name_than_the_guidances_losses(monkeypatch):
+    monkeypatch.setitem(REGULARISERS, "sds", lambda out: out["comp_rgb"].mean())
+    with pytest.raises(UserError, match="the name of the guidance's loss_sds"):
+        weighted_losses({"loss_sds": torch.ones(())}, {}, {"sds": 1})

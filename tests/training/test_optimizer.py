@@ -1,10 +1,12 @@
-"""Parts of other packages train with the rates of ``system.optimizer.params``."""
+"""Learning rates of other packages' parts, and arguments of the optimiser."""
 
 import pytest
 import torch
 
-from tests.training.runs import SMALL, launch, mocked_config, run_folder
+from tests.training.runs import CONFIGS, SMALL, launch, mocked_config, run_folder
+from threestudio_gaussiandreamer import register_parts
 from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.launch.config import load_config
 from threestudio_gaussiandreamer.launch.experiment import main
 from threestudio_gaussiandreamer.training.optimizer import check_optimizer
 
@@ -78,3 +80,27 @@ def test_a_rate_without_parameters_is_refused(tmp_path, painted_box, capsys, par
 def test_wrong_rates_are_named(params, message):
     with pytest.raises(UserError, match=message):
         check_optimizer({"name": "Adam", "params": params})
+
+
+def test_changed_arguments_hold_in_a_resumed_run(tmp_path, painted_box):
+    adamw, decay = "system.optimizer.name=AdamW", "system.optimizer.args.weight_decay"
+    options = [adamw, f"{decay}=0.01", "trainer.max_steps=1"]
+    assert launch(tmp_path, painted_box, *options) == 0
+    last = run_folder(tmp_path) / "ckpts" / "last.ckpt"
+    changed = [f"{decay}=0.5", "system.optimizer.args.betas=[0.5,0.9]"]
+    resumed = [adamw, *changed, "trainer.max_steps=2", f"resume={last}"]
+    assert launch(tmp_path, painted_box, *resumed) == 0
+    for group in checkpoint(tmp_path)["optimizer_states"][0]["param_groups"]:
+        assert group["weight_decay"] == 0.5 and list(group["betas"]) == [0.5, 0.9]
+
+
+@pytest.mark.parametrize("name", ["SGD", "Adafactor", "ASGD"])
+def test_another_optimiser_forgets_the_arguments_that_it_lacks(name):
+    register_parts()
+    config = CONFIGS / "gaussiandreamer.yaml"
+    prompt = "system.prompt_processor.prompt=a fox"
+    cfg = load_config(config, cli_args=[prompt, f"system.optimizer.name={name}"])
+    check_optimizer(cfg.system.optimizer)
+    assert "betas" not in cfg.system.optimizer.args
+    nothing = load_config(config, cli_args=[prompt, "system.optimizer.args=null"])
+    check_optimizer(nothing.system.optimizer)

@@ -7,11 +7,10 @@ import pytest
 from threestudio_gaussiandreamer import register_parts
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.core.files import existing_file
-from threestudio_gaussiandreamer.host import BaseGeometry, BaseObject, Rasterizer, register
+from threestudio_gaussiandreamer.host import BaseGeometry, BaseObject, Rasterizer, find, register
 from threestudio_gaussiandreamer.training import preflight
 from threestudio_gaussiandreamer.training.geometry import GaussianCloud
 from threestudio_gaussiandreamer.training.preflight import check_parts, preflight_parts
-from threestudio_gaussiandreamer.training.renderer import SplattingRenderer
 
 register_parts()
 
@@ -45,12 +44,10 @@ class HostRenderer(Rasterizer):
     ],
 )
 def test_parts_that_the_system_can_not_train_are_refused(name, part, base, monkeypatch):
-    parts = {"geometry": GaussianCloud, "renderer": SplattingRenderer, name: part}
-    monkeypatch.setattr(preflight, "find", parts.__getitem__)
-    cfg = {
-        f"{name}_type": name for name in ("geometry", "renderer", "guidance", "prompt_processor")
-    }
-    with pytest.raises(UserError, match=f"{name}_type is '{name}': .* derived from .*{base}"):
+    monkeypatch.setattr(preflight, "find", lambda key: part if key == "own" else find(key))
+    cfg = {"geometry_type": "gaussiandreamer-cloud", "renderer_type": "gaussiandreamer-splatting"}
+    cfg |= {"guidance_type": "g", "prompt_processor_type": "p", f"{name}_type": "own"}
+    with pytest.raises(UserError, match=f"{name}_type is 'own': .* derived from .*{base}"):
         check_parts(cfg)
 
 

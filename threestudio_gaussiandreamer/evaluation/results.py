@@ -4,7 +4,7 @@ camera.
 
 import math
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, Optional
 
@@ -13,15 +13,17 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ..core.checkpoint_file import load_file
 from ..core.errors import UserError
 from ..core.files import existing_file
 from ..formats.ply import is_gaussian_ply
 from ..gaussians.gaussians import Gaussians
-from ..host import find, get_device
+from ..host import find, get_device, warn
 from ..launch.config import load_config
 from ..prompts.prompt_processors import PROMPT_LIBRARY, resolve_prompt
 
-BLACK = (0.0, 0.0, 0.0)
+BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
+OUR_BACKGROUND, HOSTS_BACKGROUND = "gaussiandreamer-background", "solid-color-background"
 
 
 class Result(NamedTuple):
@@ -79,8 +81,26 @@ def _prompt_and_background(parsed: Path) -> tuple[Optional[str], tuple[float, fl
     if not parsed.is_file():
         return None, BLACK
     system = load_config(parsed).system
-    color = (system.get("background") or {}).get("color") or BLACK
+    color = _background_of(system, parsed.parent.parent)
     return _prompt_of(system.get("prompt_processor") or {}), tuple(float(value) for value in color)
+
+
+def _background_of(system: Mapping[str, Any], folder: Path) -> Sequence[float]:
+    """Return the colour of a run's background; a learned one is that of its last checkpoint."""
+    options, kind = system.get("background") or {}, system.get("background_type")
+    last = folder / "ckpts" / "last.ckpt"
+    color = options.get("color") or (WHITE if kind == HOSTS_BACKGROUND else BLACK)
+    learned = options.get("mode") == "learned" or options.get("learned")
+    if kind in (None, OUR_BACKGROUND, HOSTS_BACKGROUND):
+        if not learned:
+            return color
+        if last.is_file():
+            state = load_file(last)["state_dict"]
+            if kind == HOSTS_BACKGROUND:
+                return state["background.env_color"].tolist()
+            return torch.sigmoid(state["background.logit"]).tolist()
+    warn(f"{folder}: the colour {list(color)} is used in place of the background of its training")
+    return color
 
 
 def _prompt_of(processor: Mapping[str, Any]) -> Optional[str]:

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, Optional
 
 from ..core.files import atomic_file, json_text
+from ..launch.run_folder import program_anywhere
 from .rows import Row
 
 RESULT = "result.json"
@@ -101,7 +102,7 @@ def repeat_command(recipe: Recipe, job: Job) -> str:
     """Return the command that makes an asset by itself, in ``outputs/``."""
     configs = [text for source in all_sources(recipe, job) for text in ("--config", source.name)]
     device = ["--gpu", "cpu"] if recipe.cpu else []
-    command = ["python", "launch.py", *configs, "--train", *device, *run_overrides(recipe, job)]
+    command = [*program_anywhere(), *configs, "--train", *device, *run_overrides(recipe, job)]
     return f"OMP_NUM_THREADS={recipe.cores} {shlex.join(command)}"
 
 

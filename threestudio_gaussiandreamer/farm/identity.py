@@ -72,9 +72,14 @@ def _require_entries(place: Place, ours: dict[str, Any]) -> bool:
         raise UserError(f"{place}/{FILE} is damaged: {error}; choose another --out") from error
     if differs:
         name = differs[0]
+        there, here, note = theirs.get(name), ours[name], ""
+        if isinstance(there, list) and isinstance(here, list) and set(there) & set(here):
+            both = set(there) & set(here)
+            there, here = ([item for item in items if item not in both] for items in (there, here))
+            note = " (without what is in both)"
         raise UserError(
-            f"{place} belongs to another farm: its {name} is {shown(theirs.get(name))}, here "
-            f"{shown(ours[name])}; choose another --out"
+            f"{place} belongs to another farm: its {name} is {shown(there)}, here "
+            f"{shown(here)}{note}; choose another --out"
         )
     return True
 

@@ -20,6 +20,7 @@ from ..host import find, info, names
 from ..host.typed_config import parse_structured
 from ..prompts.prompts import read_prompt
 from ..training.losses import foreign_weights
+from ..training.optimizer import foreign_arguments
 from .config_source import is_text, map_strings, parse_overrides, protect, read_yaml, unprotect
 from .ddp import planned_processes
 from .run_folder import name_folders
@@ -173,14 +174,17 @@ def _forget_replaced_parts(earlier: DictConfig, later: DictConfig, path: str = "
 
     If ``later`` changes a part (``x_type``), the options in ``earlier``'s section ``x`` that the
     new part doesn't have are removed, so that ``system.geometry.prior_type=random-prior`` suffices
-    to select another prior. If ``later`` has a mandatory value (``???``), ``earlier``'s value is
-    removed too, which OmegaConf's merge would keep."""
+    to select another prior; so are the arguments that a new optimiser doesn't take. If ``later``
+    has a mandatory value (``???``), ``earlier``'s value is removed too, which OmegaConf's merge
+    would keep."""
     for key in later:
         if OmegaConf.is_missing(later, key):
             earlier._content.pop(key, None)
             continue
         section = key.removesuffix("_type")
         mine, theirs = earlier._get_node(key), later._get_node(key)
+        if f"{path}{key}" == "system.optimizer.name":
+            _keep_arguments_of(earlier._get_node("args"), theirs._value())
         if isinstance(mine, DictConfig) and isinstance(theirs, DictConfig):
             _forget_replaced_parts(mine, theirs, f"{path}{key}.")
         elif section != key and mine is not None and mine._value() != theirs._value():
@@ -195,6 +199,12 @@ def _keep_options_of(section: Any, type_name: Any, path: str) -> None:
         return
     known = {field.name for field in fields(config_class)}
     _leave_out([key for key in section if key not in known], section, type_name, path)
+
+
+def _keep_arguments_of(arguments: Any, optimizer: Any) -> None:
+    if isinstance(arguments, DictConfig):
+        foreign = foreign_arguments(optimizer, arguments)
+        _leave_out(foreign, arguments, optimizer, "system.optimizer.args")
 
 
 def _keep_weights_of(loss: Any, guidance: Any) -> None:

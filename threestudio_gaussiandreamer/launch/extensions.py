@@ -5,6 +5,7 @@ As in threestudio, a folder with an ``__init__.py`` is imported under its own na
 hyphens, and may use relative imports; a file ``part.py`` is imported as ``custom/part``. Names that
 end in ``_disabled`` or begin with a dot are skipped."""
 
+import importlib.machinery
 import importlib.util
 import sys
 import traceback
@@ -48,6 +49,8 @@ def _load(entry: Path) -> str:
     loaded = sys.modules.get(name)
     if loaded is not None and Path(loaded.__file__ or "").resolve() == file.resolve():
         return name
+    if entry.is_dir() and _is_installed(name):
+        raise UserError(f"the extension {entry} has the name of a module: rename the folder")
     spec = importlib.util.spec_from_file_location(name, file.resolve())
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module
@@ -61,6 +64,12 @@ def _load(entry: Path) -> str:
             f"the extension {entry} can't be imported: {_cause(error, entry)}"
         ) from error
     return name
+
+
+def _is_installed(name: str) -> bool:
+    """Return whether ``import name`` finds a module or package, which has a file."""
+    found = importlib.machinery.PathFinder.find_spec(name)
+    return name in sys.stdlib_module_names or (found is not None and found.origin is not None)
 
 
 def _cause(error: BaseException, entry: Path) -> str:

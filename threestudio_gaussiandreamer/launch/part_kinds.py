@@ -1,5 +1,6 @@
 """Which kind of part the key of a section names."""
 
+from pathlib import Path
 from typing import Any, Optional
 
 from torch import nn
@@ -46,6 +47,12 @@ CALLS = {"guidance": "rgb", "background": "dirs"}
 """The first argument of a call, of the kinds that other packages write without our base class."""
 
 
+CUSTOM_HINT = (
+    " (own parts are imported from the folder custom in the working folder, which has none; a "
+    "run's folder has a copy in code)"
+)
+
+
 def find_part(path: str, type_name: Any) -> type:
     """Return the part that the key ``path`` names; the message of an error names the key too."""
     if not type_name:
@@ -58,7 +65,8 @@ def find_part(path: str, type_name: Any) -> type:
     try:
         return find(type_name)
     except UserError as error:
-        raise UserError(f"{path}: {error}") from error
+        hint = "" if Path("custom").is_dir() else CUSTOM_HINT
+        raise UserError(f"{path}: {error}{hint}") from error
 
 
 def check_kind(path: str, type_name: str, part: Any) -> None:

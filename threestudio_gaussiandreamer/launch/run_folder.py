@@ -124,9 +124,14 @@ def _is_same(old: Any, new: Any) -> bool:
     return os.path.realpath(os.path.expanduser(old)) == os.path.realpath(os.path.expanduser(new))
 
 
+def program_anywhere() -> list[str]:
+    """Return how this process was started, valid in any working folder."""
+    return [os.path.abspath(part) if part.endswith("launch.py") else part for part in PROGRAM]
+
+
 def resume_command(folder: Path, gpu: Optional[str]) -> str:
     """Return the command that resumes the run in ``folder``, valid in any working folder."""
-    program = [os.path.abspath(part) if part.endswith("launch.py") else part for part in PROGRAM]
+    program = program_anywhere()
     run = folder.absolute()
     device = ["--gpu", gpu] if gpu else []
     parsed, last = run / "configs" / "parsed.yaml", run / "ckpts" / "last.ckpt"

@@ -83,5 +83,12 @@ class FlatBackground(BaseBackground):
             return to_device(torch.stack(colors), self.fixed.device).to(self.fixed)
         return self.fixed.expand(batch_size, 3)
 
+    @classmethod
+    def is_flat(cls, background: Any) -> bool:
+        """Whether a background has one colour per view: this class, or one that is derived from it
+        without a ``forward`` of its own.
+        """
+        return isinstance(background, cls) and type(background).forward is cls.forward
+
     def forward(self, dirs: Float[Tensor, "B H W 3"]) -> Float[Tensor, "B H W 3"]:
         return self.color(len(dirs))[:, None, None].expand(*dirs.shape[:-1], 3)

@@ -264,8 +264,8 @@ class GaussianDreamerDataModule(pl.LightningDataModule):
 
     def __init__(self, cfg: Any = None) -> None:
         super().__init__()
-        self.cfg = parse_structured(CameraConfig, cfg)
-        self.options = checked_options(CameraConfig, self.cfg, "data.")
+        self.cfg = parse_structured(self.Config, cfg)
+        self.options = checked_options(self.Config, self.cfg, "data.")
 
     def setup(self, stage: str | None = None) -> None:
         if stage in (None, "fit"):

@@ -39,8 +39,35 @@ def weighted_losses(
         found = ", ".join(guided) or "nothing"
         raise UserError(f"the guidance returned no loss_*, such as loss_sds: it returned {found}")
     check_weights(weights, raw)
-    raw |= {name: call(out) for name, call in REGULARISERS.items() if weights.get(name)}
+    if taken := [name for name in REGULARISERS if name in raw]:
+        raise UserError(
+            f"REGULARISERS[{taken[0]!r}] has the name of the guidance's loss_{taken[0]}; choose "
+            "another one"
+        )
+    raw |= {
+        name: _of_renders(name, call(out))
+        for name, call in REGULARISERS.items()
+        if weights.get(name)
+    }
     return {name: value * weights[name] for name, value in raw.items()}
+
+
+def _of_renders(name: str, value: Any) -> Float[Tensor, ""]:
+    """Return what a regulariser has returned, as a scalar.
+
+    Raises:
+        UserError: it isn't one number with a gradient.
+    """
+    if not isinstance(value, Tensor) or value.numel() != 1 or not value.requires_grad:
+        found = type(value).__name__
+        if isinstance(value, Tensor):
+            found = f"a tensor of shape {tuple(value.shape)}"
+            found += "" if value.requires_grad else " without a gradient"
+        raise UserError(
+            f"REGULARISERS[{name!r}] returned {found}; expected one number that is computed from "
+            "the renders, as from .mean()"
+        )
+    return value.reshape(())
 
 
 def total(losses: Mapping[str, Tensor], guidance: str) -> Float[Tensor, ""]:
@@ -190,4 +217,4 @@ REGULARISERS: dict[str, Callable[[Mapping[str, Any]], Tensor]] = {
     "opaque": lambda out: entropy(out["opacity"]),
     "tv": lambda out: total_variation(out["comp_rgb"]),
 }
-"""Functions of the renderer's outputs."""
+"""Functions of the renderer's outputs; extensions may add their own."""

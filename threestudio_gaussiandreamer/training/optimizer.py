@@ -10,7 +10,7 @@ import torch
 
 from ..core.devices import get_device
 from ..core.errors import UserError, unknown
-from ..core.options import RULE, schedule
+from ..core.options import RULE, is_list, schedule
 from ..core.schedule import parse_schedule
 from ..host import C
 from .background import FlatBackground
@@ -25,10 +25,47 @@ RATE = schedule(min=0)
 
 def make_optimizer(options: Any, groups: Groups) -> torch.optim.Optimizer:
     """Build the optimiser over parameter groups that bring their own learning rates."""
-    kind = getattr(torch.optim, options.get("name", "Adam"))
-    accepted = inspect.signature(kind).parameters
-    ours = {name: value for name, value in DEFAULTS.items() if name in accepted}
-    return kind(groups, lr=0.0, **ours | dict(options.get("args", {})))
+    name = options.get("name", "Adam")
+    ours = {key: DEFAULTS[key] for key in DEFAULTS if key not in foreign_arguments(name, DEFAULTS)}
+    given = {
+        key: value for key, value in dict(options.get("args") or {}).items() if value is not None
+    }
+    return getattr(torch.optim, name)(groups, lr=0.0, **ours | given)
+
+
+def restore_arguments(optimizer: torch.optim.Optimizer) -> None:
+    """Set the numbers of this configuration, such as betas and weight decay, in all groups; a
+    checkpoint has restored those of its run. Learning rates are set in each step.
+    """
+    numbers = {
+        name: value
+        for name, value in optimizer.defaults.items()
+        if isinstance(value, (int, float, list, tuple)) and not isinstance(value, bool)
+    }
+    numbers.pop("lr", None)
+    for group in optimizer.param_groups:
+        group.update(numbers)
+
+
+def accepted_arguments(name: str) -> dict[str, Any]:
+    """Return the arguments of an optimiser of ``torch.optim`` with their defaults, without those
+    that the system gives; empty if there is no such optimiser.
+    """
+    kind = getattr(torch.optim, str(name), None)
+    parameters = inspect.signature(kind).parameters if isinstance(kind, type) else {}
+    return {key: parameters[key].default for key in parameters if key not in ("params", "lr")}
+
+
+def foreign_arguments(name: str, arguments: Mapping[str, Any]) -> list[str]:
+    """Return the arguments that an optimiser lacks, or that are a pair in one and a number in the
+    other, as ``eps`` of Adafactor; none if there is no such optimiser.
+    """
+    accepted = accepted_arguments(name)
+    return [
+        key
+        for key, value in arguments.items()
+        if accepted and (key not in accepted or is_list(accepted[key]) != is_list(value))
+    ]
 
 
 def check_optimizer(options: Any, scheduler: Any = None) -> None:
@@ -44,7 +81,7 @@ def check_optimizer(options: Any, scheduler: Any = None) -> None:
         if key not in ("name", "args", "params"):
             raise unknown("key system.optimizer.", key, ("name", "args", "params"))
     _check_rates(options.get("params", {}))
-    name, arguments = options.get("name", "Adam"), options.get("args", {})
+    name, arguments = options.get("name", "Adam"), options.get("args") or {}
     if not isinstance(getattr(torch.optim, str(name), None), type):
         known = [name for name, value in vars(torch.optim).items() if isinstance(value, type)]
         raise unknown("system.optimizer.name", name, known)
@@ -55,8 +92,7 @@ def check_optimizer(options: Any, scheduler: Any = None) -> None:
         if not (arguments.get("capturable") and get_device().type == "cuda"):
             optimizer.step()  # on the CPU, which would refuse what a GPU takes
     except Exception as error:  # of many types
-        accepted = inspect.signature(getattr(torch.optim, name)).parameters.keys()
-        accepted = accepted - {"params", "lr"}  # which the groups bring
+        accepted = accepted_arguments(name)
         wrong = [unknown("argument", key, accepted) for key in arguments if key not in accepted]
         raise UserError(
             f"optimizer: {name} doesn't accept this: {wrong[0] if wrong else error}"

@@ -131,7 +131,7 @@ def _prompt(system: Any) -> str:
 
 def _background(background: Any) -> tuple[float, float, float]:
     """Return the colour that test views are shown on; white for backgrounds that aren't flat."""
-    if not isinstance(background, FlatBackground):
+    if not FlatBackground.is_flat(background):
         return WHITE
     if background.cfg.mode == "learned":
         red, green, blue = background.color(1)[0].tolist()

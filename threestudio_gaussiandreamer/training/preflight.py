@@ -6,11 +6,9 @@ from ..core.errors import UserError
 from ..core.methods import require_class_method
 from ..host import find, parse_structured
 from ..priors.base import preflight_prior
-from .geometry import GaussianCloud
-from .renderer import SplattingRenderer
 
-BASES = {"geometry": GaussianCloud, "renderer": SplattingRenderer}
-"""Classes whose methods, options or outputs the system uses beyond those of the host's."""
+OURS = {"geometry": "gaussiandreamer-cloud", "renderer": "gaussiandreamer-splatting"}
+"""Parts whose methods, options or outputs the system uses beyond those of the host's."""
 
 
 def check_parts(cfg: Any) -> None:
@@ -23,12 +21,12 @@ def check_parts(cfg: Any) -> None:
         key = f"{name}_type"
         if not cfg[key]:
             raise UserError(f"{key} is empty: name a registered part")
-    for name, base in BASES.items():
-        key = f"{name}_type"
+    for name, ours in OURS.items():
+        key, base = f"{name}_type", find(ours)
         if not issubclass(find(cfg[key]), base):
             raise UserError(
-                f"{key} is {cfg[key]!r}: gaussiandreamer-system needs a class that is derived from "
-                f"{base.__module__}.{base.__name__}"
+                f"{key} is {cfg[key]!r}: gaussiandreamer-system needs {ours}, or a class that is "
+                f"derived from {base.__module__}.{base.__name__}"
             )
 
 

@@ -104,7 +104,7 @@ class SplattingRenderer(Rasterizer):
     def _render(
         self, c2w: Tensor, fovy: Tensor, height: int, width: int, batch: dict[str, Any]
     ) -> LazyMapping:
-        ours = isinstance(self.background, FlatBackground)
+        ours = FlatBackground.is_flat(self.background)
         flat = self.background.color(len(c2w)) if ours else None
         opacities = self.geometry.opacities()
         out = self._rasterize(c2w, fovy, (height, width), opacities, flat)

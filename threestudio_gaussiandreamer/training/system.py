@@ -61,7 +61,7 @@ from .held_out import EvaluationConfig, HeldOut, Measurements
 from .image_targets import ImageTargets, ImageTargetsConfig, check_image_targets
 from .loss_scale import LossScale
 from .losses import check_losses, loggable, logged_names, total, weight_schedules, weighted_losses
-from .optimizer import PartRates, check_optimizer, make_optimizer
+from .optimizer import PartRates, check_optimizer, make_optimizer, restore_arguments
 from .pages import discard_turntable, save_first_cloud, turntable_name, write_turntable
 from .pictures import rgb_panel, save_pictures
 from .preflight import check_parts, preflight_parts
@@ -212,6 +212,7 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
             self.measurements = Measurements(held_out, Path(self._save_dir))
 
     def on_train_start(self) -> None:
+        restore_arguments(self.optimizers().optimizer)
         self.require_finite()
         for part in (self.density, self.image_targets):
             if problem := part.schedule_problem(self.global_step, self.trainer.max_steps):
