@@ -48,6 +48,14 @@ def test_parts_above_the_share_stay():
     assert len(without_small_parts(*two, 0.1)[1]) == len(two[1])
 
 
+@pytest.mark.parametrize("factor", [2.0**-20, 2.0**20])
+def test_simplification_is_the_same_at_any_size(factor):
+    vertices, faces = ball()
+    plain, scaled = simplified(vertices, faces, 300), simplified(factor * vertices, faces, 300)
+    np.testing.assert_array_equal(scaled[0] / factor, plain[0])
+    np.testing.assert_array_equal(scaled[1], plain[1])
+
+
 @pytest.mark.parametrize("count", [100, 300])
 def test_simplified_meshes_stay_closed_and_keep_their_size(count):
     vertices, faces = simplified(*ball(), count)

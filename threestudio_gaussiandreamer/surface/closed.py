@@ -3,6 +3,8 @@
 A mesh is closed if each edge has exactly two faces. Half-edge ``h`` of F faces is the directed edge
 of face ``h % F`` from its corner ``h // F`` to the next one."""
 
+import math
+
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
@@ -67,9 +69,14 @@ def _fewer(
 
     if len(faces) <= count:
         return vertices, faces
-    return fast_simplification.simplify(
-        vertices.astype(np.float32), faces.astype(np.int32), target_count=count, agg=aggressiveness
+    # its thresholds are for meshes of about this size; a power of two leaves all digits
+    extent = float(np.ptp(vertices, axis=0).max())
+    scale = 2.0 ** -round(math.log2(extent / 2)) if extent > 0 else 1.0
+    scaled = (vertices * scale).astype(np.float32)
+    found, faces = fast_simplification.simplify(
+        scaled, faces.astype(np.int32), target_count=count, agg=aggressiveness
     )
+    return found / scale, faces
 
 
 def _closed_again(vertices: Vertices, faces: Faces) -> tuple[Vertices, Faces] | None:
