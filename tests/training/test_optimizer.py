@@ -44,7 +44,7 @@ def test_the_colour_of_another_background_is_learned_and_resumed(train, tmp_path
     assert (color[1:] < 0.9).all()  # it was white
     groups = checkpoint(whole)["optimizer_states"][0]["param_groups"]
     rates = {group["name"]: group["lr"] for group in groups}
-    assert rates["background"] == pytest.approx(0.0425)  # that of step 3
+    assert rates["background.parameters"] == pytest.approx(0.0425)  # that of step 3
 
 
 def test_parameters_without_a_rate_are_refused_before_the_prior(train, tmp_path, capsys):

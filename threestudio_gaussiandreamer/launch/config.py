@@ -183,11 +183,14 @@ def _forget_replaced_parts(earlier: DictConfig, later: DictConfig, path: str = "
             continue
         section = key.removesuffix("_type")
         mine, theirs = earlier._get_node(key), later._get_node(key)
-        if f"{path}{key}" == "system.optimizer.name":
-            _keep_arguments_of(earlier._get_node("args"), theirs._value())
         if isinstance(mine, DictConfig) and isinstance(theirs, DictConfig):
             _forget_replaced_parts(mine, theirs, f"{path}{key}.")
-        elif section != key and mine is not None and mine._value() != theirs._value():
+            continue
+        if mine is None or mine._value() == theirs._value():
+            continue
+        if f"{path}{key}" == "system.optimizer.name":
+            _keep_arguments_of(earlier._get_node("args"), theirs._value())
+        if section != key:
             _keep_options_of(earlier._get_node(section), theirs._value(), f"{path}{section}")
             if f"{path}{section}" == "system.guidance":
                 _keep_weights_of(earlier._get_node("loss"), theirs._value())

@@ -20,6 +20,8 @@ DEFAULTS = {"betas": (0.9, 0.99), "eps": 1e-15}
 Groups = list[dict[str, Any]]
 PARTS = ("background", "material", "renderer")
 """Parts that may have parameters, beside the geometry."""
+GROUP = "{}.parameters"
+"""Name of the group of a part's parameters; our background's own group is ``background``."""
 RATE = schedule(min=0)
 
 
@@ -80,7 +82,7 @@ def check_optimizer(options: Any, scheduler: Any = None) -> None:
     for key in options:
         if key not in ("name", "args", "params"):
             raise unknown("key system.optimizer.", key, ("name", "args", "params"))
-    _check_rates(options.get("params", {}))
+    _check_rates(options.get("params") or {})
     name, arguments = options.get("name", "Adam"), options.get("args") or {}
     if not isinstance(getattr(torch.optim, str(name), None), type):
         known = [name for name, value in vars(torch.optim).items() if isinstance(value, type)]
@@ -120,7 +122,7 @@ class PartRates:
     """
 
     def __init__(self, options: Any) -> None:
-        params = options.get("params", {})
+        params = options.get("params") or {}
         self.rates = {name: parse_schedule(params[name]["lr"]) for name in params}
 
     def groups(self, system: Any) -> Groups:
@@ -132,30 +134,35 @@ class PartRates:
         return [group for name in PARTS for group in self._groups_of(name, getattr(system, name))]
 
     def _groups_of(self, name: str, part: Optional[torch.nn.Module]) -> Groups:
-        ours = isinstance(part, FlatBackground)
-        parameters = () if part is None or ours else part.parameters()
-        trained = [parameter for parameter in parameters if parameter.requires_grad]
+        groups = part.parameter_groups() if isinstance(part, FlatBackground) else []
+        with_rate = {id(parameter) for group in groups for parameter in group["params"]}
+        trained = [
+            parameter
+            for parameter in (() if part is None else part.parameters())
+            if parameter.requires_grad and id(parameter) not in with_rate
+        ]
         if trained and name not in self.rates:
             raise UserError(
                 f"{type(part).__name__} has parameters without a learning rate: set "
                 f"system.optimizer.params.{name}.lr; 0 leaves them as they are"
             )
         if name in self.rates and not trained:
+            ours = isinstance(part, FlatBackground)
             hint = " for it: its rate is system.background.lr" if ours else " to train"
             raise UserError(
                 f"system.optimizer.params.{name}: {type(part).__name__} has no parameters{hint}"
             )
-        if ours:
-            return part.parameter_groups()
-        return [{"params": trained, "name": name, "lr": 0.0}] if trained else []
+        own = {"params": trained, "name": GROUP.format(name), "lr": 0.0}
+        return [*groups, own] if trained else groups
 
     def set(self, system: Any, optimizer: torch.optim.Optimizer, epoch: int, step: int) -> None:
         """Set the learning rates of the groups of :meth:`groups`."""
         if isinstance(system.background, FlatBackground):
             system.background.set_learning_rates(optimizer, epoch, step)
+        rates = {GROUP.format(name): rate for name, rate in self.rates.items()}
         for group in optimizer.param_groups:
-            if group.get("name") in self.rates:
-                group["lr"] = C(self.rates[group["name"]], epoch, step)
+            if group.get("name") in rates:
+                group["lr"] = C(rates[group["name"]], epoch, step)
 
 
 def _some_group() -> dict[str, Any]:
