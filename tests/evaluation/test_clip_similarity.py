@@ -202,7 +202,8 @@ def test_the_background_is_the_learned_one_or_named(tmp_path, capsys, kind, opti
     (tmp_path / "configs" / "parsed.yaml").write_text(json.dumps({"system": system}))
     save(tmp_path / "save" / "it1-export" / "gaussians.ply", blob())
     state_dict = {f"background.{name}": value for name, value in state.items()}
-    save_file(tmp_path / "ckpts" / "last.ckpt", {"state_dict": state_dict})
+    content = {"state_dict": state_dict, "epoch": 0, "global_step": 1}
+    save_file(tmp_path / "ckpts" / "last.ckpt", content)
     assert results.find_result(str(tmp_path)).background == color
 
 

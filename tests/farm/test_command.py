@@ -161,6 +161,13 @@ def test_the_low_memory_configuration_is_used_where_it_is_valid():
     assert check_recipe(paper, row).low_memory.name.endswith("gaussiandreamer-lowmem.yaml")
 
 
+def test_overrides_in_another_order_are_shown_whole(tmp_path):
+    require_same_farm(Place(tmp_path), RECIPE._replace(overrides=("y=2", "y=3")))
+    whole = r'its overrides is \["y=2", "y=3"\], here \["y=3", "y=2"\]; choose'
+    with pytest.raises(ValueError, match=whole):
+        require_same_farm(Place(tmp_path), RECIPE._replace(overrides=("y=3", "y=2")))
+
+
 @pytest.mark.parametrize(
     ("other", "message"),
     [

@@ -13,8 +13,8 @@ from threestudio_gaussiandreamer.training.optimizer import check_optimizer
 COLOR = "background.env_color"
 
 
-def checkpoint(folder, name="last"):
-    return torch.load(run_folder(folder) / "ckpts" / f"{name}.ckpt", weights_only=False)
+def checkpoint(folder):
+    return torch.load(run_folder(folder) / "ckpts" / "last.ckpt", weights_only=False)
 
 
 @pytest.fixture

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..core.checkpoint_file import load_file
+from ..core.checkpoint_file import load_module_weights
 from ..core.errors import UserError
 from ..core.files import existing_file
 from ..formats.ply import is_gaussian_ply
@@ -22,8 +22,9 @@ from ..host import find, get_device, warn
 from ..launch.config import load_config
 from ..prompts.prompt_processors import PROMPT_LIBRARY, resolve_prompt
 
-BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
-OUR_BACKGROUND, HOSTS_BACKGROUND = "gaussiandreamer-background", "solid-color-background"
+BLACK = (0.0, 0.0, 0.0)
+FLAT = ("gaussiandreamer-background", "solid-color-background")
+"""Backgrounds of one colour."""
 
 
 class Result(NamedTuple):
@@ -87,18 +88,15 @@ def _prompt_and_background(parsed: Path) -> tuple[Optional[str], tuple[float, fl
 
 def _background_of(system: Mapping[str, Any], folder: Path) -> Sequence[float]:
     """Return the colour of a run's background; a learned one is that of its last checkpoint."""
-    options, kind = system.get("background") or {}, system.get("background_type")
-    last = folder / "ckpts" / "last.ckpt"
-    color = options.get("color") or (WHITE if kind == HOSTS_BACKGROUND else BLACK)
-    learned = options.get("mode") == "learned" or options.get("learned")
-    if kind in (None, OUR_BACKGROUND, HOSTS_BACKGROUND):
-        if not learned:
-            return color
+    options, last = system.get("background") or {}, folder / "ckpts" / "last.ckpt"
+    kind, color = system.get("background_type") or FLAT[0], options.get("color") or BLACK
+    if kind in FLAT:
+        background = find(kind)(options)
+        if next(background.parameters(), None) is None:
+            return background.cfg.color
         if last.is_file():
-            state = load_file(last)["state_dict"]
-            if kind == HOSTS_BACKGROUND:
-                return state["background.env_color"].tolist()
-            return torch.sigmoid(state["background.logit"]).tolist()
+            background.load_state_dict(load_module_weights(str(last), "background")[0])
+            return background(torch.zeros(1, 1, 1, 3))[0, 0, 0].tolist()
     warn(f"{folder}: the colour {list(color)} is used in place of the background of its training")
     return color
 

@@ -73,10 +73,12 @@ def _require_entries(place: Place, ours: dict[str, Any]) -> bool:
     if differs:
         name = differs[0]
         there, here, note = theirs.get(name), ours[name], ""
-        if isinstance(there, list) and isinstance(here, list) and set(there) & set(here):
-            both = set(there) & set(here)
-            there, here = ([item for item in items if item not in both] for items in (there, here))
-            note = " (without what is in both)"
+        if isinstance(there, list) and isinstance(here, list):
+            only_there = [item for item in there if item not in here]
+            only_here = [item for item in here if item not in there]
+            # else only their order differs, or nothing is in both
+            if (only_there or only_here) and (only_there, only_here) != (there, here):
+                there, here, note = only_there, only_here, " (without what is in both)"
         raise UserError(
             f"{place} belongs to another farm: its {name} is {shown(there)}, here "
             f"{shown(here)}{note}; choose another --out"

@@ -39,11 +39,6 @@ def weighted_losses(
         found = ", ".join(guided) or "nothing"
         raise UserError(f"the guidance returned no loss_*, such as loss_sds: it returned {found}")
     check_weights(weights, raw)
-    if taken := [name for name in REGULARISERS if name in raw]:
-        raise UserError(
-            f"REGULARISERS[{taken[0]!r}] has the name of the guidance's loss_{taken[0]}; choose "
-            "another one"
-        )
     raw |= {
         name: _of_renders(name, call(out))
         for name, call in REGULARISERS.items()
@@ -163,7 +158,7 @@ def check_weights(weights: Mapping[str, Any], losses: Iterable[str]) -> None:
     an earlier file.
 
     Raises:
-        UserError: a weight or a loss has no counterpart.
+        UserError: a weight or a loss has no counterpart, or a loss has a regulariser's name.
     """
     for name, weight in weights.items():
         if name not in losses and name not in REGULARISERS and not _is_none_or_zero(weight):
@@ -172,6 +167,11 @@ def check_weights(weights: Mapping[str, Any], losses: Iterable[str]) -> None:
             way_out = f"to leave it out: system.loss.lambda_{name}=0"
             raise UserError(f"{str(error).removesuffix('.')} ({way_out})")
     for name in losses:
+        if name in REGULARISERS:
+            raise UserError(
+                f"REGULARISERS[{name!r}] has the name of the guidance's loss_{name}; choose "
+                "another one"
+            )
         if name not in weights:
             raise UserError(
                 f"the guidance returns loss_{name}: give its weight, for instance "

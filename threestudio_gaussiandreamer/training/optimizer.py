@@ -28,10 +28,9 @@ RATE = schedule(min=0)
 def make_optimizer(options: Any, groups: Groups) -> torch.optim.Optimizer:
     """Build the optimiser over parameter groups that bring their own learning rates."""
     name = options.get("name", "Adam")
-    ours = {key: DEFAULTS[key] for key in DEFAULTS if key not in foreign_arguments(name, DEFAULTS)}
-    given = {
-        key: value for key, value in dict(options.get("args") or {}).items() if value is not None
-    }
+    foreign, arguments = foreign_arguments(name, DEFAULTS), options.get("args") or {}
+    ours = {key: value for key, value in DEFAULTS.items() if key not in foreign}
+    given = {key: value for key, value in arguments.items() if value is not None}
     return getattr(torch.optim, name)(groups, lr=0.0, **ours | given)
 
 
@@ -123,7 +122,7 @@ class PartRates:
 
     def __init__(self, options: Any) -> None:
         params = options.get("params") or {}
-        self.rates = {name: parse_schedule(params[name]["lr"]) for name in params}
+        self.rates = {GROUP.format(name): parse_schedule(params[name]["lr"]) for name in params}
 
     def groups(self, system: Any) -> Groups:
         """Return the groups of our background, and of other packages' parts that have parameters.
@@ -134,35 +133,33 @@ class PartRates:
         return [group for name in PARTS for group in self._groups_of(name, getattr(system, name))]
 
     def _groups_of(self, name: str, part: Optional[torch.nn.Module]) -> Groups:
-        groups = part.parameter_groups() if isinstance(part, FlatBackground) else []
+        ours, own = isinstance(part, FlatBackground), GROUP.format(name)
+        groups = part.parameter_groups() if ours else []
         with_rate = {id(parameter) for group in groups for parameter in group["params"]}
         trained = [
             parameter
             for parameter in (() if part is None else part.parameters())
             if parameter.requires_grad and id(parameter) not in with_rate
         ]
-        if trained and name not in self.rates:
+        if trained and own not in self.rates:
             raise UserError(
                 f"{type(part).__name__} has parameters without a learning rate: set "
                 f"system.optimizer.params.{name}.lr; 0 leaves them as they are"
             )
-        if name in self.rates and not trained:
-            ours = isinstance(part, FlatBackground)
+        if own in self.rates and not trained:
             hint = " for it: its rate is system.background.lr" if ours else " to train"
             raise UserError(
                 f"system.optimizer.params.{name}: {type(part).__name__} has no parameters{hint}"
             )
-        own = {"params": trained, "name": GROUP.format(name), "lr": 0.0}
-        return [*groups, own] if trained else groups
+        return [*groups, {"params": trained, "name": own, "lr": 0.0}] if trained else groups
 
     def set(self, system: Any, optimizer: torch.optim.Optimizer, epoch: int, step: int) -> None:
         """Set the learning rates of the groups of :meth:`groups`."""
         if isinstance(system.background, FlatBackground):
             system.background.set_learning_rates(optimizer, epoch, step)
-        rates = {GROUP.format(name): rate for name, rate in self.rates.items()}
         for group in optimizer.param_groups:
-            if group.get("name") in rates:
-                group["lr"] = C(rates[group["name"]], epoch, step)
+            if group.get("name") in self.rates:
+                group["lr"] = C(self.rates[group["name"]], epoch, step)
 
 
 def _some_group() -> dict[str, Any]:
