@@ -163,7 +163,7 @@ def test_right_kernels_are_used_and_compared_once(use):
 
 def test_right_kernels_are_far_from_the_tolerance(use):
     use(HostDevice())
-    errors = proof.errors_on(CPU, proof.reference())
+    errors = proof.relative_errors(proof.drawn_on(CPU), proof.reference())
     assert max(max(sizes.values()) for sizes in errors.values()) < proof.TOLERANCE / 10
     assert [len(sizes) for sizes in errors.values()] == [11, 11, 12]
 
@@ -349,6 +349,44 @@ def test_an_error_of_earlier_work_or_of_torch_is_no_verdict(use, tmp_path, monke
     device = use(HostDevice())
     picture()
     assert "blend" in device.launched
+
+
+def test_a_gradient_of_a_culled_gaussian_is_a_difference(use):
+    use(HostDevice())
+    found = proof.drawn_on(CPU)
+    found[DEFAULT]["gradient of means"][-1, 0] = 100.0
+    errors = proof.relative_errors(found, proof.reference())[DEFAULT]
+    assert [name for name, size in errors.items() if size > 0.1] == ["gradient of means"]
+
+
+def test_all_sorts_are_of_more_than_torch_sorts_by_another_kernel(use, monkeypatch):
+    lengths, sort = [], torch.Tensor.sort
+
+    def noted(values, *arguments, **options):
+        lengths.append(values.shape[-1])
+        return sort(values, *arguments, **options)
+
+    use(HostDevice())
+    monkeypatch.setattr(torch.Tensor, "sort", noted)
+    proof.drawn_on(CPU)
+    assert len(lengths) == 2 * len(proof.OPTIONS) and min(lengths) > 4096
+
+
+def test_the_number_of_threads_is_as_before(use, monkeypatch):
+    seen, draw, threads = [], proof.torch_backend.rasterize, torch.get_num_threads()
+
+    def noted(*arguments):
+        seen.append(torch.get_num_threads())
+        return draw(*arguments)
+
+    monkeypatch.setattr(proof.torch_backend, "rasterize", noted)
+    use(HostDevice())
+    try:
+        torch.set_num_threads(3)
+        picture()
+        assert seen == [1, 1] and torch.get_num_threads() == 3
+    finally:
+        torch.set_num_threads(threads)
 
 
 @pytest.mark.parametrize("warns", [False, True])

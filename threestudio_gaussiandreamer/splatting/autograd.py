@@ -41,9 +41,7 @@ class Wanted(NamedTuple):
 
 
 class SceneGradients(NamedTuple):
-    """Gradients of the loss with respect to the fields of a Scene and to means2d (B, N, 2), and the
-    sums over pixels of the latter's absolute value.
-    """
+    """Gradients of the loss with respect to the fields of a Scene and to means2d (B, N, 2)."""
 
     means: Tensor
     quats: Tensor
@@ -53,7 +51,6 @@ class SceneGradients(NamedTuple):
     colors: Tensor
     background: Optional[Tensor]
     means2d: Tensor
-    absgrad: Optional[Tensor]
 
 
 class Kernel(Protocol):
@@ -78,7 +75,9 @@ class Kernel(Protocol):
         upstream: Upstream,
         wanted: Wanted,
     ) -> SceneGradients:
-        """Differentiate; ``saved`` and ``state`` are what `forward` returned."""
+        """Differentiate; ``saved`` and ``state`` are what `forward` returned. If the options ask
+        for it, add the sums over pixels of absolute gradients to ``means2d.absgrad``.
+        """
 
 
 def rasterize(kernel: Kernel, scene: Scene, options: RasterizeOptions) -> Rasterized:
@@ -128,8 +127,6 @@ class _Rasterize(torch.autograd.Function):
         found = ctx.kernel.backward(
             scene, ctx.means2d, saved[TENSORS:], ctx.state, upstream, wanted
         )
-        if found.absgrad is not None:
-            ctx.means2d.absgrad += found.absgrad
         colors, background = (narrow(x, ctx.channels) for x in (found.colors, found.background))
         per_input = (*found[:4], found.viewmats, colors, background, None)
         return None, None, found.means2d, *per_input

@@ -79,15 +79,14 @@ class CpuKernel(NamedTuple):
         replaced the tensor that owns the state.
         """
         owner = getattr(saved[0], "owner", None) or self._draw(scene, means2d)[1]
-        found = SceneGradients(
-            *(torch.empty_like(x) for x in scene.tensors[:-1]),
-            torch.empty_like(means2d),
-            torch.empty_like(means2d) if self.options.absgrad else None,
-        )
+        found = SceneGradients(*map(torch.empty_like, (*scene.tensors[:-1], means2d)))
         found = found if wanted.viewmats else found._replace(viewmats=None)
-        given, out = _Upstream(*map(address, upstream)), _Gradients(*map(address, found))
-        inputs = (scene.struct(), self._settings(), given)
+        absgrad = torch.empty_like(means2d) if self.options.absgrad else None
+        out = _Gradients(*map(address, (*found, absgrad)))
+        inputs = (scene.struct(), self._settings(), _Upstream(*map(address, upstream)))
         _check(owner.library.splat_backward(owner.handle, *inputs, out))
+        if absgrad is not None:
+            means2d.absgrad += absgrad
         return found
 
     def _settings(self) -> "_Settings":
@@ -117,7 +116,7 @@ class _Upstream(ctypes.Structure):
 
 
 class _Gradients(ctypes.Structure):
-    _fields_ = [(name, ctypes.c_void_p) for name in SceneGradients._fields]
+    _fields_ = [(name, ctypes.c_void_p) for name in (*SceneGradients._fields, "absgrad")]
 
 
 class _State:

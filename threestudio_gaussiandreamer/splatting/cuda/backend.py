@@ -106,7 +106,8 @@ class CudaKernel(NamedTuple):
     ) -> SceneGradients:
         """Differentiate; waits for the numbers of intersections."""
         alpha, *kept = saved
-        found = empty_gradients(scene, self.context.options.absgrad, wanted.viewmats)
+        absgrad = means2d.absgrad if self.context.options.absgrad else None
+        found = empty_gradients(scene, absgrad, wanted.viewmats)
         viewmats = torch.zeros_like(scene.viewmats) if wanted.viewmats and not kept else None
         if kept:
             splats, lists = Splats(*kept[:5]), Lists(*kept[5:8])
@@ -119,8 +120,7 @@ class CudaKernel(NamedTuple):
         background = (
             _background_gradient(upstream.image, alpha, scene) if wanted.background else None
         )
-        screen = (found.means2d, found.absgrad)
-        return SceneGradients(*found[:4], viewmats, found.colors, background, *screen)
+        return SceneGradients(*found[:4], viewmats, found.colors, background, found.means2d)
 
 
 def _draw(

@@ -13,7 +13,9 @@ import torch
 from ...core.errors import UserError
 
 HEADROOM = 1.5
-STEP = 4096  # intersections; rounding up makes torch's caching allocator reuse blocks
+STEP = 8192
+"""Intersections. Rounding up makes torch's caching allocator reuse blocks; up to 4096 numbers are
+sorted by another kernel of torch, which would have to be loaded too."""
 MAX_INTERSECTIONS = (
     2**31 - 1 - STEP
 )  # intersections; torch's sort and the kernels use 32-bit indices

@@ -12,7 +12,7 @@ constexpr int SUM_LANES = 4, RANKS = WARP / SUM_LANES;  // lanes that add the ro
 struct Gradients {
   float *means, *quats, *scales, *opacities, *colors;  // as in Scene
   float* means2d;   // (B, N, 2)
-  float* absgrad;   // (B, N, 2) or null: sum over pixels of the absolute value
+  float* absgrad;   // (B, N, 2) or null: the sum over pixels of the absolute value is added
   float* camera_parts;  // (blocks, B, 12) or null: each block's part in d loss / d viewmats
 };
 
@@ -57,7 +57,7 @@ SPLAT_FN void store_world(const Gradients& out, Index i, const Gaussian<float>& 
 
 SPLAT_FN void store_screen(const Gradients& out, Index at, const Vec2<float>& mean2d, const Vec2<float>& absolute) {
   out.means2d[2 * at] = mean2d.x, out.means2d[2 * at + 1] = mean2d.y;
-  if (out.absgrad) out.absgrad[2 * at] = absolute.x, out.absgrad[2 * at + 1] = absolute.y;
+  if (out.absgrad) out.absgrad[2 * at] += absolute.x, out.absgrad[2 * at + 1] += absolute.y;
 }
 
 // The rows of a rank of a view's order: [begin, end), of view * N + Gaussian `owner`. Empty, with owner -1, behind the last visible one.

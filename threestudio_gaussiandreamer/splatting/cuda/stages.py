@@ -139,7 +139,9 @@ class BlendUpstream(NamedTuple):
 
 
 class Gradients(NamedTuple):
-    """Output of stage 1's adjoint, in the order of the struct ``splat::Gradients``."""
+    """Output of stage 1's adjoint, in the order of the struct ``splat::Gradients``. ``absgrad`` is
+    added to, the others are set.
+    """
 
     means: Tensor
     quats: Tensor
@@ -241,13 +243,12 @@ def project_backward(batch: Batch, splats: Splats, sums: Tensor, gradients: Grad
     batch.launch("project_backward", grid, THREADS, batch.context.settings, *arguments)
 
 
-def empty_gradients(scene: Scene, absgrad: bool, viewmats: bool) -> Gradients:
-    """Allocate the gradients; those that aren't needed are None."""
+def empty_gradients(scene: Scene, absgrad: Optional[Tensor], viewmats: bool) -> Gradients:
+    """Allocate the gradients but ``absgrad``; those that aren't needed are None."""
     new, (views, gaussians) = scene.means.new_empty, scene.shape
     parts = new(-(-gaussians // THREADS), views, CAMERA_SUMS) if viewmats else None
-    screen = new(views, gaussians, 2), new(views, gaussians, 2) if absgrad else None
     own = (*scene[:4], scene.colors)
-    return Gradients(*(torch.empty_like(x) for x in own), *screen, parts)
+    return Gradients(*(torch.empty_like(x) for x in own), new(views, gaussians, 2), absgrad, parts)
 
 
 def sum_cameras(batch: Batch, parts: Tensor) -> Tensor:
