@@ -1,9 +1,11 @@
-"""Which device a process computes on."""
+"""Which device a process computes on, and the number of threads."""
+
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
 
-from threestudio_gaussiandreamer.core.devices import get_device
+from threestudio_gaussiandreamer.core.devices import get_device, one_thread
 
 
 def test_without_a_gpu_it_is_the_cpu(monkeypatch):
@@ -22,3 +24,15 @@ def test_each_process_of_a_machine_has_its_own_gpu(monkeypatch, ranks, index):
     for name, value in ranks.items():
         monkeypatch.setenv(name, value)
     assert get_device() == torch.device("cuda", index)
+
+
+def test_one_thread_holds_for_new_threads_until_the_end():
+    threads = torch.get_num_threads()
+    torch.set_num_threads(3)
+    try:
+        with pytest.raises(ValueError), one_thread(), ThreadPoolExecutor(1) as pool:
+            assert [torch.get_num_threads(), pool.submit(torch.get_num_threads).result()] == [1, 1]
+            raise ValueError
+        assert torch.get_num_threads() == 3
+    finally:
+        torch.set_num_threads(threads)

@@ -3,17 +3,16 @@
 import ctypes
 import functools
 import re
-from collections.abc import Callable
-from typing import NamedTuple
 
 import pytest
 import torch
 
+from tests.helpers.broken_kernels import DEFAULT, FAULTS, BrokenDevice, Fault, other_constants
 from tests.helpers.cuda_shim.device import HostDevice, library, unavailable
 from tests.helpers.splatting_scenes import cameras, random_cloud
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.splatting import backends, rasterize
-from threestudio_gaussiandreamer.splatting.cuda import driver, nvrtc, proof, stages
+from threestudio_gaussiandreamer.splatting.cuda import driver, nvrtc, proof
 from threestudio_gaussiandreamer.training.renderer import check_backend
 
 pytestmark = pytest.mark.skipif(unavailable() is not None, reason=str(unavailable()))
@@ -21,89 +20,6 @@ CPU = torch.device("cpu")
 
 
 needs_nvrtc = pytest.mark.skipif(nvrtc.unavailable() is not None, reason=str(nvrtc.unavailable()))
-DEFAULT, HALVED, ABSOLUTE = proof.OPTIONS
-
-
-def nothing(*_) -> None:
-    """Change nothing."""
-
-
-def other_constants(*arguments, eps2d: float = 0.4) -> None:
-    """Change what the kernel alone is given."""
-    settings = settings_of(arguments)
-    settings.eps2d, settings.alpha_max = eps2d, 0.5
-
-
-def settings_of(arguments) -> stages.Settings:
-    (settings,) = (x for x in arguments if isinstance(x, stages.Settings))
-    return settings
-
-
-def no_antialiasing(*arguments) -> None:
-    settings_of(arguments).antialias = 0
-
-
-def other_constants_if_halved(*arguments) -> None:
-    if settings_of(arguments).downsample == 2:
-        other_constants(*arguments)
-
-
-def alpha_for_depth_if_halved(scene, settings, lists, images, contribution) -> None:
-    if settings.downsample == 2:
-        images.alpha, images.depth = images.depth, images.alpha
-
-
-class Fault(NamedTuple):
-    """One kernel that is given other arguments, or whose last tensor is changed after it ran."""
-
-    kernel: str
-    before: Callable[..., None] = nothing
-    after: Callable[[torch.Tensor], object] = nothing
-    draws: tuple[str, ...] = (DEFAULT, HALVED, ABSOLUTE)
-    """Which of the comparison's draws show it."""
-
-
-FAULTS = {
-    "project": Fault("project", other_constants),
-    "count_tiles": Fault("count_tiles", after=lambda counts: counts.clamp_(max=1)),
-    "list_tiles": Fault("list_tiles", after=lambda owners: owners.zero_()),
-    "find_tiles": Fault("find_tiles", after=lambda begins: begins[1].copy_(begins[0])),
-    "blend": Fault("blend", other_constants),
-    "blend_backward": Fault("blend_backward", other_constants, draws=(DEFAULT, HALVED)),
-    "blend_backward_absolute": Fault("blend_backward_absolute", other_constants, draws=(ABSOLUTE,)),
-    "sum_rows": Fault("sum_rows", after=lambda sums: sums.mul_(1.01)),
-    "project_backward": Fault("project_backward", other_constants),
-    "sum_cameras": Fault("sum_cameras", after=lambda viewmats: viewmats.mul_(1.01)),
-    "project, antialias": Fault("project", no_antialiasing, draws=(HALVED, ABSOLUTE)),
-    "project_backward, antialias": Fault(
-        "project_backward", no_antialiasing, draws=(HALVED, ABSOLUTE)
-    ),
-    "blend, downsample": Fault("blend", alpha_for_depth_if_halved, draws=(HALVED, ABSOLUTE)),
-    "blend_backward, downsample": Fault(
-        "blend_backward", other_constants_if_halved, draws=(HALVED,)
-    ),
-    "sums of absolute values": Fault(  # the last two columns
-        "blend_backward_absolute", after=lambda rows: rows[:, -2:].mul_(2), draws=(ABSOLUTE,)
-    ),
-}
-
-
-class BrokenDevice(HostDevice):
-    """Has a fault, or raises ``error`` instead."""
-
-    def __init__(self, fault: Fault, error: Exception | None = None) -> None:
-        super().__init__()
-        self.fault, self.error = fault, error
-
-    def launch(self, name: str, grid: tuple[int, int], threads: int, *arguments) -> None:
-        if name != self.fault.kernel:
-            super().launch(name, grid, threads, *arguments)
-            return
-        if self.error is not None:
-            raise self.error
-        self.fault.before(*arguments)
-        super().launch(name, grid, threads, *arguments)
-        self.fault.after(arguments[-1])
 
 
 class CompilingDevice(HostDevice):
@@ -370,23 +286,6 @@ def test_all_sorts_are_of_more_than_torch_sorts_by_another_kernel(use, monkeypat
     monkeypatch.setattr(torch.Tensor, "sort", noted)
     proof.drawn_on(CPU)
     assert len(lengths) == 2 * len(proof.OPTIONS) and min(lengths) > 4096
-
-
-def test_the_number_of_threads_is_as_before(use, monkeypatch):
-    seen, draw, threads = [], proof.torch_backend.rasterize, torch.get_num_threads()
-
-    def noted(*arguments):
-        seen.append(torch.get_num_threads())
-        return draw(*arguments)
-
-    monkeypatch.setattr(proof.torch_backend, "rasterize", noted)
-    use(HostDevice())
-    try:
-        torch.set_num_threads(3)
-        picture()
-        assert seen == [1, 1] and torch.get_num_threads() == 3
-    finally:
-        torch.set_num_threads(threads)
 
 
 @pytest.mark.parametrize("warns", [False, True])

@@ -15,8 +15,7 @@ there: first where the whole body is and looks, then the pose under a strong pri
 final one."""
 
 import math
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -25,6 +24,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from ..core.devices import one_thread
 from ..core.errors import UserError
 from ..core.files import existing_file
 from ..formats.array_files import read_arrays
@@ -147,7 +147,7 @@ def fit_bodies(
     pose[:, 0], translation = _placed(model, wanted)
     shape = torch.zeros(frames, model.shape_directions.shape[-1], dtype=torch.float64)
     moved = [pose, translation, *([shape] if fit_shape else [])]
-    with _one_thread():
+    with one_thread():
         for weight, share in STAGES:
             _minimise(
                 moved,
@@ -255,19 +255,6 @@ def _placed(
     root = (model.joint_regressor @ model.template)[0]  # the body turns about its first joint
     translation = there.mean(1) - torch.einsum("fcd,d->fc", rotation, rest.mean(0) - root) - root
     return _tensor(Rotation.from_matrix(rotation.numpy()).as_rotvec()), translation
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Limit torch to one thread in this context. The fit consists of thousands of tiny operations,
-    which thread synchronisation makes a hundred times slower on a busy machine.
-    """
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
 
 
 def _minimise(moved: list[Tensor], loss: Callable[[], Tensor], iterations: int) -> None:

@@ -19,6 +19,7 @@ from typing import Optional
 import torch
 from torch import Tensor
 
+from ...core.devices import one_thread
 from ...core.errors import UserError
 from .. import torch_backend
 from ..options import RasterizeOptions
@@ -116,7 +117,7 @@ def compare(device: torch.device) -> str:
         OSError, AttributeError: a library can't be loaded, or lacks a function.
     """
     _require_torch(device)
-    with _default_algorithms(), _one_thread(), ThreadPoolExecutor(1) as pool:
+    with _default_algorithms(), one_thread(), ThreadPoolExecutor(1) as pool:
         expected = pool.submit(reference)
         try:
             found = drawn_on(device)
@@ -158,19 +159,6 @@ def _default_algorithms() -> Iterator[None]:
         yield
     finally:
         torch.use_deterministic_algorithms(True, warn_only=warns)
-
-
-@contextlib.contextmanager
-def _one_thread() -> Iterator[None]:
-    """Let torch compute on one thread: two that start a pool of threads each wait for one another
-    longer than the comparison takes.
-    """
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
 
 
 def _require_torch(device: torch.device) -> None:
