@@ -193,12 +193,27 @@ def surface_points(
         aspect: width of a pixel over its height.
     """
     height, width = depth.shape[1:]
+    plane = _image_plane(height, width, depth.device).type_as(depth)
     focal = focal_length(fovy, height)[:, None]
-    right = (torch.arange(width, device=depth.device) + 0.5 - width / 2) * aspect / focal
-    up = (height / 2 - 0.5 - torch.arange(height, device=depth.device)) / focal
-    x, y, z, position = c2w[:, :3, :, None].unbind(2)
-    rays = (x * right[:, None] - z)[:, :, None] + (y * up[:, None])[..., None]
-    return rays.mul_(depth[:, None]).add_(position[..., None])
+    pixels = torch.addcmul(
+        _constant(((0.0, 0.0, 1.0),), focal.dtype, focal.device),
+        focal,
+        _constant(((1 / aspect, 1.0, 0.0),), focal.dtype, focal.device),
+    )
+    rays = (c2w[:, :3, :3] / pixels[:, None]) @ plane
+    points = rays.mul_(depth.flatten(1)[:, None]).add_(c2w[:, :3, 3:])
+    return points.unflatten(2, (height, width))
+
+
+@functools.lru_cache(maxsize=8)
+def _image_plane(height: int, width: int, device: torch.device) -> Float[Tensor, "3 hw"]:
+    """Return the rays through the pixel centres of an OpenGL camera of focal length 1, with -1
+    along the optical axis.
+    """
+    with torch.inference_mode(False):  # else it couldn't serve training later
+        rows, columns = (torch.arange(n, device=device) + 0.5 - n / 2 for n in (height, width))
+        y, x = torch.meshgrid(-rows, columns, indexing="ij")
+        return torch.stack([x, y, -torch.ones_like(x)]).flatten(1)
 
 
 def projection(

@@ -38,7 +38,7 @@ def ball(azimuths, size, distance=3.0):
 
 
 def table(seed=0, channels=4):
-    return torch.randn(TABLE, channels, generator=torch.Generator().manual_seed(seed))
+    return torch.randn(channels, TABLE, generator=torch.Generator().manual_seed(seed))
 
 
 def noise_of(size, table, view, draws=None):
@@ -135,7 +135,7 @@ def test_a_pixel_is_the_sum_of_its_cells_in_all_lattices():
     size = cell_size(c2w, fovy, 32)
     rows = surface_cells(depth[..., 0], c2w, fovy, size)
     values = table()
-    expected = sum(values[row.long()] for row in rows).movedim(-1, 1) / LATTICES**0.5
+    expected = sum(values[:, row.long()] for row in rows).transpose(0, 1) / LATTICES**0.5
     inside = opacity[:, None, :, :, 0] > 0
     found = noise_of(32, values, view)
     torch.testing.assert_close(found * inside, expected * inside)

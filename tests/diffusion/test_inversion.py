@@ -1,5 +1,7 @@
 """DDIM inversion."""
 
+import functools
+
 import torch
 
 from threestudio_gaussiandreamer.diffusion import sds
@@ -35,8 +37,27 @@ def test_fresh_noise_has_the_deviation_of_ddpms_reverse_step():
     x, t = torch.zeros(1, 20000, dtype=torch.float64), torch.tensor([400])
     drawn = torch.randn(1, 20000, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     z = invert(
-        lambda step: torch.zeros_like(step.z), x, t, ABAR, 400, eta=0.5, fresh=lambda step: drawn
+        lambda step: torch.zeros_like(step.z), x, t, ABAR, 400, eta=0.5, fresh=lambda index: drawn
     )
     now, later = ABAR[0], ABAR[400]
     deviation = 0.5 * ((1 - now) / (1 - later) * (1 - later / now)).sqrt()
     torch.testing.assert_close(z, deviation * drawn)
+
+
+def test_each_item_gets_its_own_fresh_noise_in_all_of_its_steps():
+    """Of three items, two end at the same timestep; the order of the batch is kept."""
+    x, t = torch.zeros(3, 1, dtype=torch.float64), torch.tensor([250, 30, 250])
+
+    def noise(index):
+        return 10.0**index * torch.tensor([[1.0], [2.0], [3.0]], dtype=torch.float64)
+
+    def still(step):
+        return torch.zeros_like(step.z)
+
+    together = invert(still, x, t, ABAR, 100, eta=1.0, fresh=noise)
+    for item in range(3):
+        own = [item]
+        drawn = functools.partial(lambda rows, index: noise(index)[rows], own)
+        alone = invert(still, x[own], t[own], ABAR, 100, eta=1.0, fresh=drawn)
+        torch.testing.assert_close(together[own], alone)
+    torch.testing.assert_close(together[2], 3 * together[0])

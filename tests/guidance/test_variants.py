@@ -190,14 +190,14 @@ def test_sdi_with_fresh_noise_follows_the_formulas_step_by_step():
         cond, uncond = both_scores(guidance, z, torch.tensor([t]))
         return cond + scale * (cond - uncond)
 
-    z, table = x, NoiseTable(0, 3)
+    z, table = x, NoiseTable(0, (1, 1, 3))
     times = [*range(0, int(t), 100), int(t)]
     for index, (now, later) in enumerate(zip(times, times[1:], strict=False)):
         eps = predicted(z, now, -7.5)
         original = (z - (1 - abars[now]) ** 0.5 * eps) / abars[now] ** 0.5
         z = abars[later] ** 0.5 * original + (1 - abars[later]) ** 0.5 * eps
         variance = (1 - abars[now]) / (1 - abars[later]) * (1 - abars[later] / abars[now])
-        drawn = table.draw((1, 1, 3), f"inversion {index}", 11, [0])[0]
+        drawn = table.draw("inversion", 11, 0, 1, part=index)[0]
         z = z + 0.3 * drawn.double() * variance**0.5
     denoised = (z - (1 - abars[t]) ** 0.5 * predicted(z, int(t), 7.5)) / abars[t] ** 0.5
     weight = ((1 - abars[t]) / abars[t]) ** 0.5

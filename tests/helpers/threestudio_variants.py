@@ -60,7 +60,7 @@ def compare_sdi(models, prediction, eta, perp_neg):
         guide.min_step = guide.max_step = 650
     x, noise = torch.randn(1, 4, 8, 8, requires_grad=True), torch.randn(1, 4, 8, 8)
     arguments = {"prompt_utils": Prompts(1, perp_neg), **tiny.first(1), "rgb_as_latents": True}
-    with mock.patch.object(NoiseTable, "draw", return_value=[noise[0]]):
+    with mock.patch.object(NoiseTable, "draw", return_value=noise):
         (own,) = grad(ours(x.movedim(1, -1), **arguments)["loss_sds"], x)
     with (
         mock.patch("random.random", return_value=0.0),  # no overshoot

@@ -91,7 +91,7 @@ def cell_size(
 
 def attached_noise(
     size: tuple[int, int],
-    table: Float[Tensor, "TABLE c"],
+    table: Float[Tensor, "c TABLE"],
     draws: Int[Tensor, " B"],
     depth: Float[Tensor, "B H W 1"],
     opacity: Float[Tensor, "B H W 1"],
@@ -114,8 +114,8 @@ def attached_noise(
     behind = background_cells(*size, depth.device) + draws[:, None, None]
     is_surface = _sampled(opacity, size) >= OPAQUE
     rows = torch.where(is_surface, cells, behind.bitwise_and_(TABLE - 1))
-    values = table.index_select(0, rows.flatten()).view(LATTICES, len(depth), -1, table.shape[1])
-    return values.sum(0).mT.contiguous().mul_(LATTICES**-0.5).unflatten(2, size)
+    values = table.index_select(1, rows.flatten()).view(-1, *rows.shape)
+    return values.sum(1).mul_(LATTICES**-0.5).transpose(0, 1).contiguous()
 
 
 def _sampled(images: Float[Tensor, "B H W 1"], size: tuple[int, int]) -> Float[Tensor, "B h w"]:

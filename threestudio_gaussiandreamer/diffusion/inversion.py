@@ -1,8 +1,9 @@
 """DDIM inversion: the deterministic trajectory from a clean latent towards noise."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import NamedTuple, Optional
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -22,17 +23,21 @@ class Step(NamedTuple):
 
 
 Predict = Callable[[Step], Float[Tensor, "R c h w"]]
-Fresh = Callable[[Step], Sequence[Float[Tensor, "c h w"]]]
+Fresh = Callable[[int], Float[Tensor, "B c h w"]]
 
 
-class Factors(NamedTuple):
-    """What each step multiplies for each item: z by ``ratio``, the predicted noise by ``slope``,
-    fresh noise by ``deviation``.
+class Plan(NamedTuple):
+    """The steps of a batch whose items are in the order of their last timesteps, so that the items
+    of a step are a slice.
     """
 
-    ratio: Float[Tensor, "K B 1 1 1"]
-    slope: Float[Tensor, "K B 1 1 1"]
-    deviation: list[list[float]]
+    order: Int[Tensor, " B"]
+    finished: list[int]
+    """The number of items that have ended before each step."""
+    steps: list[tuple[Tensor, ...]]
+    """The timestep before each step, (B,), and what it multiplies, (B, 1, 1, 1): z, the predicted
+    noise, and fresh noise.
+    """
 
 
 def invert(
@@ -54,41 +59,47 @@ def invert(
         stride: timesteps of one step; the last one ends at t.
         eta: standard deviation of the noise that a step adds, as a share of that of DDPM's reverse
             step (Song et al. 2021, eq. 16), as threestudio's SDI does.
-        fresh: returns the standard normal noise that a step adds to each of its items; needed if
+        fresh: returns the standard normal noise of all items in a step, given its index; needed if
             ``eta`` isn't 0.
     """
-    # in the order of their last timesteps, so that the items of a step are a slice
-    t, order = t.sort(stable=True)
-    starts = torch.arange(0, int(t[-1]), stride, device=t.device)
-    factors = _factors(starts, t, alphas_cumprod.to(x.device), stride, eta, x)
-    z, spare = x[order], torch.empty_like(x)
-    for index, first in enumerate((t <= starts[:, None]).sum(1).tolist()):
-        step = Step(index, order[first:], z[first:], starts[index].expand(len(t) - first))
-        moved = torch.mul(z[first:], factors.ratio[index, first:], out=spare[first:])
-        moved.addcmul_(factors.slope[index, first:], predict(step))
+    order, finished, steps = _plan(x, t, alphas_cumprod, stride, eta)
+    result, z, spare, left = torch.empty_like(x), x[order], torch.empty_like(x), 0
+    for index, (first, values) in enumerate(zip(finished, steps, strict=True)):
+        if first > left:
+            ended = first - left
+            result.index_copy_(0, order[:ended], z[:ended])
+            order, z, spare, left = order[ended:], z[ended:], spare[ended:], first
+        # a slice takes as long as the arithmetic, so nothing is sliced before an item has ended
+        now, ratio, slope, deviation = (v[first:] for v in values) if first else values
+        predicted = predict(Step(index, order, z, now))
+        torch.mul(z, ratio, out=spare).addcmul_(slope, predicted)
         if eta and fresh is not None:
-            for own, noise, by in zip(
-                moved, fresh(step), factors.deviation[index][first:], strict=True
-            ):
-                own.add_(noise, alpha=by)
-        if first:
-            spare[:first] = z[:first]
+            spare.addcmul_(deviation, fresh(index).index_select(0, order))
         z, spare = spare, z
-    return spare.index_copy_(0, order, z)
+    return result.index_copy_(0, order, z)
 
 
-def _factors(
-    starts: Int[Tensor, " K"],
+def _plan(
+    x: Float[Tensor, "B c h w"],
     t: Int[Tensor, " B"],
     alphas_cumprod: Float[Tensor, " T"],
     stride: int,
     eta: float,
-    like: Float[Tensor, "B c h w"],
-) -> Factors:
-    """Compute the factors of all steps at once."""
-    now = alphas_cumprod[starts][:, None]
-    later = alphas_cumprod[torch.minimum(starts[:, None] + stride, t)]
-    deviation = eta * ((1 - now) / (1 - later) * (1 - later / now)).clamp_min(0).sqrt()
-    shape = (*later.shape, *[1] * (like.dim() - 1))
-    ratio, slope = (factor.to(like).view(shape) for factor in sds.ddim_factors(now, later))
-    return Factors(ratio, slope, deviation.tolist())
+) -> Plan:
+    """Compute the factors of all steps at once, in NumPy, whose calls on so few numbers take a
+    third of the time of torch's.
+    """
+    ends, abar = t.cpu().numpy(), alphas_cumprod.cpu().numpy()
+    order = np.argsort(ends, kind="stable")
+    ends = ends[order]
+    starts = np.arange(0, ends[-1], stride)
+    now, later = abar[starts][:, None], abar[np.minimum(starts[:, None] + stride, ends)]
+    variance = (1 - now) / (1 - later) * (1 - later / now)
+    factors = np.stack((*sds.ddim_factors(now, later), eta * np.maximum(variance, 0) ** 0.5))
+    factors = torch.from_numpy(factors).to(x).view(*factors.shape, *[1] * (x.dim() - 1))
+    times = torch.from_numpy(starts).to(t.device)[:, None].expand(-1, len(t))
+    return Plan(
+        torch.from_numpy(order).to(t.device),
+        np.searchsorted(ends, starts, side="right").tolist(),
+        [*zip(*(values.unbind(0) for values in (times, *factors)), strict=True)],
+    )

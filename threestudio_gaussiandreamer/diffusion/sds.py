@@ -164,9 +164,9 @@ def ddim_step(
 def ddim_factors(
     abar: Float[Tensor, "*b"], abar_next: Float[Tensor, "*b"]
 ) -> tuple[Float[Tensor, "*b"], Float[Tensor, "*b"]]:
-    """Return what :func:`ddim_step` multiplies z and the noise by."""
-    ratio = (abar_next / abar).sqrt()
-    return ratio, (1 - abar_next).sqrt() - ratio * (1 - abar).sqrt()
+    """Return what :func:`ddim_step` multiplies z and the noise by; arrays give arrays."""
+    ratio = (abar_next / abar) ** 0.5
+    return ratio, (1 - abar_next) ** 0.5 - ratio * (1 - abar) ** 0.5
 
 
 def ddim_sample(

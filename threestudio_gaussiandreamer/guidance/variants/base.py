@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ...core.errors import UserError
-from ...core.options import check_options, require_defaults
+from ...core.options import checked_options, require_defaults
 from ...host import BaseObject
 
 if TYPE_CHECKING:
@@ -46,6 +46,8 @@ class Variant(BaseObject, ABC):
         pass
 
     cfg: Config
+    options: Any
+    """Of ``cfg``, as plain attributes."""
 
     NEEDS_UNCONDITIONAL: ClassVar[bool] = False
     """Whether the unconditional score is needed even if ``guidance_scale`` is 1."""
@@ -63,7 +65,7 @@ class Variant(BaseObject, ABC):
     """Outputs of the renderer that :meth:`error` reads from the batch, such as ``depth``."""
 
     def configure(self) -> None:
-        check_options(self.Config, self.cfg, "system.guidance.variant.")
+        self.options = checked_options(self.Config, self.cfg, "system.guidance.variant.")
 
     @classmethod
     def preflight(cls, guidance: type["ScoreDistillation"], cfg: Any) -> None:

@@ -62,12 +62,12 @@ class CFD(Variant):
         noised = guidance.noised(latents, noise)
         return guidance.predict_noise(noised.z, noised.t, condition) - noise, noised.abar
 
-    def table(self, step: int, latents: Float[Tensor, "B c h w"]) -> Float[Tensor, "TABLE c"]:
+    def table(self, step: int, latents: Float[Tensor, "B c h w"]) -> Float[Tensor, "c TABLE"]:
         """Return the values of the cells, the same in all processes of a run."""
-        epoch = step // self.cfg.refresh if self.cfg.refresh else 0
+        epoch = step // self.options.refresh if self.options.refresh else 0
         if self._table is None or self._table[0] != epoch:
             generator = streams.generator(run_seed(), "surface noise", epoch)
-            values = torch.randn(TABLE, latents.shape[1], generator=generator)
+            values = torch.randn(latents.shape[1], TABLE, generator=generator)
             self._table = epoch, values.to(latents.device)
         return self._table[1]
 

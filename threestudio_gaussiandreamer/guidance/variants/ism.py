@@ -46,8 +46,8 @@ class ISM(Variant):
         self, guidance: Any, latents: Float[Tensor, "B c h w"], condition: Any, batch: Batch
     ) -> Error:
         t, abar = guidance.draw_timesteps(latents)
-        interval = self._timesteps(guidance, self.cfg.interval)
-        stride = self._timesteps(guidance, self.cfg.stride)
+        interval = self._timesteps(guidance, self.options.interval)
+        stride = self._timesteps(guidance, self.options.stride)
         s = (t - interval).clamp_min(0)
 
         def predict(step: Step) -> Tensor:

@@ -57,25 +57,25 @@ class SDI(Variant):
     ) -> Error:
         t, abar = guidance.draw_timesteps(latents)
         # rounded up, since each step costs predictions and the option limits their number
-        stride = -(-len(guidance.alphas_cumprod) // self.cfg.inversion_steps)
-        scale, eta = self.cfg.inversion_scale, self.cfg.eta
+        stride = -(-len(guidance.alphas_cumprod) // self.options.inversion_steps)
+        scale, eta = self.options.inversion_scale, self.options.eta
+        table, count = self._table_for(latents), len(latents)
+        first = first_item(count)
 
         def predict(step: Step) -> Tensor:
             chosen = guidance.select(condition, step.rows)
             return guidance.guided_noise(step.z, step.t, chosen, scale)
 
-        def fresh(step: Step) -> list[Tensor]:
-            return self._fresh(guidance.step, latents, step)
+        def fresh(index: int) -> Tensor:
+            return table.draw("inversion", guidance.step, first, count, part=index)
 
         z = invert(predict, latents, t, guidance.alphas_cumprod, stride, eta=eta, fresh=fresh)
         noise = z.addcmul(sds.per_item(-abar.sqrt(), z), latents)
         noise.div_(sds.per_item((1 - abar).sqrt(), z))
         return guidance.predict_noise(z, t, condition) - noise, abar
 
-    def _fresh(self, now: int, latents: Float[Tensor, "B c h w"], step: Step) -> list[Tensor]:
-        """Draw the noise of one step of the inversion."""
-        shape, first = latents.shape[1:], first_item(len(latents))
-        if self._table is None or self._table.numel < shape.numel():
-            self._table = NoiseTable(run_seed(), shape.numel(), latents.device)
-        items = [first + row for row in step.rows.tolist()]
-        return self._table.draw(shape, f"inversion {step.index}", now, items)
+    def _table_for(self, latents: Float[Tensor, "B c h w"]) -> NoiseTable:
+        """Return the table of the noise that the inversion adds to items of this shape."""
+        if self._table is None or self._table.shape != latents.shape[1:]:
+            self._table = NoiseTable(run_seed(), latents.shape[1:], latents.device)
+        return self._table
