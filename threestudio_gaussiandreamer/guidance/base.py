@@ -226,25 +226,26 @@ class ScoreDistillation(ScoreModel):
                 if fresh:
                     self.variant.learn(self, latents.detach(), condition, batch, ~bad)
             loss = masked_loss(images, latents, grad, bad)
-            out = self._result(loss, grad.flatten(1).norm(dim=1), bad)
+            norms = torch.linalg.vector_norm(grad.flatten(1), dim=1)
+            out = self._result(loss, norms, bad.sum().float())
             if guidance_eval:
                 out["eval"] = score_pictures(self, self.add_noise(latents), prompt_utils, batch)
         return out
 
     def _result(
-        self, loss: Float[Tensor, ""], norms: Float[Tensor, " B"], bad: Bool[Tensor, " B"]
+        self, loss: Float[Tensor, ""], norms: Float[Tensor, " B"], bad_items: Float[Tensor, ""]
     ) -> dict[str, Any]:
-        """Return the loss and what is logged, from the norm of the gradient of each item and which
-        items are bad.
+        """Return the loss and what is logged, from the norm of the gradient of each item and the
+        number of bad items.
         """
         out = {
             "loss_sds": loss,
-            "grad_norm": norms.norm(),
+            "grad_norm": torch.linalg.vector_norm(norms),
             "min_step": self.min_step,
             "max_step": self.max_step,
         }
-        out |= {f"grad_norm_{i}": norm for i, norm in enumerate(norms)}
-        out |= {"bad_items": bad.sum().float(), "evaluations": float(self.evaluations)}
+        out |= {f"grad_norm_{i}": norm for i, norm in enumerate(norms.unbind(0))}
+        out |= {"bad_items": bad_items, "evaluations": float(self.evaluations)}
         return out | self.report() | self.variant.report()
 
     def _error(

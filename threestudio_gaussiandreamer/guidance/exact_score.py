@@ -155,11 +155,10 @@ class ExactScoreGuidance(ScoreDistillation):
         if found is None:
             return super().__call__(rgb, prompt_utils, **options)
         gradient, squares, error = found
-        self.evaluations, self._perplexity = 0, 1.0
-        bad = torch.zeros(len(rgb), dtype=torch.bool)
-        self._count_bad(bad)
+        self.evaluations, self._perplexity, self.bad_steps = 0, 1.0, 0
         loss = given_gradient(rgb, gradient, 0.5 * squares.sum().float() / max(len(rgb), 1))
-        return self._result(loss, squares.sqrt().float(), bad) | {"error_to_truth": error}
+        result = self._result(loss, squares.sqrt().float(), torch.zeros(()))
+        return result | {"error_to_truth": error}
 
     @torch.no_grad()
     def _in_one_pass(

@@ -104,17 +104,23 @@ def own_randomness(step: int) -> Iterator[None]:
 
     A resumed run thus draws the same values as an uninterrupted one, and rendering validation
     pictures doesn't change the values that training draws."""
-    devices = [torch.cuda.current_device()] if torch.cuda.is_available() else []
+    generators = [torch.default_generator]
+    if torch.cuda.is_available():
+        torch.cuda.init()
+        generators.append(torch.cuda.default_generators[torch.cuda.current_device()])
+    # torch.random.fork_rng takes several times longer, and torch.manual_seed a millisecond, in
+    # which it records a stack trace for each kind of device that is missing
+    states = [generator.get_state() for generator in generators]
     seed = derive_seed(item_seed(), "guidance", step)
-    with torch.random.fork_rng(devices):
-        # torch.manual_seed records a stack trace for each kind of device that is missing: a
-        # millisecond each step
-        torch.default_generator.manual_seed(seed)
-        if devices:
-            torch.cuda.manual_seed(seed)
-        elif torch.backends.mps.is_available():
-            torch.mps.manual_seed(seed)
+    for generator in generators:
+        generator.manual_seed(seed)
+    if torch.backends.mps.is_available():
+        torch.mps.manual_seed(seed)
+    try:
         yield
+    finally:
+        for generator, state in zip(generators, states, strict=True):
+            generator.set_state(state)
 
 
 # Parameters that a guidance trains itself, such as the LoRA of VSD

@@ -169,8 +169,10 @@ class NoProfiler(pl.profilers.PassThroughProfiler):
     there are dozens in a step.
     """
 
+    _nothing = contextlib.nullcontext()
+
     def profile(self, action_name: str) -> contextlib.AbstractContextManager:
-        return contextlib.nullcontext()
+        return self._nothing
 
 
 class LastNumbers(pl.callbacks.Callback):

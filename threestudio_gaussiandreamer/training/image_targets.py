@@ -122,7 +122,8 @@ class ImageTargets(nn.Module):
             background: if it is random, its colour stays that of the stage's first step.
         """
         if not self.is_active(step):
-            self.pictures = None
+            if self.pictures is not None:
+                self.pictures = None
             return batch
         if isinstance(background, FlatBackground):
             background.hold(self.cfg.start)

@@ -61,7 +61,7 @@ from .held_out import EvaluationConfig, HeldOut, Measurements
 from .image_targets import ImageTargets, ImageTargetsConfig, check_image_targets
 from .loss_scale import LossScale
 from .losses import check_losses, loggable, logged_names, total, weight_schedules, weighted_losses
-from .optimizer import PartRates, check_optimizer, make_optimizer, restore_arguments
+from .optimizer import PartRates, check_optimizer, drop_gradients, make_optimizer, restore_arguments
 from .pages import discard_turntable, save_first_cloud, turntable_name, write_turntable
 from .pictures import rgb_panel, save_pictures
 from .preflight import check_parts, preflight_parts
@@ -250,7 +250,7 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
             self.step_log.write(self.trainer, self.loss_scale.numbers)
         if self.global_step % CHECK_EVERY == 0:
             self.require_finite()
-        optimizer.zero_grad(set_to_none=True)
+        drop_gradients(optimizer)
         self.control_density(optimizer, batch)
         self.report(out, batch, guided, losses)
 

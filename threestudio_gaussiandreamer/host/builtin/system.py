@@ -2,6 +2,7 @@
 ...), update them at every step, and export the result.
 """
 
+import inspect
 from dataclasses import dataclass, field
 from typing import Any, List, Optional
 
@@ -43,6 +44,11 @@ class BaseSystem(pl.LightningModule, Updateable, SaverMixin):
         cleanup_after_test_step: bool = False
 
     cfg: Config
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        if "training_step" in vars(cls):  # Lightning asks for its signature in each step
+            cls.training_step.__signature__ = inspect.signature(cls.training_step)
 
     def __init__(self, cfg: Any, resumed: bool = False) -> None:
         super().__init__()
@@ -95,6 +101,12 @@ class BaseSystem(pl.LightningModule, Updateable, SaverMixin):
         """Return the value of a schedule at the current epoch and step."""
         return C(value, self.true_current_epoch, self.true_global_step)
 
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name == "_current_fx_name":  # Lightning sets it before and after each of its hooks
+            self.__dict__[name] = value
+        else:
+            super().__setattr__(name, value)
+
     def configure_optimizers(self) -> Any:
         """Build the optimiser of the option ``optimizer``; see :func:`optimizer_from`."""
         return optimizer_from(self.cfg.optimizer, self)
@@ -134,26 +146,22 @@ class BaseSystem(pl.LightningModule, Updateable, SaverMixin):
         self._before_batch(batch, "predict", self.trainer.predict_dataloaders)
 
     def on_train_batch_end(self, outputs: Any, batch: dict, batch_idx: int) -> None:
-        self._after_batch(self.trainer.train_dataloader)
+        self._after_batch()
 
     def on_validation_batch_end(
         self, outputs: Any, batch: dict, batch_idx: int, dataloader_idx: int = 0
     ) -> None:
-        self._after_batch(
-            self.trainer.val_dataloaders, cleanup=self.cfg.cleanup_after_validation_step
-        )
+        self._after_batch(cleanup=self.cfg.cleanup_after_validation_step)
 
     def on_test_batch_end(
         self, outputs: Any, batch: dict, batch_idx: int, dataloader_idx: int = 0
     ) -> None:
-        self._after_batch(self.trainer.test_dataloaders, cleanup=self.cfg.cleanup_after_test_step)
+        self._after_batch(cleanup=self.cfg.cleanup_after_test_step)
 
     def on_predict_batch_end(
         self, outputs: Any, batch: dict, batch_idx: int, dataloader_idx: int = 0
     ) -> None:
-        self._after_batch(
-            self.trainer.predict_dataloaders, cleanup=self.cfg.cleanup_after_test_step
-        )
+        self._after_batch(cleanup=self.cfg.cleanup_after_test_step)
 
     def _before_batch(self, batch: dict, stage: str, loader: Any) -> None:
         self.preprocess_data(batch, stage)
@@ -161,8 +169,7 @@ class BaseSystem(pl.LightningModule, Updateable, SaverMixin):
         update_if_possible(self.dataset, self.true_current_epoch, self.true_global_step)
         self.do_update_step(self.true_current_epoch, self.true_global_step)
 
-    def _after_batch(self, loader: Any, cleanup: bool = False) -> None:
-        self.dataset = loader.dataset
+    def _after_batch(self, cleanup: bool = False) -> None:
         update_end_if_possible(self.dataset, self.true_current_epoch, self.true_global_step)
         self.do_update_step_end(self.true_current_epoch, self.true_global_step)
         if cleanup and torch.cuda.is_available():
