@@ -5,7 +5,7 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 import torch
 
-from threestudio_gaussiandreamer.core.devices import get_device, one_thread
+from threestudio_gaussiandreamer.core.devices import get_device, one_thread, without_autocast
 
 
 def test_without_a_gpu_it_is_the_cpu(monkeypatch):
@@ -36,3 +36,11 @@ def test_one_thread_holds_for_new_threads_until_the_end():
         assert torch.get_num_threads() == 3
     finally:
         torch.set_num_threads(threads)
+
+
+@pytest.mark.parametrize("enabled", [True, False])
+def test_without_autocast_it_is_off_and_afterwards_as_before(enabled):
+    with torch.autocast("cpu", torch.bfloat16, enabled=enabled):
+        with without_autocast("cpu"):
+            assert not torch.is_autocast_enabled("cpu")
+        assert torch.is_autocast_enabled("cpu") == enabled

@@ -49,6 +49,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from ..core.devices import without_autocast
 from ..core.errors import UserError, unknown
 from ..core.host_copies import DelayedReads
 from ..core.methods import require_method
@@ -214,7 +215,7 @@ class ScoreDistillation(ScoreModel):
                 later step, also in its backward pass.
         """
         self.evaluations = 0
-        with torch.autocast(rgb.device.type, enabled=False):
+        with without_autocast(rgb.device.type):
             images = rgb.float().movedim(-1, 1).contiguous()
             latents = (images if rgb_as_latents else self.encode(images, **batch)).float()
             with torch.no_grad():

@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ..core.devices import without_autocast
 from ..diffusion import sds
 
 if TYPE_CHECKING:
@@ -35,7 +36,7 @@ def image_to_image(
             it has no unconditional prediction then, unless the network takes the scale.
         batch: the cameras, and what else ``encode`` and ``condition`` need.
     """
-    with torch.autocast(rgb.device.type, enabled=False):
+    with without_autocast(rgb.device.type):
         latents = guidance.encode(rgb.float().movedim(-1, 1).contiguous(), **batch).float()
         condition = guidance.condition(prompt_utils, **batch)
         start = round(strength * (len(guidance.alphas_cumprod) - 1))

@@ -2,10 +2,10 @@
 
 from typing import Optional
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ..core.devices import without_autocast
 from .backends import choose_backend
 from .options import RasterizeOptions
 from .output import Rasterized
@@ -79,6 +79,6 @@ def rasterize(
     )
     tensors = named(means, quats, scales, opacities, colors, viewmats, Ks, background)
     check(tensors, width, height, options, non_finite)
-    with torch.autocast(means.device.type, enabled=False):
+    with without_autocast(means.device.type):
         scene = as_scene(tensors, width, height)
         return choose_backend(backend, scene.means).load().rasterize(scene, options)

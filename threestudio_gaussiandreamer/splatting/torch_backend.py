@@ -20,6 +20,7 @@ from torch.autograd.function import once_differentiable
 from torch.nn.functional import pad
 from torch.utils.checkpoint import checkpoint
 
+from ..core.devices import without_autocast
 from .options import RasterizeOptions
 from .output import Rasterized, compose, track_means2d
 from .projection import Splats, project
@@ -133,7 +134,7 @@ class _Blend(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx, grad, _):
-        with torch.autocast(grad.device.type, enabled=False):
+        with without_autocast(grad.device.type):
             columns, absolute = _backward(
                 ctx.table, *ctx.saved_tensors, grad, ctx.absgrad is not None, ctx.options
             )

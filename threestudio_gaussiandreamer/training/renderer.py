@@ -25,7 +25,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from .. import cameras
-from ..core.devices import get_device
+from ..core.devices import get_device, without_autocast
 from ..core.errors import UserError, unknown
 from ..core.lazy_mapping import LazyMapping
 from ..core.options import at_least, checked_options, in_range, one_of, positive, rule
@@ -96,7 +96,7 @@ class SplattingRenderer(Rasterizer):
             first read.
         """
         device = self.geometry.means.device
-        with torch.autocast(device.type, enabled=False):
+        with without_autocast(device.type):
             return self._render(
                 c2w.to(device, torch.float32), fovy.to(device, torch.float32), height, width, batch
             )
@@ -184,7 +184,7 @@ def postponed(compute: Callable[[], Tensor], device: str) -> Callable[[], Tensor
     records = torch.is_grad_enabled()
 
     def computed() -> Tensor:
-        with torch.set_grad_enabled(records), torch.autocast(device, enabled=False):
+        with torch.set_grad_enabled(records), without_autocast(device):
             return compute()
 
     return computed
