@@ -27,24 +27,27 @@ def test_f19_a_negative_loss_is_back_propagated(fault):
     """A whole training step on a loss of -p^2, with all other parts stubbed."""
 
     def ours(parameter):
-        kept = MagicMock(param_groups=[{"params": [parameter]}])  # its zero_grad clears nothing
+        optimizer, taken = MagicMock(param_groups=[{"params": [parameter]}]), []
+        optimizer.step.side_effect = lambda: taken.append(parameter.grad)
         system = MagicMock(global_step=1, return_value={"rasterized": None, "opacity": None})
-        system.optimizers.return_value = kept
+        system.optimizers.return_value = optimizer
         system.losses.return_value = {"x": -(parameter**2).sum()}
         system.manual_backward.side_effect = lambda loss: loss.backward()
         system.loss_scale.value.return_value = 1.0
         system.loss_scale.has_skipped.return_value = False
         GaussianDreamerSystem.training_step(system, {"width": 1, "height": 1}, 0)
+        return taken[0]
 
     def if_positive(parameter):
         loss = -(parameter**2).sum()
         if loss > 0:
             loss.backward()
+        return parameter.grad
 
     def deviation(step):
         parameter = torch.tensor([2.0, 3.0], requires_grad=True)
-        step(parameter)
-        gradient = torch.zeros(2) if parameter.grad is None else parameter.grad
+        gradient = step(parameter)
+        gradient = torch.zeros(2) if gradient is None else gradient
         return (gradient + 2 * parameter.detach()).abs().max()
 
     fault(deviation, ours=ours, emulation=if_positive)
