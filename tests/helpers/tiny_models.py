@@ -29,7 +29,7 @@ CORPUS = (
 
 def nothing_cached(monkeypatch, folder: Path) -> None:
     """Hide the models in the hub's cache of this machine."""
-    import huggingface_hub
+    import huggingface_hub.constants
 
     monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_CACHE", str(folder / "empty"))
 
