@@ -273,6 +273,14 @@ def test_an_error_of_earlier_work_or_of_torch_is_no_verdict(use, tmp_path, monke
     assert "blend" in device.launched
 
 
+def test_the_scene_is_the_same_whatever_the_default_device_is():
+    expected = proof._scene(CPU, torch.float32, proof.CULLED)
+    assert len(expected.means) == proof.GAUSSIANS + proof.CULLED
+    with torch.device("meta"):
+        scene = proof._scene(CPU, torch.float32, proof.CULLED)
+    assert all(torch.equal(a, b) for a, b in zip(scene.tensors, expected.tensors, strict=True))
+
+
 def test_a_gradient_of_a_culled_gaussian_is_a_difference(use):
     use(HostDevice())
     found = proof.drawn_on(CPU)

@@ -259,7 +259,7 @@ def _scene(device: torch.device, dtype: torch.dtype, culled: int) -> Scene:
     scales, opacities = uniform(0.01, 0.2, GAUSSIANS, 3), uniform(0.05, 0.99, GAUSSIANS)
     scales[0], opacities[0] = 1.0, 0.3
     colors, background = uniform(0, 1, GAUSSIANS, 3), uniform(0, 1, len(ANGLES), 3)
-    numbers = torch.arange(GAUSSIANS + culled) % GAUSSIANS
+    numbers = torch.arange(GAUSSIANS + culled, device="cpu") % GAUSSIANS
     cloud = [x[numbers] for x in (means, quats, scales, opacities, colors)]
     cloud[0][GAUSSIANS:, 2] -= 20
     *attributes, colors, background = (x.to(device, dtype) for x in (*cloud, background))
