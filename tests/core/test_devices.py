@@ -5,7 +5,7 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 import torch
 
-from threestudio_gaussiandreamer.core.devices import get_device, one_thread, without_autocast
+from threestudio_gaussiandreamer.core.devices import get_device, torch_threads, without_autocast
 
 
 def test_without_a_gpu_it_is_the_cpu(monkeypatch):
@@ -26,16 +26,12 @@ def test_each_process_of_a_machine_has_its_own_gpu(monkeypatch, ranks, index):
     assert get_device() == torch.device("cuda", index)
 
 
-def test_one_thread_holds_for_new_threads_until_the_end():
-    threads = torch.get_num_threads()
-    torch.set_num_threads(3)
-    try:
-        with pytest.raises(ValueError), one_thread(), ThreadPoolExecutor(1) as pool:
+def test_threads_hold_for_new_threads_until_the_end():
+    with torch_threads(3):
+        with pytest.raises(ValueError), torch_threads(1), ThreadPoolExecutor(1) as pool:
             assert [torch.get_num_threads(), pool.submit(torch.get_num_threads).result()] == [1, 1]
             raise ValueError
         assert torch.get_num_threads() == 3
-    finally:
-        torch.set_num_threads(threads)
 
 
 @pytest.mark.parametrize("enabled", [True, False])

@@ -24,8 +24,8 @@ from tests.helpers.splatting_scenes import (
     one_gaussian,
     random_cloud,
 )
-from tests.helpers.threads import torch_threads
 from threestudio_gaussiandreamer.core import memory
+from threestudio_gaussiandreamer.core.devices import torch_threads
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.splatting import rasterize
 from threestudio_gaussiandreamer.splatting.cpu import backend as cpu

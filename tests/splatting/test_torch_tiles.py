@@ -13,8 +13,8 @@ from tests.helpers.splatting_scenes import (
     run,
     scene_of,
 )
-from tests.helpers.threads import torch_threads
 from tests.splatting.torch_backend_cases import compare
+from threestudio_gaussiandreamer.core.devices import torch_threads
 from threestudio_gaussiandreamer.splatting import rasterize, tiles, torch_backend
 from threestudio_gaussiandreamer.splatting.options import RasterizeOptions
 from threestudio_gaussiandreamer.splatting.projection import project

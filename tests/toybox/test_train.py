@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from tests.helpers.threads import torch_threads
 from threestudio_gaussiandreamer.core.checkpoint_file import load_file
+from threestudio_gaussiandreamer.core.devices import torch_threads
 from threestudio_gaussiandreamer.toybox import checkpoints, text_stage, train
 
 

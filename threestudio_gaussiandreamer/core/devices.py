@@ -17,12 +17,13 @@ def get_device() -> torch.device:
 
 
 @contextmanager
-def one_thread() -> Iterator[None]:
-    """Limit torch to one thread in this context, and in threads that are started in it. Thousands
-    of tiny operations take many times longer with more, whose pools wait for one another.
+def torch_threads(count: int) -> Iterator[None]:
+    """Let torch use ``count`` threads in this context, and in threads that are started in it.
+    Thousands of tiny operations take many times longer with more than one, whose pools wait for one
+    another.
     """
     threads = torch.get_num_threads()
-    torch.set_num_threads(1)
+    torch.set_num_threads(count)
     try:
         yield
     finally:

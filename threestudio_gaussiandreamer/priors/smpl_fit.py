@@ -24,7 +24,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from ..core.devices import one_thread
+from ..core.devices import torch_threads
 from ..core.errors import UserError
 from ..core.files import existing_file
 from ..formats.array_files import read_arrays
@@ -147,7 +147,7 @@ def fit_bodies(
     pose[:, 0], translation = _placed(model, wanted)
     shape = torch.zeros(frames, model.shape_directions.shape[-1], dtype=torch.float64)
     moved = [pose, translation, *([shape] if fit_shape else [])]
-    with one_thread():
+    with torch_threads(1):
         for weight, share in STAGES:
             _minimise(
                 moved,

@@ -19,7 +19,7 @@ from typing import Optional
 import torch
 from torch import Tensor
 
-from ...core.devices import one_thread
+from ...core.devices import torch_threads
 from ...core.errors import UserError
 from .. import torch_backend
 from ..options import RasterizeOptions
@@ -117,7 +117,7 @@ def compare(device: torch.device) -> str:
         OSError, AttributeError: a library can't be loaded, or lacks a function.
     """
     _require_torch(device)
-    with _default_algorithms(), one_thread(), ThreadPoolExecutor(1) as pool:
+    with _default_algorithms(), torch_threads(1), ThreadPoolExecutor(1) as pool:
         expected = pool.submit(reference)
         try:
             found = drawn_on(device)
