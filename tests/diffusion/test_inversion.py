@@ -1,6 +1,7 @@
 """DDIM inversion."""
 
 import functools
+import itertools
 
 import torch
 
@@ -61,3 +62,15 @@ def test_each_item_gets_its_own_fresh_noise_in_all_of_its_steps():
         alone = invert(still, x[own], t[own], ABAR, 100, eta=1.0, fresh=drawn)
         torch.testing.assert_close(together[own], alone)
     torch.testing.assert_close(together[2], 3 * together[0])
+
+
+def test_items_at_timestep_0_stay_even_if_the_model_returns_its_input():
+    """A prediction may be the latents themselves, whose memory the next step uses again."""
+    x, t = torch.tensor([[0.5], [2.0], [1.0]], dtype=torch.float64), torch.tensor([0, 150, 250])
+    z = invert(lambda step: step.z, x, t, ABAR, 100)
+    assert torch.equal(z[0], x[0])
+    for item, timesteps in ((1, (0, 100, 150)), (2, (0, 100, 200, 250))):
+        expected = x[item]
+        for now, later in itertools.pairwise(timesteps):
+            expected = sds.ddim_step(expected[None], expected[None], ABAR[[now]], ABAR[[later]])[0]
+        torch.testing.assert_close(z[item], expected)

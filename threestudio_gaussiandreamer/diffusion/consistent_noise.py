@@ -29,6 +29,8 @@ exclusive or, cells that are near each other never share a row.
 """
 OPAQUE = 0.5
 """Alpha below which a pixel belongs to the background."""
+EXPONENT = 0x7F800000
+"""Bits of the exponent of a float32: without the others, it is rounded down to a power of two."""
 
 
 def surface_cells(
@@ -83,10 +85,12 @@ def cell_size(
     """Return the size of each view's cells, world units.
 
     Args:
+        c2w: float32.
         height: of the latent, pixels.
     """
     footprint = c2w[:, :3, 3].norm(dim=1) / focal_length(fovy, height)
-    return torch.exp2(torch.floor(torch.log2(footprint.clamp_min(1e-6))))
+    bits = footprint.clamp_min_(1e-6).view(torch.int32)
+    return bits.bitwise_and_(EXPONENT).view(torch.float32)
 
 
 def attached_noise(
@@ -115,7 +119,9 @@ def attached_noise(
     is_surface = _sampled(opacity, size) >= OPAQUE
     rows = torch.where(is_surface, cells, behind.bitwise_and_(TABLE - 1))
     values = table.index_select(1, rows.flatten()).view(-1, *rows.shape)
-    return values.sum(1).mul_(LATTICES**-0.5).transpose(0, 1).contiguous()
+    noise = torch.empty(len(depth), len(table), *size, device=depth.device)
+    torch.sum(values, 1, out=noise.transpose(0, 1))
+    return noise.mul_(LATTICES**-0.5)
 
 
 def _sampled(images: Float[Tensor, "B H W 1"], size: tuple[int, int]) -> Float[Tensor, "B h w"]:
@@ -125,5 +131,5 @@ def _sampled(images: Float[Tensor, "B H W 1"], size: tuple[int, int]) -> Float[T
     images, (height, width) = images[..., 0], size
     if images.shape[1] % height == 0 == images.shape[2] % width:  # as below, but a view
         rows, columns = images.shape[1] // height, images.shape[2] // width
-        return images[:, rows // 2 :: rows, columns // 2 :: columns].float().contiguous()
+        return images[:, rows // 2 :: rows, columns // 2 :: columns].float()
     return F.interpolate(images[:, None].float(), size, mode="nearest-exact")[:, 0]

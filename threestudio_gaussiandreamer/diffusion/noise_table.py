@@ -37,6 +37,8 @@ class NoiseTable:
         length = max(LENGTH, SLICES * self._numel)
         self._values = torch.randn(length, generator=generator).to(device)
         self._places = length - self._numel
+        self._strides = torch.empty(1, *self.shape, device="meta").stride()
+        self._spread = int(SPREAD * self._places)
 
     def draw(
         self, stream: str, step: int, first: int, count: int, part: int = 0
@@ -45,11 +47,10 @@ class NoiseTable:
         function of (seed, stream, step, part, item). Most results are views of the table.
         """
         numel, places = self._numel, self._places
-        begin = _start(self.seed, stream, step) + part * int(SPREAD * places) + first * numel
-        begin %= places
+        begin = (_start(self.seed, stream, step) + part * self._spread + first * numel) % places
         end = begin + count * numel
         if end - numel < places:
-            return self._values[begin:end].view(count, *self.shape)
+            return self._values.as_strided((count, *self.shape), self._strides, begin)
         begins = (i % places for i in range(begin, end, numel))
         return torch.stack([self._values[i : i + numel].view(self.shape) for i in begins])
 

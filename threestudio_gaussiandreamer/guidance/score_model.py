@@ -114,9 +114,10 @@ class ScoreModel(BaseObject, ABC):
         ``guidance_interval``, none for others.
         """
         low, high = (share * len(self.alphas_cumprod) for share in self.options.guidance_interval)
-        everywhere = low == 0 and high == len(self.alphas_cumprod)
+        if low == 0 and high == len(self.alphas_cumprod):
+            return self._with_guidance(z, t, condition)
         inside = (t >= low) & (t <= high)
-        if everywhere or inside.all():
+        if inside.all():
             return self._with_guidance(z, t, condition)
         eps = torch.empty_like(z)
         for mask, predict in ((inside, self._with_guidance), (~inside, self.conditional)):
