@@ -1,6 +1,7 @@
 """``ism-variant``: interval score matching (Liang et al. 2023, LucidDreamer, arXiv:2311.11284,
 section 3.2): the score over one interval of a deterministic trajectory, without random noise. The
-trajectory is DDIM inversion, the paper's eq. 9.
+trajectory is DDIM inversion, the paper's eq. 9. The gradient is that of eq. 3 of Miao et al. (2024,
+Dreamer XL, arXiv:2405.11252), who write the paper's loss in this form.
 
     z_s = unconditional DDIM inversion of x to s = t - interval
     z_t = one more step of it, from s to t
