@@ -45,7 +45,22 @@ def test_rows_and_intervals_over_prompts(tmp_path, judge, capsys):
     content = json.loads((tmp_path / "out/scorecard.json").read_text())
     assert content["kind"]["mean"]["count"] == 2  # two prompts have known words
     assert content["multi_face"]["mean"]["count"] == 1  # and a mug has no front
-    assert "kind" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert (
+        "kind, colors, pattern, accessory: no value for 1 of the prompts ('a zebra'): " in printed
+    )
+    assert "multi_face: no value for 2 of the prompts ('a blue mug with white dots'; 'a" in printed
+
+
+def test_links_to_runs_and_to_folders_above_are_followed_once(tmp_path, judge):
+    runs = finished(tmp_path / "runs", PROMPTS[:2])
+    folder = tmp_path / "links"
+    folder.mkdir()
+    (folder / "first").symlink_to(runs / "gaussiandreamer/run0")
+    (folder / "up").symlink_to(tmp_path / "links")
+    arguments = ["--metrics", "judge", "--judge", judge, "--output", str(tmp_path / "out")]
+    assert main([str(folder), *arguments]) == 0
+    assert len((tmp_path / "out/scorecard.csv").read_text().splitlines()) == 2
 
 
 def test_a_damaged_asset_is_named_and_the_others_are_scored(tmp_path, judge, capsys):

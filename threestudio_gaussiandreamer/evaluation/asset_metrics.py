@@ -38,6 +38,7 @@ from ..host import get_device
 from ..models.clip import PictureText
 from ..prompts.view_prompts import view_directions
 from ..toybox import recognition
+from ..toybox.kinds import KINDS
 from ..toybox.models import Judge
 from ..toybox.prompt_attributes import attributes_in
 from ..toybox.views import BACKGROUND, SIZE
@@ -64,6 +65,9 @@ class Metric(ABC):
 
     columns: ClassVar[tuple[str, ...]]
     """Keys of the dictionary that :meth:`score` returns."""
+
+    undefined: ClassVar[str] = ""
+    """Why all of them are NaN for some assets."""
 
     @abstractmethod
     def __init__(self, args: Namespace) -> None:
@@ -159,6 +163,9 @@ class Recognized(Metric):
     """Which attributes of the prompt the toybox's judge recognises."""
 
     columns = ("kind", "colors", "pattern", "accessory")
+    undefined = (
+        f"the prompt doesn't name a color and one of the judge's objects: {', '.join(KINDS)}"
+    )
 
     def __init__(self, args: Namespace) -> None:
         self.judge = shared_judge(args.judge)
@@ -175,6 +182,7 @@ class Janus(Metric):
     """The share of views that the judge takes for views from another quadrant."""
 
     columns = ("multi_face",)
+    undefined = f"{Recognized.undefined}; or the object has no front"
 
     def __init__(self, args: Namespace) -> None:
         self.judge = shared_judge(args.judge)

@@ -80,7 +80,8 @@ def run(args: argparse.Namespace) -> None:
     if rows[0]:
         content = summary(metrics, *rows)
         write(output, rows[0] + rows[1], content)
-        print("\n".join([*table(content), str(output / "scorecard.csv")]))
+        notes = [line for metric in metrics for line in without_value(metric, rows[0] + rows[1])]
+        print("\n".join([*table(content), *notes, str(output / "scorecard.csv")]))
     if failed:
         raise UserError(f"{len(failed)} of the assets can't be scored: {'; '.join(failed)}")
 
@@ -152,9 +153,16 @@ def find_results(folders: Sequence[str]) -> list[Result]:
 
 
 def run_folders(folder: Path) -> Iterator[Path]:
-    """Yield the folders of finished runs below a folder; runs inside runs aren't searched."""
-    for place, names, _ in os.walk(folder):
+    """Yield the folders of finished runs below a folder, also behind links; runs inside runs aren't
+    searched.
+    """
+    seen = set()
+    for place, names, _ in os.walk(folder, followlinks=True):
         names.sort()
+        if (real := os.path.realpath(place)) in seen:  # a link to a folder above
+            names.clear()
+            continue
+        seen.add(real)
         if any(Path(place).glob("save/it*-export/*.ply")):
             names.clear()
             yield Path(place)
@@ -235,6 +243,17 @@ def table(content: dict[str, Any]) -> list[str]:
             interval = f"[{value['low']:.3f}, {value['high']:.3f}]"
             lines.append(f"{label:<18} {value['mean']:8.3f} {interval:>20} n={value['count']}")
     return lines
+
+
+def without_value(metric: Metric, rows: Rows) -> Iterator[str]:
+    """Yield a line about the prompts for which a metric isn't defined, if there are any."""
+    found = {row["prompt"]: None for row in rows if all(np.isnan(row[c]) for c in metric.columns)}
+    if found:
+        first = "; ".join(repr(prompt) for prompt in list(found)[:3])
+        yield (
+            f"{', '.join(metric.columns)}: no value for {len(found)} of the prompts ({first}"
+            f"{', ...' if len(found) > 3 else ''}): {metric.undefined}"
+        )
 
 
 main = functools.partial(run_command, parse, run)
