@@ -9,7 +9,11 @@ from threestudio_gaussiandreamer import cameras
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.host import find
 from threestudio_gaussiandreamer.training.background import FlatBackground
-from threestudio_gaussiandreamer.training.renderer import SplattingRenderer, normals_from_depth
+from threestudio_gaussiandreamer.training.renderer import (
+    SplattingRenderer,
+    normals_from_depth,
+    render,
+)
 
 
 def plane(height: int, width: int) -> tuple[torch.Tensor, ...]:
@@ -85,3 +89,13 @@ def test_a_background_that_is_not_finite_is_named():
     c2w, fovy = torch.eye(4).expand(2, 4, 4), torch.ones(2)
     with pytest.raises(UserError, match="function returned colours that aren't finite"):
         SplattingRenderer._composite(renderer, out, c2w, fovy, {})
+
+
+def test_a_renderer_that_drops_outputs_is_named():
+    def renderer(**batch):
+        return {"comp_rgb": torch.zeros(1, 4, 4, 3), "rasterized": None}
+
+    with pytest.raises(UserError, match="no comp_rgb_bg and no opacity and no depth: expected"):
+        render(renderer, {})
+    with pytest.raises(UserError, match="returned no comp_rgb and"):
+        render(lambda **batch: torch.zeros(1, 4, 4, 3), {})

@@ -15,7 +15,7 @@ downsample  1, or 2: return the 2x2 box of the rendered size (the paper renders 
 ==========  ========================================================================================
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Optional
 
@@ -51,6 +51,26 @@ def check_backend(option: str, name: str) -> None:
         raise UserError(
             f"{option}: {name} can't be used here: {reason} (auto takes the fastest that can)"
         )
+
+
+OUTPUTS = ("comp_rgb", "comp_rgb_bg", "opacity", "depth", "rasterized")
+"""What training reads of a renderer's outputs, whatever its options are."""
+
+
+def render(renderer: Rasterizer, batch: dict[str, Any]) -> Mapping[str, Any]:
+    """Return the outputs of a renderer, which may be a subclass outside this package.
+
+    Raises:
+        UserError: some of ``OUTPUTS`` aren't among them.
+    """
+    out = renderer(**batch)
+    missing = [name for name in OUTPUTS if name not in out] if isinstance(out, Mapping) else OUTPUTS
+    if missing:
+        raise UserError(
+            f"{type(renderer).__name__} returned no {' and no '.join(missing)}: expected a mapping "
+            f"with {', '.join(OUTPUTS)}; add to the one that SplattingRenderer.forward returns"
+        )
+    return out
 
 
 @register("gaussiandreamer-splatting")

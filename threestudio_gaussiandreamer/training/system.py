@@ -65,6 +65,7 @@ from .optimizer import PartRates, check_optimizer, drop_gradients, make_optimize
 from .pages import discard_turntable, save_first_cloud, turntable_name, write_turntable
 from .pictures import rgb_panel, save_pictures
 from .preflight import check_parts, preflight_parts
+from .renderer import render
 from .truth import prefetch_truth, true_views
 
 GUIDANCE_LR = 1e-4
@@ -228,7 +229,7 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
     # -- one step ----------------------------------------------------------------------------------
 
     def forward(self, batch: dict[str, Any]) -> Mapping[str, Any]:
-        return self.renderer(**batch)
+        return render(self.renderer, batch)
 
     def training_step(self, batch: dict[str, Any], batch_idx: int) -> None:
         optimizer, step = self.optimizers(), self.global_step
