@@ -50,6 +50,7 @@ from benchmarks.quality.toybox_jobs import (
     MODELS_BESIDE_GUIDANCE,
     RECOGNIZED,
     SAMPLES,
+    STEPS,
     TRUTH,
     WORLD,
     Prompt,
@@ -61,17 +62,20 @@ from benchmarks.quality.toybox_jobs import (
     setup_of_samples,
 )
 from benchmarks.quality.toybox_options import CHARTS as VARIANTS
+from benchmarks.quality.variants import evaluations_per_step
 from threestudio_gaussiandreamer.guidance.half_precision import cpu_multiplies_bfloat16
 
 KEY = ("variant", "x", "withheld", "index", "seed", "setup", "judge")
+LOOKS = ("saturation", "at_limits", "evaluations")
+"""Columns that earlier rows lack; evaluations of the 2D model, one per view and prompt."""
 COLUMNS = [*KEY, "prompt", "cpu_seconds", "gaussians"]
-COLUMNS += [*RECOGNIZED, "clip", "haze", "faint", *(f"prior_{name}" for name in RECOGNIZED)]
+COLUMNS += [*RECOGNIZED, "clip", "haze", "faint", *LOOKS, *(f"prior_{name}" for name in RECOGNIZED)]
 COLUMNS += ["options", "machine", "commit"]
 QUICK = {
     "use_timestamp": "false", "name": "toybox", "tag": "run", "system.pages": "false",
     "data.n_test_views": 1, "data.eval_width": 64, "data.eval_height": 64,
     "trainer.val_check_interval": 100000, "trainer.enable_progress_bar": "false",
-    "trainer.log_every_n_steps": 100, "system.exporter": "{formats: [ply], save_video: false}",
+    "trainer.log_every_n_steps": 10, "system.exporter": "{formats: [ply], save_video: false}",
 }  # fmt: skip
 """Options that leave out what isn't measured: pages, video and pictures."""
 RUN = f"{QUICK['name']}/{QUICK['tag']}"
@@ -190,6 +194,9 @@ def scored(task: Task, folder: Path) -> dict[str, float]:
         run(task, folder)
         record.write_text(json.dumps(time.process_time() - start))
     found = scores.of_run(folder / RUN, task.prompt.text, task.models)
+    found |= scores.looks_of(folder / RUN, task.prompt)
+    steps = int(task.variant.options.get("trainer.max_steps", STEPS))
+    found |= {"evaluations": steps * evaluations_per_step(folder / RUN)}
     return found | {"cpu_seconds": json.loads(record.read_text())}
 
 

@@ -152,6 +152,19 @@ def distillations() -> Iterator[Variant]:
             yield Variant(name.upper(), scale, options | {"system.guidance.guidance_scale": scale})
 
 
+def looks() -> Iterator[Variant]:
+    """Each distillation at the scale at which it did best, with toybox.yaml, the paper's recipe and
+    ways against its over-saturation: what saturation and diversity are measured on.
+    """
+    yield Variant(DEFAULT)
+    best = {"SDI": f"{LARGEST_SCALES['sdi']:g}"}
+    yield from (one for one in distillations() if one.key[1] == best.get(one.name, f"{GUIDANCE:g}"))
+    chosen = ("guidance scale", f"{PAPER_SCALE:g}"), ("recon_std_rescale 0.5", "0")
+    falls = ("timesteps that fall by the root of the step", "0")
+    yield from (one for one in (*over_guidance(), *schedules()) if one.key in (*chosen, falls))
+    yield Variant(PAPER_RECIPE, 0, overlay(PAPER))
+
+
 def cheaper() -> Iterator[Variant]:
     """One prediction for several steps of the same views; no guidance at some timesteps; half of
     the views a step, in as many steps and in twice as many.
@@ -275,4 +288,5 @@ CHARTS: dict[str, Callable[[], Iterator[Variant]]] = {
     "distillations": distillations,
     "cheaper": cheaper,
     "smoothness": smoothness,
+    "looks": looks,
 }

@@ -8,8 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from benchmarks.quality.toybox_jobs import PROMPT_SEED, Prompt
+from threestudio_gaussiandreamer import metrics
 from threestudio_gaussiandreamer.core.streams import numpy_generator
 from threestudio_gaussiandreamer.evaluation.results import Pictures
 from threestudio_gaussiandreamer.evaluation.text_to_3d import (
@@ -40,6 +43,28 @@ def of_run(folder: Path, prompt: str, models: str) -> dict[str, float]:
     return found | {"gaussians": len(asset.gaussians.means)}
 
 
+def looks_of(folder: Path, prompt: Prompt) -> dict[str, float]:
+    """Return the ``saturation`` of a finished run's views, relative to that of the prompt's object,
+    and ``at_limits``, the share of pixels of which a channel is 0 or 1.
+    """
+    views, truth = views_of(folder), truth_views(prompt).movedim(1, -1)
+    relative = metrics.saturation(views) / metrics.saturation(truth)
+    return {"saturation": relative, "at_limits": at_limits(views)}
+
+
+def views_of(folder: Path) -> Float[Tensor, "V H W 3"]:
+    """Render a finished run's result from the judge's directions."""
+    cloud, orbit = result_of(folder, "").gaussians, recognition.views()
+    pictures = Pictures(cloud, BACKGROUND).render(orbit.c2w, orbit.fovy, SIZE)
+    return torch.from_numpy(np.concatenate(list(pictures)))
+
+
+def at_limits(views: Float[Tensor, "V H W 3"]) -> float:
+    """Return the share of pixels of which a channel is 0 or 1 in 8 bits."""
+    levels = (255 * views).round()
+    return ((levels <= 0) | (levels >= 255)).any(-1).double().mean().item()
+
+
 def object_of(prompt: Prompt) -> Mesh:
     """Return an object with the prompt's attributes."""
     attributes = draw_attributes(PROMPT_SEED, prompt.index, held_out=prompt.withheld)
@@ -48,9 +73,16 @@ def object_of(prompt: Prompt) -> Mesh:
 
 def of_truth(prompt: Prompt, models: str) -> dict[str, float]:
     """Score ray-cast views of the prompt's object: the judge's ceiling."""
+    views = truth_views(prompt)
+    own = {"saturation": 1.0, "at_limits": at_limits(views.movedim(1, -1))}
+    return scores(models).of_pictures(views, prompt.text) | own
+
+
+def truth_views(prompt: Prompt) -> Float[Tensor, "V 3 H W"]:
+    """Ray-cast the prompt's object from the judge's directions."""
     rgba = torch.from_numpy(render(object_of(prompt), recognition.views())).movedim(-1, 1).float()
     grey = torch.tensor(BACKGROUND).reshape(1, 3, 1, 1)
-    return scores(models).of_pictures(rgba[:, :3] + (1 - rgba[:, 3:]) * grey, prompt.text)
+    return rgba[:, :3] + (1 - rgba[:, 3:]) * grey
 
 
 def of_samples(prompt: str, scale: float, seed: int, models: str) -> dict[str, float]:

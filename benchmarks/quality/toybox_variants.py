@@ -37,7 +37,9 @@ SECONDS = ("CPU seconds", "of toybox.yaml")
 DISTILLATIONS = ("paper", "distillations", "cheaper")
 """Charts that docs/distillation.md shows; docs/toybox.md shows the others."""
 SETTINGS = [
-    name for name in toybox_options.CHARTS if name not in (*DISTILLATIONS, "references", "default")
+    name
+    for name in toybox_options.CHARTS
+    if name not in (*DISTILLATIONS, "references", "default", "looks")
 ]
 ENOUGH = 8
 """Rows of the present state of which those of earlier ones say nothing more."""
