@@ -3,6 +3,7 @@
 import pytest
 
 from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.guidance import exact_score
 from threestudio_gaussiandreamer.guidance.exact_score import ExactScoreGuidance
 
 BANK = {"mesh": "toy.glb", "mode": "direction-bins", "guidance_scale": 7.5}
@@ -35,3 +36,13 @@ def test_a_picture_that_cant_be_pooled_to_the_latent_is_refused_before_the_mesh_
     with pytest.raises(UserError, match="pictures of 64x64 can't be pooled to a latent 33 high"):
         ExactScoreGuidance(options | {"image_size": 64})
     ExactScoreGuidance.preflight(options | {"image_size": 66})
+
+
+def test_guidance_without_a_direction_is_warned_of(monkeypatch):
+    messages = []
+    monkeypatch.setattr(exact_score, "warn", messages.append)
+    ExactScoreGuidance.preflight(BANK)
+    ExactScoreGuidance.preflight(BANK | {"mode": "view-agnostic", "guidance_scale": 1.0})
+    assert not messages
+    ExactScoreGuidance.preflight(BANK | {"mode": "view-agnostic"})
+    assert "guidance_scale has no effect with mode=view-agnostic" in messages[0]

@@ -47,7 +47,7 @@ def test_a_value_that_refers_to_another_section_is_read_each_time():
     ("values", "message"),
     [
         ({"szie": 3}, "unknown key 'szie': did you mean 'size'"),
-        ({"size": "big"}, "size: Value 'big'"),
+        ({"size": "big"}, "size: expected a whole number, got 'big'"),
         ({"inner": 3}, "inner"),
         ("size", "expected keys and values"),
     ],

@@ -111,7 +111,7 @@ def test_resolvers_of_threestudio(folder, expression, value):
         ("~system", "isn't an override"),
         ("data.views=[1", "the value of data.views isn't valid YAML"),
         ("nmae=x", "unknown key 'nmae': did you mean 'name'"),
-        ("seed=x", "seed: Value 'x'"),
+        ("seed=x", "seed: expected a whole number, got 'x'"),
         ("trainer=3", "trainer must be a section of keys and values, got 3"),
         ("system=3", "system must be a section of keys and values, got 3"),
         ("system=???", "no value for system"),

@@ -92,7 +92,7 @@ def test_a_strategy_whose_package_is_missing_is_refused(folder, monkeypatch, str
             "unknown key 'system.geometry.prior.cuont': did you mean "
             "'system.geometry.prior.count'?",
         ),
-        ("system.geometry.size=big", "system.geometry.size: Value 'big'"),
+        ("system.geometry.size=big", "system.geometry.size: expected a whole number, got 'big'"),
         (
             "system.geometry.prior.count=0",
             "system.geometry.prior.count: expected at least 1, got 0",
@@ -160,7 +160,7 @@ def test_a_valid_configuration_passes(folder):
 
 
 def test_a_key_of_a_part_without_options_is_named():
-    with pytest.raises(UserError, match=r"unknown key 'x.foo': choose from nothing: none exist"):
+    with pytest.raises(UserError, match=r"unknown key 'x.foo': there are none"):
         check_part("x", "optionless-part", {"foo": 1})
 
 

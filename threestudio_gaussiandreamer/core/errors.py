@@ -20,18 +20,20 @@ class Terminated(SystemExit):
     """
 
 
-def unknown(kind: str, name: str, choices: Iterable[str]) -> UserError:
+def unknown(kind: str, name: str, choices: Iterable[str], prefix: str = "") -> UserError:
     """Make the error for a name that isn't among ``choices``; its message lists the most similar
     choices, or all of them if none is similar.
+
+    Args:
+        prefix: what the message puts in front of name and similar choices, such as a section.
     """
     choices = sorted(map(str, choices))
     near = difflib.get_close_matches(str(name), choices, n=3, cutoff=0.6)
-    hint = (
-        f"did you mean {' or '.join(map(repr, near))}?"
-        if near
-        else f"choose from {', '.join(choices) or 'nothing: none exist'}."
-    )
-    return UserError(f"unknown {kind} {name!r}: {hint}")
+    if near:
+        hint = f"did you mean {' or '.join(repr(prefix + choice) for choice in near)}?"
+    else:
+        hint = f"choose from {', '.join(choices)}." if choices else "there are none."
+    return UserError(f"unknown {kind} {prefix + str(name)!r}: {hint}")
 
 
 def raised_in(error: BaseException, package: str) -> bool:

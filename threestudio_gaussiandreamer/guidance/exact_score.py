@@ -54,7 +54,7 @@ from ..core.memory import count_of, require_memory
 from ..core.options import at_least, in_range, interval, one_of, positive, required
 from ..diffusion import sds
 from ..diffusion.exact_score import LinearLatent, color_matrix, denoise, squared_distances
-from ..host import parse_structured, register
+from ..host import parse_structured, register, warn
 from ..meshes.load import AXES, load_mesh
 from ..meshes.raycast import MeshCaster
 from ..splatting.cpu import known_picture
@@ -138,7 +138,13 @@ class ExactScoreGuidance(ScoreDistillation):
     @classmethod
     def preflight(cls, cfg: Any) -> None:
         super().preflight(cfg)
-        require_used(cls, parse_structured(cls.Config, cfg))
+        cfg = parse_structured(cls.Config, cfg)
+        require_used(cls, cfg)
+        if cfg.guidance_scale != 1 and not cls.is_text_guided(cfg):
+            warn(
+                "system.guidance.guidance_scale has no effect with mode=view-agnostic, whose "
+                "unconditional score is the conditional one: 1 makes half as many evaluations"
+            )
 
     @classmethod
     def is_text_guided(cls, cfg: Any) -> bool:

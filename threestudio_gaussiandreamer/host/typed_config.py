@@ -2,6 +2,7 @@
 and the built-in one), and the built-in host passes them to the classes."""
 
 import copy
+import re
 from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any
@@ -15,6 +16,8 @@ from ..core.option_types import check_types
 
 MOST_KEPT = 256
 """Number of parsed configurations that are kept."""
+EXPECTED = {"Integer": "a whole number", "Float": "a number", "bool": "true or false"}
+"""By the names that OmegaConf has for types."""
 _parsed: dict[tuple[Any, str], DictConfig] = {}
 """By class and text of the values."""
 
@@ -56,6 +59,17 @@ def _parse(config_class: Any, values: Any) -> DictConfig:
             config_class(**{key: escape(value) for key, value in (values or {}).items()})
         )
     except OmegaConfBaseException as error:
-        raise UserError(f"{error.full_key or error.key}: {str(error).splitlines()[0]}") from error
+        raise UserError(f"{error.full_key or error.key}: {_problem(error)}") from error
     except TypeError as error:
         raise UserError(f"{config_class.__qualname__}: {error}") from error
+
+
+def _problem(error: OmegaConfBaseException) -> str:
+    """Return what is wrong with a value, in the words of the other checks of options."""
+    message = str(error).splitlines()[0]
+    found = re.fullmatch(
+        r"Value (.*) (?:of type .* could not be converted to|is not a valid) (\w+).*", message
+    )
+    if found is None or found[2] not in EXPECTED:
+        return message
+    return f"expected {EXPECTED[found[2]]}, got {found[1]}"

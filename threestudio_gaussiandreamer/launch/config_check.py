@@ -5,12 +5,11 @@ The key ``x_type`` names the part that the section ``x`` beside it configures: `
 ``system.geometry.prior``. The keys of a section are the fields of its part's ``Config``."""
 
 import dataclasses
-import difflib
 import inspect
 import os
 import types
 import typing
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -136,7 +135,7 @@ def _check_keys(path: str, values: Any, config_class: type) -> None:
     fields = {field.name: field.type for field in dataclasses.fields(config_class)}
     for key in _mapping(path, values):
         if key not in fields:
-            raise _unknown_key(path, key, fields)
+            raise unknown("key", key, fields, prefix=f"{path}.")
         if dataclasses.is_dataclass(fields[key]):
             _check_keys(f"{path}.{key}", values[key], fields[key])
 
@@ -162,19 +161,6 @@ def _mapping(path: str, values: Any) -> Any:
     return values
 
 
-def _unknown_key(path: str, key: str, choices: Collection[str]) -> UserError:
-    """Make the error for an unknown key, as ``errors.unknown`` does, but compare only the last
-    component, since keys of one section share all others.
-    """
-    near = difflib.get_close_matches(key, choices, n=3, cutoff=0.6)
-    hint = (
-        f"did you mean {' or '.join(repr(f'{path}.{name}') for name in near)}?"
-        if near
-        else f"choose from {', '.join(sorted(choices)) or 'nothing: none exist'}"
-    )
-    return UserError(f"unknown key '{path}.{key}': {hint}")
-
-
 def _check_loss(loss: Any, known: Any) -> None:
     for key, weight in (loss or {}).items():
         if not key.startswith("lambda_"):
@@ -185,17 +171,17 @@ def _check_loss(loss: Any, known: Any) -> None:
         if known is not None:
             weights = [name if name.startswith("lambda_") else f"lambda_{name}" for name in known]
             if key not in weights and weight != 0:
-                raise _unknown_key("system.loss", key, weights)
+                raise unknown("key", key, weights, prefix="system.loss.")
         validate_schedule(weight, f"system.loss.{key}")
 
 
 def _check_loggers(loggers: Any) -> None:
     for name, options in (loggers or {}).items():
         if name != "wandb":
-            raise _unknown_key("system.loggers", name, ["wandb"])
+            raise unknown("key", name, ["wandb"], prefix="system.loggers.")
         for key in _mapping(f"system.loggers.{name}", options):
             if key not in LOGGER_KEYS:
-                raise _unknown_key("system.loggers.wandb", key, LOGGER_KEYS)
+                raise unknown("key", key, LOGGER_KEYS, prefix="system.loggers.wandb.")
 
 
 def _check_arguments(section: str, values: Any, owner: type) -> None:
@@ -205,9 +191,8 @@ def _check_arguments(section: str, values: Any, owner: type) -> None:
         if key in LAUNCHER_SETS:
             raise UserError(f"{section}.{key} is set by {LAUNCHER_SETS[key]}: remove it")
         if key not in parameters:
-            raise _unknown_key(
-                section, key, [name for name in parameters if name not in LAUNCHER_SETS]
-            )
+            allowed = [name for name in parameters if name not in LAUNCHER_SETS]
+            raise unknown("key", key, allowed, prefix=f"{section}.")
         _check_type(f"{section}.{key}", value, parameters[key].annotation)
 
 

@@ -58,21 +58,29 @@ def _check_view_groups(guidance: Any, data: Any) -> None:
 
 
 def _check_reuse(guidance: Any, cfg: Any) -> None:
-    """Raise UserError where a prediction could never be used again."""
-    if guidance.get("reuse_steps", 1) == 1:
+    """Raise UserError where a prediction couldn't serve as many steps as ``reuse_steps`` says."""
+    steps = guidance.get("reuse_steps", 1)
+    if steps == 1:
         return
-    wanted = f"system.guidance.reuse_steps={guidance.reuse_steps} needs steps of the same"
-    held = cfg.data.get("hold_steps", 1)
-    changes = held < guidance.reuse_steps and not cfg.data.get("train_views", 0)
-    if cfg.data_type in DATA and changes:
-        raise UserError(f"{wanted} views: set data.hold_steps={guidance.reuse_steps}")
+    wanted = f"system.guidance.reuse_steps={steps} needs steps of the same"
+    if cfg.data_type in DATA:
+        data = parse_structured(find(cfg.data_type).Config, cfg.data)
+        if data.hold_steps % steps and not _has_one_batch(data):
+            raise UserError(f"{wanted} views: set data.hold_steps={steps}, or to a multiple of it")
     background = cfg.system.get("background") or {}
     if background.get("mode") == "learned":
         raise UserError(f"{wanted} background, and a learned one changes in each step")
-    if background.get("mode") == "random" and background.get("hold_steps", 1) == 1:
+    if background.get("mode") == "random" and background.get("hold_steps", 1) % steps:
         raise UserError(
-            f"{wanted} background: set system.background.hold_steps={guidance.reuse_steps}"
+            f"{wanted} background: set system.background.hold_steps={steps}, or to a multiple of it"
         )
+
+
+def _has_one_batch(data: Any) -> bool:
+    """Return whether all steps draw the same views of a pool: one, or one of each sector."""
+    pool = data.get("train_views", 0)
+    batches = [views for *_, views in sizes_of_stages(data)]
+    return pool == 1 or data.batch_uniform_azimuth and all(views == pool for views in batches)
 
 
 def _check_render_sizes(options: type, guidance: Any, cfg: Any) -> None:

@@ -92,8 +92,8 @@ def joint_names(names: list[str], path: Path) -> dict[str, int]:
     if missing := [name for name in NEEDED if name not in found]:
         raise UserError(
             f"BVH file {str(path)!r} has no joint that is known as the {', the '.join(missing)}: "
-            f"its joints are {', '.join(names[:40])}. Rename them, for example to LeftUpLeg, "
-            "LeftLeg, LeftArm, LeftForeArm"
+            f"its joints are {', '.join(filter(None, names[:40]))}. Rename them, for example to "
+            "LeftUpLeg, LeftLeg, LeftArm, LeftForeArm"
         )
     return found
 
