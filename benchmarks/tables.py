@@ -84,6 +84,7 @@ SECTIONS: dict[str, dict[str, Callable[[], str]]] = {
         "overhead": variant_tables.overhead,
         "learned": toybox_variants.distillations,
         "learned on a GPU": toybox_variants.on_gpu,
+        "looks": toybox_variants.looks,
         "precision": precision.table,
     },
     "docs/failures.md": {"tables": failure_table.tables},

@@ -43,6 +43,7 @@ from benchmarks.quality.toybox_variants import (
     multi_face,
     pairs_of_charts,
     recognised_share,
+    relative,
     relative_seconds,
     timed_runs,
     values_of,
@@ -72,6 +73,7 @@ LINES = {
     "toybox_count": Line("Gaussians", COUNT, "x", "Gaussians"),
 }
 RELATIVE_SECONDS = "CPU seconds / those of toybox.yaml"
+RELATIVE_EVALUATIONS = "evaluations of the 2D model / those of toybox.yaml"
 COMPARISONS = {"toybox_settings": SETTINGS, "toybox_distillations": DISTILLATIONS}
 
 
@@ -85,8 +87,13 @@ def main() -> None:
         if found := settings(measured(), charts):
             print(draw_settings(name, found, ratios))
     compared = settings(measured(), (*SETTINGS, *DISTILLATIONS), others=(EXACT,))
-    if shown := [one for one in compared if one.title in ratios]:
-        print(draw_against_seconds("toybox_seconds", shown, ratios))
+    counts = relative("evaluations", timed_runs())
+    for name, label, against in (
+        ("toybox_seconds", RELATIVE_SECONDS, ratios),
+        ("toybox_evaluations", RELATIVE_EVALUATIONS, counts),
+    ):
+        if shown := [one for one in compared if one.title in against]:
+            print(draw_against(name, label, shown, against))
 
 
 # ---- results against a number --------------------------------------------------------------------
@@ -225,13 +232,13 @@ def draw_seconds(panel: Any, found: Sequence[Setting], ratios: dict[str, float])
     finish(panel, RELATIVE_SECONDS)
 
 
-# ---- results against seconds ---------------------------------------------------------------------
+# ---- results against seconds or evaluations ------------------------------------------------------
 
 
-def draw_against_seconds(name: str, found: Sequence[Setting], ratios: dict[str, float]) -> Path:
+def draw_against(name: str, label: str, found: Sequence[Setting], ratios: dict[str, float]) -> Path:
     """Draw each setting as a point: its difference to toybox.yaml in recognised attributes and in
-    the multi-face rate against relative seconds; toybox.yaml itself at (1, 0), the paper's recipe
-    as a star.
+    the multi-face rate against relative seconds or evaluations; toybox.yaml itself at (1, 0), the
+    paper's recipe as a star.
     """
     plt = pyplot()
 
@@ -247,7 +254,7 @@ def draw_against_seconds(name: str, found: Sequence[Setting], ratios: dict[str, 
                        markersize=size, label=one.title, markeredgecolor="0.2")  # fmt: skip
         panel.axhline(0, color="0.5", linewidth=1)
         set_log_x(panel)
-        finish(panel, RELATIVE_SECONDS)
+        finish(panel, label)
     panels[0].set_ylabel("recognised attributes, difference to toybox.yaml, points")
     panels[1].set_ylabel("multi-face, difference to toybox.yaml, points")
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside right center", fontsize=8)

@@ -22,9 +22,9 @@ from benchmarks.quality.chart_runs import grouped
 from benchmarks.quality.runs import CHARTS
 from benchmarks.quality.toybox_options import CHARTS as VARIANTS
 from benchmarks.quality.toybox_scores import views_of
+from benchmarks.quality.toybox_variants import DIVERSITY
 from threestudio_gaussiandreamer import register_parts
 
-CHART = "toybox_diversity"
 COLUMNS = ["variant", "x", "withheld", "index", "setup", "seeds", "diversity"]
 
 
@@ -41,7 +41,7 @@ def main() -> None:
     arguments = parser.parse_args()
     arguments.variant, arguments.gpu = [], toybox.CPU
     register_parts()
-    path = arguments.out / f"{CHART}.csv"
+    path = arguments.out / f"{DIVERSITY}.csv"
     write_rows(path, COLUMNS, list(rows_of(arguments)))
     print(path)
 

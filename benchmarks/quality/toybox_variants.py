@@ -41,6 +41,8 @@ SETTINGS = [
     for name in toybox_options.CHARTS
     if name not in (*DISTILLATIONS, "references", "default", "looks")
 ]
+DIVERSITY = "toybox_diversity"
+"""Written by toybox_diversity.py."""
 ENOUGH = 8
 """Rows of the present state of which those of earlier ones say nothing more."""
 EARLIER = {
@@ -203,19 +205,61 @@ def haze(rows: list[Row]) -> str:
     return f"{100 * statistics.fmean(map(float, values)):.1f}" if all(values) else ""
 
 
+def looks() -> str:
+    """Return the table of saturation, diversity over the seeds and evaluations of the 2D model, of
+    the runs that have them.
+    """
+    rows = [row for row in timed_runs() if row["saturation"] and is_present(row)]
+    counts, diverse = relative("evaluations", rows), diversities()
+    lines = [
+        (
+            title,
+            counts_of(own),
+            median_of(own, "saturation", 2),
+            f"{100 * statistics.fmean(float(row['at_limits']) for row in own):.1f}",
+            diverse.get(own[0]["variant"], ""),
+            median_of(own, "evaluations"),
+            f"{counts[title]:.1f}" if title in counts else "",
+        )
+        for title, own in grouped(rows, title_of).items()
+    ]
+    head = ("variant", "prompts × seeds", "saturation / the object's", "pixels at a limit, %")
+    head += ("diversity", "evaluations", "/ those of toybox.yaml")
+    return markdown(head, lines) if lines else NOT_MEASURED
+
+
+def diversities() -> dict[str, str]:
+    """Return the mean diversity over the prompts of each variant that was measured."""
+    present = toybox_jobs.setup()
+    rows = [row for row in rows_of(DIVERSITY, RESULTS) if row["setup"] == present]
+    groups = grouped(rows, lambda row: row["variant"])
+    means = {
+        name: statistics.fmean(float(row["diversity"]) for row in own)
+        for name, own in groups.items()
+    }
+    return {name: f"{value:.3f}" for name, value in means.items()}
+
+
 def relative_seconds(rows: Iterable[Row]) -> dict[str, float]:
-    """Return the median ratio of each variant's seconds to those of toybox.yaml with the same
-    prompt, seed and present models on the same machine.
+    """Return the median ratio of each variant's seconds to those of toybox.yaml; see
+    :func:`relative`.
+    """
+    return relative("cpu_seconds", rows)
+
+
+def relative(column: str, rows: Iterable[Row]) -> dict[str, float]:
+    """Return the median ratio of each variant's value in a column to that of toybox.yaml with the
+    same prompt, seed and present models on the same machine.
     """
 
     def where(row: Row) -> tuple[str, ...]:
         return *place(row), row["machine"]
 
-    timed = grouped((row for row in rows if row["cpu_seconds"] and is_present(row)), title_of)
-    plain = {where(row): float(row["cpu_seconds"]) for row in timed[toybox_jobs.DEFAULT]}
+    known = grouped((row for row in rows if row[column] and is_present(row)), title_of)
+    plain = {where(row): float(row[column]) for row in known[toybox_jobs.DEFAULT]}
     ratios = {
-        title: [float(row["cpu_seconds"]) / plain[where(row)] for row in own if where(row) in plain]
-        for title, own in timed.items()
+        title: [float(row[column]) / plain[where(row)] for row in own if where(row) in plain]
+        for title, own in known.items()
     }
     return {title: statistics.median(found) for title, found in ratios.items() if found}
 

@@ -73,15 +73,22 @@ def test_the_draft_is_a_variant_that_was_measured():
     assert variant.key == ("steps with one prediction", "4")
 
 
+def score_nothing(monkeypatch) -> None:
+    monkeypatch.setattr(toybox_scores, "of_run", lambda folder, text, models: {"kind": 1.0})
+    monkeypatch.setattr(toybox_scores, "looks_of", lambda folder, prompt: {})
+    monkeypatch.setattr(toybox, "evaluations_per_step", lambda folder: 8.5)
+
+
 def test_a_kept_run_is_only_scored(tmp_path, monkeypatch):
     ran = []
     monkeypatch.setattr(toybox, "run", lambda task, folder: ran.append(folder.mkdir(parents=True)))
-    monkeypatch.setattr(toybox_scores, "of_run", lambda folder, text, models: {"kind": 1.0})
+    score_nothing(monkeypatch)
     task = toybox.Task(Variant(DEFAULT), prompts("seen", 1)[0], 0, "models", tmp_path)
     assert not toybox.needs_no_run(task)
     assert toybox.needs_no_run(task._replace(variant=Variant(toybox_jobs.TRUTH)))
     first, second = toybox.measured(task), toybox.measured(task)
     assert first == second and first["kind"] == 1 and first["cpu_seconds"] >= 0
+    assert first["evaluations"] == 8.5 * STEPS
     assert len(ran) == 1 and toybox.needs_no_run(task)
 
 
@@ -147,7 +154,7 @@ def test_runs_on_a_gpu_have_rows_and_folders_of_their_own(monkeypatch, tmp_path)
 
     monkeypatch.setattr("threestudio_gaussiandreamer.launch.experiment.main", launch)
     monkeypatch.setattr("torch.cuda.get_device_name", lambda: "a GPU")
-    monkeypatch.setattr(toybox_scores, "of_run", lambda folder, text, models: {"kind": 1.0})
+    score_nothing(monkeypatch)
     monkeypatch.setattr(
         toybox, "ProcessPoolExecutor", lambda *args, **kwargs: ThreadPoolExecutor(1)
     )

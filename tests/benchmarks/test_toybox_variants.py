@@ -141,3 +141,19 @@ def test_earlier_models_are_compared_by_the_same_judge(monkeypatch):
         ("state b", "1 × 1", "50", "-50"),
         ("state a †", "1 × 1", "100", "+0"),
     ]
+
+
+def test_looks_are_of_the_rows_that_have_them(monkeypatch):
+    seen = {"saturation": "1.5", "at_limits": "0.02", "evaluations": "1200", "machine": "a"}
+    csd = seen | {"variant": "CSD", "x": "4", "saturation": "1.75", "evaluations": "3000"}
+    rows = [row(**seen), row(**seen, index="1"), row(**csd), row(saturation="")]
+    monkeypatch.setattr(toybox_variants, "timed_runs", lambda: rows)
+    diverse = [
+        {"variant": "CSD", "setup": toybox_jobs.setup(), "diversity": value}
+        for value in ("0.1", "0.2")
+    ]
+    monkeypatch.setattr(toybox_variants, "rows_of", lambda chart, folder: diverse)
+    assert toybox_variants.looks().splitlines()[2:] == [
+        "| toybox.yaml | 2 × 1 | 1.50 | 2.0 |  | 1200 | 1.0 |",
+        "| CSD 4 | 1 × 1 | 1.75 | 2.0 | 0.150 | 3000 | 2.5 |",
+    ]
