@@ -124,6 +124,7 @@ SECTIONS: dict[str, dict[str, Callable[[], str]]] = {
         "loading": loading.table,
         "whole runs": start.whole_runs,
         "settings": toybox_variants.settings,
+        "ablations": toybox_variants.ablations,
         "settings on a GPU": toybox_variants.settings_on_gpu,
         "wrong priors on a GPU": toybox_variants.wrong_priors_on_gpu,
     },

@@ -211,8 +211,11 @@ def growing() -> Iterator[Variant]:
 
 
 def wrong_priors() -> Iterator[Variant]:
-    """The same with a prior of another kind, and the grey ball of ``starts`` with growing."""
-    for one in growing():
+    """The same, and numbers of Gaussians, with a prior of another kind; and the grey ball of
+    ``starts`` with growing.
+    """
+    few_and_many = (one for one in counts() if one.x in (1000, 8000))
+    for one in (*growing(), *few_and_many):
         yield one._replace(name=f"{WRONG_PRIOR}, {one.name}", wrong_prior=True)
     grown = {name: value for name, value in BALL.items() if not name.endswith("grow.enabled")}
     yield Variant("grey ball, growing", 0, grown)

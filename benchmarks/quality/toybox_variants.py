@@ -41,6 +41,8 @@ SETTINGS = [
     for name in toybox_options.CHARTS
     if name not in (*DISTILLATIONS, "references", "default", "looks")
 ]
+ABLATIONS = ("growing", "counts", "prior_quality")
+"""Charts of the paper's ablations."""
 DIVERSITY = "toybox_diversity"
 """Written by toybox_diversity.py."""
 ENOUGH = 8
@@ -98,6 +100,38 @@ def wrong_priors_on_gpu() -> str:
     lines = [line_of(marked_title(own[0]), own, whole) for own, whole in pairs]
     head = [title.replace(toybox_jobs.DEFAULT, WRONG_PRIOR) for title in HEAD]
     return markdown(head, lines) if lines else NOT_MEASURED
+
+
+def ablations() -> str:
+    """Return the table of parts of Algorithm 1, numbers of Gaussians and qualities of the prior,
+    with the learned prior and with one of another kind, from runs on a GPU and on CPUs.
+    """
+    on_gpu = measured(toybox_jobs.GPU_CHART)
+    done = {(title_of(row), place(row)) for row in on_gpu}
+    others = (row for row in measured() if (title_of(row), place(row)) not in done)
+    rows = [row for row in (*on_gpu, *others) if is_present(row)]
+    parts = [("all of it", (toybox_jobs.DEFAULT, "0"), (WRONG_PRIOR, "0"))]
+    for name, x in (one.key for chart in ABLATIONS for one in toybox_options.CHARTS[chart]()):
+        title = name if x == "0" else f"{name} {x}"
+        parts.append((title, (name, x), (f"{WRONG_PRIOR}, {name}", x)))
+    lines = [
+        (title, *cells)
+        for title, learned, wrong in parts
+        if any(cells := (*part_of(rows, learned), *part_of(rows, wrong, WRONG_PRIOR)))
+    ]
+    columns = ("prompts × seeds", "recognised, %", "− all of it", "multi-face, %")
+    head = [f"{prior}: {column}" for prior in ("learned prior", WRONG_PRIOR) for column in columns]
+    return markdown(("part", *head), lines) if lines else NOT_MEASURED
+
+
+def part_of(
+    rows: Sequence[Row], key: tuple[str, str], base: str = toybox_jobs.DEFAULT
+) -> tuple[str, ...]:
+    """Return the cells of a variant, compared with ``base``; empty ones if it wasn't measured."""
+    for own, plain in pairs_of(rows, *key, base=base):
+        _, counts, recognised, change, faces, *_ = line_of("", own, plain)
+        return counts, recognised, "" if key[0] == base else change, faces
+    return ("",) * 4
 
 
 def gpu_rows() -> list[Row]:

@@ -157,3 +157,18 @@ def test_looks_are_of_the_rows_that_have_them(monkeypatch):
         "| toybox.yaml | 2 × 1 | 1.50 | 2.0 |  | 1200 | 1.0 |",
         "| CSD 4 | 1 × 1 | 1.75 | 2.0 | 0.150 | 3000 | 2.5 |",
     ]
+
+
+def test_ablations_have_both_priors_in_one_table(monkeypatch):
+    """Runs on a GPU replace those on CPUs of the same prompt and seed."""
+    wrong = toybox_jobs.WRONG_PRIOR
+    on_gpu = [row(), row(variant="no growing", x="0", kind="0"), row(variant=wrong, colors="0")]
+    on_cpus = [row(variant="no growing", x="0"), row(variant="Gaussians", x="8000", index="1")]
+    on_cpus += [row(index="1"), row(variant=f"{wrong}, Gaussians", x="8000", kind="0", colors="0")]
+    charts = {toybox.CHART: on_cpus, toybox_jobs.GPU_CHART: on_gpu}
+    monkeypatch.setattr(toybox_variants, "measured", lambda chart=toybox.CHART: charts[chart])
+    assert toybox_variants.ablations().splitlines()[2:] == [
+        "| all of it | 2 × 1 | 100 |  | 100 | 1 × 1 | 50 |  | 100 |",
+        "| no growing | 1 × 1 | 50 | -50 | 100 |  |  |  |  |",
+        "| Gaussians 8000 | 1 × 1 | 100 | +0 | 100 | 1 × 1 | 0 | -50 | 100 |",
+    ]
