@@ -241,9 +241,11 @@ def haze(rows: list[Row]) -> str:
 
 def looks() -> str:
     """Return the table of saturation, diversity over the seeds and evaluations of the 2D model, of
-    the runs that have them.
+    the runs that have them; those on a GPU replace those on CPUs.
     """
-    rows = [row for row in timed_runs() if row["saturation"] and is_present(row)]
+    both = (*timed_runs(), *rows_of(toybox_jobs.GPU_CHART, RESULTS))
+    seen = [row for row in both if row["saturation"] and is_present(row)]
+    rows = {(title_of(row), place(row)): row for row in seen}.values()
     counts, diverse = relative("evaluations", rows), diversities()
     lines = [
         (

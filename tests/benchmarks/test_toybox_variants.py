@@ -148,13 +148,14 @@ def test_looks_are_of_the_rows_that_have_them(monkeypatch):
     csd = seen | {"variant": "CSD", "x": "4", "saturation": "1.75", "evaluations": "3000"}
     rows = [row(**seen), row(**seen, index="1"), row(**csd), row(saturation="")]
     monkeypatch.setattr(toybox_variants, "timed_runs", lambda: rows)
-    diverse = [
-        {"variant": "CSD", "setup": toybox_jobs.setup(), "diversity": value}
-        for value in ("0.1", "0.2")
-    ]
-    monkeypatch.setattr(toybox_variants, "rows_of", lambda chart, folder: diverse)
+    place = {"variant": "CSD", "setup": toybox_jobs.setup()}
+    results = {
+        toybox_variants.DIVERSITY: [place | {"diversity": value} for value in ("0.1", "0.2")],
+        toybox_jobs.GPU_CHART: [row(**seen | {"at_limits": "0.04"}, index="1")],
+    }
+    monkeypatch.setattr(toybox_variants, "rows_of", lambda chart, folder: results[chart])
     assert toybox_variants.looks().splitlines()[2:] == [
-        "| toybox.yaml | 2 × 1 | 1.50 | 2.0 |  | 1200 | 1.0 |",
+        "| toybox.yaml | 2 × 1 | 1.50 | 3.0 |  | 1200 | 1.0 |",
         "| CSD 4 | 1 × 1 | 1.75 | 2.0 | 0.150 | 3000 | 2.5 |",
     ]
 
