@@ -37,9 +37,10 @@ def main() -> None:
     add("--count", type=int, default=20, help="of prompts of each sort (default: 20)")
     add("--seeds", type=int, nargs="+", default=list(range(5)))
     add("--models", default="toybox", help="toybox, or the folder of an export")
+    add("--gpu", type=toybox.device, default=toybox.CPU, help="as the runs were made with")
     add("--out", type=Path, default=CHARTS, help="folder of the CSV (default: docs/charts)")
     arguments = parser.parse_args()
-    arguments.variant, arguments.gpu = [], toybox.CPU
+    arguments.variant = []
     register_parts()
     path = arguments.out / f"{DIVERSITY}.csv"
     write_rows(path, COLUMNS, list(rows_of(arguments)))
