@@ -65,7 +65,7 @@ def _check_reuse(guidance: Any, cfg: Any) -> None:
     wanted = f"system.guidance.reuse_steps={steps} needs steps of the same"
     if cfg.data_type in DATA:
         data = parse_structured(find(cfg.data_type).Config, cfg.data)
-        if data.hold_steps % steps and not _has_one_batch(data):
+        if data.get("hold_steps", 1) % steps and not _has_one_batch(data):
             raise UserError(f"{wanted} views: set data.hold_steps={steps}, or to a multiple of it")
     background = cfg.system.get("background") or {}
     if background.get("mode") == "learned":
