@@ -247,17 +247,18 @@ def looks() -> str:
     seen = [row for row in both if row["saturation"] and is_present(row)]
     rows = {(title_of(row), place(row)): row for row in seen}.values()
     counts, diverse = relative("evaluations", rows), diversities()
+    groups = grouped(rows, lambda row: (row["variant"], row["x"]))
     lines = [
         (
-            title,
+            title_of(own[0]),
             counts_of(own),
             median_of(own, "saturation", 2),
             f"{100 * statistics.fmean(float(row['at_limits']) for row in own):.1f}",
             diverse.get(own[0]["variant"], ""),
             median_of(own, "evaluations"),
-            f"{counts[title]:.1f}" if title in counts else "",
+            f"{counts[title_of(own[0])]:.1f}" if title_of(own[0]) in counts else "",
         )
-        for title, own in grouped(rows, title_of).items()
+        for own in (groups[one.key] for one in toybox_options.looks() if one.key in groups)
     ]
     head = ("variant", "prompts × seeds", "saturation / the object's", "pixels at a limit, %")
     head += ("diversity", "evaluations", "/ those of toybox.yaml")

@@ -264,6 +264,7 @@ def test_rows_become_tables_and_charts(monkeypatch, tmp_path, fake):
         "toybox_settings.png",
         "toybox_distillations.png",
         "toybox_seconds.png",
+        "toybox_evaluations.png",
     }
 
 
