@@ -9,12 +9,10 @@ which two seeds or more are kept.
 """
 
 import argparse
-import itertools
-import statistics
 from pathlib import Path
 
-import torch
-from torch import Tensor
+import numpy as np
+from jaxtyping import Float
 
 from benchmarks.markdown import write_rows
 from benchmarks.quality import toybox
@@ -23,6 +21,7 @@ from benchmarks.quality.runs import CHARTS
 from benchmarks.quality.toybox_options import CHARTS as VARIANTS
 from benchmarks.quality.toybox_scores import views_of
 from benchmarks.quality.toybox_variants import DIVERSITY
+from benchmarks.quality.variant_charts import difference_of
 from threestudio_gaussiandreamer import register_parts
 
 COLUMNS = ["variant", "x", "withheld", "index", "setup", "seeds", "diversity"]
@@ -62,17 +61,16 @@ def rows_of(arguments: argparse.Namespace) -> list[tuple[str, ...]]:
             str(tasks[0].prompt.index),
             tasks[0].setup,
             str(len(tasks)),
-            f"{difference([views_of(toybox.kept(task) / toybox.RUN) for task in tasks]):.4f}",
+            f"{difference_of(map(kept_views, tasks)):.4f}",
         )
         for tasks in groups.values()
         if len(tasks) > 1
     ]
 
 
-def difference(views: list[Tensor]) -> float:
-    """Return the mean over pairs of the root mean square difference of two runs' views."""
-    pairs = itertools.combinations(views, 2)
-    return statistics.mean(torch.sqrt(torch.mean((a - b) ** 2)).item() for a, b in pairs)
+def kept_views(task: toybox.Task) -> Float[np.ndarray, "V H W 3"]:
+    """Render a kept run's result from the judge's directions."""
+    return views_of(toybox.kept(task) / toybox.RUN).numpy()
 
 
 if __name__ == "__main__":

@@ -107,9 +107,7 @@ def ablations() -> str:
     with the learned prior and with one of another kind, from runs on a GPU and on CPUs.
     """
     on_gpu = measured(toybox_jobs.GPU_CHART)
-    done = {(title_of(row), place(row)) for row in on_gpu}
-    others = (row for row in measured() if (title_of(row), place(row)) not in done)
-    rows = [row for row in (*on_gpu, *others) if is_present(row)]
+    rows = [row for row in (*on_gpu, *lacking(on_gpu, measured())) if is_present(row)]
     parts = [("all of it", (toybox_jobs.DEFAULT, "0"), (WRONG_PRIOR, "0"))]
     for name, x in (one.key for chart in ABLATIONS for one in toybox_options.CHARTS[chart]()):
         title = name if x == "0" else f"{name} {x}"
@@ -137,18 +135,14 @@ def part_of(
 def gpu_rows() -> list[Row]:
     """Return the rows of runs on a GPU, and those on CPUs that it lacks of the same variants."""
     rows = measured(toybox_jobs.GPU_CHART)
-    return [*rows, *lacking(rows, measured())]
+    variants = {title_of(row) for row in rows}
+    return [*rows, *(row for row in lacking(rows, measured()) if title_of(row) in variants)]
 
 
 def lacking(rows: Sequence[Row], others: Sequence[Row]) -> list[Row]:
-    """Return those of ``others`` that aren't in ``rows``, of the variants that are."""
-    variants = {title_of(row) for row in rows}
+    """Return those of ``others`` whose variant, prompt and seed aren't in ``rows``."""
     done = {(title_of(row), place(row)) for row in rows}
-    return [
-        row
-        for row in others
-        if title_of(row) in variants and (title_of(row), place(row)) not in done
-    ]
+    return [row for row in others if (title_of(row), place(row)) not in done]
 
 
 def settings() -> str:

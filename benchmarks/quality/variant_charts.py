@@ -108,12 +108,16 @@ def write_diversity(pictures: Path, rows: list[Row]) -> None:
 
 
 def difference(folders: list[Path]) -> float:
-    """Return the mean over pairs of runs of the root mean square difference of their views."""
-    stacks = [
+    """Return :func:`difference_of` the pictures in these folders."""
+    return difference_of(
         np.stack([read(path) for path in sorted(folder.glob("*.png"))]) / 255 for folder in folders
-    ]
+    )
+
+
+def difference_of(runs_views: Iterable[np.ndarray]) -> float:
+    """Return the mean over pairs of runs of the root mean square difference of their views."""
     return statistics.mean(
-        float(np.sqrt(np.mean((a - b) ** 2))) for a, b in itertools.combinations(stacks, 2)
+        float(np.sqrt(np.mean((a - b) ** 2))) for a, b in itertools.combinations(runs_views, 2)
     )
 
 
