@@ -3,9 +3,10 @@
     python -m benchmarks.quality.variant_charts [--pictures outputs/variants]
 
 Draws docs/charts/variants_*.png and cheaper_steps.png from variants.csv, each line at its best
-measured guidance scale. With the pictures of ``benchmarks.quality.variants``, writes
-docs/charts/variants_diversity.csv: the root mean square difference of the same test view between
-two seeds, averaged over the views and all pairs, as a share of the range of colours."""
+measured guidance scale. With the pictures of ``benchmarks.quality.variants``, writes the rows of
+their runs in docs/charts/variants_diversity.csv: the root mean square difference of the same test
+view between two seeds, averaged over the views and all pairs, as a share of the range of colours.
+"""
 
 import argparse
 import itertools
@@ -96,15 +97,22 @@ def draw_charts(rows: list[Row]) -> None:
 
 
 def write_diversity(pictures: Path, rows: list[Row]) -> None:
-    """Compute the diversity of each line, scale and object that two seeds or more have run."""
+    """Compute the diversity of each line, scale and object that has pictures of two seeds or more;
+    the other rows stay.
+    """
+    columns = [*KEY[:-1], "seeds", "diversity"]
+    found = {
+        tuple(row[name] for name in KEY[:-1]): tuple(row.values())
+        for row in runs.rows_of(DIVERSITY)
+    }
     runs_of = grouped({tuple(row[name] for name in KEY) for row in rows}, lambda key: key[:-1])
-    found = []
-    for place, keys in sorted(runs_of.items()):
+    for place, keys in runs_of.items():
         folders = [picture_folder(pictures, key) for key in sorted(keys)]
         folders = [folder for folder in folders if folder.is_dir()]
         if len(folders) > 1:
-            found.append((*place, len(folders), f"{difference(folders):.4f}"))
-    write_rows(runs.CHARTS / f"{DIVERSITY}.csv", [*KEY[:-1], "seeds", "diversity"], found)
+            found[place] = (*place, len(folders), f"{difference(folders):.4f}")
+    ordered = [found[place] for place in sorted(found)]
+    write_rows(runs.CHARTS / f"{DIVERSITY}.csv", columns, ordered)
 
 
 def difference(folders: list[Path]) -> float:

@@ -61,11 +61,23 @@ BINNED, BLIND = TRUTHS = ("direction-bins", "view-agnostic")
 SCALES = (2.0, 8.5, 31.0, 101.0)
 """threestudio's 1, 7.5, 30 and 100."""
 MILD = SCALES[:2]
-FALLING = {
-    "system.guidance.max_step_percent": 0.98,
-    "system.guidance.timestep_steps": STEPS,
-    "system.guidance.timestep_schedule": "linear",
-}
+
+
+def falling(schedule: str) -> dict[str, Any]:
+    """Return the options of timesteps that fall from 0.98 during the whole run."""
+    return {
+        "system.guidance.max_step_percent": 0.98,
+        "system.guidance.timestep_steps": STEPS,
+        "system.guidance.timestep_schedule": schedule,
+    }
+
+
+def fixed(share: float) -> dict[str, Any]:
+    """Return the options of the same timestep in all steps."""
+    return {f"system.guidance.{end}_step_percent": share for end in ("min", "max")}
+
+
+FALLING = falling("linear")
 SDS, CLIPPED = "SDS", "SDS, clipped"
 CLIP = {"system.guidance.grad_clip": [0, 1.5, 2.0, STEPS]}
 
@@ -96,9 +108,9 @@ DISTILLATIONS = {
     SDS: Line("sds", {}, 101.0),
     CLIPPED: Line("sds", CLIP, 101.0),
     "SDS, rescaled": Line("sds", {"system.guidance.recon_std_rescale": 0.5}),
-    "SDS, DreamTime": Line(
-        "sds", FALLING | {"system.guidance.timestep_schedule": "dreamtime"}, 101.0
-    ),
+    "SDS, DreamTime": Line("sds", falling("dreamtime"), 101.0),
+    "SDS, t = 0.2": Line("sds", fixed(0.2)),
+    "SDS, t = 0.5": Line("sds", fixed(0.5)),
     "CSD": Line("csd", {}),
     "NFSD": Line("nfsd", {}, 8.5),
     "VSD": Line("vsd", {}, 8.5),
@@ -109,6 +121,7 @@ DISTILLATIONS = {
 CHEAPER = {
     "SDS, guidance interval": Line("sds", {"system.guidance.guidance_interval": [0.2, 0.8]}),
     "SDS, falling t": Line("sds", FALLING),
+    "SDS, t falling by the root": Line("sds", falling("sqrt")),
     "SDS, a quarter of the steps": Line("sds", length(STEPS // 4), scales=MILD),
     "SDS, half the steps": Line("sds", length(STEPS // 2), scales=MILD),
     "SDS, twice the steps": Line("sds", length(STEPS * 2), scales=MILD),

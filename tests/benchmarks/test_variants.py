@@ -142,6 +142,8 @@ def test_diversity_is_the_difference_between_seeds(charts, monkeypatch):
     (written,) = runs.rows_of("variants_diversity")
     assert written["variant"] == "SDS" and written["seeds"] == "3"
     assert float(written["diversity"]) == pytest.approx((0.2 + 0.4 + 0.2) / 3, abs=1e-3)
+    variant_charts.write_diversity(charts / "elsewhere", rows)
+    assert runs.rows_of("variants_diversity") == [written]  # rows without pictures stay
 
 
 def test_a_cheaper_line_is_compared_with_sds_of_as_many_evaluations():
