@@ -128,6 +128,7 @@ def prepare() -> None:
     """Import the package, limit this process to one thread, and keep its networks loaded."""
     import torch
 
+    from benchmarks.quality import feature_reuse  # noqa: F401, registers a guidance
     from threestudio_gaussiandreamer import register_parts
     from threestudio_gaussiandreamer.models.loaded import keep_loaded
 

@@ -178,6 +178,17 @@ def cheaper() -> Iterator[Variant]:
     yield Variant("views a step, twice the steps", 2, more_steps)
 
 
+def feature_reuse() -> Iterator[Variant]:
+    """Features of the U-Net's inner blocks reused for near views and timesteps: widths of the cells
+    of timesteps; and as many evaluations in fewer steps.
+    """
+    options = {"system.guidance_type": "feature-reuse-guidance"}
+    for width in (100, 200):
+        cell = {"system.guidance.timestep_cell": width}
+        yield Variant("timesteps that share features", width, options | cell)
+    yield Variant("steps", 100, steps(100))
+
+
 def starts() -> Iterator[Variant]:
     """What the second stage starts from, with and without the views' directions in the prompts; a
     contrast of views needs these.
@@ -290,6 +301,7 @@ CHARTS: dict[str, Callable[[], Iterator[Variant]]] = {
     "paper": lambda: iter([Variant(PAPER_RECIPE, 0, overlay(PAPER))]),
     "distillations": distillations,
     "cheaper": cheaper,
+    "feature_reuse": feature_reuse,
     "smoothness": smoothness,
     "looks": looks,
 }

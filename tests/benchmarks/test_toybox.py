@@ -13,6 +13,7 @@ import pytest
 
 from benchmarks.quality import (
     chart_runs,
+    feature_reuse,  # noqa: F401, registers a guidance
     runs,
     toybox,
     toybox_charts,
