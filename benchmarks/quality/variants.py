@@ -104,6 +104,15 @@ def views(count: int) -> dict[str, Any]:
     return length(STEPS * VIEWS // count) | {"data.batch_size": count}
 
 
+def by_error(power: int) -> dict[str, Any]:
+    """Return the options of views drawn by their error; see error_views.py."""
+    return {
+        "data_type": "error-views-datamodule",
+        "data.error_power": power,
+        "system.guidance_type": "error-measuring-guidance",
+    }
+
+
 DISTILLATIONS = {
     SDS: Line("sds", {}, 101.0),
     CLIPPED: Line("sds", CLIP, 101.0),
@@ -129,6 +138,8 @@ CHEAPER = {
         f"SDS, {count} view{'s' * (count > 1)}": Line("sds", views(count), scales=MILD)
         for count in (1, 2, 8)
     },
+    "SDS, views by error": Line("sds", by_error(1), scales=MILD),
+    "SDS, views by its square": Line("sds", by_error(2), scales=MILD),
     "SDS, 4 steps each, 240 steps": Line("sds", length(STEPS) | held(4), scales=MILD),
     "SDS, 2 steps each, 480 steps": Line("sds", length(2 * STEPS) | held(2), scales=MILD),
     "SDS, 4 steps each, 960 steps": Line("sds", length(4 * STEPS) | held(4), scales=MILD),

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from benchmarks.quality import (
+    error_views,  # noqa: F401, registers parts
     forked,
     runs,
     variant_charts,
