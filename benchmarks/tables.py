@@ -80,6 +80,7 @@ SECTIONS: dict[str, dict[str, Callable[[], str]]] = {
     "docs/distillation.md": {
         "quality": variant_tables.quality,
         "blind": variant_tables.blind,
+        "from a ball": variant_tables.from_ball,
         "cheaper": variant_tables.cheaper,
         "overhead": variant_tables.overhead,
         "learned": toybox_variants.distillations,

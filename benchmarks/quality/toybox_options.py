@@ -93,11 +93,14 @@ def over_guidance() -> Iterator[Variant]:
 
 
 def schedules() -> Iterator[Variant]:
-    """Ranges of timesteps, and clipping."""
+    """Ranges of timesteps, fixed timesteps, and clipping."""
     yield Variant("timesteps up to 0.98 throughout", 0, {"system.guidance.max_step_percent": 0.98})
     low = {"system.guidance.max_step_percent": CONFIG["system"]["guidance"]["max_step_percent"]}
     yield Variant("timesteps from 0.2", 0, low | {"system.guidance.min_step_percent": 0.2})
     yield Variant("timesteps that fall by the root of the step", 0, falling("sqrt"))
+    for share in (0.2, 0.5):
+        ends = {f"system.guidance.{end}_step_percent": share for end in ("min", "max")}
+        yield Variant("fixed timestep", share, ends)
     for clip in (0.1, 0.5):
         yield Variant("grad_clip", clip, {"system.guidance.grad_clip": clip})
     rescaled = {"system.guidance.recon_std_rescale": 0.5}

@@ -16,6 +16,7 @@ from benchmarks.quality.variants import (
     CHEAPER,
     CLIPPED,
     DISTILLATIONS,
+    FROM_BALL,
     LINES,
     SDS,
     best_scales,
@@ -145,6 +146,18 @@ def blind() -> str:
         lines.append((median(found, "psnr"), cells))
     heads = ["variant", *(f"dB, {name}" for name in objects), "multi-face", "out of gamut"]
     return markdown(heads, [cells for _, cells in sorted(lines, key=lambda line: -line[0])])
+
+
+def from_ball() -> str:
+    """Return what the choices of timesteps make of a ball."""
+    rows = [row for row in rows_of(CHART) if row["variant"] in FROM_BALL]
+    objects = objects_of(rows)
+    lines = [
+        [label, *per_object(own, objects), *faults(last(own))]
+        for label, own in grouped(rows, lambda row: row["variant"]).items()
+    ]
+    heads = ["line", *(f"dB, {name}" for name in objects), "multi-face", "out of gamut"]
+    return f"{head_of(rows)}\n\n{markdown(heads, lines)}" if rows else "Not measured yet."
 
 
 def cheaper() -> str:

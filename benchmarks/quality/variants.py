@@ -33,7 +33,7 @@ from tqdm import tqdm
 
 from benchmarks.quality import forked, runs
 from benchmarks.quality.chart_runs import Row, ends, grouped, objects_of
-from benchmarks.quality.jobs import BINS, held, steps
+from benchmarks.quality.jobs import BALL, BINS, held, steps
 
 CHART = "variants"
 STEPS, SIZE, VIEWS = 240, 64, 4
@@ -118,6 +118,7 @@ DISTILLATIONS = {
     CLIPPED: Line("sds", CLIP, 101.0),
     "SDS, rescaled": Line("sds", {"system.guidance.recon_std_rescale": 0.5}),
     "SDS, DreamTime": Line("sds", falling("dreamtime"), 101.0),
+    "SDS, t = 0.1": Line("sds", fixed(0.1)),
     "SDS, t = 0.2": Line("sds", fixed(0.2)),
     "SDS, t = 0.5": Line("sds", fixed(0.5)),
     "CSD": Line("csd", {}),
@@ -145,7 +146,13 @@ CHEAPER = {
     "SDS, 4 steps each, 960 steps": Line("sds", length(4 * STEPS) | held(4), scales=MILD),
 }
 """SDS with fewer evaluations per step, or fewer steps."""
-LINES = DISTILLATIONS | CHEAPER
+FROM_BALL = {
+    f"{label}, from a ball": line._replace(options=line.options | BALL, scales=SCALES[:1])
+    for label, line in (DISTILLATIONS | CHEAPER).items()
+    if label == SDS or label.startswith("SDS, t ")
+}
+"""Timesteps with a first shape that is wrong: a grey ball, as large as the object."""
+LINES = DISTILLATIONS | CHEAPER | FROM_BALL
 PAPER_SCALE = 101.0
 BLIND_LINES = [label for label in DISTILLATIONS if label != "CSD"]
 """CSD is refused, since without a direction there is no difference to follow."""

@@ -147,6 +147,17 @@ def test_diversity_is_the_difference_between_seeds(charts, monkeypatch):
     assert runs.rows_of("variants_diversity") == [written]  # rows without pictures stay
 
 
+def test_timesteps_are_tried_with_a_ball_too(charts, monkeypatch):
+    lines = [name for name in variants.LINES if name.startswith("SDS, t ")]
+    assert list(variants.FROM_BALL) == [f"{name}, from a ball" for name in ("SDS", *lines)]
+    for name in lines:
+        ball = variants.LINES[f"{name}, from a ball"].options
+        assert ball == variants.LINES[name].options | variants.BALL
+    rows = [row("SDS, t = 0.2, from a ball", "2", "20"), row("SDS, t = 0.2", "2", "25")]
+    monkeypatch.setattr(variant_tables, "rows_of", lambda chart: rows)
+    assert "| SDS, t = 0.2, from a ball | 20.0 |" in variant_tables.from_ball()
+
+
 def test_a_cheaper_line_is_compared_with_sds_of_as_many_evaluations():
     rows = [
         row("SDS, half the steps", "2", "20", evaluations="100"),
