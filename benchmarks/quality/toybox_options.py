@@ -93,14 +93,11 @@ def over_guidance() -> Iterator[Variant]:
 
 
 def schedules() -> Iterator[Variant]:
-    """Ranges of timesteps, fixed timesteps, and clipping."""
+    """Ranges of timesteps, and clipping."""
     yield Variant("timesteps up to 0.98 throughout", 0, {"system.guidance.max_step_percent": 0.98})
     low = {"system.guidance.max_step_percent": CONFIG["system"]["guidance"]["max_step_percent"]}
     yield Variant("timesteps from 0.2", 0, low | {"system.guidance.min_step_percent": 0.2})
     yield Variant("timesteps that fall by the root of the step", 0, falling("sqrt"))
-    for share in (0.2, 0.5):
-        ends = {f"system.guidance.{end}_step_percent": share for end in ("min", "max")}
-        yield Variant("fixed timestep", share, ends)
     for clip in (0.1, 0.5):
         yield Variant("grad_clip", clip, {"system.guidance.grad_clip": clip})
     rescaled = {"system.guidance.recon_std_rescale": 0.5}
@@ -179,6 +176,13 @@ def cheaper() -> Iterator[Variant]:
     yield Variant("views a step", 2, {"data.batch_size": 2})
     more_steps = steps(2 * STEPS) | {"data.batch_size": 2}
     yield Variant("views a step, twice the steps", 2, more_steps)
+
+
+def fixed_timesteps() -> Iterator[Variant]:
+    """The same timestep in all steps."""
+    for share in (0.2, 0.5):
+        ends = {f"system.guidance.{end}_step_percent": share for end in ("min", "max")}
+        yield Variant("fixed timestep", share, ends)
 
 
 def feature_reuse() -> Iterator[Variant]:
@@ -304,6 +308,7 @@ CHARTS: dict[str, Callable[[], Iterator[Variant]]] = {
     "paper": lambda: iter([Variant(PAPER_RECIPE, 0, overlay(PAPER))]),
     "distillations": distillations,
     "cheaper": cheaper,
+    "fixed_timesteps": fixed_timesteps,
     "feature_reuse": feature_reuse,
     "smoothness": smoothness,
     "looks": looks,

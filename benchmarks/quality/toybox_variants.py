@@ -34,7 +34,7 @@ HEAD = ("variant", "prompts × seeds", "recognised, %", "− toybox.yaml")
 HEAD += ("multi-face, %", "− toybox.yaml", "haze, %", "of toybox.yaml")
 WRONG_PRIOR = toybox_jobs.WRONG_PRIOR
 SECONDS = ("CPU seconds", "of toybox.yaml")
-DISTILLATIONS = ("paper", "distillations", "cheaper", "feature_reuse")
+DISTILLATIONS = ("paper", "distillations", "fixed_timesteps", "cheaper", "feature_reuse")
 """Charts that docs/distillation.md shows; docs/toybox.md shows the others."""
 SETTINGS = [
     name

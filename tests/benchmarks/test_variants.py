@@ -148,11 +148,12 @@ def test_diversity_is_the_difference_between_seeds(charts, monkeypatch):
 
 
 def test_timesteps_are_tried_with_a_ball_too(charts, monkeypatch):
-    lines = [name for name in variants.LINES if name.startswith("SDS, t ")]
-    assert list(variants.FROM_BALL) == [f"{name}, from a ball" for name in ("SDS", *lines)]
+    all_lines = variants.DISTILLATIONS | variants.CHEAPER
+    lines = [name for name in all_lines if name.startswith("SDS, t ")]
+    assert set(variants.FROM_BALL) == {f"{name}, from a ball" for name in ("SDS", *lines)}
     for name in lines:
         ball = variants.LINES[f"{name}, from a ball"].options
-        assert ball == variants.LINES[name].options | variants.BALL
+        assert ball == all_lines[name].options | variants.BALL
     rows = [row("SDS, t = 0.2, from a ball", "2", "20"), row("SDS, t = 0.2", "2", "25")]
     monkeypatch.setattr(variant_tables, "rows_of", lambda chart: rows)
     assert "| SDS, t = 0.2, from a ball | 20.0 |" in variant_tables.from_ball()
