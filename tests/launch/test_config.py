@@ -2,6 +2,7 @@
 
 import os
 import re
+import shutil
 import time
 from pathlib import Path
 
@@ -354,6 +355,36 @@ def test_a_run_that_is_moved_on_purpose_is_named_with_the_folder_of_its_checkpoi
     cfg = load_config("parsed.yaml", cli_args=[f"resume={last}", "exp_root_dir=moved"])
     assert cfg.trial_dir.startswith("moved/tiny/a_red_ball@")
     assert str(folder / "outputs/tiny") in messages[0] and str(folder / "moved") in messages[0]
+
+
+@pytest.fixture
+def copied(folder):
+    """A run's folder, copied and renamed; both have a checkpoint."""
+    run = Path(load("tag=a", "use_timestamp=false").trial_dir)
+    save_file(run / "ckpts/last.ckpt", {"state_dict": {}, "epoch": 0, "global_step": 3})
+    (run / "configs").mkdir()
+    dump_config(run / "configs/parsed.yaml", load("tag=a", "use_timestamp=false"))
+    return shutil.copytree(run, folder / "outputs/tiny/b")
+
+
+@pytest.mark.parametrize("resume", ["auto", "outputs/tiny/b/ckpts/last.ckpt"])
+def test_a_copy_of_a_run_continues_in_its_own_folder(folder, copied, resume):
+    parsed = "outputs/tiny/b/configs/parsed.yaml"
+    for _ in range(2):
+        cfg = load_config(parsed, cli_args=[f"resume={resume}"])
+        assert cfg.trial_dir == str(copied) and cfg.trial_name == "b" and not cfg.new_folder
+        assert Path(cfg.resume).resolve() == copied / "ckpts/last.ckpt"
+        dump_config(parsed, cfg)  # as the run does, which is resumed once more
+
+
+@pytest.mark.parametrize(
+    "options",
+    [["resume=outputs/tiny/a/ckpts/last.ckpt"], ["resume=auto", "tag=c"], []],
+    ids=["another run's checkpoint", "another tag", "not resumed"],
+)
+def test_a_copy_of_a_run_is_left_for_other_folders(folder, copied, options):
+    cfg = load_config("outputs/tiny/b/configs/parsed.yaml", cli_args=options)
+    assert cfg.trial_dir == f"outputs/tiny/{'c' if 'tag=c' in options else 'a'}"
 
 
 def test_the_parsed_file_does_not_resume_again(folder):

@@ -93,7 +93,7 @@ def load_config(*paths: str | os.PathLike, cli_args: Sequence[str] = (), n_gpus:
     _resolve(merged)
     _zero_null_weights(merged.get("system"))
     cfg = parse_structured(ExperimentConfig, merged)
-    name_folders(cfg)
+    name_folders(cfg, paths)
     return cfg
 
 

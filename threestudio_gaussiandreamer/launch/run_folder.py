@@ -5,7 +5,7 @@ import hashlib
 import os
 import shlex
 import unicodedata
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from datetime import datetime
 from difflib import get_close_matches
 from glob import escape as glob_escape
@@ -34,6 +34,10 @@ SAME = {
 defaults, None for options that are compared only where both runs give them."""
 SIZES = {"system.geometry.sh_degree": 0, "system.background.mode": "fixed"}
 """Options that decide which tensors a checkpoint has, and their sizes, and their defaults."""
+NAMING = ("exp_root_dir", "name", "tag", "timestamp")
+"""Options that name a run's folder."""
+PARSED = Path("configs", "parsed.yaml")
+"""The merged configuration of a run, in its folder."""
 SLUG_BYTES = 64
 SLUG_SOURCE = 1024
 """Characters of a text that its slug is made of: normalising takes quadratic time in the length of
@@ -49,9 +53,12 @@ WINDOWS_DEVICES = {
 }
 
 
-def name_folders(cfg: Any) -> None:
+def name_folders(cfg: Any, paths: Sequence[str | os.PathLike] = ()) -> None:
     """Set ``exp_dir``, ``timestamp``, ``trial_name`` and ``trial_dir``. A run that is resumed from
-    its ``parsed.yaml`` keeps its timestamp, and thus its folder.
+    its ``parsed.yaml`` keeps its folder, also if that has been renamed or copied.
+
+    Args:
+        paths: the files that the configuration was merged from.
 
     Raises:
         UserError: there is neither tag nor timestamp, or a component of the path is invalid.
@@ -68,6 +75,8 @@ def name_folders(cfg: Any) -> None:
     cfg.timestamp = cfg.timestamp or ""
     _require_folder_name(tag, cfg.timestamp)
     _set_trial(cfg, tag + cfg.timestamp)
+    if cfg.resume is not None:
+        _follow_config(cfg, paths)
     if cfg.resume == AUTO:
         _resume_newest(cfg, tag)
     elif cfg.resume is not None:
@@ -77,17 +86,43 @@ def name_folders(cfg: Any) -> None:
             _follow_checkpoint(cfg)
 
 
+def _follow_config(cfg: Any, paths: Sequence[str | os.PathLike]) -> None:
+    """Let a run continue in the folder of the ``parsed.yaml`` that it is given with, unless an
+    override names another folder, or the checkpoint is of another run.
+    """
+    for path in map(Path, map(os.path.abspath, paths)):
+        run = path.parent.parent
+        if path != run / PARSED or _is_same(str(run), cfg.trial_dir):
+            continue
+        stored = _run_files(run).config
+        if any(stored.get(name) != cfg.get(name) for name in NAMING):
+            continue
+        if cfg.resume == AUTO or _is_same(str(_run_of(cfg.resume)), str(run)):
+            _continue_in(run, cfg)
+            return
+
+
+def _run_of(checkpoint: str) -> Path:
+    """Return the folder of the run that a checkpoint is of."""
+    return Path(os.path.abspath(os.path.expanduser(checkpoint))).parent.parent
+
+
+def _continue_in(run: Path, cfg: Any) -> None:
+    cfg.exp_dir, cfg.trial_name = escape(str(run.parent)), run.name
+    cfg.trial_dir = escape(str(run))
+    info(f"the run continues in {run}")
+
+
 def _follow_checkpoint(cfg: Any) -> None:
     """Let a run continue in the folder of its checkpoint if only the working folder has changed,
     that is, if the checkpoint's folder has the same relative path in another working folder.
     """
-    here, run = Path(cfg.trial_dir), Path(os.path.abspath(cfg.resume)).parent.parent
+    here, run = Path(cfg.trial_dir), _run_of(cfg.resume)
     if run.name != cfg.trial_name or os.path.realpath(run) == os.path.realpath(here):
         return
     parts = Path(os.path.normpath(here)).parts
     if run.parts[-len(parts) :] == parts:
-        cfg.exp_dir, cfg.trial_dir = escape(str(run.parent)), escape(str(run))
-        info(f"the run continues in {run}")
+        _continue_in(run, cfg)
     else:
         warn(f"the checkpoint is of the run in {run}; this one writes to {os.path.abspath(here)}")
 
@@ -99,10 +134,7 @@ def changes_since(cfg: Any, options: Mapping[str, Any] = SAME) -> list[str]:
     Args:
         options: dotted keys, and their defaults.
     """
-    # only here, since a run that isn't resumed needs no reader
-    from ..view.run_files import RunFiles
-
-    earlier = OmegaConf.create(RunFiles(Path(cfg.resume).parent.parent).config)
+    earlier = OmegaConf.create(_run_files(_run_of(cfg.resume)).config)
     try:
         pairs = {
             name: [OmegaConf.select(source, name, default=default) for source in (earlier, cfg)]
@@ -115,6 +147,14 @@ def changes_since(cfg: Any, options: Mapping[str, Any] = SAME) -> list[str]:
         for name, (old, new) in pairs.items()
         if None not in (old, new) and not _is_same(old, new)
     ]
+
+
+def _run_files(folder: Path) -> Any:
+    """Return the :class:`.run_files.RunFiles` of a run's folder."""
+    # only here, since a run that isn't resumed needs no reader
+    from ..view.run_files import RunFiles
+
+    return RunFiles(folder)
 
 
 def _is_same(old: Any, new: Any) -> bool:
@@ -134,7 +174,7 @@ def resume_command(folder: Path, gpu: Optional[str]) -> str:
     program = program_anywhere()
     run = folder.absolute()
     device = ["--gpu", gpu] if gpu else []
-    parsed, last = run / "configs" / "parsed.yaml", run / "ckpts" / "last.ckpt"
+    parsed, last = run / PARSED, run / "ckpts" / "last.ckpt"
     return shlex.join([*program, "--config", str(parsed), "--train", *device, f"resume={last}"])
 
 
@@ -218,8 +258,9 @@ def _resume_newest(cfg: Any, tag: str) -> None:
     for run in [Path(cfg.trial_dir), *newest_first]:
         found = newest_readable(run / "ckpts")
         if found:
-            cfg.timestamp, cfg.new_folder = run.name.removeprefix(tag), False
-            _set_trial(cfg, run.name)
+            if run != Path(cfg.trial_dir):
+                cfg.timestamp, cfg.new_folder = run.name.removeprefix(tag), False
+                _set_trial(cfg, run.name)
             path, step = found
             cfg.resume = escape(str(path))
             info(f"resume=auto: resuming from {path} (step {step})")
