@@ -81,6 +81,19 @@ def test_options_change_what_is_written(source, tmp_path):
     assert abs(again.gaussians.means[:, 1].mean() + read.gaussians.means[:, 1].mean()) < 1e-2
 
 
+def test_dropped_harmonics_are_named_and_measured(tmp_path, capsys):
+    write_cloud(str(tmp_path / "in.ply"), StoredCloud(ball(60, 2), pruned_to=40.0))
+    command = [str(tmp_path / "in.ply"), str(tmp_path / "a.ply"), "--check", "--size", "64"]
+    assert main([*command, "--harmonics", "2"]) == 0
+    said = capsys.readouterr().out
+    assert "lost:" not in said and "check: 100.0 dB" in said
+    assert read_cloud(command[1]).pruned_to == 40
+    assert main([*command, "--harmonics", "1"]) == 0
+    said = capsys.readouterr().out
+    assert "lost: harmonics above degree 1" in said and "lost: the note about pruning" in said
+    assert "check: 100.0 dB" not in said and read_cloud(command[1]).pruned_to is None
+
+
 def test_version_4_of_spz(source, tmp_path):
     pytest.importorskip("zstandard")
     assert main([str(source), str(tmp_path / "a.spz"), "--spz-version", "4"]) == 0

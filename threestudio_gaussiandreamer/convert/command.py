@@ -35,10 +35,10 @@ from ..gaussians.axes import AXES, VIEWER_UP
 from ..gaussians.gaussians import finite
 from ..gaussians.sh import COEFFICIENTS, MAX_DEGREE
 from ..meshes.write import WRITERS
-from ..view.command import read_any
+from ..view.reading import read_any
 from . import to_mesh
 from .check import VIEWS, compare, reference
-from .losses import losses
+from .losses import dropped, losses
 
 SIZE = 256
 """Width and height of the views of ``--check`` unless given, pixels."""
@@ -127,20 +127,21 @@ def run(args: argparse.Namespace) -> None:
     _check_options(args, suffix, mesh)
     source = existing_file(args.source, "file of Gaussians or checkpoint")
     require_other_file(args.output, source)
-    stored = _read(source, args)
+    whole = _read(source, args)
+    stored = of_degree(whole, args.harmonics)
     if mesh:
         to_mesh.write_mesh(args, stored)
         return
     size = args.size or SIZE
     # before anything is written, since it refuses clouds that can't be rendered
-    truth = reference(stored, size) if args.check else None
+    truth = reference(whole, size) if args.check else None
     write_cloud(args.output, stored, suffix, spz_version=args.spz_version)
     count, written = len(stored.gaussians.means), os.path.getsize(args.output)
     print(
         f"{args.output}: {count:,} Gaussians of degree {stored.gaussians.sh_degree}, "
         f"{size_text(written)}, {written / count:.1f} bytes each"
     )
-    for loss in losses(stored, suffix, args.spz_version):
+    for loss in (*dropped(whole, stored), *losses(stored, suffix, args.spz_version)):
         print(f"lost: {loss}")
     if truth:
         found = compare(truth, read_cloud(args.output))
@@ -169,7 +170,7 @@ def _check_options(args: argparse.Namespace, suffix: str, mesh: bool) -> None:
 
 
 def _read(source: Path, args: argparse.Namespace) -> StoredCloud:
-    """Read IN and apply the options, so that the result is what OUT shall hold.
+    """Read IN and apply the options but ``--harmonics``.
 
     Raises:
         UserError: it can't be read, or holds no Gaussians that can be drawn.
@@ -179,10 +180,17 @@ def _read(source: Path, args: argparse.Namespace) -> StoredCloud:
         raise UserError(f"{args.source} holds no Gaussians that can be drawn: nothing is written")
     if args.antialiased is not None:
         stored = stored._replace(antialiased=args.antialiased)
-    if args.harmonics is not None:
-        sh = stored.gaussians.sh[:, : COEFFICIENTS[args.harmonics]]
-        stored = stored._replace(gaussians=stored.gaussians._replace(sh=sh))
     if args.producer:
         stored = from_producer(stored, args.producer)
     stored = stored.in_axes(args.up_out or VIEWER_UP)
     return stored._replace(gaussians=finite(stored.gaussians, args.source))
+
+
+def of_degree(stored: StoredCloud, degree: Optional[int]) -> StoredCloud:
+    """Return the cloud without harmonics above a degree; as it is if there are none. What it has
+    been pruned to isn't known then.
+    """
+    if degree is None or stored.gaussians.sh_degree <= degree:
+        return stored
+    sh = stored.gaussians.sh[:, : COEFFICIENTS[degree]]
+    return stored._replace(gaussians=stored.gaussians._replace(sh=sh), pruned_to=None)

@@ -48,6 +48,14 @@ def losses(cloud: StoredCloud, suffix: str, spz_version: int) -> Iterator[str]:
         yield "the note about pruning: SPZ of version 4 has no place for it"
 
 
+def dropped(whole: StoredCloud, kept: StoredCloud) -> Iterator[str]:
+    """Yield a sentence for each loss of a cloud whose degree is reduced on purpose."""
+    if kept.gaussians.sh_degree < whole.gaussians.sh_degree:
+        yield f"harmonics above degree {kept.gaussians.sh_degree}"
+        if whole.pruned_to is not None:
+            yield "the note about pruning, which is for all harmonics"
+
+
 def _counted(rows: np.ndarray, what: str) -> Iterator[str]:
     """Yield "n of N Gaussians ``what``" if n > 0.
 

@@ -9,26 +9,21 @@ look inwards, which suits objects but not rooms."""
 import bisect
 import logging
 import time
-from collections.abc import Mapping
-from pathlib import Path
 from typing import NamedTuple, Optional
 
 import numpy as np
 import torch
-from torch import Tensor
 
-from ..core.checkpoint_file import load_file
 from ..core.devices import get_device
 from ..core.errors import UserError
 from ..core.files import existing_file
-from ..formats.gaussian_files import StoredCloud, as_stored, file_size, read_cloud
+from ..formats.gaussian_files import StoredCloud, as_stored, file_size
 from ..formats.spz import COLOR_REACH
-from ..gaussians.axes import WORLD_UP, rotation_between
-from ..gaussians.gaussians import Gaussians, drawable
+from ..gaussians.axes import rotation_between
+from ..gaussians.gaussians import Gaussians
 from ..gaussians.recover import Recovery, Round
 from ..gaussians.sh import rgb_to_sh0
 from ..gaussians.simplify import Budget, rounds_to, simplify
-from ..gaussians.stored_state import require_cloud
 from ..gaussians.views import (
     EPS2D,
     LEAST_ERROR,
@@ -36,6 +31,7 @@ from ..gaussians.views import (
     bounds,
     views_around,
 )
+from ..view.reading import read_any
 from .options import (
     PruneOptions,
     budget_of,
@@ -50,21 +46,6 @@ logger = logging.getLogger(__name__)
 TRAIN_VIEWS, VAL_VIEWS, TEST_VIEWS = 64, 32, 48
 TURNS = (0.0, 45.0, 60.0)
 """Azimuth of the first view of each set, degrees."""
-CHECKPOINTS = {
-    "state_dict": {
-        name: f"geometry.{name}"
-        for name in ("means", "quats", "log_scales", "logit_opacities", "sh0", "sh_rest")
-    },
-    "splats": {
-        "means": "means",
-        "quats": "quats",
-        "log_scales": "scales",
-        "logit_opacities": "opacities",
-        "sh0": "sh0",
-        "sh_rest": "shN",
-    },
-}
-"""The names of the Gaussians' tensors in checkpoints of this package and of gsplat's trainer."""
 
 
 class PruneResult(NamedTuple):
@@ -90,38 +71,13 @@ def read(path: str, up: Optional[str] = None) -> StoredCloud:
         UserError: there is no such file, or it has fewer than two Gaussians or spherical harmonics
             that can't be rendered.
     """
-    file = existing_file(path, "file of Gaussians or checkpoint")
-    if file.suffix in (".ckpt", ".pt", ".pth"):
-        stored = StoredCloud(drawable(from_checkpoint(file), path), up or WORLD_UP)
-    else:
-        stored = read_cloud(path, up=up)
+    stored = read_any(existing_file(path, "file of Gaussians or checkpoint"), up, "IN")
     if len(stored.gaussians.means) < 2:
         raise UserError(
             f"{path} holds {len(stored.gaussians.means)} Gaussians that can be drawn: there is "
             "nothing to prune"
         )
     return stored
-
-
-def from_checkpoint(file: Path) -> Gaussians:
-    """Read the Gaussians of a training checkpoint.
-
-    Raises:
-        UserError: it has none.
-    """
-    content = load_file(file)
-    for key, names in CHECKPOINTS.items():
-        state = content.get(key) if isinstance(content, dict) else None
-        state = state if isinstance(state, Mapping) else {}
-        if all(isinstance(state.get(stored), Tensor) for stored in names.values()):
-            require_cloud(state, names, str(file), allow_non_finite=True)
-            values = {name: state[stored].detach().float() for name, stored in names.items()}
-            harmonics = torch.cat([values.pop("sh0"), values.pop("sh_rest")], 1)
-            return Gaussians(sh=harmonics, **values).arrays()
-    raise UserError(
-        f"{file} holds no cloud of Gaussians: it has neither {CHECKPOINTS['state_dict']['means']} "
-        "nor gsplat's splats"
-    )
 
 
 # ---- pruning -------------------------------------------------------------------------------------

@@ -19,22 +19,20 @@ from typing import Any, Optional
 from ..core.command import joined_values, run_command
 from ..core.errors import UserError
 from ..core.files import existing_file, is_folder, require_other_file, require_writable
-from ..formats.gaussian_files import READ, StoredCloud, read_cloud, require_format
-from ..gaussians.axes import AXES, WORLD_UP
-from ..gaussians.gaussians import drawable
+from ..formats.gaussian_files import StoredCloud
+from ..gaussians.axes import AXES
 from ..gaussians.views import EPS2D, NEAR, bounds
-from ..prune.pipeline import from_checkpoint
 from ..splatting import PRESETS
 from .gallery import write_gallery
 from .live import LiveView, require_server, serve, serve_until_stopped
 from .page import WHITE, PageOptions, Shown, decibels, require_page_size, write_page
+from .reading import read_any
 from .render import RenderSettings
 from .run_files import RunFiles, is_run
 from .run_index import write_index
 
 LONG_WORK = 200_000
 """Gaussians from which writing a page takes seconds, so that it is announced."""
-CHECKPOINT_ENDINGS = (".ckpt", ".pt", ".pth")
 OPTIONS: dict[str, dict[str, Any]] = {
     "--title": {"help": "what the page is called (default: the run's prompt, or the file's name)"},
     "--eps2d": {
@@ -179,22 +177,6 @@ def run_folder(folder: Path, args: argparse.Namespace) -> None:
     if found.cloud and not page.exists():
         write_cloud_page(found.cloud, page, args)
     print(write_index(folder))
-
-
-def read_any(source: Path, up: Optional[str] = None, option: str = "PATH") -> StoredCloud:
-    """Read the Gaussians of a file or checkpoint, without those that can't be drawn.
-
-    Args:
-        up: overrides the up axis that the file states.
-        option: names the argument in messages.
-
-    Raises:
-        UserError: the file is none of Gaussians, or damaged.
-    """
-    if source.suffix in CHECKPOINT_ENDINGS:
-        return StoredCloud(drawable(from_checkpoint(source), str(source)), up or WORLD_UP)
-    require_format(source.name, option, READ)
-    return read_cloud(str(source), up=up)
 
 
 def _value(args: argparse.Namespace, option: str) -> Any:

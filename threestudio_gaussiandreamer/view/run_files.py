@@ -83,6 +83,11 @@ class RunFiles:
         return RenderSettings.of(cfg, bound_colors=bool(bound))
 
     @property
+    def antialiased(self) -> bool:
+        """Whether the run has trained its cloud with antialiasing."""
+        return section(self.config, "system", "renderer").get("antialias") is True
+
+    @property
     def background(self) -> Optional[tuple[float, float, float]]:
         """The colour that the run has shown its cloud on; None if it isn't known."""
         color = section(self.config, "system", "background").get("color")
