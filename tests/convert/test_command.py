@@ -120,6 +120,7 @@ def test_rows_that_cant_be_drawn_are_left_out(tmp_path, caplog):
         (["in.ply", "in.ply"], "OUT is IN"),
         (["in.ply", "a.glb", "--spz-version", "4"], "--spz-version: OUT is a .glb file"),
         (["in.ply", "a.glb", "--from", "lgm", "--up", "z"], "--from and --up both say"),
+        (["in.ply", "a.glb", "--view-size", "1"], "--view-size: expected a whole number"),
         (["in.ply", "a.glb", "--harmonics", "4"], "--harmonics: expected"),
         (["in.ply", "a.glb", "--check", "--size", "2"], "--size: expected"),
         (["in.ply", "a.spz", "--size", "64"], "--size: has no effect without --check"),

@@ -56,7 +56,7 @@ def test_an_spz_file_is_y_up_and_turns_back(tmp_path, up):
     assert (tmp_path / "a.spz").stat().st_size == file_size(stored, ".spz")
 
 
-def test_files_of_other_programs_have_the_axes_of_their_format(tmp_path):
+def test_files_of_other_programs_have_the_axes_of_their_format(tmp_path, caplog):
     write_gaussians(
         tmp_path / "a.ply",
         cloud(),
@@ -64,6 +64,7 @@ def test_files_of_other_programs_have_the_axes_of_their_format(tmp_path):
     )
     read = read_cloud(str(tmp_path / "a.ply"))
     assert (read.up, read.pruned_to) == ("-y", None)
+    assert "'up: north' is none of y, -y, z: it is ignored" in caplog.text
     assert read_cloud(str(tmp_path / "a.ply"), up="z").up == "z"
 
 

@@ -241,6 +241,7 @@ def with_header(version=3, count=2, degree=1, magic=b"NGSP"):
         (b"ply\nformat", "isn't an SPZ file, or damaged"),
         (packed(b"short"), "isn't an SPZ file, or damaged"),
         (packed(BY_HAND)[:-20], "truncated or damaged"),
+        (packed(BY_HAND)[:-1], "its checksum at the end is missing"),
         (packed(BY_HAND)[:-8] + bytes(8), "incorrect data check"),
         (b"NGSP" + bytes(40), "isn't an SPZ file of version 2 to 4"),
         (with_header(magic=b"NGSX"), "isn't an SPZ file of version 2 to 4"),

@@ -280,6 +280,18 @@ class PlainConfig(BaseObject):
         color = 0.5
 
 
+class UntypedOption(BaseObject):
+    @dataclass
+    class Config(BaseObject.Config):
+        SHARES = (0.25, 0.75)
+        width: int = 3
+        color = 0.5
+
+        @staticmethod
+        def check(cfg):
+            """Has no type either."""
+
+
 class InheritedConfig(FooGuidance):
     class Config(FooGuidance.Config):
         """Adds no option."""
@@ -290,6 +302,11 @@ def test_options_of_a_config_without_decorator_are_not_ignored():
         with pytest.raises(UserError, match="Config is no dataclass: write @data"):
             require_dataclass(part)
     require_dataclass(InheritedConfig)
+
+
+def test_an_option_without_a_type_is_named():
+    with pytest.raises(UserError, match=r"Config\.color has no type: write color: float = "):
+        require_dataclass(UntypedOption)
 
 
 def test_an_endless_run_needs_its_own_number_for_checkpoints(folder):

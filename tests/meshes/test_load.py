@@ -273,7 +273,7 @@ def test_many_bad_vertices_are_an_error(tmp_path):
     [
         ("missing.glb", None, "does not exist"),
         ("a.xlsx", b"x", "unknown mesh format"),
-        ("noise.glb", b"not a glb at all" * 9, "can't read the mesh"),
+        ("noise.glb", b"not a glb at all" * 9, "can't read "),
         ("empty.obj", b"", "no faces|can't read"),
         (
             "points.ply",

@@ -195,7 +195,7 @@ class TestPointCloud:
             ("a.xyz", b"1 2 3\n4 5 fox\n", "not readable"),
             ("a.npz", b"PK\3\4 broken", "can't be read"),
             ("a.npy", b"\x93NUMPY broken", "can't be read"),
-            ("a.glb", b"glTF broken", "can't read the mesh"),
+            ("a.glb", b"glTF broken", "can't read "),
             ("a.ply", b"plyx", "not a PLY"),
         ],
     )

@@ -103,6 +103,13 @@ def test_gsplats_checkpoints_are_read(source, tmp_path):
     assert read_cloud(str(from_ply)).up == "-y"
 
 
+def test_a_cloud_of_one_gaussian_is_copied(tmp_path):
+    write_gaussians(tmp_path / "in.ply", ball(1).arrays())
+    for budget in (("--count", "1"), ("--psnr", "30")):
+        assert run(tmp_path / "in.ply", tmp_path / "out.ply", *budget)["met"]
+        assert len(read_cloud(str(tmp_path / "out.ply")).gaussians.means) == 1
+
+
 @pytest.mark.parametrize(("stated", "written"), [("z", "z"), ("-y", "-y"), (None, "-y")])
 def test_pruning_a_ply_does_not_rotate_it(tmp_path, stated, written):
     notes = [f"up: {stated}"] if stated else []

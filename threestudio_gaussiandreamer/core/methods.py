@@ -51,12 +51,19 @@ def require_class_method(owner: type, name: str) -> None:
         raise UserError(f"{owner.__name__}.{name} needs @classmethod above it")
 
 
+def _is_untyped(config: type, name: str, value: Any) -> bool:
+    """Return whether a member of a class of options looks like one without a type."""
+    is_member = name.startswith("_") or callable(value) or hasattr(value, "__get__")
+    return not (is_member or name.isupper() or name in inspect.get_annotations(config))
+
+
 def require_dataclass(owner: Any) -> None:
     """Check the options of a part, ``Config``.
 
     Raises:
         UserError: it isn't a dataclass, lacks the decorator, without which options that a subclass
-            adds are ignored, or isn't derived from that of the part's base class.
+            adds are ignored, has an option without a type, which is ignored too, or isn't derived
+            from that of the part's base class.
     """
     config, bases = owner.Config, getattr(owner.Config, "__dataclass_fields__", None)
     own = vars(config)
@@ -64,6 +71,11 @@ def require_dataclass(owner: Any) -> None:
     if bases is None or ("__dataclass_fields__" not in own and defined):
         raise UserError(
             f"{owner.__name__}.Config is no dataclass: write @dataclass above its class line"
+        )
+    if untyped := [name for name, value in own.items() if _is_untyped(config, name, value)]:
+        raise UserError(
+            f"{owner.__name__}.Config.{untyped[0]} has no type: write {untyped[0]}: "
+            f"{type(own[untyped[0]]).__name__} = ..."
         )
     for base in owner.__mro__:
         missing = getattr(getattr(base, "Config", None), "__dataclass_fields__", {}).keys() - bases

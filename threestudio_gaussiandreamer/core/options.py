@@ -206,13 +206,13 @@ def check_options(config_class: type, cfg: Any, prefix: str = "") -> None:
 
     Args:
         cfg: an instance of the dataclass, or OmegaConf's mapping of it.
-        prefix: prepended to the names of options in messages, such as "system.geometry.".
+        prefix: prepended to the names of options in messages, such as "system.geometry." or "--".
 
     Raises:
         UserError: the first value out of range; the message begins with its path.
     """
     for option in dataclasses.fields(config_class):
-        path, value = prefix + option.name, getattr(cfg, option.name)
+        path, value = prefix + _written(option.name, prefix), getattr(cfg, option.name)
         if dataclasses.is_dataclass(option.type):
             check_options(option.type, value, f"{path}.")
             continue
@@ -225,6 +225,11 @@ def check_options(config_class: type, cfg: Any, prefix: str = "") -> None:
         except ValueError as error:  # UserError is one
             names = {option.name for option in dataclasses.fields(config_class)}
             raise UserError(_located(str(error), prefix, names)) from error
+
+
+def _written(name: str, prefix: str) -> str:
+    """Return the name of an option as users write it: on a command line with hyphens."""
+    return name.replace("_", "-") if prefix == "--" else name
 
 
 def checked_options(config_class: type, cfg: Any, prefix: str = "") -> SimpleNamespace:

@@ -5,6 +5,7 @@ The axes of a file are known: a PLY has them in a comment of its header, the oth
 definition. A PLY without that comment, as other programs write it, is read as -y up, the axes of 3D
 Gaussian splatting and its viewers. The same axes are written by default."""
 
+import logging
 import re
 from collections.abc import Callable, Collection, Sequence
 from functools import partial
@@ -24,6 +25,8 @@ from .splat import read_splat
 from .spz import SPZ_UP, load_spz, read_spz_comment, spz_arrays, spz_bytes, write_spz
 from .usda import USDA_UP, write_usda
 from .usda_reader import read_usda
+
+logger = logging.getLogger(__name__)
 
 UP, PRUNED = "up:", "pruned to the likeness, dB:"
 """Keys of the comments in files; the second is the PSNR to the original cloud."""
@@ -177,8 +180,14 @@ def read_stored(file: Path, *, up: Optional[str] = None) -> StoredCloud:
 
 
 def stated_up(notes: list[str]) -> Optional[str]:
-    """Return the up axis in a file's comments, or None if they have none."""
+    """Return the up axis in a file's comments, or None if they have none that is known."""
     stated = _note(notes, UP)
+    if stated and stated not in AXES:
+        logger.warning(
+            "the up axis in the file's comment %r is none of %s: it is ignored",
+            f"{UP} {stated[:40]}",
+            ", ".join(AXES),
+        )
     return stated if stated in AXES else None
 
 

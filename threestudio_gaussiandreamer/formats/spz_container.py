@@ -138,8 +138,10 @@ def _unpack_gzip(packed: bytes, name: str) -> tuple[SpzHeader, list[memoryview]]
     while not stream.eof and stream.decompress(stream.unconsumed_tail, 1 << 16):
         # read on to the checksum at the end: extensions may follow the blocks
         pass
-    if len(data) < sum(sizes) or not stream.eof:
+    if len(data) < sum(sizes):
         _fail_truncated(name, header, sum(sizes), len(data))
+    if not stream.eof:
+        fail(name, "its checksum at the end is missing: it is truncated.")
     view, ends = memoryview(data), np.cumsum(sizes)
     return header, [view[end - size : end] for end, size in zip(ends, sizes, strict=True)]
 

@@ -21,8 +21,10 @@ BYTES_PER_FACE = 150
 
 
 def fail(path: Path, problem: str) -> NoReturn:
-    """Raise UserError with the reason why the mesh ``path`` can't be read."""
-    raise UserError(f"can't read the mesh {str(path)!r}: {problem}")
+    """Raise UserError with the reason why ``path``, of a mesh or of Gaussians in glTF, can't be
+    read.
+    """
+    raise UserError(f"can't read {str(path)!r}: {problem}")
 
 
 class Budget:

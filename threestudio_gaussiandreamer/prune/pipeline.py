@@ -68,15 +68,12 @@ def read(path: str, up: Optional[str] = None) -> StoredCloud:
         up: overrides the up axis that the file states.
 
     Raises:
-        UserError: there is no such file, or it has fewer than two Gaussians or spherical harmonics
-            that can't be rendered.
+        UserError: there is no such file, or it has no Gaussians or spherical harmonics that can be
+            rendered.
     """
     stored = read_any(existing_file(path, "file of Gaussians or checkpoint"), up, "IN")
-    if len(stored.gaussians.means) < 2:
-        raise UserError(
-            f"{path} holds {len(stored.gaussians.means)} Gaussians that can be drawn: there is "
-            "nothing to prune"
-        )
+    if not len(stored.gaussians.means):
+        raise UserError(f"{path} holds no Gaussians that can be drawn: there is nothing to prune")
     return stored
 
 
