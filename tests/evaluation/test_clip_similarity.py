@@ -20,6 +20,7 @@ from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.evaluation import clip_similarity as module
 from threestudio_gaussiandreamer.evaluation import results
 from threestudio_gaussiandreamer.evaluation.clip_similarity import Protocol, main
+from threestudio_gaussiandreamer.formats.gaussian_files import StoredCloud, write_cloud
 from threestudio_gaussiandreamer.launch.experiment import main as launch
 
 register_parts()
@@ -176,7 +177,7 @@ def test_a_runs_folder_brings_its_prompt_and_background(clip, tmp_path, monkeypa
     ]  # fmt: skip
     assert launch(["--config", "demo.yaml", "--train", "--gpu", "cpu", *overrides]) == 0
     result = results.find_result("outputs/demo/t")
-    assert result.ply == Path("outputs/demo/t/save/it1-export/gaussians.ply")
+    assert result.file == Path("outputs/demo/t/save/it1-export/gaussians.ply")
     assert result.prompt == "a {b} ${c} fox" and result.background == (0.0, 0.5, 1.0)
     (image,) = results.Pictures(results.read_result(result), result.background).render(
         Protocol().orbit.c2w[:1], torch.tensor([1.2]), 16
@@ -224,7 +225,35 @@ def test_a_prompt_of_a_library_is_compared_as_its_text(tmp_path):
 def test_the_last_export_is_taken(tmp_path):
     for step in (200, 1200, 30):
         save(tmp_path / "save" / f"it{step}-export" / "gaussians.ply", blob())
-    assert results.find_result(str(tmp_path)).ply.parent.name == "it1200-export"
+    assert results.find_result(str(tmp_path)).file.parent.name == "it1200-export"
+
+
+def test_of_one_export_the_ply_is_taken(tmp_path):
+    for name in ("gaussians.spz", "gaussians.ply", "points.ply"):
+        save(tmp_path / "save" / "it9-export" / name, blob())
+    assert results.find_result(str(tmp_path)).file.name == "points.ply"
+    save(tmp_path / "save" / "it10-export" / "gaussians.spz", blob())
+    assert results.find_result(str(tmp_path)).file.name == "gaussians.spz"
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_clouds_are_drawn_with_the_antialiasing_of_their_training(tmp_path, antialiased):
+    ply, small = tmp_path / "run/save/it1-export/gaussians.ply", blob()
+    ply.parent.mkdir(parents=True)
+    small.log_scales[:] -= 3
+    write_cloud(str(ply), StoredCloud(small, antialiased=antialiased))
+    (tmp_path / "run/configs").mkdir()
+    parsed = {"system": {"renderer": {"antialias": antialiased}, "prompt_processor": {}}}
+    (tmp_path / "run/configs/parsed.yaml").write_text(json.dumps(parsed))
+    for place in (ply, tmp_path / "run"):
+        result = results.find_result(str(place))
+        assert result.antialiased == antialiased
+        orbit = module.Protocol().orbit.rows(slice(1))
+        drawn, other = (
+            next(results.Pictures(small, antialias=flag).render(orbit.c2w, orbit.fovy, 32))
+            for flag in (result.antialiased, not result.antialiased)
+        )
+        assert (drawn.sum() < other.sum()) == antialiased
 
 
 def test_one_line_of_the_list_for_each_result(plys, tmp_path):

@@ -11,6 +11,7 @@ from tests.helpers import tiny_3d_models as tiny
 from tests.helpers import tiny_image_reward
 from threestudio_gaussiandreamer.evaluation import t3bench
 from threestudio_gaussiandreamer.evaluation.scorecard import main
+from threestudio_gaussiandreamer.formats.gaussian_files import read_cloud, write_cloud
 from threestudio_gaussiandreamer.toybox import export, models
 
 PROMPTS = ("a red fox", "a red fox", "a blue mug with white dots", "a zebra")
@@ -72,6 +73,22 @@ def test_a_damaged_asset_is_named_and_the_others_are_scored(tmp_path, judge, cap
     assert "1 of the assets can't be scored: PLY file" in capsys.readouterr().err
     with open(tmp_path / "out/scorecard.csv", newline="") as file:
         assert len(list(csv.DictReader(file))) == len(PROMPTS) - 1
+
+
+def test_runs_without_a_ply_are_scored_or_named(tmp_path, judge, capsys):
+    runs = finished(tmp_path / "runs", PROMPTS[:3])
+    exports = [runs / f"gaussiandreamer/run{i}/save/it5-export" for i in range(3)]
+    write_cloud(str(exports[0] / "gaussians.spz"), read_cloud(str(exports[0] / "gaussians.ply")))
+    (exports[1] / "model.obj").write_text("v 0 0 0")
+    for export in exports[:2]:
+        (export / "gaussians.ply").unlink()
+    arguments = ["--metrics", "judge", "--judge", judge, "--output", str(tmp_path / "out")]
+    assert main([str(runs), *arguments]) == 2
+    said = capsys.readouterr().err
+    assert "1 of the assets can't be scored" in said and f"{str(exports[1].parents[1])!r}" in said
+    with open(tmp_path / "out/scorecard.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["prompt"] for row in rows] == [PROMPTS[0], PROMPTS[2]]
 
 
 def test_a_run_in_several_folders_is_scored_once(tmp_path, judge, monkeypatch):

@@ -153,7 +153,8 @@ class Quality(Metric):
         self.model = shared_image_reward(args.imagereward)
 
     def score(self, asset: Asset) -> dict[str, float]:
-        chunks = t3bench.quality_pictures(t3bench.normalized(asset.gaussians), t3bench.SIZE)
+        cloud = t3bench.normalized(asset.gaussians)
+        chunks = t3bench.quality_pictures(cloud, t3bench.SIZE, asset.result.antialiased)
         found = [self.model.rewards(pictures, asset.prompt) for pictures in chunks]
         rewards = np.concatenate(found).reshape(-1, len(t3bench.QUALITY_FOVY))
         return {"quality": t3bench.quality(rewards)}
@@ -226,5 +227,6 @@ def rendered(
     asset: Asset, orbit: Orbit, size: int, *, background: Optional[Color] = None
 ) -> Float[np.ndarray, "V s s 3"]:
     """Render an asset in [0, 1], on the run's background unless another is given."""
-    pictures = Pictures(asset.gaussians, background or asset.result.background)
+    result = asset.result
+    pictures = Pictures(asset.gaussians, background or result.background, result.antialiased)
     return np.concatenate(list(pictures.render(orbit.c2w, orbit.fovy, size)))

@@ -130,9 +130,8 @@ def score(result: Result, prompt: str, item: int, clip: PictureText, protocol: P
     orbit = protocol.orbit.rows(needed)
     similarity, thumbnails = np.full(protocol.views, np.nan), {}
     start = 0
-    for images in Pictures(read_result(result), result.background).render(
-        orbit.c2w, orbit.fovy, protocol.size
-    ):
+    pictures = Pictures(read_result(result), result.background, result.antialiased)
+    for images in pictures.render(orbit.c2w, orbit.fovy, protocol.size):
         rows = needed[start : start + len(images)]
         similarity[rows] = PERCENT * clip.similarities(images, prompt)
         thumbnails.update(
@@ -159,7 +158,7 @@ def report(
     """Return the content of ``clip.json``."""
     seeds = np.stack([scored.per_seed for scored in scores])
     each = [
-        {"result": str(result.ply), "prompt": prompt, **_mean_and_spread(scored.per_seed)}
+        {"result": str(result.file), "prompt": prompt, **_mean_and_spread(scored.per_seed)}
         for result, prompt, scored in zip(results, prompts, scores, strict=True)
     ]
     return {
@@ -231,7 +230,7 @@ def prompts_for(
     prompts = [prompt if prompt is not None else result.prompt for result in results]
     if None in prompts:
         raise UserError(
-            f"what was {str(results[prompts.index(None)].ply)!r} made from? Give --prompt or "
+            f"what was {str(results[prompts.index(None)].file)!r} made from? Give --prompt or "
             "--prompts-file"
         )
     return prompts
@@ -365,7 +364,7 @@ def evaluate(
     clip, scores = open_clip(clip_folder), []
     for item, (result, prompt) in enumerate(zip(results, prompts, strict=True)):
         scores.append(score(result, prompt, item, clip, protocol))
-        print(f"{scores[-1].per_seed.mean():6.2f}  {prompt}  {result.ply}", flush=True)
+        print(f"{scores[-1].per_seed.mean():6.2f}  {prompt}  {result.file}", flush=True)
     content = report(results, prompts, scores, clip_folder, protocol)
     text = json_text(content, indent=2, ensure_ascii=False)
     with atomic_file(output / "clip.json") as file:

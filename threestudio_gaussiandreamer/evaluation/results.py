@@ -3,7 +3,6 @@ camera.
 """
 
 import math
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, Optional
@@ -16,13 +15,17 @@ from torch import Tensor
 from ..core.checkpoint_file import load_module_weights
 from ..core.errors import UserError
 from ..core.files import existing_file
+from ..formats.gaussian_files import is_antialiased, suffix_of
 from ..formats.ply import is_gaussian_ply
 from ..gaussians.gaussians import Gaussians
 from ..host import find, get_device, warn
 from ..launch.config import load_config
 from ..prompts.prompt_processors import PROMPT_LIBRARY, resolve_prompt
+from ..view.run_files import RunFiles, step_of
 
 BLACK = (0.0, 0.0, 0.0)
+STORED = (".spz", ".sog", ".compressed.ply")
+"""Formats of Gaussians by their extension alone."""
 FLAT = ("gaussiandreamer-background", "solid-color-background")
 """Backgrounds of one colour."""
 
@@ -30,12 +33,14 @@ FLAT = ("gaussiandreamer-background", "solid-color-background")
 class Result(NamedTuple):
     """The result of one text-to-3D run."""
 
-    ply: Path
-    """The PLY of its Gaussians."""
+    file: Path
+    """The file of its Gaussians."""
     prompt: Optional[str]
     """The prompt of the run; None if it is unknown."""
     background: tuple[float, float, float]
     """The background colour of the run, RGB in [0, 1]."""
+    antialiased: bool = False
+    """Whether it was trained with antialiasing, and so has to be drawn with it."""
 
 
 def find_result(place: str) -> Result:
@@ -46,33 +51,31 @@ def find_result(place: str) -> Result:
     """
     folder = Path(place).expanduser()
     if not folder.is_dir():
-        return _checked(
-            Result(
-                existing_file(place, "result (a run's folder or a PLY of Gaussians)"), None, BLACK
+        file = existing_file(place, "result (a run's folder or a PLY of Gaussians)")
+        if not is_gaussian_ply(file):
+            raise UserError(
+                f"{str(file)!r} is no PLY of Gaussians: a run writes one to "
+                "save/it*-export/gaussians.ply"
             )
-        )
-    exported = sorted(folder.glob("save/it*-export/*.ply"), key=_step)
-    gaussians = [path for path in exported if is_gaussian_ply(path)]
-    if not gaussians:
+        return Result(file, None, BLACK, is_antialiased(file))
+    clouds = sorted(filter(_is_cloud, folder.glob("save/it*-export/*.*")), key=_rank)
+    if not clouds:
         raise UserError(
-            f"{place!r} is no run's folder with Gaussians in save/it*-export: export it first "
-            "(--export), or name a PLY file"
+            f"{place!r} is no run's folder with Gaussians in save/it*-export: export it first, "
+            "with --export and system.exporter.formats=[ply], or name a PLY file"
         )
-    return Result(gaussians[-1], *_prompt_and_background(folder / "configs" / "parsed.yaml"))
+    prompt, background = _prompt_and_background(folder / "configs" / "parsed.yaml")
+    return Result(clouds[-1], prompt, background, RunFiles(folder).antialiased)
 
 
-def _step(path: Path) -> tuple[int, str]:
-    number = re.match(r"it(\d+)", path.parent.name)
-    return int(number[1]) if number else -1, path.name
+def _is_cloud(path: Path) -> bool:
+    suffix = suffix_of(path.name)
+    return suffix in STORED or suffix == ".ply" and is_gaussian_ply(path)
 
 
-def _checked(result: Result) -> Result:
-    if not is_gaussian_ply(result.ply):
-        raise UserError(
-            f"{str(result.ply)!r} is no PLY of Gaussians: a run writes one to "
-            "save/it*-export/gaussians.ply"
-        )
-    return result
+def _rank(path: Path) -> tuple[int, bool, str]:
+    """Order files of Gaussians by step; of one step, PLYs, which round nothing, are the last."""
+    return step_of(path.parent), path.suffix == ".ply", path.name
 
 
 def _prompt_and_background(parsed: Path) -> tuple[Optional[str], tuple[float, float, float]]:
@@ -115,20 +118,28 @@ def _prompt_of(processor: Mapping[str, Any]) -> Optional[str]:
 
 def read_result(result: Result) -> Gaussians:
     """Read all attributes of a result's Gaussians; rows that can't be rendered are skipped."""
-    return find("gaussians-prior")({"path": str(result.ply)}).gaussians("")
+    return find("gaussians-prior")({"path": str(result.file)}).gaussians("")
 
 
 class Pictures:
-    """Renders a cloud as in validation: with this package's rasteriser, a background of one colour,
-    and without gradients.
+    """Renders a cloud with this package's rasteriser and its default options, without gradients.
+
+    Args:
+        background: its colour, RGB in [0, 1].
+        antialias: whether the cloud was trained with antialiasing.
     """
 
-    def __init__(self, arrays: Gaussians, background: tuple[float, float, float] = BLACK) -> None:
+    def __init__(
+        self,
+        arrays: Gaussians,
+        background: tuple[float, float, float] = BLACK,
+        antialias: bool = False,
+    ) -> None:
         geometry = find("gaussiandreamer-cloud")({"sh_degree": math.isqrt(arrays.sh.shape[1]) - 1})
         geometry.set_arrays(**arrays._asdict())
         backdrop = find("gaussiandreamer-background")({"color": list(background)})
         renderer = find("gaussiandreamer-splatting")(
-            {}, geometry=geometry, material=None, background=backdrop
+            {"antialias": antialias}, geometry=geometry, material=None, background=backdrop
         )
         self._renderer = renderer.to(get_device()).eval()
         geometry.to(get_device())

@@ -71,11 +71,10 @@ def run(args: argparse.Namespace) -> None:
         UserError: also if an asset can't be scored, after the scorecard of the others is written.
     """
     register_parts()
-    metrics = open_metrics(args)
-    first = find_results(args.folders)
-    second = find_results([args.against]) if args.against else []
+    metrics, failed = open_metrics(args), []
+    first = find_results(args.folders, failed)
+    second = find_results([args.against], failed) if args.against else []
     output = output_folder(args.output, "--output", FILES)
-    failed: list[str] = []
     rows = [list(scored(results, metrics, failed)) for results in (first, second)]
     if rows[0]:
         content = summary(metrics, *rows)
@@ -134,22 +133,35 @@ def require_models(name: str, args: argparse.Namespace) -> None:
         raise UserError(f"--metrics {name} needs --imagereward FOLDER, after {commands}")
 
 
-def find_results(folders: Sequence[str]) -> list[Result]:
+def find_results(folders: Sequence[str], failed: list[str]) -> list[Result]:
     """Find the finished runs in these folders, sorted by path; a run in several of them once.
+
+    Args:
+        failed: gets the messages of runs without a file of Gaussians.
 
     Raises:
         UserError: a folder doesn't exist or holds no finished run.
     """
-    found: dict[Path, Result] = {}
+    found: dict[Path, Optional[Result]] = {}
     for folder in folders:
         if not Path(folder).expanduser().is_dir():
             raise UserError(f"{folder!r} is no folder: expected a run's, or one that holds runs")
         runs = list(run_folders(Path(folder).expanduser()))
         if not runs:
             raise UserError(f"{folder!r} holds no finished run, which has a save/it*-export folder")
-        new = [place for place in runs if place.resolve() not in found]
-        found |= {place.resolve(): find_result(str(place)) for place in new}
-    return list(found.values())
+        for place in runs:
+            if place.resolve() not in found:
+                found[place.resolve()] = result_or_note(place, failed)
+    return [result for result in found.values() if result]
+
+
+def result_or_note(place: Path, failed: list[str]) -> Optional[Result]:
+    """Return the result in a run's folder; None, and a message in ``failed``, if it has none."""
+    try:
+        return find_result(str(place))
+    except UserError as error:
+        failed.append(str(error))
+        return None
 
 
 def run_folders(folder: Path) -> Iterator[Path]:
@@ -163,7 +175,7 @@ def run_folders(folder: Path) -> Iterator[Path]:
             names.clear()
             continue
         seen.add(real)
-        if any(Path(place).glob("save/it*-export/*.ply")):
+        if any(Path(place).glob("save/it*-export")):
             names.clear()
             yield Path(place)
 
@@ -177,7 +189,7 @@ def scored(
         failed: gets the messages of those that can't be read or scored.
     """
     for item, result in enumerate(tqdm(results, unit="asset", disable=None)):
-        row: dict[str, Any] = {"asset": str(result.ply.parents[2])}
+        row: dict[str, Any] = {"asset": str(result.file.parents[2])}
         try:
             row["prompt"] = prompt_of(result)
             asset = Asset(result, row["prompt"], read_result(result), item)
@@ -196,7 +208,7 @@ def prompt_of(result: Result) -> str:
         UserError: its configuration has none.
     """
     if not result.prompt:
-        raise UserError(f"{str(result.ply)!r} has no prompt in its run's configs/parsed.yaml")
+        raise UserError(f"{str(result.file)!r} has no prompt in its run's configs/parsed.yaml")
     return result.prompt
 
 

@@ -90,7 +90,7 @@ def write_t3bench(
         _write_stand_ins(folder / "render_gaussians", size)
         for result, prompt in zip(results, prompts, strict=True):
             save = folder / "outputs_mesh_t3" / f"{method}_{group}" / folder_name(prompt) / "save"
-            _write_result(save, normalized(read_result(result)), size)
+            _write_result(save, normalized(read_result(result)), size, result.antialiased)
             print(f"T3Bench: {save}", flush=True)
     except OSError as error:
         raise UserError(
@@ -133,9 +133,12 @@ def _write_stand_ins(folder: Path, size: int) -> None:
             file.write(STAND_IN.format(kind=kind, names=names, size=size).encode())
 
 
-def _write_result(save: Path, arrays: Gaussians, size: int) -> None:
-    _write_views(save / "t3bench" / "quality", quality_names(), quality_pictures(arrays, size))
-    _write_views(save / "t3bench" / "caption", caption_names(), caption_pictures(arrays, size))
+def _write_result(save: Path, arrays: Gaussians, size: int, antialias: bool) -> None:
+    quality, caption = (
+        draw(arrays, size, antialias) for draw in (quality_pictures, caption_pictures)
+    )
+    _write_views(save / "t3bench" / "quality", quality_names(), quality)
+    _write_views(save / "t3bench" / "caption", caption_names(), caption)
     export = save / "it0-export"
     export.mkdir(parents=True, exist_ok=True)
     write_obj(export / "model.obj", gaussian_surface(arrays))
@@ -155,23 +158,25 @@ def _write_views(
 
 
 def quality_pictures(
-    arrays: Gaussians, size: int = SIZE
+    arrays: Gaussians, size: int = SIZE, antialias: bool = False
 ) -> Iterator[Float[np.ndarray, "B size size 3"]]:
     """Render the 162 x 5 views for quality of a normalised cloud, in the order of
     :func:`quality_names`.
     """
     positions = np.repeat(icosphere(2, RADIUS), len(QUALITY_FOVY), 0)
     angles = torch.tensor(QUALITY_FOVY).repeat(len(positions) // len(QUALITY_FOVY))
-    return Pictures(arrays).render(towards_origin(positions), angles, size, chunk=8)
+    pictures = Pictures(arrays, antialias=antialias)
+    return pictures.render(towards_origin(positions), angles, size, chunk=8)
 
 
 def caption_pictures(
-    arrays: Gaussians, size: int = SIZE
+    arrays: Gaussians, size: int = SIZE, antialias: bool = False
 ) -> Iterator[Float[np.ndarray, "B size size 3"]]:
     """Render the 12 views for captions of a normalised cloud."""
     positions = icosphere(0, RADIUS) * RADIUS
     angles = torch.full((len(positions),), CAPTION_FOVY)
-    return Pictures(arrays).render(towards_origin(positions), angles, size, chunk=8)
+    pictures = Pictures(arrays, antialias=antialias)
+    return pictures.render(towards_origin(positions), angles, size, chunk=8)
 
 
 def quality(rewards: Float[np.ndarray, "162 5"]) -> float:

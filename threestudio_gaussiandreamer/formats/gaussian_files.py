@@ -196,6 +196,11 @@ def ply_up(path: Path) -> str:
     return stated_up(read_comments(path)) or VIEWER_UP
 
 
+def is_antialiased(path: Path) -> bool:
+    """Return whether a PLY of Gaussians says that they were trained with antialiasing."""
+    return _stated_mode(read_comments(path))
+
+
 def _note(notes: list[str], key: str) -> str:
     """Return the text after ``key`` in the last note that begins with it; empty if none does."""
     return next(
