@@ -80,8 +80,8 @@ def test_runs_without_a_ply_are_scored_or_named(tmp_path, judge, capsys):
     exports = [runs / f"gaussiandreamer/run{i}/save/it5-export" for i in range(3)]
     write_cloud(str(exports[0] / "gaussians.spz"), read_cloud(str(exports[0] / "gaussians.ply")))
     (exports[1] / "model.obj").write_text("v 0 0 0")
-    for export in exports[:2]:
-        (export / "gaussians.ply").unlink()
+    for exported in exports[:2]:
+        (exported / "gaussians.ply").unlink()
     arguments = ["--metrics", "judge", "--judge", judge, "--output", str(tmp_path / "out")]
     assert main([str(runs), *arguments]) == 2
     said = capsys.readouterr().err

@@ -104,3 +104,13 @@ def test_another_optimiser_forgets_the_arguments_that_it_lacks(name):
     assert "betas" not in cfg.system.optimizer.args
     nothing = load_config(config, cli_args=[prompt, "system.optimizer.args=null"])
     check_optimizer(nothing.system.optimizer)
+
+
+def test_only_optimisers_that_can_train_are_named():
+    with pytest.raises(UserError) as error:
+        check_optimizer({"name": "zz"})
+    named = str(error.value).partition("choose from ")[2].rstrip(".").split(", ")
+    assert {"Adam", "SGD", "RMSprop"} <= set(named)
+    for name in named:
+        check_optimizer({"name": name})
+    assert not {"Optimizer", "LBFGS", "SparseAdam", "Muon"} & set(named)

@@ -27,7 +27,7 @@ def unknown(kind: str, name: str, choices: Iterable[str], prefix: str = "") -> U
     Args:
         prefix: what the message puts in front of name and similar choices, such as a section.
     """
-    choices = sorted(map(str, choices))
+    choices = sorted(set(map(str, choices)))
     near = difflib.get_close_matches(str(name), choices, n=3, cutoff=0.6)
     if near:
         hint = f"did you mean {' or '.join(repr(prefix + choice) for choice in near)}?"

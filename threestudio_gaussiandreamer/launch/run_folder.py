@@ -32,7 +32,11 @@ SAME = {
 }
 """Options that a resumed run usually has in common with the one before; the values are the
 defaults, None for options that are compared only where both runs give them."""
-SIZES = {"system.geometry.sh_degree": 0, "system.background.mode": "fixed"}
+SIZES = {
+    "system.geometry.sh_degree": 0,
+    "system.background_type": "gaussiandreamer-background",
+    "system.background.mode": "fixed",
+}
 """Options that decide which tensors a checkpoint has, and their sizes, and their defaults."""
 NAMING = ("exp_root_dir", "name", "tag", "timestamp")
 """Options that name a run's folder."""
@@ -142,10 +146,14 @@ def changes_since(cfg: Any, options: Mapping[str, Any] = SAME) -> list[str]:
         }
     except OmegaConfBaseException:  # of an interpolation, which only an edited file has
         return []
-    return [
-        f"{name} was {old!r}, now it is {new!r}"
+    changed = {
+        name: f"{name} was {old!r}, now it is {new!r}"
         for name, (old, new) in pairs.items()
         if None not in (old, new) and not _is_same(old, new)
+    }
+    # options of another part say nothing
+    return [
+        text for name, text in changed.items() if f"{name.rpartition('.')[0]}_type" not in changed
     ]
 
 

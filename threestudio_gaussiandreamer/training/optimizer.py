@@ -94,19 +94,34 @@ def check_optimizer(options: Any, scheduler: Any = None) -> None:
     name, arguments = options.get("name", "Adam"), options.get("args") or {}
     if not isinstance(getattr(torch.optim, str(name), None), type):
         known = [name for name, value in vars(torch.optim).items() if isinstance(value, type)]
-        raise unknown("system.optimizer.name", name, known)
+        raise unknown("system.optimizer.name", name, filter(_works, known))
     if not isinstance(arguments, Mapping):
         raise UserError(f"optimizer.args: expected keys and values, got {arguments!r}")
     try:
-        optimizer = make_optimizer(options, [_some_group(), _some_group()])
-        if not (arguments.get("capturable") and get_device().type == "cuda"):
-            optimizer.step()  # on the CPU, which would refuse what a GPU takes
+        _try_step(options)
     except Exception as error:  # of many types
         accepted = accepted_arguments(name)
         wrong = [unknown("argument", key, accepted) for key in arguments if key not in accepted]
         raise UserError(
             f"optimizer: {name} doesn't accept this: {wrong[0] if wrong else error}"
         ) from error
+
+
+def _works(name: str) -> bool:
+    """Return whether an optimiser of ``torch.optim`` can train the parts with its defaults."""
+    try:
+        _try_step({"name": name})
+    except Exception:  # of many types
+        return False
+    return True
+
+
+def _try_step(options: Mapping[str, Any]) -> None:
+    """Make the optimiser of some parameters, and a step."""
+    optimizer = make_optimizer(options, [_some_group(), _some_group()])
+    arguments = options.get("args") or {}
+    if not (arguments.get("capturable") and get_device().type == "cuda"):
+        optimizer.step()  # on the CPU, which would refuse what a GPU takes
 
 
 def _check_rates(params: Any) -> None:
