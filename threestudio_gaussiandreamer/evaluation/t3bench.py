@@ -134,11 +134,9 @@ def _write_stand_ins(folder: Path, size: int) -> None:
 
 
 def _write_result(save: Path, arrays: Gaussians, size: int, antialias: bool) -> None:
-    quality, caption = (
-        draw(arrays, size, antialias) for draw in (quality_pictures, caption_pictures)
-    )
-    _write_views(save / "t3bench" / "quality", quality_names(), quality)
-    _write_views(save / "t3bench" / "caption", caption_names(), caption)
+    views = (arrays, size, antialias)
+    _write_views(save / "t3bench" / "quality", quality_names(), quality_pictures(*views))
+    _write_views(save / "t3bench" / "caption", caption_names(), caption_pictures(*views))
     export = save / "it0-export"
     export.mkdir(parents=True, exist_ok=True)
     write_obj(export / "model.obj", gaussian_surface(arrays))
