@@ -3,6 +3,7 @@
 import json
 import os
 import shutil
+from datetime import datetime
 from pathlib import Path
 
 import pytest
@@ -12,6 +13,8 @@ from tests.launch.config_cases import load
 from threestudio_gaussiandreamer.core.checkpoint_file import save_file
 from threestudio_gaussiandreamer.launch import run_folder
 from threestudio_gaussiandreamer.launch.config import dump_config, load_config
+
+CHECKPOINT = {"state_dict": {}, "epoch": 0, "global_step": 3}
 
 
 def test_paths_of_one_file_are_no_change(folder):
@@ -49,7 +52,7 @@ def test_a_run_that_is_moved_on_purpose_is_named_with_the_folder_of_its_checkpoi
 def copied(folder):
     """A run's folder, copied and renamed; both have a checkpoint."""
     run = Path(load("tag=a", "use_timestamp=false").trial_dir)
-    save_file(run / "ckpts/last.ckpt", {"state_dict": {}, "epoch": 0, "global_step": 3})
+    save_file(run / "ckpts/last.ckpt", CHECKPOINT)
     (run / "configs").mkdir()
     dump_config(run / "configs/parsed.yaml", load("tag=a", "use_timestamp=false"))
     return shutil.copytree(run, folder / "outputs/tiny/b")
@@ -85,3 +88,16 @@ def test_of_another_part_only_its_type_is_named(folder):
 def test_a_copy_of_a_run_is_left_for_other_folders(folder, copied, options):
     cfg = load_config("outputs/tiny/b/configs/parsed.yaml", cli_args=options)
     assert cfg.trial_dir == f"outputs/tiny/{'c' if 'tag=c' in options else 'a'}"
+
+
+def test_a_run_of_the_same_second_is_resumed_in_its_folder(folder, monkeypatch):
+    class Noon(datetime):
+        @classmethod
+        def now(cls, tz=None):
+            return cls(2026, 1, 1, 12)
+
+    monkeypatch.setattr(run_folder, "datetime", Noon)
+    first = load("tag=a")
+    save_file(Path(first.trial_dir, "ckpts/last.ckpt"), CHECKPOINT)
+    again = load("tag=a", "resume=auto")
+    assert first.new_folder and not again.new_folder and again.trial_dir == first.trial_dir

@@ -92,7 +92,7 @@ def test_a_cloud_of_fog_is_refused():
         ({"texture": 512.5}, "--texture: expected a whole number"),
         ({"views": 1}, "--views: expected a whole number from 8"),
         ({"method": "fuson"}, "did you mean 'fusion'"),
-        ({"min_component": 2}, "--min_component: expected a number from 0 to 0.5"),
+        ({"min_component": 2}, "--min-component: expected a number from 0 to 0.5"),
         ({"eps2d": -1}, "--eps2d: expected 0 or more"),
     ],
 )

@@ -266,8 +266,9 @@ def _resume_newest(cfg: Any, tag: str) -> None:
     for run in [Path(cfg.trial_dir), *newest_first]:
         found = newest_readable(run / "ckpts")
         if found:
+            cfg.new_folder = False
             if run != Path(cfg.trial_dir):
-                cfg.timestamp, cfg.new_folder = run.name.removeprefix(tag), False
+                cfg.timestamp = run.name.removeprefix(tag)
                 _set_trial(cfg, run.name)
             path, step = found
             cfg.resume = escape(str(path))
