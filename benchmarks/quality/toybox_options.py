@@ -153,8 +153,9 @@ def distillations() -> Iterator[Variant]:
 
 
 def looks() -> Iterator[Variant]:
-    """Each distillation at the scale at which it did best, with toybox.yaml, the paper's recipe and
-    ways against its over-saturation: what saturation and diversity are measured on.
+    """Each distillation at the scale at which it did best, with toybox.yaml, the paper's recipe,
+    ways against its over-saturation, and a small timestep: what saturation and diversity are
+    measured on.
     """
     yield Variant(DEFAULT)
     best = {"SDI": f"{LARGEST_SCALES['sdi']:g}"}
@@ -162,6 +163,7 @@ def looks() -> Iterator[Variant]:
     chosen = ("guidance scale", f"{PAPER_SCALE:g}"), ("recon_std_rescale 0.5", "0")
     falls = ("timesteps that fall by the root of the step", "0")
     yield from (one for one in (*over_guidance(), *schedules()) if one.key in (*chosen, falls))
+    yield from (one for one in fixed_timesteps() if one.x == 0.2)
     yield Variant(PAPER_RECIPE, 0, overlay(PAPER))
 
 
