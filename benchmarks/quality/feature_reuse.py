@@ -36,12 +36,11 @@ from threestudio_gaussiandreamer.guidance.text_condition import (
 )
 from threestudio_gaussiandreamer.host import register, run_seed
 
-NAME = "feature-reuse-guidance"
 REUSED = 0.9
 """Share of the views in known cells that aren't predicted as a whole."""
 
 
-@register(NAME)
+@register("feature-reuse-guidance")
 class FeatureReuseGuidance(StableDiffusionGuidance):
     """Score distillation with a U-Net of which the inner blocks' features are reused."""
 

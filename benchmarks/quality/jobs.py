@@ -70,6 +70,11 @@ class Job(NamedTuple):
     """
 
 
+def fixed_timestep(share: float) -> dict[str, Any]:
+    """Return the options of the same timestep in all steps, a share of all timesteps."""
+    return {f"system.guidance.{end}_step_percent": share for end in ("min", "max")}
+
+
 def held(count: int) -> dict[str, Any]:
     """Return the options of a run with one prediction of the score model per ``count`` steps."""
     keys = ("system.guidance.reuse_steps", "data.hold_steps", "system.background.hold_steps")

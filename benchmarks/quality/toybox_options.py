@@ -5,7 +5,7 @@ from typing import Any
 
 import yaml
 
-from benchmarks.quality.jobs import held
+from benchmarks.quality.jobs import fixed_timestep, held
 from benchmarks.quality.runs import ROOT
 from benchmarks.quality.toybox_jobs import (
     CONFIG,
@@ -183,8 +183,7 @@ def cheaper() -> Iterator[Variant]:
 def fixed_timesteps() -> Iterator[Variant]:
     """The same timestep in all steps."""
     for share in (0.2, 0.5):
-        ends = {f"system.guidance.{end}_step_percent": share for end in ("min", "max")}
-        yield Variant("fixed timestep", share, ends)
+        yield Variant("fixed timestep", share, fixed_timestep(share))
 
 
 def feature_reuse() -> Iterator[Variant]:

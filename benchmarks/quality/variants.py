@@ -33,7 +33,7 @@ from tqdm import tqdm
 
 from benchmarks.quality import forked, runs
 from benchmarks.quality.chart_runs import Row, ends, grouped, objects_of
-from benchmarks.quality.jobs import BALL, BINS, held, steps
+from benchmarks.quality.jobs import BALL, BINS, fixed_timestep, held, steps
 
 CHART = "variants"
 STEPS, SIZE, VIEWS = 240, 64, 4
@@ -70,11 +70,6 @@ def falling(schedule: str) -> dict[str, Any]:
         "system.guidance.timestep_steps": STEPS,
         "system.guidance.timestep_schedule": schedule,
     }
-
-
-def fixed(share: float) -> dict[str, Any]:
-    """Return the options of the same timestep in all steps."""
-    return {f"system.guidance.{end}_step_percent": share for end in ("min", "max")}
 
 
 FALLING = falling("linear")
@@ -118,9 +113,9 @@ DISTILLATIONS = {
     CLIPPED: Line("sds", CLIP, 101.0),
     "SDS, rescaled": Line("sds", {"system.guidance.recon_std_rescale": 0.5}),
     "SDS, DreamTime": Line("sds", falling("dreamtime"), 101.0),
-    "SDS, t = 0.1": Line("sds", fixed(0.1)),
-    "SDS, t = 0.2": Line("sds", fixed(0.2)),
-    "SDS, t = 0.5": Line("sds", fixed(0.5)),
+    "SDS, t = 0.1": Line("sds", fixed_timestep(0.1)),
+    "SDS, t = 0.2": Line("sds", fixed_timestep(0.2)),
+    "SDS, t = 0.5": Line("sds", fixed_timestep(0.5)),
     "CSD": Line("csd", {}),
     "NFSD": Line("nfsd", {}, 8.5),
     "VSD": Line("vsd", {}, 8.5),
