@@ -154,7 +154,7 @@ def distillations() -> Iterator[Variant]:
 
 def looks() -> Iterator[Variant]:
     """Each distillation at the scale at which it did best, with toybox.yaml, the paper's recipe,
-    ways against its over-saturation, and a small timestep: what saturation and diversity are
+    ways against its over-saturation, and small timesteps: what saturation and diversity are
     measured on.
     """
     yield Variant(DEFAULT)
@@ -163,7 +163,7 @@ def looks() -> Iterator[Variant]:
     chosen = ("guidance scale", f"{PAPER_SCALE:g}"), ("recon_std_rescale 0.5", "0")
     falls = ("timesteps that fall by the root of the step", "0")
     yield from (one for one in (*over_guidance(), *schedules()) if one.key in (*chosen, falls))
-    yield from (one for one in fixed_timesteps() if one.x == 0.2)
+    yield from (one for one in fixed_timesteps() if one.name == "fixed timestep" and one.x < 0.5)
     yield Variant(PAPER_RECIPE, 0, overlay(PAPER))
 
 
@@ -181,9 +181,16 @@ def cheaper() -> Iterator[Variant]:
 
 
 def fixed_timesteps() -> Iterator[Variant]:
-    """The same timestep in all steps."""
-    for share in (0.2, 0.5):
+    """The same timestep in all steps, and in those after the fall of the largest timestep."""
+    for share in (0.1, 0.2, 0.5):
         yield Variant("fixed timestep", share, fixed_timestep(share))
+    guidance, share = CONFIG["system"]["guidance"], 0.2
+    start, high, _, end = guidance["max_step_percent"]
+    late = {
+        "system.guidance.min_step_percent": [start, guidance["min_step_percent"], share, end],
+        "system.guidance.max_step_percent": [start, high, share, end],
+    }
+    yield Variant(f"fixed timestep from step {start}", share, late)
 
 
 def feature_reuse() -> Iterator[Variant]:
@@ -230,11 +237,12 @@ def growing() -> Iterator[Variant]:
 
 
 def wrong_priors() -> Iterator[Variant]:
-    """The same, and numbers of Gaussians, with a prior of another kind; and the grey ball of
-    ``starts`` with growing.
+    """The same, numbers of Gaussians, and small timesteps, with a prior of another kind; and the
+    grey ball of ``starts`` with growing.
     """
     few_and_many = (one for one in counts() if one.x in (1000, 8000))
-    for one in (*growing(), *few_and_many):
+    small_timesteps = (one for one in fixed_timesteps() if one.x == 0.2)
+    for one in (*growing(), *few_and_many, *small_timesteps):
         yield one._replace(name=f"{WRONG_PRIOR}, {one.name}", wrong_prior=True)
     grown = {name: value for name, value in BALL.items() if not name.endswith("grow.enabled")}
     yield Variant("grey ball, growing", 0, grown)

@@ -237,7 +237,7 @@ def looks() -> str:
     """Return the table of saturation, diversity over the seeds and evaluations of the 2D model, of
     the runs that have them; those on a GPU replace those on CPUs.
     """
-    both = (*timed_runs(), *rows_of(toybox_jobs.GPU_CHART, RESULTS))
+    both = (*timed_runs(), *measured(toybox_jobs.GPU_CHART))
     seen = [row for row in both if row["saturation"] and is_present(row)]
     rows = {(title_of(row), place(row)): row for row in seen}.values()
     counts, diverse = relative("evaluations", rows), diversities()
@@ -248,7 +248,7 @@ def looks() -> str:
             counts_of(own),
             median_of(own, "saturation", 2),
             f"{100 * statistics.fmean(float(row['at_limits']) for row in own):.1f}",
-            diverse.get(own[0]["variant"], ""),
+            diverse.get(title_of(own[0]), ""),
             median_of(own, "evaluations"),
             f"{counts[title_of(own[0])]:.1f}" if title_of(own[0]) in counts else "",
         )
@@ -263,7 +263,7 @@ def diversities() -> dict[str, str]:
     """Return the mean diversity over the prompts of each variant that was measured."""
     present = toybox_jobs.setup()
     rows = [row for row in rows_of(DIVERSITY, RESULTS) if row["setup"] == present]
-    groups = grouped(rows, lambda row: row["variant"])
+    groups = grouped(rows, title_of)
     means = {
         name: statistics.fmean(float(row["diversity"]) for row in own)
         for name, own in groups.items()
