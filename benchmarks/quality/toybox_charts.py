@@ -1,4 +1,4 @@
-"""The charts of docs/toybox.md, from docs/charts/toybox.csv.
+"""The charts of docs/toybox.md, from docs/charts/toybox.csv and toybox_gpu.csv.
 
     python -m benchmarks.quality.toybox_charts      # draws docs/charts/toybox_*.png
 
@@ -32,7 +32,6 @@ from benchmarks.quality.toybox_tables import (
     Row,
     estimate,
     is_present,
-    measured,
     present,
     title_of,
 )
@@ -40,11 +39,13 @@ from benchmarks.quality.toybox_variants import (
     DISTILLATIONS,
     ENOUGH,
     SETTINGS,
+    all_runs,
     multi_face,
     pairs_of_charts,
     recognised_share,
     relative,
     relative_seconds,
+    runs_with_looks,
     timed_runs,
     values_of,
 )
@@ -84,10 +85,11 @@ def main() -> None:
             print(draw(name, line, varied + default_at(line, varied, rows), references(rows)))
     ratios = relative_seconds(timed_runs())
     for name, charts in COMPARISONS.items():
-        if found := settings(measured(), charts):
+        if found := settings(all_runs(), charts):
             print(draw_settings(name, found, ratios))
-    compared = settings(measured(), (*SETTINGS, *DISTILLATIONS), others=(EXACT,))
-    counts = relative("evaluations", timed_runs())
+    charts = [name for name in (*SETTINGS, *DISTILLATIONS) if name != "wrong_priors"]
+    compared = settings(all_runs(), charts, others=(EXACT,))
+    counts = relative("evaluations", runs_with_looks())
     for name, label, against in (
         ("toybox_seconds", RELATIVE_SECONDS, ratios),
         ("toybox_evaluations", RELATIVE_EVALUATIONS, counts),
@@ -229,7 +231,7 @@ def draw_seconds(panel: Any, found: Sequence[Setting], ratios: dict[str, float])
     panel.axvline(1, color="0.5", linewidth=1)
     panel.margins(x=0.1)
     panel.set_xlim(left=0)
-    finish(panel, RELATIVE_SECONDS)
+    finish(panel, RELATIVE_SECONDS.replace("/ ", "/\n"))
 
 
 # ---- results against seconds or evaluations ------------------------------------------------------

@@ -60,41 +60,44 @@ EARLIER = {
 
 
 def distillations() -> str:
-    """Return the table of score distillations and of cheaper steps with the learned models, with
-    the ratio of their seconds to those of toybox.yaml in runs that were made for that.
+    """Return the table of score distillations and of cheaper steps with the learned models, from
+    runs on a GPU and on CPUs, with the ratio of their seconds to those of toybox.yaml in runs that
+    were made for that.
     """
     ratios = {title: f"{ratio:.1f}" for title, ratio in relative_seconds(timed_runs()).items()}
     lines = [
-        (*line_of(marked_title(own[0]), own, plain), ratios.get(title_of(own[0]), ""))
-        for own, plain in pairs_of_charts(measured(), DISTILLATIONS)
+        (*line, ratios.get(line[0], "")) for line in lines_beside_cpus(all_runs(), DISTILLATIONS)
     ]
     return markdown((*HEAD, "seconds / toybox.yaml's"), lines) if lines else NOT_MEASURED
 
 
-def on_gpu(charts: Iterable[str] = DISTILLATIONS) -> str:
-    """Return the table of these charts' runs on a GPU, of which the first line is toybox.yaml on
-    CPUs. Runs of these variants that the GPU lacks are taken from CPUs.
+def settings_on_gpu() -> str:
+    """Return the table of all settings but the distillation's of which there are runs on a GPU.
+    Those that it lacks are taken from CPUs.
     """
-    rows = measured(toybox_jobs.GPU_CHART)
-    default = [row for row in rows if row["variant"] == toybox_jobs.DEFAULT and is_present(row)]
+    lines = lines_beside_cpus(gpu_rows(), SETTINGS)
+    return markdown(HEAD, lines) if lines else NOT_MEASURED
+
+
+def lines_beside_cpus(rows: Sequence[Row], charts: Iterable[str]) -> list[tuple[str, ...]]:
+    """Return a line for each variant of these charts; where there are runs of toybox.yaml on a GPU,
+    the first line is those on CPUs compared with them.
+    """
+    on_gpu = measured(toybox_jobs.GPU_CHART)
+    default = [row for row in on_gpu if row["variant"] == toybox_jobs.DEFAULT and is_present(row)]
     on_cpus = {place(row): row for row in measured() if row["variant"] == toybox_jobs.DEFAULT}
     both = [row for row in default if place(row) in on_cpus]
     same = [on_cpus[place(row)] for row in both]
     lines = [line_of(f"{toybox_jobs.DEFAULT} on CPUs", same, both)] if both else []
-    pairs = pairs_of_charts(gpu_rows(), charts)
-    lines += [line_of(marked_title(own[0]), own, plain) for own, plain in pairs]
-    return markdown(HEAD, lines) if lines else NOT_MEASURED
+    pairs = pairs_of_charts(rows, charts)
+    return lines + [line_of(marked_title(own[0]), own, plain) for own, plain in pairs]
 
 
-def settings_on_gpu() -> str:
-    return on_gpu(SETTINGS)
-
-
-def wrong_priors_on_gpu() -> str:
-    """Return the table of parts of growing with a prior of another kind, each compared with the
-    same prior and all of growing.
+def wrong_priors() -> str:
+    """Return the table of parts of growing, numbers of Gaussians and small timesteps with a prior
+    of another kind, each compared with the same prior alone, from runs on a GPU and on CPUs.
     """
-    rows = gpu_rows()
+    rows = all_runs()
     parts = [one.key for one in toybox_options.wrong_priors() if one.wrong_prior]
     pairs = [pair for key in parts for pair in pairs_of(rows, *key, base=WRONG_PRIOR)]
     lines = [line_of(marked_title(own[0]), own, whole) for own, whole in pairs]
@@ -106,8 +109,7 @@ def ablations() -> str:
     """Return the table of parts of Algorithm 1, numbers of Gaussians and qualities of the prior,
     with the learned prior and with one of another kind, from runs on a GPU and on CPUs.
     """
-    on_gpu = measured(toybox_jobs.GPU_CHART)
-    rows = [row for row in (*on_gpu, *lacking(on_gpu, measured())) if is_present(row)]
+    rows = [row for row in all_runs() if is_present(row)]
     parts = [("all of it", (toybox_jobs.DEFAULT, "0"), (WRONG_PRIOR, "0"))]
     for name, x in (one.key for chart in ABLATIONS for one in toybox_options.CHARTS[chart]()):
         title = name if x == "0" else f"{name} {x}"
@@ -134,9 +136,14 @@ def part_of(
 
 def gpu_rows() -> list[Row]:
     """Return the rows of runs on a GPU, and those on CPUs that it lacks of the same variants."""
+    variants = {title_of(row) for row in measured(toybox_jobs.GPU_CHART)}
+    return [row for row in all_runs() if title_of(row) in variants]
+
+
+def all_runs() -> list[Row]:
+    """Return the rows of runs on a GPU, and those on CPUs that it lacks."""
     rows = measured(toybox_jobs.GPU_CHART)
-    variants = {title_of(row) for row in rows}
-    return [*rows, *(row for row in lacking(rows, measured()) if title_of(row) in variants)]
+    return [*rows, *lacking(rows, measured())]
 
 
 def lacking(rows: Sequence[Row], others: Sequence[Row]) -> list[Row]:
@@ -237,9 +244,7 @@ def looks() -> str:
     """Return the table of saturation, diversity over the seeds and evaluations of the 2D model, of
     the runs that have them; those on a GPU replace those on CPUs.
     """
-    both = (*timed_runs(), *measured(toybox_jobs.GPU_CHART))
-    seen = [row for row in both if row["saturation"] and is_present(row)]
-    rows = {(title_of(row), place(row)): row for row in seen}.values()
+    rows = {(title_of(row), place(row)): row for row in runs_with_looks()}.values()
     counts, diverse = relative("evaluations", rows), diversities()
     groups = grouped(rows, lambda row: (row["variant"], row["x"]))
     lines = [
@@ -257,6 +262,14 @@ def looks() -> str:
     head = ("variant", "prompts × seeds", "saturation / the object's", "pixels at a limit, %")
     head += ("diversity", "evaluations", "/ those of toybox.yaml")
     return markdown(head, lines) if lines else NOT_MEASURED
+
+
+def runs_with_looks() -> list[Row]:
+    """Return the rows of the present state that have saturation and evaluations, those of CPUs
+    first.
+    """
+    both = (*timed_runs(), *measured(toybox_jobs.GPU_CHART))
+    return [row for row in both if row["saturation"] and is_present(row)]
 
 
 def diversities() -> dict[str, str]:

@@ -13,24 +13,28 @@ from benchmarks.quality.toybox_jobs import DEFAULT, Variant
 from tests.helpers.toybox_rows import row
 
 
-def test_variants_on_a_gpu_are_compared_there(monkeypatch):
-    """Of the runs on CPUs only one is of a variant, prompt and seed for which the GPU has none."""
+def test_runs_on_a_gpu_replace_those_on_cpus(monkeypatch):
+    """Runs on CPUs are shown of the variants, prompts and seeds for which the GPU has none."""
     charts = {toybox.CHART: [row(kind="0"), row(index="1")], toybox_jobs.GPU_CHART: []}
     monkeypatch.setattr(toybox_variants, "measured", lambda chart=toybox.CHART: charts[chart])
-    assert toybox_variants.on_gpu() == toybox_tables.NOT_MEASURED
+    monkeypatch.setattr(toybox_variants, "timed_runs", list)
+    assert toybox_variants.distillations() == toybox_tables.NOT_MEASURED
     charts[toybox_jobs.GPU_CHART] += [row(), row(variant="CSD", x="4", colors="0")]
-    lines = toybox_variants.on_gpu().splitlines()
+    lines = toybox_variants.distillations().splitlines()
     assert lines[2].startswith("| toybox.yaml on CPUs | 1 × 1 | 50 | -50 |")
     assert lines[3].startswith("| CSD 4 | 1 × 1 | 50 | -50 |") and len(lines) == 4
     assert len({line.count("|") for line in lines}) == 1
     on_cpus = [row(variant="CSD", x="4"), row(variant="CSD", x="4", index="1", kind="0")]
     charts[toybox.CHART] += [*on_cpus, row(variant="NFSD", x="4")]
-    *others, csd = toybox_variants.on_gpu().splitlines()
+    *others, csd, nfsd = toybox_variants.distillations().splitlines()
     assert csd.startswith("| CSD 4 | 2 × 1 | 50 | -50 |") and others == lines[:3]
+    assert nfsd.startswith("| NFSD 4 | 1 × 1 | 100 | +0 |")
     charts[toybox.CHART] = []
-    assert toybox_variants.on_gpu().splitlines()[2:] == lines[3:]
+    assert toybox_variants.distillations().splitlines()[2:] == lines[3:]
     charts[toybox_jobs.GPU_CHART] = [one | {"setup": "a"} for one in charts[toybox_jobs.GPU_CHART]]
-    assert [line[:10] for line in toybox_variants.on_gpu().splitlines()[2:]] == ["| CSD 4 † "]
+    assert [line[:10] for line in toybox_variants.distillations().splitlines()[2:]] == [
+        "| CSD 4 † "
+    ]
 
 
 def test_settings_on_a_gpu_are_compared_there_and_parts_of_growing_with_the_same_prior(monkeypatch):
@@ -41,12 +45,12 @@ def test_settings_on_a_gpu_are_compared_there_and_parts_of_growing_with_the_same
     rows = [row(), row(variant="CSD", x="4"), row(variant=wrong, x="0", kind="0")]
     charts = {toybox.CHART: [], toybox_jobs.GPU_CHART: rows}
     monkeypatch.setattr(toybox_variants, "measured", lambda chart=toybox.CHART: charts[chart])
-    assert toybox_variants.wrong_priors_on_gpu() == toybox_tables.NOT_MEASURED
+    assert toybox_variants.wrong_priors() == toybox_tables.NOT_MEASURED
     rows.append(row(variant=f"{wrong}, no growing", x="0", kind="0", colors="0"))
     lines = toybox_variants.settings_on_gpu().splitlines()[2:]
     assert lines[0].startswith(f"| {wrong} | 1 × 1 | 50 | -50 |")
     assert lines[1].startswith(f"| {wrong}, no growing | 1 × 1 | 0 | -100 |") and len(lines) == 2
-    head, _, line = toybox_variants.wrong_priors_on_gpu().splitlines()
+    head, _, line = toybox_variants.wrong_priors().splitlines()
     assert head.count(f"− {wrong}") == 2 and toybox_jobs.DEFAULT not in head
     assert line.startswith(f"| {wrong}, no growing | 1 × 1 | 0 | -50 |")
 
@@ -108,7 +112,8 @@ def test_seconds_are_relative_to_those_of_the_same_prompt_on_the_same_machine(mo
     rows += [row(cpu_seconds="") | own, row(cpu_seconds="99", seed="1") | own]
     assert toybox_variants.relative_seconds(rows) == {DEFAULT: 1.0, "CSD 4": 2.75}
     measured = [one | {"cpu_seconds": ""} for one in rows]
-    monkeypatch.setattr(toybox_variants, "measured", lambda: measured)
+    charts = {toybox.CHART: measured, toybox_jobs.GPU_CHART: []}
+    monkeypatch.setattr(toybox_variants, "measured", lambda chart=toybox.CHART: charts[chart])
     monkeypatch.setattr(toybox_variants, "rows_of", lambda chart, folder: rows)
     assert (
         toybox_variants.distillations()
@@ -148,12 +153,12 @@ def test_looks_are_of_the_rows_that_have_them(monkeypatch):
     csd = seen | {"variant": "CSD", "x": "4", "saturation": "1.75", "evaluations": "3000"}
     rows = [row(**seen), row(**seen, index="1"), row(**csd), row(saturation="")]
     monkeypatch.setattr(toybox_variants, "timed_runs", lambda: rows)
+    on_gpu = [row(**seen | {"at_limits": "0.04"}, index="1")]
+    monkeypatch.setattr(toybox_variants, "measured", {toybox_jobs.GPU_CHART: on_gpu}.get)
     place = {"variant": "CSD", "setup": toybox_jobs.setup()}
-    results = {
-        toybox_variants.DIVERSITY: [place | {"diversity": value} for value in ("0.1", "0.2")],
-        toybox_jobs.GPU_CHART: [row(**seen | {"at_limits": "0.04"}, index="1")],
-    }
-    monkeypatch.setattr(toybox_variants, "rows_of", lambda chart, folder: results[chart])
+    values = (("4", "0.1"), ("4", "0.2"), ("8", "0.5"))
+    found = [place | {"x": x, "diversity": value} for x, value in values]
+    monkeypatch.setattr(toybox_variants, "rows_of", lambda chart, folder: found)
     assert toybox_variants.looks().splitlines()[2:] == [
         "| toybox.yaml | 2 × 1 | 1.50 | 3.0 |  | 1200 | 1.0 |",
         "| CSD 4 | 1 × 1 | 1.75 | 2.0 | 0.150 | 3000 | 2.5 |",
