@@ -18,6 +18,7 @@ from threestudio_gaussiandreamer.convert import command as convert
 from threestudio_gaussiandreamer.formats.gaussian_files import write_cloud
 from threestudio_gaussiandreamer.view import page
 from threestudio_gaussiandreamer.view.command import main, parse
+from threestudio_gaussiandreamer.view.run_files import RunFiles
 
 
 @pytest.fixture
@@ -168,6 +169,18 @@ def test_an_empty_cloud_and_one_of_nan(tmp_path, capsys):
     write_raw_gaussians(tmp_path / "nan.ply", broken)
     assert "no Gaussians" in message(capsys, tmp_path / "nan.ply", "--html")
     assert not list(tmp_path.glob("*.html"))
+
+
+@pytest.mark.parametrize("suffix", [".sog", ".compressed.ply"])
+def test_a_run_gets_the_page_of_any_export_but_of_a_ply_first(run_folder, suffix, capsys):
+    export = run_folder / "save" / "it7-export"
+    write_cloud(str(export / f"gaussians{suffix}"), cloud(30))
+    (export / "gaussians.spz").unlink()
+    assert main([str(run_folder), "--html"]) == 0
+    assert (export / "view.html").is_file()
+    write_cloud(str(export / "gaussians.ply"), cloud(30))
+    (export / "mesh.ply").write_bytes(b"ply\nformat ascii 1.0\nelement vertex 0\nend_header\n")
+    assert RunFiles(run_folder).cloud == export / "gaussians.ply"
 
 
 def test_a_run_gets_an_index_and_a_page(run_folder, capsys):

@@ -15,7 +15,7 @@ from torch import Tensor
 from ..core.checkpoint_file import load_module_weights
 from ..core.errors import UserError
 from ..core.files import existing_file
-from ..formats.gaussian_files import is_antialiased, suffix_of
+from ..formats.gaussian_files import holds_gaussians, is_antialiased, suffix_of
 from ..formats.ply import is_gaussian_ply
 from ..gaussians.gaussians import Gaussians
 from ..host import find, get_device, warn
@@ -24,8 +24,6 @@ from ..prompts.prompt_processors import PROMPT_LIBRARY, resolve_prompt
 from ..view.run_files import RunFiles, step_of
 
 BLACK = (0.0, 0.0, 0.0)
-STORED = (".spz", ".sog", ".compressed.ply")
-"""Formats of Gaussians by their extension alone."""
 FLAT = ("gaussiandreamer-background", "solid-color-background")
 """Backgrounds of one colour."""
 
@@ -58,7 +56,7 @@ def find_result(place: str) -> Result:
                 "save/it*-export/gaussians.ply"
             )
         return Result(file, None, BLACK, is_antialiased(file))
-    clouds = sorted(filter(_is_cloud, folder.glob("save/it*-export/*.*")), key=_rank)
+    clouds = sorted(filter(holds_gaussians, folder.glob("save/it*-export/*.*")), key=_rank)
     if not clouds:
         raise UserError(
             f"{place!r} is no run's folder with Gaussians in save/it*-export: export it first, "
@@ -68,14 +66,9 @@ def find_result(place: str) -> Result:
     return Result(clouds[-1], prompt, background, RunFiles(folder).antialiased)
 
 
-def _is_cloud(path: Path) -> bool:
-    suffix = suffix_of(path.name)
-    return suffix in STORED or suffix == ".ply" and is_gaussian_ply(path)
-
-
 def _rank(path: Path) -> tuple[int, bool, str]:
     """Order files of Gaussians by step; of one step, PLYs, which round nothing, are the last."""
-    return step_of(path.parent), path.suffix == ".ply", path.name
+    return step_of(path.parent), suffix_of(path.name) == ".ply", path.name
 
 
 def _prompt_and_background(parsed: Path) -> tuple[Optional[str], tuple[float, float, float]]:

@@ -19,7 +19,13 @@ from ..gaussians.gaussians import Gaussians, drawable
 from . import spz
 from .compressed_ply import is_compressed_ply, read_compressed_ply, write_compressed_ply
 from .glb import GLB_UP, load_glb, write_glb
-from .ply import gaussians_size, read_comments, read_gaussians, write_gaussians
+from .ply import (
+    gaussians_size,
+    is_gaussian_ply,
+    read_comments,
+    read_gaussians,
+    write_gaussians,
+)
 from .sog import SOG_UP, load_sog, write_sog
 from .splat import read_splat
 from .spz import SPZ_UP, load_spz, read_spz_comment, spz_arrays, spz_bytes, write_spz
@@ -118,6 +124,8 @@ FORMATS = {
 """By extension."""
 READ = tuple(FORMATS)
 WRITTEN = tuple(suffix for suffix, known in FORMATS.items() if known.write)
+ALWAYS_GAUSSIANS = (".spz", ".sog", ".compressed.ply")
+"""Formats in which a run exports nothing but Gaussians; a PLY can be a mesh or points."""
 PRUNED_FORMATS = (".ply", ".spz")
 """Formats whose size and rounding :func:`file_size` and :func:`as_stored` know."""
 
@@ -128,6 +136,14 @@ def suffix_of(name: str) -> str:
     """
     known = [suffix for suffix in FORMATS if name.lower().endswith(suffix)]
     return max(known, key=len, default=Path(name).suffix.lower())
+
+
+def holds_gaussians(path: Path) -> bool:
+    """Return whether a file of a run's export is of Gaussians; GLB and USDA, of which the export
+    can be a mesh, are left out.
+    """
+    suffix = suffix_of(path.name)
+    return suffix in ALWAYS_GAUSSIANS or suffix == ".ply" and is_gaussian_ply(path)
 
 
 def require_format(name: str, option: str, formats: Collection[str] = WRITTEN) -> str:

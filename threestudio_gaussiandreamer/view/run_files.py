@@ -14,7 +14,7 @@ import yaml
 
 from ..core.errors import UserError
 from ..core.logs import warn
-from ..formats.ply import is_gaussian_ply
+from ..formats.gaussian_files import holds_gaussians, suffix_of
 from .render import RenderSettings
 
 T = TypeVar("T", dict, list)
@@ -101,9 +101,10 @@ class RunFiles:
 
     @property
     def cloud(self) -> Optional[Path]:
-        """The file of the exported Gaussians; None if there is none."""
+        """The file of the exported Gaussians, a PLY if there is one; None if there is none."""
         files = sorted(self.export.glob("*.*")) if self.export else []
-        return next(filter(is_cloud, files), None)
+        found = filter(holds_gaussians, files)
+        return min(found, key=lambda file: suffix_of(file.name) != ".ply", default=None)
 
     def psnr(self, key: str, step: Optional[int] = None) -> Optional[float]:
         """Return dB on held-out views; None if they aren't known.
@@ -122,11 +123,6 @@ def step_of(path: Path) -> int:
     """Return the step in the name of a result, ``it<step>-...``; -1 if there is none."""
     found = re.match(r"it(\d+)", path.name)
     return int(found[1]) if found else -1
-
-
-def is_cloud(path: Path) -> bool:
-    """Return whether a file is a PLY of Gaussians or an SPZ."""
-    return path.suffix == ".spz" or path.suffix == ".ply" and is_gaussian_ply(path)
 
 
 def is_run(folder: Path) -> bool:
