@@ -128,6 +128,9 @@ CHEAPER = {
     "SDS, falling t": Line("sds", FALLING),
     "SDS, t falling by the root": Line("sds", falling("sqrt")),
     "SDS, a quarter of the steps": Line("sds", length(STEPS // 4), scales=MILD),
+    "SDS, a quarter of the steps, t = 0.1": Line(
+        "sds", length(STEPS // 4) | fixed_timestep(0.1), scales=MILD
+    ),
     "SDS, half the steps": Line("sds", length(STEPS // 2), scales=MILD),
     "SDS, twice the steps": Line("sds", length(STEPS * 2), scales=MILD),
     **{
