@@ -42,11 +42,11 @@ from benchmarks.quality.toybox_variants import (
     all_runs,
     multi_face,
     pairs_of_charts,
+    paper_marked,
     recognised_share,
     relative,
-    relative_seconds,
     runs_with_looks,
-    timed_runs,
+    seconds_of_variants,
     values_of,
 )
 from threestudio_gaussiandreamer.evaluation.intervals import paired
@@ -83,7 +83,7 @@ def main() -> None:
     for name, line in LINES.items():
         if varied := [row for row in rows if row["variant"] == line.variant]:
             print(draw(name, line, varied + default_at(line, varied, rows), references(rows)))
-    ratios = relative_seconds(timed_runs())
+    ratios = seconds_of_variants()
     for name, charts in COMPARISONS.items():
         if found := settings(all_runs(), charts):
             print(draw_settings(name, found, ratios))
@@ -204,7 +204,7 @@ def draw_settings(name: str, found: Sequence[Setting], ratios: dict[str, float])
     draw_differences(panels[0], found, recognised_share, "recognised attributes, points")
     draw_differences(panels[1], found, multi_face, "multi-face, points")
     draw_seconds(panels[2], found, ratios)
-    panels[0].set_yticks(range(len(found)), [one.title for one in found])
+    panels[0].set_yticks(range(len(found)), [paper_marked(one.title) for one in found])
     panels[0].invert_yaxis()
     title = "Difference to toybox.yaml on the same prompts and seeds"
     figure.suptitle(title, fontsize=11)

@@ -27,10 +27,11 @@ from threestudio_gaussiandreamer.view.config_changes import leaves
 
 PAPER_SCALE = 101.0
 """threestudio's 100."""
-LARGEST_SCALES = {"csd": 8, "nfsd": 7.5, "ism": 7.5, "vsd": 7.5, "cfd": 8, "sdi": 8.5}
-"""Of other score distillations: those of their papers, in this package's convention, except CSD's,
-whose paper has none, and CFD's, whose code has 75.
+PAPER_SCALES = {"nfsd": 7.5, "ism": 7.5, "vsd": 7.5, "sdi": 8.5}
+"""Of other score distillations, in this package's convention. CSD's paper has none, and CFD's code
+has 75.
 """
+LARGEST_SCALES = PAPER_SCALES | {"csd": 8, "cfd": 8}
 PAPER = "configs/toybox-paper.yaml"
 IMAGE_TARGETS = "configs/toybox-image-targets.yaml"
 BALL = {
@@ -98,6 +99,7 @@ def schedules() -> Iterator[Variant]:
     low = {"system.guidance.max_step_percent": CONFIG["system"]["guidance"]["max_step_percent"]}
     yield Variant("timesteps from 0.2", 0, low | {"system.guidance.min_step_percent": 0.2})
     yield Variant("timesteps that fall by the root of the step", 0, falling("sqrt"))
+    yield Variant("DreamTime's timesteps", 0, falling("dreamtime"))
     for clip in (0.1, 0.5):
         yield Variant("grad_clip", clip, {"system.guidance.grad_clip": clip})
     rescaled = {"system.guidance.recon_std_rescale": 0.5}
@@ -153,13 +155,14 @@ def distillations() -> Iterator[Variant]:
 
 
 def looks() -> Iterator[Variant]:
-    """Each distillation at the scale at which it did best, with toybox.yaml, the paper's recipe,
-    ways against its over-saturation, and small timesteps: what saturation and diversity are
-    measured on.
+    """Each distillation at the scale of toybox.yaml, SDI at its largest, with toybox.yaml, the
+    paper's recipe, ways against its over-saturation, and small timesteps: what saturation and
+    diversity are measured on.
     """
     yield Variant(DEFAULT)
-    best = {"SDI": f"{LARGEST_SCALES['sdi']:g}"}
-    yield from (one for one in distillations() if one.key[1] == best.get(one.name, f"{GUIDANCE:g}"))
+    others = {"SDI": f"{LARGEST_SCALES['sdi']:g}"}
+    scales = {one.name: others.get(one.name, f"{GUIDANCE:g}") for one in distillations()}
+    yield from (one for one in distillations() if one.key[1] == scales[one.name])
     chosen = ("guidance scale", f"{PAPER_SCALE:g}"), ("recon_std_rescale 0.5", "0")
     falls = ("timesteps that fall by the root of the step", "0")
     yield from (one for one in (*over_guidance(), *schedules()) if one.key in (*chosen, falls))

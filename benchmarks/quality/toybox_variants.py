@@ -43,6 +43,8 @@ SETTINGS = [
 ]
 ABLATIONS = ("growing", "counts", "prior_quality")
 """Charts of the paper's ablations."""
+PAPER_TITLES = {f"{name.upper()} {x:g}" for name, x in toybox_options.PAPER_SCALES.items()}
+"""Lines at the guidance scale of their paper."""
 DIVERSITY = "toybox_diversity"
 """Written by toybox_diversity.py."""
 ENOUGH = 8
@@ -64,11 +66,17 @@ def distillations() -> str:
     runs on a GPU and on CPUs, with the ratio of their seconds to those of toybox.yaml in runs that
     were made for that.
     """
-    ratios = {title: f"{ratio:.1f}" for title, ratio in relative_seconds(timed_runs()).items()}
+    ratios = {title: f"{ratio:.1f}" for title, ratio in seconds_of_variants().items()}
     lines = [
-        (*line, ratios.get(line[0], "")) for line in lines_beside_cpus(all_runs(), DISTILLATIONS)
+        (paper_marked(title), *cells, ratios.get(title, ""))
+        for title, *cells in lines_beside_cpus(all_runs(), DISTILLATIONS)
     ]
     return markdown((*HEAD, "seconds / toybox.yaml's"), lines) if lines else NOT_MEASURED
+
+
+def paper_marked(title: str) -> str:
+    """Return a line's title with a mark if its guidance scale is that of its paper."""
+    return f"{title} (its paper's)" if title in PAPER_TITLES else title
 
 
 def settings_on_gpu() -> str:
@@ -282,6 +290,16 @@ def diversities() -> dict[str, str]:
         for name, own in groups.items()
     }
     return {name: f"{value:.3f}" for name, value in means.items()}
+
+
+def seconds_of_variants() -> dict[str, float]:
+    """Return :func:`relative_seconds` of the runs that have seconds. All scales of a distillation
+    have those of the scale that was timed.
+    """
+    ratios = relative_seconds(timed_runs())
+    timed = {title.rpartition(" ")[0]: ratio for title, ratio in ratios.items()}
+    variants = (one for one in toybox_options.distillations() if one.name in timed)
+    return {" ".join(one.key): timed[one.name] for one in variants} | ratios
 
 
 def relative_seconds(rows: Iterable[Row]) -> dict[str, float]:

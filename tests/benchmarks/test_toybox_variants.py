@@ -120,6 +120,15 @@ def test_seconds_are_relative_to_those_of_the_same_prompt_on_the_same_machine(mo
         .splitlines()[2]
         .endswith("| 100 | +0 | 100.0 | 100.0 | 2.8 |")
     )
+    assert toybox_variants.seconds_of_variants() == dict.fromkeys(
+        ("CSD 2", "CSD 4", "CSD 8"), 2.75
+    ) | {DEFAULT: 1.0}
+
+
+def test_the_scales_of_the_papers_are_marked():
+    titles = ("ISM 7.5", "ISM 4", "CSD 8", DEFAULT)
+    found = [toybox_variants.paper_marked(title) for title in titles]
+    assert found == ["ISM 7.5 (its paper's)", *titles[1:]]
 
 
 def test_haze_is_shown_where_all_rows_have_it():

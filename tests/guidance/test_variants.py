@@ -45,6 +45,18 @@ def test_sds_is_the_guided_noise_minus_the_noise(scale):
     assert_close(error_of(guidance, x), uncond + scale * (cond - uncond) - noise)
 
 
+@pytest.mark.parametrize("share", [0.5, 1.0])
+def test_rescaled_sds_brings_x0_to_the_deviation_of_the_conditional_one(share):
+    """eps = (z - a f x0_guided) / sigma, f = share std(x0_cond) / std(x0_guided) + 1 - share."""
+    guidance, x = mixture_guidance(guidance_scale=30.0, recon_std_rescale=share), latents()
+    t, a, sigma, noise, z = draws(guidance, x)
+    cond, uncond = both_scores(guidance, z, t)
+    x0_cond, x0_guided = ((z - sigma * eps) / a for eps in (cond, uncond + 30 * (cond - uncond)))
+    deviations = [x0.std(dim=(1, 2, 3), keepdim=True) for x0 in (x0_cond, x0_guided)]
+    factor = share * deviations[0] / deviations[1] + 1 - share
+    assert_close(error_of(guidance, x), (z - a * factor * x0_guided) / sigma - noise)
+
+
 def test_sds_on_one_gaussian_is_the_distance_to_its_mean_on_average():
     """E_eps[eps_hat - eps] = sigma a (x - m) / (a^2 s^2 + sigma^2)."""
     guidance, x = mixture_guidance(guidance_scale=1.0), latents(1)
