@@ -50,7 +50,8 @@ def rescaled(
     abar: Float[Tensor, " B"],
     share: float,
 ) -> Float[Tensor, "B c h w"]:
-    """Rescale the guided noise so that its x0 has the standard deviation of the conditional x0.
+    """Rescale the guided noise so that its x0 has the standard deviation of the conditional x0 (Lin
+    et al. 2023, arXiv:2305.08891, section 3.4).
 
     Args:
         share: 0 for no effect, 1 for the full rescaling; linear between.

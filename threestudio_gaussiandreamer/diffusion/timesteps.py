@@ -23,15 +23,16 @@ def linear(progress: float, low: int, high: int, abar: Float[Tensor, " T"]) -> i
 
 
 def square_root(progress: float, low: int, high: int, abar: Float[Tensor, " T"]) -> int:
-    """Return high - (high - low) sqrt(p), the annealing of HiFA (Zhu et al. 2023, section 4):
-    large timesteps for a short time.
+    """Return high - (high - low) sqrt(p), the annealing of HiFA (Zhu et al. 2023,
+    arXiv:2305.18766, section 4): large timesteps for a short time.
     """
     return round(high - (high - low) * progress**0.5)
 
 
 def time_prioritized(progress: float, low: int, high: int, abar: Float[Tensor, " T"]) -> int:
     """Return the timestep t whose share of the weights above it is p (DreamTime, Huang et al. 2023,
-    TP-SDS): the t that is nearest to sum_{i >= t} W(i) = p, with W normalised to 1 on [low, high].
+    arXiv:2306.12422, TP-SDS): the t that is nearest to sum_{i >= t} W(i) = p, with W normalised to
+    1 on [low, high].
     """
     weights = time_priorities(abar)[low : high + 1]
     above = weights.flip(0).cumsum(0) / weights.sum()
