@@ -45,6 +45,8 @@ ABLATIONS = ("growing", "counts", "prior_quality")
 """Charts of the paper's ablations."""
 PAPER_TITLES = {f"{name.upper()} {x:g}" for name, x in toybox_options.PAPER_SCALES.items()}
 """Lines at the guidance scale of their paper."""
+DISTILLED = "toybox_distilled"
+"""Runs of toybox.py with the models of distil_guidance.py."""
 DIVERSITY = "toybox_diversity"
 """Written by toybox_diversity.py."""
 ENOUGH = 8
@@ -67,11 +69,21 @@ def distillations() -> str:
     were made for that.
     """
     ratios = {title: f"{ratio:.1f}" for title, ratio in seconds_of_variants().items()}
-    lines = [
-        (paper_marked(title), *cells, ratios.get(title, ""))
-        for title, *cells in lines_beside_cpus(all_runs(), DISTILLATIONS)
-    ]
+    found = [*lines_beside_cpus(all_runs(), DISTILLATIONS), *distilled()]
+    lines = [(paper_marked(title), *cells, ratios.get(title, "")) for title, *cells in found]
     return markdown((*HEAD, "seconds / toybox.yaml's"), lines) if lines else NOT_MEASURED
+
+
+def distilled() -> list[tuple[str, ...]]:
+    """Return the line of toybox.yaml with the U-Net of benchmarks/models/distil_guidance.py; none
+    if it wasn't measured.
+    """
+    default = [row for row in all_runs() if row["variant"] == toybox_jobs.DEFAULT]
+    plain = {(row["index"], row["seed"]): row for row in default if is_present(row)}
+    rows = rows_of(DISTILLED, RESULTS)
+    own = [row for row in rows if (row["index"], row["seed"]) in plain]
+    same = [plain[row["index"], row["seed"]] for row in own]
+    return [line_of("guidance in one evaluation", own, same)] if own else []
 
 
 def paper_marked(title: str) -> str:

@@ -18,6 +18,7 @@ def test_runs_on_a_gpu_replace_those_on_cpus(monkeypatch):
     charts = {toybox.CHART: [row(kind="0"), row(index="1")], toybox_jobs.GPU_CHART: []}
     monkeypatch.setattr(toybox_variants, "measured", lambda chart=toybox.CHART: charts[chart])
     monkeypatch.setattr(toybox_variants, "timed_runs", list)
+    monkeypatch.setattr(toybox_variants, "distilled", list)
     assert toybox_variants.distillations() == toybox_tables.NOT_MEASURED
     charts[toybox_jobs.GPU_CHART] += [row(), row(variant="CSD", x="4", colors="0")]
     lines = toybox_variants.distillations().splitlines()
@@ -35,6 +36,17 @@ def test_runs_on_a_gpu_replace_those_on_cpus(monkeypatch):
     assert [line[:10] for line in toybox_variants.distillations().splitlines()[2:]] == [
         "| CSD 4 † "
     ]
+
+
+def test_a_distilled_model_is_compared_with_the_one_that_it_was_made_of(monkeypatch):
+    """Only where that was run with the same prompt and seed."""
+    monkeypatch.setattr(toybox_variants, "all_runs", lambda: [row(), row(variant="CSD", index="1")])
+    found = [row(setup="a", kind="0"), row(setup="a", index="1"), row(setup="a", seed="1")]
+    monkeypatch.setattr(toybox_variants, "rows_of", lambda chart, folder: found)
+    (line,) = toybox_variants.distilled()
+    assert line[:4] == ("guidance in one evaluation", "1 × 1", "50", "-50")
+    found.clear()
+    assert toybox_variants.distilled() == []
 
 
 def test_settings_on_a_gpu_are_compared_there_and_parts_of_growing_with_the_same_prior(monkeypatch):
@@ -114,7 +126,8 @@ def test_seconds_are_relative_to_those_of_the_same_prompt_on_the_same_machine(mo
     measured = [one | {"cpu_seconds": ""} for one in rows]
     charts = {toybox.CHART: measured, toybox_jobs.GPU_CHART: []}
     monkeypatch.setattr(toybox_variants, "measured", lambda chart=toybox.CHART: charts[chart])
-    monkeypatch.setattr(toybox_variants, "rows_of", lambda chart, folder: rows)
+    results = {toybox.CHART: rows, toybox_variants.DISTILLED: []}
+    monkeypatch.setattr(toybox_variants, "rows_of", lambda chart, folder: results[chart])
     assert (
         toybox_variants.distillations()
         .splitlines()[2]
