@@ -160,9 +160,8 @@ def looks() -> Iterator[Variant]:
     diversity are measured on.
     """
     yield Variant(DEFAULT)
-    others = {"SDI": f"{LARGEST_SCALES['sdi']:g}"}
-    scales = {one.name: others.get(one.name, f"{GUIDANCE:g}") for one in distillations()}
-    yield from (one for one in distillations() if one.key[1] == scales[one.name])
+    own = {"SDI": f"{LARGEST_SCALES['sdi']:g}"}
+    yield from (one for one in distillations() if one.key[1] == own.get(one.name, f"{GUIDANCE:g}"))
     chosen = ("guidance scale", f"{PAPER_SCALE:g}"), ("recon_std_rescale 0.5", "0")
     falls = ("timesteps that fall by the root of the step", "0")
     yield from (one for one in (*over_guidance(), *schedules()) if one.key in (*chosen, falls))
