@@ -82,10 +82,10 @@ inline void number_slots(View& view, bool keep) {
 }
 
 inline void count_tiles(View& view, const DepthOrder& order, int64_t part) {
-  int32_t* counts = view.histogram.data() + part * view.tiles();
-  std::fill(counts, counts + view.tiles(), 0);
-  for_each_of_part(view, order, part,
-                   [&](uint32_t gaussian) { for_each_tile(view, gaussian, [&](int tile) { counts[tile]++; }); });
+  int32_t* corners = view.histogram.data() + part * view.corners();
+  std::fill_n(corners, view.corners(), 0);
+  for_each_of_part(view, order, part, [&](uint32_t gaussian) { add_corners(view, gaussian, corners); });
+  sum_corners(view, corners);
 }
 
 // Converts the counts per (part, tile) to the position of each part's first intersection of each tile.
@@ -94,7 +94,7 @@ inline void scan_histogram(View& view, int parts) {
   for (int tile = 0; tile < view.tiles(); tile++) {
     view.tile_begin[tile] = sum;
     for (int part = 0; part < parts; part++) {
-      int32_t& here = view.histogram[size_t(part) * view.tiles() + tile];
+      int32_t& here = view.histogram[size_t(part) * view.corners() + tile];
       const int32_t count = here;
       here = sum, sum += count;
     }
@@ -102,11 +102,31 @@ inline void scan_histogram(View& view, int parts) {
   view.tile_begin[view.tiles()] = sum;
 }
 
+// Puts a Gaussian into its 1 to 2 x 2 tiles, always four times, since branches on their number would be mispredicted. What isn't
+// one of its tiles is another one once more, at the same position, where the own slot is written last.
+SPLAT_FN void fill_four(const View& view, int32_t gaussian, const Coverage& c, int32_t slot, int32_t* next, Intersection* items) {
+  const int columns = c.columns.size(), first = c.rows.begin() * view.tiles_x + c.columns.begin();
+  const int right = columns - 1, below = (c.rows.size() - 1) * view.tiles_x;
+  const int tiles[4] = {first, first + right, first + below, first + below + right};
+  const int32_t slots[4] = {slot, slot + 1, slot + columns, slot + columns + 1};
+  int32_t at[4];
+  for (int i = 0; i < 4; i++) at[i] = next[tiles[i]];
+  for (int i = 0; i < 4; i++) __builtin_prefetch(items + at[i] + 8, 1);
+  for (int i = 3; i >= 0; i--) items[at[i]] = {gaussian, slots[i]}, next[tiles[i]] = at[i] + 1;
+}
+
+// Fills the tiles with the Gaussians of a part; next[tile] is the position of the tile's next intersection.
 inline void fill_tiles(View& view, const DepthOrder& order, int64_t part) {
-  int32_t* next = view.histogram.data() + part * view.tiles();
+  int32_t* next = view.histogram.data() + part * view.corners();
+  Intersection* items = view.intersections.data();
   for_each_of_part(view, order, part, [&](uint32_t gaussian) {
+    const Coverage& c = view.coverage(gaussian);
     int32_t slot = int32_t(view.slot_begin(gaussian));
-    for_each_tile(view, gaussian, [&](int tile) { view.intersections[next[tile]++] = {int32_t(gaussian), slot++}; });
+    if (c.tiny()) return fill_four(view, int32_t(gaussian), c, slot, next, items);
+    for_each_rectangle(view, gaussian, [&](TileSpan rows, TileSpan columns) {
+      for (int y = rows.begin(); y < rows.end(); y++)
+        for (int x = columns.begin(); x < columns.end(); x++) items[next[y * view.tiles_x + x]++] = {int32_t(gaussian), slot++};
+    });
   });
 }
 
@@ -116,8 +136,10 @@ inline void deal_to_tiles(View& view, const uint64_t* keys, int64_t visible, int
   constexpr int AHEAD = PREFETCH + LANES;
   std::fill_n(view.intersections.reserve(view.intersection_count + AHEAD) + view.intersection_count, AHEAD, Intersection{});
   view.tile_begin.reserve(view.tiles() + 1);
-  if (!view.counted) {
-    view.histogram.reserve(size_t(order.parts) * view.tiles());
+  if (view.counted) {
+    sum_corners(view, view.histogram.data());
+  } else {
+    view.histogram.reserve(size_t(order.parts) * view.corners());
     parallel_for(order.parts, threads, 1, [&](int64_t part) { count_tiles(view, order, part); });
   }
   scan_histogram(view, order.parts);
@@ -127,8 +149,8 @@ inline void deal_to_tiles(View& view, const uint64_t* keys, int64_t visible, int
 // Stages 1 to 3 of one view.
 inline void build_view(const ForwardCall& call, View& view, int index, int threads) {
   view.prepare(call.scene, index);
-  view.counted = threads == 1, view.intersection_count = 0;
-  if (view.counted) std::fill_n(view.histogram.reserve(view.tiles()), view.tiles(), 0);
+  view.counted = threads == 1;
+  if (view.counted) std::fill_n(view.histogram.reserve(view.corners()), view.corners(), 0);
   view.camera = make_camera(call.scene, index);
   parallel_for(view.slices.size(), threads, 1, [&](int64_t i) { project_slice(call, view, i); });
   number_slots(view, call.keep);

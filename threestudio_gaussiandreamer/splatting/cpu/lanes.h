@@ -94,6 +94,9 @@ SPLAT_FN bool any_at_least(Floats x, float bound) {
 #endif
 }
 
+// Whether a mask is set in any lane.
+SPLAT_FN bool any_lane(Ints mask) { return any_at_least((Floats)(mask & 0x3f800000), 1.0f); }
+
 // log2(x) of a normal x > 0, relative error 2e-7: exponent + 2 atanh((m - 1) / (m + 1)) / ln 2 with m in [sqrt(1/2), sqrt(2)).
 SPLAT_FN Floats log2(Floats x) {
   const Ints shifted = (Ints)x - 0x3f3504f3;  // the bits of sqrt(1/2)

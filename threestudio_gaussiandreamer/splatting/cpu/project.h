@@ -38,34 +38,27 @@ inline Ellipse<float> ellipse_of(const Splat& s) {
   return {s.x, s.y, s.extent_y, s.c * s.c, s.level, s.inverse_a, s.tilt, s.slant};
 }
 
-// Columns [first, last] of tiles cut down to those that the ellipse meets in one row of tiles, with a safety margin.
-inline TileSpan cut_span(const Ellipse<float>& ellipse, int row, int first, int last) {
+// Of the columns of tiles of a box, those that the ellipse meets in one row of tiles, with a safety margin.
+inline TileSpan cut_span(const Ellipse<float>& ellipse, int row, TileSpan columns) {
   const float top = row * TILE_HEIGHT + 0.5f;
   const Span<float> x = row_span(ellipse, top, top + (TILE_HEIGHT - 1));
-  const float end_x = float(last * TILE_WIDTH);
+  const float end_x = float((columns.end() - 1) * TILE_WIDTH);
   const float low = clamp(x.low - 0.501f, 0.0f, end_x), high = clamp(x.high - 0.499f, -1.0f, end_x);
-  const int begin = std::max(first, int(std::ceil(low)) / TILE_WIDTH), end = high < 0 ? begin : int(high) / TILE_WIDTH + 1;
-  return {uint16_t(begin), uint16_t(std::max(begin, std::min(end, last + 1)))};
+  const int begin = std::max(columns.begin(), int(std::ceil(low)) / TILE_WIDTH);
+  const int end = high < 0 ? begin : int(high) / TILE_WIDTH + 1;
+  return tile_span(begin, std::max(begin, std::min(end, columns.end())));
 }
 
-inline Coverage no_coverage(const Slice& slice) { return {int32_t(slice.slots), 0, 0, 0, {0, 0}}; }
+// The rows and columns of tiles that the boxes around LANES ellipses meet.
+struct TileBoxes {
+  Ints left, top, columns, rows;
+};
 
-// The tiles of a splat within columns [x0, x1] and rows [y0, y1]. Cutting the rows exactly pays from six tiles on.
-inline Coverage cover(const Splat& splat, int x0, int x1, int y0, int y1, Slice& slice) {
-  if (x1 < x0 || y1 < y0) return no_coverage(slice);
-  const int columns = x1 - x0 + 1, rows = y1 - y0 + 1;
-  const Coverage box = {
-      int32_t(slice.slots), int32_t(slice.spans.size()), uint16_t(y0), uint16_t(rows), {uint16_t(x0), uint16_t(x1 + 1)}};
-  if (columns == 1 || rows == 1 || columns * rows < 6) {
-    slice.slots += columns * rows;
-    return box;
-  }
-  const Ellipse<float> ellipse = ellipse_of(splat);
-  for (int y = y0; y <= y1; y++) {
-    slice.spans.push_back(cut_span(ellipse, y, x0, x1));
-    slice.slots += slice.spans.back().end - slice.spans.back().begin;
-  }
-  return {box.slot, box.span, box.row, box.rows, {0, 0}};
+SPLAT_FN TileBoxes tile_boxes(const Camera& camera, const Screen<Floats>& screen, const Reach<Floats>& reach, Ints visible) {
+  const TileRange x = tile_range<TILE_WIDTH>(screen.mean.x, reach.extent.x, camera.size.x);
+  const TileRange y = tile_range<TILE_HEIGHT>(screen.mean.y, reach.extent.y, camera.size.y);
+  const Ints drawn = visible & (x.last >= x.first) & (y.last >= y.first);
+  return {x.first & drawn, y.first & drawn, (x.last - x.first + 1) & drawn, (y.last - y.first + 1) & drawn};
 }
 
 // A depth key orders as the depth does: positive floats compare like their bits.
@@ -91,19 +84,50 @@ SPLAT_FN void store_screen(const ForwardCall& call, int view, Group group, const
   store_items<1>(call.out.radii + at, group.count, [&](float* q) { store(q, radius); });
 }
 
-// Stores the tiles and the depth of the visible lanes, and counts them by tile where one thread sees all of them.
-inline void list_lanes(View& view, Slice& slice, Group group, const Projection<Floats>& p, const Reach<Floats>& reach, Ints visible) {
-  const TileRange x = tile_range<TILE_WIDTH>(p.screen.mean.x, reach.extent.x, view.camera.size.x);
-  const TileRange y = tile_range<TILE_HEIGHT>(p.screen.mean.y, reach.extent.y, view.camera.size.y);
-  uint64_t* keys = view.keys.data() + group.first / SLICE * SLICE;
+// Cuts down the boxes that have six tiles or more, as then it pays; returns the number of tiles in each lane.
+inline Ints cut_boxes(const View& view, const TileBoxes& box, Slice& slice, Group group, Ints& spans) {
+  Ints tiles = box.columns * box.rows;
+  const Ints large = (box.columns > 1) & (box.rows > 1) & (tiles >= 6);
+  if (!any_lane(large)) return tiles;
   for (int l = 0; l < group.count; l++) {
-    const int64_t gaussian = group.first + l;
-    const Splat& splat = view.splats[gaussian];
-    view.coverage(gaussian) = visible[l] ? cover(splat, x.first[l], x.last[l], y.first[l], y.last[l], slice) : no_coverage(slice);
-    if (!visible[l]) continue;
-    keys[slice.visible++] = depth_key(splat.depth, gaussian);
-    if (view.counted) for_each_tile(view, gaussian, [&](int tile) { view.histogram[tile]++; });
+    if (!large[l]) continue;
+    spans[l] = int32_t(slice.spans.size()), tiles[l] = 0;
+    const Ellipse<float> ellipse = ellipse_of(view.splats[group.first + l]);
+    for (int y = box.top[l]; y < box.top[l] + box.rows[l]; y++) {
+      slice.spans.push_back(cut_span(ellipse, y, tile_span(box.left[l], box.left[l] + box.columns[l])));
+      tiles[l] += slice.spans.back().size();
+    }
   }
+  return tiles;
+}
+
+// Stores the tiles of the lanes, none where they aren't visible, and counts them where one thread sees all of them.
+inline void list_tiles(View& view, Slice& slice, Group group, const TileBoxes& box) {
+  Ints spans = Ints{} - 1, slots = {};
+  const Ints tiles = cut_boxes(view, box, slice, group, spans);
+  for (int l = 0; l < LANES; l++) slots[l] = int32_t(slice.slots), slice.slots += tiles[l];
+  const Ints rows = (box.top + box.rows) << 16 | box.top, columns = (box.left + box.columns) << 16 | box.left;
+  const Vec4<Floats> words = {(Floats)slots, (Floats)spans, (Floats)rows, (Floats)columns};
+  store_items<4>(reinterpret_cast<float*>(&view.coverage(group.first)), group.count, [&](float* p) { store4(p, words); });
+  if (view.counted)
+    for (int l = 0; l < group.count; l++) add_corners(view, group.first + l, view.histogram.data());
+}
+
+inline void list_keys(View& view, Slice& slice, Group group, Floats depth, Ints visible) {
+  uint64_t* keys = view.keys.data() + group.first / SLICE * SLICE;
+  int32_t count = slice.visible;
+  for (int l = 0; l < group.count; l++) {
+    keys[count] = depth_key(depth[l], group.first + l);
+    count += visible[l] & 1;  // without a branch, which would be mispredicted; the next one replaces a key that isn't counted
+  }
+  slice.visible = count;
+}
+
+// The lanes of a group that exist.
+SPLAT_FN Ints existing(Group group) {
+  Ints lanes;
+  for (int l = 0; l < LANES; l++) lanes[l] = l;
+  return lanes < group.count;
 }
 
 inline void project_group(const ForwardCall& call, View& view, Slice& slice, Group group) {
@@ -113,10 +137,12 @@ inline void project_group(const ForwardCall& call, View& view, Slice& slice, Gro
   const Mat3<Floats> axes = world_axes(quat_to_rotation(g.quat).matrix, g.scale);
   const Projection<Floats> p = project(view.camera, g.mean, axes, settings.eps2d);
   const Reach<Floats> reach = reach_of(p, g.opacity, settings.antialias, std::log2(settings.alpha_min));
-  const Ints visible = all_finite(g, colors) & is_visible(view.camera, p, reach, settings.near, settings.far);
+  const Ints drawable = existing(group) & all_finite(g, colors);
+  const Ints visible = drawable & is_visible(view.camera, p, reach, settings.near, settings.far);
   store_splats(p, reach, colors, view.splats.data() + group.first);
   store_screen(call, view.index, group, p, reach, visible);
-  list_lanes(view, slice, group, p, reach, visible);
+  list_tiles(view, slice, group, tile_boxes(view.camera, p.screen, reach, visible));
+  list_keys(view, slice, group, p.t.z, visible);
 }
 
 inline void project_slice(const ForwardCall& call, View& view, int64_t index) {
@@ -124,9 +150,7 @@ inline void project_slice(const ForwardCall& call, View& view, int64_t index) {
   slice.spans.clear(), slice.slots = 0, slice.visible = 0;
   const int64_t end = std::min<int64_t>(call.scene.gaussians, (index + 1) * SLICE);
   for_each_group(index * SLICE, end, [&](Group group) { project_group(call, view, slice, group); });
-  (&view.coverage(end - 1))[1] = no_coverage(slice);
-  // more intersections can't be numbered: number_slots refuses the view, and needs no counts by tile
-  if (view.counted) view.counted = (view.intersection_count += slice.slots) <= INT32_MAX;
+  (&view.coverage(end - 1))[1] = {int32_t(slice.slots), -1, {0}, {0}};
 }
 
 }  // namespace splat

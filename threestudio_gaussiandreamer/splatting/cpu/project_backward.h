@@ -13,37 +13,41 @@ struct ViewmatSums {
   Vec3<Floats> translation;
 };
 
-// Sums each Gaussian's slots in their order, as LANES rows; returns which of the Gaussians have any.
+SPLAT_FN Floats keep(Ints mask, Floats x) { return select(mask, x, Floats{}); }
+SPLAT_FN Vec3<Floats> keep(Ints mask, const Vec3<Floats>& v) { return {keep(mask, v.x), keep(mask, v.y), keep(mask, v.z)}; }
+SPLAT_FN Mat3<Floats> keep(Ints mask, const Mat3<Floats>& m) { return {keep(mask, m.x), keep(mask, m.y), keep(mask, m.z)}; }
+
+// Sums each Gaussian's slots in their order, as LANES rows; returns which of the Gaussians have any. Whether a Gaussian has one
+// slot or two can't be predicted, so both are read without a branch; the second one may be the next Gaussian's.
 inline Ints gather_slots(const View& view, const float* slots, Group group, float* rows) {
   Ints drawn = {};
   for (int l = 0; l < LANES; l++) {
     const bool exists = l < group.count;
     const int64_t begin = exists ? view.slot_begin(group.first + l) : 0, end = exists ? view.slot_end(group.first + l) : 0;
-    Floats sum[ROW / LANES] = {};
-    for (int64_t slot = begin; slot < end; slot++)
-      for (int k = 0; k < ROW / LANES; k++) sum[k] += load(slots + slot * ROW + k * LANES);
-    for (int k = 0; k < ROW / LANES; k++) store(rows + l * ROW + k * LANES, sum[k]);
+    const float* row = slots + begin * ROW;
+    const Ints one = Ints{} - (end > begin), two = Ints{} - (end > begin + 1);
+    for (int k = 0; k < ROW; k += LANES) {
+      Floats sum = keep(one, load(row + k)) + keep(two, load(row + ROW + k));
+      for (int64_t i = 2; i < end - begin; i++) sum += load(row + i * ROW + k);
+      store(rows + l * ROW + k, sum);
+    }
     drawn[l] = begin < end ? -1 : 0;
   }
   return drawn;
 }
-
-SPLAT_FN Floats keep(Ints mask, Floats x) { return select(mask, x, Floats{}); }
-SPLAT_FN Vec3<Floats> keep(Ints mask, const Vec3<Floats>& v) { return {keep(mask, v.x), keep(mask, v.y), keep(mask, v.z)}; }
-SPLAT_FN Mat3<Floats> keep(Ints mask, const Mat3<Floats>& m) { return {keep(mask, m.x), keep(mask, m.y), keep(mask, m.z)}; }
 
 // LANES Gaussians and their view-independent quantities.
 struct Shapes {
   Gaussian<Floats> gaussians;
   Rotation<Floats> rotation;
   Mat3<Floats> axes;  // in the world
-};
 
-SPLAT_FN Shapes load_shapes(const Scene& scene, const SplatSettings& settings, Group group) {
-  const Gaussian<Floats> g = load_gaussians(scene, settings, group);
-  const Rotation<Floats> rotation = quat_to_rotation(g.quat);
-  return {g, rotation, world_axes(rotation.matrix, g.scale)};
-}
+  // Members are made in place: GCC copies large objects by instructions that take long to start.
+  Shapes(const Scene& scene, const SplatSettings& settings, Group group)
+      : gaussians(load_gaussians(scene, settings, group)),
+        rotation(quat_to_rotation(gaussians.quat)),
+        axes(world_axes(rotation.matrix, gaussians.scale)) {}
+};
 
 // From one view's sums to its gradients; all zero where a Gaussian touches no tile.
 SPLAT_FN ViewGradient<Floats> project_vjp(const Camera& camera, const SplatSettings& settings, const Shapes& shapes,
@@ -94,29 +98,33 @@ SPLAT_FN void store_world(const BackwardCall& call, Group group, const Shapes& s
   if (!call.scene.colors_per_view) store_vec3(out.colors + 3 * first, count, d.color);
 }
 
-SPLAT_FN bool any_lane(Ints mask) { return any_at_least(select(mask, Floats{} + 1.0f, Floats{}), 1.0f); }
+// The gradients of a group in one view, added to those in the world; returns which of the Gaussians are drawn in it.
+inline Ints project_view_backward(const BackwardCall& call, int index, Group group, const Shapes& shapes,
+                                  std::vector<ViewmatSums>& viewmats, WorldGradient<Floats>& world) {
+  const View& view = call.views[index];
+  alignas(64) float rows[LANES * ROW];
+  const Ints drawn = gather_slots(view, call.slots(view), group, rows);
+  if (!any_lane(drawn)) {
+    const Floats none[SUMS] = {};
+    store_view(call, index, group, ViewGradient<Floats>{}, none);
+    return drawn;
+  }
+  Floats sums[SUMS];
+  load_columns<SUMS>([&](int l) { return rows + l * ROW; }, sums);
+  const ViewGradient<Floats> d = project_vjp(view.camera, call.settings, shapes, sums, drawn);
+  add_view(world, view.camera, d);
+  if (!viewmats.empty()) add_viewmat(viewmats[index], shapes, d, drawn);
+  store_view(call, index, group, d, sums);
+  return drawn;
+}
 
 // All gradients of a group; `viewmats` holds a sum per view, or none.
 inline void project_group_backward(const BackwardCall& call, Group group, std::vector<ViewmatSums>& viewmats) {
-  const Shapes shapes = load_shapes(call.scene, call.settings, group);
+  const Shapes shapes(call.scene, call.settings, group);
   WorldGradient<Floats> world = {};
-  Ints drawn_anywhere = {};
-  for (int v = 0; v < call.scene.views; v++) {
-    const View& view = call.views[v];
-    alignas(64) float rows[LANES * ROW];
-    Floats sums[ROW] = {};
-    ViewGradient<Floats> d = {};
-    const Ints drawn = gather_slots(view, call.slots(view), group, rows);
-    if (any_lane(drawn)) {
-      load_columns<SUMS>([&](int l) { return rows + l * ROW; }, sums);
-      d = project_vjp(view.camera, call.settings, shapes, sums, drawn);
-      add_view(world, view.camera, d);
-      if (!viewmats.empty()) add_viewmat(viewmats[v], shapes, d, drawn);
-      drawn_anywhere |= drawn;
-    }
-    store_view(call, v, group, d, sums);
-  }
-  store_world(call, group, shapes, world, drawn_anywhere);
+  Ints drawn = {};
+  for (int v = 0; v < call.scene.views; v++) drawn |= project_view_backward(call, v, group, shapes, viewmats, world);
+  store_world(call, group, shapes, world, drawn);
 }
 
 // Adds the lanes up into the first three rows of a 4x4 matrix.

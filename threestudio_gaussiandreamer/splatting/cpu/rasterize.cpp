@@ -48,7 +48,7 @@ static int64_t slices_of(const Scene& scene) { return (scene.gaussians + BACKWAR
 static void prepare(BackwardCall& call) {
   int64_t slots = 0;
   for (int v = 0; v < call.scene.views; v++) call.first_slots.push_back(slots), slots += call.views[v].intersection_count;
-  call.work.slots.reserve(slots * ROW);
+  call.work.slots.reserve((slots + 2) * ROW);  // gather_slots reads two
   call.work.background.reserve(3 * int64_t(call.views[0].tiles()) * call.scene.views);
   const int64_t viewmats = call.out.viewmats ? 16 * slices_of(call.scene) * call.scene.views : 0;
   std::fill_n(call.work.viewmats.reserve(viewmats), viewmats, 0.0f);

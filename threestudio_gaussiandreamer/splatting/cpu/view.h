@@ -24,18 +24,27 @@ constexpr int PREFETCH = 32;  // splats ahead
 
 constexpr int SLICE = 2048;  // Gaussians projected by one task
 
+// Rows or columns of tiles, [begin, end), both below 2^16.
 struct TileSpan {
-  uint16_t begin, end;  // tile columns
+  uint32_t bits;  // end << 16 | begin
+
+  int begin() const { return bits & 0xffff; }
+  int end() const { return bits >> 16; }
+  int size() const { return end() - begin(); }
 };
 
-// The tiles of one Gaussian: `rows` rows of tiles from `row` on, in each of them the columns of `all`, or when that is empty
-// the spans of the slice from `span` on. Every pair of Gaussian and tile has a slot, where the backward pass puts its
-// gradient; those of a Gaussian follow one another, up to the first one of the next Gaussian.
+inline TileSpan tile_span(int begin, int end) { return {uint32_t(end) << 16 | uint32_t(begin)}; }
+
+// The tiles of one Gaussian: in each of its rows `columns`, or where `span` isn't negative, only the spans of the slice from
+// there on. Every pair of Gaussian and tile has a slot, where the backward pass puts its gradient; those of a Gaussian follow
+// one another, up to the first one of the next Gaussian.
 struct Coverage {
   int32_t slot;  // the first one, counted within the slice
   int32_t span;
-  uint16_t row, rows;
-  TileSpan all;
+  TileSpan rows, columns;
+
+  // Whether 1 to 2 x 2 tiles.
+  bool tiny() const { return uint32_t(rows.size() - 1) < 2 && uint32_t(columns.size() - 1) < 2; }
 };
 
 // SLICE consecutive Gaussians.
@@ -78,7 +87,7 @@ struct View {
   Buffer<Coverage> coverages;  // (N), and one more behind each slice
   std::vector<Slice> slices;
   Buffer<uint64_t> keys, spare_keys;  // depth << 32 | Gaussian
-  Buffer<int32_t> histogram;  // of the intersections by (part of the Gaussians, tile)
+  Buffer<int32_t> histogram;  // of the intersections by (part of the Gaussians, tile) as in corners()
   bool counted;               // by the projection, as one part
   Buffer<int32_t> tile_begin;    // (tiles + 1) into intersections
   Buffer<Intersection> intersections;  // by tile, then by depth; behind them zeros, as many as are read ahead
@@ -94,6 +103,7 @@ struct View {
   }
 
   int tiles() const { return tiles_x * tiles_y; }
+  int corners() const { return (tiles_x + 1) * (tiles_y + 1); }
   // The lists of the chunk of a tile that begins at an intersection.
   ChunkLists& lists_of(int tile, int first) { return lists[first / CHUNK + tile]; }
   const ChunkLists& lists_of(int tile, int first) const { return lists[first / CHUNK + tile]; }
@@ -104,14 +114,33 @@ struct View {
   int64_t slot_end(int64_t gaussian) const { return slice_of(gaussian).first_slot + (&coverage(gaussian))[1].slot; }
 };
 
-// Calls visit(tile) for the tiles of a Gaussian, in the order of its slots.
-template <class Visit> SPLAT_FN void for_each_tile(const View& view, int64_t gaussian, Visit visit) {
+// Calls visit(rows, columns) for rectangles of tiles that together are those of a Gaussian, in the order of its slots.
+template <class Visit> SPLAT_FN void for_each_rectangle(const View& view, int64_t gaussian, Visit visit) {
   const Coverage& c = view.coverage(gaussian);
-  const bool cut = c.all.begin == c.all.end;
-  const TileSpan* spans = cut ? view.slice_of(gaussian).spans.data() + c.span : &c.all;
-  for (int r = 0; r < c.rows; r++) {
-    const TileSpan span = spans[cut ? r : 0];
-    for (int x = span.begin; x < span.end; x++) visit((c.row + r) * view.tiles_x + x);
+  if (c.span < 0) return visit(c.rows, c.columns);
+  const TileSpan* spans = view.slice_of(gaussian).spans.data() + c.span;
+  for (int y = c.rows.begin(); y < c.rows.end(); y++) visit(tile_span(y, y + 1), *spans++);
+}
+
+// Counts a Gaussian's tiles at the corners of its rectangles, which takes as long for one tile as for many.
+SPLAT_FN void add_corners(const View& view, int64_t gaussian, int32_t* corners) {
+  for_each_rectangle(view, gaussian, [&](TileSpan rows, TileSpan columns) {
+    int32_t* top = corners + rows.begin() * (view.tiles_x + 1);
+    int32_t* bottom = corners + rows.end() * (view.tiles_x + 1);
+    top[columns.begin()]++, top[columns.end()]--, bottom[columns.begin()]--, bottom[columns.end()]++;
+  });
+}
+
+// From corners to the number of Gaussians in each tile, in the same memory.
+inline void sum_corners(const View& view, int32_t* corners) {
+  const int32_t* next = corners;
+  int32_t* count = corners;
+  for (int y = 0; y < view.tiles_y; y++, next++) {
+    int32_t row = 0;
+    for (int x = 0; x < view.tiles_x; x++, count++) {
+      row += *next++;
+      *count = row + (y ? count[-view.tiles_x] : 0);
+    }
   }
 }
 

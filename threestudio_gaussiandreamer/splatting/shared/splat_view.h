@@ -53,12 +53,10 @@ template <class F> struct Projection {
 
 template <class F>
 SPLAT_FN Projection<F> project(const Camera& camera, const Vec3<F>& mean, const Mat3<F>& axes_in_world, float eps2d) {
-  Projection<F> p;
-  p.t = to_camera(camera, mean);
-  p.axes = multiply(camera.rotation, axes_in_world);
-  p.screen = to_screen(camera, p.t, p.axes);
-  p.whitening = whiten(p.screen.u0, p.screen.u1, eps2d);
-  return p;
+  const Vec3<F> t = to_camera(camera, mean);
+  const Mat3<F> axes = multiply(camera.rotation, axes_in_world);
+  const Screen<F> screen = to_screen(camera, t, axes);
+  return {t, axes, screen, whiten(screen.u0, screen.u1, eps2d)};
 }
 
 // Where alpha >= alpha_min.
