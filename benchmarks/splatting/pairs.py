@@ -13,8 +13,10 @@ as many Gaussians as the demo in the middle of its pruning. Appends to
 Both checkouts must have been built: ``python setup.py build_ext --inplace``."""
 
 import argparse
-import ctypes
+import functools
+import importlib.util
 import os
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -31,14 +33,12 @@ from benchmarks.splatting.scenes import trained
 from benchmarks.start.launched import commit_of
 from threestudio_gaussiandreamer.core.streams import generator
 from threestudio_gaussiandreamer.gaussians.densify import clone_and_split
-from threestudio_gaussiandreamer.splatting import autograd
-from threestudio_gaussiandreamer.splatting.autograd import Upstream, Wanted
 from threestudio_gaussiandreamer.splatting.cpu import backend as cpu
 from threestudio_gaussiandreamer.splatting.options import RasterizeOptions
-from threestudio_gaussiandreamer.splatting.scene import Scene as KernelScene
 from threestudio_gaussiandreamer.splatting.validation import smallest_alpha
 
 ROOT = Path(__file__).resolve().parents[2]
+PACKAGE = "threestudio_gaussiandreamer"
 RESULTS = ROOT / "benchmarks/results/kernel.csv"
 COLUMNS = [
     "scene",
@@ -115,29 +115,47 @@ def split_all(cloud: Scene) -> Scene:
     return Scene(**change.values, scales=scales)
 
 
-def load_build(checkout: Path, build: str) -> ctypes.CDLL:
-    return cpu.load_library(checkout / cpu.FOLDER.relative_to(ROOT) / f"libsplat_{build}.so")
+@functools.cache
+def package_of(checkout: Path) -> str:
+    """Import the package of a checkout, under a name of its own; return the name."""
+    if checkout == ROOT:
+        return PACKAGE
+    name, folder = f"{PACKAGE}_of_{commit_of(checkout)}", checkout / PACKAGE
+    spec = importlib.util.spec_from_file_location(
+        name, folder / "__init__.py", submodule_search_locations=[str(folder)]
+    )
+    sys.modules[name] = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(sys.modules[name])
+    return name
 
 
 def kernel_passes(checkout: Path, build: str, case: Case, threads: int) -> tuple[Pass, Pass]:
-    """Return a forward and a backward pass of a checkout's kernel, without torch's autograd."""
-    library = load_build(checkout, build)
+    """Return a forward and a backward pass of a checkout's kernel, without torch's autograd. The
+    gradient of the background isn't asked for, as few trainings need it; kernels up to cb299c3
+    compute it all the same.
+    """
+    package = package_of(checkout)
+    backend, autograd, scenes = (
+        importlib.import_module(f"{package}.splatting.{name}")
+        for name in ("cpu.backend", "autograd", "scene")
+    )
     views = len(case.viewmats)
     cloud, background = case.cloud, torch.zeros(views, 3)
-    scene = KernelScene(
+    scene = scenes.Scene(
         *cloud[:4], case.viewmats, cloud.colors, background, case.Ks, case.size, case.size
     )
     image, depth, alpha = (
         x.expand(views, -1, -1, -1).contiguous() for x in make_cotangents(case.size)
     )
-    kernel = cpu.CpuKernel(case.options, True, threads, library)
+    upstream = autograd.Upstream(image, alpha, depth)
+    wanted = autograd.Wanted(False, False) if hasattr(autograd, "Wanted") else False
+    kernel = backend.CpuKernel(case.options, True, threads, backend._load(build))
     means2d, saved = torch.zeros(views, len(cloud.means), 2), []
 
     def forward() -> None:
         saved[:] = kernel.forward(scene, means2d)[1]
 
-    def backward() -> autograd.SceneGradients:
-        upstream, wanted = Upstream(image, alpha, depth), Wanted(False, True)
+    def backward() -> object:
         return kernel.backward(scene, means2d, tuple(saved), None, upstream, wanted)
 
     return forward, backward

@@ -33,15 +33,10 @@ class Upstream(NamedTuple):
     depth: Optional[Tensor]
 
 
-class Wanted(NamedTuple):
-    """Which of the optional gradients are needed."""
-
-    viewmats: bool
-    background: bool
-
-
 class SceneGradients(NamedTuple):
-    """Gradients of the loss with respect to the fields of a Scene and to means2d (B, N, 2)."""
+    """Gradients of the loss with respect to the fields of a Scene, but for the background, and to
+    means2d (B, N, 2).
+    """
 
     means: Tensor
     quats: Tensor
@@ -49,7 +44,6 @@ class SceneGradients(NamedTuple):
     opacities: Tensor
     viewmats: Optional[Tensor]
     colors: Tensor
-    background: Optional[Tensor]
     means2d: Tensor
 
 
@@ -73,7 +67,7 @@ class Kernel(Protocol):
         saved: tuple[Tensor, ...],
         state: Any,
         upstream: Upstream,
-        wanted: Wanted,
+        wants_viewmats: bool,
     ) -> SceneGradients:
         """Differentiate; ``saved`` and ``state`` are what `forward` returned. If the options ask
         for it, add the sums over pixels of absolute gradients to ``means2d.absgrad``.
@@ -108,7 +102,8 @@ class _Rasterize(torch.autograd.Function):
         ctx.kernel, ctx.size, ctx.means2d, ctx.channels = kernel, size, means2d, scene.channels
         scene = scene._replace(colors=widen(scene.colors), background=widen(scene.background))
         drawn, saved, ctx.state = kernel.forward(scene, means2d)
-        ctx.save_for_backward(*scene.tensors, *saved)
+        alpha = drawn.alpha if _needed(ctx).background else None
+        ctx.save_for_backward(*scene.tensors, alpha, *saved)
         ctx.set_materialize_grads(False)
         ctx.mark_non_differentiable(drawn.radii, drawn.contribution)
         return narrow(drawn.image, ctx.channels), *drawn[1:]
@@ -116,17 +111,31 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx, *grads: Optional[Tensor]):
-        saved = ctx.saved_tensors
-        scene = Scene(*saved[:TENSORS], *ctx.size)
+        tensors, (alpha, *saved) = ctx.saved_tensors[:TENSORS], ctx.saved_tensors[TENSORS:]
+        scene, needed = Scene(*tensors, *ctx.size), _needed(ctx)
         channels = (CHANNELS, 1, 1)
         upstream = Upstream(
             *(None if d is None else widen(d, n) for d, n in zip(grads[:3], channels, strict=True))
         )
-        needed = Scene(*ctx.needs_input_grad[-TENSORS:], *ctx.size)
-        wanted = Wanted(needed.viewmats, needed.background)
         found = ctx.kernel.backward(
-            scene, ctx.means2d, saved[TENSORS:], ctx.state, upstream, wanted
+            scene, ctx.means2d, tuple(saved), ctx.state, upstream, needed.viewmats
         )
-        colors, background = (narrow(x, ctx.channels) for x in (found.colors, found.background))
+        colors, background = narrow(found.colors, ctx.channels), None
+        if needed.background:
+            background = narrow(_background_gradient(upstream.image, alpha, scene), ctx.channels)
         per_input = (*found[:4], found.viewmats, colors, background, None)
         return None, None, found.means2d, *per_input
+
+
+def _needed(ctx: Any) -> Scene:
+    """Return which of a scene's tensors need a gradient."""
+    return Scene(*ctx.needs_input_grad[-TENSORS:], *ctx.size)
+
+
+def _background_gradient(d_image: Optional[Tensor], alpha: Tensor, scene: Scene) -> Tensor:
+    """Return d loss / d background (B, 3); by rows first, so that the sum doesn't depend on the
+    number of threads.
+    """
+    if d_image is None:
+        return torch.zeros_like(scene.background)
+    return (d_image * (1 - alpha)).sum(2).sum(1)

@@ -17,7 +17,7 @@ from torch import Tensor
 from ...core.errors import UserError, unknown
 from ...core.memory import main_memory
 from .. import autograd
-from ..autograd import Drawn, SceneGradients, Upstream, Wanted
+from ..autograd import Drawn, SceneGradients, Upstream
 from ..channels import CHANNELS
 from ..options import RasterizeOptions
 from ..output import Rasterized
@@ -73,14 +73,14 @@ class CpuKernel(NamedTuple):
         saved: tuple[Tensor, ...],
         state: None,
         upstream: Upstream,
-        wanted: Wanted,
+        wants_viewmats: bool,
     ) -> SceneGradients:
         """Differentiate; render again if hooks on saved tensors (checkpointing, offloading) have
         replaced the tensor that owns the state.
         """
         owner = getattr(saved[0], "owner", None) or self._draw(scene, means2d)[1]
-        found = SceneGradients(*map(torch.empty_like, (*scene.tensors[:-1], means2d)))
-        found = found if wanted.viewmats else found._replace(viewmats=None)
+        found = SceneGradients(*map(torch.empty_like, (*scene[:6], means2d)))
+        found = found if wants_viewmats else found._replace(viewmats=None)
         absgrad = torch.empty_like(means2d) if self.options.absgrad else None
         out = _Gradients(*map(address, (*found, absgrad)))
         inputs = (scene.struct(), self._settings(), _Upstream(*map(address, upstream)))

@@ -22,7 +22,7 @@ struct BackwardScratch {
   Staged staged;
   BlendedList blended;
   alignas(64) float sums[CHUNK * ROW];
-  alignas(64) float transmittance[TILE_PIXELS], behind[TILE_PIXELS], alpha[TILE_PIXELS];
+  alignas(64) float transmittance[TILE_PIXELS], behind[TILE_PIXELS];
   UpstreamPlanes upstream;
 };
 
@@ -121,25 +121,24 @@ SPLAT_FN Batch<BATCH> values_of(const BatchSplats& s, const BlockState& block) {
   return each<BATCH>([&](int k) { return s[k].red * block.red + value.of[k]; });
 }
 
-// Front to back: the alphas of a list of splats, zero where a pixel has stopped, and their weights, also added to the tile's
-// alpha. Transmittance and weight are computed as in the forward pass, so that both stop at the same splat.
+// Front to back: the alphas of a list of splats, zero where a pixel has stopped, and their weights. Transmittance and weight are
+// computed as in the forward pass, so that both stop at the same splat.
 SPLAT_FN void blend_again(BackwardScratch& scratch, const BlockPixels& pixels, const uint16_t* list, int length,
                           const BlendLimits& limits) {
   BlendedList& blended = scratch.blended;
-  Floats transmittance = load(scratch.transmittance + pixels.first), sum = load(scratch.alpha + pixels.first);
+  Floats transmittance = load(scratch.transmittance + pixels.first);
   in_batches(length, [&](auto batch, int first) __attribute__((always_inline)) {
     const auto powers = power_at<batch.value>({scratch.staged, list + first}, pixels);
     const auto alphas = alpha_of(powers, limits.log2_alpha_min, limits.alpha_max);
     for (int k = 0; k < batch.value; k++) {
       const Floats alpha = alphas.of[k], weight = weight_of(alpha, transmittance, limits.stop);
       blended.alpha[first + k] = select(transmittance >= limits.stop, alpha, Floats{}), blended.weight[first + k] = weight;
-      transmittance -= alpha * transmittance, sum += weight;
+      transmittance -= alpha * transmittance;
     }
     transmittance = select(transmittance >= limits.stop, transmittance, Floats{});  // avoids denormals
     return true;
   });
   for (int i = whole_batches(length); i < whole_vectors(length); i++) blended.weight[i] = Floats{};  // as clear_rows
-  store(scratch.alpha + pixels.first, sum);
 }
 
 // Back to front: what the gradients of a batch of splats need, to the rows from `row` on.
@@ -194,20 +193,6 @@ inline void start_behind(const Vec3<float>& background, BackwardScratch& scratch
           load(up.red + p) * background.x + load(up.green + p) * background.y + load(up.blue + p) * background.z);
 }
 
-inline Vec3<float> over_lanes(const Vec3<Floats>& sum) {
-  Vec3<float> total = {};
-  for (int l = 0; l < LANES; l++) total = total + Vec3<float>{sum.x[l], sum.y[l], sum.z[l]};
-  return total;
-}
-
-// d loss / d background of one tile: the sum over its pixels of (1 - alpha) d loss / d colour, by lane first.
-inline Vec3<float> background_sum(const float* alpha, const UpstreamPlanes& up) {
-  Vec3<Floats> sum = {};
-  for (int p = 0; p < TILE_PIXELS; p += LANES)
-    sum = sum + (1.0f - load(alpha + p)) * Vec3<Floats>{load(up.red + p), load(up.green + p), load(up.blue + p)};
-  return over_lanes(sum);
-}
-
 inline void store_sums(const View& view, const float* sums, int first, int count, float* slots) {
   for (int i = 0; i < count; i++) stream(slots + int64_t(view.intersections[first + i].slot) * ROW, sums + i * ROW, ROW);
 }
@@ -240,21 +225,18 @@ inline void blend_lists_backward(const BackwardCall& call, const View& view, int
   end_streams();
 }
 
-// One tile of one view: fills the slots of its intersections, returns d loss / d background.
-inline Vec3<float> blend_tile_backward(const BackwardCall& call, const View& view, int tile) {
+// One tile of one view: fills the slots of its intersections.
+inline void blend_tile_backward(const BackwardCall& call, const View& view, int tile) {
   const TileFrame frame = frame_of(view, tile);
-  const Layers<const float> upstream = upstream_of(call, view.index);
-  if (frame.begin == frame.end) return over_lanes(sum_colors(upstream, frame, call.settings.downsample));
+  if (frame.begin == frame.end) return;
   BackwardScratch scratch;
   read_tile(call, view.index, frame, scratch.upstream);
-  if (tile + 1 < view.tiles()) prefetch_tile<false>(upstream, frame_of(view, tile + 1), call.settings.downsample);
+  if (tile + 1 < view.tiles()) prefetch_tile<false>(upstream_of(call, view.index), frame_of(view, tile + 1), call.settings.downsample);
   start_behind(background_of(call.scene, view.index), scratch);
-  std::memset(scratch.alpha, 0, sizeof scratch.alpha);
   if (call.out.absgrad)
     blend_lists_backward<true>(call, view, tile, frame, scratch);
   else
     blend_lists_backward<false>(call, view, tile, frame, scratch);
-  return background_sum(scratch.alpha, scratch.upstream);
 }
 
 }  // namespace splat

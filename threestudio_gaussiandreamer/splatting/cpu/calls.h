@@ -17,7 +17,6 @@ struct ForwardCall {
 // Buffers of a backward pass.
 struct Workspace {
   Buffer<float> slots;       // (intersections of all views, ROW): gradient sums of a splat in a tile
-  Buffer<float> background;  // (views, tiles, 3)
   Buffer<float> viewmats;    // (slices of Gaussians, views, 16)
 };
 

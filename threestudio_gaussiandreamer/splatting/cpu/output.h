@@ -149,14 +149,4 @@ inline void read_tile(const BackwardCall& call, int view, const TileFrame& frame
   call.settings.downsample == 2 ? read_tile_as<2>(in, frame, planes) : read_tile_as<1>(in, frame, planes);
 }
 
-// The sum of d loss / d colour over a tile's pixels, by lane first.
-inline Vec3<Floats> sum_colors(const Layers<const float>& in, const TileFrame& frame, int downsample) {
-  Vec3<Floats> sum = {};
-  const auto add = [&](int, int, int64_t at, int pixels) {
-    sum = sum + load_items<3>(in.image + 3 * at, pixels, load3<Floats>);
-  };
-  if (in.image) downsample == 2 ? for_each_run<2>(in, frame, add) : for_each_run<1>(in, frame, add);
-  return sum;
-}
-
 }  // namespace splat

@@ -49,17 +49,14 @@ static void prepare(BackwardCall& call) {
   int64_t slots = 0;
   for (int v = 0; v < call.scene.views; v++) call.first_slots.push_back(slots), slots += call.views[v].intersection_count;
   call.work.slots.reserve((slots + 2) * ROW);  // gather_slots reads two
-  call.work.background.reserve(3 * int64_t(call.views[0].tiles()) * call.scene.views);
   const int64_t viewmats = call.out.viewmats ? 16 * slices_of(call.scene) * call.scene.views : 0;
   std::fill_n(call.work.viewmats.reserve(viewmats), viewmats, 0.0f);
 }
 
 static void blend_views_backward(const BackwardCall& call) {
   const int tiles = call.views[0].tiles();
-  parallel_for(int64_t(tiles) * call.scene.views, call.settings.threads, TILE_GRAIN, [&](int64_t i) {
-    const Vec3<float> background = blend_tile_backward(call, call.views[i / tiles], int(i % tiles));
-    std::memcpy(call.work.background.data() + 3 * i, &background, sizeof background);
-  });
+  parallel_for(int64_t(tiles) * call.scene.views, call.settings.threads, TILE_GRAIN,
+               [&](int64_t i) { blend_tile_backward(call, call.views[i / tiles], int(i % tiles)); });
 }
 
 static void project_slice_backward(const BackwardCall& call, int64_t slice) {
@@ -70,21 +67,13 @@ static void project_slice_backward(const BackwardCall& call, int64_t slice) {
   for (size_t v = 0; v < viewmats.size(); v++) store_viewmat(viewmats[v], matrices + 16 * v);
 }
 
-// out[i] = the sum over p of parts[p * stride + i] for i < width, in double and in the order of p.
-static void sum_parts(const float* parts, int64_t count, int64_t stride, int width, float* out) {
-  for (int i = 0; i < width; i++) {
+// Adds up the parts of d loss / d viewmats, in double and in their order.
+static void sum_viewmats(const BackwardCall& call) {
+  const int64_t width = 16 * call.scene.views;
+  for (int64_t i = 0; i < width; i++) {
     double sum = 0;
-    for (int64_t p = 0; p < count; p++) sum += parts[p * stride + i];
-    out[i] = float(sum);
-  }
-}
-
-static void sum_over_views(const BackwardCall& call) {
-  const int64_t tiles = call.views[0].tiles(), views = call.scene.views;
-  for (int v = 0; v < views; v++) {
-    sum_parts(call.work.background.data() + 3 * tiles * v, tiles, 3, 3, call.out.background + 3 * v);
-    if (call.out.viewmats)
-      sum_parts(call.work.viewmats.data() + 16 * v, slices_of(call.scene), 16 * views, 16, call.out.viewmats + 16 * v);
+    for (int64_t slice = 0; slice < slices_of(call.scene); slice++) sum += call.work.viewmats[slice * width + i];
+    call.out.viewmats[i] = float(sum);
   }
 }
 
@@ -92,7 +81,7 @@ static void backward(BackwardCall call) {
   prepare(call);
   blend_views_backward(call);
   parallel_for(slices_of(call.scene), call.settings.threads, 1, [&](int64_t slice) { project_slice_backward(call, slice); });
-  sum_over_views(call);
+  if (call.out.viewmats) sum_viewmats(call);
 }
 
 // 0, or the bytes that couldn't be allocated; -1 if their number is unknown.

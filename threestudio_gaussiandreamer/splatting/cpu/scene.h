@@ -28,7 +28,7 @@ struct SplatUpstream {
 struct SplatGradients {
   float *means, *quats, *scales, *opacities;  // as in splat::Scene
   float* viewmats;                            // may be null
-  float *colors, *background;
+  float* colors;
   float* means2d;  // (B, N, 2)
   float* absgrad;  // (B, N, 2), sums over the pixels of absolute values; may be null
 };

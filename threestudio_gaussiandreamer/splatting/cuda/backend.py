@@ -22,7 +22,7 @@ from torch import Tensor
 
 from ...core.errors import UserError
 from .. import autograd
-from ..autograd import Drawn, SceneGradients, Upstream, Wanted
+from ..autograd import Drawn, SceneGradients, Upstream
 from ..channels import CHANNELS
 from ..options import RasterizeOptions
 from ..output import Rasterized
@@ -86,14 +86,14 @@ class CudaKernel(NamedTuple):
         """Render; the state for backward is the number of intersections of each view."""
         if not len(scene.means):
             images = _background_alone(scene, self.context)
-            return Drawn(*images[:3], *means2d.new_zeros(2, *scene.shape)), (images.alpha,), None
+            return Drawn(*images[:3], *means2d.new_zeros(2, *scene.shape)), (), None
         batch = make_batch(scene, self.context)
         splats, radii, contribution = project(batch, means2d)
         totals = self.context.device.read_async(splats.ends[:, -1])
         images = _empty_images(scene, self.context)
         lists = _draw(batch, splats, totals, images, contribution)
         kept = (*splats, *lists, *images[3:]) if self.context.tracked else ()
-        return Drawn(*images[:3], radii, contribution), (images.alpha, *kept), totals
+        return Drawn(*images[:3], radii, contribution), kept, totals
 
     def backward(
         self,
@@ -102,25 +102,21 @@ class CudaKernel(NamedTuple):
         saved: tuple[Tensor, ...],
         state: Optional[AsyncReadback],
         upstream: Upstream,
-        wanted: Wanted,
+        wants_viewmats: bool,
     ) -> SceneGradients:
         """Differentiate; waits for the numbers of intersections."""
-        alpha, *kept = saved
         absgrad = means2d.absgrad if self.context.options.absgrad else None
-        found = empty_gradients(scene, absgrad, wanted.viewmats)
-        viewmats = torch.zeros_like(scene.viewmats) if wanted.viewmats and not kept else None
-        if kept:
-            splats, lists = Splats(*kept[:5]), Lists(*kept[5:8])
-            blended = BlendUpstream(*upstream, *kept[8:])
+        found = empty_gradients(scene, absgrad, wants_viewmats)
+        viewmats = torch.zeros_like(scene.viewmats) if wants_viewmats and not saved else None
+        if saved:
+            splats, lists = Splats(*saved[:5]), Lists(*saved[5:8])
+            blended = BlendUpstream(*upstream, *saved[8:])
             batch = make_batch(scene, self.context)
             sums = _sums_of_rows(batch, splats, lists, state.values(), blended)
             project_backward(batch, splats, sums, found)
             if found.camera_parts is not None:
                 viewmats = sum_cameras(batch, found.camera_parts)
-        background = (
-            _background_gradient(upstream.image, alpha, scene) if wanted.background else None
-        )
-        return SceneGradients(*found[:4], viewmats, found.colors, background, found.means2d)
+        return SceneGradients(*found[:4], viewmats, found.colors, found.means2d)
 
 
 def _draw(
@@ -226,9 +222,3 @@ def _background_alone(scene: Scene, context: LaunchContext) -> Images:
     size, new = _shown_size(scene, context), scene.means.new_zeros
     image = new(*size, CHANNELS) + scene.background[:, None, None]
     return Images(image, new(*size, 1), new(*size, 1), None, None)
-
-
-def _background_gradient(d_image: Optional[Tensor], alpha: Tensor, scene: Scene) -> Tensor:
-    if d_image is None:
-        return torch.zeros_like(scene.background)
-    return (d_image * (1 - alpha)).sum((1, 2))
