@@ -106,15 +106,23 @@ inline void blend_tile(const ForwardCall& call, View& view, int tile) {
   write_tile(call, view.index, frame, scratch.planes);
 }
 
+// The largest of the weights in a Gaussian's slots [begin, end). Whether there are one to four can't be predicted: for fewer than
+// four, the last one is read again.
+inline float largest_peak(const float* peaks, int64_t begin, int64_t end) {
+  if (begin == end) return 0.0f;
+  const int64_t last = end - 1;
+  const auto at = [&](int64_t slot) { return peaks[std::min(slot, last)]; };
+  float peak = std::max(std::max(at(begin), at(begin + 1)), std::max(at(begin + 2), at(begin + 3)));
+  for (int64_t slot = begin + 4; slot < end; slot++) peak = std::max(peak, peaks[slot]);
+  return peak;
+}
+
 // The contribution of the Gaussians of a slice: the largest weight in any tile.
 inline void store_contributions(const ForwardCall& call, const View& view, int64_t slice) {
   float* contribution = call.out.contribution + view.index * call.scene.gaussians;
   const int64_t end = std::min<int64_t>(call.scene.gaussians, (slice + 1) * SLICE);
-  for (int64_t gaussian = slice * SLICE; gaussian < end; gaussian++) {
-    float peak = 0.0f;
-    for (int64_t slot = view.slot_begin(gaussian); slot < view.slot_end(gaussian); slot++) peak = std::max(peak, view.peaks[slot]);
-    contribution[gaussian] = peak;
-  }
+  for (int64_t gaussian = slice * SLICE; gaussian < end; gaussian++)
+    contribution[gaussian] = largest_peak(view.peaks.data(), view.slot_begin(gaussian), view.slot_end(gaussian));
 }
 
 }  // namespace splat
