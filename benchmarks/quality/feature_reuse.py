@@ -100,6 +100,28 @@ class FeatureReuseGuidance(StableDiffusionGuidance):
         return (*self._cells[view], int(t) // self.cfg.timestep_cell, prompt)
 
 
+class Blocks:
+    """Runs the blocks of a U-Net that has no further inputs, and holds its skip connections."""
+
+    def __init__(self, unet: nn.Module, z: Latents, t: Timesteps, tokens: Embeddings):
+        self.embedded = unet.time_embedding(unet.get_time_embed(sample=z, timestep=t))
+        self.tokens, self.skips = tokens, []
+
+    def run(self, block: nn.Module, hidden: Tensor, **options: Any) -> Any:
+        if getattr(block, "has_cross_attention", False):
+            options["encoder_hidden_states"] = self.tokens
+        return block(hidden_states=hidden, temb=self.embedded, **options)
+
+    def down(self, block: nn.Module, hidden: Tensor) -> Tensor:
+        hidden, outputs = self.run(block, hidden)
+        self.skips += outputs
+        return hidden
+
+    def up(self, block: nn.Module, hidden: Tensor) -> Tensor:
+        skipped = tuple(self.skips.pop() for _ in block.resnets)[::-1]
+        return self.run(block, hidden, res_hidden_states_tuple=skipped)
+
+
 def predict(
     unet: nn.Module,
     z: Latents,
@@ -107,7 +129,7 @@ def predict(
     tokens: Embeddings,
     features: Optional[Float[Tensor, "B c h w"]] = None,
 ) -> tuple[Latents, Float[Tensor, "B c h w"]]:
-    """Run a U-Net that has no further inputs.
+    """Predict the noise.
 
     Args:
         features: of the inner blocks, which aren't run then.
@@ -115,34 +137,21 @@ def predict(
     Returns:
         the output, and the features of the inner blocks.
     """
-    embedded = unet.time_embedding(unet.get_time_embed(sample=z, timestep=t))
-
-    def run(block: nn.Module, hidden: Tensor, **options: Any) -> Any:
-        if getattr(block, "has_cross_attention", False):
-            options["encoder_hidden_states"] = tokens
-        return block(hidden_states=hidden, temb=embedded, **options)
-
-    def up(block: nn.Module, hidden: Tensor) -> Tensor:
-        skipped = tuple(skips.pop() for _ in block.resnets)[::-1]
-        return run(block, hidden, res_hidden_states_tuple=skipped)
-
     first, *inner_down = unet.down_blocks
     *inner_up, last = unet.up_blocks
-    hidden = unet.conv_in(z)
-    skips = [hidden]
-    hidden, outputs = run(first, hidden)
-    skips += outputs
+    blocks, hidden = Blocks(unet, z, t, tokens), unet.conv_in(z)
+    blocks.skips = [hidden]
+    hidden = blocks.down(first, hidden)
     if features is None:
         for block in inner_down:
-            hidden, outputs = run(block, hidden)
-            skips += outputs
+            hidden = blocks.down(block, hidden)
         if unet.mid_block is not None:
-            hidden = run(unet.mid_block, hidden)
+            hidden = blocks.run(unet.mid_block, hidden)
         for block in inner_up:
-            hidden = up(block, hidden)
+            hidden = blocks.up(block, hidden)
         features = hidden
-    del skips[len(last.resnets) :]
-    output = up(last, features)
+    del blocks.skips[len(last.resnets) :]
+    output = blocks.up(last, features)
     return unet.conv_out(unet.conv_act(unet.conv_norm_out(output))), features
 
 

@@ -25,7 +25,7 @@ inline Ints gather_slots(const View& view, const float* slots, Group group, floa
     const bool exists = l < group.count;
     const int64_t begin = exists ? view.slot_begin(group.first + l) : 0, end = exists ? view.slot_end(group.first + l) : 0;
     const float* row = slots + begin * ROW;
-    const Ints one = Ints{} - (end > begin), two = Ints{} - (end > begin + 1);
+    const Ints one = Ints{} - int(end > begin), two = Ints{} - int(end > begin + 1);
     for (int k = 0; k < ROW; k += LANES) {
       Floats sum = keep(one, load(row + k)) + keep(two, load(row + ROW + k));
       for (int64_t i = 2; i < end - begin; i++) sum += load(row + i * ROW + k);
