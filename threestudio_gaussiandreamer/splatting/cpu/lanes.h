@@ -10,6 +10,7 @@
 #endif
 
 #define SPLAT_FN static inline __attribute__((always_inline))
+#define SPLAT_METHOD inline __attribute__((always_inline))
 
 namespace splat {
 
@@ -96,6 +97,87 @@ SPLAT_FN bool any_at_least(Floats x, float bound) {
 
 // Whether a mask is set in any lane.
 SPLAT_FN bool any_lane(Ints mask) { return any_at_least((Floats)(mask & 0x3f800000), 1.0f); }
+
+SPLAT_FN Ints load_ints(const uint32_t* p) {
+  Ints v;
+  std::memcpy(&v, p, sizeof v);
+  return v;
+}
+SPLAT_FN void store_ints(uint32_t* p, Ints v) { std::memcpy(p, &v, sizeof v); }
+
+// The lower halves of the lanes.
+SPLAT_FN void store_halves(uint16_t* p, Ints v) {
+#if defined(__AVX512F__)
+  _mm256_storeu_si256(reinterpret_cast<__m256i*>(p), _mm512_cvtepi32_epi16((__m512i)v));
+#else
+  typedef uint16_t Halves __attribute__((vector_size(2 * LANES)));
+  const Halves halves = __builtin_convertvector(v, Halves);
+  std::memcpy(p, &halves, sizeof halves);
+#endif
+}
+
+SPLAT_FN Ints lane_numbers() {
+  Ints lanes;
+  for (int l = 0; l < LANES; l++) lanes[l] = l;
+  return lanes;
+}
+
+#if defined(__AVX512F__)
+// Some of the lanes.
+struct Choice {
+  __mmask16 lanes;
+
+  int count() const { return __builtin_popcount(lanes); }
+  // These lanes one after the other, then zeros.
+  SPLAT_METHOD Ints front(Ints x) const { return (Ints)_mm512_maskz_compress_epi32(lanes, (__m512i)x); }
+};
+
+SPLAT_FN Choice with_any_bit(Ints x, uint32_t bits) { return {_mm512_test_epi32_mask((__m512i)x, _mm512_set1_epi32(int(bits)))}; }
+SPLAT_FN Choice with_bit(Ints x, int bit) { return with_any_bit(x, 1u << bit); }
+#else
+// The positions of the bits of each byte, low to high.
+struct BitPositions {
+  uint8_t of[256][8] = {};
+  constexpr BitPositions() {
+    for (int byte = 0; byte < 256; byte++)
+      for (int bit = 0, count = 0; bit < 8; bit++)
+        if (byte >> bit & 1) of[byte][count++] = uint8_t(bit);
+  }
+};
+constexpr BitPositions BIT_POSITIONS;
+
+// Some of the lanes, as bits.
+struct Choice {
+  int lanes;
+
+  int count() const { return __builtin_popcount(lanes); }
+  // These lanes one after the other, then the first lane.
+  SPLAT_METHOD Ints front(Ints x) const {
+    const uint8_t* positions = BIT_POSITIONS.of[lanes];
+#if defined(__AVX2__)
+    const __m256i order = _mm256_cvtepu8_epi32(_mm_loadl_epi64(reinterpret_cast<const __m128i*>(positions)));
+    return (Ints)_mm256_permutevar8x32_epi32((__m256i)x, order);
+#else
+    Ints chosen;
+    for (int l = 0; l < LANES; l++) chosen[l] = x[positions[l]];
+    return chosen;
+#endif
+  }
+};
+
+SPLAT_FN Choice negative(Ints x) {
+#if defined(__AVX2__)
+  return {_mm256_movemask_ps((__m256)x)};
+#else
+  int lanes = 0;
+  for (int l = 0; l < LANES; l++) lanes |= (x[l] < 0) << l;
+  return {lanes};
+#endif
+}
+
+SPLAT_FN Choice with_any_bit(Ints x, uint32_t bits) { return negative((x & int(bits)) != 0); }
+SPLAT_FN Choice with_bit(Ints x, int bit) { return negative(x << (31 - bit)); }
+#endif
 
 // log2(x) of a normal x > 0, relative error 2e-7: exponent + 2 atanh((m - 1) / (m + 1)) / ln 2 with m in [sqrt(1/2), sqrt(2)).
 SPLAT_FN Floats log2(Floats x) {

@@ -123,13 +123,6 @@ inline void list_keys(View& view, Slice& slice, Group group, Floats depth, Ints 
   slice.visible = count;
 }
 
-// The lanes of a group that exist.
-SPLAT_FN Ints existing(Group group) {
-  Ints lanes;
-  for (int l = 0; l < LANES; l++) lanes[l] = l;
-  return lanes < group.count;
-}
-
 inline void project_group(const ForwardCall& call, View& view, Slice& slice, Group group) {
   const SplatSettings& settings = call.settings;
   const Gaussian<Floats> g = load_gaussians(call.scene, settings, group);
@@ -137,7 +130,7 @@ inline void project_group(const ForwardCall& call, View& view, Slice& slice, Gro
   const Mat3<Floats> axes = world_axes(quat_to_rotation(g.quat).matrix, g.scale);
   const Projection<Floats> p = project(view.camera, g.mean, axes, settings.eps2d);
   const Reach<Floats> reach = reach_of(p, g.opacity, settings.antialias, std::log2(settings.alpha_min));
-  const Ints drawable = existing(group) & all_finite(g, colors);
+  const Ints drawable = (lane_numbers() < group.count) & all_finite(g, colors);
   const Ints visible = drawable & is_visible(view.camera, p, reach, settings.near, settings.far);
   store_splats(p, reach, colors, view.splats.data() + group.first);
   store_screen(call, view.index, group, p, reach, visible);

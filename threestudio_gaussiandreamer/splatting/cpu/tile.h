@@ -74,113 +74,52 @@ SPLAT_FN void block_masks(const SplatLanes& s, Ints words[MASK_WORDS]) {
 // The staged splats of a chunk and which blocks each of them touches.
 struct Staged {
   alignas(64) LocalSplat splats[CHUNK + 1];          // the last one is invisible
-  alignas(64) uint32_t touching[MASK_WORDS][CHUNK];  // a bit per block; zero behind the last splat, up to a whole group
-  int groups;                                        // of 64 splats
-#if defined(__AVX512F__)
+  alignas(64) uint32_t touching[MASK_WORDS][CHUNK];  // a bit per block; zero behind the last splat, up to a whole vector
+  int count;
   // The splats that touch the row `row` of blocks (-1: none is listed yet): their number, their positions, and a bit per block,
   // which is zero up to a whole vector.
   int row, in_row;
-  alignas(64) uint32_t row_positions[CHUNK + 16], row_touching[CHUNK + 16];
-#else
-  uint64_t splats_of[BLOCKS / 64][CHUNK];  // [64 blocks][64 splats][block], one bit per splat
-#endif
+  alignas(64) uint32_t row_positions[CHUNK + LANES], row_touching[CHUNK + LANES];
 };
 
 // The splats of one block, see ChunkLists; has room for whole vectors behind the last one.
-using BlockList = uint16_t[CHUNK + 16];
+using BlockList = uint16_t[CHUNK + LANES];
 
 template <class Row> SPLAT_FN Row& row_at(Row* rows, uint16_t position) {
   static_assert(sizeof(Row) == sizeof(float) * ROW, "a row");
   return *reinterpret_cast<Row*>(reinterpret_cast<uintptr_t>(rows) + sizeof(float) * position);
 }
 
-#if defined(__AVX512F__)
-SPLAT_FN void list_splats(Staged& staged) { staged.row = -1; }
-
 // Lists the splats that touch a row of blocks, so that the list of each of its blocks is a choice of those.
 SPLAT_FN void list_row(Staged& staged, int row) {
   const uint32_t* words = staged.touching[row / 4];
-  const __m512i all = _mm512_set1_epi32(int(0xffu << 8 * (row % 4))), step = _mm512_set1_epi32(16 * ROW);
-  __m512i positions = _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
-  positions = _mm512_mullo_epi32(positions, _mm512_set1_epi32(ROW));
+  Ints positions = lane_numbers() * ROW;
   int count = 0;
-  for (int i = 0; i < staged.groups * 64; i += 16) {
-    const __m512i blocks = _mm512_load_si512(words + i);
-    const __mmask16 touching = _mm512_test_epi32_mask(blocks, all);
-    _mm512_storeu_si512(staged.row_positions + count, _mm512_maskz_compress_epi32(touching, positions));
-    _mm512_storeu_si512(staged.row_touching + count, _mm512_maskz_compress_epi32(touching, blocks));
-    count += __builtin_popcount(touching);
-    positions = _mm512_add_epi32(positions, step);
+  for (int i = 0; i < staged.count; i += LANES, positions += LANES * ROW) {
+    const Ints blocks = load_ints(words + i);
+    const Choice touching = with_any_bit(blocks, 0xffu << 8 * (row % 4));
+    store_ints(staged.row_positions + count, touching.front(positions));
+    store_ints(staged.row_touching + count, touching.front(blocks));
+    count += touching.count();
   }
-  _mm512_storeu_si512(staged.row_touching + count, _mm512_setzero_si512());
+  store_ints(staged.row_touching + count, Ints{});
   staged.row = row, staged.in_row = count;
 }
 
 // Writes the splats that touch a block; returns how many.
-SPLAT_FN int list_block(Staged& staged, int block, BlockList& list) {
+SPLAT_FN int list_block(Staged& staged, int block, uint16_t* list) {
   if (staged.row != block / BLOCKS_PER_ROW) list_row(staged, block / BLOCKS_PER_ROW);
-  const __m512i bit = _mm512_set1_epi32(int(1u << block % 32));
   int count = 0;
-  for (int i = 0; i < staged.in_row; i += 16) {
-    const __mmask16 touching = _mm512_test_epi32_mask(_mm512_load_si512(staged.row_touching + i), bit);
-    const __m512i positions = _mm512_load_si512(staged.row_positions + i);
-    const __m256i splats = _mm512_cvtepi32_epi16(_mm512_maskz_compress_epi32(touching, positions));
-    _mm256_storeu_si256(reinterpret_cast<__m256i*>(list + count), splats);
-    count += __builtin_popcount(touching);
+  for (int i = 0; i < staged.in_row; i += LANES) {
+    const Choice touching = with_bit(load_ints(staged.row_touching + i), block % 32);
+    store_halves(list + count, touching.front(load_ints(staged.row_positions + i)));
+    count += touching.count();
   }
   return count;
 }
-#else
-// Transposes 64 x 64 bits: bit i of word j becomes bit j of word i (Warren, Hacker's Delight, 7-3).
-inline void transpose_bits(uint64_t* words) {
-  uint64_t mask = 0x00000000ffffffff;
-  for (int step = 32; step; step >>= 1, mask ^= mask << step)
-    for (int i = 0; i < 64; i += 2 * step)
-      for (int j = i; j < i + step; j++) {
-        const uint64_t swap = (words[j] >> step ^ words[j + step]) & mask;
-        words[j] ^= swap << step, words[j + step] ^= swap;
-      }
-}
 
-// From the blocks of each splat to the splats of each block.
-inline void list_splats(Staged& staged) {
-  for (int part = 0; part < BLOCKS / 64; part++) {
-    uint64_t* words = staged.splats_of[part];
-    for (int i = 0; i < staged.groups * 64; i++)
-      words[i] = uint64_t(staged.touching[2 * part + 1][i]) << 32 | staged.touching[2 * part][i];
-    for (int group = 0; group < staged.groups; group++) transpose_bits(words + group * 64);
-  }
-}
-
-// The positions of the bits of each byte, low to high.
-struct BitPositions {
-  uint8_t of[256][8] = {};
-  uint8_t count[256] = {};
-  constexpr BitPositions() {
-    for (int byte = 0; byte < 256; byte++)
-      for (int bit = 0; bit < 8; bit++)
-        if (byte >> bit & 1) of[byte][count[byte]++] = uint8_t(bit);
-  }
-};
-constexpr BitPositions BIT_POSITIONS;
-
-// Writes the splats that touch a block; returns how many.
-SPLAT_FN int list_block(const Staged& staged, int block, BlockList& list) {
-  typedef uint8_t Bytes __attribute__((vector_size(8)));
-  typedef uint16_t Words __attribute__((vector_size(16)));
-  const uint64_t* words = staged.splats_of[block / 64] + block % 64;
-  int count = 0;
-  for (int group = 0; group < staged.groups; group++)
-    for (uint64_t word = words[group * 64], first = group * 64; word; word >>= 8, first += 8) {
-      Bytes positions;
-      std::memcpy(&positions, BIT_POSITIONS.of[word & 255], sizeof positions);
-      const Words splats = (__builtin_convertvector(positions, Words) + uint16_t(first)) * ROW;
-      std::memcpy(list + count, &splats, sizeof splats);
-      count += BIT_POSITIONS.count[word & 255];
-    }
-  return count;
-}
-#endif
+inline int whole_batches(int length) { return (length + BATCH - 1) / BATCH * BATCH; }
+inline int whole_vectors(int length) { return (length + LANES - 1) / LANES * LANES; }
 
 // Transforms `count` splats to the coordinates of a tile, and finds the blocks that they touch.
 SPLAT_FN void stage(const View& view, const TileFrame& frame, int first, int count, bool find_blocks, Staged& staged) {
@@ -195,13 +134,9 @@ SPLAT_FN void stage(const View& view, const TileFrame& frame, int first, int cou
   }
   staged.splats[CHUNK] = LocalSplat(), staged.splats[CHUNK].log2_opacity = -1e30f;
   if (!find_blocks) return;
-  staged.groups = (count + 63) / 64;
-  for (uint32_t* words : staged.touching) std::fill(words + count, words + staged.groups * 64, 0);
-  list_splats(staged);
+  staged.count = count, staged.row = -1;
+  for (uint32_t* words : staged.touching) std::fill(words + count, words + whole_vectors(count), 0);
 }
-
-inline int whole_batches(int length) { return (length + BATCH - 1) / BATCH * BATCH; }
-inline int whole_vectors(int length) { return (length + LANES - 1) / LANES * LANES; }
 
 // The pixel centres of a block in tile coordinates.
 struct BlockPixels {
@@ -250,7 +185,7 @@ using LiveBlocks = std::bitset<BLOCKS>;
 
 // Writes the splats that touch a block, filled up to whole vectors with the invisible one, since the backward pass reads whole
 // vectors; returns how many touch it.
-SPLAT_FN int list_filled(Staged& staged, int block, BlockList& list) {
+SPLAT_FN int list_filled(Staged& staged, int block, uint16_t* list) {
   const int length = list_block(staged, block, list);
   std::fill(list + length, list + whole_vectors(length), CHUNK * ROW);
   return length;
@@ -260,7 +195,7 @@ SPLAT_FN int list_filled(Staged& staged, int block, BlockList& list) {
 inline bool can_keep(const Staged& staged, ChunkLists& lists) {
   int64_t pairs = 0;
   for (const uint32_t* words : staged.touching)
-    for (int i = 0; i < staged.groups * 64; i++) pairs += __builtin_popcount(words[i]);
+    for (int i = 0; i < staged.count; i++) pairs += __builtin_popcount(words[i]);
   if (pairs <= KEPT_PAIRS * CHUNK) lists.splats.reserve(pairs + BLOCKS * LANES);
   return pairs <= KEPT_PAIRS * CHUNK;
 }
