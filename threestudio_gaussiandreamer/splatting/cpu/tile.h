@@ -187,7 +187,7 @@ using LiveBlocks = std::bitset<BLOCKS>;
 // vectors; returns how many touch it.
 SPLAT_FN int list_filled(Staged& staged, int block, uint16_t* list) {
   const int length = list_block(staged, block, list);
-  std::fill(list + length, list + whole_vectors(length), CHUNK * ROW);
+  store_halves(list + length, Ints{} + CHUNK * ROW);
   return length;
 }
 
