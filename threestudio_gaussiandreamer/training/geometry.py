@@ -199,7 +199,7 @@ class GaussianCloud(BaseGeometry):
         spherical harmonics have more than the constant band.
         """
         if self.bands == 1:
-            colors = sh.sh0_to_rgb(self.sh0[:, 0])
+            colors = sh.sh0_to_rgb(self.sh0.squeeze(1))
         else:
             dirs = torch.nn.functional.normalize(
                 self.means.detach()[None] - camera_positions[:, None], dim=-1

@@ -11,6 +11,7 @@ All are means over pixels, whereas score distillation is a sum over latents: rai
 proportion to height x width.
 """
 
+import functools
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Optional
 
@@ -74,7 +75,7 @@ def total(losses: Mapping[str, Tensor], guidance: str) -> Float[Tensor, ""]:
     Raises:
         UserError: the sum has no gradient.
     """
-    loss = torch.stack(list(losses.values())).sum()
+    loss = functools.reduce(torch.add, losses.values())
     if not loss.requires_grad:
         names = ", ".join(f"loss_{name}" for name in losses)
         raise UserError(
