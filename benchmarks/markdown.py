@@ -10,9 +10,17 @@ from threestudio_gaussiandreamer.core.files import atomic_file
 
 
 def read(path: Path) -> list[dict[str, str]]:
-    """Return the rows of a CSV; lines that begin with # are comments."""
+    """Return the rows of a CSV; lines that begin with # are comments.
+
+    Raises:
+        ValueError: a row has more or fewer fields than the header.
+    """
     with open(path, newline="") as file:
-        return list(csv.DictReader(line for line in file if not line.startswith("#")))
+        rows = list(csv.DictReader(line for line in file if not line.startswith("#")))
+    for row in rows:
+        if None in row or None in row.values():
+            raise ValueError(f"{path}: a row has another number of fields than the header: {row}")
+    return rows
 
 
 def write(path: Path, columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> None:

@@ -16,6 +16,7 @@ import argparse
 import functools
 import importlib.util
 import os
+import re
 import sys
 import time
 from collections.abc import Callable
@@ -120,7 +121,7 @@ def package_of(checkout: Path) -> str:
     """Import the package of a checkout, under a name of its own; return the name."""
     if checkout == ROOT:
         return PACKAGE
-    name, folder = f"{PACKAGE}_of_{commit_of(checkout)}", checkout / PACKAGE
+    name, folder = PACKAGE + re.sub(r"\W", "_", str(checkout)), checkout / PACKAGE
     spec = importlib.util.spec_from_file_location(
         name, folder / "__init__.py", submodule_search_locations=[str(folder)]
     )

@@ -40,7 +40,8 @@ def test_split_gaussians_are_smaller_and_cover_the_same_place():
 def test_a_case_is_measured_with_each_number_of_threads(tmp_path, monkeypatch):
     monkeypatch.setattr(pairs, "RESULTS", tmp_path / "kernel.csv")
     monkeypatch.setattr(cpu, "usable_builds", lambda: ["v3", "base"])
-    monkeypatch.setattr(cpu, "_load", lambda build: cpu.library())
+    library = cpu.library()
+    monkeypatch.setattr(cpu, "_load", lambda build: library)
     arguments = ["--against", str(ROOT), "--rounds", "1", "--threads", "1", "2"]
     monkeypatch.setattr("sys.argv", ["", *arguments, "--cases", "demo 256"])
     pairs.main()

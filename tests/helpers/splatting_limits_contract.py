@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from torch.utils.checkpoint import checkpoint
 
 from tests.helpers.splatting_draws import BACKGROUND, compare, draw
 from tests.helpers.splatting_scenes import (
@@ -162,6 +163,24 @@ class LimitsContract:
         with torch.autograd.graph.saved_tensors_hooks(torch.clone, lambda x: x):
             hooked = draw(backend, cloud, camera, 40, 12)
         assert equal(plain, hooked)
+
+    @pytest.mark.parametrize("use_reentrant", [False, True])
+    def test_checkpointing(self, backend, use_reentrant):
+        """Without reentrance, each saved tensor may be read once."""
+        camera = cameras(1, 40, 12, dtype=torch.float32)
+
+        def gradients(run):
+            cloud = random_cloud(30, seed=13).to(torch.float32).leaves()
+            background = BACKGROUND.to(torch.float32).expand(1, 3).clone().requires_grad_()
+            run(*cloud, background).square().sum().backward()
+            return [leaf.grad for leaf in (*cloud, background)]
+
+        def image(*tensors):
+            cloud, background = tensors[:-1], tensors[-1]
+            return rasterize(*cloud, *camera, 40, 12, background=background, backend=backend).image
+
+        again = gradients(lambda *x: checkpoint(image, *x, use_reentrant=use_reentrant))
+        assert all(torch.equal(a, b) for a, b in zip(again, gradients(image), strict=True))
 
     def test_backward_twice_adds_up(self, backend):
         cloud, camera = (

@@ -29,6 +29,7 @@ from threestudio_gaussiandreamer.core.devices import torch_threads
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.splatting import rasterize
 from threestudio_gaussiandreamer.splatting.cpu import backend as cpu
+from threestudio_gaussiandreamer.splatting.validation import LARGEST_SIDE
 
 pytestmark = pytest.mark.skipif(cpu.unavailable() is not None, reason=str(cpu.unavailable()))
 
@@ -219,7 +220,27 @@ def test_the_limit_is_the_memory_of_the_container(monkeypatch, tmp_path):
     rasterize(*scene, backend="cpu")
 
 
+@pytest.mark.parametrize("threads", [1, 4])
+def test_the_last_tile_of_the_tallest_image(threads):
+    """Its number and the one behind it still have 16 bits."""
+    cloud, sums = one_gaussian(mean=(0.0, 0.0, 2.0), scale=0.01).to(torch.float32), []
+    for height in (64, LARGEST_SIDE):
+        viewmats, Ks = (x.to(torch.float32) for x in front_camera(1, height, 100.0))
+        Ks[:, 1, 2] = height - 3.0
+        with torch_threads(threads):
+            out = rasterize(*cloud, viewmats, Ks, 1, height, backend="cpu")
+        sums.append(out.alpha[0, -64:].flatten())
+        assert out.alpha.sum() == sums[-1].sum() > 0.1
+    torch.testing.assert_close(*sums, rtol=0, atol=1e-6)
+
+
 # ---- the library ---------------------------------------------------------------------------------
+
+
+def test_a_library_of_another_version_is_refused(monkeypatch):
+    monkeypatch.setattr(cpu, "INTERFACE", cpu.INTERFACE + 1)
+    with pytest.raises(OSError, match="earlier version"):
+        cpu._load(cpu.usable_builds()[0])
 
 
 def test_a_build_that_does_not_exist_is_named(force):

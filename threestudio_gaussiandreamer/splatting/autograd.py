@@ -111,14 +111,15 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx, *grads: Optional[Tensor]):
-        tensors, (alpha, *saved) = ctx.saved_tensors[:TENSORS], ctx.saved_tensors[TENSORS:]
-        scene, needed = Scene(*tensors, *ctx.size), _needed(ctx)
+        saved = ctx.saved_tensors  # hooks run at each reading
+        scene, needed = Scene(*saved[:TENSORS], *ctx.size), _needed(ctx)
+        alpha, *of_kernel = saved[TENSORS:]
         channels = (CHANNELS, 1, 1)
         upstream = Upstream(
             *(None if d is None else widen(d, n) for d, n in zip(grads[:3], channels, strict=True))
         )
         found = ctx.kernel.backward(
-            scene, ctx.means2d, tuple(saved), ctx.state, upstream, needed.viewmats
+            scene, ctx.means2d, tuple(of_kernel), ctx.state, upstream, needed.viewmats
         )
         colors, background = narrow(found.colors, ctx.channels), None
         if needed.background:

@@ -11,7 +11,7 @@ from .options import RasterizeOptions
 from .scene import Scene
 
 PRESETS = {"fast": 1 / 255, "balanced": 1 / 1024, "accurate": 1 / 65536}
-LARGEST_SIDE = 2**20  # pixels; kernels number the columns of their tiles with 16 bits
+LARGEST_SIDE = 16 * (2**16 - 1)  # pixels; kernels number tiles and their ends with 16 bits
 GAUSSIANS = ("means", "quats", "scales", "opacities", "colors")
 
 

@@ -25,6 +25,7 @@ from ..scene import Scene, SceneStruct, address
 
 FOLDER = pathlib.Path(__file__).parent
 BUILDS = ("v4", "v3", "base")  # best first
+INTERFACE = 2  # as in scene.h
 
 
 def unavailable() -> Optional[str]:
@@ -194,7 +195,7 @@ def load_library(path: pathlib.Path) -> ctypes.CDLL:
             version.
     """
     library = ctypes.CDLL(str(path))
-    if not hasattr(library, "splat_set_memory"):
+    if not hasattr(library, "splat_interface") or library.splat_interface() != INTERFACE:
         raise OSError(f"{path} is of an earlier version: install the package again")
     library.splat_forward.restype = library.splat_backward.restype = ctypes.c_int64
     library.splat_forward.argtypes = [

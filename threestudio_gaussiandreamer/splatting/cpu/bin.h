@@ -102,8 +102,8 @@ inline void scan_histogram(View& view, int parts) {
   view.tile_begin[view.tiles()] = sum;
 }
 
-// Puts a Gaussian into its 1 to 2 x 2 tiles, always four times, since branches on their number would be mispredicted. What isn't
-// one of its tiles is another one once more, at the same position, where the own slot is written last.
+// Puts a Gaussian into its 1 to 2 x 2 tiles by four writes, since branches on their number would be mispredicted. Where there are
+// fewer tiles, some are written twice, at the same position, and the right slot is written last.
 SPLAT_FN void fill_four(const View& view, int32_t gaussian, const Coverage& c, int32_t slot, int32_t* next, Intersection* items) {
   const int columns = c.columns.size(), first = c.rows.begin() * view.tiles_x + c.columns.begin();
   const int right = columns - 1, below = (c.rows.size() - 1) * view.tiles_x;

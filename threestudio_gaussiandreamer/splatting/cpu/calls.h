@@ -16,8 +16,8 @@ struct ForwardCall {
 
 // Buffers of a backward pass.
 struct Workspace {
-  Buffer<float> slots;       // (intersections of all views, ROW): gradient sums of a splat in a tile
-  Buffer<float> viewmats;    // (slices of Gaussians, views, 16)
+  Buffer<float> slots;     // (intersections of all views, ROW): gradient sums of a splat in a tile
+  Buffer<float> viewmats;  // (slices of Gaussians, views, 16)
 };
 
 struct BackwardCall {

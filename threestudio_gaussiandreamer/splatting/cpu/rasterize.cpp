@@ -100,6 +100,8 @@ template <class Body> static int64_t guarded(const Body& body) {
 
 extern "C" {
 
+int32_t splat_interface() { return SPLAT_INTERFACE; }
+
 void splat_set_memory(int64_t bytes) { splat::memory_of_machine() = bytes; }
 
 int64_t splat_forward(const splat::Scene* scene, const SplatSettings* settings, const SplatPictures* out, SplatState** state) {

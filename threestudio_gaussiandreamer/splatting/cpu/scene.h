@@ -5,6 +5,9 @@
 
 #include "splat_scene.h"
 
+// Raised with every change of what follows, so that no library is called as another version of it.
+constexpr int32_t SPLAT_INTERFACE = 2;
+
 struct SplatSettings {
   float near, far, eps2d, alpha_min, alpha_max, stop;
   int32_t antialias, downsample, threads;
@@ -59,6 +62,8 @@ extern "C" {
 int64_t splat_forward(const splat::Scene*, const SplatSettings*, const SplatPictures*, SplatState** state);
 int64_t splat_backward(SplatState*, const splat::Scene*, const SplatSettings*, const SplatUpstream*, const SplatGradients*);
 void splat_release(SplatState*);  // null is ignored
+// SPLAT_INTERFACE of the source that this library was built from.
+int32_t splat_interface();
 // Limits what a call may take; the memory of the machine or its container.
 void splat_set_memory(int64_t bytes);
 int64_t splat_gradients_to_pictures(const SplatKnownPictures*, const SplatKnownGradient*);

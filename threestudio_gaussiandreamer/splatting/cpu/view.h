@@ -24,7 +24,7 @@ constexpr int PREFETCH = 32;  // splats ahead
 
 constexpr int SLICE = 2048;  // Gaussians projected by one task
 
-// Rows or columns of tiles, [begin, end), both below 2^16.
+// Rows or columns of tiles, [begin, end), both below 2^16: validation.py limits the size of images.
 struct TileSpan {
   uint32_t bits;  // end << 16 | begin
 
@@ -87,7 +87,7 @@ struct View {
   Buffer<Coverage> coverages;  // (N), and one more behind each slice
   std::vector<Slice> slices;
   Buffer<uint64_t> keys, spare_keys;  // depth << 32 | Gaussian
-  Buffer<int32_t> histogram;  // of the intersections by (part of the Gaussians, tile) as in corners()
+  Buffer<int32_t> histogram;  // of the intersections: corners() numbers per part of the Gaussians, see sum_corners
   bool counted;               // by the projection, as one part
   Buffer<int32_t> tile_begin;    // (tiles + 1) into intersections
   Buffer<Intersection> intersections;  // by tile, then by depth; behind them zeros, as many as are read ahead
@@ -122,7 +122,8 @@ template <class Visit> SPLAT_FN void for_each_rectangle(const View& view, int64_
   for (int y = c.rows.begin(); y < c.rows.end(); y++) visit(tile_span(y, y + 1), *spans++);
 }
 
-// Counts a Gaussian's tiles at the corners of its rectangles, which takes as long for one tile as for many.
+// Counts a Gaussian's tiles at the corners of its rectangles, which takes as long for many tiles as for one. The count of a tile
+// is at most the number of Gaussians, even in scenes with too many intersections to be numbered.
 SPLAT_FN void add_corners(const View& view, int64_t gaussian, int32_t* corners) {
   for_each_rectangle(view, gaussian, [&](TileSpan rows, TileSpan columns) {
     int32_t* top = corners + rows.begin() * (view.tiles_x + 1);
@@ -131,7 +132,7 @@ SPLAT_FN void add_corners(const View& view, int64_t gaussian, int32_t* corners) 
   });
 }
 
-// From corners to the number of Gaussians in each tile, in the same memory.
+// From the corners() numbers of add_corners to the number of Gaussians in each tile, in the first tiles() of them.
 inline void sum_corners(const View& view, int32_t* corners) {
   const int32_t* next = corners;
   int32_t* count = corners;
