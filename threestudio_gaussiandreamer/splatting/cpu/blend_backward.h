@@ -231,7 +231,8 @@ inline void blend_tile_backward(const BackwardCall& call, const View& view, int 
   if (frame.begin == frame.end) return;
   BackwardScratch scratch;
   read_tile(call, view.index, frame, scratch.upstream);
-  if (tile + 1 < view.tiles()) prefetch_tile<false>(upstream_of(call, view.index), frame_of(view, tile + 1), call.settings.downsample);
+  if (tile + 1 < view.tiles())
+    prefetch_tile<false>(upstream_of(call, view.index), frame_of(view, tile + 1), call.settings.downsample);
   start_behind(background_of(call.scene, view.index), scratch);
   if (call.out.absgrad)
     blend_lists_backward<true>(call, view, tile, frame, scratch);

@@ -10,7 +10,6 @@
 #endif
 
 #define SPLAT_FN static inline __attribute__((always_inline))
-#define SPLAT_METHOD inline __attribute__((always_inline))
 
 namespace splat {
 
@@ -95,9 +94,6 @@ SPLAT_FN bool any_at_least(Floats x, float bound) {
 #endif
 }
 
-// Whether a mask is set in any lane.
-SPLAT_FN bool any_lane(Ints mask) { return any_at_least((Floats)(mask & 0x3f800000), 1.0f); }
-
 SPLAT_FN Ints load_ints(const uint32_t* p) {
   Ints v;
   std::memcpy(&v, p, sizeof v);
@@ -122,49 +118,24 @@ SPLAT_FN Ints lane_numbers() {
   return lanes;
 }
 
-#if defined(__AVX512F__)
-// Some of the lanes.
+// Some of the lanes, a bit for each.
 struct Choice {
+#if defined(__AVX512F__)
   __mmask16 lanes;
+#else
+  int lanes;
+#endif
 
   int count() const { return __builtin_popcount(lanes); }
-  // These lanes one after the other, then zeros.
-  SPLAT_METHOD Ints front(Ints x) const { return (Ints)_mm512_maskz_compress_epi32(lanes, (__m512i)x); }
 };
 
+#if defined(__AVX512F__)
 SPLAT_FN Choice with_any_bit(Ints x, uint32_t bits) { return {_mm512_test_epi32_mask((__m512i)x, _mm512_set1_epi32(int(bits)))}; }
 SPLAT_FN Choice with_bit(Ints x, int bit) { return with_any_bit(x, 1u << bit); }
+
+// The chosen lanes one after the other; what follows them is not specified.
+SPLAT_FN Ints to_front(Choice chosen, Ints x) { return (Ints)_mm512_maskz_compress_epi32(chosen.lanes, (__m512i)x); }
 #else
-// The positions of the bits of each byte, low to high.
-struct BitPositions {
-  uint8_t of[256][8] = {};
-  constexpr BitPositions() {
-    for (int byte = 0; byte < 256; byte++)
-      for (int bit = 0, count = 0; bit < 8; bit++)
-        if (byte >> bit & 1) of[byte][count++] = uint8_t(bit);
-  }
-};
-constexpr BitPositions BIT_POSITIONS;
-
-// Some of the lanes, as bits.
-struct Choice {
-  int lanes;
-
-  int count() const { return __builtin_popcount(lanes); }
-  // These lanes one after the other, then the first lane.
-  SPLAT_METHOD Ints front(Ints x) const {
-    const uint8_t* positions = BIT_POSITIONS.of[lanes];
-#if defined(__AVX2__)
-    const __m256i order = _mm256_cvtepu8_epi32(_mm_loadl_epi64(reinterpret_cast<const __m128i*>(positions)));
-    return (Ints)_mm256_permutevar8x32_epi32((__m256i)x, order);
-#else
-    Ints chosen;
-    for (int l = 0; l < LANES; l++) chosen[l] = x[positions[l]];
-    return chosen;
-#endif
-  }
-};
-
 SPLAT_FN Choice negative(Ints x) {
 #if defined(__AVX2__)
   return {_mm256_movemask_ps((__m256)x)};
@@ -177,7 +148,33 @@ SPLAT_FN Choice negative(Ints x) {
 
 SPLAT_FN Choice with_any_bit(Ints x, uint32_t bits) { return negative((x & int(bits)) != 0); }
 SPLAT_FN Choice with_bit(Ints x, int bit) { return negative(x << (31 - bit)); }
+
+// The positions of the bits of each byte, low to high.
+struct BitPositions {
+  uint8_t of[256][8] = {};
+  constexpr BitPositions() {
+    for (int byte = 0; byte < 256; byte++)
+      for (int bit = 0, count = 0; bit < 8; bit++)
+        if (byte >> bit & 1) of[byte][count++] = uint8_t(bit);
+  }
+};
+constexpr BitPositions BIT_POSITIONS;
+
+SPLAT_FN Ints to_front(Choice chosen, Ints x) {
+  const uint8_t* positions = BIT_POSITIONS.of[chosen.lanes];
+#if defined(__AVX2__)
+  const __m256i order = _mm256_cvtepu8_epi32(_mm_loadl_epi64(reinterpret_cast<const __m128i*>(positions)));
+  return (Ints)_mm256_permutevar8x32_epi32((__m256i)x, order);
+#else
+  Ints front;
+  for (int l = 0; l < LANES; l++) front[l] = x[positions[l]];
+  return front;
 #endif
+}
+#endif
+
+// Whether a mask is set in any lane.
+SPLAT_FN bool any_lane(Ints mask) { return with_bit(mask, 31).lanes != 0; }
 
 // log2(x) of a normal x > 0, relative error 2e-7: exponent + 2 atanh((m - 1) / (m + 1)) / ln 2 with m in [sqrt(1/2), sqrt(2)).
 SPLAT_FN Floats log2(Floats x) {

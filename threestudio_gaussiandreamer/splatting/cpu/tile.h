@@ -98,8 +98,8 @@ SPLAT_FN void list_row(Staged& staged, int row) {
   for (int i = 0; i < staged.count; i += LANES, positions += LANES * ROW) {
     const Ints blocks = load_ints(words + i);
     const Choice touching = with_any_bit(blocks, 0xffu << 8 * (row % 4));
-    store_ints(staged.row_positions + count, touching.front(positions));
-    store_ints(staged.row_touching + count, touching.front(blocks));
+    store_ints(staged.row_positions + count, to_front(touching, positions));
+    store_ints(staged.row_touching + count, to_front(touching, blocks));
     count += touching.count();
   }
   store_ints(staged.row_touching + count, Ints{});
@@ -112,7 +112,7 @@ SPLAT_FN int list_block(Staged& staged, int block, uint16_t* list) {
   int count = 0;
   for (int i = 0; i < staged.in_row; i += LANES) {
     const Choice touching = with_bit(load_ints(staged.row_touching + i), block % 32);
-    store_halves(list + count, touching.front(load_ints(staged.row_positions + i)));
+    store_halves(list + count, to_front(touching, load_ints(staged.row_positions + i)));
     count += touching.count();
   }
   return count;
