@@ -181,7 +181,7 @@ def ray_directions(
 def surface_points(
     depth: Float[Tensor, "B h w"],
     c2w: Float[Tensor, "B _ 4"],
-    fovy: Float[Tensor, " B"],
+    focal: Float[Tensor, " B"],
     aspect: float = 1.0,
 ) -> Float[Tensor, "B 3 h w"]:
     """Return the world coordinates of the points on the rendered surface.
@@ -189,19 +189,18 @@ def surface_points(
     Args:
         depth: along the optical axis, at the centres of h x w pixels.
         c2w: OpenGL cameras; the fourth row isn't needed.
-        fovy: radians.
+        focal: :func:`focal_length` for this height.
         aspect: width of a pixel over its height.
     """
     height, width = depth.shape[1:]
     plane = _image_plane(height, width, depth.device).type_as(depth)
-    focal = focal_length(fovy, height)[:, None]
     pixels = torch.addcmul(
         _constant(((0.0, 0.0, 1.0),), focal.dtype, focal.device),
-        focal,
+        focal[:, None],
         _constant(((1 / aspect, 1.0, 0.0),), focal.dtype, focal.device),
     )
-    rays = (c2w[:, :3, :3] / pixels[:, None]) @ plane
-    points = rays.mul_(depth.flatten(1)[:, None]).add_(c2w[:, :3, 3:])
+    axes = c2w[:, :3, :3] / pixels[:, None]
+    points = torch.baddbmm(c2w[:, :3, 3:], axes, plane * depth.flatten(1)[:, None])
     return points.unflatten(2, (height, width))
 
 

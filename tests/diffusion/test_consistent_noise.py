@@ -6,7 +6,12 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
-from threestudio_gaussiandreamer.cameras import orbit_c2w, ray_directions, surface_points
+from threestudio_gaussiandreamer.cameras import (
+    focal_length,
+    orbit_c2w,
+    ray_directions,
+    surface_points,
+)
 from threestudio_gaussiandreamer.diffusion.consistent_noise import (
     LATTICES,
     PRIMES,
@@ -38,7 +43,8 @@ def ball(azimuths, size, distance=3.0):
 
 
 def table(seed=0, channels=4):
-    return torch.randn(channels, TABLE, generator=torch.Generator().manual_seed(seed))
+    values = torch.randn(channels, TABLE, generator=torch.Generator().manual_seed(seed))
+    return values * LATTICES**-0.5
 
 
 def noise_of(size, table, view, draws=None):
@@ -49,7 +55,7 @@ def noise_of(size, table, view, draws=None):
 
 def test_points_lie_on_the_surface():
     depth, opacity, c2w, fovy = ball([0.0, 70.0], 64)
-    points = surface_points(depth[..., 0], c2w, fovy).movedim(1, -1)
+    points = surface_points(depth[..., 0], c2w, focal_length(fovy, 64)).movedim(1, -1)
     inside = opacity[..., 0] > 0
     assert inside.float().mean() > 0.2
     torch.testing.assert_close(
@@ -119,11 +125,11 @@ def test_a_background_is_standard_normal_and_its_pixels_are_independent():
 def test_cells_are_cubes_of_each_lattice():
     """The hash of the coordinates, point by point in Python's integers."""
     depth, opacity, c2w, fovy = ball([30.0, 200.0], 16)
-    size = cell_size(c2w, fovy, 16)
-    points = surface_points(depth[..., 0], c2w[:, :3] / size[:, None, None], fovy)
-    rows = surface_cells(depth[..., 0], c2w, fovy, size)
+    focal = focal_length(fovy, 16)
+    points, size = surface_points(depth[..., 0], c2w, focal), cell_size(c2w, focal)
+    rows = surface_cells(points, size) % TABLE
     for lattice, view, y, x in np.ndindex(*rows.shape):
-        shifted = points[view, :, y, x].numpy() + np.float32(lattice / LATTICES)
+        shifted = (points[view, :, y, x] / size[view]).numpy() + np.float32(lattice / LATTICES)
         cell = [int(c) for c in np.floor(shifted)]
         expected = sum(c * prime for c, prime in zip(cell, PRIMES, strict=True))
         expected += lattice * TABLE // LATTICES
@@ -132,10 +138,11 @@ def test_cells_are_cubes_of_each_lattice():
 
 def test_a_pixel_is_the_sum_of_its_cells_in_all_lattices():
     depth, opacity, c2w, fovy = view = ball([30.0], 32)
-    size = cell_size(c2w, fovy, 32)
-    rows = surface_cells(depth[..., 0], c2w, fovy, size)
+    focal = focal_length(fovy, 32)
+    points = surface_points(depth[..., 0], c2w, focal)
+    rows = surface_cells(points, cell_size(c2w, focal)) % TABLE
     values = table()
-    expected = sum(values[:, row.long()] for row in rows).transpose(0, 1) / LATTICES**0.5
+    expected = sum(values[:, row.long()] for row in rows).transpose(0, 1)
     inside = opacity[:, None, :, :, 0] > 0
     found = noise_of(32, values, view)
     torch.testing.assert_close(found * inside, expected * inside)

@@ -34,22 +34,17 @@ EXPONENT = 0x7F800000
 
 
 def surface_cells(
-    depth: Float[Tensor, "B h w"],
-    c2w: Float[Tensor, "B 4 4"],
-    fovy: Float[Tensor, " B"],
-    size: Float[Tensor, " B"],
-    aspect: float = 1.0,
+    points: Float[Tensor, "B 3 h w"], size: Float[Tensor, " B"]
 ) -> Int[Tensor, "L B h w"]:
-    """Return the row of each point's cell, a hash, for each lattice.
+    """Return a hash of each point's cell, for each lattice. Its row is the hash modulo ``TABLE``.
 
     Args:
-        size: of the cells, world units.
-        aspect: width of a pixel over its height.
+        size: of the cells, world units: a power of two.
     """
-    points = surface_points(depth, c2w[:, :3] / size[:, None, None], fovy, aspect)
-    lattices = _lattices(depth.device)
-    cells = (points + lattices.shifts).floor_().int().mul_(lattices.primes)
-    return cells.sum(2, dtype=torch.int32).add_(lattices.marks).bitwise_and_(TABLE - 1)
+    lattices = _lattices(points.device)
+    per_unit = size.reciprocal()[:, None, None, None]
+    cells = torch.addcmul(lattices.shifts, points, per_unit).floor_().int().mul_(lattices.primes)
+    return cells.sum(2, dtype=torch.int32).add_(lattices.marks)
 
 
 class Lattices(NamedTuple):
@@ -79,16 +74,14 @@ def background_cells(height: int, width: int, device: torch.device) -> Int[Tenso
     return _lattices(device).marks + rows[:, None] + columns
 
 
-def cell_size(
-    c2w: Float[Tensor, "B 4 4"], fovy: Float[Tensor, " B"], height: int
-) -> Float[Tensor, " B"]:
+def cell_size(c2w: Float[Tensor, "B 4 4"], focal: Float[Tensor, " B"]) -> Float[Tensor, " B"]:
     """Return the size of each view's cells, world units.
 
     Args:
         c2w: float32.
-        height: of the latent, pixels.
+        focal: of the latents, pixels.
     """
-    footprint = c2w[:, :3, 3].norm(dim=1) / focal_length(fovy, height)
+    footprint = torch.linalg.vector_norm(c2w[:, :3, 3], dim=1) / focal
     bits = footprint.clamp_min_(1e-6).view(torch.int32)
     return bits.bitwise_and_(EXPONENT).view(torch.float32)
 
@@ -106,30 +99,30 @@ def attached_noise(
 
     Args:
         size: (h, w) of the latents.
-        table: standard normal values of the cells.
+        table: values of the cells, normal numbers of variance 1 / ``LATTICES``.
         draws: random int32 numbers in [0, TABLE), from which the background's noise follows.
         depth: of the renderer, along the optical axis; renders needn't have the latents' aspect
             ratio, since models get them squeezed to a square.
     """
-    c2w, fovy = c2w.float(), fovy.float()
+    c2w, focal = c2w.float(), focal_length(fovy.float(), size[0])
     aspect = (depth.shape[2] / depth.shape[1]) / (size[1] / size[0])
-    cell = cell_size(c2w, fovy, size[0])
-    cells = surface_cells(_sampled(depth, size), c2w, fovy, cell, aspect)
+    points = surface_points(_sampled(depth, size), c2w, focal, aspect)
+    cells = surface_cells(points, cell_size(c2w, focal))
     behind = background_cells(*size, depth.device) + draws[:, None, None]
     is_surface = _sampled(opacity, size) >= OPAQUE
-    rows = torch.where(is_surface, cells, behind.bitwise_and_(TABLE - 1))
+    rows = torch.where(is_surface, cells, behind).bitwise_and_(TABLE - 1)
     values = table.index_select(1, rows.flatten()).view(-1, *rows.shape)
     noise = torch.empty(len(depth), len(table), *size, device=depth.device)
     torch.sum(values, 1, out=noise.transpose(0, 1))
-    return noise.mul_(LATTICES**-0.5)
+    return noise
 
 
 def _sampled(images: Float[Tensor, "B H W 1"], size: tuple[int, int]) -> Float[Tensor, "B h w"]:
     """Return the pixels nearest to the centres of h x w pixels; between an edge and what is behind
     it there is no surface.
     """
-    images, (height, width) = images[..., 0], size
+    height, width = size
     if images.shape[1] % height == 0 == images.shape[2] % width:  # as below, but a view
         rows, columns = images.shape[1] // height, images.shape[2] // width
-        return images[:, rows // 2 :: rows, columns // 2 :: columns].float()
-    return F.interpolate(images[:, None].float(), size, mode="nearest-exact")[:, 0]
+        return images[:, rows // 2 :: rows, columns // 2 :: columns, 0].float()
+    return F.interpolate(images.movedim(-1, 1).float(), size, mode="nearest-exact")[:, 0]

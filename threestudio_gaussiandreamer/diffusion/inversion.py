@@ -1,6 +1,7 @@
 """DDIM inversion: the deterministic trajectory from a clean latent towards noise."""
 
-from collections.abc import Callable
+import itertools
+from collections.abc import Callable, Iterable
 from functools import lru_cache
 from typing import NamedTuple, Optional
 
@@ -52,35 +53,48 @@ def invert(
         fresh: returns the standard normal noise of all items in a step, given its index; needed if
             ``eta`` isn't 0.
     """
-    factors = _factors(alphas_cumprod, stride, eta)
-    ends, result = t.tolist(), x.clone()
-    # in this order, the items that end in a step are the first of those that are left
-    order = [i for i in sorted(range(len(ends)), key=ends.__getitem__) if ends[i]]
-    rows = torch.tensor(order, dtype=torch.long, device=x.device)
+    ends = t.tolist()
+    # in this order, the items that have ended are always the first
+    order = sorted(range(len(ends)), key=ends.__getitem__)
+    rows = left = torch.tensor(order, dtype=torch.long, device=x.device)
+    table = _factors(alphas_cumprod, stride, eta)
+    factors = _factors_of_steps(table, [ends[item] for item in order], stride, x)
+    ended: list[Tensor] = []
     # a step writes to memory that is there: to allocate it takes longer than the arithmetic
     z = x.index_select(0, rows)
-    spare, noise = torch.empty_like(z), torch.zeros_like(z)
-    for index, start in enumerate(range(0, max(ends), stride)):
-        predicted = predict(Step(index, rows, z, torch.full_like(rows, start)))
+    spare, noise = torch.empty_like(z), torch.empty_like(z)
+    for index, (ratio, slope, deviation) in enumerate(factors):
+        if gone := len(z) - len(ratio):
+            ended.append(z[:gone])
+            left, z, spare, noise = left[gone:], z[gone:], spare[gone:], noise[gone:]
+        predicted = predict(Step(index, left, z, left.new_full(left.shape, index * stride)))
+        torch.mul(z, ratio, out=spare).addcmul_(predicted, slope)
         if eta and fresh is not None:
-            torch.index_select(fresh(index).to(x), 0, rows, out=noise)
-        count = sum(ends[item] <= start + stride for item in order)
-        for row, item in enumerate(order[:count]):
-            _move(factors[ends[item]], z[row], predicted[row], noise[row], out=result[item])
-        if count:
-            order, values = order[count:], (rows, z, spare, predicted, noise)
-            rows, z, spare, predicted, noise = (v[count:] for v in values)
-        if order:
-            _move(factors[start + stride], z, predicted, noise, out=spare)
-            z, spare = spare, z
-    return result
+            torch.index_select(fresh(index).to(x), 0, left, out=noise)
+            spare.addcmul_(noise, deviation)
+        z, spare = spare, z
+    return torch.empty_like(x).index_copy_(0, rows, torch.cat([*ended, z]))
 
 
-def _move(factors: Factors, z: Tensor, predicted: Tensor, noise: Tensor, out: Tensor) -> None:
-    ratio, slope, deviation = factors
-    torch.mul(z, ratio, out=out).add_(predicted, alpha=slope)
-    if deviation:
-        out.add_(noise, alpha=deviation)
+def _factors_of_steps(
+    table: list[Factors], ends: list[int], stride: int, like: Float[Tensor, "B *d"]
+) -> Iterable[tuple[Tensor, Tensor, Tensor]]:
+    """Return the factors of each step for the items that it moves, each (R, 1, ..., 1): all of them
+    are views of one tensor.
+
+    Args:
+        table: the factors of the step that ends at each timestep.
+        ends: the timesteps of the items, ascending.
+    """
+    counts: list[int] = []
+    factors: list[float] = []
+    for start in range(0, ends[-1], stride):
+        moved = [table[min(end, start + stride)] for end in ends if end > start]
+        counts += [len(moved)] * 3
+        factors += itertools.chain(*zip(*moved, strict=True))
+    values = torch.tensor(factors, dtype=like.dtype, device=like.device)
+    parts = values.view(-1, *[1] * (like.dim() - 1)).split_with_sizes(counts)
+    return zip(parts[::3], parts[1::3], parts[2::3], strict=True)
 
 
 @lru_cache(maxsize=4)

@@ -221,7 +221,8 @@ def normals_from_depth(
 
     ``depth`` is along the optical axis; the normal is the cross product of the surface's
     differences along rows and columns."""
-    points = cameras.surface_points(depth[..., 0], c2w, fovy)
+    focal = cameras.focal_length(fovy, depth.shape[1])
+    points = cameras.surface_points(depth[..., 0], c2w, focal)
     padded = F.pad(points, (1, 1, 1, 1), mode="replicate")
     down = padded[:, :, 2:, 1:-1] - padded[:, :, :-2, 1:-1]
     right = padded[:, :, 1:-1, 2:] - padded[:, :, 1:-1, :-2]

@@ -26,7 +26,7 @@ from ...core import streams
 from ...core.distributed import first_item
 from ...core.errors import UserError
 from ...core.options import at_least
-from ...diffusion.consistent_noise import TABLE, attached_noise
+from ...diffusion.consistent_noise import LATTICES, TABLE, attached_noise
 from ...host import register, run_seed
 from .base import Batch, Error, Variant
 
@@ -68,15 +68,15 @@ class CFD(Variant):
         if self._table is None or self._table[0] != epoch:
             generator = streams.generator(run_seed(), "surface noise", epoch)
             values = torch.randn(latents.shape[1], TABLE, generator=generator)
-            self._table = epoch, values.to(latents.device)
+            self._table = epoch, (values * LATTICES**-0.5).to(latents.device)
         return self._table[1]
 
     @staticmethod
     def draws(step: int, latents: Float[Tensor, "B c h w"]) -> Int[Tensor, " B"]:
         """Return a random row of the table for each item of this step."""
-        first = first_item(len(latents))
+        seed, first = run_seed(), first_item(len(latents))
         rows = [
-            streams.derive_seed(run_seed(), "background cells", step, item) % TABLE
+            streams.derive_seed(seed, "background cells", step, item) % TABLE
             for item in range(first, first + len(latents))
         ]
         return torch.tensor(rows, dtype=torch.int32, device=latents.device)
