@@ -14,6 +14,7 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 import torch
 
+from tests.helpers import avx512_emulated
 from tests.helpers.splatting_contract import KernelContract
 from tests.helpers.splatting_draws import compare, draw
 from tests.helpers.splatting_scenes import (
@@ -31,6 +32,8 @@ from threestudio_gaussiandreamer.splatting import rasterize
 from threestudio_gaussiandreamer.splatting.cpu import backend as cpu
 from threestudio_gaussiandreamer.splatting.validation import LARGEST_SIDE
 
+EMULATED = "v4 emulated"
+
 pytestmark = pytest.mark.skipif(cpu.unavailable() is not None, reason=str(cpu.unavailable()))
 
 
@@ -39,6 +42,10 @@ def force(monkeypatch):
     """Return a function that selects one build."""
 
     def force(name):
+        if name == EMULATED:
+            name, folder = "v4", pathlib.Path(avx512_emulated.folder().name)
+            monkeypatch.setattr(cpu, "usable_builds", lambda: [name])
+            monkeypatch.setattr(cpu, "_path", lambda build: folder / f"libsplat_{build}.so")
         monkeypatch.setenv("GAUSSIANDREAMER_ISA", name)
         cpu.library.cache_clear()
 
@@ -46,7 +53,7 @@ def force(monkeypatch):
     cpu.library.cache_clear()
 
 
-@pytest.fixture(params=cpu.usable_builds())
+@pytest.fixture(params=cpu.usable_builds() + [EMULATED] * avx512_emulated.is_needed())
 def isa(request, force):
     force(request.param)
     return request.param
