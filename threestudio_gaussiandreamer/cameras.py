@@ -200,7 +200,8 @@ def surface_points(
         _constant(((1 / aspect, 1.0, 0.0),), focal.dtype, focal.device),
     )
     axes = c2w[:, :3, :3] / pixels[:, None]
-    points = torch.baddbmm(c2w[:, :3, 3:], axes, plane * depth.flatten(1)[:, None])
+    # the product is that of half integers: with depths in it, TF32 would round them
+    points = torch.addcmul(c2w[:, :3, 3:], axes @ plane, depth.flatten(1)[:, None])
     return points.unflatten(2, (height, width))
 
 

@@ -13,11 +13,13 @@ from threestudio_gaussiandreamer.cameras import (
     surface_points,
 )
 from threestudio_gaussiandreamer.diffusion.consistent_noise import (
+    ITEM,
     LATTICES,
     PRIMES,
     TABLE,
     attached_noise,
     cell_size,
+    cell_values,
     surface_cells,
 )
 
@@ -43,14 +45,12 @@ def ball(azimuths, size, distance=3.0):
 
 
 def table(seed=0, channels=4):
-    values = torch.randn(channels, TABLE, generator=torch.Generator().manual_seed(seed))
-    return values * LATTICES**-0.5
+    return cell_values(channels, torch.Generator().manual_seed(seed))
 
 
-def noise_of(size, table, view, draws=None):
-    """Return the noise of latents of size x size pixels, with background ``draws`` from 0."""
-    draws = torch.arange(len(view[0]), dtype=torch.int32) if draws is None else draws
-    return attached_noise((size, size), table, draws, *view)
+def noise_of(size, table, view, draw=0, first=0):
+    """Return the noise of latents of size x size pixels."""
+    return attached_noise((size, size), table, draw, first, *view)
 
 
 def test_points_lie_on_the_surface():
@@ -69,9 +69,8 @@ def test_a_model_that_gets_renders_squeezed_sees_the_noise_of_the_same_points():
     """A pixel of latents as wide as high is in the middle of three square ones."""
     depth, opacity, *cameras = ball([20.0], 96)
     wide = [F.pad(image[..., 0], (96, 96))[..., None] for image in (depth, opacity)]
-    draws = torch.zeros(1, dtype=torch.int32)
-    squeezed = attached_noise((32, 32), table(), draws, *wide, *cameras)
-    whole = attached_noise((32, 96), table(), draws, *wide, *cameras)
+    squeezed = attached_noise((32, 32), table(), 0, 0, *wide, *cameras)
+    whole = attached_noise((32, 96), table(), 0, 0, *wide, *cameras)
     inside = wide[1][0, 1::3, 4::9, 0] > 0
     assert inside.sum() > 50
     assert torch.equal(squeezed[..., inside], whole[..., 1::3][..., inside])
@@ -102,15 +101,23 @@ def test_near_views_see_the_same_noise_and_far_views_do_not():
 
 def test_the_background_has_noise_of_its_own_in_each_view_and_draw():
     size, view = 32, ball([0.0, 0.0], 128)
-    noise = noise_of(size, table(), view)
-    again = noise_of(size, table(), view, torch.tensor([0, 7], dtype=torch.int32))
+    noise, again = noise_of(size, table(), view), noise_of(size, table(), view, draw=7)
+    assert torch.equal(noise_of(size, table(), [x[1:] for x in view], first=1)[0], noise[1])
     corner = (slice(None), slice(0, 6), slice(0, 6))
-    assert torch.equal(noise[0], again[0])
     assert torch.equal(noise[1, :, 16, 16], again[1, :, 16, 16])  # the surface
     for a, b in ((noise[0], noise[1]), (noise[1], again[1])):
         correlation = torch.corrcoef(torch.stack([a[corner].flatten(), b[corner].flatten()]))
         assert abs(float(correlation[0, 1])) < 0.25  # three deviations of 144 numbers
     assert len(noise[0][corner].unique()) == 4 * 6 * 6
+
+
+def test_no_background_of_seven_items_is_that_of_another_one_shifted():
+    """Nor with the lattices exchanged, whose rows are half of the table apart."""
+    shifts = np.arange(-63, 64)
+    pixels = shifts[:, None] * PRIMES[0] + shifts * PRIMES[1]
+    shifted = {*(pixels % TABLE).ravel(), *((pixels + TABLE // LATTICES) % TABLE).ravel()}
+    assert not shifted & {items * ITEM % TABLE for items in range(1, 7)}
+    assert 7 * ITEM % TABLE in shifted
 
 
 def test_a_background_is_standard_normal_and_its_pixels_are_independent():

@@ -14,7 +14,8 @@ from tests.helpers.mixture_guidance import (
     mixture_guidance,
     noise_of,
 )
-from threestudio_gaussiandreamer.diffusion.consistent_noise import attached_noise
+from threestudio_gaussiandreamer.core import streams
+from threestudio_gaussiandreamer.diffusion.consistent_noise import TABLE, attached_noise
 from threestudio_gaussiandreamer.diffusion.noise_table import NoiseTable
 
 EXACT = 1e-10
@@ -287,7 +288,8 @@ def test_cfd_uses_the_surfaces_noise():
     noise = attached_noise(
         x.shape[-2:],
         guidance.variant.table(guidance.step + 1, x),  # the same in another step
-        guidance.variant.draws(guidance.step, x),
+        streams.derive_seed(0, "background cells", guidance.step) % TABLE,
+        0,
         *(batch[name] for name in ("depth", "opacity", "c2w", "fovy")),
     )
     t, a, sigma, *_ = draws(guidance, x)

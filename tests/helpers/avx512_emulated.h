@@ -29,6 +29,7 @@ template <class Test> EMULATED __mmask16 mask_of(Test test) {
 }
 
 EMULATED void stream(float* to, Floats v) {
+  if (reinterpret_cast<uintptr_t>(to) % sizeof v) __builtin_trap();
   for (int l = 0; l < LANES; l++) to[l] = v[l];
 }
 EMULATED Floats set1(float x) { return Floats{} + x; }
@@ -67,7 +68,7 @@ EMULATED Floats insert(Floats v, __m128 quad, int group) {
   return v;
 }
 
-// x - floor(x); of infinity, 0.
+// x - floor(x), rounded to nearest, where the instruction rounds down; of infinity, 0.
 EMULATED Floats fraction(Floats x) {
   for (int l = 0; l < LANES; l++) x[l] = std::isinf(x[l]) ? 0.0f : x[l] - std::floor(x[l]);
   return x;

@@ -1,11 +1,11 @@
 """Gaussian noise that is attached to surfaces, so that all views of a point see the same noise.
 
-Space is divided into cubic cells, each with its own standard normal values, one per channel, in
-``LATTICES`` ways that are shifted against each other. A pixel of the latent looks up the cells of
-the point of the rendered surface at its centre, one per lattice; its noise is their sum over the
-square root of their number. Each pixel is thus standard normal, and pixels are independent unless
-they see the same cell. A cell's size is a power of two, from half the distance of two such points
-at the origin to all of it: views from similar distances share their cells.
+Space is divided into cubic cells, each with its own normal values of variance 1 / ``LATTICES``, one
+per channel, in ``LATTICES`` ways that are shifted against each other. A pixel of the latent looks
+up the cells of the point of the rendered surface at its centre, one per lattice; its noise is their
+sum. Each pixel is thus standard normal, and pixels are independent unless they see the same cell.
+A cell's size is a power of two, from half the distance of two such points at the origin to all of
+it: views from similar distances share their cells.
 
 The values stand in a table that a hash of the cell looks up. The pixels of the background look up
 rows that change with each draw."""
@@ -27,10 +27,20 @@ PRIMES = (73856093, 19349663, 83492791)
 """Of Teschner et al. (2003). Rows are sums of the products, modulo ``TABLE``: other than with their
 exclusive or, cells that are near each other never share a row.
 """
+ITEM = 61045
+"""Distance between the rows of neighbouring items. Neither it nor its multiples up to 6 are a
+distance between the rows of two pixels of 64 x 64: the background of an item isn't that of another
+one, shifted.
+"""
 OPAQUE = 0.5
 """Alpha below which a pixel belongs to the background."""
 EXPONENT = 0x7F800000
 """Bits of the exponent of a float32: without the others, it is rounded down to a power of two."""
+
+
+def cell_values(channels: int, generator: torch.Generator) -> Float[Tensor, "c TABLE"]:
+    """Draw the values of the cells."""
+    return torch.randn(channels, TABLE, generator=generator) * LATTICES**-0.5
 
 
 def surface_cells(
@@ -65,13 +75,23 @@ def _lattices(device: torch.device) -> Lattices:
 
 
 @lru_cache(maxsize=4)
-def background_cells(height: int, width: int, device: torch.device) -> Int[Tensor, "L 1 h w"]:
-    """Return a number for each lattice and pixel of an image, from which its row follows."""
-    rows, columns = (
-        torch.arange(n, dtype=torch.int32, device=device) * prime
-        for n, prime in zip((height, width), PRIMES, strict=False)
+def background_cells(
+    first: int, count: int, height: int, width: int, device: torch.device
+) -> Int[Tensor, "L B h w"]:
+    """Return a number for each lattice, item and pixel, from which its row follows in each step.
+
+    Args:
+        first: number of the first of ``count`` items.
+    """
+    items, rows, columns = (
+        torch.arange(begin, begin + n, dtype=torch.int32, device=device) * factor
+        for begin, n, factor in (
+            (first, count, ITEM),
+            (0, height, PRIMES[0]),
+            (0, width, PRIMES[1]),
+        )
     )
-    return _lattices(device).marks + rows[:, None] + columns
+    return _lattices(device).marks + items[:, None, None] + rows[:, None] + columns
 
 
 def cell_size(c2w: Float[Tensor, "B 4 4"], focal: Float[Tensor, " B"]) -> Float[Tensor, " B"]:
@@ -89,7 +109,8 @@ def cell_size(c2w: Float[Tensor, "B 4 4"], focal: Float[Tensor, " B"]) -> Float[
 def attached_noise(
     size: tuple[int, int],
     table: Float[Tensor, "c TABLE"],
-    draws: Int[Tensor, " B"],
+    draw: int,
+    first: int,
     depth: Float[Tensor, "B H W 1"],
     opacity: Float[Tensor, "B H W 1"],
     c2w: Float[Tensor, "B 4 4"],
@@ -99,8 +120,9 @@ def attached_noise(
 
     Args:
         size: (h, w) of the latents.
-        table: values of the cells, normal numbers of variance 1 / ``LATTICES``.
-        draws: random int32 numbers in [0, TABLE), from which the background's noise follows.
+        table: :func:`cell_values`.
+        draw: random number in [0, TABLE), from which the background's noise in a step follows.
+        first: number of the first item among those of all processes.
         depth: of the renderer, along the optical axis; renders needn't have the latents' aspect
             ratio, since models get them squeezed to a square.
     """
@@ -108,7 +130,7 @@ def attached_noise(
     aspect = (depth.shape[2] / depth.shape[1]) / (size[1] / size[0])
     points = surface_points(_sampled(depth, size), c2w, focal, aspect)
     cells = surface_cells(points, cell_size(c2w, focal))
-    behind = background_cells(*size, depth.device) + draws[:, None, None]
+    behind = background_cells(first, len(depth), *size, depth.device) + draw
     is_surface = _sampled(opacity, size) >= OPAQUE
     rows = torch.where(is_surface, cells, behind).bitwise_and_(TABLE - 1)
     values = table.index_select(1, rows.flatten()).view(-1, *rows.shape)

@@ -46,6 +46,7 @@ def invert(
 
     Args:
         predict: returns the noise in the latents of a step.
+        x: float32 or float64.
         alphas_cumprod: abar by timestep.
         stride: timesteps of one step; the last one ends at t.
         eta: standard deviation of the noise that a step adds, as a share of that of DDPM's reverse

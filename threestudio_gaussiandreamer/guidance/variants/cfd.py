@@ -18,15 +18,14 @@ refresh  steps after which the surface gets new noise; 0: never, the paper's det
 from dataclasses import dataclass, field
 from typing import Any, Optional
 
-import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from ...core import streams
 from ...core.distributed import first_item
 from ...core.errors import UserError
 from ...core.options import at_least
-from ...diffusion.consistent_noise import LATTICES, TABLE, attached_noise
+from ...diffusion.consistent_noise import TABLE, attached_noise, cell_values
 from ...host import register, run_seed
 from .base import Batch, Error, Variant
 
@@ -56,7 +55,8 @@ class CFD(Variant):
         noise = attached_noise(
             latents.shape[-2:],
             self.table(guidance.step, latents),
-            self.draws(guidance.step, latents),
+            streams.derive_seed(run_seed(), "background cells", guidance.step) % TABLE,
+            first_item(len(latents)),
             *(batch[name] for name in (*self.RENDERS, "c2w", "fovy")),
         )
         noised = guidance.noised(latents, noise)
@@ -67,16 +67,6 @@ class CFD(Variant):
         epoch = step // self.options.refresh if self.options.refresh else 0
         if self._table is None or self._table[0] != epoch:
             generator = streams.generator(run_seed(), "surface noise", epoch)
-            values = torch.randn(latents.shape[1], TABLE, generator=generator)
-            self._table = epoch, (values * LATTICES**-0.5).to(latents.device)
+            values = cell_values(latents.shape[1], generator)
+            self._table = epoch, values.to(latents.device)
         return self._table[1]
-
-    @staticmethod
-    def draws(step: int, latents: Float[Tensor, "B c h w"]) -> Int[Tensor, " B"]:
-        """Return a random row of the table for each item of this step."""
-        seed, first = run_seed(), first_item(len(latents))
-        rows = [
-            streams.derive_seed(seed, "background cells", step, item) % TABLE
-            for item in range(first, first + len(latents))
-        ]
-        return torch.tensor(rows, dtype=torch.int32, device=latents.device)

@@ -73,8 +73,8 @@ class SDI(Variant):
         z = invert(predict, latents, t, guidance.alphas_cumprod, stride, eta=eta, fresh=fresh)
         # from a table: to compute the factors of a few items takes longer than the arithmetic
         factors = _noise_factors(guidance.alphas_cumprod, z.dtype, z.device).index_select(1, t)
-        scale, slope = factors.view(2, -1, *[1] * (z.dim() - 1))
-        noise = z.addcmul(scale, latents).mul_(slope)
+        shift, per_sigma = factors.view(2, -1, *[1] * (z.dim() - 1))
+        noise = z.addcmul(shift, latents).mul_(per_sigma)
         return guidance.predict_noise(z, t, condition) - noise, abar
 
     def _table_for(self, latents: Float[Tensor, "B c h w"]) -> NoiseTable:
