@@ -4,13 +4,9 @@
 
 #include <immintrin.h>
 
-#include <atomic>
 #include <cmath>
-#include <condition_variable>
 #include <cstdint>
 #include <cstring>
-#include <mutex>
-#include <thread>
 
 #define __AVX512F__ 1  // after immintrin.h, whose own declarations depend on it
 
