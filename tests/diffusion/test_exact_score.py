@@ -16,6 +16,7 @@ from threestudio_gaussiandreamer.diffusion.exact_score import (
     mode_variance,
     responsibilities,
     squared_distances,
+    squared_norms,
 )
 
 ABAR = sds.sd_alphas_cumprod()
@@ -182,8 +183,22 @@ def test_items_are_independent_with_shared_and_with_separate_banks():
 def test_distances_in_chunks_are_the_distances(monkeypatch):
     z, bank, abar = randn(2, 30), randn(11, 30, seed=1), ABAR[torch.tensor([50, 700])]
     whole = squared_distances(z, bank, abar)
-    monkeypatch.setattr("threestudio_gaussiandreamer.diffusion.exact_score.CHUNK_ELEMENTS", 150)
-    torch.testing.assert_close(squared_distances(z, bank, abar), whole, rtol=1e-15, atol=0)
+    monkeypatch.setattr("threestudio_gaussiandreamer.diffusion.exact_score.CPU_CHUNK_ELEMENTS", 150)
+    for norms in (None, squared_norms(bank)):
+        in_chunks = squared_distances(z, bank, abar, norms)
+        torch.testing.assert_close(in_chunks, whole, rtol=1e-15, atol=0)
+
+
+@pytest.mark.parametrize("shared", [True, False])
+def test_images_without_a_responsibility_do_not_change_the_mean(shared):
+    """At a small timestep an item has one image, and each item another one."""
+    bank, abar = randn(2, 7, 30), ABAR[torch.tensor([0, 0])]
+    bank = bank[0] if shared else bank
+    z = torch.stack([bank[..., 2, :].expand(2, -1)[0], bank[..., 5, :].expand(2, -1)[1]])
+    out = denoise(z, abar, bank, log_prior=torch.tensor([0.0] * 6 + [-torch.inf]))
+    assert ((out.responsibilities > 0).sum(1) < 7).all()
+    expected = torch.einsum("bk,bkd->bd", out.responsibilities, bank.expand(2, -1, -1))
+    torch.testing.assert_close(out.denoised, expected, rtol=0, atol=1e-14)
 
 
 def test_logits_in_float32_at_512_are_stable():

@@ -29,9 +29,9 @@ from torch import Tensor
 from ..core.errors import UserError
 from . import sds
 
-CHUNK_ELEMENTS = 2**18
-"""Largest number of elements of a float64 temporary for the distances, unless one image has more:
-2 MiB, which caches hold.
+CPU_CHUNK_ELEMENTS, GPU_CHUNK_ELEMENTS = 2**18, 2**24
+"""Largest number of elements of a temporary, unless one image has more: 2 MiB in float64, which the
+caches of a CPU hold, and 128 MiB, since on a GPU each operation is a launch.
 """
 
 
@@ -50,21 +50,37 @@ class Denoised(NamedTuple):
     """
 
 
+def images_per_chunk(elements: int, device: torch.device) -> int:
+    """Return how many images of so many elements are processed at once; at least one."""
+    most = CPU_CHUNK_ELEMENTS if device.type == "cpu" else GPU_CHUNK_ELEMENTS
+    return max(1, most // max(elements, 1))
+
+
+def squared_norms(images: Float[Tensor, "*batch K d"]) -> Float[Tensor, "*batch K"]:
+    """Compute |x_k|^2 in float64."""
+    return images.double().square().sum(-1)
+
+
 def squared_distances(
-    z: Float[Tensor, "B d"], bank: Float[Tensor, "*batch K d"], abar: Float[Tensor, " B"]
+    z: Float[Tensor, "B d"],
+    bank: Float[Tensor, "*batch K d"],
+    abar: Float[Tensor, " B"],
+    norms: Optional[Float[Tensor, "*batch K"]] = None,
 ) -> Float[Tensor, "B K"]:
     """Compute |z - sqrt(abar) x_k|^2 in float64.
 
     Args:
         bank: the images x_k, shared (K, d) or per item (B, K, d).
+        norms: ``squared_norms(bank)`` if they are already known, for instance for several z.
     """
     a, z = abar.double().sqrt().to(z.device)[:, None], z.double()
-    chunk = max(1, CHUNK_ELEMENTS * bank.shape[-2] // max(bank.numel(), 1))
+    chunk = images_per_chunk(bank.numel() // max(bank.shape[-2], 1), bank.device)
     parts = []
-    for part in bank.split(chunk, dim=-2):
-        x = part.double()
+    for first in range(0, bank.shape[-2], chunk):
+        x = bank[..., first : first + chunk, :].double()
+        squares = squared_norms(x) if norms is None else norms[..., first : first + chunk]
         products = z @ x.mT if x.dim() == 2 else (z[:, None] @ x.mT)[:, 0]
-        parts.append(a * (a * x.square().sum(-1) - 2 * products))
+        parts.append(a * (a * squares - 2 * products))
     distances = torch.cat(parts, dim=1) + z.square().sum(1, keepdim=True)
     return distances.clamp_min_(0)
 
@@ -116,8 +132,7 @@ def denoise(
             else squared_distances(z, bank, abar)
         )
     gamma = responsibilities(distances, variance, log_prior=log_prior, temperature=temperature)
-    bank = bank.expand(len(z), -1, -1).to(z)
-    mean = bank[:, 0] if bank.shape[1] == 1 else torch.einsum("bk,bkd->bd", gamma.to(z), bank)
+    mean = _mean(gamma, bank).to(z)
     residual = z - sds.per_item(abar.double().sqrt(), z) * mean
     eps = sds.per_item((1 - abar.double()).sqrt() / variance, z) * residual
     denoised = (
@@ -125,6 +140,15 @@ def denoise(
     )
     entropy = -torch.special.xlogy(gamma, gamma).sum(1)
     return Denoised(eps, denoised, gamma, entropy.exp())
+
+
+def _mean(gamma: Float[Tensor, "B K"], bank: Float[Tensor, "*batch K d"]) -> Float[Tensor, "B d"]:
+    """Compute m, from the images with a responsibility above 0 for any item: often one of many."""
+    if bank.shape[-2] == 1:
+        return bank[..., 0, :].expand(len(gamma), -1)
+    used = (gamma > 0).any(0)
+    gamma, bank = gamma[:, used].to(bank), bank[..., used, :]
+    return gamma @ bank if bank.dim() == 2 else (gamma[:, None] @ bank)[:, 0]
 
 
 def log_density(

@@ -61,7 +61,7 @@ from ..splatting.cpu import known_picture
 from .base import GUIDANCE_SCALE, ScoreDistillation
 from .exact_score_checks import check_render_size, picture_size, pooling_factor, require_used
 from .known_truth import MeshTruth, background_of, composite, resized
-from .picture_bank import Bank, Mixture, bank_modes, direction_indices, rows_of
+from .picture_bank import Bank, Mixture, direction_indices, mixture_of
 from .variants.sds import SDS
 
 MODES = ("view-exact", "direction-bins", "view-agnostic")
@@ -305,10 +305,12 @@ class ExactScoreGuidance(ScoreDistillation):
     ) -> tuple:
         modes = mixture.modes.flatten(1)
         options = {"std": self.options.std, "temperature": self.options.temperature}
-        if mixture.log_prior is None:
+        if mixture.norms is None:
             return denoise(z, abar, modes, **options), None
-        distances = squared_distances(z, modes, abar)
+        distances = squared_distances(z, modes, abar, mixture.norms)
         cond = denoise(z, abar, modes, log_prior=mixture.log_prior, distances=distances, **options)
+        if mixture.log_prior is None:
+            return cond, None
         return cond, denoise(z, abar, modes, distances=distances, **options)
 
     # Mixtures
@@ -327,21 +329,16 @@ class ExactScoreGuidance(ScoreDistillation):
         """Build a mixture of the camera's own view, if any, and the bank's views. The own view and
         the bank's ``members`` are its conditional modes.
         """
-        own_views = [] if own is None else [own]
-        if members.all() or not self.guided:
-            if own is not None and not members.any():
+        own_count = 0 if own is None else len(own)
+        if not self.guided or members.all():
+            if own_count and not members.any():
                 return Mixture(own, None)
-            return Mixture(
-                torch.cat(
-                    [*own_views, bank_modes(rows_of(self.bank(*self._size), members), background)]
-                ),
-                None,
-            )
-        conditional = torch.cat([torch.ones(len(own_views), dtype=torch.bool), members]).to(
-            background.device
+            return mixture_of(own, self.bank(*self._size), members, background)
+        conditional = torch.cat([torch.ones(own_count, dtype=torch.bool), members])
+        everything = mixture_of(own, self.bank(*self._size), torch.ones_like(members), background)
+        return everything._replace(
+            log_prior=torch.where(conditional, 0.0, -torch.inf).to(background)
         )
-        modes = torch.cat([*own_views, bank_modes(self.bank(*self._size), background)])
-        return Mixture(modes, torch.where(conditional, 0.0, -torch.inf))
 
     def _members(self, batch: dict[str, Any], count: int) -> Bool[Tensor, "B K"]:
         """Return a mask of the bank's views in the conditional mixture of each item."""

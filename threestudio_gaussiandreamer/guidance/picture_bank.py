@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
-from ..diffusion.exact_score import LinearLatent
+from ..diffusion.exact_score import LinearLatent, images_per_chunk, squared_norms
 from ..prompts.view_prompts import view_directions
 from .known_truth import composite
 
@@ -29,6 +29,8 @@ class Mixture(NamedTuple):
     """0 for the modes of the conditional mixture, -inf for others, which belong only to the
     unconditional mixture; None if all are conditional and no unconditional mixture is needed.
     """
+    norms: Optional[Float[Tensor, " K"]] = None
+    """``squared_norms`` of the modes; None for a single one, which needs no distances."""
 
 
 def direction_indices(
@@ -43,23 +45,37 @@ def direction_indices(
     return indices
 
 
-def bank_modes(bank: Bank, background: Float[Tensor, "bh bw 3"]) -> Float[Tensor, "K c h w"]:
-    """Encode the bank on a background of one colour (1, 1, 3) or of pixels (H', W', 3)."""
-    if background.shape[:2] == (1, 1):  # pooling and compositing commute
-        pooled = bank.pooled.to(background.device)
-        return bank.latent.encode_pooled(
-            pooled[:, :3] + (1 - pooled[:, 3:]) * background.reshape(3, 1, 1)
-        )
-    return torch.cat(
-        [bank.latent.encode(composite(rgba, background[None])) for rgba in bank.rgba.split(16)]
-    )
+def mixture_of(
+    own: Optional[Float[Tensor, "V c h w"]],
+    bank: Bank,
+    members: Bool[Tensor, " K"],
+    background: Float[Tensor, "bh bw 3"],
+) -> Mixture:
+    """Return a mixture of encoded pictures, if any, and of the marked ones of a bank.
+
+    Args:
+        background: what the bank is composited on: one colour (1, 1, 3) or pixels (H', W', 3).
+    """
+    rows = members.nonzero().flatten().to(bank.rgba.device)
+    own = _encoded(bank, rows[:0], background) if own is None else own
+    modes = own.new_empty(len(own) + len(rows), *own.shape[1:])
+    norms = own.new_empty(len(modes), dtype=torch.float64)
+    modes[: len(own)], norms[: len(own)] = own, squared_norms(own.flatten(1))
+    first = len(own)
+    for some in rows.split(images_per_chunk(bank.rgba[0].numel(), background.device)):
+        place = slice(first, first + len(some))
+        modes[place] = _encoded(bank, some, background)
+        norms[place] = squared_norms(modes[place].flatten(1))
+        first = place.stop
+    return Mixture(modes, None, norms)
 
 
-def rows_of(bank: Bank, members: Bool[Tensor, " K"]) -> Bank:
-    """Return the marked pictures."""
-    members = members.to(bank.rgba.device)
-    return (
-        bank
-        if members.all()
-        else bank._replace(rgba=bank.rgba[members], pooled=bank.pooled[members])
-    )
+def _encoded(
+    bank: Bank, rows: Int[Tensor, " k"], background: Float[Tensor, "bh bw 3"]
+) -> Float[Tensor, "k c h w"]:
+    if background.shape[:2] != (1, 1):
+        return bank.latent.encode(composite(bank.rgba.index_select(0, rows), background[None]))
+    # pooling and compositing commute
+    pooled = bank.pooled.index_select(0, rows).to(background.device)
+    on_color = pooled[:, :3] + (1 - pooled[:, 3:]) * background.reshape(3, 1, 1)
+    return bank.latent.encode_pooled(on_color)
