@@ -1,35 +1,70 @@
 import pytest
 import torch
 
-from threestudio_gaussiandreamer.diffusion import exact_score
+from threestudio_gaussiandreamer.diffusion import exact_score, sds
 from threestudio_gaussiandreamer.guidance.known_truth import composite
-from threestudio_gaussiandreamer.guidance.picture_bank import Bank, mixture_of
+from threestudio_gaussiandreamer.guidance.picture_bank import Bank, Modes, mixture_of
 
-MEMBERS = torch.tensor([True, True, False, True, False, True, True])
-
-
-@pytest.fixture
-def bank():
-    generator = torch.Generator().manual_seed(0)
-    rgba = torch.randint(0, 256, (7, 8, 8, 4), generator=generator, dtype=torch.uint8)
-    pooled = torch.nn.functional.avg_pool2d(rgba.movedim(-1, 1) / 255, 2)
-    matrix = exact_score.color_matrix(4)
-    return Bank(rgba, pooled, exact_score.LinearLatent(2, matrix).normalised(pooled[:, :3]))
+MEMBERS = torch.tensor(
+    [[True, True, False, True, False, True, True], [False] * 6 + [True], [True] * 7]
+)
+"""Of each item, in the bank."""
+ABAR = sds.sd_alphas_cumprod()[torch.tensor([20, 300, 900])]
 
 
+def uniform(*shape, seed):
+    return torch.rand(shape, generator=torch.Generator().manual_seed(seed))
+
+
+@pytest.fixture(params=["pixel", "latent"])
+def bank(request):
+    rgba = (255 * uniform(7, 8, 8, 4, seed=0)).byte()
+    pixels = rgba.movedim(-1, 1) / 255
+    if request.param == "pixel":
+        return Bank.of(rgba, pixels, exact_score.LinearLatent())
+    pooled = torch.nn.functional.avg_pool2d(pixels, 2)
+    latent = exact_score.LinearLatent(2, exact_score.color_matrix(4))
+    return Bank.of(rgba, pooled, latent.normalised(pooled[:, :3]))
+
+
+def predicted(mixtures, z, abar, conditional):
+    modes = Modes.of(mixtures)
+    distances = modes.squared_distances(z, abar)
+    prior = modes.log_prior if conditional else None
+    return exact_score.denoise_by(
+        modes.weighted_sum, z.flatten(1), abar, distances, std=0.05, log_prior=prior
+    )
+
+
+@pytest.mark.parametrize("has_own", [False, True])
+@pytest.mark.parametrize("guided", [False, True])
 @pytest.mark.parametrize("size", [1, 8])
-@pytest.mark.parametrize("own_views", [None, 0, 2])
-@pytest.mark.parametrize("pictures_at_a_time", [1, 2, 100])
-def test_modes_are_the_own_views_and_the_marked_pictures(
-    bank, monkeypatch, size, own_views, pictures_at_a_time
+@pytest.mark.parametrize("pictures_at_a_time", [1, 3, 100])
+def test_scores_are_those_of_pictures_composited_on_the_background_of_each_item(
+    bank, monkeypatch, size, guided, has_own, pictures_at_a_time
 ):
-    monkeypatch.setattr(exact_score, "CPU_CHUNK_ELEMENTS", pictures_at_a_time * 8 * 8 * 4)
-    background = torch.rand(size, size, 3, generator=torch.Generator().manual_seed(1))
-    own = None if own_views is None else torch.ones(own_views, 4, 4, 4)
-    mixture = mixture_of(own, bank, MEMBERS, background)
-    pictures = bank.latent.encode(composite(bank.rgba[MEMBERS], background[None]))
-    expected = pictures if own is None else torch.cat([own, pictures])
-    torch.testing.assert_close(mixture.modes, expected, rtol=0, atol=1e-5)
-    norms = mixture.modes.flatten(1).double().square().sum(1)
-    torch.testing.assert_close(mixture.norms, norms, rtol=1e-14, atol=0)
-    assert mixture.log_prior is None
+    elements = bank.pictures.layers[0].numel()
+    monkeypatch.setattr(exact_score, "CPU_CHUNK_ELEMENTS", pictures_at_a_time * elements)
+    backgrounds = uniform(len(MEMBERS), size, size, 3, seed=1)
+    z = bank.latent.encode(composite(bank.rgba[: len(MEMBERS)], backgrounds)) + 0.1
+    own = z.flip(0) if has_own else [None] * len(MEMBERS)
+    items = zip(own, MEMBERS, backgrounds, strict=True)
+    mixtures = [mixture_of(*item, bank, guided) for item in items]
+    of_a_color = size == 1  # whose items have the same pictures
+    for conditional in (True, False) if guided else (True,):
+        together = predicted(mixtures, z, ABAR, conditional) if of_a_color else None
+        for i in range(len(MEMBERS)):
+            item = slice(i, i + 1)
+            pictures = bank.rgba[MEMBERS[i]] if conditional else bank.rgba
+            modes = bank.latent.encode(composite(pictures, backgrounds[item]))
+            modes = torch.cat([own[item], modes]) if has_own else modes
+            alone = predicted(mixtures[item], z[item], ABAR[item], conditional)
+            expected = exact_score.denoise(
+                z[item].flatten(1).double(), ABAR[item], modes.flatten(1).double(), std=0.05
+            )
+            for found in (alone, together and type(together)(*(x[item] for x in together))):
+                if found is not None:
+                    torch.testing.assert_close(found.eps.double(), expected.eps, rtol=0, atol=1e-4)
+                    torch.testing.assert_close(
+                        found.perplexity, expected.perplexity, rtol=1e-3, atol=0
+                    )

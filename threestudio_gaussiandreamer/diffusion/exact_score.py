@@ -19,7 +19,7 @@ The closed-form denoiser memorises: for d above a few hundred it returns the nea
 measures this: it is then 1."""
 
 import math
-from typing import NamedTuple, Optional
+from typing import Callable, NamedTuple, Optional
 
 import torch
 import torch.nn.functional as F
@@ -41,7 +41,7 @@ class Denoised(NamedTuple):
     eps: Float[Tensor, "B d"]
     """The optimal prediction of the noise."""
     denoised: Float[Tensor, "B d"]
-    """E[x0 | z]; may be a view of the bank."""
+    """E[x0 | z]."""
     responsibilities: Float[Tensor, "B K"]
     """float64, rows sum to 1."""
     perplexity: Float[Tensor, " B"]
@@ -56,31 +56,23 @@ def images_per_chunk(elements: int, device: torch.device) -> int:
     return max(1, most // max(elements, 1))
 
 
-def squared_norms(images: Float[Tensor, "*batch K d"]) -> Float[Tensor, "*batch K"]:
-    """Compute |x_k|^2 in float64."""
-    return images.double().square().sum(-1)
-
-
 def squared_distances(
     z: Float[Tensor, "B d"],
     bank: Float[Tensor, "*batch K d"],
     abar: Float[Tensor, " B"],
-    norms: Optional[Float[Tensor, "*batch K"]] = None,
 ) -> Float[Tensor, "B K"]:
     """Compute |z - sqrt(abar) x_k|^2 in float64.
 
     Args:
         bank: the images x_k, shared (K, d) or per item (B, K, d).
-        norms: ``squared_norms(bank)`` if they are already known, for instance for several z.
     """
     a, z = abar.double().sqrt().to(z.device)[:, None], z.double()
     chunk = images_per_chunk(bank.numel() // max(bank.shape[-2], 1), bank.device)
     parts = []
     for first in range(0, bank.shape[-2], chunk):
         x = bank[..., first : first + chunk, :].double()
-        squares = squared_norms(x) if norms is None else norms[..., first : first + chunk]
         products = z @ x.mT if x.dim() == 2 else (z[:, None] @ x.mT)[:, 0]
-        parts.append(a * (a * squares - 2 * products))
+        parts.append(a * (a * x.square().sum(-1) - 2 * products))
     distances = torch.cat(parts, dim=1) + z.square().sum(1, keepdim=True)
     return distances.clamp_min_(0)
 
@@ -123,7 +115,6 @@ def denoise(
         distances: ``squared_distances(z, bank, abar)`` if they are already known, for instance
             for two mixtures of one bank.
     """
-    variance = mode_variance(abar, std)
     if distances is None:
         single = bank.shape[-2] == 1  # its responsibility is 1 at any distance
         distances = (
@@ -131,8 +122,26 @@ def denoise(
             if single
             else squared_distances(z, bank, abar)
         )
+    options = {"std": std, "log_prior": log_prior, "temperature": temperature}
+    return denoise_by(lambda gamma: weighted_sum(gamma, bank), z, abar, distances, **options)
+
+
+def denoise_by(
+    mean_of: Callable[[Float[Tensor, "B K"]], Float[Tensor, "B d"]],
+    z: Float[Tensor, "B d"],
+    abar: Float[Tensor, " B"],
+    distances: Float[Tensor, "B K"],
+    *,
+    std: float = 0.0,
+    log_prior: Optional[Float[Tensor, "*prior K"]] = None,
+    temperature: float = 1.0,
+) -> Denoised:
+    """As :func:`denoise`, for images that are known by their ``squared_distances`` and by a
+    function from responsibilities, in the type of z, to the mean m.
+    """
+    variance = mode_variance(abar, std)
     gamma = responsibilities(distances, variance, log_prior=log_prior, temperature=temperature)
-    mean = _mean(gamma, bank).to(z)
+    mean = mean_of(gamma.to(z))
     residual = z - sds.per_item(abar.double().sqrt(), z) * mean
     eps = sds.per_item((1 - abar.double()).sqrt() / variance, z) * residual
     denoised = (
@@ -142,13 +151,15 @@ def denoise(
     return Denoised(eps, denoised, gamma, entropy.exp())
 
 
-def _mean(gamma: Float[Tensor, "B K"], bank: Float[Tensor, "*batch K d"]) -> Float[Tensor, "B d"]:
-    """Compute m, from the images with a responsibility above 0 for any item: often one of many."""
-    if bank.shape[-2] == 1:
-        return bank[..., 0, :].expand(len(gamma), -1)
-    used = (gamma > 0).any(0)
-    gamma, bank = gamma[:, used].to(bank), bank[..., used, :]
-    return gamma @ bank if bank.dim() == 2 else (gamma[:, None] @ bank)[:, 0]
+def weighted_sum(
+    weights: Float[Tensor, "B K"], bank: Float[Tensor, "*batch K d"]
+) -> Float[Tensor, "B d"]:
+    """Sum the images with weights >= 0, in the weights' type. Images without a weight in any item,
+    often all but one, aren't read.
+    """
+    used = (weights > 0).any(0).nonzero().flatten()
+    weights, bank = weights[:, used], bank.index_select(-2, used).to(weights)
+    return weights @ bank if bank.dim() == 2 else (weights[:, None] @ bank)[:, 0]
 
 
 def log_density(

@@ -38,6 +38,7 @@ A mixture over the bank doesn't depend on the camera's distance either, so a fai
 towards far views. To measure multi-face alone, give cameras and bank the same single distance and
 angle of view."""
 
+import itertools
 import math
 from dataclasses import dataclass, field
 from typing import Any, Optional, Tuple
@@ -53,7 +54,7 @@ from ..core.given_gradient import given_gradient
 from ..core.memory import count_of, require_memory
 from ..core.options import at_least, in_range, interval, one_of, positive, required
 from ..diffusion import sds
-from ..diffusion.exact_score import LinearLatent, color_matrix, denoise, squared_distances
+from ..diffusion.exact_score import Denoised, LinearLatent, color_matrix, denoise_by
 from ..host import parse_structured, register, warn
 from ..meshes.load import AXES, load_mesh
 from ..meshes.raycast import MeshCaster
@@ -61,7 +62,7 @@ from ..splatting.cpu import known_picture
 from .base import GUIDANCE_SCALE, ScoreDistillation
 from .exact_score_checks import check_render_size, picture_size, pooling_factor, require_used
 from .known_truth import MeshTruth, background_of, composite, resized
-from .picture_bank import Bank, Mixture, direction_indices, mixture_of
+from .picture_bank import Bank, Mixture, Modes, direction_indices, mixture_of
 from .variants.sds import SDS
 
 MODES = ("view-exact", "direction-bins", "view-agnostic")
@@ -244,22 +245,27 @@ class ExactScoreGuidance(ScoreDistillation):
         background = background_of(comp_rgb_bg, len(c2w), c2w.device)
         own = self._own_views(c2w, fovy, background) if self._needs_own_view else [None] * len(c2w)
         members = self._members(batch, len(c2w))
-        return [self._mixture(own[i], members[i], background[i]) for i in range(len(c2w))]
+        if not self.guided and not members.any():
+            return [Mixture(view) for view in own]
+        bank = self.bank(*self._size)
+        items = zip(own, members, background, strict=True)
+        return [mixture_of(*item, bank, self.guided) for item in items]
 
     def predict(
         self, z: Float[Tensor, "B c h w"], t: Int[Tensor, " B"], condition: list[Mixture]
     ) -> tuple[Tensor, Optional[Tensor]]:
         abar = self.alphas_cumprod.to(t.device)[t]
-        items = [
-            self._predict_item(z[i : i + 1].flatten(1), abar[i : i + 1], mixture)
-            for i, mixture in enumerate(condition)
-        ]
-        cond = torch.cat([item[0].eps for item in items]).view_as(z)
+        predictions = []
+        for _, group in itertools.groupby(condition, lambda mixture: id(mixture.pictures)):
+            mixtures, first = list(group), sum(len(cond.eps) for cond, _ in predictions)
+            items = slice(first, first + len(mixtures))
+            predictions.append(self._predict_items(z[items], abar[items], Modes.of(mixtures)))
         self.evaluations += len(z) * (2 if self.guided else 1)
-        self._perplexity = float(torch.cat([item[0].perplexity for item in items]).mean())
+        self._perplexity = float(torch.cat([cond.perplexity for cond, _ in predictions]).mean())
+        eps = torch.cat([cond.eps for cond, _ in predictions]).view_as(z)
         if not self.guided:
-            return cond, None
-        return cond, torch.cat([(item[1] or item[0]).eps for item in items]).view_as(z)
+            return eps, None
+        return eps, torch.cat([uncond.eps for _, uncond in predictions]).view_as(z)
 
     def conditional(
         self, z: Float[Tensor, "B c h w"], t: Int[Tensor, " B"], condition: list[Mixture]
@@ -286,12 +292,11 @@ class ExactScoreGuidance(ScoreDistillation):
         """Return sqrt(abar / (1 - abar)) (x - x_1) for mixtures of one picture without width, in
         whose score the noise cancels.
         """
-        one = all(len(mixture.modes) == 1 and mixture.log_prior is None for mixture in condition)
-        if self.options.std or not one:
+        if self.options.std or any(mixture.pictures is not None for mixture in condition):
             return None
         _, abar = self.draw_timesteps(latents)
         self._perplexity = 1.0
-        difference = latents - torch.cat([mixture.modes for mixture in condition])
+        difference = latents - torch.stack([mixture.own for mixture in condition])
         return difference.mul_(sds.per_item((abar / (1 - abar)).sqrt(), difference)), abar
 
     def report(self) -> dict[str, float]:
@@ -300,18 +305,14 @@ class ExactScoreGuidance(ScoreDistillation):
         """
         return {"perplexity": self._perplexity}
 
-    def _predict_item(
-        self, z: Float[Tensor, "1 d"], abar: Float[Tensor, "1"], mixture: Mixture
-    ) -> tuple:
-        modes = mixture.modes.flatten(1)
+    def _predict_items(
+        self, z: Float[Tensor, "B c h w"], abar: Float[Tensor, " B"], modes: Modes
+    ) -> tuple[Denoised, Optional[Denoised]]:
+        """Return the conditional prediction, and the unconditional one if there is guidance."""
+        known = (modes.weighted_sum, z.flatten(1), abar, modes.squared_distances(z, abar))
         options = {"std": self.options.std, "temperature": self.options.temperature}
-        if mixture.norms is None:
-            return denoise(z, abar, modes, **options), None
-        distances = squared_distances(z, modes, abar, mixture.norms)
-        cond = denoise(z, abar, modes, log_prior=mixture.log_prior, distances=distances, **options)
-        if mixture.log_prior is None:
-            return cond, None
-        return cond, denoise(z, abar, modes, distances=distances, **options)
+        cond = denoise_by(*known, log_prior=modes.log_prior, **options)
+        return cond, denoise_by(*known, **options) if self.guided else None
 
     # Mixtures
     # ----------------------------------------------------------------------------------------------
@@ -319,26 +320,6 @@ class ExactScoreGuidance(ScoreDistillation):
     @property
     def _needs_own_view(self) -> bool:
         return self.options.mode == "view-exact" or self.options.bank_includes_view
-
-    def _mixture(
-        self,
-        own: Optional[Float[Tensor, "1 c h w"]],
-        members: Bool[Tensor, " K"],
-        background: Float[Tensor, "bh bw 3"],
-    ) -> Mixture:
-        """Build a mixture of the camera's own view, if any, and the bank's views. The own view and
-        the bank's ``members`` are its conditional modes.
-        """
-        own_count = 0 if own is None else len(own)
-        if not self.guided or members.all():
-            if own_count and not members.any():
-                return Mixture(own, None)
-            return mixture_of(own, self.bank(*self._size), members, background)
-        conditional = torch.cat([torch.ones(own_count, dtype=torch.bool), members])
-        everything = mixture_of(own, self.bank(*self._size), torch.ones_like(members), background)
-        return everything._replace(
-            log_prior=torch.where(conditional, 0.0, -torch.inf).to(background)
-        )
 
     def _members(self, batch: dict[str, Any], count: int) -> Bool[Tensor, "B K"]:
         """Return a mask of the bank's views in the conditional mixture of each item."""
@@ -354,9 +335,9 @@ class ExactScoreGuidance(ScoreDistillation):
 
     def _own_views(
         self, c2w: Tensor, fovy: Tensor, background: Float[Tensor, "B bh bw 3"]
-    ) -> Float[Tensor, "B 1 c h w"]:
+    ) -> Float[Tensor, "B c h w"]:
         rgba = self.truth.pictures(c2w, fovy, *self._size)
-        return self._latent().encode(composite(rgba, background))[:, None]
+        return self._latent().encode(composite(rgba, background))
 
     def bank(self, height: int, width: int) -> Bank:
         """Return the bank at a picture size, in pixels; the bank of the last size is cached."""
@@ -377,7 +358,7 @@ class ExactScoreGuidance(ScoreDistillation):
         if self.cfg.space == "latent":
             matrix = color_matrix(self.cfg.latent_channels if self.cfg.color_matrix else 3)
             latent = latent._replace(matrix=matrix).normalised(pooled[:, :3])
-        return Bank((images * 255).round().byte(), pooled, latent)
+        return Bank.of((images * 255).round().byte(), pooled, latent)
 
     def _latent(self) -> LinearLatent:
         return LinearLatent() if self.options.space == "pixel" else self.bank(*self._size).latent

@@ -7,7 +7,7 @@ from .base import is_guided, variant_class
 from .variants.base import require_unset
 
 MAX_MODE_BYTES = 2**31
-"""Largest memory of a bank in the space of pixels, for each item."""
+"""Largest memory of a bank in the space of pixels; over backgrounds of pixels, of each item's."""
 OF_LATENTS = ("latent_size", "latent_channels", "color_matrix")
 OF_BANK = ("bank_views", "bank_includes_view", "bank_elevation_range", "bank_distance_range")
 OF_BANK += ("bank_fovy_range",)
@@ -50,7 +50,7 @@ def picture_size(cfg: Any, guided: bool, height: int, width: int) -> tuple[int, 
     if (cfg.mode != "view-exact" or guided) and needed > MAX_MODE_BYTES:
         raise UserError(
             f"a bank of {cfg.bank_views} views of {height}x{width} pixels needs "
-            f"{needed / 2**30:.1f} GiB for each item:"
+            f"up to {needed / 2**30:.1f} GiB for each item:"
             " use system.guidance.space=latent, or a smaller system.guidance.image_size"
         )
     return height, width

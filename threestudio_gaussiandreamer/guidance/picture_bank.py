@@ -6,9 +6,51 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
-from ..diffusion.exact_score import LinearLatent, images_per_chunk, squared_norms
+from ..diffusion.exact_score import (
+    LinearLatent,
+    images_per_chunk,
+    squared_distances,
+    weighted_sum,
+)
 from ..prompts.view_prompts import view_directions
-from .known_truth import composite
+from .known_truth import composite, resized
+
+
+class Pictures(NamedTuple):
+    """Encoded pictures, each a linear combination of its layers: channel c of picture k is
+    ``sum_l mixing[c, l] layers[k, l]``.
+
+    Over a colour, the layers are the picture over black and the share of the colour in each pixel.
+    Distances follow from scalar products with the layers, so a bank needn't be composited on the
+    colour of each item.
+    """
+
+    layers: Float[Tensor, "K l h w"]
+    products: Float[Tensor, "K l l"]
+    """Scalar products of each picture's layers, float64."""
+
+    @staticmethod
+    def of(layers: Float[Tensor, "K l h w"]) -> "Pictures":
+        wide = [part.double() for part in _chunks(layers)]
+        return Pictures(layers, torch.cat([part @ part.mT for part in wide]))
+
+    def squared_distances(
+        self, z: Float[Tensor, "B c h w"], abar: Float[Tensor, " B"], mixing: Float[Tensor, "B c l"]
+    ) -> Float[Tensor, "B K"]:
+        """Compute |z - sqrt(abar) x_k|^2 in float64."""
+        a, z, mixing = abar.double().sqrt()[:, None], z.flatten(2).double(), mixing.double()
+        of_layers = (mixing.mT @ z).flatten(1)
+        parts = [of_layers @ part.flatten(1).double().mT for part in _chunks(self.layers)]
+        norms = torch.einsum("bcl,klm,bcm->bk", mixing, self.products, mixing)
+        distances = a * (a * norms - 2 * torch.cat(parts, dim=1))
+        return (distances + z.square().sum(dim=(1, 2))[:, None]).clamp_min_(0)
+
+    def weighted_sum(
+        self, weights: Float[Tensor, "B K"], mixing: Float[Tensor, "B c l"]
+    ) -> Float[Tensor, "B d"]:
+        """Sum the pictures with weights >= 0."""
+        layers = weighted_sum(weights, self.layers.flatten(1)).unflatten(1, (mixing.shape[2], -1))
+        return (mixing.to(layers) @ layers).flatten(1)
 
 
 class Bank(NamedTuple):
@@ -16,21 +58,97 @@ class Bank(NamedTuple):
 
     rgba: UInt8[Tensor, "K H W 4"]
     """Premultiplied."""
-    pooled: Float[Tensor, "K 4 h w"]
-    """float32 in [0, 1], averaged over the latent's pixels."""
+    pictures: Pictures
+    """Over a colour."""
     latent: LinearLatent
+
+    @staticmethod
+    def of(
+        rgba: UInt8[Tensor, "K H W 4"], pooled: Float[Tensor, "K 4 h w"], latent: LinearLatent
+    ) -> "Bank":
+        """Encode pictures, which ``pooled`` has as averages over the latent's pixels, in [0, 1]."""
+        # pooling and compositing commute
+        layers = torch.cat([latent.encode_pooled(pooled[:, :3]), 1 - pooled[:, 3:]], dim=1)
+        return Bank(rgba, Pictures.of(layers.contiguous()), latent)
 
 
 class Mixture(NamedTuple):
-    """The modes of one item's mixture distribution."""
+    """The modes of one item's mixture distribution: the view of its camera, pictures, or both."""
 
-    modes: Float[Tensor, "K c h w"]
-    log_prior: Optional[Float[Tensor, " K"]]
+    own: Optional[Float[Tensor, "c h w"]]
+    """The view of the camera, encoded; the first mode."""
+    pictures: Optional[Pictures] = None
+    mixing: Optional[Float[Tensor, "c l"]] = None
+    """Of the pictures' layers."""
+    log_prior: Optional[Float[Tensor, " K"]] = None
     """0 for the modes of the conditional mixture, -inf for others, which belong only to the
-    unconditional mixture; None if all are conditional and no unconditional mixture is needed.
+    unconditional mixture or to none. Without pictures it is None.
     """
-    norms: Optional[Float[Tensor, " K"]] = None
-    """``squared_norms`` of the modes; None for a single one, which needs no distances."""
+
+
+class Modes(NamedTuple):
+    """The modes of the items of a batch whose mixtures have the same pictures."""
+
+    own: Optional[Float[Tensor, "B d"]]
+    pictures: Optional[Pictures]
+    mixing: Optional[Float[Tensor, "B c l"]]
+    log_prior: Optional[Float[Tensor, "B K"]]
+
+    @staticmethod
+    def of(mixtures: list[Mixture]) -> "Modes":
+        own, pictures, mixing, log_prior = mixtures[0]
+        if own is not None:
+            own = torch.stack([mixture.own for mixture in mixtures]).flatten(1)
+        if pictures is not None:
+            mixing = torch.stack([mixture.mixing for mixture in mixtures])
+            log_prior = torch.stack([mixture.log_prior for mixture in mixtures])
+        return Modes(own, pictures, mixing, log_prior)
+
+    def squared_distances(
+        self, z: Float[Tensor, "B c h w"], abar: Float[Tensor, " B"]
+    ) -> Float[Tensor, "B K"]:
+        """Compute the distances in float64, or zeros for single modes, which need none."""
+        if self.pictures is None:
+            return z.new_zeros((len(z), 1), dtype=torch.float64)
+        distances = self.pictures.squared_distances(z, abar, self.mixing)
+        if self.own is None:
+            return distances
+        own = squared_distances(z.flatten(1), self.own[:, None], abar)
+        return torch.cat([own, distances], dim=1)
+
+    def weighted_sum(self, weights: Float[Tensor, "B K"]) -> Float[Tensor, "B d"]:
+        """Sum the modes with weights >= 0."""
+        if self.own is None:
+            return self.pictures.weighted_sum(weights, self.mixing)
+        own = weights[:, :1] * self.own
+        if self.pictures is None:
+            return own
+        return own + self.pictures.weighted_sum(weights[:, 1:], self.mixing)
+
+
+def mixture_of(
+    own: Optional[Float[Tensor, "c h w"]],
+    members: Bool[Tensor, " K"],
+    background: Float[Tensor, "bh bw 3"],
+    bank: Bank,
+    guided: bool,
+) -> Mixture:
+    """Return a mixture whose conditional modes are the camera's own view, if any, and the
+    ``members`` of a bank; if it is ``guided``, the whole bank is in its unconditional mixture.
+
+    Args:
+        background: what the bank is composited on: one colour (1, 1, 3) or pixels (H', W', 3).
+    """
+    if background.shape[:2] == (1, 1):
+        pictures, mixing = bank.pictures, _mixing_of_color(bank.latent, background)
+    else:
+        rows = torch.arange(len(members)) if guided else members.nonzero().flatten()
+        members = members[rows]
+        pictures = Pictures.of(_composited(bank, rows.to(bank.rgba.device), background))
+        mixing = torch.eye(pictures.layers.shape[1], device=background.device)
+    conditional = torch.cat([torch.ones(int(own is not None), dtype=torch.bool), members])
+    log_prior = torch.where(conditional, 0.0, -torch.inf).to(background.device)
+    return Mixture(own, pictures, mixing, log_prior)
 
 
 def direction_indices(
@@ -45,37 +163,26 @@ def direction_indices(
     return indices
 
 
-def mixture_of(
-    own: Optional[Float[Tensor, "V c h w"]],
-    bank: Bank,
-    members: Bool[Tensor, " K"],
-    background: Float[Tensor, "bh bw 3"],
-) -> Mixture:
-    """Return a mixture of encoded pictures, if any, and of the marked ones of a bank.
-
-    Args:
-        background: what the bank is composited on: one colour (1, 1, 3) or pixels (H', W', 3).
-    """
-    rows = members.nonzero().flatten().to(bank.rgba.device)
-    own = _encoded(bank, rows[:0], background) if own is None else own
-    modes = own.new_empty(len(own) + len(rows), *own.shape[1:])
-    norms = own.new_empty(len(modes), dtype=torch.float64)
-    modes[: len(own)], norms[: len(own)] = own, squared_norms(own.flatten(1))
-    first = len(own)
-    for some in rows.split(images_per_chunk(bank.rgba[0].numel(), background.device)):
-        place = slice(first, first + len(some))
-        modes[place] = _encoded(bank, some, background)
-        norms[place] = squared_norms(modes[place].flatten(1))
-        first = place.stop
-    return Mixture(modes, None, norms)
+def _mixing_of_color(latent: LinearLatent, color: Float[Tensor, "1 1 3"]) -> Float[Tensor, "c l"]:
+    """Return how a colour is added to a picture over black: by its difference to black."""
+    color = color.reshape(1, 3, 1, 1)
+    tint = (latent.encode_pooled(color) - latent.encode_pooled(torch.zeros_like(color)))[0, :, :, 0]
+    return torch.cat([torch.eye(len(tint), device=tint.device), tint], dim=1)
 
 
-def _encoded(
+def _composited(
     bank: Bank, rows: Int[Tensor, " k"], background: Float[Tensor, "bh bw 3"]
 ) -> Float[Tensor, "k c h w"]:
-    if background.shape[:2] != (1, 1):
-        return bank.latent.encode(composite(bank.rgba.index_select(0, rows), background[None]))
-    # pooling and compositing commute
-    pooled = bank.pooled.index_select(0, rows).to(background.device)
-    on_color = pooled[:, :3] + (1 - pooled[:, 3:]) * background.reshape(3, 1, 1)
-    return bank.latent.encode_pooled(on_color)
+    """Encode pictures on a background of pixels."""
+    latents = bank.pictures.layers.new_empty(len(rows), *bank.pictures.layers[0, :-1].shape)
+    chunk = images_per_chunk(bank.rgba[0].numel(), bank.rgba.device)
+    size = tuple(bank.rgba.shape[1:3])
+    background = resized(background.movedim(-1, 0)[None], size).movedim(1, -1)
+    for some, place in zip(rows.split(chunk), latents.split(chunk), strict=True):
+        rgb = composite(bank.rgba.index_select(0, some), background)
+        place.copy_(bank.latent.encode(rgb))
+    return latents
+
+
+def _chunks(layers: Float[Tensor, "K l h w"]) -> tuple[Float[Tensor, "k l p"], ...]:
+    return layers.flatten(2).split(images_per_chunk(layers[:1].numel(), layers.device))
