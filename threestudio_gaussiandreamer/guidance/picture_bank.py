@@ -67,9 +67,13 @@ class Bank(NamedTuple):
         rgba: UInt8[Tensor, "K H W 4"], pooled: Float[Tensor, "K 4 h w"], latent: LinearLatent
     ) -> "Bank":
         """Encode pictures, which ``pooled`` has as averages over the latent's pixels, in [0, 1]."""
-        # pooling and compositing commute
-        layers = torch.cat([latent.encode_pooled(pooled[:, :3]), 1 - pooled[:, 3:]], dim=1)
-        return Bank(rgba, Pictures.of(layers.contiguous()), latent)
+        channels = 3 if latent.matrix is None else len(latent.matrix)
+        layers = pooled.new_empty(len(pooled), channels + 1, *pooled.shape[2:])
+        chunk = images_per_chunk(layers[0].numel(), layers.device)
+        for part, place in zip(pooled.split(chunk), layers.split(chunk), strict=True):
+            # pooling and compositing commute
+            place[:, :-1], place[:, -1] = latent.encode_pooled(part[:, :3]), 1 - part[:, 3]
+        return Bank(rgba, Pictures.of(layers), latent)
 
 
 class Mixture(NamedTuple):
