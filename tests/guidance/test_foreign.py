@@ -123,6 +123,7 @@ def test_each_signature_gets_what_it_takes():
     [
         (torch.zeros(3), "returned Tensor"),
         ({"loss_sds": torch.zeros(4)}, r"returned loss_sds of shape \(4,\)"),
+        ({"loss_sds": "x"}, "returned loss_sds of type str: one number was expected"),
         (None, "returned NoneType"),
         ({"loss_sds": torch.tensor(torch.nan)}, "returned loss_sds = nan: expected a finite"),
         ({"loss_sds": torch.inf}, "returned loss_sds = inf"),

@@ -12,6 +12,7 @@ import torch
 from tests.helpers.checkpoints import whole_checkpoint
 from tests.launch.bad_input_cases import DEMO, SMALL, assert_refused
 from threestudio_gaussiandreamer import host, register_parts
+from threestudio_gaussiandreamer.core.checkpoint_file import load_checkpoint
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.core.images import read as read_image
 from threestudio_gaussiandreamer.launch import experiment, folder_lock
@@ -288,6 +289,15 @@ def test_a_run_that_is_resumed_at_its_end_is_measured(launch_demo):
         for folder in (TRIAL, TRIAL.with_name("other"))
     )
     assert (other["step"], other["psnr"]) == (first["step"], first["psnr"])
+
+
+def test_the_last_checkpoint_resumes_if_the_others_have_weights_only(launch_demo):
+    assert launch_demo("checkpoint.save_weights_only=true")[0] == 0
+    assert "optimizer_states" in load_checkpoint(TRIAL / "ckpts/last.ckpt")
+    (other,) = (path for path in (TRIAL / "ckpts").iterdir() if path.name != "last.ckpt")
+    message = "has no optimizer_states, which Lightning writes unless checkpoint.save_weights_only"
+    code, err = launch_demo(f"resume={other}")
+    assert code == 2 and message in err
 
 
 @pytest.mark.parametrize("stage", ["validate", "test", "export"])

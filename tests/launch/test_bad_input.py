@@ -149,7 +149,10 @@ register_parts()
             "Adam doesn't accept this: unknown argument 'bets': did you mean 'betas'?",
         ),
         ("system.optimizer.args.eps=-1", "Adam doesn't accept this: Invalid epsilon value"),
-        ("system.optimizer.args.betas=[0.9]", "optimizer: Adam doesn't accept this"),
+        (
+            "system.optimizer.args.betas=[0.9]",
+            "system.optimizer.args.betas: Adam doesn't accept this: list index out of range",
+        ),
         ("system.optimizer.args={fused: true, foreach: true}", "Adam doesn't accept this: `fused`"),
         ("system.optimizer.args.capturable=true", "Adam doesn't accept this: If capturable=True"),
         ("system.optimizer.args=3", "system.optimizer.args: expected keys and values"),
@@ -187,8 +190,14 @@ register_parts()
         ),
         (
             "trainer.val_check_interval=0",
-            "trainer.val_check_interval: expected a number of steps above 0",
+            "trainer.val_check_interval: expected a whole number of steps above 0, got 0",
         ),
+        (
+            "trainer.val_check_interval=0.5",
+            "trainer.val_check_interval: expected a whole number of steps above 0, got 0.5",
+        ),
+        ("trainer=", "trainer is empty, which would remove its"),
+        ("system.guidance=", "system.guidance is empty, which would remove its"),
         ("trainer.log_every_n_steps=-1", "trainer.log_every_n_steps: expected 0 or more"),
         (
             "trainer.accumulate_grad_batches=2",

@@ -12,7 +12,11 @@ from tests.helpers.pruning import FAST, ball, run
 from threestudio_gaussiandreamer.formats.gaussian_files import PRUNED, read_cloud, write_cloud
 from threestudio_gaussiandreamer.formats.ply import read_comments, read_gaussians, write_gaussians
 from threestudio_gaussiandreamer.gaussians import recover
+from threestudio_gaussiandreamer.gaussians.views import psnr_to_original, render_all
+from threestudio_gaussiandreamer.host import get_device
+from threestudio_gaussiandreamer.prune import PruneOptions
 from threestudio_gaussiandreamer.prune import command as prune
+from threestudio_gaussiandreamer.prune.pipeline import views_of
 
 
 def test_a_count_is_met_exactly(source, tmp_path):
@@ -61,11 +65,28 @@ def test_a_second_run_of_nearly_the_same_budget_has_nearly_nothing_to_spend(sour
 def test_a_count_that_changes_nothing_keeps_the_note(source, tmp_path):
     once = run(source, tmp_path / "once.ply", "--psnr", "32")["after"]["gaussians"]
     run(tmp_path / "once.ply", tmp_path / "same.ply", "--count", str(once))
-    run(tmp_path / "once.ply", tmp_path / "fewer.ply", "--count", str(once - 50))
-    assert (
-        read_cloud(str(tmp_path / "same.ply")).pruned_to == 32
-        and read_cloud(str(tmp_path / "fewer.ply")).pruned_to is None
-    )
+    run(source, tmp_path / "whole.ply", "--count", "600")
+    assert read_cloud(str(tmp_path / "same.ply")).pruned_to == 32
+    assert read_cloud(str(tmp_path / "whole.ply")).pruned_to is None
+
+
+@pytest.mark.parametrize("budget", [("--count", "150"), ("--bytes", "12kB")])
+def test_what_pruning_to_a_count_or_size_has_lost_counts_towards_a_later_quality(
+    source, tmp_path, budget
+):
+    """Against the original, which the later runs don't see."""
+    run(source, tmp_path / "fewer.ply", *budget)
+    lost = read_cloud(str(tmp_path / "fewer.ply")).pruned_to
+    run(tmp_path / "fewer.ply", tmp_path / "again.ply", "--psnr", str(lost - 1))
+    first = read_cloud(str(source))
+    views = views_of(first, PruneOptions(size=48))[-1]
+    pictures = render_all(first.gaussians.tensors(get_device()), views)
+    for name, least in (("fewer.ply", lost), ("again.ply", lost - 1)):
+        found = read_cloud(str(tmp_path / name))
+        assert found.pruned_to == pytest.approx(least)
+        cloud = found.gaussians.tensors(get_device())
+        assert psnr_to_original(cloud, views, pictures) > least - 0.5
+    assert not run(tmp_path / "fewer.ply", tmp_path / "more.ply", "--psnr", str(lost + 1))["met"]
 
 
 def test_a_quality_that_the_format_cannot_give_is_not_said_to_be_met(source, tmp_path, caplog):

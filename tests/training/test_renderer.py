@@ -75,11 +75,18 @@ def test_depth_and_normals_are_computed_when_they_are_read():
         assert gradient.any()
 
 
-def test_a_background_of_another_shape_is_named():
+@pytest.mark.parametrize(
+    ("colors", "message"),
+    [
+        (torch.zeros(3), r"returned colours \(3,\).*; expected \(2, 4, 5, 3\)"),
+        (None, r"returned NoneType; expected a tensor of colours \(2, 4, 5, 3\)"),
+    ],
+)
+def test_a_background_of_another_shape_or_type_is_named(colors, message):
     out = SimpleNamespace(image=torch.zeros(2, 4, 5, 3), alpha=torch.zeros(2, 4, 5, 1))
-    renderer = SimpleNamespace(background=lambda dirs: torch.zeros(3))
+    renderer = SimpleNamespace(background=lambda dirs: colors)
     c2w, fovy = torch.eye(4).expand(2, 4, 4), torch.ones(2)
-    with pytest.raises(UserError, match=r"returned colours \(3,\).*; expected \(2, 4, 5, 3\)"):
+    with pytest.raises(UserError, match=message):
         SplattingRenderer._composite(renderer, out, c2w, fovy, {})
 
 

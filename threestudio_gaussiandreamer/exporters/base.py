@@ -101,12 +101,12 @@ def outputs_of(exporter: Exporter) -> list[ExporterOutput]:
         UserError: it returns something else than a list of ExporterOutput.
     """
     found = exporter()
-    if not isinstance(found, (list, tuple)) or not all(
-        isinstance(x, ExporterOutput) for x in found
-    ):
+    is_list = isinstance(found, (list, tuple))
+    wrong = [x for x in (found if is_list else [found]) if not isinstance(x, ExporterOutput)]
+    if wrong:
         raise UserError(
-            f"{type(exporter).__name__} returned {type(found).__name__}; expected a list of "
-            "ExporterOutput"
+            f"{type(exporter).__name__} returned {'entries of type ' if is_list else ''}"
+            f"{type(wrong[0]).__name__}; expected a list of ExporterOutput"
         )
     return list(found)
 

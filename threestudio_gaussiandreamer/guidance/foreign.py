@@ -76,12 +76,14 @@ def _checked(out: Any, name: str, device: torch.device) -> dict[str, Any]:
             f"{name} returned {type(out).__name__}: a guidance returns a dict with its losses "
             "as loss_*"
         )
-    losses = {
-        key: torch.as_tensor(value, device=device)
-        for key, value in out.items()
-        if key.startswith("loss_")
-    }
-    for key, loss in losses.items():
+    losses = {key: value for key, value in out.items() if key.startswith("loss_")}
+    for key, value in losses.items():
+        try:
+            losses[key] = loss = torch.as_tensor(value, device=device)
+        except (TypeError, ValueError, RuntimeError) as error:
+            raise UserError(
+                f"{name} returned {key} of type {type(value).__name__}: one number was expected"
+            ) from error
         if loss.numel() != 1:
             raise UserError(
                 f"{name} returned {key} of shape {tuple(loss.shape)}: one number was expected, "

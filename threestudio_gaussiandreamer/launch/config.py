@@ -140,6 +140,8 @@ def _merge(sources: list[DictConfig]) -> DictConfig:
     try:
         merged = OmegaConf.create({})
         for source in sources:
+            if source is sources[-1]:
+                _require_values(merged, source)
             _forget_replaced_parts(merged, source)
             merged = OmegaConf.merge(merged, source)
     except OmegaConfBaseException as error:
@@ -155,6 +157,21 @@ def _merge(sources: list[DictConfig]) -> DictConfig:
             merged[section] = {}
         _require_section(merged, section)
     return merged
+
+
+def _require_values(merged: DictConfig, overrides: DictConfig, path: str = "") -> None:
+    """Check that no override empties the section of a part or of the launcher, as ``trainer=``."""
+    for key in overrides:
+        section, override = merged._get_node(key), overrides._get_node(key)
+        if not isinstance(section, DictConfig) or not len(section):
+            continue
+        if isinstance(override, DictConfig):
+            _require_values(section, override, f"{path}{key}.")
+        elif override._value() is None and (not path or f"{key}_type" in merged):
+            raise UserError(
+                f"{path}{key} is empty, which would remove its {len(section)} keys: set one of "
+                f"them, such as {path}{key}.{next(iter(section))}=<value>"
+            )
 
 
 def _require_section(merged: DictConfig, name: str) -> None:

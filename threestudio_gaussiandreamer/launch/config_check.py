@@ -243,10 +243,11 @@ def _check_trainer_ranges(trainer: Any) -> None:
             f"trainer.num_nodes: expected 1, got {trainer.num_nodes}; several machines need a "
             f"launcher that sets {' or '.join(sorted(CLUSTER))}"
         )
-    if trainer.get("val_check_interval") in (0, 0.0):
+    interval = trainer.get("val_check_interval")
+    if interval == 0 or (isinstance(interval, float) and interval != 1):
         raise UserError(
-            "trainer.val_check_interval: expected a number of steps above 0 (for no "
-            "validation: trainer.limit_val_batches=0)"
+            "trainer.val_check_interval: expected a whole number of steps above 0, got "
+            f"{interval} (for no validation: trainer.limit_val_batches=0)"
         )
     if trainer.get("limit_test_batches") in (0, 0.0):
         raise UserError(

@@ -172,6 +172,7 @@ class Run:
             raise UserError(
                 f"{self.cfg.resume} isn't a training checkpoint: it has no "
                 f"{', '.join(missing)}, which Lightning writes"
+                + (" unless checkpoint.save_weights_only=true" * (LIGHTNINGS_KEY in checkpoint))
             )
         self.check_content(checkpoint)
         self.size_changes = changes_since(self.cfg, SIZES)
@@ -288,6 +289,8 @@ class Run:
         # without the version counter a resumed run overwrites last.ckpt instead of adding
         # last-v1.ckpt
         checkpointing = {"enable_version_counter": False, **plain(self.cfg.checkpoint)}
+        if checkpointing.get("save_weights_only"):
+            checkpointing["save_last"] = False  # last.ckpt is LastCheckpoint's, always complete
         last = LastCheckpoint(self.last, checkpoint_io)
         callbacks = [EarlierRunAside(self.folder)] if self.starts_anew else []
         callbacks += [

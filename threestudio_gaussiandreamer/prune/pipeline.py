@@ -85,8 +85,8 @@ def prune_to_budget(
 ) -> PruneResult:
     """Prune a cloud to the budget of ``options``.
 
-    A guaranteed PSNR to the original cloud is stored in the result (``pruned_to``), so that pruning
-    again counts from the original.
+    The PSNR to the original cloud, asked for or measured, is stored in the result (``pruned_to``),
+    so that pruning again counts from the original.
 
     Args:
         suffix: of the file to be written, ".ply" or ".spz".
@@ -101,8 +101,8 @@ def prune_to_budget(
     after, reached = _simplify(stored, _remaining_budget(asked, stored), options, suffix)
     if options.bytes is not None:
         limit = parse_bytes(options.bytes, f"{where}bytes")
-        after, reached = _shrink(after, reached, limit, options, suffix, where)
-    spent = reached if stored.pruned_to is None else combined_psnr(stored.pruned_to, reached)
+        after, reached = _shrink(stored, after, reached, limit, options, suffix, where)
+    spent = _spent(stored, reached)
     met = asked.psnr is None or error_of(spent) <= error_of(asked.psnr) + 2 * LEAST_ERROR
     if not met:
         logger.warning(
@@ -115,16 +115,21 @@ def prune_to_budget(
     return PruneResult(stored, after, time.perf_counter() - started, met)
 
 
+def _spent(stored: StoredCloud, reached: float) -> float:
+    """Return the PSNR to the original of a cloud that has ``reached`` a PSNR to the given one."""
+    return reached if stored.pruned_to is None else combined_psnr(stored.pruned_to, reached)
+
+
 def _psnr_note(
     stored: StoredCloud, after: StoredCloud, asked: Budget, spent: float, met: bool
 ) -> Optional[float]:
-    """Return the PSNR to the original that is stored in the file; None if there is no guarantee for
-    it, as after pruning to a count.
+    """Return the PSNR to the original that is stored in the file; None if a cloud that has never
+    been pruned keeps all Gaussians.
     """
-    if asked.psnr is not None:
-        return asked.psnr if met else spent
+    if asked.psnr is not None and met:
+        return asked.psnr
     unchanged = len(after.gaussians.means) == len(stored.gaussians.means)
-    return spent if stored.pruned_to is not None and unchanged else None
+    return None if asked.psnr is None and stored.pruned_to is None and unchanged else spent
 
 
 def _remaining_budget(asked: Budget, stored: StoredCloud) -> Budget:
@@ -164,6 +169,7 @@ def _count_within(size: int, stored: StoredCloud, suffix: str, where: str) -> in
 
 
 def _shrink(
+    stored: StoredCloud,
     after: StoredCloud,
     reached: float,
     limit: int,
@@ -171,16 +177,17 @@ def _shrink(
     suffix: str,
     where: str,
 ) -> tuple[StoredCloud, float]:
-    """Prune further until the file has at most ``limit`` bytes.
+    """Prune further until the file, with the note of its PSNR, has at most ``limit`` bytes.
 
     This is needed because the remaining Gaussians may compress worse than the subset from which the
     count was estimated.
     """
-    while (size := file_size(after, suffix)) > limit:
+    while (size := file_size(after._replace(pruned_to=_spent(stored, reached)), suffix)) > limit:
         count = len(after.gaussians.means)
         fewer = min(int(count * limit / size), count - 1)
         budget = Budget(count=parse_count(fewer, f"{where}bytes: the number of Gaussians that fit"))
-        after, reached = _simplify(after, budget, options, suffix)
+        after, again = _simplify(after, budget, options, suffix)
+        reached = combined_psnr(reached, again)
     return after, reached
 
 

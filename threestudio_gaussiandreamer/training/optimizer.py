@@ -94,7 +94,8 @@ def check_optimizer(options: Any, scheduler: Any = None) -> None:
     name, arguments = options.get("name", "Adam"), options.get("args") or {}
     if not isinstance(getattr(torch.optim, str(name), None), type):
         known = [name for name, value in vars(torch.optim).items() if isinstance(value, type)]
-        raise unknown("system.optimizer.name", name, filter(_works, known))
+        working = [known_name for known_name in known if _works({"name": known_name})]
+        raise unknown("system.optimizer.name", name, working)
     if not isinstance(arguments, Mapping):
         raise UserError(f"optimizer.args: expected keys and values, got {arguments!r}")
     try:
@@ -102,15 +103,21 @@ def check_optimizer(options: Any, scheduler: Any = None) -> None:
     except Exception as error:  # of many types
         accepted = accepted_arguments(name)
         wrong = [unknown("argument", key, accepted) for key in arguments if key not in accepted]
+        refused = [
+            f".args.{key}"
+            for key, value in arguments.items()
+            if not _works({"name": name, "args": {key: value}})
+        ]
         raise UserError(
-            f"optimizer: {name} doesn't accept this: {wrong[0] if wrong else error}"
+            f"optimizer{refused[0] if refused and not wrong else ''}: {name} doesn't accept this: "
+            f"{wrong[0] if wrong else str(error).splitlines()[0]}"
         ) from error
 
 
-def _works(name: str) -> bool:
-    """Return whether an optimiser of ``torch.optim`` can train the parts with its defaults."""
+def _works(options: Mapping[str, Any]) -> bool:
+    """Return whether an optimiser of ``torch.optim`` can train the parts with these options."""
     try:
-        _try_step({"name": name})
+        _try_step(options)
     except Exception:  # of many types
         return False
     return True

@@ -188,6 +188,11 @@ class SplattingRenderer(Rasterizer):
         if rays is None or rays.shape[1:3] != (height, width):
             rays = cameras.ray_directions(c2w, fovy, height, width)
         background = self.background(rays.to(out.image))
+        if not isinstance(background, Tensor):
+            raise UserError(
+                f"{type(self.background).__name__} returned {type(background).__name__}; expected "
+                f"a tensor of colours {tuple(out.image.shape)}"
+            )
         if background.shape != out.image.shape:
             raise UserError(
                 f"{type(self.background).__name__} returned colours {tuple(background.shape)} for "
