@@ -58,7 +58,7 @@ def check(guidance, **prior):
 
 
 def test_a_guidance_gets_options_that_are_not_given():
-    with pytest.raises(UserError, match="weights 'missing.bin' does not exist"):
+    with pytest.raises(UserError, match="^system.guidance: weights 'missing.bin' does not exist"):
         check("test-weights-guidance")
 
 
@@ -68,5 +68,5 @@ def test_a_preflight_of_another_kind_is_named():
 
 
 def test_the_prior_is_checked_first():
-    with pytest.raises(UserError, match="does not exist"):
+    with pytest.raises(UserError, match="^system.geometry.prior: mesh 'no.glb' does not exist"):
         check("test-weights-guidance", prior_type="mesh-prior", prior={"path": "no.glb"})

@@ -1,5 +1,7 @@
 """Check what the parts of a run need from outside, before any long work."""
 
+import contextlib
+from collections.abc import Iterator
 from typing import Any
 
 from ..core.errors import UserError
@@ -38,12 +40,26 @@ def preflight_parts(geometry: Any, cfg: Any) -> None:
         cfg: the system's options.
 
     Raises:
-        UserError: something that a part needs, such as a file, is missing.
+        UserError: something that a part needs, such as a file, is missing; the message names the
+            part's section.
     """
     if not len(geometry):
-        preflight_prior(geometry.prior(), geometry.cfg.keep_attributes)
+        with _named("system.geometry.prior"):
+            preflight_prior(geometry.prior(), geometry.cfg.keep_attributes)
     for name in ("prompt_processor", "guidance"):
         part = find(cfg[f"{name}_type"])
         if hasattr(part, "preflight"):
             require_class_method(part, "preflight")
-            part.preflight(parse_structured(part.Config, cfg[name]))
+            with _named(f"system.{name}"):
+                part.preflight(parse_structured(part.Config, cfg[name]))
+
+
+@contextlib.contextmanager
+def _named(section: str) -> Iterator[None]:
+    """Put a section of the configuration in front of errors that don't name it."""
+    try:
+        yield
+    except UserError as error:
+        if section in str(error):
+            raise
+        raise UserError(f"{section}: {error}") from error
