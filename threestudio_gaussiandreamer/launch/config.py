@@ -140,7 +140,7 @@ def _merge(sources: list[DictConfig]) -> DictConfig:
     try:
         merged = OmegaConf.create({})
         for source in sources:
-            if source is sources[-1]:
+            if source is sources[-1]:  # the command line
                 _require_values(merged, source)
             _forget_replaced_parts(merged, source)
             merged = OmegaConf.merge(merged, source)

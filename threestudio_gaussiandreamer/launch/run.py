@@ -169,10 +169,11 @@ class Run:
             if key not in checkpoint
         ]
         if missing:
+            # without its own key Lightning didn't write the file at all
+            exception = " unless checkpoint.save_weights_only=true"
             raise UserError(
-                f"{self.cfg.resume} isn't a training checkpoint: it has no "
-                f"{', '.join(missing)}, which Lightning writes"
-                + (" unless checkpoint.save_weights_only=true" * (LIGHTNINGS_KEY in checkpoint))
+                f"{self.cfg.resume} isn't a training checkpoint: it has no {', '.join(missing)}, "
+                f"which Lightning writes{exception if LIGHTNINGS_KEY in checkpoint else ''}"
             )
         self.check_content(checkpoint)
         self.size_changes = changes_since(self.cfg, SIZES)
