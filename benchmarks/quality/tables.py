@@ -36,7 +36,10 @@ sees (`mode: direction-bins`), a *view-blind* one neither (`mode: view-agnostic`
 The runs of the base recipe were measured before colours were kept in [0, 1] (the effect is
 under "Colours that viewers show"). Those of the paper's recipe, which doesn't bound colours, were
 repeated after its growing radius became a share of the longest side; their seconds are those of the
-first measurement, on the same processor as the other rows', with as many Gaussians and steps.
+first measurement, on the same processor as the other rows', with as many Gaussians and steps. All
+seconds of direction bins and view-blind scores were measured before the distances to their pictures
+became [scalar products](../threestudio_gaussiandreamer/guidance/picture_bank.py), and are longer
+than now.
 """
 NOTES = {
     "count": "Pruned in the loop to that count, trained with it from the start, or ranked "
