@@ -3,7 +3,7 @@ import torch
 
 from threestudio_gaussiandreamer.diffusion import exact_score, sds
 from threestudio_gaussiandreamer.guidance.known_truth import composite
-from threestudio_gaussiandreamer.guidance.picture_bank import Bank, Modes, mixture_of
+from threestudio_gaussiandreamer.guidance.picture_bank import Bank, mixture_of, modes_of
 
 MEMBERS = torch.tensor(
     [[True, True, False, True, False, True, True], [False] * 6 + [True], [True] * 7]
@@ -28,12 +28,9 @@ def bank(request):
 
 
 def predicted(mixtures, z, abar, conditional):
-    modes = Modes.of(mixtures)
-    distances = modes.squared_distances(z, abar)
-    prior = modes.log_prior if conditional else None
-    return exact_score.denoise_by(
-        modes.weighted_sum, z.flatten(1), abar, distances, std=0.05, log_prior=prior
-    )
+    modes, log_prior = modes_of(mixtures)
+    prior = log_prior if conditional else None
+    return exact_score.denoise(z.flatten(1), abar, modes, std=0.05, log_prior=prior)
 
 
 @pytest.mark.parametrize("has_own", [False, True])

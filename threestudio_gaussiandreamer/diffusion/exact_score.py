@@ -19,7 +19,7 @@ The closed-form denoiser memorises: for d above a few hundred it returns the nea
 measures this: it is then 1."""
 
 import math
-from typing import Callable, NamedTuple, Optional
+from typing import NamedTuple, Optional, Protocol, Union
 
 import torch
 import torch.nn.functional as F
@@ -50,6 +50,34 @@ class Denoised(NamedTuple):
     """
 
 
+class KnownImages(Protocol):
+    """The known images x_k of the items of a batch."""
+
+    def squared_distances(
+        self, z: Float[Tensor, "B d"], abar: Float[Tensor, " B"]
+    ) -> Float[Tensor, "B K"]:
+        """Compute |z - sqrt(abar) x_k|^2 in float64; a single image may have any distance."""
+
+    def weighted_sum(self, weights: Float[Tensor, "B K"]) -> Float[Tensor, "B d"]:
+        """Sum the images with weights >= 0, in the weights' type."""
+
+
+class ImageTensor(NamedTuple):
+    """Images in a tensor, shared or per item."""
+
+    images: Float[Tensor, "*batch K d"]
+
+    def squared_distances(
+        self, z: Float[Tensor, "B d"], abar: Float[Tensor, " B"]
+    ) -> Float[Tensor, "B K"]:
+        if self.images.shape[-2] == 1:  # its responsibility is 1 at any distance
+            return z.new_zeros((len(z), 1), dtype=torch.float64)
+        return squared_distances(z, self.images, abar)
+
+    def weighted_sum(self, weights: Float[Tensor, "B K"]) -> Float[Tensor, "B d"]:
+        return weighted_sum(weights, self.images)
+
+
 def images_per_chunk(elements: int, device: torch.device) -> int:
     """Return how many images of so many elements are processed at once; at least one."""
     most = CPU_CHUNK_ELEMENTS if device.type == "cpu" else GPU_CHUNK_ELEMENTS
@@ -57,23 +85,33 @@ def images_per_chunk(elements: int, device: torch.device) -> int:
 
 
 def squared_distances(
-    z: Float[Tensor, "B d"],
-    bank: Float[Tensor, "*batch K d"],
-    abar: Float[Tensor, " B"],
+    z: Float[Tensor, "B d"], bank: Float[Tensor, "*batch K d"], abar: Float[Tensor, " B"]
 ) -> Float[Tensor, "B K"]:
     """Compute |z - sqrt(abar) x_k|^2 in float64.
 
     Args:
         bank: the images x_k, shared (K, d) or per item (B, K, d).
     """
-    a, z = abar.double().sqrt().to(z.device)[:, None], z.double()
+    wide_z, norms, products = z.double(), [], []
     chunk = images_per_chunk(bank.numel() // max(bank.shape[-2], 1), bank.device)
-    parts = []
-    for first in range(0, bank.shape[-2], chunk):
-        x = bank[..., first : first + chunk, :].double()
-        products = z @ x.mT if x.dim() == 2 else (z[:, None] @ x.mT)[:, 0]
-        parts.append(a * (a * x.square().sum(-1) - 2 * products))
-    distances = torch.cat(parts, dim=1) + z.square().sum(1, keepdim=True)
+    for part in bank.split(chunk, dim=-2):
+        x = part.double()
+        products.append(wide_z @ x.mT if x.dim() == 2 else (wide_z[:, None] @ x.mT)[:, 0])
+        norms.append(x.square().sum(-1))
+    return expanded_distances(wide_z, abar, torch.cat(norms, dim=-1), torch.cat(products, dim=1))
+
+
+def expanded_distances(
+    z: Float[Tensor, "B d"],
+    abar: Float[Tensor, " B"],
+    norms: Float[Tensor, "*batch K"],
+    products: Float[Tensor, "B K"],
+) -> Float[Tensor, "B K"]:
+    """Compute |z - sqrt(abar) x_k|^2 from |x_k|^2 and the scalar products of z and x_k; all but
+    abar are float64.
+    """
+    a = abar.double().sqrt().to(z.device)[:, None]
+    distances = a * (a * norms - 2 * products) + z.square().sum(1, keepdim=True)
     return distances.clamp_min_(0)
 
 
@@ -97,7 +135,7 @@ def responsibilities(
 def denoise(
     z: Float[Tensor, "B d"],
     abar: Float[Tensor, " B"],
-    bank: Float[Tensor, "*batch K d"],
+    bank: Union[Float[Tensor, "*batch K d"], KnownImages],
     *,
     std: float = 0.0,
     log_prior: Optional[Float[Tensor, "*prior K"]] = None,
@@ -108,40 +146,19 @@ def denoise(
 
     Args:
         abar: cumulative product of 1 - beta, per item, in (0, 1).
-        bank: the images x_k, shared (K, d) or per item (B, K, d).
+        bank: the images x_k, shared (K, d) or per item (B, K, d), or what takes their place.
         std: s, the standard deviation of each mode, >= 0.
         log_prior: log pi_k, not necessarily normalised; by default uniform.
         temperature: 1 is exact; see :func:`responsibilities`.
-        distances: ``squared_distances(z, bank, abar)`` if they are already known, for instance
-            for two mixtures of one bank.
+        distances: the squared distances to the images if they are already known, for instance for
+            two mixtures of one bank.
     """
-    if distances is None:
-        single = bank.shape[-2] == 1  # its responsibility is 1 at any distance
-        distances = (
-            z.new_zeros((len(z), 1), dtype=torch.float64)
-            if single
-            else squared_distances(z, bank, abar)
-        )
-    options = {"std": std, "log_prior": log_prior, "temperature": temperature}
-    return denoise_by(lambda gamma: weighted_sum(gamma, bank), z, abar, distances, **options)
-
-
-def denoise_by(
-    mean_of: Callable[[Float[Tensor, "B K"]], Float[Tensor, "B d"]],
-    z: Float[Tensor, "B d"],
-    abar: Float[Tensor, " B"],
-    distances: Float[Tensor, "B K"],
-    *,
-    std: float = 0.0,
-    log_prior: Optional[Float[Tensor, "*prior K"]] = None,
-    temperature: float = 1.0,
-) -> Denoised:
-    """As :func:`denoise`, for images that are known by their ``squared_distances`` and by a
-    function from responsibilities, in the type of z, to the mean m.
-    """
+    images = ImageTensor(bank) if isinstance(bank, Tensor) else bank
     variance = mode_variance(abar, std)
+    if distances is None:
+        distances = images.squared_distances(z, abar)
     gamma = responsibilities(distances, variance, log_prior=log_prior, temperature=temperature)
-    mean = mean_of(gamma.to(z))
+    mean = images.weighted_sum(gamma.to(z))
     residual = z - sds.per_item(abar.double().sqrt(), z) * mean
     eps = sds.per_item((1 - abar.double()).sqrt() / variance, z) * residual
     denoised = (

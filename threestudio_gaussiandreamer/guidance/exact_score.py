@@ -54,7 +54,7 @@ from ..core.given_gradient import given_gradient
 from ..core.memory import count_of, require_memory
 from ..core.options import at_least, in_range, interval, one_of, positive, required
 from ..diffusion import sds
-from ..diffusion.exact_score import Denoised, LinearLatent, color_matrix, denoise_by
+from ..diffusion.exact_score import Denoised, LinearLatent, color_matrix, denoise
 from ..host import parse_structured, register, warn
 from ..meshes.load import AXES, load_mesh
 from ..meshes.raycast import MeshCaster
@@ -62,7 +62,7 @@ from ..splatting.cpu import known_picture
 from .base import GUIDANCE_SCALE, ScoreDistillation
 from .exact_score_checks import check_render_size, picture_size, pooling_factor, require_used
 from .known_truth import MeshTruth, background_of, composite, resized
-from .picture_bank import Bank, Mixture, Modes, direction_indices, mixture_of
+from .picture_bank import Bank, Mixture, direction_indices, mixture_of, modes_of
 from .variants.sds import SDS
 
 MODES = ("view-exact", "direction-bins", "view-agnostic")
@@ -255,11 +255,11 @@ class ExactScoreGuidance(ScoreDistillation):
         self, z: Float[Tensor, "B c h w"], t: Int[Tensor, " B"], condition: list[Mixture]
     ) -> tuple[Tensor, Optional[Tensor]]:
         abar = self.alphas_cumprod.to(t.device)[t]
-        predictions = []
-        for _, group in itertools.groupby(condition, lambda mixture: id(mixture.pictures)):
-            mixtures, first = list(group), sum(len(cond.eps) for cond, _ in predictions)
-            items = slice(first, first + len(mixtures))
-            predictions.append(self._predict_items(z[items], abar[items], Modes.of(mixtures)))
+        by_pictures = itertools.groupby(condition, lambda mixture: id(mixture.pictures))
+        groups = [list(group) for _, group in by_pictures]
+        sizes = [len(group) for group in groups]
+        parts = zip(z.flatten(1).split(sizes), abar.split(sizes), groups, strict=True)
+        predictions = [self._predict_items(*part) for part in parts]
         self.evaluations += len(z) * (2 if self.guided else 1)
         self._perplexity = float(torch.cat([cond.perplexity for cond, _ in predictions]).mean())
         eps = torch.cat([cond.eps for cond, _ in predictions]).view_as(z)
@@ -306,13 +306,16 @@ class ExactScoreGuidance(ScoreDistillation):
         return {"perplexity": self._perplexity}
 
     def _predict_items(
-        self, z: Float[Tensor, "B c h w"], abar: Float[Tensor, " B"], modes: Modes
+        self, z: Float[Tensor, "B d"], abar: Float[Tensor, " B"], mixtures: list[Mixture]
     ) -> tuple[Denoised, Optional[Denoised]]:
-        """Return the conditional prediction, and the unconditional one if there is guidance."""
-        known = (modes.weighted_sum, z.flatten(1), abar, modes.squared_distances(z, abar))
+        """Return the conditional prediction, and the unconditional one if there is guidance, of
+        items with the same pictures.
+        """
+        modes, log_prior = modes_of(mixtures)
         options = {"std": self.options.std, "temperature": self.options.temperature}
-        cond = denoise_by(*known, log_prior=modes.log_prior, **options)
-        return cond, denoise_by(*known, **options) if self.guided else None
+        options["distances"] = modes.squared_distances(z, abar)
+        cond = denoise(z, abar, modes, log_prior=log_prior, **options)
+        return cond, denoise(z, abar, modes, **options) if self.guided else None
 
     # Mixtures
     # ----------------------------------------------------------------------------------------------

@@ -7,7 +7,10 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from ..diffusion.exact_score import (
+    ImageTensor,
+    KnownImages,
     LinearLatent,
+    expanded_distances,
     images_per_chunk,
     squared_distances,
     weighted_sum,
@@ -35,15 +38,14 @@ class Pictures(NamedTuple):
         return Pictures(layers, torch.cat([part @ part.mT for part in wide]))
 
     def squared_distances(
-        self, z: Float[Tensor, "B c h w"], abar: Float[Tensor, " B"], mixing: Float[Tensor, "B c l"]
+        self, z: Float[Tensor, "B d"], abar: Float[Tensor, " B"], mixing: Float[Tensor, "B c l"]
     ) -> Float[Tensor, "B K"]:
         """Compute |z - sqrt(abar) x_k|^2 in float64."""
-        a, z, mixing = abar.double().sqrt()[:, None], z.flatten(2).double(), mixing.double()
-        of_layers = (mixing.mT @ z).flatten(1)
+        z, mixing = z.double(), mixing.double()
+        of_layers = (mixing.mT @ z.unflatten(1, (mixing.shape[1], -1))).flatten(1)
         parts = [of_layers @ part.flatten(1).double().mT for part in _chunks(self.layers)]
         norms = torch.einsum("bcl,klm,bcm->bk", mixing, self.products, mixing)
-        distances = a * (a * norms - 2 * torch.cat(parts, dim=1))
-        return (distances + z.square().sum(dim=(1, 2))[:, None]).clamp_min_(0)
+        return expanded_distances(z, abar, norms, torch.cat(parts, dim=1))
 
     def weighted_sum(
         self, weights: Float[Tensor, "B K"], mixing: Float[Tensor, "B c l"]
@@ -94,40 +96,36 @@ class Modes(NamedTuple):
     """The modes of the items of a batch whose mixtures have the same pictures."""
 
     own: Optional[Float[Tensor, "B d"]]
-    pictures: Optional[Pictures]
-    mixing: Optional[Float[Tensor, "B c l"]]
-    log_prior: Optional[Float[Tensor, "B K"]]
-
-    @staticmethod
-    def of(mixtures: list[Mixture]) -> "Modes":
-        own, pictures, mixing, log_prior = mixtures[0]
-        if own is not None:
-            own = torch.stack([mixture.own for mixture in mixtures]).flatten(1)
-        if pictures is not None:
-            mixing = torch.stack([mixture.mixing for mixture in mixtures])
-            log_prior = torch.stack([mixture.log_prior for mixture in mixtures])
-        return Modes(own, pictures, mixing, log_prior)
+    pictures: Pictures
+    mixing: Float[Tensor, "B c l"]
 
     def squared_distances(
-        self, z: Float[Tensor, "B c h w"], abar: Float[Tensor, " B"]
+        self, z: Float[Tensor, "B d"], abar: Float[Tensor, " B"]
     ) -> Float[Tensor, "B K"]:
-        """Compute the distances in float64, or zeros for single modes, which need none."""
-        if self.pictures is None:
-            return z.new_zeros((len(z), 1), dtype=torch.float64)
         distances = self.pictures.squared_distances(z, abar, self.mixing)
         if self.own is None:
             return distances
-        own = squared_distances(z.flatten(1), self.own[:, None], abar)
-        return torch.cat([own, distances], dim=1)
+        return torch.cat([squared_distances(z, self.own[:, None], abar), distances], dim=1)
 
     def weighted_sum(self, weights: Float[Tensor, "B K"]) -> Float[Tensor, "B d"]:
-        """Sum the modes with weights >= 0."""
         if self.own is None:
             return self.pictures.weighted_sum(weights, self.mixing)
-        own = weights[:, :1] * self.own
-        if self.pictures is None:
-            return own
-        return own + self.pictures.weighted_sum(weights[:, 1:], self.mixing)
+        of_pictures = self.pictures.weighted_sum(weights[:, 1:], self.mixing)
+        return weights[:, :1] * self.own + of_pictures
+
+
+def modes_of(
+    mixtures: list[Mixture],
+) -> tuple[KnownImages, Optional[Float[Tensor, "B K"]]]:
+    """Return the modes of mixtures with the same pictures, and the logarithms of their priors."""
+    own, pictures = mixtures[0].own, mixtures[0].pictures
+    if own is not None:
+        own = torch.stack([mixture.own for mixture in mixtures]).flatten(1)
+    if pictures is None:
+        return ImageTensor(own[:, None]), None
+    mixing = torch.stack([mixture.mixing for mixture in mixtures])
+    log_prior = torch.stack([mixture.log_prior for mixture in mixtures])
+    return Modes(own, pictures, mixing), log_prior
 
 
 def mixture_of(
