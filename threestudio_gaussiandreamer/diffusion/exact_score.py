@@ -19,7 +19,7 @@ The closed-form denoiser memorises: for d above a few hundred it returns the nea
 measures this: it is then 1."""
 
 import math
-from typing import NamedTuple, Optional, Protocol, Union
+from typing import NamedTuple, Optional, Protocol, Union, runtime_checkable
 
 import torch
 import torch.nn.functional as F
@@ -50,6 +50,7 @@ class Denoised(NamedTuple):
     """
 
 
+@runtime_checkable  # for --typecheck
 class KnownImages(Protocol):
     """The known images x_k of the items of a batch."""
 
