@@ -111,6 +111,9 @@ def test_an_unknown_format_is_named(tmp_path):
     (tmp_path / "prompts.json").write_text('{"prompt": "a fox"}')
     with pytest.raises(UserError, match="'.json': did you mean '.jsonl'"):
         list(read_rows(tmp_path / "prompts.json"))
+    (tmp_path / "prompts.xlsx").touch()
+    with pytest.raises(UserError, match="'.xlsx': choose from .csv, .jsonl, .ndjson, .txt"):
+        list(read_rows(tmp_path / "prompts.xlsx"))
 
 
 def test_a_missing_list_is_named_with_its_neighbours(tmp_path):

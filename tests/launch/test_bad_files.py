@@ -300,6 +300,14 @@ def test_the_last_checkpoint_resumes_if_the_others_have_weights_only(launch_demo
     assert code == 2 and message in err
 
 
+def test_a_checkpoint_of_another_optimiser_is_named(launch_demo):
+    assert launch_demo("trainer.max_steps=1")[0] == 0
+    last = f"resume={TRIAL}/ckpts/last.ckpt"
+    code, err = launch_demo(last, "system.optimizer.name=SGD")
+    assert "is of another run: system.optimizer.name was 'Adam', now it is 'SGD'" in err
+    assert code == 2 and "SGD can't resume from its optimizer_states, which may be another" in err
+
+
 @pytest.mark.parametrize("stage", ["validate", "test", "export"])
 def test_export_without_a_checkpoint_is_an_error(stage, launch_demo):
     """Only training can start from the prior; an untrained cloud would be taken for the result."""

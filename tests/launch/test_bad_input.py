@@ -180,7 +180,7 @@ register_parts()
             "pixels, twice take about 39.99 TB of memory",
         ),
         ("data.train_views=1000000000000", "data.train_views: 1000000000000 views take about"),
-        ("data.batch_size=[4096, 4096]", "data.batch_size: 2 entries need 1 resolution_milestones"),
+        ("data.batch_size=[4096, 4096]", "2 entries need 1 resolution_milestones, the steps"),
         ("data.eval_height=100000", "data.eval_height: expected a number from 1 to 16384"),
         ("data={height: 9999, width: 9999, batch_size: 999}", "data.batch_size: 999 views of"),
         ("system.geometry.prior.num_points=999999999999", "999999999999 points take about"),

@@ -252,7 +252,7 @@ def test_a_prompt_from_a_file(folder):
         and "prompt_file" not in cfg.system.prompt_processor
     )
     assert cfg.trial_name.startswith("a_fox__red___x_-")
-    with pytest.raises(UserError, match="prompt file 'nothing.txt' does not exist"):
+    with pytest.raises(UserError, match="prompt_file.* 'nothing.txt' does not exist"):
         load("system.prompt_processor.prompt_file=nothing.txt")
     with pytest.raises(UserError, match="both prompt and prompt_file"):
         load("system.prompt_processor.prompt_file=prompt.txt", f"{PROMPT}=x")

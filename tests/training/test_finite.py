@@ -6,7 +6,9 @@ import torch
 from tests.training.runs import launch, run_folder
 from threestudio_gaussiandreamer.training import system
 from threestudio_gaussiandreamer.training.finite import (
+    CHECK_EVERY,
     NonFiniteParameters,
+    RecentLosses,
     optimizer_tensors,
     require_finite,
 )
@@ -19,6 +21,18 @@ def test_one_number_that_is_not_finite_is_named(value):
     bad[4, 1] = value
     with pytest.raises(NonFiniteParameters, match=r"step 7: 1 of the 15 numbers of means are NaN"):
         require_finite([("quats", torch.ones(5, 4)), ("means", bad)], step=7)
+
+
+def test_the_loss_that_was_bad_first_is_named():
+    losses, good = RecentLosses(), torch.tensor(1.0, requires_grad=True)
+    for step in range(CHECK_EVERY + 5):
+        bad = step in (0, 9, 12)  # the check after step 0 would have found it
+        losses.add(step, {"sds": good, "tv": good * torch.nan if bad else good})
+    means = [("means", torch.full((2,), torch.nan))]
+    with pytest.raises(NonFiniteParameters, match="after the weighted loss_tv was nan in step 9:"):
+        require_finite(means, step=30, losses=losses)
+    with pytest.raises(NonFiniteParameters, match="means are NaN or infinite: the run stops"):
+        require_finite(means, step=1, losses=RecentLosses())
 
 
 def test_infinities_are_distinguished_from_sums_that_overflow():
@@ -53,7 +67,8 @@ def test_a_run_that_turns_non_finite_stops_and_saves_nothing_of_it(
     steps = ["trainer.max_steps=5", "trainer.val_check_interval=5"]
     assert launch(tmp_path, painted_box, *steps, *NON_FINITE[cause]) == 2
     errors = capsys.readouterr().err
-    assert errors.count("are NaN or infinite: the run stops") == 1 and "step 3:" in errors
+    assert errors.count("are NaN or infinite") == 1 and "step 3:" in errors
+    assert ("after the weighted loss_sds was inf in step 0" in errors) == (cause == "loss")
     assert not [*tmp_path.rglob("*.ckpt"), *tmp_path.rglob("it*")]
 
 

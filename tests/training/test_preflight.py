@@ -51,9 +51,9 @@ def test_parts_that_the_system_can_not_train_are_refused(name, part, base, monke
         check_parts(cfg)
 
 
-def check(guidance, **prior):
+def check(guidance_type, guidance=(), **prior):
     options = {"prompt_processor_type": "plain-prompt-processor", "prompt_processor": {}}
-    cfg = options | {"guidance_type": guidance, "guidance": {}}
+    cfg = options | {"guidance_type": guidance_type, "guidance": dict(guidance)}
     preflight_parts(GaussianCloud(prior), cfg)
 
 
@@ -65,6 +65,15 @@ def test_a_guidance_gets_options_that_are_not_given():
 def test_a_preflight_of_another_kind_is_named():
     with pytest.raises(UserError, match="InstancePreflight.preflight needs @classmethod"):
         check("test-instance-preflight-guidance")
+
+
+@pytest.mark.parametrize(
+    ("mesh", "message"),
+    [("no.glb", "mesh 'no.glb' does not exist"), (__file__, "unknown mesh format of")],
+)
+def test_the_mesh_of_a_guidance_is_checked(mesh, message):
+    with pytest.raises(UserError, match=f"^system.guidance: {message}"):
+        check("exact-score-guidance", {"mesh": mesh})
 
 
 def test_the_prior_is_checked_first():

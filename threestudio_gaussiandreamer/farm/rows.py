@@ -60,7 +60,7 @@ def read_rows(path: Path) -> Iterator[Row]:
     existing_file(path, "prompt list")
     suffix = path.suffix.lower()
     if suffix not in FORMATS:
-        raise unknown(f"format of the prompt list {str(path)!r}:", suffix, FORMATS)
+        raise unknown(f"format of the prompt list {str(path)!r}:", suffix, filter(None, FORMATS))
     for line, values in FORMATS[suffix](path):
         try:
             yield make_row(values, line)

@@ -56,7 +56,7 @@ from ..core.options import at_least, in_range, interval, one_of, positive, requi
 from ..diffusion import sds
 from ..diffusion.exact_score import Denoised, LinearLatent, color_matrix, denoise
 from ..host import parse_structured, register, warn
-from ..meshes.load import AXES, load_mesh
+from ..meshes.load import AXES, load_mesh, mesh_file
 from ..meshes.raycast import MeshCaster
 from ..splatting.cpu import known_picture
 from .base import GUIDANCE_SCALE, ScoreDistillation
@@ -140,6 +140,7 @@ class ExactScoreGuidance(ScoreDistillation):
     def preflight(cls, cfg: Any) -> None:
         super().preflight(cfg)
         cfg = parse_structured(cls.Config, cfg)
+        mesh_file(cfg.mesh)
         require_used(cls, cfg)
         if cfg.guidance_scale != 1 and not cls.is_text_guided(cfg):
             warn(

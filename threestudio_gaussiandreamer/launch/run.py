@@ -175,10 +175,10 @@ class Run:
                 f"{self.cfg.resume} isn't a training checkpoint: it has no {', '.join(missing)}, "
                 f"which Lightning writes{exception if LIGHTNINGS_KEY in checkpoint else ''}"
             )
+        for change in changes_since(self.cfg):  # they may explain what is found next
+            warn(f"{self.cfg.resume} is of another run: {change}")
         self.check_content(checkpoint)
         self.size_changes = changes_since(self.cfg, SIZES)
-        for change in changes_since(self.cfg):
-            warn(f"{self.cfg.resume} is of another run: {change}")
         self.resumed_step = checkpoint["global_step"]
         return checkpoint["epoch"], self.resumed_step
 

@@ -29,6 +29,7 @@ SAME = {
     "system.guidance_type": None,
     "system.guidance.mesh": None,
     "system.guidance.pretrained_model_name_or_path": None,
+    "system.optimizer.name": "Adam",
 }
 """Options that a resumed run usually has in common with the one before; the values are the
 defaults, None for options that are compared only where both runs give them."""

@@ -201,8 +201,8 @@ def _try_step(optimizer: Mapping, state: Mapping, parameters: Mapping, what: str
         restored.step()
     except Exception as error:  # torch doesn't check keys and types
         raise UserError(
-            f"{what}: {kind.__name__} can't resume from its optimizer_states: "
-            f"{type(error).__name__} {error}"
+            f"{what}: {kind.__name__} can't resume from its optimizer_states, which may be another "
+            f"optimiser's: {type(error).__name__} {error}"
         ) from error
     for name, value in optimizer_tensors(restored):
         if not value.isfinite().all():

@@ -74,7 +74,7 @@ def read_prompt(path: str) -> str:
     Raises:
         UserError: the file is missing, isn't UTF-8, or is larger than ``MAX_PROMPT_BYTES``.
     """
-    file = existing_file(path, "prompt file")
+    file = existing_file(path, "prompt file (system.prompt_processor.prompt_file)")
     try:
         with open(file, "rb") as opened:
             content = opened.read(MAX_PROMPT_BYTES + 1)

@@ -80,7 +80,8 @@ class CameraConfig:
             ):
                 raise UserError(
                     f"{name}: {len(values)} entries need {len(values) - 1} "
-                    f"resolution_milestones, got {len(cfg.resolution_milestones)}"
+                    "resolution_milestones, the steps at which the next entry applies, got "
+                    f"{len(cfg.resolution_milestones)}"
                 )
         _check_milestones(cfg)
         _check_groups(cfg)

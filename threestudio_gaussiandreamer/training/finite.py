@@ -5,7 +5,9 @@ Adam's moments stay NaN once they are, and the rasteriser skips Gaussians with N
 check such a run would end without an error, and with holes in the object.
 """
 
-from collections.abc import Iterable, Iterator
+from collections import deque
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Optional
 
 import torch
 from jaxtyping import Float
@@ -19,6 +21,26 @@ CHECK_EVERY = 25
 """Optimiser steps between two checks, each of which synchronises with the device once."""
 
 Named = Iterable[tuple[str, Tensor]]
+
+
+class RecentLosses:
+    """The losses of the steps since the last check. They stay on their device, and are read only if
+    parameters turn out not to be finite.
+    """
+
+    def __init__(self) -> None:
+        self._steps: deque[tuple[int, dict[str, Tensor]]] = deque(maxlen=CHECK_EVERY)
+
+    def add(self, step: int, losses: Mapping[str, Tensor]) -> None:
+        self._steps.append((step, {name: loss.detach() for name, loss in losses.items()}))
+
+    def first_bad(self) -> str:
+        """Return which loss was NaN or infinite first, for a message; empty if none was."""
+        for step, losses in self._steps:
+            for name, loss in losses.items():
+                if not loss.isfinite().all():
+                    return f", after the weighted loss_{name} was {loss.item()} in step {step}"
+        return ""
 
 
 class NonFiniteParameters(UserError):
@@ -39,13 +61,23 @@ def optimizer_tensors(optimizer: torch.optim.Optimizer) -> Iterator[tuple[str, T
                     yield f"{name}.{key}", value
 
 
+def training_tensors(
+    module: torch.nn.Module, optimizers: Iterable[torch.optim.Optimizer]
+) -> Iterator[tuple[str, Tensor]]:
+    """Yield every parameter of a module, and the tensors of its optimisers, with their names."""
+    yield from module.named_parameters()
+    for optimizer in optimizers:
+        yield from optimizer_tensors(optimizer)
+
+
 @torch.no_grad()
-def require_finite(tensors: Named, step: int) -> None:
+def require_finite(tensors: Named, step: int, losses: Optional[RecentLosses] = None) -> None:
     """Check that no tensor contains NaN or infinity; synchronises with the device once.
 
     Args:
         tensors: (name, values of any shape).
         step: finished optimiser steps, for the message.
+        losses: those that may be the cause, for the message.
 
     Raises:
         NonFiniteParameters: the message has the name of the first tensor that isn't finite, and the
@@ -59,7 +91,8 @@ def require_finite(tensors: Named, step: int) -> None:
     name, values = next((n, v) for n, v in named if not v.isfinite().all())
     raise NonFiniteParameters(
         f"step {step}: {int((~values.isfinite()).sum())} of the {values.numel()} numbers of {name} "
-        "are NaN or infinite: the run stops, and nothing of this state is saved or exported. "
+        f"are NaN or infinite{losses.first_bad() if losses else ''}: the run stops, and nothing of "
+        "this state is saved or exported. "
         "Usual causes are a guidance that returns NaN, an optimiser without a positive eps "
         "(system.optimizer.args), weights of losses that overflow float32 (system.loss) and too "
         "large learning rates (system.geometry.lr_*)"

@@ -56,7 +56,7 @@ from ..prune import PruneOptions
 from .density import DensityControl, RenderedQuality
 from .events import StepLog, log_scores
 from .export import GaussianSavers, export, exported_files
-from .finite import CHECK_EVERY, optimizer_tensors, require_finite, warn_if_invisible
+from .finite import CHECK_EVERY, RecentLosses, require_finite, training_tensors, warn_if_invisible
 from .held_out import EvaluationConfig, HeldOut, Measurements
 from .image_targets import ImageTargets, ImageTargetsConfig, check_image_targets
 from .loss_scale import LossScale
@@ -130,7 +130,7 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         self.automatic_optimization = False
         self.__dict__["guidance"] = self.measurements = self.prompt_utils = None
         self.loss_scale = LossScale()
-        self.step_log = StepLog()
+        self.step_log, self.recent_losses = StepLog(), RecentLosses()
         self._learnt: Optional[dict[str, Tensor]] = None
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
@@ -173,10 +173,8 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
 
     def require_finite(self) -> None:
         """Check parameters and optimiser state; see :func:`.finite.require_finite`."""
-        of_optimizers = (
-            named for optimizer in self.trainer.optimizers for named in optimizer_tensors(optimizer)
-        )
-        require_finite([*self.named_parameters(), *of_optimizers], self.true_global_step)
+        tensors = training_tensors(self, self.trainer.optimizers)
+        require_finite(tensors, self.true_global_step, self.recent_losses)
 
     def ensure_cloud(self) -> None:
         """Run the prior, unless the cloud has been loaded from a checkpoint."""
@@ -240,6 +238,7 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         self.density.before_backward(out, step)
         guided = self.supervise(out, batch)
         losses = self.losses(guided, out)
+        self.recent_losses.add(step, losses)
         self.manual_backward(total(losses, self.options.guidance_type))
         average_gradients(p for group in optimizer.param_groups for p in group["params"])
         self.image_targets.hold_shapes(optimizer, step)
