@@ -4,6 +4,7 @@ Sections, key names, resolvers and the output tree are threestudio's. Two things
 makes no folder, and what is text stays text (see ``config_source.py``). The sources are read by
 ``config_source.py``; the folder is named by ``run_folder.py``."""
 
+import functools
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
@@ -137,13 +138,11 @@ def _with_prompt_from_file(source: DictConfig) -> DictConfig:
 
 
 def _merge(sources: list[DictConfig]) -> DictConfig:
+    *files, overrides = sources
     try:
-        merged = OmegaConf.create({})
-        for source in sources:
-            if source is sources[-1]:  # the command line
-                _require_values(merged, source)
-            _forget_replaced_parts(merged, source)
-            merged = OmegaConf.merge(merged, source)
+        merged = functools.reduce(_overlaid, files, OmegaConf.create({}))
+        _require_values(merged, overrides)
+        merged = _overlaid(merged, overrides)
     except OmegaConfBaseException as error:
         raise UserError(f"the configurations can't be merged: {_explain(error)}") from error
     except TypeError as error:
@@ -157,6 +156,11 @@ def _merge(sources: list[DictConfig]) -> DictConfig:
             merged[section] = {}
         _require_section(merged, section)
     return merged
+
+
+def _overlaid(earlier: DictConfig, later: DictConfig) -> DictConfig:
+    _forget_replaced_parts(earlier, later)
+    return OmegaConf.merge(earlier, later)
 
 
 def _require_values(merged: DictConfig, overrides: DictConfig, path: str = "") -> None:
