@@ -10,7 +10,6 @@ clouds are drawn with the defaults below."""
 
 import argparse
 import functools
-import math
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -19,15 +18,14 @@ from typing import Any, Optional
 from ..core.command import joined_values, run_command
 from ..core.errors import UserError
 from ..core.files import existing_file, is_folder, require_other_file, require_writable
-from ..formats.gaussian_files import StoredCloud
 from ..gaussians.axes import AXES
-from ..gaussians.views import EPS2D, NEAR, bounds
+from ..gaussians.views import EPS2D
 from ..splatting import PRESETS
+from .cloud_page import cloud_page
 from .gallery import write_gallery
 from .live import LiveView, require_server, serve, serve_until_stopped
-from .page import WHITE, PageOptions, Shown, decibels, require_page_size, write_page
+from .page import write_page
 from .reading import read_any
-from .render import RenderSettings
 from .run_files import RunFiles, is_run
 from .run_index import write_index
 
@@ -114,22 +112,12 @@ def run(args: argparse.Namespace) -> None:
 
 def write_cloud_page(source: Path, out: Path, args: argparse.Namespace) -> None:
     """Write the page of a file or checkpoint, as its run has drawn it or as the options say."""
-    background = _color(args.background)
-    _require_dilation(args.eps2d)
-    stored = read_any(source, args.up)
-    count = len(stored.gaussians.means)
-    require_page_size(count, str(source))
+    given = {name[2:].replace("-", "_"): _value(args, name) for name in OPTIONS}
+    shown, options = cloud_page(source, **given)
+    count = len(shown.cloud.gaussians.means)
     if count > LONG_WORK:
         print(f"{out}: packing {count:,} Gaussians", file=sys.stderr, flush=True)
-    run_files = RunFiles.around(source)
-    options = PageOptions(
-        title=args.title or (run_files.prompt if run_files else source.name),
-        name=source.stem,
-        settings=_settings(args, run_files, stored),
-        background=background or (run_files and run_files.background) or WHITE,
-    )
-    quality = decibels(run_files.psnr("result")) if _is_result(source, run_files) else ""
-    write_page(out, Shown(stored, "result", quality), options)
+    write_page(out, shown, options)
     print(f"{out}: {count:,} Gaussians, {out.stat().st_size / 1e6:.2f} MB")
 
 
@@ -181,45 +169,3 @@ def run_folder(folder: Path, args: argparse.Namespace) -> None:
 
 def _value(args: argparse.Namespace, option: str) -> Any:
     return getattr(args, option[2:].replace("-", "_"))
-
-
-def _settings(
-    args: argparse.Namespace, run_files: Optional[RunFiles], stored: StoredCloud
-) -> RenderSettings:
-    """Return the run's settings, or the defaults for a cloud of unknown units, overridden by the
-    options that are given.
-    """
-    if run_files is not None:
-        settings = run_files.settings
-    else:
-        near = NEAR * bounds(stored.gaussians.tensors())[1]
-        settings = RenderSettings(near=near, far=math.inf, antialias=stored.antialiased)
-    given = {name: getattr(args, name) for name in ("eps2d", "antialias", "bound_colors")}
-    if args.preset is not None:
-        given["alpha_min"] = PRESETS[args.preset]
-    return settings._replace(**{name: x for name, x in given.items() if x is not None})
-
-
-def _is_result(source: Path, run_files: Optional[RunFiles]) -> bool:
-    """Return whether the scores of a run are those of this file: an export of its last step."""
-    if run_files is None:
-        return False
-    steps = run_files.scores.get("result")
-    step = steps.get("step") if isinstance(steps, dict) else None
-    return source.resolve().parent == (run_files.save / f"it{step}-export").resolve()
-
-
-def _require_dilation(eps2d: Optional[float]) -> None:
-    if eps2d is not None and not 0 <= eps2d < 1e6:
-        raise UserError(f"--eps2d: expected a number of square pixels from 0 on, got {eps2d:g}")
-
-
-def _color(text: Optional[str]) -> Optional[tuple[float, float, float]]:
-    """Parse a colour such as ff8000; None if none is given."""
-    if text is None:
-        return None
-    try:
-        red, green, blue = bytes.fromhex(text.removeprefix("#"))
-    except ValueError as error:
-        raise UserError(f"--background: expected RRGGBB, such as ff8000, got {text!r}") from error
-    return (red / 255, green / 255, blue / 255)

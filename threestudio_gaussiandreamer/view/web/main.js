@@ -77,7 +77,9 @@ class Viewer {
   }
 
   writeAddress() {
-    history.replaceState(null, "", `#${poseToHash(this.pose)}`);
+    // whole, since "#..." is relative to the address of the notebook that embeds the page
+    const here = location.href.split("#")[0];
+    history.replaceState(null, "", `${here}#${poseToHash(this.pose)}`);
   }
 
   invalidate() {

@@ -1,0 +1,81 @@
+"""Show a cloud in a notebook (Jupyter, Colab, Kaggle):
+
+    from threestudio_gaussiandreamer.view.notebook import show
+    show("outputs/toybox/a_red_fox@20260101-120000")   # a run, or a file of Gaussians
+
+as the last line of a cell. The page of ``page.py`` is embedded, so it works without a server and
+without a network, and is stored with the notebook."""
+
+import html
+import os
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from ..core.errors import UserError
+from ..core.files import existing_file, is_folder
+from .cloud_page import cloud_page
+from .page import page
+from .run_files import RunFiles
+
+MAX_BYTES = 20_000_000
+"""Colab doesn't show an output that is larger."""
+
+
+class EmbeddedPage(NamedTuple):
+    """A page that a notebook shows in the output of a cell."""
+
+    content: str
+    """HTML."""
+    height: int
+    """Pixels."""
+
+    def _repr_html_(self) -> str:
+        # ASCII, so that the scripts keep the hashes of their policy in any encoding; the sandbox
+        # keeps the page from the notebook's own content
+        content = html.escape(self.content).encode("ascii", "xmlcharrefreplace").decode()
+        return (
+            f'<iframe srcdoc="{content}" allow="fullscreen" '
+            f'sandbox="allow-scripts allow-downloads" width="100%" height="{self.height}" '
+            'style="border: 0"></iframe>'
+        )
+
+    def __repr__(self) -> str:
+        return f"EmbeddedPage of {len(self.content) / 1e6:.2f} MB, which only a notebook shows"
+
+
+def show(path: str | os.PathLike, *, height: int = 480, **options: Any) -> EmbeddedPage:
+    """Return the interactive view of a cloud, for the last line of a cell.
+
+    Args:
+        path: the folder of a run, of which the last exported cloud is shown; or a file of Gaussians
+            or a checkpoint.
+        height: pixels.
+        options: see :func:`.cloud_page.cloud_page`.
+
+    Raises:
+        UserError: the run has exported no cloud, or the page is too large for a notebook; see also
+            :func:`.cloud_page.cloud_page`.
+    """
+    source = _source(path)
+    written = source.with_name("view.html")
+    if is_folder(path) and not options and written.is_file():
+        content = written.read_text()  # shows the first cloud too
+    else:
+        content = page(*cloud_page(source, **options))
+    if len(content) > MAX_BYTES:
+        raise UserError(
+            f"the page of {source} has {len(content) / 1e6:.0f} MB, more than the "
+            f"{MAX_BYTES / 1e6:.0f} of a notebook's output: prune the cloud first, or write the "
+            f"page to a file by `python -m threestudio_gaussiandreamer.view {source} --html`"
+        )
+    return EmbeddedPage(content, height)
+
+
+def _source(path: str | os.PathLike) -> Path:
+    """Return the file of Gaussians or checkpoint to show."""
+    if not is_folder(path):
+        return existing_file(path, "file of Gaussians or checkpoint")
+    found = RunFiles(Path(path).expanduser()).cloud
+    if found is None:
+        raise UserError(f"{str(path)!r} is no run with an exported cloud: name a file or a run")
+    return found
