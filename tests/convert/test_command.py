@@ -136,6 +136,8 @@ def test_rows_that_cant_be_drawn_are_left_out(tmp_path, caplog):
         (["in.ply", "a.glb", "--up-out", "z"], "--up-out: OUT is a .glb file"),
         (["in.ply", "a.spz", "--up-out", "z"], "--up-out: OUT is a .spz file"),
         (["in.ply", "a.glb", "--from", "blender"], None),
+        (["in.ply", "a.ply", "--up", "-z"], None),
+        (["in.ply", "a.ply", "--up-out", "-z"], None),
     ],
 )
 def test_errors_are_found_before_anything_is_written(

@@ -8,7 +8,12 @@ import time
 import pytest
 
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.core.files import atomic_file, json_text, remove_abandoned
+from threestudio_gaussiandreamer.core.files import (
+    atomic_file,
+    existing_file,
+    json_text,
+    remove_abandoned,
+)
 
 
 @pytest.mark.parametrize("name", ["a" * 255, "ü" * 127, "\U0001f98a" * 63], ids=["a", "ü", "fox"])
@@ -43,3 +48,8 @@ def test_only_old_temporary_files_of_the_same_name_are_removed(tmp_path):
         os.utime(tmp_path / name, (changed, changed))
     remove_abandoned(tmp_path / "a[1].npz")
     assert {path.name for path in tmp_path.iterdir()} == {".a[1].npz.3-4.tmp", ".b.npz.1-2.tmp"}
+
+
+def test_what_is_no_regular_file_is_called_so():
+    with pytest.raises(UserError, match="mesh '/dev/null' is no regular file$"):
+        existing_file("/dev/null", "mesh")

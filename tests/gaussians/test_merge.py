@@ -202,3 +202,27 @@ def test_pairs_in_parts_give_the_duplicates_of_all_costs_at_once(monkeypatch):
     at_once = merging.duplicates(params, spent)
     assert len(in_parts[0]) > 10
     assert all(torch.equal(*both) for both in zip(in_parts, at_once, strict=True))
+
+
+def test_a_large_gaussian_does_not_absorb_the_small_ones_near_it():
+    """Their share of the weight is small, and so is the cost of each."""
+    rng = torch.Generator().manual_seed(0)
+    many = {
+        name: value[:1].repeat(2000, *[1] * (value.dim() - 1)) for name, value in shell().items()
+    }
+    many["means"] = torch.rand(2000, 3, generator=rng)
+    many["log_scales"] = torch.full((2000, 3), -9.0)
+    many["log_scales"][0] = -1.0
+    change = merge_duplicates(many)
+    assert len(change.parents) > 1900
+    assert change.values["log_scales"].max() < -0.9  # e^354 before
+
+
+@pytest.mark.parametrize("size", [-5.0, -7.0])
+def test_a_small_gaussian_in_a_large_one_hardly_changes_it(size):
+    pair = {name: value[:1].repeat(2, *[1] * (value.dim() - 1)) for name, value in shell().items()}
+    pair["log_scales"][1] = size
+    pair["logit_opacities"][:] = 3.0
+    merged = merging._together(pair, torch.tensor([[0, 1]]))
+    assert merged["log_scales"].sum() == pytest.approx(pair["log_scales"][0].sum().item(), abs=0.2)
+    assert merged["logit_opacities"].item() == pytest.approx(3.0, abs=0.2)

@@ -220,3 +220,32 @@ def test_evaluation_has_what_the_hosts_saver_reads():
 def test_bad_options_are_named_at_once(cfg, message):
     with pytest.raises(UserError, match=message):
         Stub(cfg)
+
+
+@pytest.mark.parametrize(
+    ("returned", "message"),
+    [
+        (lambda z: z, r"returned only \(4, 3, 6, 5\); expected a pair"),
+        (lambda z: (z[:1], None), r"returned \(1, 3, 6, 5\) and None; .* shape \(4, 3, 6, 5\)"),
+        (lambda z: (z, z[:, :1]), r"returned \(4, 3, 6, 5\) and \(4, 1, 6, 5\)"),
+        (lambda z: (z, z, z), r"returned \(4, 3, 6, 5\) and .*; expected a pair"),
+        (lambda z: None, "returned only None"),
+    ],
+)
+def test_what_predict_returns_is_checked(monkeypatch, returned, message):
+    monkeypatch.setattr(Stub, "predict", lambda self, z, t, condition: returned(z))
+    with pytest.raises(UserError, match=f"Stub.predict {message}"):
+        step(Stub({"guidance_scale": 7.5}), uniform(4, 6, 5, 3))
+
+
+def test_a_scale_without_an_unconditional_prediction_is_reported_once(caplog):
+    guidance = Stub({"guidance_scale": 7.5})
+    for _ in range(2):
+        step(guidance, uniform(4, 6, 5, 3))
+    assert caplog.text.count("guidance_scale=7.5 has no effect: Stub.predict returns no") == 1
+
+
+def test_a_report_that_is_no_dictionary_is_named(monkeypatch):
+    monkeypatch.setattr(Stub, "report", lambda self: None)
+    with pytest.raises(UserError, match="Stub.report returned NoneType; expected a dictionary"):
+        step(Stub({"guidance_scale": 1.0}), uniform(4, 6, 5, 3))

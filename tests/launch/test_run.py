@@ -53,6 +53,16 @@ def test_a_source_that_can_not_be_read_is_left_out_of_the_copy_with_a_warning(
     assert files(tmp_path / "copy") == {"part.py"}
 
 
+def test_data_beside_a_part_is_recorded_and_large_files_are_named(tmp_path, caplog):
+    (tmp_path / "part").mkdir()
+    for name in ("part.py", "sizes.json", ".hidden"):
+        (tmp_path / "part" / name).write_text("1")
+    (tmp_path / "part/weights.npy").write_bytes(bytes(callbacks.LARGEST_DATA + 1))
+    callbacks.copy_sources(tmp_path / "part", tmp_path / "copy", data=True)
+    assert files(tmp_path / "copy") == {"part.py", "sizes.json"}
+    assert "weights.npy isn't copied" in caplog.text
+
+
 def test_a_deleted_configuration_is_stored_as_it_was_read(launch, monkeypatch):
     monkeypatch.setattr(
         tiny_parts.TinySystem, "post_configure", lambda self: os.unlink("tiny.yaml")

@@ -388,3 +388,34 @@ def test_shared_meshes(shared_folder, name, front, faces):
         else (red > 0.9) & (blue > 0.5) & (blue < 0.75)
     )
     assert nose.sum() > 200 and points[nose, 0].mean() > 0.5
+
+
+OFF_FACES = "3 0 2 1\n3 0 1 3\n3 0 3 2\n3 1 2 3\n"
+CORNERS = ("0 0 0", "1 0 0", "0 1 0", "0 0 1")
+
+
+@pytest.mark.parametrize(
+    ("head", "colors"),
+    [
+        ("COFF\n4 4 6\n", ["255 0 0 255", "0 255 0 255", "0 0 255 255", "51 51 51 0"]),
+        ("OFF 4 4 6 # a comment\n\n", ["1.0 0 0", "0 1.0 0", "0 0 1.0", "0.2 0.2 0.2"]),
+    ],
+)
+def test_colours_of_an_off_files_vertices(tmp_path, head, colors):
+    path = tmp_path / "a.off"
+    rows = [f"{corner} {color}\n" for corner, color in zip(CORNERS, colors, strict=True)]
+    path.write_text(head + "".join(rows) + OFF_FACES)
+    mesh = load_mesh(path)
+    expected = np.float32([[1, 0, 0], [0, 1, 0], [0, 0, 1], [0.2, 0.2, 0.2]])
+    np.testing.assert_allclose(mesh.vertex_colors, expected, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("head", "behind", "warned"), [("OFF", " 255 0 0", True), ("OFF", "", False)]
+)
+def test_other_colours_of_an_off_file_are_reported(tmp_path, caplog, head, behind, warned):
+    path = tmp_path / "a.off"
+    faces = OFF_FACES.replace("\n", f"{behind}\n")
+    path.write_text(f"{head}\n4 4 6\n" + "\n".join(CORNERS) + f"\n{faces}")
+    assert not load_mesh(path).has_colors
+    assert ("colours of its faces aren't read" in caplog.text) == warned

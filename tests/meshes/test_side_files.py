@@ -83,6 +83,18 @@ def test_an_obj_with_coordinates_and_no_material_is_grey(head, tmp_path):
     np.testing.assert_array_equal(cloud.colors, HALF)
 
 
+@pytest.mark.parametrize("before", ["", "-s 1 1 1 ", "-clamp on -bm 0.5 ", "-o 0.0 -1 -imfchan r "])
+def test_options_of_a_texture_are_no_part_of_its_name(before, tmp_path, caplog):
+    (tmp_path / "a.mtl").write_text(f"newmtl m\nmap_Kd {before}my pictures/a 1.png\n")
+    (tmp_path / "a.obj").write_text("mtllib a.mtl\n" + TRIANGLE)
+    (tmp_path / "my pictures").mkdir()
+    (tmp_path / "my pictures/a 1.png").write_bytes(png(np.uint8([[0x80]])))
+    mesh = load_mesh(tmp_path / "a.obj")
+    color = surface_colors(mesh, np.array([0]), np.full((1, 3), 1 / 3))
+    np.testing.assert_allclose(color, HALF, atol=2e-3)
+    assert not caplog.text
+
+
 @pytest.mark.parametrize("name", ["p.png", "p.exr", "P.PNG "])
 @pytest.mark.parametrize("content", [b"", b"not a picture"])
 def test_a_texture_of_an_obj_that_is_no_picture_is_refused(name, content, tmp_path):

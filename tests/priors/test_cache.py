@@ -1,5 +1,7 @@
-"""The prior runs once per (prior, options, prompt, seed) and folder."""
+"""The prior runs once per (prior, options, their files, prompt, seed) and folder."""
 
+import importlib.util
+import os
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,7 +10,7 @@ import pytest
 from threestudio_gaussiandreamer.formats.ply import read_points
 from threestudio_gaussiandreamer.gaussians.point_cloud import PointCloud
 from threestudio_gaussiandreamer.host import BaseObject
-from threestudio_gaussiandreamer.priors.cache import cached_cloud
+from threestudio_gaussiandreamer.priors.cache import cache_key, cached_cloud
 
 
 class CountingPrior(BaseObject):
@@ -57,3 +59,60 @@ def test_a_damaged_cache_is_ignored_and_no_folder_means_no_cache(tmp_path):
     cached_cloud(CountingPrior({}), "a fox", tmp_path)
     cached_cloud(CountingPrior({}), "a fox", None)
     assert CountingPrior.calls == 3
+
+
+class FilePrior(CountingPrior):
+    @dataclass
+    class Config(CountingPrior.Config):
+        source: str = ""
+
+
+def test_a_changed_file_runs_the_prior_again(tmp_path):
+    """A mesh that was mended, or weights in a folder that were replaced."""
+    (tmp_path / "models").mkdir()
+    file = tmp_path / "models" / "a.ply"
+    for source in (file, tmp_path / "models"):
+        file.write_text("red")
+        FilePrior.calls = 0
+        for text in ("red", "red", "redder"):
+            if file.read_text() != text:
+                file.write_text(text)
+            cached_cloud(
+                FilePrior({"source": str(source)}), "a fox", tmp_path / f"save {source.name}"
+            )
+        os.utime(file, ns=(1, 1))  # as long as before
+        cached_cloud(FilePrior({"source": str(source)}), "a fox", tmp_path / f"save {source.name}")
+        assert FilePrior.calls == 3
+
+
+@pytest.mark.parametrize("source", ["grey", "", "no\0name", "~nobody/x", 300 * "x"])
+def test_other_texts_are_no_files(source):
+    assert cache_key(FilePrior({"source": source}), "") == cache_key(
+        FilePrior({"source": source}), ""
+    )
+
+
+def test_changed_code_runs_the_prior_again(tmp_path):
+    """Of a file, and of another file of the same package."""
+
+    def key_of(path) -> str:
+        spec = importlib.util.spec_from_file_location("parts_of_a_user", path)
+        module = importlib.util.module_from_spec(spec)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setitem(importlib.import_module("sys").modules, spec.name, module)
+            spec.loader.exec_module(module)
+            return cache_key(module.Own({}), "")
+
+    code = f"from {__name__} import CountingPrior\nclass Own(CountingPrior):\n    pass\n"
+    path = tmp_path / "own.py"
+    path.write_text(code)
+    (tmp_path / "shapes.py").write_text("a = 1\n")
+    first = key_of(path)
+    (tmp_path / "shapes.py").write_text("a = 2\n")
+    assert key_of(path) == first
+    path.write_text(code + "# other\n")
+    second = key_of(path)
+    (tmp_path / "__init__.py").touch()
+    third = key_of(path)
+    (tmp_path / "shapes.py").write_text("a = 3\n")
+    assert len({first, second, third, key_of(path)}) == 4

@@ -188,6 +188,24 @@ class TestValidation:
         with pytest.raises(UserError, match="function returned list; expected a PointCloud"):
             points_of(lambda prompt: [], "a toy")
 
+    @pytest.mark.parametrize(
+        ("faces", "message"),
+        [
+            ([[0, 1, 9999]], "faces of the points 0 to 9999"),
+            ([[-1, 0, 1]], "faces of the points -1 to 1"),
+            ([[0, 1]], r"faces \(1, 2\) of type int64; expected integers"),
+            (np.zeros((2, 3), np.float32), r"faces \(2, 3\) of type float32"),
+        ],
+    )
+    def test_faces_of_other_points_are_refused(self, faces, message):
+        with pytest.raises(UserError, match=f"x gave {message}"):
+            validated(self.cloud()._replace(faces=faces), "x")
+
+    def test_faces_may_be_a_list(self):
+        cloud = self.cloud(bad=[0])._replace(faces=[[0, 1, 2], [1, 2, 3]])
+        # the face with the dropped point is dropped too, and the rows of the other are renumbered
+        np.testing.assert_array_equal(validated(cloud, "x").faces, [[0, 1, 2]])
+
     def test_empty_and_misshapen_clouds_are_refused(self):
         with pytest.raises(UserError, match="no points"):
             validated(PointCloud(points=np.zeros((0, 3)), colors=np.zeros((0, 3))), "x")

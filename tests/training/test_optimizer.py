@@ -8,6 +8,7 @@ from threestudio_gaussiandreamer import register_parts
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.launch.config import load_config
 from threestudio_gaussiandreamer.launch.experiment import main
+from threestudio_gaussiandreamer.training.geometry import GaussianCloud
 from threestudio_gaussiandreamer.training.optimizer import check_optimizer
 
 COLOR = "background.env_color"
@@ -114,3 +115,24 @@ def test_only_optimisers_that_can_train_are_named():
     for name in named:
         check_optimizer({"name": name})
     assert not {"Optimizer", "LBFGS", "SparseAdam", "Muon"} & set(named)
+
+
+def test_a_parameter_of_an_own_geometry_is_not_left_untrained(
+    tmp_path, painted_box, capsys, monkeypatch
+):
+    def configure(self):
+        once(self)
+        self.bright = torch.nn.Parameter(torch.zeros(1))
+
+    once = GaussianCloud.configure
+    monkeypatch.setattr(GaussianCloud, "configure", configure)
+    assert launch(tmp_path, painted_box, "system.geometry.prior.path=missing.glb") == 2
+    assert "has the parameter bright without a learning rate" in capsys.readouterr().err
+    groups = GaussianCloud.parameter_groups
+    own = [{"name": "bright", "lr": 0.1}]
+    monkeypatch.setattr(
+        GaussianCloud,
+        "parameter_groups",
+        lambda self: groups(self) + [{"params": [self.bright]} | group for group in own],
+    )
+    assert launch(tmp_path, painted_box, "trainer.max_steps=1") == 0

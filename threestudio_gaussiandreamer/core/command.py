@@ -57,7 +57,8 @@ def joined_values(
     """
     joined: list[str] = []
     for word in sys.argv[1:] if argv is None else argv:
-        if joined and joined[-1] in options and word in values:
+        # a wrong "-z" too, so that it is a wrong value and no missing one
+        if joined and joined[-1] in options and {word, word.lstrip("-")} & {*values}:
             joined[-1] += f"={word}"
         else:
             joined.append(word)

@@ -33,8 +33,11 @@ def existing_file(path: str | os.PathLike, kind: str, bundled: Collection[str] =
         path = Path(path).expanduser()
         if path.is_file():
             return path
-        reason = "is a folder, not a file" if path.is_dir() else "does not exist"
-        neighbours = near_names(path, bundled)
+        if path.is_dir():
+            reason = "is a folder, not a file"
+        else:
+            reason = "is no regular file" if path.exists() else "does not exist"
+        neighbours = near_names(path, bundled) if reason == "does not exist" else ""
     except (OSError, ValueError, RuntimeError) as error:
         # the name is too long or contains NUL, or "~user" names an unknown user
         raise UserError(f"{kind} {str(path)!r}: not a usable file name ({error}).") from error

@@ -11,7 +11,10 @@ deviation ``COLOR_TOLERANCE``:
     tolerance^2))
     S    = f S_i + (1 - f) S_j + f (1 - f) (m_i - m_j)(m_i - m_j)^T,   f = w_i / (w_i + w_j),   w =
          opacity x mean cross-section
-"""
+
+In the cost, f is at least ``LEAST_SHARE`` and at most 1 - ``LEAST_SHARE``. Otherwise a large
+Gaussian would be a duplicate of every small one near it, since the cost goes to 0 with the share of
+one of the two, whatever its size; it would absorb one after another and grow with each."""
 
 from collections.abc import Iterator, Mapping
 from typing import NamedTuple
@@ -31,6 +34,7 @@ DUPLICATE = 0.07
 the original, for untrained clouds too.
 """
 COLOR_TOLERANCE = 0.1
+LEAST_SHARE = 1e-3
 NEIGHBOURS = 4
 PAIRS_AT_ONCE = 2**18
 """Pairs whose properties are in memory at the same time."""
@@ -166,19 +170,22 @@ def _pairs(
     yield from torch.from_numpy(np.sort(pairs, axis=1)).split(PAIRS_AT_ONCE)
 
 
+def _shares(shapes: _Shapes, pairs: Int[Tensor, "P 2"]) -> Float[Tensor, " P"]:
+    """Return f, the first one's share of the weight of each pair."""
+    first, second = shapes.weights[pairs].unbind(1)
+    return first / (first + second)
+
+
 def _moments(
-    shapes: _Shapes, pairs: Int[Tensor, "P 2"]
-) -> tuple[Float[Tensor, " P"], Float[Tensor, "P 3"], Float[Tensor, "P 3 3"]]:
-    """Return the mean and the covariance of each pair, after the first one's share f of the
-    weight.
-    """
+    shapes: _Shapes, pairs: Int[Tensor, "P 2"], f: Float[Tensor, " P"]
+) -> tuple[Float[Tensor, "P 3"], Float[Tensor, "P 3 3"]]:
+    """Return the mean and the covariance of each pair for the first one's share f."""
     i, j = pairs.unbind(1)
-    f = shapes.weights[i] / (shapes.weights[i] + shapes.weights[j])
     apart = shapes.means[i] - shapes.means[j]
     means = shapes.means[j] + f[:, None] * apart
     weight, first, second = f[:, None, None], _covariances(shapes, i), _covariances(shapes, j)
     within = weight * first + (1 - weight) * second
-    return f, means, within + weight * (1 - weight) * apart[:, :, None] * apart[:, None]
+    return means, within + weight * (1 - weight) * apart[:, :, None] * apart[:, None]
 
 
 def _costs_of_duplicates(shapes: _Shapes, pairs: Int[Tensor, "P 2"]) -> Float[Tensor, " P"]:
@@ -196,7 +203,7 @@ def _least_costs(shapes: _Shapes, pairs: Int[Tensor, "P 2"]) -> Float[Tensor, " 
     |W + g d d^T| >= |W| (1 + g |d|^2 / trace W).
     """
     i, j = pairs.unbind(1)
-    f = shapes.weights[i] / (shapes.weights[i] + shapes.weights[j])
+    f = _shares(shapes, pairs).clamp(LEAST_SHARE, 1 - LEAST_SHARE)
     within = f * shapes.traces[i] + (1 - f) * shapes.traces[j]
     growth = torch.log1p(f * (1 - f) * (shapes.means[i] - shapes.means[j]).square().sum(1) / within)
     return 0.5 * (growth + _color_cost(shapes, pairs, f))
@@ -211,7 +218,8 @@ def _color_cost(
 
 def _costs(shapes: _Shapes, pairs: Int[Tensor, "P 2"]) -> Float[Tensor, " P"]:
     i, j = pairs.unbind(1)
-    f, _, covariances = _moments(shapes, pairs)
+    f = _shares(shapes, pairs).clamp(LEAST_SHARE, 1 - LEAST_SHARE)
+    _, covariances = _moments(shapes, pairs, f)
     growth = (
         torch.linalg.slogdet(covariances).logabsdet
         - f * shapes.log_determinants[i]
@@ -247,8 +255,13 @@ def _together(params: Mapping[str, Tensor], pairs: Int[Tensor, "P 2"]) -> dict[s
 
     params = {name: value.detach().cpu()[pairs.flatten()] for name, value in params.items()}
     shapes, pairs = _shapes(params), torch.arange(2 * len(pairs)).view(-1, 2)
-    f, means, covariances = _moments(shapes, pairs)
-    summed, product = shapes.opacities[pairs].sum(1), shapes.opacities[pairs].prod(1)
+    f = _shares(shapes, pairs)
+    means, covariances = _moments(shapes, pairs, f)
+    # one that covers less than half of the other's area adds as much less to its opacity
+    areas = (shapes.log_scales.sum(1) * (2 / 3)).exp()[pairs]
+    covered = (2 * areas / areas.amax(1, keepdim=True)).clamp(max=1)
+    spread = shapes.opacities[pairs] * covered
+    summed, product = spread.sum(1), spread.prod(1)
     opacities = summed - product
     # The composited alpha of the pair, 1 - (1 - a g)(1 - b g), falls off more slowly than g: scale
     # the covariance so that its integral over the plane is the same.

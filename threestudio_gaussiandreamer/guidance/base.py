@@ -247,7 +247,7 @@ class ScoreDistillation(ScoreModel):
         }
         out |= {f"grad_norm_{i}": norm for i, norm in enumerate(norms.unbind(0))}
         out |= {"bad_items": bad_items, "evaluations": float(self.evaluations)}
-        return out | self.report() | self.variant.report()
+        return out | _reported(self) | _reported(self.variant)
 
     def _error(
         self,
@@ -320,6 +320,21 @@ class ScoreDistillation(ScoreModel):
                 f"step {step}: the score of {count} of {len(bad)} items isn't finite; "
                 "they are left out"
             )
+
+
+def _reported(part: ScoreModel | Variant) -> dict[str, float]:
+    """Return what a guidance or a variant reports.
+
+    Raises:
+        UserError: it isn't a dictionary.
+    """
+    found = part.report()
+    if not isinstance(found, dict):
+        raise UserError(
+            f"{type(part).__name__}.report returned {type(found).__name__}; expected a dictionary "
+            "of names and numbers, {} if there is none"
+        )
+    return found
 
 
 def is_guided(cfg: Any, variant: Variant | type[Variant]) -> bool:

@@ -20,7 +20,7 @@ from ..core.options import at_least, in_range, interval, one_of, schedule
 from ..diffusion import sds
 from ..diffusion.noise_prediction import rescaled
 from ..diffusion.timesteps import SCHEDULES, scheduled_timestep
-from ..host import BaseObject, C, run_seed
+from ..host import BaseObject, C, run_seed, warn
 from .score_pictures import Noised
 
 GUIDANCE_SCALE = in_range(-1e6, 1e6)
@@ -68,7 +68,7 @@ class ScoreModel(BaseObject, ABC):
 
     def configure(self) -> None:
         self.alphas_cumprod = sds.sd_alphas_cumprod()
-        self.evaluations = 0
+        self.evaluations, self._has_warned = 0, False
 
     def update_step(self, epoch: int, global_step: int, on_load_weights: bool = False) -> None:
         """Evaluate the schedules at this step."""
@@ -90,6 +90,26 @@ class ScoreModel(BaseObject, ABC):
         """Predict the noise in z, conditional and unconditional (None if ``guidance_scale`` is 1);
         called without gradients.
         """
+
+    def _predicted(
+        self, z: Float[Tensor, "B c h w"], t: Int[Tensor, " B"], condition: Any
+    ) -> tuple[Float[Tensor, "B c h w"], Optional[Float[Tensor, "B c h w"]]]:
+        """Call ``predict``, and check what it returns: a smaller tensor would be broadcast.
+
+        Raises:
+            UserError: it isn't a pair of predictions in the shape of z.
+        """
+        found = self.predict(z, t, condition)
+        entries = found if isinstance(found, (tuple, list)) else [found]
+        shapes = [getattr(entry, "shape", entry) for entry in entries]
+        if entries is not found or shapes not in ([z.shape, z.shape], [z.shape, None]):
+            what = " and ".join(str(tuple(x)) if isinstance(x, tuple) else repr(x) for x in shapes)
+            raise UserError(
+                f"{type(self).__name__}.predict returned {'' if entries is found else 'only '}"
+                f"{what}; expected a pair, the conditional and the unconditional prediction (or "
+                f"None), of the shape {tuple(z.shape)} of the noisy latents"
+            )
+        return found
 
     def select(self, condition: Any, rows: Int[Tensor, " R"]) -> Any:
         """Return the conditions of some items. Conditions that are None, a tensor or a list with
@@ -147,8 +167,14 @@ class ScoreModel(BaseObject, ABC):
             rescale: see ``recon_std_rescale``.
         """
         if scale == 1:
-            return self.predict(z, t, condition)[0].to(z)
+            return self._predicted(z, t, condition)[0].to(z)
         cond, uncond = self.both(z, t, condition)
+        if uncond is cond and not self._has_warned:
+            self._has_warned = True
+            warn(
+                f"guidance_scale={scale:g} has no effect: {type(self).__name__}.predict returns no "
+                "unconditional prediction"
+            )
         guided = sds.classifier_free(cond, uncond, scale)
         return rescaled(guided, cond, z, self.abar_of(t), rescale) if rescale else guided
 
@@ -158,14 +184,15 @@ class ScoreModel(BaseObject, ABC):
         """Predict the noise, conditional and unconditional; the same if the score model has only
         one.
         """
-        cond, uncond = self.predict(z, t, condition)
-        return cond.to(z), (cond if uncond is None else uncond).to(z)
+        cond, uncond = self._predicted(z, t, condition)
+        cond = cond.to(z)
+        return cond, cond if uncond is None else uncond.to(z)
 
     def conditional(
         self, z: Float[Tensor, "B c h w"], t: Int[Tensor, " B"], condition: Any
     ) -> Float[Tensor, "B c h w"]:
         """Predict the conditional noise alone; subclasses that can save time here override it."""
-        return self.predict(z, t, condition)[0].to(z)
+        return self._predicted(z, t, condition)[0].to(z)
 
     def unconditional(
         self, z: Float[Tensor, "B c h w"], t: Int[Tensor, " B"], condition: Any

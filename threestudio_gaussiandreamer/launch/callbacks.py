@@ -28,6 +28,8 @@ SHARE_OF_TIME = 0.01
 """Largest share of the running time that is spent on writing checkpoints."""
 SECONDS_SHOWN = 0.5
 """Time from one drawing of the progress bar to the next, seconds: one costs as much as a log."""
+LARGEST_DATA = 2**20
+"""Size in bytes up to which files beside a part's code are copied with it."""
 SOURCE_ENDINGS = (".py", ".yaml", ".h", ".cpp", ".cu", ".html", ".css", ".js", ".glsl")
 
 
@@ -92,19 +94,28 @@ class RunRecord(pl.Callback):
         package = Path(__file__).parents[1]
         copy_sources(package, self.folder / "code" / package.name)
         if Path("custom").is_dir():
-            copy_sources(Path("custom"), self.folder / "code" / "custom")
+            copy_sources(Path("custom"), self.folder / "code" / "custom", data=True)
 
 
-def copy_sources(source: Path, destination: Path) -> None:
+def copy_sources(source: Path, destination: Path, data: bool = False) -> None:
     """Copy the source files below a folder, leaving out hidden files and folders, everything that
     isn't source, and, with a warning, what can't be read.
+
+    Args:
+        data: copy other files too, which a part may read; larger ones are named in a warning.
     """
     for folder, folders, names in os.walk(source):
         folders[:] = [name for name in folders if not name.startswith((".", "__pycache__"))]
         for name in names:
             path = Path(folder, name)
-            if name.startswith(".") or not name.endswith(SOURCE_ENDINGS) or not path.is_file():
+            if name.startswith(".") or not path.is_file():
                 continue  # such as an editor's lock (a broken link) or a FIFO
+            if not name.endswith(SOURCE_ENDINGS):
+                if not data:
+                    continue
+                if path.stat().st_size > LARGEST_DATA:
+                    warn(f"{path} isn't copied to {destination}, since it is large")
+                    continue
             try:
                 content = path.read_bytes()
             except OSError as error:

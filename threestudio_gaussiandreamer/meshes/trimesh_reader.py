@@ -2,6 +2,7 @@
 
 import io
 import logging
+import re
 from pathlib import Path
 from typing import Any, Optional
 
@@ -21,6 +22,11 @@ MATERIALS = ".mtl"
 
 UNSET_COLOR = (102, 102, 102)
 """trimesh's default for materials without a colour; ignored, since it would darken the texture."""
+
+TEXTURE_OPTIONS = re.compile(
+    r"^\s*(-[a-z]+\s+((on|off|[rgbmlz]|sphere|cube_[a-z]+|[-+.\de]+)\s+)+)+", re.IGNORECASE
+)
+"""Options in front of the name of a texture in an OBJ's material, such as ``-clamp on``."""
 
 log = logging.getLogger(__name__)
 
@@ -54,6 +60,8 @@ def _parts(path: Path, budget: Budget) -> list[Mesh]:
     )
     if files.refused:
         raise files.refused
+    if path.suffix.lower() == ".off":
+        _add_off_colors(scene, path)
     parts = []
     for node in scene.graph.nodes_geometry:
         world, name = scene.graph[node]
@@ -62,6 +70,28 @@ def _parts(path: Path, budget: Budget) -> list[Mesh]:
             part = _colored(_surface(geometry, path, budget), geometry, files)
             parts.append(part._replace(vertices=_placed(part.vertices, world)))
     return parts
+
+
+def _add_off_colors(scene: Any, path: Path) -> None:
+    """Set the colours of an OFF file's vertices, which trimesh doesn't read; log a warning for
+    those of faces, which aren't read here either.
+    """
+    lines = [
+        line.partition("#")[0].split() for line in path.read_text(errors="replace").split("\n")
+    ]
+    (kind, *counts), *lines = filter(None, lines)
+    (vertices, faces, *_), *lines = [counts, *lines] if counts else lines
+    rows, polygons = lines[: int(vertices)], lines[int(vertices) :][: int(faces)]
+    if any(len(polygon) > int(polygon[0]) + 1 for polygon in polygons):
+        log.warning(
+            "%s: the colours of its faces aren't read; convert it to PLY to keep them", path
+        )
+    (geometry,) = scene.geometry.values()
+    if kind.upper() in ("OFF", "COFF") and {len(row) for row in rows} <= {6, 7}:
+        colors = np.array([row[3:6] for row in rows], float)
+        is_byte = all(text.isdigit() for row in rows for text in row[3:6])
+        colors = (colors if is_byte else 255 * colors).round().clip(0, 255)
+        geometry.visual.vertex_colors = colors.astype(np.uint8)
 
 
 class _Resolver:
@@ -78,7 +108,7 @@ class _Resolver:
 
     def get(self, name: str) -> bytes:
         try:
-            content = self._files.read(name)
+            content = self._files.read(TEXTURE_OPTIONS.sub("", name))
             if content is not None and not name.strip().lower().endswith(MATERIALS):
                 # trimesh would read the part without a texture that can't be opened
                 open_texture(content, repr(name[:80]), self.budget)

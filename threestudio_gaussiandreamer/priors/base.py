@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 from typing import Any, Optional
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ..core.errors import UserError
@@ -213,8 +213,8 @@ def validated(cloud: PointCloud, name: str) -> PointCloud:
 
     Raises:
         UserError: it isn't a PointCloud, there are no points, points, colours and normals aren't
-            all arrays (P, 3), more than 5 % of the rows are not finite, or most colours are far
-            outside [0, 1], as those from 0 to 255 are.
+            all arrays (P, 3), faces don't name three of the points each, more than 5 % of the rows
+            are not finite, or most colours are far outside [0, 1], as those from 0 to 255 are.
     """
     if not isinstance(cloud, PointCloud):
         raise UserError(f"{name} returned {type(cloud).__name__}; expected a PointCloud")
@@ -231,6 +231,8 @@ def validated(cloud: PointCloud, name: str) -> PointCloud:
         )
     if not len(points):
         raise UserError(f"{name} gave no points: its source is empty")
+    if cloud.faces is not None:
+        cloud = cloud._replace(faces=_valid_faces(cloud.faces, len(points), name))
     finite = np.isfinite(points).all(axis=1) & np.isfinite(colors).all(axis=1)
     if bad := int((~finite).sum()):
         report_non_finite(bad, len(points), name)
@@ -250,6 +252,24 @@ def _as_array(values: Any, name: str) -> Float[np.ndarray, "..."]:
         raise UserError(
             f"{name} gave something else than arrays of points, colours and normals: {error}"
         ) from error
+
+
+def _valid_faces(faces: Any, count: int, name: str) -> Int[np.ndarray, "F 3"]:
+    """Return faces as an array of rows of points.
+
+    Raises:
+        UserError: they aren't, or name points that there aren't.
+    """
+    found = np.asarray(faces.detach().cpu() if isinstance(faces, Tensor) else faces)
+    if found.ndim != 2 or found.shape[1] != 3 or found.dtype.kind not in "iu":
+        raise UserError(
+            f"{name} gave faces {found.shape} of type {found.dtype}; expected integers (F, 3)"
+        )
+    if len(found) and not 0 <= found.min() <= found.max() < count:
+        raise UserError(
+            f"{name} gave faces of the points {found.min()} to {found.max()}; it has {count}"
+        )
+    return found
 
 
 def require_unit_range(colors: Float[np.ndarray, "P 3"], name: str) -> None:

@@ -1,7 +1,10 @@
 """Cache the output of the prior in the run's folder, from which a restarted run reads it."""
 
 import hashlib
+import itertools
 import json
+import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Optional
 
@@ -17,10 +20,14 @@ from ..host import info, run_seed, warn
 from .base import points_of
 from .turntable import save_turntable
 
+OURS = Path(__file__).parents[1]
+MAX_FILES = 1000
+"""Files of a folder that are compared; models have fewer."""
+
 
 def cached_cloud(prior: Any, prompt: str, save_dir: Optional[str]) -> PointCloud:
     """Return ``prior(prompt)``, read from ``save/prior/points.npz`` if that file is of the same
-    prior, options, prompt and seed.
+    prior, options, files, prompt and seed.
 
     ``points.ply`` and ``turntable.gif`` are written beside it, for inspection. If ``save_dir`` is
     None, nothing is read or written."""
@@ -48,12 +55,48 @@ def cached_cloud(prior: Any, prompt: str, save_dir: Optional[str]) -> PointCloud
 
 
 def cache_key(prior: Any, prompt: str) -> str:
-    """Return a digest of everything that the prior's output depends on."""
+    """Return a digest of everything that the prior's output depends on: also of the files that its
+    options name and of the code of its class, which a user may have changed between two runs.
+    """
     options = (
         OmegaConf.to_container(prior.cfg) if OmegaConf.is_config(prior.cfg) else vars(prior.cfg)
     )
     content = [type(prior).__module__, type(prior).__qualname__, options, prompt, run_seed()]
+    content += [*_files(options), *_code(type(prior))]
     return hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()
+
+
+def _files(options: Any) -> Iterator[tuple[str, int, int]]:
+    """Yield name, size and time of change of the files that options name, or that are below the
+    folders that they name.
+    """
+    if isinstance(options, dict):
+        options = list(options.values())
+    if isinstance(options, (list, tuple)):
+        for value in options:
+            yield from _files(value)
+    elif isinstance(options, (str, Path)) and options:
+        try:
+            path = Path(options).expanduser()
+            inside = sorted(itertools.islice(path.rglob("*"), MAX_FILES)) if path.is_dir() else []
+            for file in (path, *inside):
+                if file.is_file():
+                    yield file.name, file.stat().st_size, file.stat().st_mtime_ns
+        except (OSError, ValueError, RuntimeError):  # no usable name, or not to be read
+            return
+
+
+def _code(kind: type) -> Iterator[tuple[str, str]]:
+    """Yield name and digest of the source files of a class and those it is derived from; of another
+    package's class, of all files of that package.
+    """
+    modules = {base.__module__ for base in kind.__mro__}
+    found = [getattr(sys.modules.get(name), "__file__", None) for name in sorted(modules)]
+    for file in map(Path, filter(None, found)):
+        is_foreign = OURS not in file.parents and (file.parent / "__init__.py").is_file()
+        for source in sorted(file.parent.rglob("*.py")) if is_foreign else [file]:
+            if source.is_file():
+                yield source.name, hashlib.sha256(source.read_bytes()).hexdigest()
 
 
 def read_cache(path: Path, key: str) -> Optional[PointCloud]:

@@ -40,20 +40,23 @@ def weighted_losses(
         found = ", ".join(guided) or "nothing"
         raise UserError(f"the guidance returned no loss_*, such as loss_sds: it returned {found}")
     check_weights(weights, raw)
-    raw |= {
-        name: _of_renders(name, call(out))
-        for name, call in REGULARISERS.items()
-        if weights.get(name)
-    }
+    raw |= {name: _of_renders(name, out) for name in REGULARISERS if weights.get(name)}
     return {name: value * weights[name] for name, value in raw.items()}
 
 
-def _of_renders(name: str, value: Any) -> Float[Tensor, ""]:
-    """Return what a regulariser has returned, as a scalar.
+def _of_renders(name: str, out: Mapping[str, Any]) -> Float[Tensor, ""]:
+    """Return a regulariser of the renderer's outputs.
 
     Raises:
-        UserError: it isn't one number with a gradient.
+        UserError: it reads an output that there isn't, or doesn't return one number with a
+            gradient.
     """
+    try:
+        value = REGULARISERS[name](out)
+    except KeyError as error:
+        if error.args[0] in out:
+            raise
+        raise unknown(f"output that REGULARISERS[{name!r}] reads:", error.args[0], out) from error
     if not isinstance(value, Tensor) or value.numel() != 1 or not value.requires_grad:
         found = type(value).__name__
         if isinstance(value, Tensor):

@@ -159,8 +159,10 @@ class PartRates:
         """Return the groups of our background, and of other packages' parts that have parameters.
 
         Raises:
-            UserError: such a part has no learning rate, or there is a rate without such a part.
+            UserError: such a part has no learning rate, or there is a rate without such a part; or
+                the geometry has parameters in none of its own groups.
         """
+        _require_groups(system.geometry)
         return [group for name in PARTS for group in self._groups_of(name, getattr(system, name))]
 
     def _groups_of(self, name: str, part: Optional[torch.nn.Module]) -> Groups:
@@ -191,6 +193,19 @@ class PartRates:
         for group in optimizer.param_groups:
             if group.get("name") in self.rates:
                 group["lr"] = C(self.rates[group["name"]], epoch, step)
+
+
+def _require_groups(geometry: Any) -> None:
+    """Check that each parameter of a class that is derived from our geometry would be trained."""
+    groups, kind = geometry.parameter_groups(), type(geometry).__name__
+    trained = {id(parameter) for group in groups for parameter in group["params"]}
+    for name, parameter in geometry.named_parameters():
+        if parameter.requires_grad and parameter.numel() and id(parameter) not in trained:
+            raise UserError(
+                f"{kind} has the parameter {name} without a learning rate: define "
+                f"{kind}.parameter_groups, which adds {{'params': [...], 'name': {name!r}, "
+                "'lr': ...} to those of super()"
+            )
 
 
 def _some_group() -> dict[str, Any]:
