@@ -133,12 +133,3 @@ def test_an_error_is_in_the_log_of_its_asset(place, monkeypatch):
     monkeypatch.setattr(Worker, "_run", fails)
     assert Worker().make(JOB, setting(place))["error"] == "ValueError: no such thing"
     assert "Traceback" in (place.work_folder(JOB.row) / "log.txt").read_text()
-
-
-def test_a_part_that_ends_the_process_is_reported_as_such(place, monkeypatch):
-    def ends(*args):
-        raise SystemExit(3)
-
-    monkeypatch.setattr(Worker, "_run", ends)
-    outcome = Worker().make(JOB, setting(place))
-    assert outcome["state"] == FAILED and "ended the process: SystemExit(3)" in outcome["error"]

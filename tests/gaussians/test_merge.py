@@ -226,3 +226,13 @@ def test_a_small_gaussian_in_a_large_one_hardly_changes_it(size):
     merged = merging._together(pair, torch.tensor([[0, 1]]))
     assert merged["log_scales"].sum() == pytest.approx(pair["log_scales"][0].sum().item(), abs=0.2)
     assert merged["logit_opacities"].item() == pytest.approx(3.0, abs=0.2)
+
+
+@pytest.mark.parametrize(("opacity", "larger"), [(0.005, 0.6), (0.0001, 1.5)])
+def test_a_small_gaussian_in_a_large_faint_one_stays_opaque(opacity, larger):
+    pair = {name: value[:1].repeat(2, *[1] * (value.dim() - 1)) for name, value in shell().items()}
+    pair["log_scales"][1] += larger
+    pair["logit_opacities"] = torch.tensor([0.9, opacity]).logit()
+    merged = merge_duplicates(pair).values
+    assert len(merged["means"]) == 1 and merged["logit_opacities"].sigmoid() > 0.89
+    assert psnr(picture(merged), picture(pair)) > 45

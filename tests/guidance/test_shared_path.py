@@ -226,7 +226,7 @@ def test_bad_options_are_named_at_once(cfg, message):
     ("returned", "message"),
     [
         (lambda z: z, r"returned only \(4, 3, 6, 5\); expected a pair"),
-        (lambda z: (z[:1], None), r"returned \(1, 3, 6, 5\) and None; .* shape \(4, 3, 6, 5\)"),
+        (lambda z: (z[:1], None), r"returned \(1, 3, 6, 5\) and NoneType; .* shape \(4, 3, 6, 5\)"),
         (lambda z: (z, z[:, :1]), r"returned \(4, 3, 6, 5\) and \(4, 1, 6, 5\)"),
         (lambda z: (z, z, z), r"returned \(4, 3, 6, 5\) and .*; expected a pair"),
         (lambda z: None, "returned only None"),

@@ -53,14 +53,16 @@ def test_a_source_that_can_not_be_read_is_left_out_of_the_copy_with_a_warning(
     assert files(tmp_path / "copy") == {"part.py"}
 
 
-def test_data_beside_a_part_is_recorded_and_large_files_are_named(tmp_path, caplog):
+def test_data_beside_a_part_is_recorded_up_to_a_total_size(tmp_path, caplog):
     (tmp_path / "part").mkdir()
     for name in ("part.py", "sizes.json", ".hidden"):
         (tmp_path / "part" / name).write_text("1")
-    (tmp_path / "part/weights.npy").write_bytes(bytes(callbacks.LARGEST_DATA + 1))
-    callbacks.copy_sources(tmp_path / "part", tmp_path / "copy", data=True)
+    (tmp_path / "part/weights.npy").write_bytes(bytes(11))
+    callbacks.copy_sources(tmp_path / "part", tmp_path / "copy", 10)
     assert files(tmp_path / "copy") == {"part.py", "sizes.json"}
-    assert "weights.npy isn't copied" in caplog.text
+    assert "1 files below" in caplog.text and "weights.npy, aren't copied" in caplog.text
+    callbacks.copy_sources(tmp_path / "part", tmp_path / "all", 12)
+    assert files(tmp_path / "all") == {"part.py", "sizes.json", "weights.npy"}
 
 
 def test_a_deleted_configuration_is_stored_as_it_was_read(launch, monkeypatch):

@@ -399,6 +399,7 @@ CORNERS = ("0 0 0", "1 0 0", "0 1 0", "0 0 1")
     [
         ("COFF\n4 4 6\n", ["255 0 0 255", "0 255 0 255", "0 0 255 255", "51 51 51 0"]),
         ("OFF 4 4 6 # a comment\n\n", ["1.0 0 0", "0 1.0 0", "0 0 1.0", "0.2 0.2 0.2"]),
+        ("\ufeffCOFF\n4 4 6\n", ["1 0 0 1", "0 1 0 1", "0 0 1 1", "0.2 0.2 0.2 1"]),
     ],
 )
 def test_colours_of_an_off_files_vertices(tmp_path, head, colors):
@@ -411,11 +412,22 @@ def test_colours_of_an_off_files_vertices(tmp_path, head, colors):
 
 
 @pytest.mark.parametrize(
-    ("head", "behind", "warned"), [("OFF", " 255 0 0", True), ("OFF", "", False)]
+    ("head", "of_vertices", "of_faces", "warned"),
+    [
+        ("OFF", "", " 255 0 0", "faces"),
+        ("OFF", "", "", None),
+        ("NOFF", " 0 0 1", "", None),
+        ("CNOFF", " 0 0 1 255 0 0", "", "vertices"),
+        ("COFF", " 1 0 red", "", "vertices"),
+        ("COFF", " nan 0 0 1", "", "vertices"),
+    ],
 )
-def test_other_colours_of_an_off_file_are_reported(tmp_path, caplog, head, behind, warned):
+def test_other_colours_of_an_off_file_are_reported(
+    tmp_path, caplog, head, of_vertices, of_faces, warned
+):
     path = tmp_path / "a.off"
-    faces = OFF_FACES.replace("\n", f"{behind}\n")
-    path.write_text(f"{head}\n4 4 6\n" + "\n".join(CORNERS) + f"\n{faces}")
+    vertices = "".join(f"{corner}{of_vertices}\n" for corner in CORNERS)
+    path.write_text(f"{head}\n4 4 6\n" + vertices + OFF_FACES.replace("\n", f"{of_faces}\n"))
     assert not load_mesh(path).has_colors
-    assert ("colours of its faces aren't read" in caplog.text) == warned
+    found = f"colours of its {warned} aren't read" in caplog.text
+    assert found if warned else "colours" not in caplog.text

@@ -83,7 +83,9 @@ def test_an_obj_with_coordinates_and_no_material_is_grey(head, tmp_path):
     np.testing.assert_array_equal(cloud.colors, HALF)
 
 
-@pytest.mark.parametrize("before", ["", "-s 1 1 1 ", "-clamp on -bm 0.5 ", "-o 0.0 -1 -imfchan r "])
+@pytest.mark.parametrize(
+    "before", ["", "-s 1 1 1 ", "-clamp on -bm 0.5 ", "-o 0.0 -1 -imfchan r ", "-texres 512x512 "]
+)
 def test_options_of_a_texture_are_no_part_of_its_name(before, tmp_path, caplog):
     (tmp_path / "a.mtl").write_text(f"newmtl m\nmap_Kd {before}my pictures/a 1.png\n")
     (tmp_path / "a.obj").write_text("mtllib a.mtl\n" + TRIANGLE)

@@ -194,6 +194,7 @@ class TestValidation:
             ([[0, 1, 9999]], "faces of the points 0 to 9999"),
             ([[-1, 0, 1]], "faces of the points -1 to 1"),
             ([[0, 1]], r"faces \(1, 2\) of type int64; expected integers"),
+            ([[0, 1], [0, 1, 2]], "faces that are no array"),
             (np.zeros((2, 3), np.float32), r"faces \(2, 3\) of type float32"),
         ],
     )

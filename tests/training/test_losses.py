@@ -109,6 +109,9 @@ def test_an_output_that_there_is_not_is_named(monkeypatch):
     monkeypatch.setitem(REGULARISERS, "own", lambda out: out["comp_rbg"].mean())
     with pytest.raises(UserError, match="'own'. reads: 'comp_rbg': did you mean 'comp_rgb'"):
         weighted_losses({"loss_sds": torch.ones(())}, {"comp_rgb": 0}, {"sds": 1, "own": 2})
+    monkeypatch.setitem(REGULARISERS, "own", lambda out: {}["a table of its own"])
+    with pytest.raises(KeyError, match="a table of its own"):
+        weighted_losses({"loss_sds": torch.ones(())}, {"comp_rgb": 0}, {"sds": 1, "own": 2})
 
 
 def test_an_own_regulariser_has_another_name_than_the_guidances_losses(monkeypatch):

@@ -33,15 +33,14 @@ def existing_file(path: str | os.PathLike, kind: str, bundled: Collection[str] =
         path = Path(path).expanduser()
         if path.is_file():
             return path
-        if path.is_dir():
-            reason = "is a folder, not a file"
+        if path.exists():
+            reason = "is a folder, not a file" if path.is_dir() else "is no regular file"
         else:
-            reason = "is no regular file" if path.exists() else "does not exist"
-        neighbours = near_names(path, bundled) if reason == "does not exist" else ""
+            reason = f"does not exist{near_names(path, bundled)}"
     except (OSError, ValueError, RuntimeError) as error:
         # the name is too long or contains NUL, or "~user" names an unknown user
         raise UserError(f"{kind} {str(path)!r}: not a usable file name ({error}).") from error
-    raise UserError(f"{kind} {str(path)!r} {reason}{neighbours}")
+    raise UserError(f"{kind} {str(path)!r} {reason}")
 
 
 def near_names(path: Path, bundled: Collection[str] = ()) -> str:

@@ -100,8 +100,6 @@ class Worker:
             if earlier is not None:
                 return {"state": FINISHED, **earlier}
             return self._make(job)
-        except SystemExit as error:  # of a part; the worker would end, as if it had died
-            return outcome_of(RuntimeError(f"a part ended the process: SystemExit({error.code!r})"))
         except Exception as error:
             return outcome_of(error)
         finally:

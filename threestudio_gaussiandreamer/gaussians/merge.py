@@ -249,7 +249,7 @@ def _merged(
 
 def _together(params: Mapping[str, Tensor], pairs: Int[Tensor, "P 2"]) -> dict[str, Tensor]:
     """Compute the merged Gaussian of each pair: mean and covariance by :func:`_moments`, opacity
-    a + b - a b, and the weighted mean of the harmonics.
+    a + b - a b, less for parts that cover little of it, and the weighted mean of the harmonics.
     """
     from scipy.spatial.transform import Rotation
 
@@ -257,9 +257,10 @@ def _together(params: Mapping[str, Tensor], pairs: Int[Tensor, "P 2"]) -> dict[s
     shapes, pairs = _shapes(params), torch.arange(2 * len(pairs)).view(-1, 2)
     f = _shares(shapes, pairs)
     means, covariances = _moments(shapes, pairs, f)
-    # one that covers less than half of the other's area adds as much less to its opacity
+    # one that covers less than half of the merged area adds as much less to its opacity
     areas = (shapes.log_scales.sum(1) * (2 / 3)).exp()[pairs]
-    covered = (2 * areas / areas.amax(1, keepdim=True)).clamp(max=1)
+    merged_areas = (torch.linalg.slogdet(covariances).logabsdet / 3).exp()
+    covered = (2 * areas / merged_areas[:, None]).clamp(max=1)
     spread = shapes.opacities[pairs] * covered
     summed, product = spread.sum(1), spread.prod(1)
     opacities = summed - product

@@ -101,9 +101,11 @@ class ScoreModel(BaseObject, ABC):
         """
         found = self.predict(z, t, condition)
         entries = found if isinstance(found, (tuple, list)) else [found]
-        shapes = [getattr(entry, "shape", entry) for entry in entries]
-        if entries is not found or shapes not in ([z.shape, z.shape], [z.shape, None]):
-            what = " and ".join(str(tuple(x)) if isinstance(x, tuple) else repr(x) for x in shapes)
+        shapes = [entry.shape if isinstance(entry, Tensor) else type(entry) for entry in entries]
+        if entries is not found or shapes not in ([z.shape, z.shape], [z.shape, type(None)]):
+            what = " and ".join(
+                shape.__name__ if isinstance(shape, type) else str(tuple(shape)) for shape in shapes
+            )
             raise UserError(
                 f"{type(self).__name__}.predict returned {'' if entries is found else 'only '}"
                 f"{what}; expected a pair, the conditional and the unconditional prediction (or "

@@ -7,7 +7,7 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -28,8 +28,8 @@ SHARE_OF_TIME = 0.01
 """Largest share of the running time that is spent on writing checkpoints."""
 SECONDS_SHOWN = 0.5
 """Time from one drawing of the progress bar to the next, seconds: one costs as much as a log."""
-LARGEST_DATA = 2**20
-"""Size in bytes up to which files beside a part's code are copied with it."""
+DATA_BYTES = 2**22
+"""Total size up to which files beside the code of parts are copied with it."""
 SOURCE_ENDINGS = (".py", ".yaml", ".h", ".cpp", ".cu", ".html", ".css", ".js", ".glsl")
 
 
@@ -94,36 +94,48 @@ class RunRecord(pl.Callback):
         package = Path(__file__).parents[1]
         copy_sources(package, self.folder / "code" / package.name)
         if Path("custom").is_dir():
-            copy_sources(Path("custom"), self.folder / "code" / "custom", data=True)
+            copy_sources(Path("custom"), self.folder / "code" / "custom", DATA_BYTES)
 
 
-def copy_sources(source: Path, destination: Path, data: bool = False) -> None:
-    """Copy the source files below a folder, leaving out hidden files and folders, everything that
-    isn't source, and, with a warning, what can't be read.
+def copy_sources(source: Path, destination: Path, data_bytes: int = 0) -> None:
+    """Copy the source files below a folder, leaving out hidden files and folders, and, with a
+    warning, what can't be read.
 
     Args:
-        data: copy other files too, which a part may read; larger ones are named in a warning.
+        data_bytes: copy other files too, which a part may read, up to so many bytes in total; a
+            warning says if there are more.
     """
+    left_out = []
+    for path in _visible_files(source):
+        is_source = path.name.endswith(SOURCE_ENDINGS)
+        if not is_source and not data_bytes:
+            continue
+        try:
+            if not is_source and path.stat().st_size > data_bytes:
+                left_out.append(path)
+                continue
+            content = path.read_bytes()
+        except OSError as error:
+            warn(f"{path} isn't copied to {destination}: {error.strerror}")
+            continue
+        data_bytes -= 0 if is_source else len(content)
+        copy = destination / path.relative_to(source)
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        write_copy(copy, content)
+    if left_out:
+        warn(
+            f"{len(left_out)} files below {source}, such as {left_out[0]}, aren't copied to "
+            f"{destination}, since they are large"
+        )
+
+
+def _visible_files(source: Path) -> Iterator[Path]:
     for folder, folders, names in os.walk(source):
         folders[:] = [name for name in folders if not name.startswith((".", "__pycache__"))]
         for name in names:
             path = Path(folder, name)
-            if name.startswith(".") or not path.is_file():
-                continue  # such as an editor's lock (a broken link) or a FIFO
-            if not name.endswith(SOURCE_ENDINGS):
-                if not data:
-                    continue
-                if path.stat().st_size > LARGEST_DATA:
-                    warn(f"{path} isn't copied to {destination}, since it is large")
-                    continue
-            try:
-                content = path.read_bytes()
-            except OSError as error:
-                warn(f"{path} isn't copied to {destination}: {error.strerror}")
-                continue
-            copy = destination / path.relative_to(source)
-            copy.parent.mkdir(parents=True, exist_ok=True)
-            write_copy(copy, content)
+            if not name.startswith(".") and path.is_file():
+                yield path  # an editor's lock (a broken link) or a FIFO is no file
 
 
 def write_copy(path: Path, content: bytes) -> None:

@@ -17,17 +17,20 @@ class SideFiles:
     def __init__(self, path: Path, budget: Budget) -> None:
         self.path, self.budget = path, budget
 
-    def read(self, name: str) -> Optional[bytes]:
+    def read(self, name: str, otherwise: Optional[str] = None) -> Optional[bytes]:
         """Return the content of the file ``name``; log a warning and return None if there is none.
 
         The name is relative to the mesh's folder and may have the separators of Windows. If there
         is no such file, one with the same base name next to the mesh is read.
 
+        Args:
+            otherwise: another name to try.
+
         Raises:
             UserError: it is no regular file (a FIFO would block), or can't be read.
         """
-        relative = name.strip().replace("\\", "/").lstrip("/")
-        for candidate in (relative, relative.rpartition("/")[2]):
+        names = [x.strip().replace("\\", "/").lstrip("/") for x in (name, otherwise or name)]
+        for candidate in (x for relative in names for x in (relative, relative.rpartition("/")[2])):
             try:
                 return self._content(self.path.parent / candidate)
             except (FileNotFoundError, NotADirectoryError):

@@ -24,7 +24,7 @@ UNSET_COLOR = (102, 102, 102)
 """trimesh's default for materials without a colour; ignored, since it would darken the texture."""
 
 TEXTURE_OPTIONS = re.compile(
-    r"^\s*(-[a-z]+\s+((on|off|[rgbmlz]|sphere|cube_[a-z]+|[-+.\de]+)\s+)+)+", re.IGNORECASE
+    r"^\s*(-[a-z]+\s+((on|off|[rgbmlz]|sphere|cube_[a-z]+|[-+.\dex]+)\s+){1,3})+", re.IGNORECASE
 )
 """Options in front of the name of a texture in an OBJ's material, such as ``-clamp on``."""
 
@@ -74,24 +74,36 @@ def _parts(path: Path, budget: Budget) -> list[Mesh]:
 
 def _add_off_colors(scene: Any, path: Path) -> None:
     """Set the colours of an OFF file's vertices, which trimesh doesn't read; log a warning for
-    those of faces, which aren't read here either.
+    others, such as those of faces.
     """
-    lines = [
-        line.partition("#")[0].split() for line in path.read_text(errors="replace").split("\n")
-    ]
-    (kind, *counts), *lines = filter(None, lines)
+    text = path.read_text(encoding="utf-8-sig", errors="replace")
+    (kind, *counts), *lines = filter(
+        None, (line.partition("#")[0].split() for line in text.split("\n"))
+    )
     (vertices, faces, *_), *lines = [counts, *lines] if counts else lines
     rows, polygons = lines[: int(vertices)], lines[int(vertices) :][: int(faces)]
-    if any(len(polygon) > int(polygon[0]) + 1 for polygon in polygons):
+    colors = _rgb_of([row[3:] for row in rows]) if kind.upper() in ("OFF", "COFF") else None
+    has_more = "C" in kind.upper() or kind.upper() == "OFF" and any(len(row) > 3 for row in rows)
+    of_faces = any(len(polygon) > int(polygon[0]) + 1 for polygon in polygons)
+    if of_faces or has_more and colors is None:
+        what = "faces" if of_faces else "vertices"
         log.warning(
-            "%s: the colours of its faces aren't read; convert it to PLY to keep them", path
+            "%s: the colours of its %s aren't read; convert it to PLY to keep them", path, what
         )
-    (geometry,) = scene.geometry.values()
-    if kind.upper() in ("OFF", "COFF") and {len(row) for row in rows} <= {6, 7}:
-        colors = np.array([row[3:6] for row in rows], float)
-        is_byte = all(text.isdigit() for row in rows for text in row[3:6])
-        colors = (colors if is_byte else 255 * colors).round().clip(0, 255)
-        geometry.visual.vertex_colors = colors.astype(np.uint8)
+    if colors is not None:
+        (geometry,) = scene.geometry.values()
+        geometry.visual.vertex_colors = colors
+
+
+def _rgb_of(rows: list[list[str]]) -> Optional[np.ndarray]:
+    """Return colours, written from 0 to 1 or to 255, as bytes; None if not every row has one."""
+    try:
+        colors = np.array([row[:3] for row in rows], float).reshape(-1, 3)
+    except ValueError:  # of other lengths, or no numbers
+        return None
+    if len(colors) < len(rows) or not np.isfinite(colors).all():
+        return None
+    return (colors * (255 if colors.max() <= 1 else 1)).round().clip(0, 255).astype(np.uint8)
 
 
 class _Resolver:
@@ -108,7 +120,7 @@ class _Resolver:
 
     def get(self, name: str) -> bytes:
         try:
-            content = self._files.read(TEXTURE_OPTIONS.sub("", name))
+            content = self._files.read(name, TEXTURE_OPTIONS.sub("", name))
             if content is not None and not name.strip().lower().endswith(MATERIALS):
                 # trimesh would read the part without a texture that can't be opened
                 open_texture(content, repr(name[:80]), self.budget)

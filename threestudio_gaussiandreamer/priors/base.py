@@ -260,7 +260,12 @@ def _valid_faces(faces: Any, count: int, name: str) -> Int[np.ndarray, "F 3"]:
     Raises:
         UserError: they aren't, or name points that there aren't.
     """
-    found = np.asarray(faces.detach().cpu() if isinstance(faces, Tensor) else faces)
+    try:
+        found = np.asarray(faces.detach().cpu() if isinstance(faces, Tensor) else faces)
+    except ValueError as error:  # rows of different lengths
+        raise UserError(f"{name} gave faces that are no array of integers: {error}") from error
+    if not found.size:
+        found = np.zeros((0, 3), np.int64)
     if found.ndim != 2 or found.shape[1] != 3 or found.dtype.kind not in "iu":
         raise UserError(
             f"{name} gave faces {found.shape} of type {found.dtype}; expected integers (F, 3)"

@@ -11,6 +11,7 @@ from typing import Any, Optional
 import numpy as np
 from omegaconf import OmegaConf
 
+from .. import __version__
 from ..core.errors import UserError
 from ..core.files import atomic_file
 from ..formats.array_files import read_arrays
@@ -55,14 +56,15 @@ def cached_cloud(prior: Any, prompt: str, save_dir: Optional[str]) -> PointCloud
 
 
 def cache_key(prior: Any, prompt: str) -> str:
-    """Return a digest of everything that the prior's output depends on: also of the files that its
-    options name and of the code of its class, which a user may have changed between two runs.
+    """Return a digest of what the prior's output depends on: also of the files that its options
+    name (but not of those that these name, such as textures) and of the code of its class, which
+    may have changed between two runs.
     """
     options = (
         OmegaConf.to_container(prior.cfg) if OmegaConf.is_config(prior.cfg) else vars(prior.cfg)
     )
     content = [type(prior).__module__, type(prior).__qualname__, options, prompt, run_seed()]
-    content += [*_files(options), *_code(type(prior))]
+    content += [__version__, *_files(options), *_code(type(prior))]
     return hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()
 
 
@@ -88,15 +90,17 @@ def _files(options: Any) -> Iterator[tuple[str, int, int]]:
 
 def _code(kind: type) -> Iterator[tuple[str, str]]:
     """Yield name and digest of the source files of a class and those it is derived from; of another
-    package's class, of all files of that package.
+    package's class, of all files in its folder if that is a package.
     """
     modules = {base.__module__ for base in kind.__mro__}
     found = [getattr(sys.modules.get(name), "__file__", None) for name in sorted(modules)]
     for file in map(Path, filter(None, found)):
         is_foreign = OURS not in file.parents and (file.parent / "__init__.py").is_file()
         for source in sorted(file.parent.rglob("*.py")) if is_foreign else [file]:
-            if source.is_file():
+            try:
                 yield source.name, hashlib.sha256(source.read_bytes()).hexdigest()
+            except OSError:  # not to be read
+                continue
 
 
 def read_cache(path: Path, key: str) -> Optional[PointCloud]:

@@ -44,6 +44,17 @@ def weighted_losses(
     return {name: value * weights[name] for name, value in raw.items()}
 
 
+class _Outputs(dict):
+    """The renderer's outputs for a regulariser; a missing one is named."""
+
+    def __init__(self, reader: str, out: Mapping[str, Any]) -> None:
+        super().__init__(out)
+        self.reader = reader
+
+    def __missing__(self, name: str) -> None:
+        raise unknown(f"output that REGULARISERS[{self.reader!r}] reads:", name, self)
+
+
 def _of_renders(name: str, out: Mapping[str, Any]) -> Float[Tensor, ""]:
     """Return a regulariser of the renderer's outputs.
 
@@ -51,12 +62,7 @@ def _of_renders(name: str, out: Mapping[str, Any]) -> Float[Tensor, ""]:
         UserError: it reads an output that there isn't, or doesn't return one number with a
             gradient.
     """
-    try:
-        value = REGULARISERS[name](out)
-    except KeyError as error:
-        if error.args[0] in out:
-            raise
-        raise unknown(f"output that REGULARISERS[{name!r}] reads:", error.args[0], out) from error
+    value = REGULARISERS[name](_Outputs(name, out))
     if not isinstance(value, Tensor) or value.numel() != 1 or not value.requires_grad:
         found = type(value).__name__
         if isinstance(value, Tensor):

@@ -35,7 +35,7 @@ class EmbeddedPage(NamedTuple):
         content = html.escape(self.content).encode("ascii", "xmlcharrefreplace").decode()
         return (
             f'<iframe srcdoc="{content}" allow="fullscreen" '
-            f'sandbox="allow-scripts allow-downloads" width="100%" height="{self.height}" '
+            f'sandbox="allow-scripts allow-downloads" width="100%" height="{int(self.height)}" '
             'style="border: 0"></iframe>'
         )
 
@@ -59,7 +59,7 @@ def show(path: str | os.PathLike, *, height: int = 480, **options: Any) -> Embed
     source = _source(path)
     written = source.with_name("view.html")
     if is_folder(path) and not options and written.is_file():
-        content = written.read_text()  # shows the first cloud too
+        content = written.read_text(encoding="utf-8")  # shows the first cloud too
     else:
         content = page(*cloud_page(source, **options))
     if len(content) > MAX_BYTES:
