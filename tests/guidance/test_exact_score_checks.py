@@ -35,7 +35,7 @@ def test_a_picture_that_cant_be_pooled_to_the_latent_is_refused_before_the_mesh_
     options = BANK | {"mesh": "no.glb", "space": "latent", "latent_size": 33}
     with pytest.raises(UserError, match="pictures of 64x64 can't be pooled to a latent 33 high"):
         ExactScoreGuidance(options | {"image_size": 64})
-    ExactScoreGuidance.preflight(options | {"image_size": 66})
+    ExactScoreGuidance.preflight(options | {"mesh": "toy.glb", "image_size": 66})
 
 
 def test_guidance_without_a_direction_is_warned_of(monkeypatch):
