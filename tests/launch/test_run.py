@@ -61,6 +61,9 @@ def test_data_beside_a_part_is_recorded_up_to_a_total_size(tmp_path, caplog):
     callbacks.copy_sources(tmp_path / "part", tmp_path / "copy", 10)
     assert files(tmp_path / "copy") == {"part.py", "sizes.json"}
     assert "1 files below" in caplog.text and "weights.npy, aren't copied" in caplog.text
+    caplog.clear()
+    callbacks.copy_sources(tmp_path / "part", tmp_path / "exact", 1)  # nothing is left then
+    assert "1 files below" in caplog.text
     callbacks.copy_sources(tmp_path / "part", tmp_path / "all", 12)
     assert files(tmp_path / "all") == {"part.py", "sizes.json", "weights.npy"}
 

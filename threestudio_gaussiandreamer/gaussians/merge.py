@@ -55,6 +55,8 @@ class _Shapes(NamedTuple):
     """Of the covariances."""
     log_determinants: Float[Tensor, " N"]
     opacities: Float[Tensor, " N"]
+    areas: Float[Tensor, " N"]
+    """The mean cross-sections, without a common factor."""
     weights: Float[Tensor, " N"]
     colors: Float[Tensor, "N 3"]
 
@@ -117,10 +119,12 @@ def _shapes(params: Mapping[str, Tensor]) -> _Shapes:
     opacities = logits.sigmoid()
     harmonics = params["sh0"] if "sh0" in params else params["sh"]
     colors = C0 * harmonics[:, 0].detach().cpu().double()
-    weights = opacities * (log_scales.sum(1) * (2 / 3)).exp()
+    areas = (log_scales.sum(1) * (2 / 3)).exp()
+    weights = opacities * areas
     traces = (2 * log_scales).exp().sum(1)
     log_determinants = 2 * log_scales.sum(1)
-    return _Shapes(means, log_scales, quats, traces, log_determinants, opacities, weights, colors)
+    sizes = (traces, log_determinants)
+    return _Shapes(means, log_scales, quats, *sizes, opacities, areas, weights, colors)
 
 
 def _covariances(shapes: _Shapes, rows: Int[Tensor, " P"]) -> Float[Tensor, "P 3 3"]:
@@ -170,10 +174,10 @@ def _pairs(
     yield from torch.from_numpy(np.sort(pairs, axis=1)).split(PAIRS_AT_ONCE)
 
 
-def _shares(shapes: _Shapes, pairs: Int[Tensor, "P 2"]) -> Float[Tensor, " P"]:
-    """Return f, the first one's share of the weight of each pair."""
+def _shares(shapes: _Shapes, pairs: Int[Tensor, "P 2"], least: float = 0.0) -> Float[Tensor, " P"]:
+    """Return f, the first one's share of the weight of each pair; at least ``least`` for both."""
     first, second = shapes.weights[pairs].unbind(1)
-    return first / (first + second)
+    return (first / (first + second)).clamp(least, 1 - least)
 
 
 def _moments(
@@ -203,7 +207,7 @@ def _least_costs(shapes: _Shapes, pairs: Int[Tensor, "P 2"]) -> Float[Tensor, " 
     |W + g d d^T| >= |W| (1 + g |d|^2 / trace W).
     """
     i, j = pairs.unbind(1)
-    f = _shares(shapes, pairs).clamp(LEAST_SHARE, 1 - LEAST_SHARE)
+    f = _shares(shapes, pairs, LEAST_SHARE)
     within = f * shapes.traces[i] + (1 - f) * shapes.traces[j]
     growth = torch.log1p(f * (1 - f) * (shapes.means[i] - shapes.means[j]).square().sum(1) / within)
     return 0.5 * (growth + _color_cost(shapes, pairs, f))
@@ -218,7 +222,7 @@ def _color_cost(
 
 def _costs(shapes: _Shapes, pairs: Int[Tensor, "P 2"]) -> Float[Tensor, " P"]:
     i, j = pairs.unbind(1)
-    f = _shares(shapes, pairs).clamp(LEAST_SHARE, 1 - LEAST_SHARE)
+    f = _shares(shapes, pairs, LEAST_SHARE)
     _, covariances = _moments(shapes, pairs, f)
     growth = (
         torch.linalg.slogdet(covariances).logabsdet
@@ -258,9 +262,8 @@ def _together(params: Mapping[str, Tensor], pairs: Int[Tensor, "P 2"]) -> dict[s
     f = _shares(shapes, pairs)
     means, covariances = _moments(shapes, pairs, f)
     # one that covers less than half of the merged area adds as much less to its opacity
-    areas = (shapes.log_scales.sum(1) * (2 / 3)).exp()[pairs]
     merged_areas = (torch.linalg.slogdet(covariances).logabsdet / 3).exp()
-    covered = (2 * areas / merged_areas[:, None]).clamp(max=1)
+    covered = (2 * shapes.areas[pairs] / merged_areas[:, None]).clamp(max=1)
     spread = shapes.opacities[pairs] * covered
     summed, product = spread.sum(1), spread.prod(1)
     opacities = summed - product

@@ -105,10 +105,10 @@ def copy_sources(source: Path, destination: Path, data_bytes: int = 0) -> None:
         data_bytes: copy other files too, which a part may read, up to so many bytes in total; a
             warning says if there are more.
     """
-    left_out = []
+    has_data, left_out = data_bytes > 0, []
     for path in _visible_files(source):
         is_source = path.name.endswith(SOURCE_ENDINGS)
-        if not is_source and not data_bytes:
+        if not is_source and not has_data:
             continue
         try:
             if not is_source and path.stat().st_size > data_bytes:

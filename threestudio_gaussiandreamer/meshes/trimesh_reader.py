@@ -51,9 +51,9 @@ def read_with_trimesh(path: Path) -> list[Mesh]:
 def _parts(path: Path, budget: Budget) -> list[Mesh]:
     import trimesh
 
-    files = _Resolver(path, budget)
+    files, content = _Resolver(path, budget), path.read_bytes()
     scene = trimesh.load_scene(
-        io.BytesIO(path.read_bytes()),
+        io.BytesIO(content),
         file_type=path.suffix.lower().lstrip("."),
         resolver=files,
         process=False,
@@ -61,7 +61,7 @@ def _parts(path: Path, budget: Budget) -> list[Mesh]:
     if files.refused:
         raise files.refused
     if path.suffix.lower() == ".off":
-        _add_off_colors(scene, path)
+        _add_off_colors(scene, content.decode("utf-8-sig", errors="replace"), path)
     parts = []
     for node in scene.graph.nodes_geometry:
         world, name = scene.graph[node]
@@ -72,13 +72,12 @@ def _parts(path: Path, budget: Budget) -> list[Mesh]:
     return parts
 
 
-def _add_off_colors(scene: Any, path: Path) -> None:
+def _add_off_colors(scene: Any, text: str, path: Path) -> None:
     """Set the colours of an OFF file's vertices, which trimesh doesn't read; log a warning for
     others, such as those of faces.
     """
-    text = path.read_text(encoding="utf-8-sig", errors="replace")
     (kind, *counts), *lines = filter(
-        None, (line.partition("#")[0].split() for line in text.split("\n"))
+        None, (line.partition("#")[0].split() for line in text.splitlines())
     )
     (vertices, faces, *_), *lines = [counts, *lines] if counts else lines
     rows, polygons = lines[: int(vertices)], lines[int(vertices) :][: int(faces)]

@@ -168,12 +168,7 @@ class PartRates:
     def _groups_of(self, name: str, part: Optional[torch.nn.Module]) -> Groups:
         ours, own = isinstance(part, FlatBackground), GROUP.format(name)
         groups = part.parameter_groups() if ours else []
-        with_rate = {id(parameter) for group in groups for parameter in group["params"]}
-        trained = [
-            parameter
-            for parameter in (() if part is None else part.parameters())
-            if parameter.requires_grad and id(parameter) not in with_rate
-        ]
+        trained = [] if part is None else [*_without_group(part, groups).values()]
         if trained and own not in self.rates:
             raise UserError(
                 f"{type(part).__name__} has parameters without a learning rate: set "
@@ -195,12 +190,21 @@ class PartRates:
                 group["lr"] = C(self.rates[group["name"]], epoch, step)
 
 
+def _without_group(part: torch.nn.Module, groups: Groups) -> dict[str, torch.nn.Parameter]:
+    """Return the trainable parameters of a part, by name, that are in none of these groups."""
+    grouped = {id(parameter) for group in groups for parameter in group["params"]}
+    return {
+        name: parameter
+        for name, parameter in part.named_parameters()
+        if parameter.requires_grad and id(parameter) not in grouped
+    }
+
+
 def _require_groups(geometry: Any) -> None:
     """Check that each parameter of a class that is derived from our geometry would be trained."""
-    groups, kind = geometry.parameter_groups(), type(geometry).__name__
-    trained = {id(parameter) for group in groups for parameter in group["params"]}
-    for name, parameter in geometry.named_parameters():
-        if parameter.requires_grad and parameter.numel() and id(parameter) not in trained:
+    kind = type(geometry).__name__
+    for name, parameter in _without_group(geometry, geometry.parameter_groups()).items():
+        if parameter.numel():
             raise UserError(
                 f"{kind} has the parameter {name} without a learning rate: define "
                 f"{kind}.parameter_groups, which adds {{'params': [...], 'name': {name!r}, "

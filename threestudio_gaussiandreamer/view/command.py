@@ -26,7 +26,7 @@ from .gallery import write_gallery
 from .live import LiveView, require_server, serve, serve_until_stopped
 from .page import write_page
 from .reading import read_any
-from .run_files import RunFiles, is_run
+from .run_files import RunFiles, cloud_file, is_run
 from .run_index import write_index
 
 LONG_WORK = 200_000
@@ -130,17 +130,7 @@ def served(args: argparse.Namespace) -> LiveView:
     if given := [name for name in PAGE_OPTIONS if _value(args, name) is not None]:
         raise UserError(f"{' '.join(given)}: is for the page that --html writes")
     require_server(args.host, args.port)
-    name = args.path
-    if is_folder(name):
-        folder = Path(name).expanduser()
-        found = RunFiles(folder).cloud if is_run(folder) else None
-        if found is None:
-            raise UserError(
-                f"{args.path!r} is no run with an exported cloud: name a file or a run, or give "
-                "--html for the gallery of a folder of runs"
-            )
-        name = str(found)
-    source = existing_file(name, "file of Gaussians or checkpoint")
+    source = cloud_file(args.path, ", or give --html for the gallery of a folder of runs")
     return serve(read_any(source, args.up), args.host, args.port, args.title or source.name)
 
 

@@ -8,14 +8,13 @@ without a network, and is stored with the notebook."""
 
 import html
 import os
-from pathlib import Path
 from typing import Any, NamedTuple
 
 from ..core.errors import UserError
-from ..core.files import existing_file, is_folder
+from ..core.files import is_folder
 from .cloud_page import cloud_page
 from .page import page
-from .run_files import RunFiles
+from .run_files import cloud_file
 
 MAX_BYTES = 20_000_000
 """Colab doesn't show an output that is larger."""
@@ -56,7 +55,7 @@ def show(path: str | os.PathLike, *, height: int = 480, **options: Any) -> Embed
         UserError: the run has exported no cloud, or the page is too large for a notebook; see also
             :func:`.cloud_page.cloud_page`.
     """
-    source = _source(path)
+    source = cloud_file(path)
     written = source.with_name("view.html")
     if is_folder(path) and not options and written.is_file():
         content = written.read_text(encoding="utf-8")  # shows the first cloud too
@@ -69,13 +68,3 @@ def show(path: str | os.PathLike, *, height: int = 480, **options: Any) -> Embed
             f"page to a file by `python -m threestudio_gaussiandreamer.view {source} --html`"
         )
     return EmbeddedPage(content, height)
-
-
-def _source(path: str | os.PathLike) -> Path:
-    """Return the file of Gaussians or checkpoint to show."""
-    if not is_folder(path):
-        return existing_file(path, "file of Gaussians or checkpoint")
-    found = RunFiles(Path(path).expanduser()).cloud
-    if found is None:
-        raise UserError(f"{str(path)!r} is no run with an exported cloud: name a file or a run")
-    return found

@@ -3,6 +3,7 @@
 Nothing here trusts a file: what is missing or damaged is left out."""
 
 import json
+import os
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -13,6 +14,7 @@ from typing import Any, Optional, TypeVar
 import yaml
 
 from ..core.errors import UserError
+from ..core.files import existing_file, is_folder
 from ..core.logs import warn
 from ..formats.gaussian_files import holds_gaussians, suffix_of
 from .render import RenderSettings
@@ -117,6 +119,26 @@ class RunFiles:
         psnr = found.get("psnr")
         known = isinstance(psnr, float) and step in (None, found.get("step"))
         return psnr if known else None
+
+
+def cloud_file(path: str | os.PathLike, hint: str = "") -> Path:
+    """Return the last exported cloud of a run, or the file of Gaussians or checkpoint itself.
+
+    Args:
+        hint: end of the message for a folder.
+
+    Raises:
+        UserError: the file is missing, or the folder is no run with an exported cloud.
+    """
+    if not is_folder(path):
+        return existing_file(path, "file of Gaussians or checkpoint")
+    folder = Path(path).expanduser()
+    found = RunFiles(folder).cloud if is_run(folder) else None
+    if found is None:
+        raise UserError(
+            f"{str(path)!r} is no run with an exported cloud: name a file or a run{hint}"
+        )
+    return found
 
 
 def step_of(path: Path) -> int:
