@@ -88,7 +88,7 @@ FORMATS = (
         True,
         True,
         "all attributes in float32; the notes as extras",
-        "Cesium, Babylon.js, PlayCanvas; others as points",
+        "Babylon.js, PlayCanvas; others as points; Cesium only SPZ inside",
     ),
     Format(
         "USDA, ParticleField3DGaussianSplat",

@@ -313,6 +313,28 @@ def test_other_formats_read_back_the_right_way_up(tmp_path, name):
     np.testing.assert_allclose(read.means, means[order], atol=0.01)
 
 
+def test_a_glb_has_spz_inside_on_demand(tmp_path):
+    (output,) = build("glb-exporter", geometry(60, 1), spz=True)()
+    path = write(output, tmp_path)
+    assert b"KHR_gaussian_splatting_compression_spz_2" in path.read_bytes()
+    assert len(read_cloud(str(path)).gaussians.means) == 60
+
+
+def test_the_axis_of_a_mesh_is_for_its_obj(monkeypatch, tmp_path):
+    """glTF is y up by definition, whatever ``up`` says."""
+    pytest.importorskip("skimage")
+    source, rng = geometry(400, 0), torch.Generator().manual_seed(1)
+    source.means.data = torch.rand(400, 3, generator=rng) * torch.tensor([0.3, 0.5, 2.0])
+    source.log_scales.data[:], source.logit_opacities.data[:] = -3, 4
+    small = dict(method="density", resolution=32, views=8, view_size=64, texture=64, faces=200)
+    outputs = build("gaussiandreamer-mesh-exporter", source, up="z", **small)()
+    tall = {
+        output.save_name: np.ptp(output.params["mesh"].vertices, axis=0).argmax()
+        for output in outputs
+    }
+    assert tall == {"mesh.glb": 1, "mesh.obj": 2}
+
+
 def test_the_version_of_spz_is_an_option(tmp_path):
     pytest.importorskip("zstandard")
     (output,) = build("spz-exporter", version=4)()

@@ -8,16 +8,21 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from tests.helpers.object_clouds import assert_close, ball
+from tests.helpers.object_clouds import assert_close, ball, in_order_of
 from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.formats.gaussian_files import StoredCloud, read_cloud, write_cloud
 from threestudio_gaussiandreamer.formats.glb import load_glb, read_glb, write_glb
+from threestudio_gaussiandreamer.formats.spz import spz_arrays
 from threestudio_gaussiandreamer.gaussians.axes import rotate
-from threestudio_gaussiandreamer.meshes.colors import srgb_to_linear
+from threestudio_gaussiandreamer.gaussians.sh import C0, rgb_to_sh0, sh0_colors, sh0_to_rgb
+from threestudio_gaussiandreamer.meshes.colors import linear_to_srgb, srgb_to_linear
 from threestudio_gaussiandreamer.meshes.gltf import read_gltf
 from threestudio_gaussiandreamer.meshes.load import load_mesh
 
 PRIMITIVE = ("meshes", 0, "primitives", 0)
 SPLATTING = (*PRIMITIVE, "extensions", "KHR_gaussian_splatting")
+SPZ = "KHR_gaussian_splatting_compression_spz_2"
+SPZ_ROUNDING = {"means": 1e-3, "log_scales": 0.04, "opacities": 5e-3, "sh": 0.08}
 
 
 def parsed(path):
@@ -114,15 +119,102 @@ def test_an_empty_cloud(tmp_path):
 
 
 def test_another_colour_space_is_reported(path, caplog):
-    read_glb(changed(path, ((*SPLATTING, "colorSpace"), "lin_rec709_display")))
-    assert "colours of 'lin_rec709_display' are read as sRGB" in caplog.text
+    read_glb(changed(path, ((*SPLATTING, "colorSpace"), "srgb_p3_display")))
+    assert "colours of 'srgb_p3_display' are read as sRGB" in caplog.text
+
+
+def test_linear_colours_become_display_values(tmp_path, caplog):
+    cloud = ball(50, 1)
+    cloud.sh[:, 0] = rgb_to_sh0(srgb_to_linear(sh0_colors(cloud.sh[:, 0])))
+    write_glb(tmp_path / "a.glb", cloud)
+    linear = changed(tmp_path / "a.glb", ((*SPLATTING, "colorSpace"), "lin_rec709_display"))
+    read = read_glb(linear)
+    np.testing.assert_allclose(
+        sh0_to_rgb(read.sh[:, 0]), sh0_colors(ball(50, 1).sh[:, 0]), atol=2e-3
+    )
+    # a small harmonic moves the display value as it moves the linear one
+    step = cloud._replace(sh=cloud.sh.copy())
+    step.sh[:, 0] += 1e-3 * cloud.sh[:, 1]
+    moved = linear_to_srgb(sh0_to_rgb(step.sh[:, 0])) - sh0_to_rgb(read.sh[:, 0])
+    np.testing.assert_allclose(moved, C0 * 1e-3 * read.sh[:, 1], rtol=0.05, atol=1e-5)
+    assert "linear colours become sRGB" in caplog.text
+
+
+def test_other_extensions_inside_do_no_harm(path):
+    read = read_glb(path)
+    inner = {"EXT_splat_lod": {"level": 1}, "KHR_x_compression_y": {"bufferView": 0}}
+    assert_close(read, read_glb(changed(path, ((*SPLATTING, "extensions"), inner))))
+
+
+def test_files_of_splat_transform_face_the_front(path):
+    """Their front is where the camera of a PLY with -y up is, -z."""
+    turned = read_glb(changed(path, (("asset", "generator"), "splat-transform 2.7.1")))
+    np.testing.assert_array_equal(turned.means, ball(50, 1).means * np.float32([-1, 1, -1]))
+
+
+# ---- SPZ inside ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+def test_spz_inside_is_as_cesium_reads_it(tmp_path, degree):
+    """CesiumJS needs each attribute, without OPACITY, a matrix, and SPZ's axes as they are."""
+    cloud = ball(100, degree)
+    write_cloud(str(tmp_path / "a.spz.glb"), StoredCloud(cloud, "y", antialiased=True))
+    document, binary = parsed(tmp_path / "a.spz.glb")
+    (primitive,), names = document["meshes"][0]["primitives"], {"POSITION", "COLOR_0"}
+    names |= {f"KHR_gaussian_splatting:{name}" for name in ("ROTATION", "SCALE")}
+    names |= {
+        f"KHR_gaussian_splatting:SH_DEGREE_{d}_COEF_{n}"
+        for d in range(1, degree + 1)
+        for n in range(2 * d + 1)
+    }
+    assert set(primitive["attributes"]) == names and "matrix" in document["nodes"][0]
+    assert not any("bufferView" in accessor for accessor in document["accessors"])
+    color = document["accessors"][primitive["attributes"]["COLOR_0"]]
+    assert color == {"componentType": 5121, "count": 100, "type": "VEC4", "normalized": True}
+    packed = binary[: document["bufferViews"][0]["byteLength"]]
+    read = read_cloud(str(tmp_path / "a.spz.glb"))
+    assert_close(spz_arrays(packed), read.gaussians)
+    assert read.antialiased and read.up == "y"
+    assert_close(in_order_of(cloud, read.gaussians), read.gaussians, **SPZ_ROUNDING)
+    assert (tmp_path / "a.spz.glb").stat().st_size < 40 * 100 + 8000
+
+
+def test_spz_inside_with_the_published_metadata_is_half_a_turn_away(tmp_path):
+    write_cloud(str(tmp_path / "a.spz.glb"), StoredCloud(ball(100), "y"))
+    stored = read_glb(tmp_path / "a.spz.glb")
+    turned = read_glb(changed(tmp_path / "a.spz.glb", ((*SPLATTING, "kernel"), "ellipse")))
+    np.testing.assert_array_equal(turned.means, stored.means * np.float32([-1, 1, -1]))
+
+
+def test_an_empty_cloud_with_spz(tmp_path):
+    write_cloud(str(tmp_path / "a.spz.glb"), StoredCloud(ball(0), "y"))
+    assert read_glb(tmp_path / "a.spz.glb").means.shape == (0, 3)
+
+
+@pytest.mark.parametrize(
+    ("places", "said"),
+    [
+        ([(("accessors", 0, "count"), 7)], "SPZ has 50 rows for 7 Gaussians"),
+        ([(("bufferViews", 0, "byteLength"), 99)], "SPZ file .*damaged|truncated"),
+        ([((*SPLATTING, "extensions"), {"KHR_new_compression": {}})], "compressed by KHR_new_comp"),
+        ([((*SPLATTING, "extensions", SPZ), {})], "isn't that of a glTF file"),
+    ],
+    ids=range(4),
+)
+def test_damaged_spz_inside_is_refused(tmp_path, places, said):
+    write_cloud(str(tmp_path / "a.spz.glb"), StoredCloud(ball(50), "y"))
+    with pytest.raises(UserError, match=said):
+        read_glb(changed(tmp_path / "a.spz.glb", *places))
+
+
+# ---- damaged and foreign files -------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     ("places", "said"),
     [
         ([((*SPLATTING, "kernel"), "square")], "kernel 'square'; 'ellipse' was expected"),
-        ([((*SPLATTING, "extensions"), {"KHR_spz": {}})], "compressed by KHR_spz"),
         ([((*PRIMITIVE, "extensions"), None), (("extensionsUsed",), None)], "holds no Gaussians"),
         ([((*PRIMITIVE, "attributes", "KHR_gaussian_splatting:SCALE"), None)], "lack the .*SCALE"),
         ([((*PRIMITIVE, "attributes", "KHR_gaussian_splatting:SH_DEGREE_1_COEF_1"), None)], "lack"),
@@ -134,7 +226,7 @@ def test_another_colour_space_is_reported(path, caplog):
         ([(("bufferViews", 2, "byteLength"), 10**9)], "ends after its buffer"),
         ([(("meshes", 0, "primitives"), [7])], "isn't that of a glTF file"),
     ],
-    ids=range(12),
+    ids=range(11),
 )
 def test_damaged_and_foreign_files_are_refused(path, places, said):
     with pytest.raises(UserError, match=said):
@@ -154,12 +246,17 @@ def test_many_nodes_of_one_mesh_cost_no_memory(tmp_path):
     assert peak < 8 << 20
 
 
-def test_drafts_with_logarithms_are_refused_by_name(tmp_path):
+def test_logarithms_of_drafts_are_read(tmp_path, caplog):
     cloud = ball(5)
     write_glb(tmp_path / "a.glb", cloud)
     data = (tmp_path / "a.glb").read_bytes()
     scales = np.exp(cloud.log_scales).tobytes()
     assert scales in data
     (tmp_path / "a.glb").write_bytes(data.replace(scales, cloud.log_scales.tobytes()))
-    with pytest.raises(UserError, match="drafts of the extension before 2026 stored logarithms"):
+    assert_close(cloud, read_glb(tmp_path / "a.glb"), opacities=1e-6)
+    assert "scales are read as logarithms" in caplog.text
+    one = np.exp(cloud.log_scales)
+    one[0, 0] = -1
+    (tmp_path / "a.glb").write_bytes(data.replace(scales, one.tobytes()))
+    with pytest.raises(UserError, match="some of its scales are below 0"):
         read_glb(tmp_path / "a.glb")

@@ -5,7 +5,7 @@ and written, .splat and .gltf are read; IN may also be a checkpoint. The command
 what OUT can't hold of IN, and ``--check`` measures the PSNR between them.
 
 A .glb or .obj is a textured mesh of the cloud's surface; ``--gaussians`` writes the Gaussians
-themselves into a .glb."""
+themselves into a .glb, and a .spz.glb holds them always, as SPZ, which CesiumJS needs."""
 
 import argparse
 import os

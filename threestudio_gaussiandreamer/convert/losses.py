@@ -37,6 +37,7 @@ def losses(cloud: StoredCloud, suffix: str, spz_version: int) -> Iterator[str]:
     Args:
         suffix: the format, a key of ``formats.gaussian_files.FORMATS``.
     """
+    suffix = ".spz" if suffix == ".spz.glb" else suffix
     if suffix in ROUNDING:
         yield ROUNDING[suffix]
     if cloud.gaussians.sh_degree and suffix in HARMONICS:

@@ -1,9 +1,16 @@
-"""``glb-exporter``: the Gaussians as a GLB with KHR_gaussian_splatting, for Cesium, Babylon.js
-and PlayCanvas.
+"""``glb-exporter``: the Gaussians as a GLB with KHR_gaussian_splatting, for Babylon.js and
+PlayCanvas, or with SPZ inside for Cesium.
 
-The options are those of every exporter: see ``exporters/base.py``.
+===========  ==================================================================================
+option       meaning
+===========  ==================================================================================
+save_name    name of the file in the export folder
+spz          compress by KHR_gaussian_splatting_compression_spz_2, the only kind that CesiumJS reads
+save_video   also render the turntable
+===========  ==================================================================================
 
-Nothing is rounded; y is up, as glTF requires. Programs without the extension show points."""
+Without ``spz`` nothing is rounded, and programs without the extension show points. y is up, as glTF
+requires."""
 
 from dataclasses import dataclass, field
 
@@ -13,10 +20,13 @@ from .base import SAVE_NAME, CloudExporter
 
 @register("glb-exporter")
 class GlbExporter(CloudExporter):
-    suffix = ".glb"
-
     @dataclass
     class Config(CloudExporter.Config):
         save_name: str = field(default="gaussians.glb", metadata=SAVE_NAME)
+        spz: bool = False
 
     cfg: Config
+
+    @property
+    def suffix(self) -> str:
+        return ".spz.glb" if self.cfg.spz else ".glb"

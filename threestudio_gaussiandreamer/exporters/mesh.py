@@ -5,8 +5,8 @@ and PNG. In the built-in host it is ``mesh-exporter`` too.
 option         meaning
 =============  ===================================================================================
 save_name      name of the GLB in the export folder; OBJ, MTL and PNG have the same stem
-up             the files' up axis: ``y`` (the front faces +z), as glTF and most programs that read
-               OBJ expect, or ``z`` for this package's world
+up             the OBJ's up axis: ``y`` (the front faces +z), as most programs that read OBJ expect,
+               or ``z`` for this package's world; a GLB has y up by definition
 obj            also write the OBJ with its MTL and PNG
 unlit          ask viewers to show the texture without lighting
 faces          largest number of triangles
@@ -28,6 +28,7 @@ from pathlib import Path
 from typing import List
 
 from ..core.errors import UserError
+from ..formats.glb import GLB_UP
 from ..gaussians.axes import WORLD_UP, rotation_between
 from ..host import ExporterOutput, register, register_builtin
 from ..surface.options import MeshOptions
@@ -65,16 +66,21 @@ class MeshExporter(FileExporter):
 
     def __call__(self) -> List[ExporterOutput]:
         mesh = mesh_from_gaussians(self.gaussians(), self._options())
-        rotation = rotation_between(WORLD_UP, self.cfg.up)
-        params = {
-            "mesh": mesh._replace(vertices=mesh.vertices @ rotation.T),
-            "unlit": self.cfg.unlit,
-        }
-        names = [self.cfg.save_name]
-        names += [str(Path(self.cfg.save_name).with_suffix(".obj"))] if self.cfg.obj else []
+        ups = {self.cfg.save_name: GLB_UP}
+        if self.cfg.obj:
+            ups[str(Path(self.cfg.save_name).with_suffix(".obj"))] = self.cfg.up
         return [
-            ExporterOutput(save_name=name, save_type="textured_mesh", params=params)
-            for name in names
+            ExporterOutput(
+                save_name=name,
+                save_type="textured_mesh",
+                params={
+                    "mesh": mesh._replace(
+                        vertices=mesh.vertices @ rotation_between(WORLD_UP, up).T
+                    ),
+                    "unlit": self.cfg.unlit,
+                },
+            )
+            for name, up in ups.items()
         ]
 
     def _options(self) -> MeshOptions:

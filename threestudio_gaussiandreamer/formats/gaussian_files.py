@@ -18,7 +18,7 @@ from ..gaussians.axes import AXES, VIEWER_UP, WORLD_UP, rotate, rotation_between
 from ..gaussians.gaussians import Gaussians, drawable
 from . import spz
 from .compressed_ply import is_compressed_ply, read_compressed_ply, write_compressed_ply
-from .glb import GLB_UP, load_glb, write_glb
+from .glb import GLB_UP, load_glb, write_glb, write_spz_glb
 from .ply import (
     gaussians_size,
     is_gaussian_ply,
@@ -117,6 +117,7 @@ FORMATS = {
     ".spz": CloudFormat(SPZ_UP, _read_spz, _write_spz),
     ".sog": CloudFormat(SOG_UP, _read_sog, _write_sog),
     ".glb": CloudFormat(GLB_UP, load_glb, write_glb),
+    ".spz.glb": CloudFormat(GLB_UP, load_glb, write_spz_glb),
     ".gltf": CloudFormat(GLB_UP, load_glb, None),
     ".usda": CloudFormat(USDA_UP, read_usda, write_usda),
     ".splat": CloudFormat(VIEWER_UP, lambda path: (read_splat(path), []), None),
@@ -124,7 +125,7 @@ FORMATS = {
 """By extension."""
 READ = tuple(FORMATS)
 WRITTEN = tuple(suffix for suffix, known in FORMATS.items() if known.write)
-ALWAYS_GAUSSIANS = (".spz", ".sog", ".compressed.ply")
+ALWAYS_GAUSSIANS = (".spz", ".sog", ".compressed.ply", ".spz.glb")
 """Formats in which a run exports nothing but Gaussians; a PLY can be a mesh or points."""
 PRUNED_FORMATS = (".ply", ".spz")
 """Formats whose size and rounding :func:`file_size` and :func:`as_stored` know."""

@@ -1,12 +1,17 @@
-"""Gaussians in GLB files by the glTF extension KHR_gaussian_splatting, plain and uncompressed.
+"""Gaussians in GLB files by the glTF extension KHR_gaussian_splatting, plain or as SPZ.
 
-Written to the release candidate in Khronos' repository, its revision of 15 April 2026: points with
-the kernel "ellipse" in the colour space "srgb_rec709_display"; scales and opacities are linear,
-quaternions xyzw, harmonics with the Condon-Shortley phase as in PLY files, all float32. ``COLOR_0``
-lets programs without the extension show coloured points. Axes are glTF's, y up, front +z.
+Plain files follow the ratified extension: points with the kernel "ellipse" in the colour space
+"srgb_rec709_display"; scales and opacities are linear, quaternions xyzw, harmonics with the
+Condon-Shortley phase as in PLY files, all float32. ``COLOR_0`` lets programs without the extension
+show coloured points. Axes are glTF's, y up, front +z.
+
+Files with KHR_gaussian_splatting_compression_spz_2 hold an SPZ file in a buffer view. They are
+written as CesiumJS reads them, which takes SPZ's coordinates for glTF's. The draft of that
+extension wants them half a turn apart; files of programs that follow it are known by the ``kernel``
+that Cesium's lack.
 
 The extension has no place for antialiasing and notes, so they are in ``extras`` of the asset.
-Compressions of the extension, kernels other than "ellipse", and nodes that scale by different
+Other compressions of the extension, kernels other than "ellipse", and nodes that scale by different
 factors along the axes aren't read."""
 
 import logging
@@ -27,11 +32,21 @@ from ..meshes.glb_file import write_glb_file
 from ..meshes.gltf import parse_errors
 from ..meshes.gltf_document import Document
 from ..meshes.gltf_poses import world_matrices
-from .packing import FLOAT_OPACITY_MARGIN, logits, opacities, to_byte, unit_quats
+from .packing import (
+    FLOAT_OPACITY_MARGIN,
+    displayed,
+    is_linear,
+    logits,
+    opacities,
+    to_byte,
+    unit_quats,
+)
+from .spz import spz_arrays, spz_bytes
 
 logger = logging.getLogger(__name__)
 GLB_UP = "y"
 EXTENSION = "KHR_gaussian_splatting"
+SPZ = f"{EXTENSION}_compression_spz_2"
 SPLATTING = {
     "kernel": "ellipse",
     "colorSpace": "srgb_rec709_display",
@@ -44,6 +59,10 @@ DECODED_BYTES, DECODED_BYTES_PER_HARMONIC = 300, 72
 """Upper bounds of the memory that reading takes, per Gaussian and per harmonic of a Gaussian."""
 SAME_SCALE = 1e-4
 """Largest relative difference of a node's scales that counts as rounding."""
+HALF_TURN = np.diag([-1.0, 1.0, -1.0])
+"""About the y axis."""
+TURNED_GENERATOR = "splat-transform"
+"""It turns the axes of a PLY by half a turn about z, so that the front of its files is -z."""
 
 
 def write_glb(path: str | os.PathLike, gaussians: Gaussians, notes: Sequence[str] = ()) -> None:
@@ -60,6 +79,32 @@ def write_glb(path: str | os.PathLike, gaussians: Gaussians, notes: Sequence[str
     attributes = _attributes(gaussians)
     blocks = [values.tobytes() for values in attributes.values()]
     write_glb_file(path, _document(attributes, gaussians.means, notes), blocks)
+
+
+def write_spz_glb(path: str | os.PathLike, gaussians: Gaussians, notes: Sequence[str] = ()) -> None:
+    """Write a GLB with an SPZ file inside; arguments and errors are those of :func:`write_glb`."""
+    gaussians = finite(gaussians, str(path))
+    # arrays without content stand for what the SPZ holds; CesiumJS knows no OPACITY and DEGREE_0
+    zero = np.broadcast_to(np.float32(0), (len(gaussians.means), 4))
+    attributes = {
+        "POSITION": zero[:, :3],
+        "COLOR_0": zero.astype(np.uint8),
+        f"{EXTENSION}:ROTATION": zero,
+        f"{EXTENSION}:SCALE": zero[:, :3],
+        **dict.fromkeys(_semantics(gaussians.sh.shape[1])[1:], zero[:, :3]),
+    }
+    document = _document(attributes, gaussians.means, notes)
+    if len(gaussians.means):
+        (primitive,) = document["meshes"][0]["primitives"]
+        primitive["extensions"] = {EXTENSION: {"extensions": {SPZ: {"bufferView": 0}}}}
+        document["extensionsUsed"] = document["extensionsRequired"] = [EXTENSION, SPZ]
+        document["bufferViews"] = [{}]
+        # CesiumJS needs the matrix even where it is the identity
+        document["nodes"] = [{"mesh": 0, "matrix": np.eye(4).ravel().tolist()}]
+        for accessor in document["accessors"]:
+            del accessor["bufferView"]
+    blocks = [spz_bytes(gaussians)] if len(gaussians.means) else []
+    write_glb_file(path, document, blocks)
 
 
 def read_glb(path: str | os.PathLike) -> Gaussians:
@@ -85,9 +130,13 @@ def load_glb(path: str | os.PathLike) -> tuple[Gaussians, list[str]]:
         ]
         if not parts and EXTENSION not in document.json.get("extensionsUsed", []):
             document.fail(f"no primitive has the extension {EXTENSION}: it holds no Gaussians")
-        extras = document.json["asset"].get("extras")
+        asset = document.json["asset"]
+    extras = asset.get("extras")
     notes = extras.get("notes") if isinstance(extras, dict) else None
-    return _merged(parts), [str(note) for note in notes] if isinstance(notes, list) else []
+    gaussians = _merged(parts)
+    if str(asset.get("generator")).startswith(TURNED_GENERATOR):
+        gaussians = rotate(gaussians, HALF_TURN)
+    return gaussians, [str(note) for note in notes] if isinstance(notes, list) else []
 
 
 # ---- writing -------------------------------------------------------------------------------------
@@ -191,9 +240,38 @@ def _harmonics(primitive: Primitive) -> int:
 
 
 def _read_primitive(document: Document, primitive: Primitive) -> Gaussians:
-    _check_extension(document, primitive)
+    extension = primitive["extensions"][EXTENSION]
+    kernel = extension.get("kernel", SPLATTING["kernel"])
+    if kernel != SPLATTING["kernel"]:
+        document.fail(f"its Gaussians have the kernel {str(kernel)[:40]!r}; 'ellipse' was expected")
+    inner = extension.get("extensions", {})
+    read = _read_spz if SPZ in inner else _read_plain
+    gaussians = read(document, primitive)
+    space = extension.get("colorSpace", SPLATTING["colorSpace"])
+    if is_linear(space):
+        return displayed(gaussians, str(document.path))
+    if "709" not in str(space):
+        logger.warning("%s: colours of %r are read as sRGB", document.path, str(space)[:40])
+    return gaussians
+
+
+def _read_spz(document: Document, primitive: Primitive) -> Gaussians:
+    extension = primitive["extensions"][EXTENSION]
+    view, _ = document.view(extension["extensions"][SPZ].get("bufferView"))
+    gaussians = spz_arrays(bytes(view), str(document.path))
+    count = document.count(primitive["attributes"]["POSITION"])
+    if len(gaussians.means) != count:
+        document.fail(f"its SPZ has {len(gaussians.means)} rows for {count} Gaussians")
+    return rotate(gaussians, HALF_TURN) if "kernel" in extension else gaussians
+
+
+def _read_plain(document: Document, primitive: Primitive) -> Gaussians:
     attributes = primitive["attributes"]
     count = document.count(attributes["POSITION"])
+    stored = document.entry("accessors", attributes["POSITION"])
+    inner = primitive["extensions"][EXTENSION].get("extensions", {})
+    if inner and not {"bufferView", "sparse"} & stored.keys():
+        document.fail(f"its Gaussians are compressed by {list(inner)[0][:80]}, which isn't read")
 
     def rows(semantic: str, kind: str) -> np.ndarray:
         if semantic not in attributes:
@@ -203,15 +281,10 @@ def _read_primitive(document: Document, primitive: Primitive) -> Gaussians:
             document.fail(f"{semantic} has {len(values)} rows for {count} Gaussians")
         return values
 
-    scales = rows(f"{EXTENSION}:SCALE", "VEC3")
-    if (scales < 0).any():
-        document.fail("scales below 0: drafts of the extension before 2026 stored logarithms")
-    with np.errstate(divide="ignore"):
-        log_scales = np.log(scales)
     return Gaussians(
         means=rows("POSITION", "VEC3"),
         quats=rows(f"{EXTENSION}:ROTATION", "VEC4")[:, [3, 0, 1, 2]],
-        log_scales=log_scales,
+        log_scales=_log_scales(rows(f"{EXTENSION}:SCALE", "VEC3"), document),
         logit_opacities=logits(rows(f"{EXTENSION}:OPACITY", "SCALAR")[:, 0], FLOAT_OPACITY_MARGIN),
         sh=np.stack(
             [rows(semantic, "VEC3") for semantic in _semantics(_harmonics(primitive))], axis=1
@@ -219,17 +292,17 @@ def _read_primitive(document: Document, primitive: Primitive) -> Gaussians:
     )
 
 
-def _check_extension(document: Document, primitive: Primitive) -> None:
-    extension = primitive["extensions"][EXTENSION]
-    if compressed := list(extension.get("extensions", {})):
-        document.fail(
-            f"its Gaussians are compressed by {compressed[0][:60]}, which isn't read here"
-        )
-    kernel, space = extension.get("kernel", "ellipse"), extension.get("colorSpace")
-    if kernel != SPLATTING["kernel"]:
-        document.fail(f"its Gaussians have the kernel {str(kernel)[:40]!r}; 'ellipse' was expected")
-    if space != SPLATTING["colorSpace"]:
-        logger.warning("%s: colours of %r are read as sRGB", document.path, str(space)[:40])
+def _log_scales(scales: Float[np.ndarray, "N 3"], document: Document) -> Float[np.ndarray, "N 3"]:
+    """Return the logarithms of scales. The extension's drafts up to April 2026, and splat-transform
+    until June 2026, stored logarithms, most of which are negative.
+    """
+    if len(scales) and np.median(scales) < 0:
+        logger.warning("%s: scales are read as logarithms, as drafts of 2026 had", document.path)
+        return scales
+    if (scales < 0).any():
+        document.fail("some of its scales are below 0")
+    with np.errstate(divide="ignore"):
+        return np.log(scales)
 
 
 def _moved(gaussians: Gaussians, world: Float[np.ndarray, "4 4"], document: Document) -> Gaussians:

@@ -1,8 +1,16 @@
 """Encodings that several compact formats of Gaussians share: bytes, logits, spatial order."""
 
+import logging
+from typing import Any
+
 import numpy as np
 from jaxtyping import Float, Integer
 
+from ..gaussians.gaussians import Gaussians
+from ..gaussians.sh import rgb_to_sh0, sh0_to_rgb
+from ..meshes.colors import linear_to_srgb
+
+log = logging.getLogger(__name__)
 OPACITY_MARGIN = 1 / 2040
 """Opacities that are read from bytes are clamped to this distance from 0 and 1, an eighth of a
 step, since their logits are infinite there.
@@ -81,6 +89,28 @@ def logits(values: Float[np.ndarray, " N"], margin: float) -> Float[np.ndarray, 
     from scipy.special import logit
 
     return logit(np.clip(values.astype(np.float64), margin, 1 - margin)).astype(np.float32)
+
+
+def is_linear(space: Any) -> bool:
+    """Return whether a colour space's name is that of linear light, as "lin_rec709_display"."""
+    return "lin" in str(space).lower()
+
+
+def displayed(gaussians: Gaussians, name: str) -> Gaussians:
+    """Return Gaussians whose harmonics are of linear light with those of display values, and log
+    it: exact for the constant part; the others follow the slope of sRGB's curve there.
+
+    Args:
+        name: the file, for the message.
+    """
+    log.warning("%s: linear colours become sRGB; blended edges look a little different", name)
+    linear = sh0_to_rgb(gaussians.sh[:, :1]).clip(0)
+    slope = np.where(
+        linear <= 0.0031308, 12.92, 1.055 / 2.4 * np.maximum(linear, 0.0031308) ** (1 / 2.4 - 1)
+    )
+    sh = (gaussians.sh * slope).astype(np.float32)
+    sh[:, :1] = rgb_to_sh0(linear_to_srgb(linear))
+    return gaussians._replace(sh=sh)
 
 
 def to_byte(values: Float[np.ndarray, "*shape"]) -> Integer[np.ndarray, "*shape"]:

@@ -22,6 +22,7 @@ INDICES = ("u1", "<u2", "<u4")
 READ_EXTENSIONS = {
     "EXT_texture_webp",
     "KHR_gaussian_splatting",
+    "KHR_gaussian_splatting_compression_spz_2",
     "KHR_materials_pbrSpecularGlossiness",
     "KHR_mesh_quantization",
     "KHR_texture_transform",
@@ -184,7 +185,7 @@ class Document:
         if "sparse" not in entry:
             self.fail(
                 f"the numbers of accessor {index} aren't in the file; if they are compressed "
-                "(Draco, meshopt), export it without that"
+                "(Draco, meshopt, SPZ), export it without that"
             )
         self.budget.spend(shape[0] * shape[1] * dtype.itemsize, f"accessor {index}")
         return np.zeros(shape, dtype)
