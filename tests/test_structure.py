@@ -31,7 +31,7 @@ RINGS = ring_of()
 MATHS_MAY_USE = {"torch", "numpy", "scipy", "jaxtyping"} | set(sys.stdlib_module_names)
 LIBRARIES = {  # of ring 0, beyond MATHS_MAY_USE
     "core": {"imageio", "PIL"},
-    "formats": {"PIL", "tqdm", "zstandard"},
+    "formats": {"PIL", "pxr", "tqdm", "zstandard"},
     "meshes": {"trimesh", "embreex", "PIL", "tqdm"},
 }
 HOST = {"lightning", "pytorch_lightning", "omegaconf", "threestudio"}
@@ -44,6 +44,7 @@ HEAVY = HOST | {
     "PIL",
     "smplx",
     "anny",
+    "pxr",
     "zstandard",
 }
 HEAVY |= {"skimage", "fast_simplification", "xatlas"}

@@ -313,10 +313,13 @@ def test_other_formats_read_back_the_right_way_up(tmp_path, name):
     np.testing.assert_allclose(read.means, means[order], atol=0.01)
 
 
-def test_a_glb_has_spz_inside_on_demand(tmp_path):
-    (output,) = build("glb-exporter", geometry(60, 1), spz=True)()
+@pytest.mark.parametrize(
+    ("name", "file", "head"), [("glb", "a.spz.glb", b"glTF"), ("usda", "a.usdz", b"PK")]
+)
+def test_the_extension_selects_a_variant(tmp_path, name, file, head):
+    (output,) = build(f"{name}-exporter", geometry(60, 1), save_name=file)()
     path = write(output, tmp_path)
-    assert b"KHR_gaussian_splatting_compression_spz_2" in path.read_bytes()
+    assert path.read_bytes().startswith(head) and path.name == file
     assert len(read_cloud(str(path)).gaussians.means) == 60
 
 

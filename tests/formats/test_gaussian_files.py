@@ -82,7 +82,7 @@ def test_notes_are_comments_of_the_ply(tmp_path):
 
 def test_mistakes(tmp_path):
     with pytest.raises(
-        UserError, match=r"OUT: expected the name of a .ply, .* or .usda file, got 'a.obj'"
+        UserError, match=r"OUT: expected the name of a .ply, .* or .usdz file, got 'a.obj'"
     ):
         write_cloud("a.obj", StoredCloud(cloud()))
     write_cloud(str(tmp_path / "a.ply"), StoredCloud(cloud()))

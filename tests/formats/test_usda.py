@@ -1,16 +1,24 @@
-"""USDA files: as OpenUSD's own parser reads them (optional: ``pip install usd-core``), and as this
+"""USD files: as OpenUSD's own parser reads them (optional: ``pip install usd-core``), and as this
 package does.
 """
 
+import struct
+import sys
+import zipfile
+
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from tests.helpers.object_clouds import assert_close, ball
 from tests.helpers.usd_reader import read_with_pxr
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.formats.gaussian_files import StoredCloud, read_cloud, write_cloud
-from threestudio_gaussiandreamer.formats.usda import HARMONICS, write_usda
-from threestudio_gaussiandreamer.formats.usda_reader import read_usda
+from threestudio_gaussiandreamer.formats.usda import HARMONICS, write_usda, write_usdz
+from threestudio_gaussiandreamer.formats.usda_reader import read_usd, read_usda
+from threestudio_gaussiandreamer.gaussians.axes import rotate
+from threestudio_gaussiandreamer.gaussians.sh import rgb_to_sh0, sh0_colors
+from threestudio_gaussiandreamer.meshes.colors import srgb_to_linear
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
@@ -93,6 +101,161 @@ def test_what_openusd_writes_is_read(tmp_path):
     assert notes == ["a note"]
 
 
+def test_texts_of_several_lines_and_z_up_are_read(tmp_path):
+    """NVIDIA's converter writes such a comment, and OpenUSD other texts."""
+    cloud = ball(9, 1)
+    write_usda(tmp_path / "a.usda", cloud, ["a note"])
+    text = (tmp_path / "a.usda").read_text()
+    text = text.replace("#usda 1.0\n(", '#usda 1.0\n(\n    """Source file:\nupAxis = "X" a.ply"""')
+    text = text.replace("elementSize", "doc = '''one\n) two'''\n        elementSize")
+    (tmp_path / "b.usda").write_text(text)
+    read, notes = read_usda(tmp_path / "b.usda")
+    assert_close(cloud, read, means=0, sh=0, log_scales=1e-6, opacities=1e-6)
+    assert notes == ["a note"]
+    (tmp_path / "b.usda").write_text(text.replace('upAxis = "Y"', 'upAxis = "Z"'))
+    in_z = StoredCloud(read_usda(tmp_path / "b.usda")[0], "y").in_axes("z").gaussians
+    assert_close(cloud, in_z, opacities=1e-6)
+
+
+@pytest.mark.parametrize("place", ["prim", "array"])
+def test_linear_colours_become_display_values(tmp_path, place, caplog):
+    cloud = ball(9)
+    cloud.sh[:, 0] = rgb_to_sh0(srgb_to_linear(sh0_colors(ball(9).sh[:, 0])))
+    write_usda(tmp_path / "a.usda", cloud)
+    text = (tmp_path / "a.usda").read_text()
+    space = {
+        "prim": ("    float3[] scales", '    uniform token colorSpace:name = "lin_rec709_scene"\n'),
+        "array": ("        elementSize", '        colorSpace = "lin_rec709_scene"\n'),
+    }
+    before, added = space[place]
+    (tmp_path / "a.usda").write_text(text.replace(before, added + before, 1))
+    for read in (read_usda(tmp_path / "a.usda")[0], by_openusd(tmp_path / "a.usda")):
+        colors = sh0_colors(read.sh[:, 0])
+        np.testing.assert_allclose(colors, sh0_colors(ball(9).sh[:, 0]), atol=2e-3)
+    assert "linear colours become sRGB" in caplog.text
+
+
+# ---- USDZ ----------------------------------------------------------------------------------------
+
+
+def test_a_usdz_is_as_phones_want_it(tmp_path):
+    """One layer, not compressed, at a multiple of 64 bytes; files are the same each time."""
+    cloud = ball(300, 1)
+    for name in ("a.usdz", "b.usdz"):
+        write_usdz(tmp_path / name, cloud, ["a note"])
+    data = (tmp_path / "a.usdz").read_bytes()
+    with zipfile.ZipFile(tmp_path / "a.usdz") as archive:
+        (layer,) = archive.infolist()
+        assert layer.filename.endswith(".usda") and layer.compress_type == zipfile.ZIP_STORED
+    name, extra = struct.unpack_from("<HH", data, layer.header_offset + 26)
+    start = layer.header_offset + 30 + name + extra
+    assert start % 64 == 0 and data[start : start + 9] == b"#usda 1.0"
+    assert data == (tmp_path / "b.usdz").read_bytes()
+    read, notes = read_usda(tmp_path / "a.usdz")
+    assert_close(cloud, read, means=0, sh=0, log_scales=1e-6, opacities=1e-6)
+    assert notes == ["a note"]
+
+
+def test_openusd_reads_our_usdz(tmp_path):
+    write_usdz(tmp_path / "a.usdz", ball(50, 1))
+    _, _, read = read_with_pxr(tmp_path / "a.usdz")
+    assert_close(ball(50, 1), read, means=0, sh=0, log_scales=1e-6, opacities=1e-6)
+
+
+@pytest.mark.parametrize("cut", [40, 200])
+def test_a_damaged_usdz_is_named(tmp_path, cut):
+    write_usdz(tmp_path / "a.usdz", ball(50))
+    (tmp_path / "b.usdz").write_bytes((tmp_path / "a.usdz").read_bytes()[:cut])
+    for read in (read_usda, read_usd):
+        with pytest.raises(UserError, match="b.usdz' is damaged"):
+            read(tmp_path / "b.usdz")
+
+
+# ---- by OpenUSD ----------------------------------------------------------------------------------
+
+
+def by_openusd(path):
+    """What the reader makes of the same layer in binary, which only OpenUSD reads."""
+    Sdf = pytest.importorskip("pxr.Sdf", reason="usd-core isn't installed")
+    Sdf.Layer.FindOrOpen(str(path)).Export(str(path.with_suffix(".usdc")))
+    return read_usd(path.with_suffix(".usdc"))[0]
+
+
+def test_binary_files_are_read(tmp_path):
+    cloud = ball(20, 3)
+    stored = StoredCloud(cloud, "y", pruned_to=40.0, antialiased=True)
+    write_cloud(str(tmp_path / "a.usda"), stored)
+    assert_close(cloud, by_openusd(tmp_path / "a.usda"), means=0, sh=0, opacities=1e-6)
+    read = read_cloud(str(tmp_path / "a.usdc"))
+    assert (read.up, read.pruned_to, read.antialiased) == ("y", 40, True)
+    empty = ball(0)
+    write_usda(tmp_path / "b.usda", empty)
+    assert by_openusd(tmp_path / "b.usda").means.shape == (0, 3)
+
+
+def test_scenes_with_transforms_and_half_precision_are_read(tmp_path):
+    """Two references to one prim under moved nodes, in a layer with z up."""
+    pytest.importorskip("pxr", reason="usd-core isn't installed")
+    from pxr import Gf, Usd, UsdGeom
+
+    cloud = ball(20, 1)
+    write_usda(tmp_path / "a.usda", cloud)
+    text = (tmp_path / "a.usda").read_text()
+    text = text.replace("point3f[] positions", "point3h[] positionsh")
+    text = text.replace("quatf[] orientations", "quath[] orientationsh")
+    (tmp_path / "a.usda").write_text(text)
+    stage = Usd.Stage.CreateNew(str(tmp_path / "scene.usda"))
+    UsdGeom.SetStageUpAxis(stage, "Z")
+    turn, shift = Rotation.from_euler("xyz", [10, 20, 30], degrees=True), np.array([1.0, 2, 3])
+    for name in ("one", "two"):
+        node = UsdGeom.Xform.Define(stage, f"/World/{name}")
+        node.GetPrim().GetReferences().AddReference("./a.usda")
+        if name == "two":
+            node.AddTranslateOp().Set(Gf.Vec3d(*shift))
+            node.AddRotateXYZOp().Set(Gf.Vec3f(10, 20, 30))
+            node.AddScaleOp().Set(Gf.Vec3f(2, 2, 2))
+        node.GetPrim().SetTypeName("ParticleField3DGaussianSplat")
+    stage.Save()
+    read = read_cloud(str(tmp_path / "scene.usda")).in_axes("z").gaussians
+    assert len(read.means) == 40
+    rough = {"means": 2e-3, "quats": 2e-3, "opacities": 1e-6, "sh": 1e-5}
+    assert_close(cloud, read.rows(slice(20)), **rough)
+    moved = rotate(cloud, turn.as_matrix())
+    moved = moved._replace(
+        means=(2 * moved.means + shift).astype(np.float32), log_scales=moved.log_scales + np.log(2)
+    )
+    assert_close(moved, read.rows(slice(20, 40)), **rough | {"means": 4e-3})
+
+
+def test_what_openusd_cant_read_either_is_said(tmp_path):
+    pytest.importorskip("pxr", reason="usd-core isn't installed")
+    write_usda(tmp_path / "a.usda", ball(20))
+    by_openusd(tmp_path / "a.usda")
+    cut = (tmp_path / "a.usdc").read_bytes()[:900]
+    (tmp_path / "b.usdc").write_bytes(cut)
+    with pytest.raises(UserError, match="b.usdc.*OpenUSD: .*corrupt"):
+        read_usd(tmp_path / "b.usdc")
+    (tmp_path / "c.usda").write_text('#usda 1.0\ndef Sphere "a"\n{\n}\n')
+    with pytest.raises(UserError, match="line 2: expected one prim 'def ParticleField3DGauss"):
+        read_usd(tmp_path / "c.usda")
+    text = (tmp_path / "a.usda").read_text().replace("Degree = 0", "Degree = 1")
+    (tmp_path / "d.usda").write_text(text)
+    with pytest.raises(UserError, match="has 20 values, expected 80"):
+        read_usd(tmp_path / "d.usda")
+
+
+def test_without_openusd_the_package_is_named(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pxr", None)
+    (tmp_path / "a.usdc").write_bytes(b"PXR-USDC" + bytes(100))
+    with pytest.raises(UserError, match="pip install usd-core"):
+        read_usd(tmp_path / "a.usdc")
+    write_usdz(tmp_path / "a.usdz", ball(20))
+    assert len(read_usd(tmp_path / "a.usdz")[0].means) == 20
+
+
+# ---- damaged and foreign files -------------------------------------------------------------------
+
+
 @pytest.mark.parametrize(
     ("before", "after", "said"),
     [
@@ -105,7 +268,8 @@ def test_what_openusd_writes_is_read(tmp_path):
         ("opacities = [", "opacities = [, ", "opacities: could not convert"),
         ("Degree = 0", "Degree = 4", "should be 0 to 3, not '4'"),
         ("Degree = 0", "Degree = 1", f"{HARMONICS} has 2 values, expected 8"),
-        ('upAxis = "Y"', 'upAxis = "Z"', "its upAxis is 'Z'"),
+        ('upAxis = "Y"', 'upAxis = "X"', "its upAxis is 'X'"),
+        ("    float3[] scales", "    token[] xformOpOrder = [1]\n    float3[] scales", "transform"),
         ("def Particle", "over Particle", "expected one prim"),
         ("    float3[] scales", "    def Xform {", "expected an attribute on one line"),
         (
@@ -118,7 +282,7 @@ def test_what_openusd_writes_is_read(tmp_path):
         ('interpolation = "vertex"\n    )', 'interpolation = "vertex"', "ends before the ')'"),
         ("\n{\n", "\n", "expected the '{' of the prim"),
         ("elementSize", "point3f[] positions = [(1, 1, 1)]\n x", "an attribute of the prim"),
-        ("(\n    default", '(\n    doc = """a\n    default', "texts of several lines"),
+        ("(\n    default", '(\n    doc = """a\n    default', "ends before the ')'"),
     ],
 )
 def test_other_files_are_refused_with_the_line(tmp_path, before, after, said):

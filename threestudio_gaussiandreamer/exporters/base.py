@@ -19,7 +19,7 @@ from typing import List, NamedTuple, Optional
 from ..core.errors import UserError
 from ..core.methods import find_method, require_method
 from ..core.options import check_options, one_of, rule
-from ..formats.gaussian_files import FORMATS, StoredCloud
+from ..formats.gaussian_files import FORMATS, StoredCloud, suffix_of
 from ..gaussians.axes import AXES
 from ..gaussians.gaussians import Gaussians, finite
 from ..gaussians.views import EPS2D
@@ -123,11 +123,15 @@ class CloudExporter(FileExporter):
 
     suffix = ""
     """The format, a key of ``formats.gaussian_files.FORMATS``."""
+    variants: tuple[str, ...] = ()
+    """Formats that the extension of ``save_name`` selects instead."""
 
     def __call__(self) -> List[ExporterOutput]:
         """Return one file of save_type "gaussians"; its params are ``{"stored": StoredCloud,
         "suffix": str}``.
         """
-        stored = StoredCloud(self.gaussians()).in_axes(FORMATS[self.suffix].up)
-        params = {"stored": stored, "suffix": self.suffix}
+        named = suffix_of(self.cfg.save_name)
+        suffix = named if named in self.variants else self.suffix
+        stored = StoredCloud(self.gaussians()).in_axes(FORMATS[suffix].up)
+        params = {"stored": stored, "suffix": suffix}
         return [ExporterOutput(save_name=self.cfg.save_name, save_type="gaussians", params=params)]

@@ -1,15 +1,10 @@
 """``glb-exporter``: the Gaussians as a GLB with KHR_gaussian_splatting, for Babylon.js and
-PlayCanvas, or with SPZ inside for Cesium.
+PlayCanvas.
 
-===========  ==================================================================================
-option       meaning
-===========  ==================================================================================
-save_name    name of the file in the export folder
-spz          compress by KHR_gaussian_splatting_compression_spz_2, the only kind that CesiumJS reads
-save_video   also render the turntable
-===========  ==================================================================================
+The options are those of every exporter: see ``exporters/base.py``. A ``save_name`` that ends with
+.spz.glb has SPZ inside, the only kind that CesiumJS reads.
 
-Without ``spz`` nothing is rounded, and programs without the extension show points. y is up, as glTF
+Without that nothing is rounded, and programs without the extension show points. y is up, as glTF
 requires."""
 
 from dataclasses import dataclass, field
@@ -20,13 +15,10 @@ from .base import SAVE_NAME, CloudExporter
 
 @register("glb-exporter")
 class GlbExporter(CloudExporter):
+    suffix, variants = ".glb", (".spz.glb",)
+
     @dataclass
     class Config(CloudExporter.Config):
         save_name: str = field(default="gaussians.glb", metadata=SAVE_NAME)
-        spz: bool = False
 
     cfg: Config
-
-    @property
-    def suffix(self) -> str:
-        return ".spz.glb" if self.cfg.spz else ".glb"

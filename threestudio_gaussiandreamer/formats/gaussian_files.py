@@ -29,8 +29,8 @@ from .ply import (
 from .sog import SOG_UP, load_sog, write_sog
 from .splat import read_splat
 from .spz import SPZ_UP, load_spz, read_spz_comment, spz_arrays, spz_bytes, write_spz
-from .usda import USDA_UP, write_usda
-from .usda_reader import read_usda
+from .usda import USDA_UP, write_usda, write_usdz
+from .usda_reader import read_usd
 
 logger = logging.getLogger(__name__)
 
@@ -119,7 +119,10 @@ FORMATS = {
     ".glb": CloudFormat(GLB_UP, load_glb, write_glb),
     ".spz.glb": CloudFormat(GLB_UP, load_glb, write_spz_glb),
     ".gltf": CloudFormat(GLB_UP, load_glb, None),
-    ".usda": CloudFormat(USDA_UP, read_usda, write_usda),
+    ".usda": CloudFormat(USDA_UP, read_usd, write_usda),
+    ".usdz": CloudFormat(USDA_UP, read_usd, write_usdz),
+    ".usdc": CloudFormat(USDA_UP, read_usd, None),
+    ".usd": CloudFormat(USDA_UP, read_usd, None),
     ".splat": CloudFormat(VIEWER_UP, lambda path: (read_splat(path), []), None),
 }
 """By extension."""

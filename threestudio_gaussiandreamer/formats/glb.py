@@ -24,8 +24,8 @@ from jaxtyping import Float
 
 from ..core.file_memory import require_file_memory
 from ..core.files import existing_file
-from ..gaussians.axes import rotate
-from ..gaussians.gaussians import Gaussians, finite
+from ..gaussians.axes import placed, rotate
+from ..gaussians.gaussians import Gaussians, finite, joined
 from ..gaussians.sh import COEFFICIENTS, sh0_colors
 from ..meshes.colors import srgb_to_linear
 from ..meshes.glb_file import write_glb_file
@@ -57,8 +57,6 @@ FLOAT, BYTE, POINTS, ARRAY_BUFFER = 5126, 5121, 0, 34962
 TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 DECODED_BYTES, DECODED_BYTES_PER_HARMONIC = 300, 72
 """Upper bounds of the memory that reading takes, per Gaussian and per harmonic of a Gaussian."""
-SAME_SCALE = 1e-4
-"""Largest relative difference of a node's scales that counts as rounding."""
 HALF_TURN = np.diag([-1.0, 1.0, -1.0])
 """About the y axis."""
 TURNED_GENERATOR = "splat-transform"
@@ -122,18 +120,18 @@ def load_glb(path: str | os.PathLike) -> tuple[Gaussians, list[str]]:
     path = existing_file(path, "GLB file")
     with parse_errors(path):
         document = Document(path)
-        placed = list(_primitives(document))
-        _require_memory(document, [primitive for primitive, _ in placed])
+        found = list(_primitives(document))
+        _require_memory(document, [primitive for primitive, _ in found])
         parts = [
-            _moved(_read_primitive(document, primitive), world, document)
-            for primitive, world in placed
+            placed(_read_primitive(document, primitive), world, f"GLB file {str(path)!r}")
+            for primitive, world in found
         ]
         if not parts and EXTENSION not in document.json.get("extensionsUsed", []):
             document.fail(f"no primitive has the extension {EXTENSION}: it holds no Gaussians")
         asset = document.json["asset"]
     extras = asset.get("extras")
     notes = extras.get("notes") if isinstance(extras, dict) else None
-    gaussians = _merged(parts)
+    gaussians = joined(parts)
     if str(asset.get("generator")).startswith(TURNED_GENERATOR):
         gaussians = rotate(gaussians, HALF_TURN)
     return gaussians, [str(note) for note in notes] if isinstance(notes, list) else []
@@ -303,35 +301,3 @@ def _log_scales(scales: Float[np.ndarray, "N 3"], document: Document) -> Float[n
         document.fail("some of its scales are below 0")
     with np.errstate(divide="ignore"):
         return np.log(scales)
-
-
-def _moved(gaussians: Gaussians, world: Float[np.ndarray, "4 4"], document: Document) -> Gaussians:
-    """Transform Gaussians to world coordinates.
-
-    Raises:
-        UserError: the matrix isn't a rotation, a translation and one scale.
-    """
-    if np.array_equal(world, np.eye(4)):
-        return gaussians
-    scales = np.linalg.norm(world[:3, :3], axis=0)
-    scale = scales.mean()
-    rotation = world[:3, :3] / (scale if 0 < scale < np.inf else 1)
-    close = np.allclose(rotation.T @ rotation, np.eye(3), atol=SAME_SCALE)
-    if not close or np.linalg.det(rotation) < 0 or not np.isfinite(world).all():
-        document.fail("a node mirrors its Gaussians or scales them by different factors")
-    turned = rotate(gaussians, rotation)
-    return turned._replace(
-        means=(turned.means * scale + world[:3, 3]).astype(np.float32),
-        log_scales=(turned.log_scales + np.log(scale)).astype(np.float32),
-    )
-
-
-def _merged(parts: list[Gaussians]) -> Gaussians:
-    """Concatenate parts; harmonics that a part lacks are zero."""
-    if not parts:
-        shapes = (0, 3), (0, 4), (0, 3), (0,), (0, 1, 3)
-        return Gaussians(*(np.zeros(shape, np.float32) for shape in shapes))
-    most = max(part.sh.shape[1] for part in parts)
-    pads = [((0, 0), (0, most - part.sh.shape[1]), (0, 0)) for part in parts]
-    parts = [part._replace(sh=np.pad(part.sh, pad)) for part, pad in zip(parts, pads, strict=True)]
-    return Gaussians(*(np.concatenate(values) for values in zip(*parts, strict=True)))

@@ -7,11 +7,14 @@ other, all float32 with 9 digits. Axes: y up, front +z; one unit is one metre. U
 for antialiasing: it and the notes are in the layer's ``customLayerData``."""
 
 import os
+import struct
+import zipfile
 from collections.abc import Iterator, Sequence
 from typing import BinaryIO
 
 import numpy as np
 
+from ..core.errors import UserError
 from ..core.files import atomic_file
 from ..gaussians.gaussians import Gaussians, finite
 from .packing import opacities, unit_quats
@@ -31,6 +34,12 @@ TYPES = {
 """Of the prim's attributes."""
 REACH = 3.0
 """Standard deviations of a Gaussian that the prim's extent contains."""
+LAYER, ALIGNMENT, ZIP_HEADER = "gaussians.usda", 64, 30
+"""Of a USDZ: the name of its layer, the alignment of its content, and the size of the header before
+the name.
+"""
+PADDING, PADDING_ID = struct.Struct("<HH"), 0x1986
+"""The extra field that aligns the content, and OpenUSD's mark of it."""
 ROWS = 4096
 """Values that are formatted at once."""
 
@@ -47,10 +56,31 @@ def write_usda(path: str | os.PathLike, gaussians: Gaussians, notes: Sequence[st
     """
     gaussians = finite(gaussians, str(path))
     with atomic_file(path) as file:
-        file.write(_head(gaussians, notes).encode("ascii"))
-        for array in _arrays(gaussians):
-            _write_array(file, *array)
-        file.write(b"}\n")
+        _write_layer(file, gaussians, notes)
+
+
+def write_usdz(path: str | os.PathLike, gaussians: Gaussians, notes: Sequence[str] = ()) -> None:
+    """Write a USDZ, which phones open: a zip archive of one USDA layer, not compressed, whose
+    content begins at a multiple of 64 bytes. Arguments and errors are those of :func:`write_usda`,
+    and the layer may have 2 GiB at most.
+    """
+    gaussians = finite(gaussians, str(path))
+    layer = zipfile.ZipInfo(LAYER)  # without a date, so that files are reproducible
+    padding = -(ZIP_HEADER + len(LAYER) + PADDING.size) % ALIGNMENT
+    layer.extra = PADDING.pack(PADDING_ID, padding) + bytes(padding)
+    with atomic_file(path) as file, zipfile.ZipFile(file, "w") as archive:
+        try:
+            with archive.open(layer, "w") as content:
+                _write_layer(content, gaussians, notes)
+        except RuntimeError as error:
+            raise UserError(f"{str(path)!r}: a USDZ may have 2 GiB at most ({error})") from error
+
+
+def _write_layer(file: BinaryIO, gaussians: Gaussians, notes: Sequence[str]) -> None:
+    file.write(_head(gaussians, notes).encode("ascii"))
+    for array in _arrays(gaussians):
+        _write_array(file, *array)
+    file.write(b"}\n")
 
 
 def _head(gaussians: Gaussians, notes: Sequence[str]) -> str:

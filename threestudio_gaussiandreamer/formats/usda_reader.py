@@ -1,37 +1,75 @@
-"""Read USDA text of one ParticleField3DGaussianSplat prim at the top of its layer, with one line
-for each attribute, as ``usda.py`` and OpenUSD write it.
+"""Read USD files of Gaussians. Text of one ParticleField3DGaussianSplat prim at the top of its
+layer, with one line for each attribute, as ``usda.py``, OpenUSD and NVIDIA's converter write it,
+is read here, also inside a USDZ; all else by OpenUSD where it is installed: binary layers, scenes
+with transforms, references and several prims, half precision, and the first of time samples.
 
-Other prims, transforms, references, time samples and half precision aren't read; other attributes
-are ignored. The unit of the layer is ignored too."""
+Other attributes are ignored, and so is the unit of the layer."""
 
+import io
 import os
 import re
+import zipfile
+from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple, NoReturn
+from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
 from jaxtyping import Float
 
 from ..core.errors import UserError
 from ..core.files import existing_file
-from ..gaussians.gaussians import Gaussians
+from ..gaussians.axes import placed, rotate, rotation_between
+from ..gaussians.gaussians import Gaussians, joined
 from ..gaussians.sh import COEFFICIENTS, MAX_DEGREE
-from .packing import FLOAT_OPACITY_MARGIN, logits
-from .usda import DEGREE, HARMONICS, MAGIC, SCHEMA, TYPES
+from .packing import FLOAT_OPACITY_MARGIN, displayed, is_linear, logits
+from .usda import DEGREE, HARMONICS, MAGIC, SCHEMA, TYPES, USDA_UP
 
 PRIM = re.compile(rb'def %b "\w+"( \()?' % SCHEMA.encode())
 HEAD = re.compile(rb"(?:custom )?(?:uniform )?([\w\[\]]+) ([\w:]+)")
+LONG_QUOTES = (b'"""', b"'''")
+"""Marks at both ends of texts of several lines."""
+COLOR_SPACE = "colorSpace:name"
+"""The attribute by which a prim names the colour space of its harmonics."""
+COLOR_SPACE_OF_ARRAY = re.compile(rb"^colorSpace = (.*)", re.MULTILINE)
+TRANSFORM = "xformOpOrder"
 UP_AXIS = re.compile(rb'upAxis = "(\w+)"')
 NOTES = re.compile(rb'string\[\] notes = \[((?:"[^"\\]*"(?:, )?)*)\]')
 WIDTHS = {"point3f[]": 3, "float3[]": 3, "quatf[]": 4, "float[]": 1}
 """Numbers of one value, by the type of an array."""
+ARRAYS = tuple(name for name in TYPES if name != DEGREE)
 OF_NUMBERS = b"0123456789+-.eEinfa "
 """Bytes that numbers consist of, inf and nan included."""
 TO_SPACES = bytes.maketrans(b"()", b"  ")
 
 
+def read_usd(path: str | os.PathLike) -> tuple[Gaussians, list[str]]:
+    """Read a USD file of any kind; see :func:`read_usda`, which needs no library.
+
+    Raises:
+        UserError: there is no such file, it holds no Gaussians that are supported, it is damaged,
+            or only OpenUSD could read it and isn't installed.
+    """
+    try:
+        return read_usda(path)
+    except UserError as error:
+        path = existing_file(path, "USD file")
+        try:
+            from pxr import Tf
+        except ImportError:
+            raise UserError(
+                f"{error}; OpenUSD reads more kinds of files: pip install usd-core (the extra "
+                "[usd]), or export it as .usda with one prim"
+            ) from error
+        try:
+            return _read_by_openusd(path, error)
+        except Tf.ErrorException as damage:
+            reason = str(damage).strip().splitlines()[0].rpartition(" : ")[2]
+            raise UserError(f"{error}; OpenUSD: {reason[:200]}") from damage
+
+
 def read_usda(path: str | os.PathLike) -> tuple[Gaussians, list[str]]:
-    """Read a USDA file; rows with values that aren't finite are kept.
+    """Read a USDA file, or a USDZ that begins with one; rows with values that aren't finite are
+    kept.
 
     Returns:
         the Gaussians, y up, and the notes in the layer's custom data.
@@ -39,13 +77,81 @@ def read_usda(path: str | os.PathLike) -> tuple[Gaussians, list[str]]:
     Raises:
         UserError: there is no such file, it has another content or layout, or it is damaged.
     """
-    path = existing_file(path, "USDA file")
+    path = existing_file(path, "USD file")
     try:
-        lines = _Lines(path.read_bytes(), path)
+        lines = _Lines(_text(path), path)
     except OSError as error:
         raise UserError(f"cannot read {str(path)!r}: {error.strerror or error}.") from error
-    notes = _read_head(lines)
-    return _gaussians(_read_attributes(lines), lines), notes
+    up, notes = _read_head(lines)
+    return _upright(_gaussians(_read_attributes(lines), lines), up), notes
+
+
+def _text(path: Path) -> bytes:
+    """Return the content of a layer, in a USDZ that of its first file."""
+    data = path.read_bytes()
+    if data[:2] != b"PK":
+        return data
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            first = archive.infolist()[0]
+            # files of a USDZ aren't compressed, so that this can't be larger than the file
+            return archive.read(first) if first.compress_type == zipfile.ZIP_STORED else b""
+    except (zipfile.BadZipFile, IndexError, ValueError, EOFError, RuntimeError) as error:
+        raise UserError(f"USDZ file {str(path)!r} is damaged: {error}") from error
+
+
+def _upright(gaussians: Gaussians, up: str) -> Gaussians:
+    """Return Gaussians of a layer with y up."""
+    return gaussians if up == USDA_UP else rotate(gaussians, rotation_between(up, USDA_UP))
+
+
+# ---- OpenUSD -------------------------------------------------------------------------------------
+
+
+def _read_by_openusd(path: Path, error: UserError) -> tuple[Gaussians, list[str]]:
+    """Read all prims of a stage.
+
+    Args:
+        error: is raised where there are none.
+    """
+    from pxr import Usd, UsdGeom
+
+    stage, now = Usd.Stage.Open(str(path)), Usd.TimeCode.EarliestTime()
+    worlds = UsdGeom.XformCache(now)
+    prims = Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies())
+    parts = [
+        placed(
+            _of_prim(prim, now, path),
+            np.array(worlds.GetLocalToWorldTransform(prim)).T,
+            f"USD file {str(path)!r}",
+        )
+        for prim in prims
+        if prim.GetTypeName() == SCHEMA
+    ]
+    if not parts:
+        raise error
+    notes = stage.GetRootLayer().customLayerData.get("notes", [])
+    up = UsdGeom.GetStageUpAxis(stage).lower()
+    return _upright(joined(parts), up), [str(note) for note in notes]
+
+
+def _of_prim(prim: Any, now: Any, path: Path) -> Gaussians:
+    """Read one prim, whose attributes of half precision have names that end with h."""
+
+    def fail(problem: str) -> NoReturn:
+        raise UserError(f"USD file {str(path)!r}, prim {prim.GetPath()}: {problem}")
+
+    def array(name: str) -> np.ndarray:
+        found = [prim.GetAttribute(name + ending).Get(now) for ending in ("", "h")
+                 if prim.HasAttribute(name + ending)]  # fmt: skip
+        values = next((value for value in found if value), ())
+        rows = np.array(values, np.float32).reshape(-1, WIDTHS[TYPES[name]])
+        return rows[:, [3, 0, 1, 2]] if name == "orientations" else rows  # OpenUSD's are xyzw
+
+    harmonics, space = prim.GetAttribute(HARMONICS), prim.GetAttribute(COLOR_SPACE)
+    spaces = [space.Get() if space else "", harmonics.GetColorSpace() if harmonics else ""]
+    degree, arrays = prim.GetAttribute(DEGREE).Get(), {name: array(name) for name in ARRAYS}
+    return _built(str(degree), arrays, any(map(is_linear, spaces)), str(path), fail)
 
 
 # ---- layout --------------------------------------------------------------------------------------
@@ -56,19 +162,26 @@ class _Attribute(NamedTuple):
     value: bytes
 
 
+EMPTY = _Attribute(b"token[]", b"[]")
+
+
 class _Lines:
-    """The lines of a layer, stripped, without empty ones and comments."""
+    """The lines of a layer, stripped, without empty ones, comments and the content of texts of
+    several lines.
+    """
 
     def __init__(self, data: bytes, path: Path) -> None:
-        self._lines, self._path, self.number = data.split(b"\n"), path, 0
+        for quotes in LONG_QUOTES:
+            parts = data.split(quotes)
+            parts[1::2] = [b'""' + b"\n" * text.count(b"\n") for text in parts[1::2]]
+            data = b"".join(parts)
+        self._lines, self.path, self.number = data.split(b"\n"), path, 0
 
     def take(self) -> bytes:
         """Return the next line, or an empty one at the end."""
         while self.number < len(self._lines):
             line = self._lines[self.number].strip()
             self.number += 1
-            if b'"""' in line:
-                self.fail("texts of several lines aren't read")
             if line and (not line.startswith(b"#") or self.number == 1):
                 return line
         return b""
@@ -83,16 +196,16 @@ class _Lines:
         return taken
 
     def fail(self, problem: str) -> NoReturn:
-        raise UserError(f"USDA file {str(self._path)!r}, line {self.number}: {problem}")
+        raise UserError(f"USDA file {str(self.path)!r}, line {self.number}: {problem}")
 
 
-def _read_head(lines: _Lines) -> list[str]:
-    """Read up to the prim's opening brace; return the notes."""
+def _read_head(lines: _Lines) -> tuple[str, list[str]]:
+    """Read up to the prim's opening brace; return the axis that is up, and the notes."""
     if lines.take() != MAGIC.encode():
         lines.fail(f"this is not a USDA file, which begins with {MAGIC!r}")
-    line, notes = lines.take(), []
+    line, metadata = lines.take(), b""
     if line == b"(":
-        notes = _notes(_metadata(lines), lines)
+        metadata = b"\n".join(_metadata(lines))
         line = lines.take()
     prim = PRIM.fullmatch(line)
     if prim is None:
@@ -101,16 +214,19 @@ def _read_head(lines: _Lines) -> list[str]:
         _metadata(lines)
     if lines.take() != b"{":
         lines.fail("expected the '{' of the prim")
-    return notes
+    return _up(metadata, lines), _notes(metadata)
 
 
-def _notes(metadata: list[bytes], lines: _Lines) -> list[str]:
-    """Return the notes in a layer's metadata, after checking that y is up."""
-    text = b"\n".join(metadata)
-    axes = UP_AXIS.findall(text)
-    if set(axes) - {b"Y"}:
-        lines.fail(f"only files with y up are read, and its upAxis is {_shown(axes[0])}")
-    found = NOTES.search(text)
+def _up(metadata: bytes, lines: _Lines) -> str:
+    axes = UP_AXIS.findall(metadata)
+    if set(axes) - {b"Y", b"Z"}:
+        lines.fail(f"only files with y or z up are read, and its upAxis is {_shown(axes[0])}")
+    return axes[0].decode().lower() if axes else USDA_UP
+
+
+def _notes(metadata: bytes) -> list[str]:
+    """Return the notes in a layer's metadata."""
+    found = NOTES.search(metadata)
     notes = re.findall(rb'"([^"]*)"', found[1]) if found else []
     return [note.decode("ascii", "replace") for note in notes]
 
@@ -129,7 +245,11 @@ def _read_attributes(lines: _Lines) -> dict[str, _Attribute]:
         if value:
             found[name] = _Attribute(head[1], value.removesuffix(b" ("))
         if line.endswith(b" ("):
-            _metadata(lines)
+            metadata = b"\n".join(_metadata(lines))
+            if name == HARMONICS and (space := COLOR_SPACE_OF_ARRAY.search(metadata)):
+                found[COLOR_SPACE] = _Attribute(b"token", space[1])
+    if found.get(TRANSFORM, EMPTY).value != EMPTY.value:
+        lines.fail("the prim has a transform")
     if rest := lines.take():
         lines.fail(f"expected one prim, but after it there is {_shown(rest)}")
     return found
@@ -153,24 +273,42 @@ def _shown(line: bytes) -> str:
 
 
 def _gaussians(attributes: dict[str, _Attribute], lines: _Lines) -> Gaussians:
-    degree = _value(attributes, DEGREE, lines)
-    if degree not in [b"%d" % known for known in range(MAX_DEGREE + 1)]:
-        lines.fail(f"{DEGREE} should be 0 to {MAX_DEGREE}, not {_shown(degree)}")
-    arrays = {name: _array(attributes, name, lines) for name in TYPES if name != DEGREE}
+    degree = _value(attributes, DEGREE, lines).decode("ascii", "replace")
+    arrays = {name: _array(attributes, name, lines) for name in ARRAYS}
+    linear = is_linear(attributes.get(COLOR_SPACE, EMPTY).value)
+    return _built(degree, arrays, linear, str(lines.path), lines.fail)
+
+
+def _built(
+    degree: str,
+    arrays: dict[str, Float[np.ndarray, "N width"]],
+    linear: bool,
+    name: str,
+    fail: Callable[[str], NoReturn],
+) -> Gaussians:
+    """Return the Gaussians of a prim after checking the numbers of its values.
+
+    Args:
+        linear: whether its colours are of linear light.
+        name: the file, for messages.
+    """
+    if degree not in map(str, range(MAX_DEGREE + 1)):
+        fail(f"{DEGREE} should be 0 to {MAX_DEGREE}, not {degree[:60]!r}")
     count, harmonics = len(arrays["positions"]), COEFFICIENTS[int(degree)]
-    for name, values in arrays.items():
-        expected = count * (harmonics if name == HARMONICS else 1)
+    for attribute, values in arrays.items():
+        expected = count * (harmonics if attribute == HARMONICS else 1)
         if len(values) != expected:
-            lines.fail(f"{name} has {len(values)} values, expected {expected}")
+            fail(f"{attribute} has {len(values)} values, expected {expected}")
     with np.errstate(divide="ignore", invalid="ignore"):  # of scales that are 0 or negative
         log_scales = np.log(arrays["scales"])
-    return Gaussians(
+    gaussians = Gaussians(
         means=arrays["positions"],
         quats=arrays["orientations"],
         log_scales=log_scales,
         logit_opacities=logits(arrays["opacities"][:, 0], FLOAT_OPACITY_MARGIN),
         sh=arrays[HARMONICS].reshape(count, harmonics, 3),
     )
+    return displayed(gaussians, name) if linear else gaussians
 
 
 def _value(attributes: dict[str, _Attribute], name: str, lines: _Lines) -> bytes:

@@ -29,6 +29,8 @@ AXES = {
     "z": np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]),
 }
 """Rotation to the axes (right, up, front), by the name of the axis that is up."""
+SAME_SCALE = 1e-4
+"""Largest relative difference of a node's scales that counts as rounding."""
 FRONTS = {"y": "+z", "-y": "-z", "z": "+x"}
 
 
@@ -49,6 +51,29 @@ def rotate(gaussians: Gaussians, rotation: Float[np.ndarray, "3 3"]) -> Gaussian
             quats=_rotate_quats(gaussians.quats, rotation),
             sh=_rotate_sh(gaussians.sh, rotation),
         )
+
+
+def placed(gaussians: Gaussians, world: Float[np.ndarray, "4 4"], name: str) -> Gaussians:
+    """Transform Gaussians by the matrix of their node in a scene.
+
+    Args:
+        name: the file, for the message.
+
+    Raises:
+        UserError: the matrix isn't a rotation, a translation and one scale.
+    """
+    if np.array_equal(world, np.eye(4)):
+        return gaussians
+    scale = np.linalg.norm(world[:3, :3], axis=0).mean()
+    rotation = world[:3, :3] / (scale if 0 < scale < np.inf else 1)
+    close = np.allclose(rotation.T @ rotation, np.eye(3), atol=SAME_SCALE)
+    if not close or np.linalg.det(rotation) < 0 or not np.isfinite(world).all():
+        raise UserError(f"{name}: a node mirrors its Gaussians or scales them by different factors")
+    turned = rotate(gaussians, rotation)
+    return turned._replace(
+        means=(turned.means * scale + world[:3, 3]).astype(np.float32),
+        log_scales=(turned.log_scales + np.log(scale)).astype(np.float32),
+    )
 
 
 def _rotate_quats(

@@ -2,7 +2,7 @@
 optimisers: logarithms of the scales, logits of the opacities, spherical harmonics for colours."""
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -73,6 +73,17 @@ def usable(gaussians: Gaussians) -> Bool[np.ndarray, " N"]:
         gaussians.log_scales < np.inf,
     ]
     return np.concatenate(columns, axis=1).all(axis=1)
+
+
+def joined(parts: Sequence[Gaussians]) -> Gaussians:
+    """Concatenate arrays of Gaussians; harmonics that a part lacks are zero."""
+    if not parts:
+        shapes = (0, 3), (0, 4), (0, 3), (0,), (0, 1, 3)
+        return Gaussians(*(np.zeros(shape, np.float32) for shape in shapes))
+    most = max(part.sh.shape[1] for part in parts)
+    pads = [((0, 0), (0, most - part.sh.shape[1]), (0, 0)) for part in parts]
+    parts = [part._replace(sh=np.pad(part.sh, pad)) for part, pad in zip(parts, pads, strict=True)]
+    return Gaussians(*(np.concatenate(values) for values in zip(*parts, strict=True)))
 
 
 def drawable(gaussians: Gaussians, name: str) -> Gaussians:
