@@ -1,8 +1,10 @@
 """What a run writes beside its results, and concurrent runs in one folder."""
 
 import datetime
+import errno
 import fcntl
 import os
+import shutil
 import signal
 from pathlib import Path
 
@@ -12,7 +14,13 @@ from tests.helpers import tiny_parts
 from tests.helpers.tiny_runs import files, only_run
 from threestudio_gaussiandreamer.core.checkpoint_file import load_checkpoint
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.launch import callbacks, experiment, run, run_folder
+from threestudio_gaussiandreamer.launch import (
+    callbacks,
+    checkpoints,
+    experiment,
+    run,
+    run_folder,
+)
 from threestudio_gaussiandreamer.launch.config import load_config
 from threestudio_gaussiandreamer.launch.ddp import ReplicatedStrategy
 from threestudio_gaussiandreamer.launch.experiment import main
@@ -49,23 +57,25 @@ def test_a_source_that_can_not_be_read_is_left_out_of_the_copy_with_a_warning(
     (tmp_path / "source/secret.py").touch()
     (tmp_path / "source/part.py").touch()
     monkeypatch.setattr(Path, "read_bytes", forbidden)
-    callbacks.copy_sources(tmp_path / "source", tmp_path / "copy")
-    assert files(tmp_path / "copy") == {"part.py"}
+    read = dict(callbacks.read_sources(tmp_path / "source", tmp_path / "copy"))
+    assert read == {tmp_path / "copy/part.py": b""}
 
 
 def test_data_beside_a_part_is_recorded_up_to_a_total_size(tmp_path, caplog):
+    def read(data_bytes):
+        found = callbacks.read_sources(tmp_path / "part", tmp_path, data_bytes)
+        return {path.name for path, _ in found}
+
     (tmp_path / "part").mkdir()
     for name in ("part.py", "sizes.json", ".hidden"):
         (tmp_path / "part" / name).write_text("1")
     (tmp_path / "part/weights.npy").write_bytes(bytes(11))
-    callbacks.copy_sources(tmp_path / "part", tmp_path / "copy", 10)
-    assert files(tmp_path / "copy") == {"part.py", "sizes.json"}
+    assert read(10) == {"part.py", "sizes.json"}
     assert "1 files below" in caplog.text and "weights.npy, aren't copied" in caplog.text
     caplog.clear()
-    callbacks.copy_sources(tmp_path / "part", tmp_path / "exact", 1)  # nothing is left then
+    read(1)  # nothing is left then
     assert "1 files below" in caplog.text
-    callbacks.copy_sources(tmp_path / "part", tmp_path / "all", 12)
-    assert files(tmp_path / "all") == {"part.py", "sizes.json", "weights.npy"}
+    assert read(12) == {"part.py", "sizes.json", "weights.npy"}
 
 
 def test_a_deleted_configuration_is_stored_as_it_was_read(launch, monkeypatch):
@@ -166,24 +176,88 @@ def test_a_run_from_step_0_puts_earlier_results_aside(launch):
     assert not save.with_name("save-3").exists()
 
 
-@pytest.mark.parametrize("stage", ["preflight", "configure_optimizers"])
-def test_a_start_that_fails_leaves_the_earlier_run_in_its_place(launch, monkeypatch, stage):
-    """What ``preflight`` finds, such as a wrong path, leaves the record of the run too; the prior
-    runs in ``configure_optimizers``.
-    """
-    assert launch("--train", *ONE_FOLDER)[0] == 0
-    folder = Path("outputs/tiny/run")
-    record = (folder / "configs/parsed.yaml").read_text()
-
-    def fail(_: object) -> None:
+def fail_in(stage, monkeypatch):
+    def fail(*_: object) -> None:
         raise UserError("none.glb does not exist")
 
-    monkeypatch.setattr(tiny_parts.TinySystem, stage, fail, raising=False)
-    code, out, err = launch("--train", *ONE_FOLDER, "seed=5")
+    monkeypatch.setattr(tiny_parts.TinySystem, stage, fail)
+
+
+@pytest.mark.parametrize("stage", ["configure_optimizers", "training_step"])
+@pytest.mark.parametrize("options", [["seed=5"], ["resume=auto", "seed=5", "trainer.max_steps=9"]])
+def test_a_start_that_fails_leaves_the_earlier_run_in_its_place(
+    launch, monkeypatch, stage, options
+):
+    """The prior runs in ``configure_optimizers``; ``training_step`` is before a checkpoint."""
+    Path("custom").mkdir()
+    Path("custom/part.py").write_text("OF = 'the first run'")
+    assert launch("--train", *ONE_FOLDER)[0] == 0
+    folder = Path("outputs/tiny/run")
+    names = {name for name in files(folder) if name.startswith(("configs/", "code/", "ckpts/"))}
+    names.add("cmd.txt")
+    record = {name: (folder / name).read_bytes() for name in names}
+    Path("custom/part.py").write_text("OF = 'the second'")
+    with monkeypatch.context() as patch:
+        fail_in(stage, patch)
+        code, out, err = launch("--train", *ONE_FOLDER, *options)
     assert code and "none.glb does not exist" in out + err
-    assert (folder / "ckpts/last.ckpt").is_file() and not (folder / "ckpts-2").exists()
-    if stage == "preflight":
-        assert (folder / "configs/parsed.yaml").read_text() == record
+    assert "to resume" not in out or "resume=auto" in options
+    assert {name: (folder / name).read_bytes() for name in names} == record
+    assert not (folder / "ckpts-2").exists()
+    again = ["resume=auto", "trainer.max_steps=8"]
+    assert launch("--train", *again, config=str(folder / "configs/parsed.yaml"))[0] == 0
+    assert load_checkpoint(folder / "ckpts/last.ckpt")["global_step"] == 8
+    assert load_config(folder / "configs/parsed.yaml").seed == 3
+
+
+def test_an_option_that_does_not_fit_the_checkpoint_leaves_the_record_of_the_run(launch):
+    assert launch("--train", *ONE_FOLDER)[0] == 0
+    parsed = Path("outputs/tiny/run/configs/parsed.yaml")
+    record = parsed.read_bytes()
+    resumed = ["resume=auto", "trainer.max_steps=8"]
+    code, _, err = launch("--train", *ONE_FOLDER, *resumed, "system.geometry.size=4")
+    assert code == 2 and "was made by another configuration" in err
+    assert parsed.read_bytes() == record
+    assert launch("--train", *resumed, config=str(parsed))[0] == 0
+
+
+def test_the_record_of_a_new_run_is_written_with_its_first_checkpoint(launch, monkeypatch):
+    """At each write there is either no checkpoint beside the record, or one of the same run."""
+    assert launch("--train", *ONE_FOLDER)[0] == 0
+    folder = Path("outputs/tiny/run")
+    parsed, last, seen = folder / "configs/parsed.yaml", folder / "ckpts/last.ckpt", []
+
+    def save(path, content):
+        seen.append((load_config(parsed).seed, last.is_file()))
+        save_file(path, content)
+
+    save_file = checkpoints.save_file
+    monkeypatch.setattr(checkpoints, "save_file", save)
+    assert launch("--train", *ONE_FOLDER, "seed=5")[0] == 0
+    assert seen[0] == (5, False)
+    seen.clear()
+    go_on = ["resume=auto", "trainer.max_steps=9"]
+    assert launch("--train", *ONE_FOLDER, *go_on, "seed=7")[0] == 0
+    assert seen[0] == (5, True) and load_config(parsed).seed == 7
+
+
+def test_a_full_disk_leaves_the_results_that_would_be_set_aside(launch, monkeypatch):
+    save = Path("outputs/tiny/run/save")
+    for name in ("it9-export", "prior"):
+        (save / name).mkdir(parents=True)
+        (save / name / "file").write_text(name)
+
+    def copy(source, target, **_):
+        Path(target).write_text("ha")  # half of it
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), target)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(shutil, "copyfile", copy)
+        code, _, err = launch("--train", *ONE_FOLDER)
+    assert code == 2 and "No space left on device" in err and "make room" in err
+    assert files(save.parent) >= {"save/it9-export/file", "save/prior/file"}
+    assert not list(save.parent.glob("save-*")) and (save / "prior/file").read_text() == "prior"
+    assert launch("--train", *ONE_FOLDER)[0] == 0 and save.with_name("save-2").is_dir()
 
 
 def test_a_run_may_start_from_the_weights_of_the_checkpoints_that_it_puts_aside(launch):

@@ -10,7 +10,7 @@ import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, Optional
 
 import torch
 
@@ -20,7 +20,13 @@ from ..core.signals import interrupt, restore_handlers, set_handlers
 from ..host import info, pl, warn
 from .checkpoints import AtomicCheckpointIO
 from .config import dump_config
-from .folder_lock import set_run_aside
+from .folder_lock import (
+    free_number,
+    has_checkpoints,
+    set_checkpoints_aside,
+    set_results_aside,
+)
+from .run_folder import PARSED
 
 SECONDS_BETWEEN = 60.0
 """Shortest time between two checkpoints, seconds: a crash loses about as much training."""
@@ -45,7 +51,9 @@ class Stopped(BaseException):
 
 class RunRecord(pl.Callback):
     """Write ``configs/raw.yaml``, ``configs/parsed.yaml``, ``code/`` and ``cmd.txt`` when the first
-    stage starts, before the prior.
+    stage starts, before the prior. If the folder has record and checkpoints of an earlier run, they
+    are replaced together, with the first checkpoint of this one, so that a start that is refused or
+    stopped leaves the earlier run as it was.
 
     Args:
         folder: the run's folder.
@@ -65,19 +73,33 @@ class RunRecord(pl.Callback):
     ) -> None:
         self.folder, self.cfg, self.sources, self.command = folder, cfg, sources, command
         self.records_code = records_code
-        self._is_written = False
+        self._code: dict[Path, bytes] = {}
+        self._is_due = self._is_read = False
 
     def setup(self, trainer: Any, pl_module: Any, stage: str) -> None:
-        if trainer.is_global_zero and not self._is_written:
-            self._is_written = True
-            self.save_configs()
-            if self.records_code:
-                self.save_code()
-            # append, since a resumed run has several command lines
-            # surrogateescape: paths on the command line may be no UTF-8
-            log = self.folder / "cmd.txt"
-            with open(log, "a", encoding="utf-8", errors="surrogateescape") as file:
-                file.write(self.command + "\n")
+        if not trainer.is_global_zero or self._is_read:
+            return
+        self._is_read = self._is_due = True
+        if self.records_code:  # now, since the files may change before they are written
+            self._code = self.read_code()
+        if not (has_checkpoints(self.folder) and (self.folder / PARSED).is_file()):
+            self.write()
+
+    def write(self) -> None:
+        """Write the record, unless it has been written."""
+        if not self._is_due:
+            return
+        self._is_due = False
+        self.save_configs()
+        for path, content in self._code.items():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_copy(path, content)
+        self._code = {}
+        # append, since a resumed run has several command lines
+        # surrogateescape: paths on the command line may be no UTF-8
+        log = self.folder / "cmd.txt"
+        with open(log, "a", encoding="utf-8", errors="surrogateescape") as file:
+            file.write(self.command + "\n")
 
     def save_configs(self) -> None:
         """Write the configuration before and after merging and resolving."""
@@ -87,21 +109,29 @@ class RunRecord(pl.Callback):
             # not if the run is resumed from its own parsed.yaml: keep the original raw.yaml
             if path.resolve().parent != configs.resolve():
                 write_copy(configs / (f"raw-{i}.yaml" if i else "raw.yaml"), content)
-        dump_config(configs / "parsed.yaml", self.cfg)
+        dump_config(self.folder / PARSED, self.cfg)
 
-    def save_code(self) -> None:
-        """Copy the sources of this package and of the extensions."""
-        package = Path(__file__).parents[1]
-        copy_sources(package, self.folder / "code" / package.name)
+    def read_code(self) -> dict[Path, bytes]:
+        """Read the sources of this package and of the extensions.
+
+        Returns:
+            the content of the copies, by their paths.
+        """
+        package, copies = Path(__file__).parents[1], self.folder / "code"
+        found = dict(read_sources(package, copies / package.name))
         if Path("custom").is_dir():
-            copy_sources(Path("custom"), self.folder / "code" / "custom", DATA_BYTES)
+            found |= read_sources(Path("custom"), copies / "custom", DATA_BYTES)
+        return found
 
 
-def copy_sources(source: Path, destination: Path, data_bytes: int = 0) -> None:
-    """Copy the source files below a folder, leaving out hidden files and folders, and, with a
-    warning, what can't be read.
+def read_sources(
+    source: Path, destination: Path, data_bytes: int = 0
+) -> Iterator[tuple[Path, bytes]]:
+    """Yield path and content of the copies of the source files below a folder, leaving out hidden
+    files and folders, and, with a warning, what can't be read.
 
     Args:
+        destination: the folder of the copies.
         data_bytes: copy other files too, which a part may read, up to so many bytes in total; a
             warning says if there are more.
     """
@@ -119,9 +149,7 @@ def copy_sources(source: Path, destination: Path, data_bytes: int = 0) -> None:
             warn(f"{path} isn't copied to {destination}: {error.strerror}")
             continue
         data_bytes -= 0 if is_source else len(content)
-        copy = destination / path.relative_to(source)
-        copy.parent.mkdir(parents=True, exist_ok=True)
-        write_copy(copy, content)
+        yield destination / path.relative_to(source), content
     if left_out:
         warn(
             f"{len(left_out)} files below {source}, such as {left_out[0]}, aren't copied to "
@@ -145,17 +173,24 @@ def write_copy(path: Path, content: bytes) -> None:
 
 
 class EarlierRunAside(pl.Callback):
-    """Rename checkpoints and results of an earlier run in the folder when the prior's cloud is
-    there, so that a start that fails leaves them in their place. Parts may read weights from there
-    when they are built.
+    """Rename the results of an earlier run in the folder when the prior's cloud is there, and its
+    checkpoints before the first one of this run, so that a start that fails leaves them in their
+    place. Parts may read weights from there when they are built.
     """
 
     def __init__(self, folder: Path) -> None:
-        self.folder = folder
+        self.folder, self.number = folder, 0
 
     def on_fit_start(self, trainer: Any, pl_module: Any) -> None:
-        for earlier in set_run_aside(self.folder):
-            info(f"starting at step 0: files of an earlier run are now in {earlier}")
+        self.number = free_number(self.folder)
+        self._say(set_results_aside(self.folder, self.number))
+
+    def set_checkpoints_aside(self) -> None:
+        self._say(set_checkpoints_aside(self.folder, self.number))
+
+    def _say(self, aside: Optional[Path]) -> None:
+        if aside is not None:
+            info(f"started at step 0: files of an earlier run are now in {aside}")
 
 
 class ProgressBar(pl.callbacks.TQDMProgressBar):

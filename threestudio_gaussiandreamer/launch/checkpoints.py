@@ -2,8 +2,10 @@
 that they can't run code.
 """
 
+import contextlib
 import os
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +16,13 @@ from ..host import pl
 class AtomicCheckpointIO(pl.plugins.CheckpointIO):
     """Save checkpoints with a checksum into a temporary file that is synced and renamed; see
     :mod:`.core.checkpoint_file`.
+
+    Args:
+        first: returns a context in which the first checkpoint is written.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, first: Callable[[], Any] = contextlib.nullcontext) -> None:
+        self.first = first
         self.saved_steps: dict[str, int] = {}
         self.seconds = 0.0
         """Duration of the last write."""
@@ -31,7 +37,8 @@ class AtomicCheckpointIO(pl.plugins.CheckpointIO):
                 unchanged.
         """
         started = time.monotonic()
-        save_file(path, checkpoint)
+        with contextlib.nullcontext() if self.saved_steps else self.first():
+            save_file(path, checkpoint)
         self.seconds = time.monotonic() - started
         self.saved_steps[os.path.abspath(path)] = checkpoint.get("global_step", -1)
 

@@ -24,8 +24,6 @@ from ..core.errors import UserError
 
 SUBFOLDERS = ("ckpts", "configs", "code", "save", "tb_logs", "csv_logs")
 FILES = ("ckpts/last.ckpt", "configs/parsed.yaml", "cmd.txt")
-RESULTS = {"ckpts": "*.ckpt", "save": "it*"}
-"""Folders that a training fills, and the files of which each run has its own."""
 LONGEST_RESULT = 200
 """Upper bound of the length of paths that a run writes below its folder, bytes."""
 LOCK_FILE = ".lock"
@@ -128,35 +126,59 @@ def claim(path: Path) -> RunFolder:
             return RunFolder(path, first_made, _lock(path))
 
 
-def set_run_aside(folder: Path) -> list[Path]:
-    """Rename checkpoints and results of an earlier run: resume=auto could take the ones, and the
-    page of a run shows the cloud of the latest step. The prior's points, which may serve again, are
-    copied back.
+def free_number(folder: Path) -> int:
+    """Return the smallest number from 2 on with which no folder of earlier results is named."""
+    taken = {path.name for path in folder.glob("*-*")}
+    return next(n for n in count(2) if not taken & {f"ckpts-{n}", f"save-{n}"})
+
+
+def set_results_aside(folder: Path, number: int) -> Optional[Path]:
+    """Rename ``save`` to ``save-<number>`` if it has results: the page of a run shows the cloud of
+    the latest step. The prior's points, which may serve again, are copied.
 
     Returns:
-        the new paths.
+        the new path; None if it wasn't renamed.
+
+    Raises:
+        UserError: the points can't be copied, for instance since the disk is full; everything is
+            left in its place.
     """
-    checkpoints, results = (set_aside(folder / name, files) for name, files in RESULTS.items())
-    if results and (results / "prior").is_dir():
-        shutil.copytree(results / "prior", folder / "save" / "prior")
-    return [path for path in (checkpoints, results) if path]
+    save, fresh = folder / "save", folder / "save-new"
+    if not any(save.glob("it*")):
+        return None
+    try:
+        shutil.rmtree(fresh, ignore_errors=True)  # of a process that was killed here
+        if (save / "prior").is_dir():
+            shutil.copytree(save / "prior", fresh / "prior")
+    except OSError as error:
+        shutil.rmtree(fresh, ignore_errors=True)
+        # copytree lists the files that it couldn't copy
+        listed = error.args[0] if isinstance(error, shutil.Error) else ()
+        why = listed[0][2] if listed else error.strerror
+        raise UserError(
+            f"cannot copy the prior's points from {save / 'prior'}: {why}; make room, or choose "
+            "another exp_root_dir or tag. The earlier run's results are in their place."
+        ) from error
+    aside = save.rename(folder / f"save-{number}")
+    if fresh.is_dir():
+        fresh.rename(save)
+    return aside
 
 
-def has_results(folder: Path) -> bool:
-    """Return whether :func:`set_run_aside` would rename anything."""
-    return any(any((folder / name).glob(files)) for name, files in RESULTS.items())
-
-
-def set_aside(path: Path, content: str) -> Optional[Path]:
-    """Rename a folder to the first of ``path-2``, ``path-3``, ... that doesn't exist, unless it is
-    missing or holds nothing of the pattern ``content``.
+def set_checkpoints_aside(folder: Path, number: int) -> Optional[Path]:
+    """Rename ``ckpts`` to ``ckpts-<number>`` if it has checkpoints, which resume=auto could take.
 
     Returns:
         the new path; None if it wasn't renamed.
     """
-    if not any(path.glob(content)):
+    if not has_checkpoints(folder):
         return None
-    return path.rename(next(name for name in numbered(path) if not name.exists()))
+    return (folder / "ckpts").rename(folder / f"ckpts-{number}")
+
+
+def has_checkpoints(folder: Path) -> bool:
+    """Return whether a run's folder has checkpoints."""
+    return any((folder / "ckpts").glob("*.ckpt"))
 
 
 def make_folder(path: Path) -> Optional[Path]:

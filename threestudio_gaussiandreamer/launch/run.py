@@ -6,7 +6,7 @@ cmd.txt}``"""
 import argparse
 import contextlib
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import Any, Optional
@@ -31,9 +31,9 @@ from .callbacks import (
 from .checkpoints import AtomicCheckpointIO
 from .config_check import build, plain
 from .ddp import environment_plugins, planned_processes, trainer_options
-from .folder_lock import RunFolder, claim, claim_new, has_results, require_writable
+from .folder_lock import RunFolder, claim, claim_new, require_writable
 from .live_viewer import LiveViewer, ViewerConfig
-from .run_folder import SIZES, changes_since, renumber, resume_command
+from .run_folder import PARSED, SIZES, changes_since, renumber, resume_command
 from .section_checks import check_shared_views
 from .stage_errors import lightning_errors, write_errors
 from .training_state import check_training_state
@@ -72,6 +72,7 @@ class Run:
         self.callbacks, self.records_code = list(callbacks), records_code
         self.sources, self.command = sources, command
         self.claimed = RunFolder(Path(cfg.trial_dir))
+        self.checkpoint_io = AtomicCheckpointIO(self.first_checkpoint)
         self.resumed_step = -1
         self.has_trained = False
         self.size_changes: list[str] = []
@@ -137,14 +138,11 @@ class Run:
         if checkpoint is not None and self.args.stage != "train":
             self.system.set_resume_status(*checkpoint)
         self.system.set_save_dir(str(self.folder / "save"))
-        if self.starts_anew and has_results(self.folder) and hasattr(self.system, "preflight"):
-            self.system.preflight()  # before the record of the earlier run is replaced
+        with_code = self.records_code and self.args.stage == "train"
+        self.record = RunRecord(self.folder, self.cfg, self.sources, self.command, with_code)
+        at_zero = self.args.stage == "train" and self.cfg.resume is None and not get_rank()
+        self.aside = EarlierRunAside(self.folder) if at_zero else None
         self.trainer = self.build_trainer()
-
-    @property
-    def starts_anew(self) -> bool:
-        """Whether this process begins a training, in a folder that may have an earlier one."""
-        return self.args.stage == "train" and self.cfg.resume is None and not get_rank()
 
     def read_resume(self) -> Optional[tuple[int, int]]:
         """Return the epoch and step of the checkpoint to resume from; None without one. The file is
@@ -254,16 +252,14 @@ class Run:
             "profiler": NoProfiler(),
             **plain(self.cfg.trainer),
         }
-        checkpoint_io = AtomicCheckpointIO()
         training = self.args.stage == "train"
         callbacks = self.callbacks + ([ProgressBar()] if options["enable_progress_bar"] else [])
         processes = planned_processes(self.n_gpus, options)
         required = {
             "accelerator": "gpu" if self.n_gpus else "cpu",
             "logger": self.build_loggers() if training else False,
-            "callbacks": callbacks
-            + (self.training_callbacks(checkpoint_io) if training else self.records()),
-            "plugins": [checkpoint_io, *environment_plugins(processes)],
+            "callbacks": callbacks + (self.training_callbacks() if training else self.records()),
+            "plugins": [self.checkpoint_io, *environment_plugins(processes)],
             "inference_mode": False,
             "default_root_dir": str(self.folder),
         }
@@ -278,32 +274,41 @@ class Run:
         ]
         return loggers + list(self.system.get_loggers())
 
-    def record(self, with_code: bool) -> RunRecord:
-        return RunRecord(self.folder, self.cfg, self.sources, self.command, with_code)
-
     def records(self) -> list:
         """Return what records a stage other than training, unless the folder has a run's record."""
-        has_one = (self.folder / "configs/parsed.yaml").is_file()
-        return [] if has_one else [self.record(with_code=False)]
+        return [] if (self.folder / PARSED).is_file() else [self.record]
 
-    def training_callbacks(self, checkpoint_io: AtomicCheckpointIO) -> list:
+    def training_callbacks(self) -> list:
         # without the version counter a resumed run overwrites last.ckpt instead of adding
         # last-v1.ckpt
         checkpointing = {"enable_version_counter": False, **plain(self.cfg.checkpoint)}
         if checkpointing.get("save_weights_only"):
             checkpointing["save_last"] = False  # last.ckpt is LastCheckpoint's, always complete
-        last = LastCheckpoint(self.last, checkpoint_io)
-        callbacks = [EarlierRunAside(self.folder)] if self.starts_anew else []
+        last = LastCheckpoint(self.last, self.checkpoint_io)
+        callbacks = [] if self.aside is None else [self.aside]
         callbacks += [
             pl.callbacks.ModelCheckpoint(dirpath=str(self.last.parent), **checkpointing),
             LearningRates(logging_interval="step"),
             LastNumbers(),
-            self.record(self.records_code),
+            self.record,
             last,
         ]
         if self.view is not None:
             callbacks.append(LiveViewer(self.view, self.viewer, lambda: bool(last.signum)))
         return callbacks
+
+    @contextlib.contextmanager
+    def first_checkpoint(self) -> Iterator[None]:
+        """Replace the record of an earlier run while the first checkpoint is written in this
+        context. At no time does the folder have a checkpoint beside the record of another start: of
+        a run from step 0, the earlier checkpoints are renamed first; of a resumed run, the record
+        follows its checkpoint.
+        """
+        if self.aside is not None:
+            self.aside.set_checkpoints_aside()
+            self.record.write()
+        yield
+        self.record.write()
 
     # -- the folder --------------------------------------------------------------------------------
 
@@ -339,6 +344,8 @@ class Run:
     def print_resume_command(self) -> None:
         """Print how to go on after an error, if this run has trained and has a checkpoint."""
         training = self.args.stage == "train" and self.trainer is not None
-        if training and self.trainer.global_step and self.last.is_file() and not get_rank():
+        # not the checkpoint of an earlier run, of which this one has replaced none yet
+        own = self.cfg.resume is not None or self.checkpoint_io.saved_steps
+        if training and self.trainer.global_step and own and self.last.is_file() and not get_rank():
             with contextlib.suppress(OSError):  # of a closed pipe, which would hide the first error
                 print(f"to resume: {resume_command(self.folder, self.args.gpu)}", flush=True)

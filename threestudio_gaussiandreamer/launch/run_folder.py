@@ -282,8 +282,8 @@ def _resume_newest(cfg: Any, tag: str) -> None:
 
 
 def _earlier_checkpoints(run: Path) -> str:
-    """Name the last checkpoint of earlier runs in a folder, see ``folder_lock.set_run_aside``; an
-    empty text if there is none.
+    """Name the last checkpoint of earlier runs in a folder, see
+    ``callbacks.EarlierRunAside``; an empty text if there is none.
     """
     aside = run.glob("ckpts-*/*.ckpt")
     latest = max(aside, key=lambda path: path.stat().st_mtime, default=None)
