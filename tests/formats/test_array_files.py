@@ -1,16 +1,19 @@
-"""NPY and NPZ from untrusted sources: what NumPy wrote is read to the bit; wrong headers are
-rejected.
+"""NPY, NPZ and pickled dicts from untrusted sources: what NumPy wrote is read to the bit; wrong
+headers are rejected, and no code is run.
 """
 
 import io
+import os
+import pickle
 import tracemalloc
 import zipfile
 
 import numpy as np
 import pytest
+import scipy.sparse
 
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.formats.array_files import PickledArray, read_arrays
+from threestudio_gaussiandreamer.formats.array_files import read_arrays
 
 ARRAYS = {
     "a": np.arange(12.0).reshape(3, 4),
@@ -49,11 +52,52 @@ def test_what_is_missing_is_named(tmp_path):
 def test_objects_are_not_unpickled_unless_nobody_asked_for_them(tmp_path):
     np.savez(tmp_path / "x.npz", good=np.ones(3), bad=np.array({"a": 1}, dtype=object))
     assert read_arrays(tmp_path / "x.npz", "file", ["good"])["good"].sum() == 3
-    with pytest.raises(PickledArray, match="could run code"):
+    with pytest.raises(UserError, match="could run code"):
         read_arrays(tmp_path / "x.npz", "file", ["bad"])
-    (tmp_path / "x.pkl").write_bytes(b"\x80\4N.")
-    with pytest.raises(PickledArray):
-        read_arrays(tmp_path / "x.pkl", "file", ["bad"])
+
+
+@pytest.mark.parametrize("protocol", range(pickle.HIGHEST_PROTOCOL + 1))
+def test_pickled_dicts_of_arrays_are_read(tmp_path, protocol):
+    given = ARRAYS | {"columns": np.asfortranarray(np.eye(3)[:, :2]), "big": np.ones(2, ">i4")}
+    (tmp_path / "x.pkl").write_bytes(pickle.dumps(given, protocol))
+    read = read_arrays(tmp_path / "x.pkl", "file", list(given))
+    for name, values in given.items():
+        np.testing.assert_array_equal(read[name], values)
+        assert read[name].dtype == values.dtype
+
+
+class Runs:
+    def __reduce__(self):
+        return (exec, ("import os; os.environ['RAN'] = '1'",))
+
+
+@pytest.mark.parametrize(
+    ("data", "said"),
+    [
+        (b"\x80\4N.", "something else than a dict"),
+        (pickle.dumps(Runs()), "holds an object 'exec'"),
+        (pickle.dumps({"a": Runs()}), "holds an object 'exec'"),
+        (pickle.dumps({"a": [Runs()]}), "Python objects as 'a'"),
+        (pickle.dumps({"a": np.array([Runs()], object)}), "Python objects as 'a'"),
+        (pickle.dumps({"b": 1}), "no array 'a', only b"),
+        (pickle.dumps({"a": np.ones(9)})[:-40], "can't be read"),
+        (b"\x80\2Nr\xff\xff\xff\x7f.", "fill the memory"),
+        (b"\x80\2cposix\nsystem\nX\4\0\0\0trueb.", "can't be read"),
+    ],
+)
+def test_pickles_run_no_code(tmp_path, monkeypatch, data, said):
+    monkeypatch.delenv("RAN", raising=False)
+    (tmp_path / "x.pkl").write_bytes(data)
+    with pytest.raises(UserError, match=said):
+        read_arrays(tmp_path / "x.pkl", "file", ["a"])
+    assert "RAN" not in os.environ
+
+
+def test_a_sparse_matrix_that_would_fill_the_memory_is_refused(tmp_path):
+    wide = scipy.sparse.csc_matrix((10**6, 10**6))
+    (tmp_path / "x.pkl").write_bytes(pickle.dumps({"a": wide}))
+    with pytest.raises(UserError, match="a sparse matrix .* of memory"):
+        read_arrays(tmp_path / "x.pkl", "file", ["a"])
 
 
 def npy(header: str, body: bytes) -> bytes:

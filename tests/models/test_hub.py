@@ -182,6 +182,14 @@ def test_a_folder_that_is_no_model_says_what_is_missing(tmp_path):
         hub.find_model(str(tmp_path), ["unet"])
 
 
+def test_weights_that_are_a_pointer_are_named(model, tmp_path):
+    folder = copied(model, tmp_path / "tiny")
+    (weights,) = (folder / "unet").glob("*.safetensors")
+    weights.write_bytes(b"version https://git-lfs.github.com/spec/v1\n")
+    with pytest.raises(UserError, match="unet/.*safetensors is a pointer of Git LFS"):
+        hub.find_model(str(folder), IMAGE)
+
+
 def test_pickled_weights_are_refused(model, tmp_path):
     folder = copied(model, tmp_path / "pickled", without=["unet/*.safetensors"])
     (folder / "unet" / "diffusion_pytorch_model.bin").write_bytes(b"a pickle")
@@ -302,7 +310,8 @@ def test_no_network_is_one_clear_message(monkeypatch, tmp_path):
         raise socket.gaierror(-2, "Name or service not known")
 
     monkeypatch.setattr(socket, "getaddrinfo", blocked)
-    with pytest.raises(UserError, match="could not be reached.*--local-dir models/tiny"):
+    said = "could not be reached.*--local-dir models/tiny.*HF_ENDPOINT"
+    with pytest.raises(UserError, match=said):
         hub.find_model("people/tiny", IMAGE)
 
 

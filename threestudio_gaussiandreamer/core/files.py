@@ -18,6 +18,16 @@ ABANDONED_SECONDS = 3600
 """Age from which a temporary file is taken for that of a killed process."""
 
 
+PLACEHOLDERS = {
+    b"version https://git-lfs": "a pointer of Git LFS, not the file itself: run `git lfs pull` "
+    "where it is from, or download it again",
+    b"<!doctype html": "a web page, not the file itself, as an address of a page gives it: "
+    "download it again by the link of the file",
+}
+PLACEHOLDERS[b"<html"] = PLACEHOLDERS[b"<!doctype html"]
+"""What downloads leave in a file's place, by its first bytes in lower case."""
+
+
 def existing_file(path: str | os.PathLike, kind: str, bundled: Collection[str] = ()) -> Path:
     """Return ``path`` as a :class:`Path` after checking that it is an existing file.
 
@@ -27,11 +37,12 @@ def existing_file(path: str | os.PathLike, kind: str, bundled: Collection[str] =
 
     Raises:
         UserError: the path doesn't exist or is no regular file; the message lists the files of its
-            folder with similar names.
+            folder with similar names. Or it is one of ``PLACEHOLDERS``.
     """
     try:
         path = Path(path).expanduser()
         if path.is_file():
+            require_content(path, f"{kind} {str(path)!r}")
             return path
         if path.exists():
             reason = "is a folder, not a file" if path.is_dir() else "is no regular file"
@@ -41,6 +52,17 @@ def existing_file(path: str | os.PathLike, kind: str, bundled: Collection[str] =
         # the name is too long or contains NUL, or "~user" names an unknown user
         raise UserError(f"{kind} {str(path)!r}: not a usable file name ({error}).") from error
     raise UserError(f"{kind} {str(path)!r} {reason}")
+
+
+def require_content(path: Path, name: str) -> None:
+    """Raise UserError if a file is one of ``PLACEHOLDERS``; ``name`` is for the message. One that
+    can't be read is left to its reader.
+    """
+    with suppress(OSError), open(path, "rb") as file:
+        start = file.read(64).lstrip().lower()
+        for placeholder, what in PLACEHOLDERS.items():
+            if start.startswith(placeholder):
+                raise UserError(f"{name} is {what}")
 
 
 def near_names(path: Path, bundled: Collection[str] = ()) -> str:

@@ -1,15 +1,22 @@
-"""Read NPY and NPZ files from untrusted sources: without pickles, within a memory budget, and with
-one type of error for every kind of damage.
+"""Read NPY and NPZ files, and pickled dicts of arrays, from untrusted sources: without running any
+code of theirs, within a memory budget, and with one type of error for every kind of damage.
 
 ``numpy.load`` trusts the header: it allocates the size that the header gives, ignores trailing
-data, and raises many types of errors for damaged files."""
+data, and raises many types of errors for damaged files.
 
+In a pickle every class and function is replaced by one that only keeps what it was called with.
+What that stands for is worked out afterwards, for the few kinds that hold arrays: NumPy's, SciPy's
+sparse matrices, and chumpy's in the files of SMPL and MANO, which need no chumpy so."""
+
+import io
 import math
 import os
+import pickle
+import pickletools
 import zipfile
 from collections.abc import Collection, Sequence
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 import numpy as np
 from numpy.lib import format as npy
@@ -24,15 +31,15 @@ CONVERTED_BYTES = 16
 """Memory per number that is added to the budget for callers, which make two float64 copies."""
 
 
-class PickledArray(UserError):
-    """Raised for an array of Python objects, which would have to be unpickled."""
+PICKLES = (".pkl", ".pickle")
+"""Extensions of pickles, whose oldest kind has no mark at its start."""
 
 
 def read_arrays(
     path: str | os.PathLike, kind: str, required: Sequence[str], optional: Collection[str] = ()
 ) -> dict[str, np.ndarray]:
-    """Read named arrays from an NPZ, or the single array of an NPY, which gets the first required
-    name.
+    """Read named arrays from an NPZ or a pickled dict, or the single array of an NPY, which gets
+    the first required name.
 
     Args:
         kind: what the file is, for messages ("motion file").
@@ -40,26 +47,30 @@ def read_arrays(
         optional: names of arrays that may be missing; other arrays are not read.
 
     Raises:
-        PickledArray: an array holds Python objects; it isn't unpickled, since that could run code.
-        UserError: the file is neither NPZ nor NPY, is damaged, lacks a required array, or needs
-            more memory than the budget of its size.
+        UserError: the file is neither NPZ nor NPY nor a pickle, is damaged, lacks a required array,
+            holds other Python objects in its place, or needs more memory than the budget of its
+            size.
     """
     path, where = Path(path), f"{kind} {str(path)!r}"
     try:
         with open(path, "rb") as file:
             start = file.read(len(npy.MAGIC_PREFIX))
             file.seek(0)
+            size = os.fstat(file.fileno()).st_size
             if start == npy.MAGIC_PREFIX:
-                return {required[0]: _read_array(file, os.fstat(file.fileno()).st_size, where)}
-            if start[:1] == b"\x80":
-                raise PickledArray(f"{where} is a pickle, which could run code, and isn't opened")
+                if not _read_header(file, size)[1].hasobject:
+                    file.seek(0)
+                    return {required[0]: _read_array(file, size, where)}
+                return _read_pickle(file.read(), where, required, optional)
+            if start[:1] == pickle.PROTO or path.suffix.lower() in PICKLES:
+                return _read_pickle(file.read(), where, required, optional)
             with zipfile.ZipFile(file) as archive:
                 return _read_archive(archive, where, required, optional)
     except UserError:
         raise
     except Exception as error:  # zipfile, zlib, ast and tokenize each raise errors of their own
         raise UserError(
-            f"{where} can't be read: it is no NPZ or NPY file, or is damaged "
+            f"{where} can't be read: it is no NPZ or NPY file or pickled dict, or is damaged "
             f"({type(error).__name__}: {error})"
         ) from error
 
@@ -109,7 +120,7 @@ def _read_array(file: IO[bytes], size: int, where: str) -> np.ndarray:
     """Read the array in a stream; header and data must have ``size`` bytes together."""
     shape, dtype = _read_header(file, size)
     if dtype.hasobject:
-        raise PickledArray(
+        raise UserError(
             f"{where} holds Python objects as a pickle, which could run code, and isn't opened"
         )
     if min(shape, default=0) < 0 or file.tell() + math.prod(shape) * dtype.itemsize != size:
@@ -131,3 +142,97 @@ def _read_header(file: IO[bytes], size: int) -> tuple[tuple[int, ...], np.dtype]
     read = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
     shape, _, dtype = read(file)
     return shape, dtype
+
+
+# ---- pickles -------------------------------------------------------------------------------------
+
+
+class _Object:
+    """Stands for an object of any class, or for the result of any function, in a pickle."""
+
+    kind = ""
+    made_from: tuple[Any, ...]
+
+    def __new__(cls, *made_from: Any, **_: Any) -> "_Object":
+        self = super().__new__(cls)
+        self.made_from, self.state = made_from, {}
+        return self
+
+    def __setstate__(self, state: Any) -> None:
+        self.state = state
+
+
+OURS = {
+    "encode": lambda text, _: text.encode("latin1"),
+    "bytes": lambda: b"",
+    "_reconstructor": lambda cls, *_: cls(),
+}
+"""Functions of ours that make bytes, and objects of protocols 0 and 1, by the names of those that
+pickles call for it.
+"""
+
+
+class _Unpickler(pickle.Unpickler):
+    def find_class(self, module: str, name: str) -> Any:
+        return OURS.get(name) or type(_Object.__name__, (_Object,), {"kind": name})
+
+
+def _read_pickle(
+    data: bytes, where: str, required: Sequence[str], optional: Collection[str]
+) -> dict[str, np.ndarray]:
+    for opcode, argument, _ in pickletools.genops(data):  # checks the sizes that it announces
+        if opcode.name in ("PUT", "LONG_BINPUT") and int(argument) > len(data):
+            raise UserError(f"{where} is damaged: it would fill the memory")
+    content = _plain(_Unpickler(io.BytesIO(data), encoding="latin1").load(), where, len(data))
+    if isinstance(content, list) and len(content) == 1:  # numpy.save's array of one dict
+        content = content[0]
+    if not isinstance(content, dict):
+        raise UserError(f"{where} is a pickle of something else than a dict of arrays")
+    if missing := [name for name in required if name not in content]:
+        raise UserError(
+            f"{where} has no array {', '.join(map(repr, missing))}, only "
+            f"{', '.join(map(str, content)) or 'none'}"
+        )
+    names = [name for name in (*required, *optional) if name in content]
+    arrays = {name: np.array(_plain(content[name], where, len(data))) for name in names}
+    for name, values in arrays.items():
+        if values.dtype.hasobject:
+            raise UserError(f"{where} holds Python objects as {name!r}; an array was expected")
+    return arrays
+
+
+def _plain(value: Any, where: str, size: int) -> Any:
+    """Return what an object of a pickle of ``size`` bytes stands for; other values as they are."""
+    if not isinstance(value, _Object):
+        return value
+    state = value.state
+    if value.kind == "_reconstruct":
+        _, shape, kind, columns_first, data = state
+        return _array(data, kind, shape, "F" if columns_first else "C")
+    if value.kind == "_frombuffer":
+        return _array(*value.made_from)
+    if value.kind == "Ch":
+        return _plain(state["x"], where, size)
+    if value.kind == "Select":
+        source, rows = (_plain(state[name], where, size) for name in ("a", "idxs"))
+        return np.ravel(source)[rows].reshape(state["preferred_shape"])
+    if value.kind in ("csc_matrix", "csr_matrix"):
+        from scipy import sparse
+
+        shape = state.get("_shape", state.get("shape"))
+        require_file_memory(3 * 8 * math.prod(shape), size, where, f"a sparse matrix {shape}")
+        parts = [_plain(state[name], where, size) for name in ("data", "indices", "indptr")]
+        return getattr(sparse, value.kind)(tuple(parts), shape).toarray()
+    raise UserError(f"{where} holds an object {value.kind[:60]!r}; an array was expected")
+
+
+def _array(data: Any, kind: _Object, shape: tuple[int, ...], order: str) -> Any:
+    """Make an array from what NumPy pickles of it; one of Python objects is a list."""
+    (name, *_), mark = kind.made_from, kind.state[1] if kind.state else "="
+    if name == "O8":
+        return data
+    dtype = np.dtype(f"{mark if mark in '<>' else ''}{name}")
+    if dtype.hasobject:
+        raise ValueError(f"an array of {name}")
+    raw = data.encode("latin1") if isinstance(data, str) else data
+    return np.frombuffer(raw, dtype).reshape(shape, order=order)

@@ -15,6 +15,7 @@ from queue import Empty, SimpleQueue
 from typing import Any, NamedTuple, Optional
 
 from ..core.errors import UserError
+from ..core.files import require_content
 from ..host import info
 from .bundled import DIFFUSION, model_part
 from .extras import require_extra
@@ -131,10 +132,13 @@ def is_hub_id(name: str) -> bool:
 
 
 def _checked(folder: Path, source: Source) -> Path:
-    """Return ``folder``; raise UserError if needed files are missing from it."""
+    """Return ``folder``; raise UserError if needed files are missing from it or only stand for
+    them.
+    """
     names = files_below(folder)
     try:
-        source.picks(names)
+        for name in source.picks(names):
+            require_content(folder / name, name)
     except UserError as error:
         known = "model_index.json" in names or "config.json" in names
         hint = (
@@ -337,5 +341,6 @@ def _how_to_get(source: Source) -> str:
     )
     return (
         f"{moved} With a network connection: `{command}`; then set {source.option} to that folder."
-        " To run without any weights: --config demo.yaml."
+        " Where the hub is out of reach, HF_ENDPOINT names a mirror of it, and ModelScope has many "
+        "of its models (docs/models.md). To run without any weights: --config demo.yaml."
     )

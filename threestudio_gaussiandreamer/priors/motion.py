@@ -4,9 +4,10 @@ points on its surface.
 =================  =================================================================================
 option             meaning
 =================  =================================================================================
-motion             joint positions as MDM gives them, NPZ or NPY; ``motion_files.py`` says how to
-                   make it of results.npy
-body_model         the user's NPZ of SMPL, SMPL-H or SMPL-X (neutral); its licence is the user's
+motion             joint positions as MDM gives them, its results.npy or another NPY or NPZ: see
+                   ``motion_files.py``
+body_model         the user's NPZ or PKL of SMPL, SMPL-H or SMPL-X (neutral), with the user's
+                   licence
 sample             which of the file's motions; null: any
 frame              a number, from 0; or ``clip``: the frame whose body fits the text best
 num_frames         frames of each motion that ``clip`` chooses from, evenly spaced
@@ -314,6 +315,6 @@ def _check_source(cfg: Any) -> None:
         )
     if cfg.motion and not cfg.body_model:
         raise UserError(
-            "body_model: set it to your NPZ of SMPL (https://smpl.is.tue.mpg.de), SMPL-H or "
+            "body_model: set it to your NPZ or PKL of SMPL (https://smpl.is.tue.mpg.de), SMPL-H or "
             "SMPL-X; the package brings none"
         )

@@ -1,11 +1,8 @@
-"""Read the output of a text-to-motion model, joint positions, texts and lengths, without loading
-pickles.
+"""Read the output of a text-to-motion model: joint positions, texts and lengths.
 
-MDM's ``results.npy`` is a pickled dict, and loading a pickle can run code, so it is refused with a
-message that has the command for converting it to an NPZ. Supported files:
-
-* NPZ with ``motion`` (S, J, 3, F), and optionally ``text`` (S,) strings and ``lengths`` (S,)
-frames; * NPY with (S, J, 3, F), or one motion as (J, 3, F) or (F, J, 3).
+* MDM's ``results.npy``, a pickled dict, of which no code is run, or an NPZ, with ``motion``
+  (S, J, 3, F), and optionally ``text`` (S,) strings and ``lengths`` (S,) frames;
+* NPY with (S, J, 3, F), or one motion as (J, 3, F) or (F, J, 3).
 
 J is 22 (HumanML3D) or 24 joints in SMPL's order; metres, y up, as HumanML3D has them.
 """
@@ -17,14 +14,9 @@ from jaxtyping import Float
 
 from ..core.errors import UserError
 from ..core.files import existing_file
-from ..formats.array_files import PickledArray, read_arrays
+from ..formats.array_files import read_arrays
 
 JOINT_COUNTS = (22, 24)
-CONVERT = (
-    "python -c \"import numpy as np; d = np.load('results.npy', allow_pickle=True).item(); "
-    "np.savez('results.npz', motion=d['motion'], text=np.array(d['text'], str), "
-    "lengths=np.array(d['lengths']))\""
-)
 EXPECTED = "arrays (samples, 22 or 24 joints, 3, frames) were expected"
 
 
@@ -46,10 +38,7 @@ def read_motions(path: str) -> Motions:
             says what to do.
     """
     file = existing_file(path, "motion file")
-    try:
-        arrays = read_arrays(file, "motion file", ["motion"], ["text", "lengths"])
-    except PickledArray as error:
-        raise UserError(f"{error}; if it is yours, convert it:\n{CONVERT}") from error
+    arrays = read_arrays(file, "motion file", ["motion"], ["text", "lengths"])
     positions = _sample_frame_joint(arrays["motion"], path)
     lengths = _lengths(arrays.get("lengths"), positions, path)
     texts = None if "text" not in arrays else [str(text) for text in np.atleast_1d(arrays["text"])]

@@ -1,8 +1,8 @@
 """SMPL's pose, and optionally its shape, from the positions of its joints: a small optimisation
 with priors.
 
-The body model is the user's own file, an NPZ of SMPL, SMPL-H or SMPL-X: their first 22 joints are
-the same. The kinematics are smplx's. What is minimised, over the rotations of all joints
+The body model is the user's own file, an NPZ or PKL of SMPL, SMPL-H or SMPL-X: their first 22
+joints are the same. The kinematics are smplx's. What is minimised, over the rotations of all joints
 (axis-angle), a translation and a few shape coefficients, summed over the frames, which share
 nothing:
 
@@ -33,13 +33,6 @@ from .skeleton import BODY_JOINTS
 
 FIELDS = ("v_template", "shapedirs", "posedirs", "J_regressor", "weights", "kintree_table", "f")
 """Arrays of a body model's file that are used."""
-CONVERT = (
-    "python -c \"import pickle, numpy as np; d = pickle.load(open('SMPL_NEUTRAL.pkl', 'rb'), "
-    "encoding='latin1'); "
-    "np.savez('SMPL_NEUTRAL.npz', **{k: np.array(d[k].toarray() if hasattr(d[k], 'toarray') "
-    "else d[k]) for k in "
-    "('v_template', 'shapedirs', 'posedirs', 'J_regressor', 'weights', 'kintree_table', 'f')})\""
-)
 SMPL_JOINTS = 24
 TRUNK = (0, 1, 2, 3, 6, 9, 13, 14, 16, 17)
 """Pelvis, hips, spine, collars and shoulders, which move almost as one."""
@@ -89,22 +82,15 @@ class BodyFit(NamedTuple):
 
 
 def load_body_model(path: str, *, num_shape: int = 10) -> BodyModel:
-    """Read the user's body model; only NPZ, because the PKL files of SMPL run code when they are
-    opened.
+    """Read the user's body model, an NPZ or SMPL's own PKL, of which no code is run.
 
     Args:
         num_shape: shape coefficients that are used.
 
     Raises:
-        UserError: missing, a pickle, or not a body model; the message says what to do.
+        UserError: missing, or not a body model; the message says what to do.
     """
-    file = existing_file(path, "body model")
-    if file.suffix.lower() == ".pkl":
-        raise UserError(
-            f"body model {path!r} is a pickle, which could run code, and isn't opened; if it "
-            f"is yours, convert it:\n{CONVERT}"
-        )
-    arrays = _arrays(file)
+    arrays = _arrays(existing_file(path, "body model"))
     _check_shapes(arrays, path)
     _check_values(arrays, path)
     vertices, joints = len(arrays["v_template"]), len(arrays["J_regressor"])
@@ -284,8 +270,8 @@ def _arrays(file: Path) -> dict[str, np.ndarray]:
     try:
         return read_arrays(file, "body model", FIELDS)
     except UserError as error:
-        expected = "an NPZ of SMPL, SMPL-H or SMPL-X with plain arrays was expected"
-        raise UserError(f"{error}: {expected}; from a PKL it is made by\n{CONVERT}") from error
+        expected = "the NPZ or PKL of SMPL, SMPL-H or SMPL-X was expected"
+        raise UserError(f"{error}: {expected}") from error
 
 
 def _check_shapes(arrays: dict[str, np.ndarray], path: str) -> None:
