@@ -32,6 +32,13 @@ def test_the_last_line_of_an_asset_counts(path):
     assert ledger.damaged == 0
 
 
+def test_a_finished_asset_without_files_is_made_again(path):
+    nothing = {"files": [], "picture": None, "page": None}
+    ledger = Ledger(path)
+    ledger.append([line(FOX, FINISHED, **nothing), line(CAT, FINISHED, **nothing | {"page": "a"})])
+    assert Ledger(path).state(FOX) == RUNNING and Ledger(path).state(CAT) == FINISHED
+
+
 @pytest.mark.parametrize("cut", range(1, 40))
 def test_half_a_line_is_skipped_and_the_next_one_is_whole(path, cut):
     ledger = Ledger(path)

@@ -6,6 +6,7 @@ import pytest
 
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.farm.rows import MOST_LINE_BYTES, Row, check_rows, read_rows
+from threestudio_gaussiandreamer.launch.run_folder import safe_name
 
 
 def listed(tmp_path, text, suffix=".txt"):
@@ -65,6 +66,23 @@ def test_the_key_depends_on_what_the_asset_depends_on():
 def test_prompts_that_begin_alike_have_different_names(tmp_path):
     one, other = rows(tmp_path, f"{'a ' * 50}fox\n{'a ' * 50}cat")
     assert one.name != other.name and len(one.name.encode()) < 80
+    assert safe_name(one.name) == one.name  # a run with this tag writes into this folder
+
+
+def test_texts_that_are_no_folders_names_are_an_asset_each(tmp_path):
+    long = "a photo of " * 9
+    texts = [
+        *(f"{long}fox", f"{long}cat", "caf\u00e9", "cafe\u0301", "\U0001f98a", "\U0001f98a!"),
+        *("\U0001f468\u200d\U0001f467", "a\u00a0cat", "a/b", "../b", "..", ".a", "/a"),
+        *("a fox.", "a fox..", "a fox", "CON", "nul", "con.txt", "com\u00b9", "\U0001fae9"),
+    ]
+    path = listed(tmp_path, "\r\n".join(texts))
+    assert check_rows(path) == len(texts)
+    found = list(read_rows(path))
+    assert [row.prompt for row in found] == texts
+    for row in found:
+        assert safe_name(row.name) == row.name and "/" not in row.name
+        assert row.name.split(".")[0].lower() not in ("", "con", "nul", "com\u00b9")
 
 
 @pytest.mark.parametrize(
@@ -77,6 +95,10 @@ def test_prompts_that_begin_alike_have_different_names(tmp_path):
         (b"a fox\na\0cat", ".txt", "line 2 isn't UTF-8 text"),
         ("a fox\n" + "a" * 100_000, ".txt", f"line 2 is longer than {MOST_LINE_BYTES} bytes"),
         ("a fox\na cat\na fox", ".txt", "lines 1 and 3 have the same name 'a_fox'"),
+        ("A fox\na fox", ".txt", "lines 1 and 2 have the same name 'a_fox' (upper and lower case"),
+        ("prompt\r\na fox".encode("utf-16"), ".csv", "which Excel saves as CSV UTF-8"),
+        ("a fox\u2028a cat", ".txt", "line 1: the prompt 'a fox\\u2028a cat' has a line break"),
+        ('{"prompt": "\\ud800"}', ".jsonl", "line 1: the prompt '\\ud800' has a line break"),
         ("a fox\na\x1b[0m", ".txt", "line 2: the prompt 'a\\x1b[0m' has a line break"),
         ("promt\na fox", ".csv", "unknown column 'promt': did you mean 'prompt'?"),
         ("a fox\n???", ".txt", "line 2: '???' can't be a text"),

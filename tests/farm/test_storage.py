@@ -1,6 +1,7 @@
 """The farm's folder below a URL: in memory, and on an S3 server that runs on this machine."""
 
 import os
+import signal
 import socket
 import subprocess
 import sys
@@ -9,13 +10,16 @@ import urllib.request
 
 import pytest
 
+from threestudio_gaussiandreamer.core.checkpoint_file import newest_readable, save_file
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.farm import assets, remote_ledger, storage
+from threestudio_gaussiandreamer.farm import assets, remote_ledger, storage, worker
+from threestudio_gaussiandreamer.farm.assets import Job, Recipe
 from threestudio_gaussiandreamer.farm.ledger import FINISHED, RUNNING
 from threestudio_gaussiandreamer.farm.remote_ledger import open_ledger
 from threestudio_gaussiandreamer.farm.report import write_report
 from threestudio_gaussiandreamer.farm.rows import Row
 from threestudio_gaussiandreamer.farm.storage import RemotePlace, Unreachable, place_of
+from threestudio_gaussiandreamer.farm.worker import Setting, Worker
 
 FOX = Row("fox", "a fox")
 
@@ -93,7 +97,7 @@ def live_of_an_asset(url):
     assert first.finished(FOX) is None  # the local result doesn't count
     first.keep_checkpoint(FOX)
     second.fetch_checkpoint(FOX)
-    assert (second.work_folder(FOX) / "ckpts/last.ckpt").read_text() == "ckpts/last.ckpt"
+    assert (second.work_folder(FOX) / "ckpts/fetched.ckpt").read_text() == "ckpts/last.ckpt"
     first.publish(FOX)
     assert second.finished(FOX)["hash"] == "ab" and not folder.exists()
     assert first.read("assets/fox/save/it5-export/a.ply") == b"save/it5-export/a.ply"
@@ -128,7 +132,8 @@ def test_an_asset_and_a_ledger_on_s3(s3, tmp_path):
 
 
 def test_checkpoints_of_earlier_attempts_are_not_uploaded(tmp_path):
-    for name in ("ckpts/last.ckpt", "ckpts-2/last.ckpt", "ckpts-2/.part", assets.RESULT):
+    made = ("ckpts/last.ckpt", "ckpts/fetched.ckpt", "ckpts-2/last.ckpt", "ckpts-2/.part")
+    for name in (*made, assets.RESULT):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).touch()
     names = [str(path.relative_to(tmp_path)) for path in storage.uploaded_files(tmp_path)]
@@ -177,20 +182,61 @@ def test_a_store_that_is_gone_is_named(memory, monkeypatch):
         place.finished(FOX)
 
 
+def checkpoint(place, step):
+    """Write the last checkpoint of an asset's run."""
+    content = {"global_step": step, "epoch": 0, "state_dict": {}}
+    save_file(place.work_folder(FOX) / storage.LAST, content)
+
+
+def test_the_newer_checkpoint_wins_on_every_machine(memory, tmp_path):
+    first, second = (RemotePlace(memory, scratch=tmp_path / name) for name in "ab")
+    for place, step in ((first, 3), (second, 7)):
+        place.fetch_checkpoint(FOX)
+        checkpoint(place, step)
+        place.keep_checkpoint(FOX)
+    first.fetch_checkpoint(FOX)
+    assert newest_readable(first.work_folder(FOX) / "ckpts")[1] == 7
+    first.keep_checkpoint(FOX)  # its own file is older than the one that it goes on from
+    third = RemotePlace(memory, scratch=tmp_path / "c")
+    third.fetch_checkpoint(FOX)
+    assert newest_readable(third.work_folder(FOX) / "ckpts")[1] == 7
+
+
+def test_what_a_stopped_worker_has_saved_is_there_for_others(memory, tmp_path, monkeypatch):
+    def stopped(self, job, folder, attempt):
+        checkpoint(place, 4278)
+        return None, 128 + signal.SIGTERM
+
+    monkeypatch.setattr(worker.Worker, "_run", stopped)
+    monkeypatch.setattr(worker, "keep_loaded", lambda: None)
+    monkeypatch.chdir(tmp_path)
+    place = RemotePlace(memory)
+    setting = Setting(0, Recipe((), (), True, 1), place, None, ".", "now", 1)
+    assert Worker().make(Job(FOX), setting)["state"] == worker.STOPPED
+    other = RemotePlace(memory, scratch=tmp_path / "other")
+    other.fetch_checkpoint(FOX)
+    assert newest_readable(other.work_folder(FOX) / "ckpts")[1] == 4278
+
+
 def test_many_parts_of_a_ledger_are_joined(memory, monkeypatch, tmp_path):
     monkeypatch.setattr(remote_ledger, "SECONDS_BETWEEN", 0.0)
     monkeypatch.setattr(remote_ledger, "MOST_PARTS", 4)
     place = RemotePlace(memory)
     ledger = open_ledger(place)
     for _ in range(6):
-        ledger.append([{"name": "fox", "key": FOX.key, "state": RUNNING}])
+        ledger.append([{"name": "fox", "key": FOX.key, "state": RUNNING, "worker_seconds": 2.0}])
     ledger.append([{"name": "fox", "key": FOX.key, "state": FINISHED}])
     assert len(place.names("ledger")) == 7
     read = open_ledger(RemotePlace(memory, scratch=tmp_path / "a"), only_read=True)
     assert read.state(FOX) == FINISHED and len(place.names("ledger")) == 7
+    parts = {name: place.read(name) for name in place.names("ledger")}
     joined = open_ledger(RemotePlace(memory, scratch=tmp_path / "b"))
     assert joined.state(FOX) == FINISHED and len(place.names("ledger")) == 1
-    assert open_ledger(RemotePlace(memory, scratch=tmp_path / "c")).state(FOX) == FINISHED
+    for again in ({}, parts):  # also where a kill has left the parts beside it
+        for name, content in again.items():
+            place.write(name, content)
+        read = open_ledger(RemotePlace(memory, scratch=tmp_path / "c"), only_read=True)
+        assert read.state(FOX) == FINISHED and read.worker_seconds(FOX) == 12.0
 
 
 def test_an_unknown_protocol_is_refused():

@@ -1,6 +1,7 @@
 """What a worker makes of errors, and how often it tries."""
 
 import errno
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -124,6 +125,17 @@ def test_a_folder_that_a_dying_process_still_holds_is_waited_for(monkeypatch):
 def test_a_machine_without_the_folder_is_named(place):
     outcome = Worker().make(JOB, setting(place, start="/nowhere"))
     assert outcome["state"] == FAILED and "has no folder /nowhere" in outcome["error"]
+
+
+def test_an_asset_without_files_has_failed(place, monkeypatch):
+    """Such as one whose run has written to another folder."""
+    run = SimpleNamespace(
+        system=SimpleNamespace(geometry=None), trainer=SimpleNamespace(global_step=5)
+    )
+    monkeypatch.setattr(Worker, "_run", lambda *args: (run, 0))
+    outcome = Worker().make(JOB, setting(place))
+    assert outcome["state"] == FAILED and "has left no files in" in outcome["error"]
+    assert place.finished(JOB.row) is None
 
 
 def test_an_error_is_in_the_log_of_its_asset(place, monkeypatch):

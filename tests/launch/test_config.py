@@ -204,10 +204,22 @@ def test_a_harmless_tag_names_its_folder_as_it_is(text):
 
 
 @pytest.mark.parametrize(
-    "text", ["a:b", "..", ".hidden", "-rf", "con", "NUL.txt", "a ", "x" * 65, "a@b", "\n"]
+    "text",
+    ["a:b", "..", ".hidden", "-rf", "con", "NUL.txt", "com\u00b9", "a ", "x" * 65, "a@b", "\n"],
 )
 def test_a_harmful_tag_becomes_a_slug_with_a_hash(text):
     assert safe_name(text) != text and re.search(r"-[0-9a-f]{8}$", safe_name(text))
+
+
+@given(st.text(), st.integers(0, 30))
+@example("a fox " * 20, 1)
+@example("NUL.txt", 1)
+@example("con .x", 1)
+@example("a" * 55 + "\U0001f98a-0123abcd", 1)
+@example("\ud800", 1)
+def test_the_name_of_a_name_is_itself(text, times):
+    name = safe_name(text * times)
+    assert safe_name(name) == name and len(name.encode()) <= 64 + 9
 
 
 def test_a_long_text_of_combining_characters_names_its_folder_at_once():

@@ -125,7 +125,13 @@ def parse_result(content: bytes, row: Row) -> Optional[dict[str, Any]]:
         result = json.loads(content)
     except ValueError:
         return None
-    return result if isinstance(result, dict) and result.get("key") == row.key else None
+    ours = isinstance(result, dict) and result.get("key") == row.key
+    return result if ours and has_files(result) else None
+
+
+def has_files(result: dict[str, Any]) -> bool:
+    """Return whether a result names anything that was made; without it an asset isn't finished."""
+    return "files" not in result or any(map(result.get, ("files", "picture", "page")))
 
 
 def read_result(folder: Path, row: Row) -> Optional[dict[str, Any]]:

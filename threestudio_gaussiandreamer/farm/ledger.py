@@ -1,9 +1,10 @@
 """The ledger of a farm: what is running, finished and failed, one JSON object per line.
 
-The file is only appended to, by one process, and a line is on the disk before the farm goes on.
-The last line of an asset counts, but ``worker_seconds``, which a line has when a worker is done
-with the asset, are added up. A process that was killed may leave half a line: it is skipped when
-the file is read, and the next line begins below it."""
+The file is only appended to, by one process, and a line is on the disk before the farm goes on. The
+last line of an asset counts, but ``worker_seconds``, which a line has when a worker is done with
+the asset, are added up; ``all_worker_seconds`` in place of earlier lines is their sum. A process
+that was killed may leave half a line: it is skipped when the file is read, and the next line begins
+below it."""
 
 import json
 import os
@@ -14,6 +15,7 @@ from typing import Any, NamedTuple, Optional
 
 from ..core.errors import UserError
 from ..core.files import json_text
+from .assets import has_files
 from .rows import Row, name_number
 
 FILE = "ledger.jsonl"
@@ -68,7 +70,7 @@ class Ledger:
     def _note(self, line: dict[str, Any], offset: int) -> None:
         number = name_number(line["name"])
         earlier = self.index[number].worker_seconds if number in self.index else 0.0
-        spent = earlier + line.get("worker_seconds", 0.0)
+        spent = line.get("all_worker_seconds", earlier + line.get("worker_seconds", 0.0))
         self.index[number] = Entry(offset, STATES.index(line["state"]), line["key"], spent)
 
     def _entry(self, row: Row) -> Optional[Entry]:
@@ -157,6 +159,8 @@ def parse_line(content: bytes) -> Optional[dict[str, Any]]:
         return None
     try:
         line = json.loads(content)
+        if line["state"] == FINISHED and not has_files(line):
+            line["state"] = RUNNING
         known = line["state"] in STATES and isinstance(line["name"], str)
         return line if known and isinstance(line["key"], str) else None
     except (ValueError, TypeError, KeyError, RecursionError):

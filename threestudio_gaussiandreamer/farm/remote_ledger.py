@@ -4,8 +4,10 @@ a series of small files, which are joined again when the farm is started.
 Lines of the last seconds may be missing after a kill. Nothing is made twice then: before it makes
 an asset, a worker looks for its ``result.json``."""
 
+import json
 import time
 
+from ..core.files import json_text
 from .ledger import FILE, Ledger
 from .storage import Place, RemotePlace
 
@@ -64,13 +66,15 @@ class RemoteLedger(Ledger):
         super().close()
 
     def _join(self, parts: list[str]) -> None:
-        """Replace the parts by one with the last line of each asset."""
+        """Replace the parts by one with the last line of each asset and the seconds of all."""
         with open(self.path, "rb") as file:
             last = []
             for entry in sorted(self.index.values()):
                 file.seek(entry.offset)
-                last.append(file.readline())
-        # a reader between the two steps sees these lines twice, which changes nothing
-        joined = parts[-1].removesuffix(".jsonl") + "-joined.jsonl"
+                line = {**json.loads(file.readline()), "all_worker_seconds": entry.worker_seconds}
+                last.append(json_text(line).encode() + b"\n")
+        # a reader between the two steps sees these lines twice, which changes nothing, since the
+        # name is sorted after that of the last part
+        joined = parts[-1].removesuffix(".jsonl") + "_joined.jsonl"
         self.place.write(joined, b"".join(last))
         self.place.remove(parts)

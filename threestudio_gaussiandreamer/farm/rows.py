@@ -18,6 +18,7 @@ import csv
 import hashlib
 import json
 import shlex
+import unicodedata
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple, Optional
@@ -30,6 +31,8 @@ from ..launch.run_folder import safe_name
 COLUMNS = ("prompt", "name", "seed", "config", "overrides")
 MOST_LINE_BYTES = 32_768
 MOST_SEED = 2**32 - 1
+NOT_TEXT = ("Cc", "Cs", "Zl", "Zp")
+"""Unicode's categories of control characters, surrogates and line breaks."""
 
 
 class Row(NamedTuple):
@@ -76,11 +79,12 @@ def check_rows(path: Path) -> int:
     """
     lines: dict[int, int] = {}
     for row in read_rows(path):
-        earlier = lines.setdefault(name_number(row.name), row.line)
+        earlier = lines.setdefault(name_number(row.name.casefold()), row.line)
         if earlier != row.line:
             raise UserError(
-                f"{path}: lines {earlier} and {row.line} have the same name {row.name!r}; remove "
-                "one, or give names in a CSV or JSONL list (columns prompt, name, seed)"
+                f"{path}: lines {earlier} and {row.line} have the same name {row.name!r} (upper "
+                "and lower case are one folder on some machines); remove one, or give names in a "
+                "CSV or JSONL list (columns prompt, name, seed)"
             )
     if not lines:
         raise UserError(f"{path} has no prompts: expected one per line, such as 'a fox'")
@@ -119,7 +123,7 @@ def make_row(values: Mapping[str, Any], line: int = 0) -> Row:
 def _prompt(value: Any) -> str:
     if not isinstance(value, str) or not value.strip():
         raise UserError(f"the prompt is {value!r}; expected a text, such as 'a fox'")
-    if not value.isprintable():
+    if any(unicodedata.category(character) in NOT_TEXT for character in value):
         raise UserError(f"the prompt {value[:80]!r} has a line break or a control character")
     return require_no_marker(value.strip())
 
@@ -206,7 +210,8 @@ def _decoded(content: bytes, path: Path, number: int) -> str:
 
 def _not_text(path: Path, number: int) -> UserError:
     return UserError(
-        f"{path}, line {number} isn't UTF-8 text; expected a list of prompts (.txt, .csv, .jsonl)"
+        f"{path}, line {number} isn't UTF-8 text; expected a list of prompts (.txt, .csv, .jsonl), "
+        "which Excel saves as CSV UTF-8"
     )
 
 

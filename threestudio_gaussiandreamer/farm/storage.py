@@ -18,8 +18,8 @@ from ..core.files import atomic_file
 from . import assets
 from .rows import Row
 
-NOT_UPLOADED = ("ckpts/epoch=*", "ckpts/*-prev.ckpt", "ckpts/.*", "ckpts-*/*", "tb_logs/*")
-LAST = "ckpts/last.ckpt"
+LAST, FETCHED = "ckpts/last.ckpt", "ckpts/fetched.ckpt"
+NOT_UPLOADED = ("ckpts/epoch=*", "ckpts/*-prev.ckpt", FETCHED, "ckpts/.*", "ckpts-*/*", "tb_logs/*")
 TRIES, FIRST_WAIT = 4, 0.5
 """Attempts of one transfer, and the seconds before the second one; they double."""
 Answer = TypeVar("Answer")
@@ -168,18 +168,20 @@ class RemotePlace(Place):
         self._drop_part(row)
 
     def fetch_checkpoint(self, row: Row) -> None:
-        path = self.work_folder(row) / LAST
-        if path.exists():
-            return
+        """Bring it beside what this machine has of the asset, of which ``resume=auto`` takes the
+        checkpoint with the highest step.
+        """
+        folder = self.work_folder(row)
+        self._kept = {row.name: _written(folder / LAST)}  # which may be older than the other
         content = self.read(self._part(row))
         if content is not None:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            with atomic_file(path) as file:
+            (folder / FETCHED).parent.mkdir(parents=True, exist_ok=True)
+            with atomic_file(folder / FETCHED) as file:
                 file.write(content)
 
     def keep_checkpoint(self, row: Row) -> None:
         path = self.work_folder(row) / LAST
-        written = path.stat().st_mtime if path.exists() else 0.0
+        written = _written(path)
         if written > self._kept.get(row.name, 0.0):
             self._put(path, self._part(row))
             self._kept = {row.name: written}
@@ -221,6 +223,11 @@ class RemotePlace(Place):
                     ) from error
                 time.sleep(FIRST_WAIT * 2**attempt)
         raise AssertionError("unreachable")
+
+
+def _written(path: Path) -> float:
+    """Return when a file was written; 0 without one."""
+    return path.stat().st_mtime if path.exists() else 0.0
 
 
 def uploaded_files(folder: Path) -> Iterator[Path]:

@@ -125,9 +125,12 @@ class Worker:
         with written_log(folder / "log.txt"):
             run, code = self._run(job, folder, attempt)
         if code:
+            self.setting.place.keep_checkpoint(job.row)
             return {"state": STOPPED, "error": f"stopped by signal {code - 128}"}
         seconds = round(time.monotonic() - began, 3)
         result = {**result_of(job, folder, run), "seconds": seconds, "attempts": attempt}
+        if not assets.has_files(result):
+            raise UserError(f"the run has left no files in {folder}")
         assets.write_result(folder, result)
         self.setting.place.publish(job.row)
         return {"state": FINISHED, **result}

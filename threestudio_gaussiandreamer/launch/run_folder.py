@@ -3,6 +3,7 @@
 
 import hashlib
 import os
+import re
 import shlex
 import unicodedata
 from collections.abc import Mapping, Sequence
@@ -44,6 +45,8 @@ NAMING = ("exp_root_dir", "name", "tag", "timestamp")
 PARSED = Path("configs", "parsed.yaml")
 """The merged configuration of a run, in its folder."""
 SLUG_BYTES = 64
+HASH = r"-[0-9a-f]{8}$"
+"""The end of a name that :func:`safe_name` has made."""
 SLUG_SOURCE = 1024
 """Characters of a text that its slug is made of: normalising takes quadratic time in the length of
 a run of combining characters.
@@ -228,18 +231,28 @@ def _require_folder_name(tag: str, timestamp: str) -> None:
 
 def safe_name(text: str) -> str:
     """Convert ``text`` to a valid folder name: unchanged if it is valid on all systems and at most
-    64 bytes long, else a slug of at most 64 bytes and a hash of the text.
+    64 bytes long, else a slug of at most 64 bytes and a hash of the text. A name that this function
+    has returned stays as it is, since a farm's worker passes its asset's name as a run's tag.
 
     Valid characters are letters, digits, ``-_.,+=()'!`` and inner spaces. A name may not begin with
     a dot or hyphen or end with a dot, or be that of a Windows device."""
+    hashed = re.search(HASH, text)
+    if text and _slug(text, SLUG_BYTES + len(hashed[0]) if hashed else SLUG_BYTES) == text:
+        return text
+    digest = hashlib.sha256(text.encode(errors="surrogatepass")).hexdigest()[:8]
+    return f"{_slug(text, SLUG_BYTES) or 'run'}-{digest}"
+
+
+def _slug(text: str, most_bytes: int) -> str:
+    """Return the beginning of ``text`` as a valid folder name, or an empty text."""
     slug = "".join(
         c if c.isalnum() or c in SLUG_CHARACTERS else "_"
         for c in unicodedata.normalize("NFC", text[:SLUG_SOURCE])
     )
-    slug = slug.encode()[:SLUG_BYTES].decode(errors="ignore").lstrip("-. ").rstrip(". ")
-    if slug and slug == text and slug.split(".")[0].lower() not in WINDOWS_DEVICES:
-        return slug
-    return f"{slug or 'run'}-{hashlib.sha256(text.encode()).hexdigest()[:8]}"
+    slug = slug.encode()[:most_bytes].decode(errors="ignore").lstrip("-. ").rstrip(". ")
+    # Windows ignores what follows a dot, and reads a raised digit as that digit
+    device = unicodedata.normalize("NFKC", slug.split(".")[0]).strip().lower()
+    return f"_{slug}"[:most_bytes] if device in WINDOWS_DEVICES else slug
 
 
 def _set_trial(cfg: Any, trial_name: str) -> None:
