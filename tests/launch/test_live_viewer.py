@@ -44,14 +44,20 @@ class Watched:
 class Buttons:
     """Buttons without a panel; the score model's picture is asked for in every step."""
 
+    pausing = False
+    """Whether every step begins with a short pause."""
+
     def __init__(self, view):
+        self.waited = False
         self.view, self.picture, self.paused = view, threading.Event(), False
         self.picture.set()
+        self.cameras = SimpleNamespace(value=True)
         self.steps = 0
 
     def may_go_on(self):
         if not self.paused:
-            return True
+            self.waited = self.pausing and not self.waited
+            return not self.waited
         self.steps -= 1
         return self.steps >= 0
 
@@ -77,14 +83,15 @@ def views(monkeypatch):
     return opened
 
 
-def test_the_training_is_the_same_with_a_viewer(launch_demo, views, tmp_path):
+def test_the_training_is_the_same_with_a_viewer(launch_demo, views, tmp_path, monkeypatch):
+    monkeypatch.setattr(Buttons, "pausing", True)
     run = ["use_timestamp=false", "trainer.max_steps=4"]
     assert launch_demo(*run, "tag=off")[0] == 0
     shown = ["viewer.enabled=true", "viewer.updates_per_second=30", "viewer.keep_serving=false"]
     assert launch_demo(*run, *shown, "tag=on")[0] == 0
     (view,) = views
     assert view.shown[-1][1].startswith("step 4, ") and view.cameras > 0 and view.closed
-    assert len(view.pictures) == 4 and view.pictures[0].dtype == np.uint8
+    assert len(view.pictures) == 8 and view.pictures[0].dtype == np.uint8
     results = tmp_path / "outputs" / "demo"
     assert_same_training(results / "off/ckpts/last.ckpt", results / "on/ckpts/last.ckpt")
 
@@ -142,12 +149,30 @@ def test_a_pause_ends_with_one_step_or_with_a_signal(viewer, monkeypatch):
     made, trainer, system = viewer
     waits = []
     monkeypatch.setattr(live_viewer.time, "sleep", waits.append)
+    made.controls.picture.clear()
     made.controls.paused, made.controls.steps = True, 1
     made.on_train_batch_start(trainer, system, {}, 0)
     assert not waits
     made.stopping = lambda: len(waits) == 5
     made.on_train_batch_start(trainer, system, {}, 1)
     assert len(waits) == 5
+
+
+def test_the_picture_is_shown_in_a_pause(viewer, monkeypatch):
+    made, trainer, system = viewer
+    monkeypatch.setattr(live_viewer.time, "sleep", lambda seconds: None)
+    monkeypatch.setattr(live_viewer, "score_picture", lambda system, batch: batch["picture"])
+    made.controls.paused = True
+    made.stopping = lambda: len(made.view.pictures) == 2
+    made.on_train_batch_start(trainer, system, {"picture": "of the next views"}, 0)
+    assert made.view.pictures == ["of the next views"] * 2
+
+
+def test_cameras_that_are_switched_off_are_not_sent(viewer):
+    made, trainer, system = viewer
+    made.controls.cameras.value = False
+    assert made._show_if_due(trainer, system, {})
+    assert not made.view.cameras
 
 
 @pytest.mark.parametrize(

@@ -55,20 +55,48 @@ def test_viser_gets_covariances_colours_and_opacities():
 class Button:
     """A button of viser's panel without a browser."""
 
+    def __init__(self, value=None):
+        self.value = value
+
     def on_click(self, pressed):
         self.press = lambda: pressed(None)
+
+    on_update = on_click
+
+    def remove(self):
+        pass
 
 
 @pytest.fixture
 def panel():
     """A view whose panel makes :class:`Button`, and its buttons by label."""
     buttons = {}
-    gui = SimpleNamespace(add_button=lambda label: buttons.setdefault(label, Button()))
-    return SimpleNamespace(server=SimpleNamespace(gui=gui)), buttons
+    removed = []
+
+    def add(label, *value):
+        return buttons.setdefault(label, Button(*value))
+
+    gui = SimpleNamespace(add_button=add, add_checkbox=add)
+    server = SimpleNamespace(gui=gui)
+    view = SimpleNamespace(server=server, remove_cameras=lambda: removed.append(1))
+    return view, buttons, removed
+
+
+def test_the_cameras_are_switched_off_and_go_after_training(panel):
+    view, buttons, removed = panel
+    controls = live.Controls(view)
+    switch = buttons["Training cameras"]
+    switch.press()
+    assert controls.cameras.value and not removed
+    switch.value = False
+    switch.press()
+    assert len(removed) == 1
+    controls.remove()
+    assert len(removed) == 2
 
 
 def test_one_step_is_made_for_a_press_during_a_pause_only(panel):
-    view, buttons = panel
+    view, buttons, _ = panel
     controls = live.Controls(view)
     buttons["One step"].press()
     assert controls.may_go_on()
@@ -104,6 +132,59 @@ def test_the_address_of_any_free_port():
         view.close()
 
 
+def handshake(port, **headers):
+    """Return the status of the answer to a WebSocket's opening request with ``headers``."""
+    lines = [
+        "GET / HTTP/1.1",
+        *(f"{name}: {value}" for name, value in headers.items()),
+        "Upgrade: websocket",
+        "Connection: Upgrade",
+        "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==",
+        "Sec-WebSocket-Version: 13",
+        "Sec-WebSocket-Protocol: viser-v" + pytest.importorskip("viser").__version__,
+    ]
+    with socket.create_connection(("127.0.0.1", port), timeout=30) as connection:
+        connection.sendall("\r\n".join([*lines, "", ""]).encode())
+        return int(connection.recv(4096).split()[1])
+
+
+def test_only_the_servers_own_page_is_answered():
+    pytest.importorskip("viser")
+    view = live.LiveView("127.0.0.1", 0, "cloud")
+    port = view.server.get_port()
+    own, local = f"127.0.0.1:{port}", f"localhost:{port}"
+    try:
+        for site in (own, local, "localhost:9000", f"[::1]:{port}", f"{socket.gethostname()}:1"):
+            assert handshake(port, Host=site, Origin=f"http://{site}") == 101, site
+        assert handshake(port, Host=own) == 101  # no browser
+        for origin in ("https://evil.example", "null", f"http://127.0.0.1:{port + 1}", ""):
+            assert handshake(port, Host=own, Origin=origin) == 403, origin
+        # DNS rebinding: the name of another site leads here
+        rebound = f"evil.example:{port}"
+        assert handshake(port, Host=rebound, Origin=f"http://{rebound}") == 403
+        assert handshake(port, Host=rebound) == 403
+        assert handshake(port, Host=f"127.0.0.1.evil.example:{port}") == 403
+        assert handshake(port, Host=f"evil.example@127.0.0.1:{port}", Origin="http://a") == 403
+    finally:
+        view.close()
+
+
+def test_the_name_that_is_listened_on_is_known():
+    assert live.is_own_page("gpu7.lab:80", "http://gpu7.lab:80", "gpu7.lab")
+    assert live.is_own_page("192.168.0.7:80", "https://192.168.0.7:80", "0.0.0.0")
+    assert not live.is_own_page("gpu8.lab:80", "http://gpu8.lab:80", "gpu7.lab")
+    assert not live.is_own_page(None, None, "0.0.0.0")
+
+
+def test_a_server_that_cannot_be_guarded_is_not_used(monkeypatch):
+    stopped = []
+    server = SimpleNamespace(stop=lambda: stopped.append(1))
+    monkeypatch.setattr(pytest.importorskip("viser"), "ViserServer", lambda **_: server)
+    with pytest.raises(UserError, match="this version of viser"):
+        live.LiveView("127.0.0.1", 0, "cloud")
+    assert stopped
+
+
 def test_updates_replace_the_cloud_and_the_cameras_and_are_counted():
     pytest.importorskip("viser")
     view = live.LiveView("127.0.0.1", 0, "cloud")
@@ -117,6 +198,8 @@ def test_updates_replace_the_cloud_and_the_cameras_and_are_counted():
             view.show_cameras(poses, np.full(views, 0.5, np.float32), 1.5)
             assert [frustum.position[0] for frustum in view._frustums] == [views] * views
             assert view._frustums[0].fov == 0.5 and view._frustums[0].aspect == 1.5
+        view.remove_cameras()
+        assert not view._frustums
         assert view.server_seconds() > 0
     finally:
         view.close()

@@ -101,21 +101,25 @@ class LiveViewer(pl.Callback):
         self, trainer: Any, pl_module: Any, batch: Any, batch_idx: int
     ) -> None:
         while not (self.controls.may_go_on() or self.stopping()):
+            self._show_picture_if_asked(pl_module, batch)
             self._show_if_due(trainer, pl_module)
             time.sleep(POLL)
 
     def on_train_batch_end(
         self, trainer: Any, pl_module: Any, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
-        if self.controls.picture.is_set():
-            self.controls.picture.clear()
-            self.controls.show_picture(score_picture(pl_module, batch))
+        self._show_picture_if_asked(pl_module, batch)
         self._show_if_due(trainer, pl_module, batch)
 
     def on_train_end(self, trainer: Any, pl_module: Any) -> None:
         cloud = current_cloud(pl_module)
         self.view.show(cloud, status(trainer, cloud))
         self.controls.remove()
+
+    def _show_picture_if_asked(self, system: Any, batch: dict[str, Any]) -> None:
+        if self.controls.picture.is_set():
+            self.controls.picture.clear()
+            self.controls.show_picture(score_picture(system, batch))
 
     def _show_if_due(
         self, trainer: Any, pl_module: Any, batch: Optional[dict[str, Any]] = None
@@ -128,7 +132,7 @@ class LiveViewer(pl.Callback):
         with self.budget.update():
             cloud = current_cloud(pl_module)
             self.view.show(cloud, status(trainer, cloud))
-            if batch is not None:
+            if batch is not None and self.controls.cameras.value:
                 pose, fovy = (batch[name].detach().cpu().numpy() for name in ("c2w", "fovy"))
                 self.view.show_cameras(pose, fovy, batch["width"] / batch["height"])
         return True

@@ -5,12 +5,15 @@ that ``--html`` writes draws them with the options of the run.
 """
 
 import contextlib
+import http
+import ipaddress
 import math
 import socket
 import threading
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import Any, Optional
+from urllib.parse import urlsplit
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -67,7 +70,11 @@ class LiveView:
         import viser
 
         before = set(threading.enumerate())
-        self.server = viser.ViserServer(host=host, port=port, verbose=False)
+        with own_pages_only(host) as guards:
+            self.server = viser.ViserServer(host=host, port=port, verbose=False)
+        if not guards:
+            self.server.stop()
+            raise UserError("viewer: this version of viser isn't known: pip install 'viser==1.1.*'")
         self._clocks = cpu_clocks(set(threading.enumerate()) - before)
         self.server.scene.set_up_direction("+z")
         name = "localhost" if host == "0.0.0.0" else host
@@ -138,10 +145,15 @@ class LiveView:
             frustum.wxyz, frustum.position = turn, pose[:3, 3]
             frustum.fov, frustum.aspect = float(angle), aspect
 
-    def _add_frustums(self, count: int) -> None:
-        """Replace the frustums by new ones, whose poses are set later."""
+    def remove_cameras(self) -> None:
+        """Remove the frustums."""
         for frustum in self._frustums:
             frustum.remove()
+        self._frustums = []
+
+    def _add_frustums(self, count: int) -> None:
+        """Replace the frustums by new ones, whose poses are set later."""
+        self.remove_cameras()
         self._frustums = [
             self.server.scene.add_camera_frustum(f"/cameras/{i}", fov=1, aspect=1, scale=0.15)
             for i in range(count)
@@ -153,7 +165,8 @@ class LiveView:
 
 
 class Controls:
-    """The buttons of a training run in a view's panel: pause, step and the score model's picture.
+    """The buttons of a training run in a view's panel: pause, step, the score model's picture and
+    the training cameras, which may hide the object.
 
     Browsers set the flags from the server's threads; the training reads them.
     """
@@ -167,7 +180,10 @@ class Controls:
         step.on_click(lambda _: self.step.set())
         picture = gui.add_button("Picture of the score model")
         picture.on_click(lambda _: self.picture.set())
-        self._buttons, self._gui = [self._pause, step, picture], gui
+        self.cameras = gui.add_checkbox("Training cameras", True)
+        self.cameras.on_update(lambda _: self.cameras.value or view.remove_cameras())
+        self._buttons, self._gui = [self._pause, step, picture, self.cameras], gui
+        self._view = view
         self._image: Optional[Any] = None
 
     def may_go_on(self) -> bool:
@@ -186,8 +202,9 @@ class Controls:
             self._image.image = image
 
     def remove(self) -> None:
-        """Remove the buttons, after the training."""
+        """Remove the buttons and the cameras, after the training."""
         self.paused.clear()
+        self._view.remove_cameras()
         for button in self._buttons:
             button.remove()
 
@@ -198,6 +215,59 @@ class Controls:
             self.step.clear()  # pressed before the pause
             self.paused.set()
         self._pause.label = "Go on" if self.paused.is_set() else "Pause"
+
+
+def is_own_page(site: Optional[str], origin: Optional[str], host: str) -> bool:
+    """Return whether a request may be answered: whether it is from a page of this server.
+
+    A page of another site is told by its origin. With DNS rebinding a site's name leads to this
+    machine, so that origin and host agree; therefore names are refused that aren't known to be of
+    this machine. An address can't be rebound. Programs other than browsers send no origin; they
+    could send any, so that they are answered.
+
+    Args:
+        site: the header Host.
+        origin: the header Origin; ``None`` without one.
+        host: the name or address that the server listens on.
+    """
+    name = (urlsplit(f"http://{site or ''}").hostname or "").rstrip(".")
+    if origin is not None and urlsplit(origin).netloc.lower() != (site or "").lower():
+        return False
+    known = {"localhost", host.lower(), socket.gethostname().lower()}
+    if name in known or name.endswith(".localhost"):
+        return True
+    with contextlib.suppress(ValueError):
+        return bool(ipaddress.ip_address(name))
+    return False
+
+
+@contextlib.contextmanager
+def own_pages_only(host: str) -> Iterator[list[Any]]:
+    """Let the viser server that is started in this context refuse what isn't
+    :func:`is_own_page`, since viser answers every site and has no option against that. Yield the
+    guards; a server without one isn't guarded.
+    """
+    import websockets.asyncio.server as sockets
+
+    guards: list[Any] = []
+    serve_all = sockets.serve
+
+    def serve_own(*args: Any, process_request: Any = None, **kwargs: Any) -> Any:
+        def check(connection: Any, request: Any) -> Any:
+            headers = request.headers
+            if not is_own_page(headers.get("Host"), headers.get("Origin"), host):
+                reason = "viewer: only its own page, at an address or a known name, is answered\n"
+                return connection.respond(http.HTTPStatus.FORBIDDEN, reason)
+            return process_request(connection, request) if process_request else None
+
+        guards.append(check)
+        return serve_all(*args, process_request=check, **kwargs)
+
+    sockets.serve = serve_own
+    try:
+        yield guards
+    finally:
+        sockets.serve = serve_all
 
 
 def cpu_clocks(threads: Iterable[threading.Thread]) -> list[int]:
