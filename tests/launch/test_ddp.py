@@ -12,7 +12,9 @@ import torch
 
 from tests.helpers.tiny_runs import files
 from tests.training import runs
+from threestudio_gaussiandreamer.core import launcher
 from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.core.launcher import require_launcher, train_alone
 from threestudio_gaussiandreamer.launch import ddp
 from threestudio_gaussiandreamer.launch.ddp import (
     LONGEST_WAIT,
@@ -21,7 +23,6 @@ from threestudio_gaussiandreamer.launch.ddp import (
     environment_plugins,
     is_lost_process,
     planned_processes,
-    train_alone,
     trainer_options,
 )
 
@@ -35,7 +36,7 @@ SLURM = {"SLURM_NTASKS": "4", "SLURM_NNODES": "2", "SLURM_JOB_NAME": "train"}
 @pytest.fixture
 def environment(monkeypatch):
     """Sets the variables of a launcher; without a call there is none."""
-    for name in [*TORCHRUN, *SLURM]:
+    for name in ["TORCHELASTIC_RUN_ID", "SLURM_JOB_NAME", *launcher.INDICES, *launcher.SIZES]:
         monkeypatch.delenv(name, raising=False)
 
     def launched_by(variables):
@@ -91,6 +92,72 @@ def test_a_worker_of_a_farm_trains_alone(environment, variables):
     assert planned_processes(0, {}) == Processes(1, 1)
 
 
+def test_a_shell_of_slurm_trains_with_one_process_and_says_so(environment, caplog):
+    environment(SLURM | {"SLURM_JOB_NAME": "interactive"})
+    require_launcher()
+    found = planned_processes(0, {})
+    assert found == Processes(1, 1) and environment_plugins(found) == []
+    assert "SLURM has 4 tasks, which a shell (SLURM_JOB_NAME=interactive) doesn't" in caplog.text
+    assert "the number of processes that train is 1; for all: srun --job-name" in caplog.text
+
+
+def test_a_batch_job_with_one_task_needs_none_of_sruns_variables(environment):
+    environment(SLURM | {"SLURM_NTASKS": "1", "SLURM_NNODES": "1"})
+    require_launcher()
+    assert environment_plugins(planned_processes(0, {}))
+    environment(dict.fromkeys(launcher.SLURM, "0"))
+    assert environment_plugins(planned_processes(0, {})) == []
+
+
+@pytest.mark.parametrize("name", [*launcher.INDICES, *launcher.SIZES])
+@pytest.mark.parametrize("value", ["x", "", "-1", "1.5"])
+def test_a_variable_that_is_no_number_is_named(name, value):
+    with pytest.raises(UserError, match=f"variable {name} is '{value}'; expected a whole number"):
+        require_launcher({name: value})
+
+
+RANKS = {"RANK": "1", "LOCAL_RANK": "1"}
+TASK = dict.fromkeys(launcher.SLURM, "1")
+
+
+@pytest.mark.parametrize(
+    ("variables", "said"),
+    [
+        (SLURM, "SLURM_NTASKS is set, but not SLURM_PROCID, SLURM_LOCALID, SLURM_NODEID: start"),
+        (SLURM | {k: "0" for k in TASK if k != "SLURM_NODEID"}, "set, but not SLURM_NODEID: start"),
+        (TORCHRUN, "TORCHELASTIC_RUN_ID is set, but not RANK, LOCAL_RANK: start .* with torchrun"),
+        ({"TORCHELASTIC_RUN_ID": "1"}, "not RANK, LOCAL_RANK, WORLD_SIZE, LOCAL_WORLD_SIZE: "),
+        (TORCHRUN | RANKS | {"WORLD_SIZE": "3"}, "WORLD_SIZE is 3, no multiple of LOCAL_WORLD_"),
+        (TASK | SLURM | {"SLURM_NTASKS": "3"}, "SLURM_NTASKS is 3, no multiple of SLURM_NNODES"),
+        ({"RANK": "1", "WORLD_SIZE": "2"}, "RANK is 1, but nothing says how many .* torchrun"),
+        (TASK | SLURM | {"SLURM_JOB_NAME": "bash"}, "SLURM_PROCID is 1, but nothing says"),
+        ({"SLURM_NTASKS": "0"}, "SLURM_NTASKS is '0'; expected a whole number from 1 on"),
+    ],
+)
+def test_what_is_missing_beside_a_variable_is_named(variables, said):
+    with pytest.raises(UserError, match=said):
+        require_launcher(variables)
+
+
+def test_variables_of_launchers_are_fine():
+    for variables in ({}, TORCHRUN | RANKS, SLURM | TASK):
+        require_launcher(variables)
+    # as Lightning starts its second process
+    require_launcher({"LOCAL_RANK": "1", "NODE_RANK": "0", "WORLD_SIZE": "2"})
+
+
+@pytest.mark.parametrize(
+    "program", ["launch.experiment --config demo.yaml --train --gpu cpu", "prune a.ply"]
+)
+def test_a_broken_variable_is_one_line_before_lightning_is_imported(program):
+    line = [sys.executable, "-m", *f"threestudio_gaussiandreamer.{program}".split()]
+    done = subprocess.run(
+        line, cwd=ROOT, env=os.environ | {"LOCAL_RANK": "x"}, capture_output=True, text=True
+    )
+    assert done.returncode == 2 and done.stderr.startswith("error: the environment variable LOCAL_")
+    assert done.stderr.count("\n") == 1
+
+
 def test_a_single_process_needs_no_strategy():
     assert trainer_options(Processes(1, 1), None) == {"devices": 1, "num_nodes": 1}
     strategy = trainer_options(Processes(2, 2), "auto")["strategy"]
@@ -100,7 +167,7 @@ def test_a_single_process_needs_no_strategy():
 
 def test_lightning_starts_the_processes_in_a_job_with_one_task(environment):
     assert environment_plugins(Processes(2, 1)) == []
-    environment(SLURM | {"SLURM_NTASKS": "1"})
+    environment(SLURM | {"SLURM_NTASKS": "1"} | dict.fromkeys(launcher.SLURM, "0"))
     (plugin,) = environment_plugins(planned_processes(2, {}))
     assert not plugin.creates_processes_externally
     assert (

@@ -11,6 +11,7 @@ from collections.abc import Callable, Collection, Sequence
 from typing import Any, Optional
 
 from .errors import Terminated, UserError
+from .launcher import require_numbers
 from .output import tolerant_output
 from .signals import raised_signals
 
@@ -73,7 +74,10 @@ def run_main(module: str) -> int:
     received: Sequence[int] = ()
     try:
         with raised_signals() as received:
+            require_numbers()
             main = importlib.import_module(module).main
+    except UserError as error:
+        return exit_code(error)
     except BaseException:
         if not received:
             raise

@@ -14,6 +14,7 @@ from typing import Any, Optional
 
 from ..core.command import run_command
 from ..core.errors import UserError
+from ..core.launcher import train_alone
 from ..core.signals import raised_signals
 from ..launch.experiment import configure_logging
 from ..launch.folder_lock import FolderInUse, claim, require_writable
@@ -131,8 +132,7 @@ def positive(text: str) -> float:
 
 def run_farm(args: argparse.Namespace) -> int:
     """Make the assets, or only the report, and return the exit code."""
-    from ..launch.ddp import train_alone  # imports Lightning, which --help doesn't need
-
+    train_alone()  # whatever has started this process, such as a job of SLURM
     configure_logging(verbose=False)
     total = check_rows(args.prompts)
     root, overrides = split_root(args.overrides)
@@ -143,7 +143,6 @@ def run_farm(args: argparse.Namespace) -> int:
     if not is_url(str(place)):
         require_writable(place.folder, "--out" if args.out else "exp_root_dir")
     # before Ray starts: this takes a second
-    train_alone()  # whatever has started this process, such as a job of SLURM
     recipe = make_recipe(args.config, overrides, cpu=True, cores=args.cores)
     recipe = check_recipe(recipe, read_rows(args.prompts))
     with claimed(place):

@@ -19,6 +19,7 @@ from typing import Any, NamedTuple, Optional
 
 from .. import __version__, register_parts
 from ..core.errors import UserError
+from ..core.launcher import train_alone
 from ..models.loaded import keep_loaded, load_counts
 from . import assets
 from .assets import Job, Recipe, Source
@@ -76,11 +77,9 @@ class Worker:
                 "folder that all machines share"
             )
         os.chdir(setting.start)
+        train_alone()  # before Lightning is imported, which reads the variables
         import torch
 
-        from ..launch.ddp import train_alone
-
-        train_alone()
         torch.set_num_threads(setting.recipe.cores)
         keep_loaded()
         register_parts()

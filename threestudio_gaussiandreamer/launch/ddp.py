@@ -18,9 +18,10 @@ from typing import Any, NamedTuple, Optional
 
 import torch
 
+from ..core import launcher
 from ..core.distributed import is_active
 from ..core.errors import UserError, raised_in
-from ..host import pl
+from ..host import pl, warn
 
 LONGEST_WAIT = timedelta(hours=12)
 """A process waits so long for the others, for instance while the first one renders results."""
@@ -97,12 +98,6 @@ def is_lost_process(error: Exception) -> bool:
     return is_active() and from_torch and bool(LOST_CONNECTION.search(str(error)))
 
 
-def train_alone() -> None:
-    """Let later runs of this process be single ones, whatever program has started it."""
-    for key in ("TORCHELASTIC_RUN_ID", "SLURM_NTASKS"):
-        os.environ.pop(key, None)
-
-
 def _require_count(option: str, value: Any) -> None:
     whole = isinstance(value, int) and not isinstance(value, bool) and value > 0
     if value is not None and not whole:
@@ -114,10 +109,8 @@ def _started_processes() -> Optional[Processes]:
     if "TORCHELASTIC_RUN_ID" in os.environ:
         local = int(os.environ["LOCAL_WORLD_SIZE"])
         return Processes(local, int(os.environ["WORLD_SIZE"]) // local, TORCHRUN)
-    if not _environments().SLURMEnvironment.detect():
-        return None
     tasks, nodes = (int(os.environ.get(f"SLURM_{key}", 1)) for key in ("NTASKS", "NNODES"))
-    return Processes(tasks // nodes, nodes, SLURM) if tasks > 1 else None
+    return Processes(tasks // nodes, nodes, SLURM) if launcher.many_tasks() else None
 
 
 def _environments() -> Any:
@@ -127,10 +120,18 @@ def _environments() -> Any:
 
 def environment_plugins(processes: Processes) -> list[Any]:
     """Return the plugin that lets Lightning start the processes inside of a SLURM job with a single
-    task, where it would wait for SLURM to start them.
+    task, where it would wait for SLURM to start them, or miss what only ``srun`` sets.
     """
+    tasks = os.environ.get("SLURM_NTASKS", "1")
+    if launcher.is_shell() and processes.started_by is None and int(tasks) > processes.total:
+        warn(
+            f"SLURM has {tasks} tasks, which a shell (SLURM_JOB_NAME="
+            f"{os.environ['SLURM_JOB_NAME']}) doesn't start: the number of processes that train "
+            f"is {processes.total}; for all: srun --job-name train --ntasks-per-node ..."
+        )
     in_job = _environments().SLURMEnvironment.detect()
-    alone = processes.started_by is None and processes.total > 1
+    by_srun = all(name in os.environ for name in launcher.SLURM)
+    alone = processes.started_by is None and (processes.total > 1 or not by_srun)
     return [_environments().LightningEnvironment()] if in_job and alone else []
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Optional
 
 from ..core.errors import UserError, unknown
+from ..core.launcher import require_launcher
 
 # how this process was started, for messages that show a command to resume the run
 PROGRAM = {
@@ -104,8 +105,10 @@ def choose_gpu(gpu: Optional[str], overrides: Sequence[str] = ()) -> None:
             for.
 
     Raises:
-        UserError: ``gpu`` is neither "cpu" nor a list of numbers.
+        UserError: ``gpu`` is neither "cpu" nor a list of numbers, or the launcher's variables are
+            wrong.
     """
+    require_launcher()
     if gpu is not None and not re.fullmatch(r"cpu|\d+(,\d+)*", gpu):
         raise UserError(f"--gpu {gpu}: expected cpu, or numbers of GPUs such as 0 or 0,1")
     os.environ.setdefault("CUDA_DEVICE_ORDER", "PCI_BUS_ID")

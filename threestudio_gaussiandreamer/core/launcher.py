@@ -1,0 +1,92 @@
+"""The environment variables by which torchrun, SLURM and others number the processes of a run."""
+
+import os
+from collections.abc import Mapping
+
+from .errors import UserError
+
+INDICES = (
+    *("RANK", "LOCAL_RANK", "GROUP_RANK", "NODE_RANK", "JSM_NAMESPACE_RANK", "MASTER_PORT"),
+    *("SLURM_PROCID", "SLURM_LOCALID", "SLURM_NODEID", "SLURM_JOB_ID", "PL_GLOBAL_SEED"),
+)
+SIZES = ("WORLD_SIZE", "LOCAL_WORLD_SIZE", "SLURM_NTASKS", "SLURM_NNODES")
+TORCHRUN = ("RANK", "LOCAL_RANK", "WORLD_SIZE", "LOCAL_WORLD_SIZE")
+SLURM = ("SLURM_PROCID", "SLURM_LOCALID", "SLURM_NODEID")
+"""What torchrun, and SLURM's ``srun``, always tell a process."""
+
+
+def require_numbers(environment: Mapping[str, str] = os.environ) -> None:
+    """Check the variables before Lightning is imported, which reads some of them at once.
+
+    Raises:
+        UserError: one isn't a whole number.
+    """
+    for name in (*INDICES, *SIZES):
+        text, lowest = environment.get(name), int(name in SIZES)
+        whole = text is None or text.isascii() and text.isdigit() and len(text) < 20
+        if not whole or text is not None and int(text) < lowest:
+            raise UserError(
+                f"the environment variable {name} is {text!r}; expected a whole number from "
+                f"{lowest} on, as torchrun or SLURM sets it: `unset {name}` for a single process"
+            )
+
+
+def require_launcher(environment: Mapping[str, str] = os.environ) -> None:
+    """Check the variables of a run, which may be one of several processes.
+
+    Raises:
+        UserError: one isn't a whole number, or some of those that belong together are missing.
+    """
+    require_numbers(environment)
+    by_torchrun, by_slurm = "TORCHELASTIC_RUN_ID" in environment, many_tasks(environment)
+    if by_torchrun:
+        _require_all("TORCHELASTIC_RUN_ID", TORCHRUN, "torchrun", environment)
+        _require_multiple("WORLD_SIZE", "LOCAL_WORLD_SIZE", environment)
+    elif by_slurm:
+        _require_all("SLURM_NTASKS", SLURM, "srun", environment)
+        _require_multiple("SLURM_NTASKS", "SLURM_NNODES", environment)
+    for name, started, hint in (
+        ("RANK", by_torchrun, "start the command with torchrun"),
+        ("SLURM_PROCID", by_slurm or by_torchrun, "give srun --job-name and --ntasks-per-node"),
+    ):
+        if not started and int(environment.get(name, 0)):
+            raise UserError(
+                f"the environment variable {name} is {environment[name]}, but nothing says how "
+                f"many processes there are: {hint}, or `unset {name}` for a single process"
+            )
+
+
+def many_tasks(environment: Mapping[str, str] = os.environ) -> bool:
+    """Return whether SLURM has several tasks for this run, and isn't an interactive shell."""
+    return int(environment.get("SLURM_NTASKS", 1)) > 1 and not is_shell(environment)
+
+
+def is_shell(environment: Mapping[str, str] = os.environ) -> bool:
+    """Return whether this is a shell that SLURM has opened, as ``salloc`` does."""
+    return environment.get("SLURM_JOB_NAME") in ("bash", "interactive")
+
+
+def train_alone() -> None:
+    """Let later runs of this process be single ones, whatever program has started it."""
+    for name in ("TORCHELASTIC_RUN_ID", *INDICES, *SIZES):
+        os.environ.pop(name, None)
+
+
+def _require_all(
+    first: str, names: tuple[str, ...], program: str, environment: Mapping[str, str]
+) -> None:
+    missing = [name for name in names if name not in environment]
+    if missing:
+        raise UserError(
+            f"the environment variable {first} is set, but not {', '.join(missing)}: start the "
+            f"command with {program}, or `unset {first}` for a single process"
+        )
+
+
+def _require_multiple(total: str, part: str, environment: Mapping[str, str]) -> None:
+    size, step = (int(environment.get(name, 1)) for name in (total, part))
+    if size % step:
+        raise UserError(
+            f"the environment variable {total} is {size}, no multiple of {part}, which is {step}: "
+            "give each machine as many processes"
+        )
