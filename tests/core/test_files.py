@@ -54,13 +54,13 @@ def test_only_old_temporary_files_of_the_same_name_are_removed(tmp_path):
     ("content", "said"),
     [
         (b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 9\n", "git lfs pull"),
-        (b"\n<!DOCTYPE html><html><head>", "a web page"),
-        (b"<html>", "a web page"),
+        (b"\n<!DOCTYPE html><html><head>", " web page"),
+        (b"<html>", " web page"),
     ],
 )
 def test_what_a_download_left_in_a_files_place_is_named(tmp_path, content, said):
     (tmp_path / "base_40m_textvec.pt").write_bytes(content)
-    with pytest.raises(UserError, match=f"^checkpoint .*base_40m_textvec.pt' is .*{said}"):
+    with pytest.raises(UserError, match=f"^checkpoint '[^']*' is a.*{said}"):
         existing_file(tmp_path / "base_40m_textvec.pt", "checkpoint")
 
 

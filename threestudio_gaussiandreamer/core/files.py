@@ -42,16 +42,18 @@ def existing_file(path: str | os.PathLike, kind: str, bundled: Collection[str] =
     try:
         path = Path(path).expanduser()
         if path.is_file():
-            require_content(path, f"{kind} {str(path)!r}")
-            return path
-        if path.exists():
+            reason = ""
+        elif path.exists():
             reason = "is a folder, not a file" if path.is_dir() else "is no regular file"
         else:
             reason = f"does not exist{near_names(path, bundled)}"
     except (OSError, ValueError, RuntimeError) as error:
         # the name is too long or contains NUL, or "~user" names an unknown user
         raise UserError(f"{kind} {str(path)!r}: not a usable file name ({error}).") from error
-    raise UserError(f"{kind} {str(path)!r} {reason}")
+    if reason:
+        raise UserError(f"{kind} {str(path)!r} {reason}")
+    require_content(path, f"{kind} {str(path)!r}")
+    return path
 
 
 def require_content(path: Path, name: str) -> None:

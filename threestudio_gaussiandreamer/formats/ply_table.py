@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import BinaryIO, NamedTuple, NoReturn, Optional
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from ..core.errors import UserError
 from ..core.files import atomic_file, existing_file
@@ -149,6 +149,10 @@ class PlyTable:
             if isinstance(names, str):
                 return self._columns[names].astype(np.float32)
             return np.stack([self._columns[name].astype(np.float32) for name in names], axis=1)
+
+    def doubles(self, names: tuple[str, ...]) -> Float[np.ndarray, "N C"]:
+        """Return several columns as float64, which holds every stored number exactly."""
+        return np.stack([self._columns[name].astype(np.float64) for name in names], axis=1)
 
     def stored_type(self, name: str) -> np.dtype:
         """Return the number type that the header states."""
@@ -398,3 +402,117 @@ def _require_room(file: BinaryIO, vertices: Element, size: int, path: str) -> No
             f"{vertices.count} vertices need {size} bytes, but {remaining} follow the header: "
             "it is truncated or damaged.",
         )
+
+
+# ---- faces ---------------------------------------------------------------------------------------
+
+
+class Lists(NamedTuple):
+    """A property of all faces: their numbers or lists, one after the other."""
+
+    lengths: Int[np.ndarray, " F"]
+    values: Float[np.ndarray, " V"]
+
+
+def read_faces(path: str | os.PathLike) -> dict[str, Lists]:
+    """Read the properties of the faces, by name, of a file whose vertices :class:`PlyTable` has
+    read; empty where there are no faces.
+
+    Raises:
+        UserError: they are damaged or truncated.
+    """
+    with open(path, "rb") as file:
+        header = read_header(file, str(path))
+        for element in header.elements:
+            if element.name == "face":
+                try:
+                    return _lists(_numbers(file.read(), element, header.encoding), element)
+                except (ValueError, IndexError, OverflowError, struct.error) as error:
+                    _fail(str(path), f"its faces are truncated or damaged ({error}).")
+            if element.name == "vertex" and header.encoding == "ascii":  # checked before
+                count = element.count if element.properties else 0
+                while count and (line := file.readline()):
+                    count -= bool(line.strip())
+            else:
+                _skip(file, element, header.encoding, str(path))
+    return {}
+
+
+def _numbers(data: bytes, element: Element, encoding: str) -> Float[np.ndarray, " T"]:
+    """Return all numbers of an element, those before its lists included, and what follows it."""
+    if element.count > len(data):
+        raise ValueError(f"{element.count} are announced")
+    if encoding == "ascii":
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DeprecationWarning)  # of text after the numbers
+            return np.fromstring(data, np.float64, sep=" ")
+    order = BYTE_ORDERS[encoding]
+    kinds = [
+        (entry.count_type and np.dtype(order + entry.count_type), np.dtype(order + entry.type))
+        for entry in element.properties
+    ]
+    rows, at = [], 0
+    while len(rows) < element.count:
+        fields, row = [], at
+        for length, kind in kinds:
+            count = 1
+            if length:
+                count = int(np.frombuffer(data, length, 1, row)[0])
+                fields.append((f"length {len(fields)}", length))
+                row += length.itemsize
+            fields.append((f"value {len(fields)}", kind, (count,)))
+            row += count * kind.itemsize
+        layout = np.dtype(fields)
+        if not rows and element.count * layout.itemsize <= len(data):  # are all as the first?
+            same = np.frombuffer(data, layout, element.count)
+            lengths = [name for name in layout.names if name.startswith("length")]
+            if all((same[name] == same[name][0]).all() for name in lengths):
+                return _flat(same)
+        rows.append(_flat(np.frombuffer(data, layout, 1, at)))
+        at = row
+    return np.concatenate([*rows, np.empty(0)])
+
+
+def _flat(rows: np.ndarray) -> Float[np.ndarray, " T"]:
+    columns = [rows[name].reshape(len(rows), -1) for name in rows.dtype.names]
+    return np.concatenate(columns, axis=1, dtype=np.float64).ravel()
+
+
+def _lists(numbers: Float[np.ndarray, " T"], element: Element) -> dict[str, Lists]:
+    """Divide the numbers of an element into its properties."""
+    count, at, row, alike = element.count, 0, 0, True
+    ends = np.zeros((count, len(element.properties)), np.int64)
+    lengths = np.ones_like(ends)
+    while row < count:
+        first = at
+        for column, entry in enumerate(element.properties):
+            if entry.count_type:
+                lengths[row, column], at = int(numbers[at]), at + 1
+            if lengths[row, column] < 0:
+                raise ValueError("a list of negative length")
+            at += lengths[row, column]
+            ends[row, column] = at
+        row += 1
+        if row == 1:  # are all as the first?
+            alike = count * (at - first) <= len(numbers)
+            table = numbers[: count * (at - first)].reshape(count, -1) if alike else numbers
+            starts = ends[0] - lengths[0]
+            for column, entry in enumerate(element.properties):
+                if entry.count_type and alike:
+                    alike = (table[:, starts[column] - 1] == lengths[0, column]).all()
+            if alike:
+                lengths[:] = lengths[0]
+                ends[:] = ends[0] + (at - first) * np.arange(count)[:, None]
+                break
+    if count and ends[-1].max(initial=0) > len(numbers):
+        raise ValueError("the last ones are missing")
+    return {
+        entry.name: Lists(lengths[:, column], numbers[_ranges(ends[:, column], lengths[:, column])])
+        for column, entry in enumerate(element.properties)
+    }
+
+
+def _ranges(ends: Int[np.ndarray, " F"], lengths: Int[np.ndarray, " F"]) -> np.ndarray:
+    """Return the indices of all ranges that end before ``ends``, one after the other."""
+    within = np.arange(lengths.sum()) - np.repeat(np.cumsum(lengths) - lengths, lengths)
+    return within + np.repeat(ends - lengths, lengths)

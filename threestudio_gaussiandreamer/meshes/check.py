@@ -1,12 +1,11 @@
-"""Check OBJ and PLY files before trimesh reads them, for damage that it would ignore silently or
-read wrongly.
+"""Check OBJ files before trimesh reads them, for damage that it would ignore silently or read
+wrongly.
 """
 
 import functools
 import re
 from pathlib import Path
 
-from ..formats.ply_table import PlyTable
 from .budget import fail
 
 # No text matches one of these patterns in two ways: backtracking on a long line would take
@@ -19,15 +18,12 @@ RELATIVE_FACE = re.compile(rb"^f .*-", re.MULTILINE)
 
 
 def check_mesh_file(path: Path) -> None:
-    """Check an OBJ or PLY file; other formats are left to their reader.
+    """Check an OBJ file; other formats are left to their reader.
 
     Raises:
         UserError: the file is damaged, or uses a feature that trimesh reads wrongly.
     """
-    extension = path.suffix.lower()
-    if extension == ".ply":
-        PlyTable.read(path)
-    if extension == ".obj":
+    if path.suffix.lower() == ".obj":
         _check_obj(path.read_bytes(), path)
 
 

@@ -21,6 +21,7 @@ from ..core.files import existing_file
 from .gltf import read_gltf
 from .merge import merged
 from .mesh import MAX_NON_FINITE, Mesh, face_areas
+from .ply_mesh import read_ply_mesh
 from .trimesh_reader import read_with_trimesh
 
 GLTF_FORMATS = ("glb", "gltf")
@@ -98,7 +99,9 @@ def read_parts(path: Path) -> list[Mesh]:
         UserError: the format is unknown, or the file is damaged or too large (``budget.py``).
     """
     extension = _extension(path)
-    return read_gltf(path) if extension in GLTF_FORMATS else read_with_trimesh(path)
+    if extension in GLTF_FORMATS:
+        return read_gltf(path)
+    return read_ply_mesh(path) if extension == "ply" else read_with_trimesh(path)
 
 
 def mesh_formats() -> set[str]:

@@ -1,4 +1,4 @@
-"""Parts of mesh files in the formats that trimesh reads: OBJ, PLY, STL, OFF, ..."""
+"""Parts of mesh files in the formats that trimesh reads: OBJ, STL, OFF, ..."""
 
 import io
 import logging
@@ -13,7 +13,7 @@ from .budget import Budget, fail
 from .check import check_mesh_file
 from .colors import linear_to_srgb, unit_rgb
 from .gltf import LARGEST_UV
-from .mesh import GREY, MAX_NON_FINITE, Mesh
+from .mesh import Mesh
 from .side_files import SideFiles
 from .textures import decode_image, open_texture
 
@@ -172,32 +172,10 @@ def _colored(part: Mesh, geometry: Any, files: _Resolver) -> Mesh:
     if visual.kind == "texture":
         return _with_material(part, visual, files)
     if visual.kind == "vertex":
-        return part._replace(vertex_colors=_vertex_colors(geometry, files.budget.path))
+        return part._replace(vertex_colors=unit_rgb(visual.vertex_colors))
     if visual.kind == "face":
         return part._replace(face_colors=unit_rgb(visual.face_colors))
     return part
-
-
-def _vertex_colors(geometry: Any, path: Path) -> np.ndarray:
-    """Return the vertices' colours, with grey for those in a PLY that aren't finite, which trimesh
-    silently converts to black.
-    """
-    colors = unit_rgb(geometry.visual.vertex_colors)
-    stored = geometry.metadata.get("_ply_raw", {}).get("vertex", {"properties": ()})
-    names = [name for name in ("red", "green", "blue") if name in stored["properties"]]
-    finite = np.all(
-        [np.isfinite(stored["data"][name]).reshape(-1) for name in names], axis=0
-    ) | np.zeros(len(colors), bool)
-    if (bad := int((~finite).sum())) > MAX_NON_FINITE * len(finite):
-        raise UserError(
-            f"{bad} of {len(finite)} colours of {str(path)!r} aren't finite (at most 5 % may "
-            "be): export the mesh again"
-        )
-    if bad:
-        log.warning(
-            "%d of %d colours of %s aren't finite: they become grey", bad, len(finite), path
-        )
-    return np.where(finite[:, None], colors, np.float32(GREY))
 
 
 def _with_material(part: Mesh, visual: Any, files: _Resolver) -> Mesh:
