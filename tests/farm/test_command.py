@@ -82,6 +82,23 @@ def test_a_cluster_that_is_out_of_reach_is_named(farm):
     assert code == 2 and "--address 127.0.0.1:1: no Ray cluster answers there" in err
 
 
+@pytest.mark.parametrize(
+    ("address", "said"),
+    [
+        ("127.0.0.1:1", "refused"),
+        ("http://127.0.0.1:8265", "expected host:port"),
+        ("http://head", "expected host:port"),
+        ("host:x", "invalid literal"),
+    ],
+)
+def test_an_address_of_the_environment_is_named_as_such(farm, monkeypatch, address, said):
+    pytest.importorskip("ray")
+    monkeypatch.setenv("RAY_ADDRESS", address)
+    code, err = farm("a fox")
+    assert code == 2 and f"RAY_ADDRESS {address}: no Ray cluster answers there" in err
+    assert said in err and "`unset RAY_ADDRESS`" in err and "--address" not in err
+
+
 def test_without_ray_the_extra_is_named(farm, monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
     code, err = farm("a fox")

@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 
 import pytest
@@ -153,6 +154,22 @@ def test_an_asset_that_hangs_is_made_again(tmp_path):
     code, said = farm.run("--time-limit", "20", "--retries", "9")
     assert code == 0 and "toy0: restarted: no step for" in said, said
     assert farm.lines()[-1]["state"] == "finished" and farm.lines()[-1]["attempts"] >= 2
+
+
+def test_a_long_folder_for_temporary_files_and_proxies_do_not_matter(tmp_path, monkeypatch):
+    long = tmp_path / ("x" * 90)
+    long.mkdir()
+    for name in ("http_proxy", "https_proxy", "all_proxy", "grpc_proxy"):
+        monkeypatch.setenv(name, "http://127.0.0.1:9")
+    monkeypatch.delenv("no_proxy", raising=False)
+    monkeypatch.delenv("RAY_TMPDIR", raising=False)
+    monkeypatch.setenv("TMPDIR", str(long))
+    monkeypatch.setattr(tempfile, "tempdir", None)
+    ray = cluster.connect(None)
+    try:
+        cluster.require_same_version(ray)
+    finally:
+        ray.shutdown()
 
 
 def test_a_machine_with_another_version_is_refused(monkeypatch):

@@ -5,6 +5,7 @@ and hands it the asset again."""
 
 import os
 import socket
+import tempfile
 from typing import Any, NamedTuple, Optional
 
 from .. import __version__
@@ -15,6 +16,10 @@ from .worker import Setting, Worker
 
 OBJECT_STORE_BYTES = 100 << 20
 """Memory for what workers send each other: little."""
+LONGEST_FOLDER = 36
+"""Characters of a folder for temporary files in which Ray's sockets have names that are short
+enough for the operating system, which allows about 107.
+"""
 SECONDS_TO_ANSWER = 120
 """How long a machine or a worker may take to start."""
 
@@ -37,37 +42,40 @@ def connect(address: Optional[str]) -> Any:
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     import ray
 
+    source = "--address" if address else "RAY_ADDRESS"
     address = address or os.environ.get("RAY_ADDRESS") or "local"
     options: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
     if address == "local":
         options |= {"include_dashboard": False, "object_store_memory": OBJECT_STORE_BYTES}
-    else:
-        require_answer(address)
+        if len(tempfile.gettempdir()) > LONGEST_FOLDER and os.path.isdir("/tmp"):
+            os.environ.setdefault("RAY_TMPDIR", "/tmp")
     try:
+        require_answer(address)
         ray.init(address=address, **options)
-    except (ConnectionError, ValueError, RuntimeError, ray.exceptions.RayError) as error:
-        raise _out_of_reach(address, error) from error
+    except (OSError, ValueError, RuntimeError, OverflowError, ray.exceptions.RayError) as error:
+        raise _out_of_reach(source, address, error) from error
     return ray
 
 
 def require_answer(address: str) -> None:
-    """Raise UserError unless something accepts connections at ``address`` within seconds: Ray's
-    own attempt takes minutes.
+    """Raise an error unless something accepts connections at ``address`` within seconds: Ray's own
+    attempt takes minutes.
     """
     host, _, port = address.removeprefix("ray://").rpartition(":")
-    if not host:  # "auto", which Ray resolves by itself
-        return
-    try:
+    if "://" in address.removeprefix("ray://"):
+        raise ValueError("expected host:port, such as that which `ray start --head` prints")
+    if host:  # else "local", or "auto", which Ray resolves by itself
         socket.create_connection((host.strip("[]"), int(port)), timeout=5).close()
-    except (OSError, ValueError, OverflowError) as error:
-        raise _out_of_reach(address, error) from error
 
 
-def _out_of_reach(address: str, error: Exception) -> UserError:
-    said = (str(error).strip().splitlines() or [type(error).__name__])[0]
+def _out_of_reach(source: str, address: str, error: Exception) -> UserError:
+    said = (str(error).strip().splitlines() or [type(error).__name__])[0][:300]
+    if address == "local":
+        return UserError(f"Ray can't be started on this machine: {said}")
+    leave = "leave --address out" if source == "--address" else "`unset RAY_ADDRESS`"
     return UserError(
-        f"--address {address}: no Ray cluster answers there ({said[:300]}); start one with "
-        "`ray start --head`, or leave --address out to run on this machine"
+        f"{source} {address}: no Ray cluster answers there ({said}); start one with "
+        f"`ray start --head`, or {leave} to run on this machine"
     )
 
 
