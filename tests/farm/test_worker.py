@@ -138,6 +138,19 @@ def test_an_asset_without_files_has_failed(place, monkeypatch):
     assert place.finished(JOB.row) is None
 
 
+def test_an_exit_of_a_part_fails_its_asset_and_one_of_ray_ends_the_worker(place, monkeypatch):
+    def exits(self, *args):
+        exec("raise SystemExit(3)", {"__name__": module})
+
+    monkeypatch.setattr(Worker, "_run", exits)
+    module = "a_part"
+    outcome = Worker().make(JOB, setting(place))
+    assert outcome["state"] == FAILED and "ended the run with sys.exit(3)" in outcome["error"]
+    module = "ray._private.worker"
+    with pytest.raises(SystemExit):
+        Worker().make(JOB, setting(place))
+
+
 def test_an_error_is_in_the_log_of_its_asset(place, monkeypatch):
     def fails(*args):
         raise ValueError("no such thing")

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, Optional
 
 from .. import __version__, register_parts
-from ..core.errors import UserError
+from ..core.errors import UserError, raised_in
 from ..core.launcher import train_alone
 from ..models.loaded import keep_loaded, load_counts
 from . import assets
@@ -99,6 +99,12 @@ class Worker:
             if earlier is not None:
                 return {"state": FINISHED, **earlier}
             return self._make(job)
+        except SystemExit as stop:
+            if raised_in(stop, "ray."):  # which ends this process
+                raise
+            from ..launch.experiment import foreign_exit
+
+            return outcome_of(foreign_exit(stop))
         except Exception as error:
             return outcome_of(error)
         finally:
