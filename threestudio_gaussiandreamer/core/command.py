@@ -107,4 +107,4 @@ def exit_code(error: Exception, verbose: bool = False) -> int:
         print(
             f"stopped: the reader of the output has closed it ({error.strerror})", file=sys.stderr
         )
-    return 128 + signal.SIGPIPE
+    return 128 + 13  # SIGPIPE, which Windows doesn't have

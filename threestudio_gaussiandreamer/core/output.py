@@ -47,7 +47,9 @@ def tolerant_output() -> Iterator[None]:
     earlier = sys.stdout, sys.stderr
     with contextlib.ExitStack() as opened:
         sys.stdout, sys.stderr = (
-            opened.enter_context(open(os.devnull, "w")) if stream is None else _tolerant(stream)
+            opened.enter_context(open(os.devnull, "w", encoding="utf-8"))
+            if stream is None
+            else _tolerant(stream)
             for stream in earlier
         )
         try:

@@ -176,7 +176,7 @@ def stored_bytes(folder: Path) -> int:
 def scores(folder: Path) -> dict[str, float]:
     """Return the numbers that a run has measured on its result."""
     try:
-        measured = json.loads((folder / "save" / "metrics.json").read_text())["result"]
+        measured = json.loads((folder / "save" / "metrics.json").read_bytes())["result"]
     except (OSError, ValueError, KeyError, TypeError):
         return {}
     names = ("psnr", "ssim", "multi_face")

@@ -239,7 +239,7 @@ def written_sources(sources: list[Source]) -> Iterator[list[str]]:
 @contextlib.contextmanager
 def written_log(path: Path) -> Iterator[None]:
     """Append what a run prints, and the traceback of its error, to a file."""
-    with open(path, "a", buffering=1, errors="backslashreplace") as file:
+    with open(path, "a", buffering=1, encoding="utf-8", errors="backslashreplace") as file:
         with contextlib.redirect_stdout(file), contextlib.redirect_stderr(file):
             try:
                 yield
@@ -253,9 +253,9 @@ def count_attempts(folder: Path, session: str) -> tuple[int, int]:
     in this session.
     """
     path = folder / "attempts.txt"
-    with open(path, "a") as file:
+    with open(path, "a", encoding="utf-8") as file:
         file.write(f"{session} {socket.gethostname()} {os.getpid()}\n")
-    lines = path.read_text().splitlines()
+    lines = path.read_text(encoding="utf-8").splitlines()
     return len(lines), sum(line.startswith(f"{session} ") for line in lines)
 
 
@@ -313,7 +313,7 @@ def reset_peak_memory() -> None:
     if torch.cuda.is_available():
         torch.cuda.reset_peak_memory_stats()
     with contextlib.suppress(OSError):
-        Path("/proc/self/clear_refs").write_text("5")
+        Path("/proc/self/clear_refs").write_text("5", encoding="utf-8")
 
 
 def peak_megabytes() -> float:
@@ -323,7 +323,7 @@ def peak_megabytes() -> float:
     if torch.cuda.is_available():
         return round(torch.cuda.max_memory_allocated() / 2**20, 1)
     try:
-        status = Path("/proc/self/status").read_text()
+        status = Path("/proc/self/status").read_text(encoding="utf-8")
     except OSError:
         return 0.0
     peaks = [line.split()[1] for line in status.splitlines() if line.startswith("VmHWM")]

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, fields
 from itertools import combinations
 from typing import Any, Optional
 
+import omegaconf
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -329,8 +330,9 @@ def register_resolvers() -> None:
         "not": lambda value: not value,
         "cmaxgt0orcmaxgt0": lambda a, b: C_max(a) > 0 or C_max(b) > 0,
     }
-    # omegaconf 2.4 renamed it
-    enter = getattr(OmegaConf, "register_resolver", OmegaConf.register_new_resolver)
+    # omegaconf 2.4 gave the new function the name that the one without nesting had before
+    is_old = [int(part) for part in omegaconf.__version__.split(".")[:2]] < [2, 4]
+    enter = OmegaConf.register_new_resolver if is_old else OmegaConf.register_resolver
     for name, function in resolvers.items():
         if not OmegaConf.has_resolver(name):
             enter(name, function)

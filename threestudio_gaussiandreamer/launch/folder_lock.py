@@ -340,7 +340,7 @@ def _create(file: Path, content: str) -> None:
     """Create a file that must not exist; it is removed if the content can't be written."""
     descriptor = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL)
     try:
-        with open(descriptor, "w") as opened:
+        with open(descriptor, "w", encoding="utf-8") as opened:
             opened.write(content)
     except OSError:  # the disk is full
         file.unlink(missing_ok=True)

@@ -216,7 +216,7 @@ def _fastest_hits(mesh: Mesh) -> Hits:
 def _report_slow_caster(reason: str) -> None:
     log.warning(
         "embreex is missing (%s): drawing the mesh with plain numpy, which is slower; `pip "
-        "install embreex` for speed.",
+        "install embreex` for speed, except on Linux on ARM, for which it has no wheel.",
         reason,
     )
 

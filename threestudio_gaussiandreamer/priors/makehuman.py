@@ -127,8 +127,8 @@ def _read_body(folder: Path, person: Person) -> Body:
     for name, weight in target_weights(person).items():
         rows, offsets = read_target(folder / "targets" / f"{name}.target.gz")
         shape[rows] += weight * offsets
-    rig = json.loads((folder / "rigs" / "standard" / "rig.default.json").read_text())
-    skin = json.loads((folder / "rigs" / "standard" / "weights.default.json").read_text())
+    rig = json.loads((folder / "rigs" / "standard" / "rig.default.json").read_bytes())
+    skin = json.loads((folder / "rigs" / "standard" / "weights.default.json").read_bytes())
     bones = rig.get("bones", rig)
     quads = np.concatenate([base.groups[group] for group in GROUPS])
     corners = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])

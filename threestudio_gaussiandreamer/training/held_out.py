@@ -308,7 +308,7 @@ def _read_scores(path: Path) -> dict[str, Any]:
     missing or damaged.
     """
     try:
-        values = json.loads(path.read_text()) if path.is_file() else {}
+        values = json.loads(path.read_bytes()) if path.is_file() else {}
     except (OSError, ValueError, RecursionError):
         return {}
     stored = values if isinstance(values, dict) else {}

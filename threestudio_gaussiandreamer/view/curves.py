@@ -31,7 +31,7 @@ def read_curves(folder: Path, names: Sequence[str]) -> dict[str, Curve]:
 
 def _add_log(path: Path, values: dict[str, dict[float, float]]) -> None:
     try:
-        with open(path, newline="", errors="replace") as file:
+        with open(path, newline="", encoding="utf-8", errors="replace") as file:
             for row in csv.DictReader(file):
                 step = _number(row.get("step"))
                 for name, found in values.items():

@@ -102,7 +102,7 @@ def page(shown: Shown, options: PageOptions, before: Optional[Shown] = None) -> 
         **{name: sources([name]) for name in SHADERS},
     }
     # in one pass, so that a prompt that holds "{{data}}" stays as it is
-    template = (WEB / "page.html").read_text()
+    template = (WEB / "page.html").read_text(encoding="utf-8")
     return re.sub(r"\{\{([\w.]+)\}\}", lambda match: fields[match[1]], template)
 
 
@@ -190,7 +190,7 @@ def _poster(cloud: StoredCloud, settings: RenderSettings, pose: Pose) -> str:
 @cache
 def _source(name: str) -> str:
     """Read a file of ``web/``; drop indentation, blank lines and comment lines."""
-    lines = (line.strip() for line in (WEB / name).read_text().splitlines())
+    lines = (line.strip() for line in (WEB / name).read_text(encoding="utf-8").splitlines())
     return "\n".join(line for line in lines if line and not line.startswith("//"))
 
 

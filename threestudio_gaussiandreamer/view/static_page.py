@@ -13,7 +13,7 @@ POLICY = "script-src 'none'; object-src 'none'; base-uri 'none'; form-action 'no
 
 @cache
 def _style() -> str:
-    return (WEB / "static.css").read_text()
+    return (WEB / "static.css").read_text(encoding="utf-8")
 
 
 def document(title: str, parts: Iterable[str]) -> str:

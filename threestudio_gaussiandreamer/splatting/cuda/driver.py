@@ -152,7 +152,7 @@ def driver_build() -> str:
     such file, as Windows, including its Linux subsystem.
     """
     try:
-        found = re.search(r"\d+(\.\d+)+", VERSION_FILE.read_text(errors="replace"))
+        found = re.search(r"\d+(\.\d+)+", VERSION_FILE.read_bytes().decode(errors="replace"))
     except OSError:
         return ""
     return f"{found[0]} " if found else ""

@@ -142,14 +142,14 @@ def compile_unit(unit: str, target: str) -> Compiled:
 
 
 def source(unit: str) -> str:
-    return (KERNELS / f"{unit}.cu").read_text()
+    return (KERNELS / f"{unit}.cu").read_text(encoding="utf-8")
 
 
 @functools.cache
 def headers() -> dict[str, str]:
     """Return the text of each header that a ``.cu`` file may include, by name."""
     return {
-        path.name: path.read_text()
+        path.name: path.read_text(encoding="utf-8")
         for path in (*sorted(KERNELS.glob("*.h")), *sorted(SHARED.glob("*.h")))
     }
 
