@@ -171,6 +171,15 @@ def test_a_damaged_usdz_is_named(tmp_path, cut):
             read(tmp_path / "b.usdz")
 
 
+def test_a_zip_archive_that_is_called_usdz_is_named(tmp_path):
+    write_usda(tmp_path / "a.usda", ball(50))
+    with zipfile.ZipFile(tmp_path / "b.usdz", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.write(tmp_path / "a.usda", "a.usda")
+    for read in (read_usda, read_usd):
+        with pytest.raises(UserError, match="b.usdz' is a compressed zip archive"):
+            read(tmp_path / "b.usdz")
+
+
 # ---- by OpenUSD ----------------------------------------------------------------------------------
 
 
@@ -236,7 +245,7 @@ def test_what_openusd_cant_read_either_is_said(tmp_path):
     with pytest.raises(UserError, match="b.usdc.*OpenUSD: .*corrupt"):
         read_usd(tmp_path / "b.usdc")
     (tmp_path / "c.usda").write_text('#usda 1.0\ndef Sphere "a"\n{\n}\n')
-    with pytest.raises(UserError, match="line 2: expected one prim 'def ParticleField3DGauss"):
+    with pytest.raises(UserError, match="c.usda': none of its prims is a ParticleField3DGauss"):
         read_usd(tmp_path / "c.usda")
     text = (tmp_path / "a.usda").read_text().replace("Degree = 0", "Degree = 1")
     (tmp_path / "d.usda").write_text(text)

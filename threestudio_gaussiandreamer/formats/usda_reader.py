@@ -61,7 +61,7 @@ def read_usd(path: str | os.PathLike) -> tuple[Gaussians, list[str]]:
                 "[usd]), or export it as .usda with one prim"
             ) from error
         try:
-            return _read_by_openusd(path, error)
+            return _read_by_openusd(path)
         except Tf.ErrorException as damage:
             reason = str(damage).strip().splitlines()[0].rpartition(" : ")[2]
             raise UserError(f"{error}; OpenUSD: {reason[:200]}") from damage
@@ -94,8 +94,14 @@ def _text(path: Path) -> bytes:
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             first = archive.infolist()[0]
-            # files of a USDZ aren't compressed, so that this can't be larger than the file
-            return archive.read(first) if first.compress_type == zipfile.ZIP_STORED else b""
+            if first.compress_type != zipfile.ZIP_STORED:  # or it may be larger than the file
+                raise UserError(
+                    f"USDZ file {str(path)!r} is a compressed zip archive, which no USDZ may be: "
+                    "write it by a program that exports USDZ"
+                )
+            return archive.read(first)
+    except UserError:
+        raise
     except (zipfile.BadZipFile, IndexError, ValueError, EOFError, RuntimeError) as error:
         raise UserError(f"USDZ file {str(path)!r} is damaged: {error}") from error
 
@@ -108,12 +114,8 @@ def _upright(gaussians: Gaussians, up: str) -> Gaussians:
 # ---- OpenUSD -------------------------------------------------------------------------------------
 
 
-def _read_by_openusd(path: Path, error: UserError) -> tuple[Gaussians, list[str]]:
-    """Read all prims of a stage.
-
-    Args:
-        error: is raised where there are none.
-    """
+def _read_by_openusd(path: Path) -> tuple[Gaussians, list[str]]:
+    """Read all prims of a stage."""
     from pxr import Usd, UsdGeom
 
     stage, now = Usd.Stage.Open(str(path)), Usd.TimeCode.EarliestTime()
@@ -129,7 +131,7 @@ def _read_by_openusd(path: Path, error: UserError) -> tuple[Gaussians, list[str]
         if prim.GetTypeName() == SCHEMA
     ]
     if not parts:
-        raise error
+        raise UserError(f"USD file {str(path)!r}: none of its prims is a {SCHEMA}")
     notes = stage.GetRootLayer().customLayerData.get("notes", [])
     up = UsdGeom.GetStageUpAxis(stage).lower()
     return _upright(joined(parts), up), [str(note) for note in notes]
