@@ -5,6 +5,7 @@ import shlex
 from pathlib import Path
 
 import pytest
+import yaml
 
 from benchmarks import tables
 from threestudio_gaussiandreamer import register_parts
@@ -93,7 +94,7 @@ def test_a_launch_that_is_shown_is_accepted(arguments, tmp_path, monkeypatch):
     overrides = [
         override
         for override in args.overrides
-        if not re.search("spiral-prior|front-first|variant.behind", override)
+        if not re.search("spiral-prior|front-first|variant.behind|extent", override)
     ]  # extensions, tried below
     monkeypatch.chdir(tmp_path)
     check_config(load_config(*paths, cli_args=overrides))
@@ -121,6 +122,7 @@ PARTS = {
         "system.guidance.variant.behind=0.2",
     ],
     "custom/smooth_depth.py": ["system.loss.lambda_smooth_depth=1000"],
+    "custom/extent.py": ["system.exporter.formats=[ply,extent]"],
     "custom/sky.py": [
         "system.background_type=sky-background",
         "system.optimizer.params.background.lr=0.01",
@@ -143,6 +145,25 @@ def test_an_extension_that_is_shown_trains(name, source, tmp_path, monkeypatch):
         ["--config", "demo.yaml", "--train", "--gpu", "cpu", *TINY, *PARTS[name]]
     )
     assert code == 0 and Path("outputs/demo/t/save/it2-export/gaussians.ply").is_file()
+
+
+def test_the_documented_imports_exist():
+    (block,) = (
+        block
+        for block in blocks(TEXTS["docs/extending.md"], "python")
+        if block.startswith("from threestudio_gaussiandreamer import")
+    )
+    exec(block, {})
+
+
+def test_the_command_of_the_example_for_ci_is_accepted(tmp_path, monkeypatch):
+    (block,) = blocks(TEXTS["docs/extending.md"], "yaml")
+    steps = yaml.safe_load(block)["jobs"]["smoke"]["steps"]
+    words = shlex.split(steps[-1]["run"])
+    assert words.pop(0) == "gaussiandreamer" and words.pop().endswith("=spiral-prior")
+    monkeypatch.chdir(tmp_path)
+    args = parse_arguments(words)
+    check_config(load_config(*map(find_config, args.config), cli_args=args.overrides))
 
 
 @pytest.mark.parametrize("page", tables.PAGES)

@@ -13,8 +13,8 @@ import pytest
 
 from tests.helpers import tiny_models
 from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.core.extras import require_extra
 from threestudio_gaussiandreamer.models import hub, model_files
-from threestudio_gaussiandreamer.models.extras import require_extra
 
 huggingface_hub = pytest.importorskip("huggingface_hub")
 pytest.importorskip("diffusers")

@@ -11,6 +11,7 @@ from collections.abc import Callable, Collection, Sequence
 from typing import Any, Optional
 
 from .errors import Terminated, UserError
+from .extras import error_of_extra
 from .launcher import require_numbers
 from .output import tolerant_output
 from .signals import raised_signals
@@ -92,8 +93,10 @@ def exit_code(error: Exception, verbose: bool = False) -> int:
     """Print one message about the error that ended a command, and return the exit code.
 
     Raises:
-        Exception: ``error`` itself, unless it is a UserError or BrokenPipeError.
+        Exception: ``error`` itself, unless it is a UserError, a BrokenPipeError, or about a missing
+            module of an extra.
     """
+    error = error_of_extra(error) or error
     if not isinstance(error, (UserError, BrokenPipeError)):
         raise error
     if verbose:

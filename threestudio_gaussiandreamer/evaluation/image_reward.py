@@ -17,8 +17,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from ..core.errors import UserError
+from ..core.extras import require_extra
 from ..models.clip import preprocessed
-from ..models.extras import require_extra
 from ..priors.weights import load_exactly, read_state_dict
 
 WEIGHTS, VOCABULARY = "ImageReward.pt", "vocab.txt"

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, Optional
 
 from .. import __version__
 from ..core.errors import UserError
-from ..models.extras import require_extra
+from ..core.extras import require_extra
 from .board import Board
 from .worker import Setting, Worker
 

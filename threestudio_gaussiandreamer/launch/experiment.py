@@ -20,11 +20,18 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Optional
 
-from ..core.command import exit_code
+from ..core.command import exit_code, run_command
 from ..core.errors import Terminated, UserError
 from ..core.output import tolerant_output
 from ..core.signals import raised_signals
-from .options import PROGRAM, announce_device, choose_gpu, find_config, parse_arguments
+from .options import (
+    LIST_PARTS,
+    PROGRAM,
+    announce_device,
+    choose_gpu,
+    find_config,
+    parse_arguments,
+)
 
 if TYPE_CHECKING:
     from .run import Run
@@ -54,6 +61,8 @@ def main(argv: Optional[Sequence[str]] = None) -> int:
     if SIGHUP, Ctrl-C, a closed pipe or SIGTERM stopped the run."""
     limit_openmp_spin()
     argv = list(sys.argv[1:] if argv is None else argv)
+    if LIST_PARTS in argv:
+        return run_command(lambda _: None, lambda _: list_parts())
     try:
         args = parse_arguments(argv)
     except SystemExit as stop:
@@ -63,6 +72,19 @@ def main(argv: Optional[Sequence[str]] = None) -> int:
             return run_until_signal(args, argv)
         except Exception as error:
             return exit_code(error, args.verbose)
+
+
+def list_parts() -> None:
+    """Print the registered parts, with those in ``custom/``: a line for each kind and part."""
+    from .. import register_parts
+
+    register_parts()
+    from .extensions import load_extensions
+    from .part_kinds import parts_by_kind
+
+    load_extensions()
+    for kind, parts in parts_by_kind().items():
+        print(kind, *(f"  {part}" for part in parts), sep="\n")
 
 
 def run_until_signal(args: argparse.Namespace, argv: Sequence[str]) -> int:

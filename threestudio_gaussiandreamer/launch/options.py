@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Optional
 
+from .. import __version__
 from ..core.errors import UserError, unknown
 from ..core.launcher import require_launcher
 
@@ -20,6 +21,7 @@ PROGRAM = {
 }.get(Path(sys.argv[0]).name, ["python", "-m", f"{__package__}.experiment"])
 
 
+LIST_PARTS = "--list-parts"
 STAGES = {
     "train": "train, then render the test views",
     "validate": "render the validation views",
@@ -76,6 +78,10 @@ def parse_with_overrides(
 
 
 def _add_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--version", action="version", version=__version__)
+    parser.add_argument(
+        LIST_PARTS, action="store_true", help="list the registered parts, with those in custom/"
+    )
     stages = parser.add_mutually_exclusive_group(required=True)
     for stage, text in STAGES.items():
         stages.add_argument(

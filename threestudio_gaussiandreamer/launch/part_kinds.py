@@ -86,6 +86,16 @@ def check_kind(path: str, type_name: str, part: Any) -> None:
     )
 
 
+def parts_by_kind() -> dict[str, list[str]]:
+    """Return the names of the registered parts; the kind "other" has those without a base class
+    that tells theirs, such as guidances that are plain objects.
+    """
+    found: dict[str, list[str]] = {}
+    for name in names():
+        found.setdefault(_kind_of(find(name)) or "other", []).append(name)
+    return {kind: found[kind] for kind in (*KINDS, "other") if kind in found}
+
+
 def _require_call(path: str, kind: str, part: type) -> None:
     """Raise UserError for a guidance, exporter or background that can't be called."""
     call = "forward" if issubclass(part, nn.Module) else "__call__"

@@ -17,6 +17,7 @@ MODULES = (
     "priors.motion",
     "priors.anny",
     "guidance.exact_score",
+    "guidance.mock",
     "guidance.stable_diffusion",
     "guidance.deep_floyd",
     "guidance.mvdream",

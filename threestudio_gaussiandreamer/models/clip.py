@@ -14,8 +14,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ..core.extras import require_extra
 from .bundled import CLIP, model_part
-from .extras import require_extra
 from .hub import Source, locate
 from .model_files import (
     component_files,

@@ -15,10 +15,10 @@ from queue import Empty, SimpleQueue
 from typing import Any, NamedTuple, Optional
 
 from ..core.errors import UserError
+from ..core.extras import require_extra
 from ..core.files import require_content
 from ..host import info
 from .bundled import DIFFUSION, model_part
-from .extras import require_extra
 from .families import Family, require_family, require_names
 from .model_files import files_below, needed_files
 

@@ -14,8 +14,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ..core.extras import require_extra
 from ..host import get_device, warn
-from .extras import require_extra
 from .loaded import loaded
 from .model_files import free_memory, load_network, load_settings
 

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..core.errors import UserError
-from ..models.extras import missing_extra
+from ..core.extras import missing_extra
 from .skeleton import BODY_JOINTS, JOINTS
 
 DATA = "data/mpfb2"

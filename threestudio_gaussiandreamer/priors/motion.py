@@ -44,6 +44,7 @@ from jaxtyping import Float
 
 from ..cameras import orbit_c2w
 from ..core.errors import UserError
+from ..core.extras import require_extra
 from ..core.files import existing_file
 from ..core.options import at_least, in_range, is_whole, positive, satisfies
 from ..gaussians.point_cloud import PointCloud
@@ -52,7 +53,6 @@ from ..meshes.load import load_mesh
 from ..meshes.mesh import Mesh
 from ..meshes.raycast import MeshCaster, over_background
 from ..models.clip import clip_source, picture_similarities
-from ..models.extras import require_extra
 from ..models.hub import Source, locate
 from .base import COLOR, SCALE, Prior, points
 from .mesh import colored_cloud, face_normals

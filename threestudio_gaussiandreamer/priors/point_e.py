@@ -41,6 +41,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..core.errors import UserError
+from ..core.extras import require_extra
 from ..core.files import existing_file
 from ..core.options import in_range, is_numbers, positive, required, satisfies
 from ..gaussians.point_cloud import PointCloud
@@ -48,7 +49,6 @@ from ..host import info, register
 from ..models.bundled import NAME as BUNDLED
 from ..models.bundled import POINTS, model_part
 from ..models.clip import clip_source, load_text_encoder, load_tokenizer, text_condition
-from ..models.extras import require_extra
 from ..models.hub import Source, locate
 from ..models.loaded import loaded
 from ..models.model_files import free_memory

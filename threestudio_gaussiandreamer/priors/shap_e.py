@@ -51,6 +51,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..core.errors import UserError
+from ..core.extras import require_extra
 from ..core.files import existing_file
 from ..core.memory import count_of, require_memory
 from ..core.options import in_range, one_of, positive
@@ -58,7 +59,6 @@ from ..gaussians.point_cloud import PointCloud
 from ..host import info, register
 from ..meshes.colors import linear_to_srgb
 from ..models.clip import load_text_encoder, load_tokenizer, text_condition
-from ..models.extras import require_extra
 from ..models.hub import Source, locate
 from ..models.loaded import loaded
 from ..models.model_files import free_memory, load_network, load_settings, needed_files

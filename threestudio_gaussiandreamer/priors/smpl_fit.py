@@ -26,9 +26,9 @@ from torch import Tensor
 
 from ..core.devices import torch_threads
 from ..core.errors import UserError
+from ..core.extras import require_extra
 from ..core.files import existing_file
 from ..formats.array_files import read_arrays
-from ..models.extras import require_extra
 from .skeleton import BODY_JOINTS
 
 FIELDS = ("v_template", "shapedirs", "posedirs", "J_regressor", "weights", "kintree_table", "f")

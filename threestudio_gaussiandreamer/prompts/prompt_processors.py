@@ -46,11 +46,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..core.errors import UserError
+from ..core.extras import require_extra
 from ..core.files import existing_file, is_folder
 from ..core.options import check_options, in_range
 from ..host import BaseObject, info, parse_structured, register, register_builtin
 from ..models.embedding_cache import EmbeddingCache, Encode, require_cache_folder
-from ..models.extras import require_extra
 from ..models.families import Family
 from ..models.hub import find_model
 from ..models.model_files import fingerprint

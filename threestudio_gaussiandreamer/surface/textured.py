@@ -7,11 +7,11 @@ import torch
 from jaxtyping import Float, Int
 
 from ..core.errors import UserError
+from ..core.extras import require_extra
 from ..core.options import check_options
 from ..gaussians.gaussians import Gaussians, finite, opaque
 from ..gaussians.surface import MIN_OPACITY, gaussian_surface
 from ..meshes.mesh import Mesh
-from ..models.extras import require_extra
 from .bake import bake
 from .closed import simplified, without_small_parts
 from .fusion import DepthFusion

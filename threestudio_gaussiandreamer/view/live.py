@@ -19,13 +19,13 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from ..core.errors import UserError
+from ..core.extras import require_extra
 from ..core.signals import restore_handlers, set_handlers
 from ..formats.gaussian_files import StoredCloud
 from ..gaussians.axes import WORLD_UP
 from ..gaussians.gaussians import Gaussians
 from ..gaussians.sh import sh0_colors
 from ..gaussians.surface import covariance_matrices
-from ..models.extras import require_extra
 from .render import AZIMUTH, ELEVATION, Pose, first_pose, require_gaussians
 
 LARGEST_HALF = 6e4
