@@ -146,6 +146,19 @@ def test_ctrl_c_leaves_checkpoints_and_a_failed_asset_is_reported(tmp_path):
     assert "system.geometry.prior.path=no.glb" in failed[0]["command"]
 
 
+def test_prompts_of_any_length_and_characters_have_an_asset_each_with_its_files(tmp_path):
+    farm = Farm(tmp_path, write_farm(tmp_path, 1, 2))
+    long = "a photo of a very long and winding road through the hills with "
+    rows = [{"prompt": text} for text in (f"{long}a fox", f"{long}a cat", "\U0001f98a/..", "con.x")]
+    (tmp_path / "prompts.jsonl").write_text("\n".join(map(json.dumps, rows)))
+    code, said = farm.run()
+    assert code == 0 and f"{len(rows)} finished, 0 failed" in said, said
+    folders = [folder for folder in (farm.out / "assets").iterdir() if folder.is_dir()]
+    assert len(folders) == len(rows)
+    hashes = {json.loads((folder / assets.RESULT).read_text())["hash"] for folder in folders}
+    assert len(hashes) == len(rows) and all(any(assets.exported(folder)) for folder in folders)
+
+
 def test_an_asset_that_hangs_is_made_again(tmp_path):
     (tmp_path / "custom").mkdir()
     (tmp_path / "custom/hanging.py").write_text(HANGS_ONCE)
