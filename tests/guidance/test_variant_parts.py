@@ -309,3 +309,18 @@ class OtherError(Variant):
 def test_a_variant_without_the_method_error_is_refused_before_the_run(mesh_path, name, said):
     with pytest.raises(UserError, match=rf"{said}.*\(guidance, latents, condition, batch\)"):
         guidance(mesh_path, variant_type=f"test-{name}-variant")
+
+
+def test_a_variant_that_is_not_finite_is_named_and_not_the_score_model(caplog):
+    @register("test-nan-variant")
+    class WithNan(Variant):
+        def error(self, guidance, latents, condition, batch):
+            noised = guidance.add_noise(latents)
+            error = guidance.predict_noise(noised.z, noised.t, condition) - noised.noise
+            return error * torch.nan, noised.abar
+
+    guide = mixture_guidance(variant_type="test-nan-variant", max_bad_steps=2)
+    guide(latents(), rgb_as_latents=True)
+    assert "step 3: WithNan.error of" in caplog.text
+    with pytest.raises(UserError, match="WithNan.error returned NaN or infinity in 2 steps"):
+        guide(latents(), rgb_as_latents=True)

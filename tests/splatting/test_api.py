@@ -267,3 +267,12 @@ def test_auto_prefers_the_native_library_and_says_once_when_it_cannot(monkeypatc
         if "no compiler was found" in record.getMessage()
     ] and len(caplog.records) == 1
     backends._warn_once.cache_clear()
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "said"),
+    [("scales", -2.0, r"exp\(\)"), ("opacities", 3.0, r"sigmoid\(\)"), ("opacities", -1.0, "0, 1")],
+)
+def test_logarithms_and_logits_are_refused(name, value, said):
+    with pytest.raises(UserError, match=f"{name} must be .*{said}"):
+        call(**{name: torch.full_like(arguments()[name], value)})

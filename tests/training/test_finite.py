@@ -38,7 +38,7 @@ def test_the_loss_that_was_bad_first_is_named():
 def test_infinities_are_distinguished_from_sums_that_overflow():
     with pytest.raises(NonFiniteParameters, match="2 of the 2"):
         require_finite([("means", torch.tensor([float("inf"), -float("inf")]))], step=0)
-    require_finite([("means", torch.full((1000,), 3e38)), ("empty", torch.zeros(0))], step=0)
+    require_finite([("exp_avg", torch.full((1000,), 3e38)), ("empty", torch.zeros(0))], step=0)
     require_finite([], step=0)
 
 
@@ -110,3 +110,27 @@ def test_a_cloud_that_is_not_finite_is_neither_shown_nor_exported(
     assert launch(tmp_path, painted_box, stage=stage) == 2
     assert "3 of the 600 numbers of geometry.sh0 are NaN or infinite" in capsys.readouterr().err
     assert not list(tmp_path.rglob("it*"))
+
+
+def test_finite_numbers_of_a_cloud_that_no_camera_sees_are_named():
+    with pytest.raises(NonFiniteParameters, match=r"1 of the 6 numbers of geometry.means are beyo"):
+        require_finite([("geometry.means", torch.tensor([[0, 0, -1e20], [0, 1, 2]]))], step=2)
+    with pytest.raises(NonFiniteParameters, match="3 numbers of log_scales are beyond 30"):
+        require_finite([("log_scales", torch.tensor([100.0, 0, 0]))], step=2)
+    require_finite([("means.exp_avg", torch.tensor([1e20])), ("means", torch.zeros(0, 3))], step=2)
+
+
+def test_a_run_that_loses_its_cloud_ends_with_an_error(tmp_path, painted_box, capsys):
+    steps = ["trainer.max_steps=3", "system.pages=false"]
+    assert launch(tmp_path, painted_box, *steps, "system.geometry.lr_means=1e30") == 2
+    assert "lr_means: expected values of 1e+06 or less" in capsys.readouterr().err
+    assert launch(tmp_path, painted_box, *steps, "system.geometry.lr_scales=20") == 2
+    errors = capsys.readouterr().err
+    assert "numbers of geometry.log_scales are beyond 30" in errors and "lr_*" in errors
+    assert not [*tmp_path.rglob("*.ckpt"), *tmp_path.rglob("it*")]
+
+
+@pytest.mark.parametrize("option", ["prior.scale=1e30", "grow.radius=1e38", "prior.jitter=1e30"])
+def test_sizes_beyond_any_use_are_refused(tmp_path, painted_box, capsys, option):
+    assert launch(tmp_path, painted_box, f"system.geometry.{option}") == 2
+    assert f"system.geometry.{option.split('=')[0]}: expected a number" in capsys.readouterr().err

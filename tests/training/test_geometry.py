@@ -13,7 +13,7 @@ from threestudio_gaussiandreamer.gaussians.densify import screen_gradients
 from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
 from threestudio_gaussiandreamer.gaussians.grow import nearest_distance_scales
 from threestudio_gaussiandreamer.gaussians.point_cloud import PointCloud
-from threestudio_gaussiandreamer.host import find, register
+from threestudio_gaussiandreamer.host import BaseGeometry, find, register
 from threestudio_gaussiandreamer.splatting import Rasterized
 from threestudio_gaussiandreamer.training.density import DensityControl
 from threestudio_gaussiandreamer.training.geometry import GaussianCloud
@@ -345,3 +345,18 @@ def test_initialize_runs_the_prior_by_its_name():
 def test_a_value_out_of_range_is_named(wrong, named):
     with pytest.raises(UserError, match=named):
         GaussianCloud(wrong)
+
+
+def test_a_cloud_that_no_system_has_filled_is_refused_in_training(sphere_points):
+    empty = find("gaussiandreamer-cloud")({})
+    with pytest.raises(UserError, match="is empty.*system_type must be gaussiandreamer-system"):
+        empty.do_update_step(0, 0)
+    empty.do_update_step(0, 0, on_load_weights=True)
+    started(sphere_points).do_update_step(0, 0)
+
+
+def test_a_geometry_without_gaussians_is_named_by_renderer_and_exporter():
+    for part in ("gaussiandreamer-splatting", "mesh-exporter"):
+        with pytest.raises(UserError, match="BaseGeometry is no cloud of Gaussians: it has no"):
+            made = find(part)({}, geometry=BaseGeometry({}), material=None, background=None)
+            made()

@@ -10,6 +10,7 @@ from threestudio_gaussiandreamer.training.losses import (
     REGULARISERS,
     check_losses,
     loggable,
+    require_gradients,
     total,
     total_variation,
     weighted_losses,
@@ -118,3 +119,26 @@ def test_an_own_regulariser_has_another_name_than_the_guidances_losses(monkeypat
     monkeypatch.setitem(REGULARISERS, "sds", lambda out: out["comp_rgb"].mean())
     with pytest.raises(UserError, match="the name of the guidance's loss_sds"):
         weighted_losses({"loss_sds": torch.ones(())}, {}, {"sds": 1})
+
+
+def test_a_regulariser_that_is_not_finite_is_named_at_once(monkeypatch):
+    monkeypatch.setitem(REGULARISERS, "own", lambda out: out["comp_rgb"].mean() / 0)
+    out = {"comp_rgb": torch.ones(1, 2, 2, 3, requires_grad=True)}
+    with pytest.raises(UserError, match=r"REGULARISERS\['own'\] returned inf: expected a finite"):
+        weighted_losses({"loss_sds": torch.ones(())}, out, {"sds": 1, "own": 2})
+
+
+def test_one_loss_without_a_gradient_among_others_is_named():
+    with_one = torch.ones(2, requires_grad=True).sum()
+    with pytest.raises(UserError, match="^loss_sds of my-guidance has no gradient"):
+        total({"sds": with_one.detach(), "tv": with_one}, "my-guidance")
+
+
+def test_gradients_that_reach_no_gaussian_are_named():
+    cloud, other = torch.nn.Linear(2, 1), torch.nn.Parameter(torch.ones(()))
+    losses = {"sds": other * 2}
+    losses["sds"].backward()
+    with pytest.raises(UserError, match="no gradient of loss_sds reaches the Gaussians"):
+        require_gradients(cloud, losses)
+    cloud(torch.ones(2)).sum().backward()
+    require_gradients(cloud, losses)

@@ -51,9 +51,12 @@ def satisfies(expected: str, holds: Callable[[Any], bool]) -> Rule:
     return rule(check)
 
 
-def positive(unit: str = "") -> Rule:
-    """Accept numbers that are above 0, also after conversion to float32."""
-    return satisfies(f"a number above 0{_with_unit(unit)}", is_positive)
+def positive(unit: str = "", most: float = FLOAT32_MAX) -> Rule:
+    """Accept numbers that are above 0, also after conversion to float32, and at most ``most``."""
+    bound = "" if most == FLOAT32_MAX else f" and at most {most:g}"
+    return satisfies(
+        f"a number above 0{bound}{_with_unit(unit)}", lambda v: is_positive(v) and v <= most
+    )
 
 
 def at_least(low: float, unit: str = "") -> Rule:

@@ -21,6 +21,7 @@ from ..core.methods import find_method, require_method
 from ..core.options import check_options, one_of, rule
 from ..formats.gaussian_files import FORMATS, StoredCloud, suffix_of
 from ..gaussians.axes import AXES
+from ..gaussians.densify import LOG_SCALE_RANGE
 from ..gaussians.gaussians import Gaussians, finite
 from ..gaussians.views import EPS2D
 from ..host import BaseGeometry, Exporter, ExporterOutput
@@ -115,7 +116,8 @@ def read_gaussians(geometry: BaseGeometry) -> Gaussians:
     """Read the Gaussians of a geometry as float32 arrays. Those with values that aren't finite are
     skipped with a warning.
     """
-    return finite(Gaussians.of(geometry).arrays(), "export")
+    found = finite(Gaussians.of(geometry).arrays(), "export")
+    return found._replace(log_scales=found.log_scales.clip(*LOG_SCALE_RANGE))  # as they are drawn
 
 
 class CloudExporter(FileExporter):

@@ -2,7 +2,7 @@
 optimisers: logarithms of the scales, logits of the opacities, spherical harmonics for colours."""
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -37,7 +37,12 @@ class Gaussians(NamedTuple):
 
     @classmethod
     def of(cls, source: Any) -> "Gaussians":
-        """Collect the attributes of ``source`` that have the names of the fields."""
+        """Collect the attributes of ``source`` that have the names of the fields.
+
+        Raises:
+            UserError: it lacks some.
+        """
+        require_attributes(source, cls._fields)
         return cls(*(getattr(source, name) for name in cls._fields))
 
     @property
@@ -59,6 +64,15 @@ class Gaussians(NamedTuple):
     def tensors(self, device: torch.device | str = "cpu") -> "Gaussians":
         """Convert to float32 tensors on ``device``."""
         return self.map(lambda values: torch.as_tensor(values).float().to(device))
+
+
+def require_attributes(source: Any, names: Iterable[str]) -> None:
+    """Raise UserError if a geometry, which may be another package's, has no such attributes."""
+    if missing := [name for name in names if not hasattr(source, name)]:
+        raise UserError(
+            f"{type(source).__name__} is no cloud of Gaussians: it has no {', '.join(missing)}; "
+            "set system.geometry_type to gaussiandreamer-cloud, or to a geometry derived from it"
+        )
 
 
 def usable(gaussians: Gaussians) -> Bool[np.ndarray, " N"]:

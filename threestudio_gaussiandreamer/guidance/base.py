@@ -214,7 +214,7 @@ class ScoreDistillation(ScoreModel):
                 item wasn't finite. On a GPU it is raised when that is known, which may be in a
                 later step, also in its backward pass.
         """
-        self.evaluations = 0
+        self.evaluations, self.prediction_sum = 0, None
         with without_autocast(rgb.device.type):
             images = rgb.float().movedim(-1, 1).contiguous()
             latents = (images if rgb_as_latents else self.encode(images, **batch)).float()
@@ -301,23 +301,38 @@ class ScoreDistillation(ScoreModel):
         return grad if self.grad_clip is None else grad.clamp(-self.grad_clip, self.grad_clip), bad
 
     def _count_bad(self, bad: Bool[Tensor, " B"]) -> None:
-        self.reads.submit(bad, functools.partial(self._note_bad, self.step))
+        total = self.prediction_sum
+        good_scores = torch.zeros_like(bad[:1]) if total is None else total.isfinite().to(bad)[None]
+        self.reads.submit(
+            torch.cat([bad, good_scores]), functools.partial(self._note_bad, self.step)
+        )
 
-    def _note_bad(self, step: int, bad: Bool[Tensor, " B"]) -> None:
-        """Count the bad items of a step; warn of them, or raise NonFiniteScore."""
+    def _note_bad(self, step: int, found: Bool[Tensor, " B1"]) -> None:
+        """Count the bad items of a step; warn of them, or raise NonFiniteScore.
+
+        Args:
+            found: the bad items, and whether all predictions of the score model were finite.
+        """
+        bad, good_scores = found[:-1], bool(found[-1])
         count = int(bad.sum())
         self.bad_items += count
         self.bad_steps = self.bad_steps + 1 if count else 0
         if self.bad_steps >= self.options.max_bad_steps:
+            culprit, advice = "the score model", (
+                "use full precision (half_precision_weights=false), and check the model and the "
+                "prior"
+            )
+            if good_scores:
+                culprit = f"{type(self.variant).__name__}.error"
+                advice = "the predictions of the score model that it was given are finite"
             raise NonFiniteScore(
-                f"the score model returned NaN or infinity in {self.bad_steps} steps in a row"
-                f" (step {step}, {self.bad_items} items so far):"
-                " use full precision (half_precision_weights=false), and check the model and "
-                "the prior"
+                f"{culprit} returned NaN or infinity in {self.bad_steps} steps in a row"
+                f" (step {step}, {self.bad_items} items so far): {advice}"
             )
         if count:
+            what = f"{type(self.variant).__name__}.error" if good_scores else "the score"
             warn(
-                f"step {step}: the score of {count} of {len(bad)} items isn't finite; "
+                f"step {step}: {what} of {count} of {len(bad)} items isn't finite; "
                 "they are left out"
             )
 

@@ -65,6 +65,8 @@ class ScoreModel(BaseObject, ABC):
     """Of ``cfg``, as plain attributes."""
     evaluations: int
     """Of the score model, one per item and prompt, since a step began; ``predict`` counts them."""
+    prediction_sum: Optional[Float[Tensor, ""]] = None
+    """Of all that ``predict`` returned since a step began; None if it wasn't called."""
 
     def configure(self) -> None:
         self.alphas_cumprod = sds.sd_alphas_cumprod()
@@ -111,6 +113,9 @@ class ScoreModel(BaseObject, ABC):
                 f"{what}; expected a pair, the conditional and the unconditional prediction (or "
                 f"None), of the shape {tuple(z.shape)} of the noisy latents"
             )
+        # a sum isn't finite if an entry isn't; read only if the error turns out not to be finite
+        sums = sum(entry.detach().float().sum() for entry in found if entry is not None)
+        self.prediction_sum = sums if self.prediction_sum is None else self.prediction_sum + sums
         return found
 
     def select(self, condition: Any, rows: Int[Tensor, " R"]) -> Any:

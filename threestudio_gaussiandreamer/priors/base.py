@@ -66,7 +66,7 @@ COLOR = satisfies("null, 'grey', 'random' or [red, green, blue] in [0, 1]", is_c
 HEIGHT = satisfies(
     "'auto' or a number in world units", lambda value: value == "auto" or is_number(value)
 )
-SCALE = positive("world units")
+SCALE = positive("world units", most=1e6)
 PATH = required("this prior reads a file; set path to it")
 
 

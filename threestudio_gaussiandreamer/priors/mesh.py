@@ -35,7 +35,7 @@ import torch
 import torch.nn.functional as F
 from jaxtyping import Float, Int
 
-from ..core.options import at_least
+from ..core.options import at_least, in_range
 from ..formats.producers import MESH
 from ..gaussians.point_cloud import PointCloud
 from ..host import register
@@ -102,7 +102,7 @@ class MeshPrior(MeshFilePrior):
     @dataclass
     class Config(MeshFilePrior.Config):
         color_smoothing: int = field(default=0, metadata=at_least(0))
-        jitter: float = field(default=0.0, metadata=at_least(0))
+        jitter: float = field(default=0.0, metadata=in_range(0, 1e3))
 
     cfg: Config
 

@@ -1,5 +1,6 @@
 """Check the arguments of `rasterize`, and convert them to a `Scene`."""
 
+import math
 from numbers import Integral, Real
 from typing import Optional
 
@@ -46,6 +47,7 @@ def check(
     check_shapes(tensors)
     check_numbers(width, height, options)
     check_finite(policy, tensors)
+    check_activated(tensors)
 
 
 def as_scene(tensors: dict[str, Tensor], width: int, height: int) -> Scene:
@@ -170,6 +172,34 @@ def check_numbers(width: int, height: int, options: RasterizeOptions) -> None:
     for name, (holds, wanted, got) in ranges.items():
         if not holds:
             raise UserError(f"{name} must be {wanted}; got {got}.")
+
+
+_looked_at: set[torch.device] = set()
+
+
+def check_activated(tensors: dict[str, Tensor]) -> None:
+    """Refuse logarithms in place of scales and logits in place of opacities: on a CPU always, on
+    another device in the first call only, since looking waits for it.
+
+    Raises:
+        UserError: a scale is negative, or an opacity outside [0, 1].
+    """
+    device = tensors["means"].device
+    if device.type != "cpu" and device in _looked_at:
+        return
+    _looked_at.add(device)
+    for name, high, hint in (
+        ("scales", math.inf, "exp() of logarithms"),
+        ("opacities", 1 + 1e-4, "sigmoid() of logits"),
+    ):
+        values = tensors[name].detach()
+        bad = values.isfinite() & ((values < 0) | (values > high))
+        if bad.any():
+            wanted = "0 or more" if high == math.inf else "in [0, 1]"
+            raise UserError(
+                f"{name} must be {wanted}, got {values[bad][0].item():g}, one of {int(bad.sum())} "
+                f"beyond: pass {hint}"
+            )
 
 
 def _is_whole(number) -> bool:

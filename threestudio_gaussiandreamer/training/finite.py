@@ -5,6 +5,7 @@ Adam's moments stay NaN once they are, and the rasteriser skips Gaussians with N
 check such a run would end without an error, and with holes in the object.
 """
 
+import math
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Optional
@@ -19,6 +20,10 @@ from ..host import warn
 
 CHECK_EVERY = 25
 """Optimiser steps between two checks, each of which synchronises with the device once."""
+
+LIMITS = {"means": 1e9, "log_scales": 30.0, "sh0": 1e9, "sh_rest": 1e9}
+"""Magnitudes from which on a cloud is lost, although its numbers are finite: no camera sees that
+far, and scales of e^30 are far beyond the e^10 that is drawn at most."""
 
 Named = Iterable[tuple[str, Tensor]]
 
@@ -72,7 +77,8 @@ def training_tensors(
 
 @torch.no_grad()
 def require_finite(tensors: Named, step: int, losses: Optional[RecentLosses] = None) -> None:
-    """Check that no tensor contains NaN or infinity; synchronises with the device once.
+    """Check that no tensor contains NaN, infinity or, of a cloud, numbers beyond ``LIMITS``;
+    synchronises with the device once.
 
     Args:
         tensors: (name, values of any shape).
@@ -86,17 +92,34 @@ def require_finite(tensors: Named, step: int, losses: Optional[RecentLosses] = N
     named = list(tensors)
     # a float64 sum of float32 values can't overflow, so it is finite if and only if all of them are
     sums = [values.sum(dtype=torch.float64).to(named[0][1].device) for _, values in named]
+    sums += [_beyond(name, values).sum().to(sums[0]) for name, values in named]
     if not sums or torch.stack(sums).isfinite().all():
         return
-    name, values = next((n, v) for n, v in named if not v.isfinite().all())
+    name, values = next((n, v) for n, v in named if not (v + _beyond(n, v)).isfinite().all())
+    bad = ~values.isfinite()
+    what = "NaN or infinite"
+    if not bad.any():
+        bad, what = ~_beyond(name, values).isfinite(), f"beyond {_limit(name):g}"
     raise NonFiniteParameters(
-        f"step {step}: {int((~values.isfinite()).sum())} of the {values.numel()} numbers of {name} "
-        f"are NaN or infinite{losses.first_bad() if losses else ''}: the run stops, and nothing of "
+        f"step {step}: {int(bad.sum())} of the {values.numel()} numbers of {name} "
+        f"are {what}{losses.first_bad() if losses else ''}: the run stops, and nothing of "
         "this state is saved or exported. "
         "Usual causes are a guidance that returns NaN, an optimiser without a positive eps "
-        "(system.optimizer.args), weights of losses that overflow float32 (system.loss) and too "
-        "large learning rates (system.geometry.lr_*)"
+        "(system.optimizer.args), weights of losses that overflow float32 (system.loss), too "
+        "large learning rates (system.geometry.lr_*) and, at the start, sizes in the options of "
+        "system.geometry.prior and grow"
     )
+
+
+def _limit(name: str) -> float:
+    return LIMITS.get(name.rpartition(".")[2], math.inf)
+
+
+def _beyond(name: str, values: Tensor) -> Tensor:
+    """Return infinity where the values of a tensor are beyond its limit, else 0."""
+    if (limit := _limit(name)) == math.inf:
+        return values.new_zeros(())
+    return torch.where(values.abs() > limit, math.inf, values.new_zeros(()))
 
 
 def warn_if_invisible(opacity: Float[Tensor, "B H W 1"], step: int) -> None:

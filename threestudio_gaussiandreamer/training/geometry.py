@@ -94,17 +94,17 @@ class GaussianCloud(BaseGeometry):
         prior: dict = field(default_factory=dict)
         grow: GrowConfig = field(default_factory=GrowConfig)
         scale_rule: str = field(default="nearest", metadata=one_of(SCALE_RULES))
-        scale_factor: float = field(default=1.0, metadata=positive())
+        scale_factor: float = field(default=1.0, metadata=positive(most=1e6))
         init_opacity: float = field(default=0.1, metadata=between(0, 1))
         sh_degree: int = field(default=0, metadata=in_range(0, 3))
         bound_colors: bool = True
         keep_attributes: bool = True
-        lr_means: Any = field(default=5e-5, metadata=schedule(min=0))
-        lr_scales: Any = field(default=1e-3, metadata=schedule(min=0))
-        lr_quats: Any = field(default=1e-2, metadata=schedule(min=0))
-        lr_opacities: Any = field(default=1e-2, metadata=schedule(min=0))
-        lr_sh: Any = field(default=1.25e-2, metadata=schedule(min=0))
-        lr_sh_rest: Any = field(default=6.25e-4, metadata=schedule(min=0))
+        lr_means: Any = field(default=5e-5, metadata=schedule(min=0, max=1e6))
+        lr_scales: Any = field(default=1e-3, metadata=schedule(min=0, max=1e6))
+        lr_quats: Any = field(default=1e-2, metadata=schedule(min=0, max=1e6))
+        lr_opacities: Any = field(default=1e-2, metadata=schedule(min=0, max=1e6))
+        lr_sh: Any = field(default=1.25e-2, metadata=schedule(min=0, max=1e6))
+        lr_sh_rest: Any = field(default=6.25e-4, metadata=schedule(min=0, max=1e6))
         densify: DensifyConfig = field(default_factory=DensifyConfig)
         budget: Any = None
         prune: PruneConfig = field(default_factory=PruneConfig)
@@ -136,6 +136,18 @@ class GaussianCloud(BaseGeometry):
 
     def __len__(self) -> int:
         return len(self.means)
+
+    def update_step(self, epoch: int, global_step: int, on_load_weights: bool = False) -> None:
+        """Refuse a cloud that no one has filled, as in another package's system: nothing would be
+        trained.
+        """
+        super().update_step(epoch, global_step, on_load_weights=on_load_weights)
+        if not (len(self) or on_load_weights):
+            raise UserError(
+                "gaussiandreamer-cloud is empty, so that nothing would be trained or drawn: "
+                "system_type must be gaussiandreamer-system, whose start fills it from "
+                "system.geometry.prior, or resume and weights must name a checkpoint of one"
+            )
 
     def _shapes(self, n: int) -> dict[str, tuple[int, ...]]:
         harmonics = {"sh0": (n, 1, 3), "sh_rest": (n, self.bands - 1, 3)}

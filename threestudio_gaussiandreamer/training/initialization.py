@@ -30,7 +30,7 @@ CAP_VIEWS = (32, 256)
 class GrowConfig:
     enabled: bool = True
     num_candidates: int = field(default=1_000_000, metadata=count_of("candidates", 0, 48))
-    radius: float = field(default=0.01, metadata=positive())
+    radius: float = field(default=0.01, metadata=positive(most=100))
     color_range: List[float] = field(default_factory=lambda: [0.0, 0.2], metadata=interval())
     clamp: bool = True
     max_points: int = field(default=400_000, metadata=at_least(0))

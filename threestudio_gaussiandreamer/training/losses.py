@@ -72,6 +72,11 @@ def _of_renders(name: str, out: Mapping[str, Any]) -> Float[Tensor, ""]:
             f"REGULARISERS[{name!r}] returned {found}; expected one number that is computed from "
             "the renders, as from .mean()"
         )
+    # on a GPU, looking would wait for it: there finite.py names it at its next check
+    if value.device.type == "cpu" and not value.isfinite():
+        raise UserError(
+            f"REGULARISERS[{name!r}] returned {value.item()}: expected a finite number"
+        )
     return value.reshape(())
 
 
@@ -85,13 +90,27 @@ def total(losses: Mapping[str, Tensor], guidance: str) -> Float[Tensor, ""]:
         UserError: the sum has no gradient.
     """
     loss = functools.reduce(torch.add, losses.values())
-    if not loss.requires_grad:
-        names = ", ".join(f"loss_{name}" for name in losses)
+    # a plain 0 is a loss that is switched off; only one without a gradient has to be looked at
+    constant = [name for name, value in losses.items() if not value.requires_grad and value != 0]
+    if constant or not loss.requires_grad:
+        names = ", ".join(f"loss_{name}" for name in (constant if loss.requires_grad else losses))
         raise UserError(
             f"{names} of {guidance} has no gradient: compute it from the renders, without detach() "
             "or torch.no_grad()"
         )
     return loss
+
+
+def require_gradients(geometry: torch.nn.Module, losses: Mapping[str, Tensor]) -> None:
+    """Raise UserError if no gradient of the losses has reached the cloud, as when a guidance
+    computes its loss from a copy of the renders, or from parameters of its own alone.
+    """
+    if all(parameter.grad is None for parameter in geometry.parameters()):
+        names = ", ".join(f"loss_{name}" for name in losses)
+        raise UserError(
+            f"no gradient of {names} reaches the Gaussians, so that they wouldn't be trained: "
+            "compute it from the renders, without detach() or torch.no_grad()"
+        )
 
 
 def weight_schedules(options: Mapping[str, Any]) -> dict[str, Schedule]:

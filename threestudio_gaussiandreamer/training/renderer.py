@@ -29,6 +29,7 @@ from ..core.devices import get_device, without_autocast
 from ..core.errors import UserError, unknown
 from ..core.lazy_mapping import LazyMapping
 from ..core.options import at_least, checked_options, in_range, one_of, positive, rule
+from ..gaussians.gaussians import require_attributes
 from ..host import Rasterizer, register
 from ..splatting import PRESETS, Rasterized, available_backends, rasterize
 from ..splatting.backends import refusal
@@ -94,6 +95,7 @@ class SplattingRenderer(Rasterizer):
     cfg: Config
 
     def configure(self, geometry: Any, material: Any, background: Any) -> None:
+        require_attributes(geometry, ("means", "quats", "scales", "opacities", "colors"))
         super().configure(geometry, material, background)
         self.options = checked_options(self.Config, self.cfg, "system.renderer.")
 

@@ -60,7 +60,15 @@ from .finite import CHECK_EVERY, RecentLosses, require_finite, training_tensors,
 from .held_out import EvaluationConfig, HeldOut, Measurements
 from .image_targets import ImageTargets, ImageTargetsConfig, check_image_targets
 from .loss_scale import LossScale
-from .losses import check_losses, loggable, logged_names, total, weight_schedules, weighted_losses
+from .losses import (
+    check_losses,
+    loggable,
+    logged_names,
+    require_gradients,
+    total,
+    weight_schedules,
+    weighted_losses,
+)
 from .optimizer import PartRates, check_optimizer, drop_gradients, make_optimizer, restore_arguments
 from .pages import discard_turntable, save_first_cloud, turntable_name, write_turntable
 from .pictures import rgb_panel, save_pictures
@@ -240,6 +248,7 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         losses = self.losses(guided, out)
         self.recent_losses.add(step, losses)
         self.manual_backward(total(losses, self.options.guidance_type))
+        require_gradients(self.geometry, losses)
         average_gradients(p for group in optimizer.param_groups for p in group["params"])
         self.image_targets.hold_shapes(optimizer, step)
         loss_scale = self.loss_scale.value(self.trainer)
@@ -336,6 +345,7 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
 
     def on_train_end(self) -> None:
         flush_reads(self.step_log, self.geometry, self.guidance)
+        self.require_finite()
         if self.measurements:
             self.measurements.stop_clock()
 
