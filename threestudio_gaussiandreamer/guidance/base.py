@@ -318,9 +318,12 @@ class ScoreDistillation(ScoreModel):
         self.bad_items += count
         self.bad_steps = self.bad_steps + 1 if count else 0
         if self.bad_steps >= self.options.max_bad_steps:
-            culprit, advice = "the score model", (
-                "use full precision (half_precision_weights=false), and check the model and the "
-                "prior"
+            culprit, advice = (
+                "the score model",
+                (
+                    "use full precision (half_precision_weights=false), and check the model and the "
+                    "prior"
+                ),
             )
             if good_scores:
                 culprit = f"{type(self.variant).__name__}.error"

@@ -74,9 +74,7 @@ def _of_renders(name: str, out: Mapping[str, Any]) -> Float[Tensor, ""]:
         )
     # on a GPU, looking would wait for it: there finite.py names it at its next check
     if value.device.type == "cpu" and not value.isfinite():
-        raise UserError(
-            f"REGULARISERS[{name!r}] returned {value.item()}: expected a finite number"
-        )
+        raise UserError(f"REGULARISERS[{name!r}] returned {value.item()}: expected a finite number")
     return value.reshape(())
 
 
