@@ -321,8 +321,8 @@ class ScoreDistillation(ScoreModel):
             culprit, advice = (
                 "the score model",
                 (
-                    "use full precision (half_precision_weights=false), and check the model and the "
-                    "prior"
+                    "use full precision (half_precision_weights=false), and check the model and "
+                    "the prior"
                 ),
             )
             if good_scores:
