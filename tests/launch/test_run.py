@@ -6,6 +6,7 @@ import fcntl
 import os
 import shutil
 import signal
+import sys
 from pathlib import Path
 
 import pytest
@@ -25,6 +26,7 @@ from threestudio_gaussiandreamer.launch.config import load_config
 from threestudio_gaussiandreamer.launch.ddp import ReplicatedStrategy
 from threestudio_gaussiandreamer.launch.experiment import main
 from threestudio_gaussiandreamer.launch.folder_lock import claim
+from threestudio_gaussiandreamer.view.run_index import write_index
 
 # -- files beside the run --------------------------------------------------------------------------
 
@@ -316,3 +318,29 @@ def test_runs_of_one_second_have_a_folder_each(launch, monkeypatch):
     name = "a_red_ball@20260131-120000"
     assert [folder.name for folder in folders] == [name, f"{name}-2", f"{name}-3"]
     assert load_config(folders[1] / "configs/parsed.yaml").trial_dir == str(folders[1])
+
+
+def test_a_file_that_another_stage_removes_is_named_in_one_line(launch, trained, monkeypatch):
+    """As the pictures of a turntable, which another --test of the same step writes too."""
+    test_step = tiny_parts.TinySystem.test_step
+
+    def removed_after(system, batch, batch_idx):
+        test_step(system, batch, batch_idx)
+        Path(system.get_save_path(f"it6-test/{int(batch['index'])}.png")).unlink()
+        open(system.get_save_path("it6-test/0.png"), "rb")
+
+    monkeypatch.setattr(tiny_parts.TinySystem, "test_step", removed_after)
+    code, _, err = launch(
+        "--test", f"resume={trained}/ckpts/last.ckpt", config=f"{trained}/configs/parsed.yaml"
+    )
+    assert code == 2 and "another command works in" in err and "it6-test/0.png" in err
+
+
+def test_an_index_lists_what_is_left(trained, monkeypatch):
+    class Vanishing(type(Path())):
+        def stat(self, **options):
+            if self.name == "it3-0.png" and sys._getframe(1).f_code.co_name == "_size":
+                raise FileNotFoundError(2, "No such file or directory", str(self))
+            return super().stat(**options)
+
+    assert "it6-0.png" in write_index(Vanishing(trained)).read_text()

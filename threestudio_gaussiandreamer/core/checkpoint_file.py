@@ -67,8 +67,11 @@ def load_file(path: str | os.PathLike, map_location: Any = "cpu") -> Any:
         if path.is_dir():
             raise UserError(f"{path} is a folder, not a checkpoint" + _siblings(path / "*"))
         raise UserError(f"there is no checkpoint {path}" + _siblings(path))
-    _verify(path)
-    require_plain_archive(path)
+    try:
+        _verify(path)
+        require_plain_archive(path)
+    except FileNotFoundError as error:  # the run that writes there has replaced it
+        raise UserError(f"the checkpoint {path} has just been removed{_siblings(path)}") from error
     try:
         content = torch.load(path, map_location=map_location, weights_only=True)
     except pickle.UnpicklingError as error:

@@ -73,7 +73,8 @@ def write_errors(folder: Path) -> Iterator[None]:
         folder: of the run's results, for messages.
 
     Raises:
-        UserError: the disk is full, access is denied, or a path exists as something else.
+        UserError: the disk is full, access is denied, a path exists as something else, or another
+            process has removed a file in the folder.
     """
 
     def said(error: OSError) -> str:
@@ -89,12 +90,23 @@ def write_errors(folder: Path) -> Iterator[None]:
     earlier, threading.excepthook = threading.excepthook, in_a_thread
     try:
         yield
+    except FileNotFoundError as error:
+        if not _is_below(error.filename, folder):
+            raise
+        raise UserError(
+            f"{error.filename} has been removed or replaced while it was needed: another command "
+            f"works in {folder}; run this one again when that has ended"
+        ) from error
     except OSError as error:
         if not _is_write_error(error):
             raise
         raise UserError(said(error)) from error
     finally:
         threading.excepthook = earlier
+
+
+def _is_below(path: Any, folder: Path) -> bool:
+    return isinstance(path, (str, Path)) and folder.absolute() in Path(path).absolute().parents
 
 
 def _is_write_error(error: Optional[BaseException]) -> bool:

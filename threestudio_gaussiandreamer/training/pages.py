@@ -85,7 +85,7 @@ def turntable_name(system: Any) -> str:
 def discard_turntable(system: Any) -> None:
     """Remove the pictures of an earlier test of the same step, which may have had more views."""
     for path in Path(system.get_save_dir(), turntable_name(system)).glob("*.png"):
-        path.unlink()
+        path.unlink(missing_ok=True)  # another test may remove them too
 
 
 def write_turntable(system: Any) -> None:

@@ -151,7 +151,10 @@ def _file(path: Path, folder: Path) -> str:
 
 
 def _size(path: Path) -> str:
-    size = float(path.stat().st_size)
+    try:
+        size = float(path.stat().st_size)
+    except FileNotFoundError:  # another stage has replaced it since the folder was listed
+        return ""
     return f"{size / 1e6:.1f} MB" if size >= 1e6 else f"{size / 1e3:.1f} kB"
 
 
