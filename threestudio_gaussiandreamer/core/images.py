@@ -24,8 +24,14 @@ _MP4_OPTIONS = {
     "codec": "libx264",
     "pixelformat": "yuv420p",
     "macro_block_size": 1,
-    # put the index first, so that a browser can start to play before it has the whole file
-    "output_params": ["-movflags", "+faststart"],
+    "output_params": [
+        # put the index first, so that a browser can start to play before it has the whole file
+        *("-movflags", "+faststart"),
+        # ffmpeg takes BT.601's matrix and says nothing; players assume BT.709's above 720 lines
+        *("-vf", "scale=out_color_matrix=bt709:out_range=tv"),
+        *("-colorspace", "bt709", "-color_primaries", "bt709"),
+        *("-color_trc", "bt709", "-color_range", "tv"),
+    ],
 }
 
 
