@@ -2,6 +2,7 @@
 can add markup or break them.
 """
 
+import json
 import os
 import re
 from datetime import datetime
@@ -12,6 +13,8 @@ from urllib.parse import unquote
 import numpy as np
 import pytest
 
+from benchmarks.viewers.browser import chromium
+from benchmarks.viewers.devtools import open_page
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.core.images import write
 from threestudio_gaussiandreamer.view.gallery import write_gallery
@@ -75,6 +78,35 @@ def test_the_index_shows_what_the_run_has(full_run):
     found = Tags(full_run / "index.html")
     assert found.tags.count("svg") == 3 and "iframe" in found.tags and "video" in found.tags
     assert found.tags.count("img") == 3  # poster, comparison, validation
+
+
+def test_the_downloads_come_first(full_run):
+    (full_run / "save" / "it7-export" / "model.glb").write_bytes(b"glTF")
+    text = write_index(full_run).read_text()
+    (row,) = re.findall(r"Downloads</h2>(.*?)</section>", text)
+    for name in ("gaussians.spz", "model.glb", "view.html", "it7-test.mp4"):
+        assert f">{name}</a>" in row
+    assert text.index("Downloads") < text.index("In 3D")
+
+
+def test_numbers_are_written_as_in_the_terminal(full_run):
+    scores = {"result": {"psnr": 31.25, "multi_face": 0.25, "gaussians": 12345678.0}}
+    (full_run / "save" / "metrics.json").write_text(json.dumps(scores))
+    log = full_run / "csv_logs" / "version_0" / "metrics.csv"
+    log.write_text("gaussians,step\n10000,1\n20000,123456\n")
+    text = write_index(full_run).read_text()
+    assert ">10,000<" in text and ">123,456<" in text
+    assert "<td>25 %</td><td>12,345,678</td>" in text and "e+0" not in text
+    assert "sides look alike" in text
+
+
+@pytest.mark.skipif(chromium() is None, reason="no Chromium is installed")
+def test_a_phone_shows_the_gallery_without_scrolling_sideways(full_run):
+    full_run.rename(full_run.with_name("a_long_path_" * 12))
+    with open_page(write_gallery(full_run.parent).as_uri()) as page:
+        size = {"width": 320, "height": 600, "deviceScaleFactor": 1, "mobile": True}
+        page.call("Emulation.setDeviceMetricsOverride", **size)
+        assert page.evaluate("document.documentElement.scrollWidth") <= 320
 
 
 def test_every_file_is_linked_and_every_link_leads_to_a_file(full_run):

@@ -49,6 +49,13 @@ def _number(text: object) -> float:
         return math.nan
 
 
+def number(value: float) -> str:
+    """Format a number with five digits, or all that are before its point; none is large enough for
+    an exponent.
+    """
+    return f"{value:,.0f}" if abs(value) >= 1e4 else f"{value:.5g}"
+
+
 def svg(curve: Curve, title: str) -> str:
     """Draw a curve over steps; values that span several powers of ten on a logarithmic axis."""
     curve = curve[:: -(-len(curve) // MAX_POINTS)]
@@ -65,10 +72,10 @@ def svg(curve: Curve, title: str) -> str:
         f'<path d="M{LEFT},{TOP}V{HEIGHT - BOTTOM}H{WIDTH - 8}" fill="none" stroke="#bbb"/>'
         f'<polyline points="{points}" fill="none" stroke="#25c" stroke-width="1.5"/>'
         + _text(LEFT, 14, heading, "start")
-        + _text(LEFT - 4, TOP + 8, f"{max(values):.4g}", "end")
-        + _text(LEFT - 4, HEIGHT - BOTTOM, f"{min(values):.4g}", "end")
-        + _text(LEFT, HEIGHT - 6, f"step {steps[0]:g}", "start")
-        + _text(WIDTH - 8, HEIGHT - 6, f"{steps[-1]:g}", "end")
+        + _text(LEFT - 4, TOP + 8, number(max(values)), "end")
+        + _text(LEFT - 4, HEIGHT - BOTTOM, number(min(values)), "end")
+        + _text(LEFT, HEIGHT - 6, f"step {number(steps[0])}", "start")
+        + _text(WIDTH - 8, HEIGHT - 6, number(steps[-1]), "end")
         + "</svg>"
     )
 

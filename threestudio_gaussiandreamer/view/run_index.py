@@ -9,7 +9,7 @@ from typing import Any
 
 from ..core.files import atomic_file, json_text
 from .config_changes import config_changes
-from .curves import read_curves, svg
+from .curves import number, read_curves, svg
 from .run_files import RunFiles, read_json, read_text, step_of
 from .static_page import address, document, element, link, media, section, table
 
@@ -45,6 +45,7 @@ def write_index(folder: Path) -> Path:
 def _parts(run: RunFiles) -> Iterator[str]:
     yield element("h1", run.prompt)
     yield element("p", run.folder.name)
+    yield section("Downloads", _downloads(run))
     yield section("In 3D", _viewer(run))
     yield section("Turntable", _turntable(run))
     yield section("Scores on held-out views", _scores(run))
@@ -65,6 +66,17 @@ def _commands(run: RunFiles) -> Iterator[str]:
     yield from (f"<p>{element('code', line)}</p>" for line in lines[-MAX_COMMANDS:])
 
 
+def _downloads(run: RunFiles) -> str:
+    """Return a list of the export's files, the page and the meshes among them, and the video."""
+    exported = (path for path in run.export.iterdir() if path.is_file()) if run.export else ()
+    items = [_file(path, run.folder, path.name) for path in [*sorted(exported), *_videos(run)[-1:]]]
+    return f'<ul class="downloads">{"".join(items)}</ul>' if items else ""
+
+
+def _videos(run: RunFiles) -> list[Path]:
+    return sorted(run.save.glob("it*-test.mp4"), key=step_of)
+
+
 def _viewer(run: RunFiles) -> str:
     page = run.export and run.export / "view.html"
     if not page or not page.is_file():
@@ -77,7 +89,7 @@ def _viewer(run: RunFiles) -> str:
 
 def _turntable(run: RunFiles) -> str:
     """Return the video of the latest test views, or the animated picture."""
-    videos = sorted(run.save.glob("it*-test.mp4"), key=step_of)
+    videos = _videos(run)
     if videos:
         where = address(videos[-1], run.folder)
         return media("video", src=where, controls="", loop="", muted="", width="384") + "</video>"
@@ -89,12 +101,17 @@ def _scores(run: RunFiles) -> str:
     for key in ("prior", "result"):
         found = run.scores.get(key)
         if isinstance(found, dict):
-            rows.append([key, *(_shown(found.get(name)) for name in SCORES)])
-    return table(("", *SCORES.values()), rows)
+            rows.append([key, *(_shown(found.get(name), name) for name in SCORES)])
+    note = "multi-face says nothing of an object whose sides look alike, such as a ball or a box"
+    return table(("", *SCORES.values()), rows) + (element("p", note) if rows else "")
 
 
-def _shown(value: Any) -> str:
-    return f"{value:.5g}" if isinstance(value, float) else str("–" if value is None else value)
+def _shown(value: Any, name: str = "") -> str:
+    if isinstance(value, (int, float)) and name == "multi_face":
+        return f"{100 * value:.0f} %"
+    if isinstance(value, (int, float)):
+        return number(value)
+    return str("–" if value is None else value)
 
 
 def _curves(run: RunFiles) -> Iterator[str]:
@@ -145,8 +162,8 @@ def _files(folder: Path) -> Iterator[str]:
         yield element("p", f"and {len(files) - MAX_FILES} more files")
 
 
-def _file(path: Path, folder: Path) -> str:
-    text = str(path.relative_to(folder)).encode(errors="replace").decode()
+def _file(path: Path, folder: Path, name: str = "") -> str:
+    text = (name or str(path.relative_to(folder))).encode(errors="replace").decode()
     return f"<li>{link(path, folder, text)} {element('small', _size(path))}</li>"
 
 
