@@ -149,18 +149,62 @@ class TestGaussians:
         (tmp_path / "b.ply").write_bytes(
             (tmp_path / "a.ply")
             .read_bytes()
-            .replace(b"property float nx", b"property float filter_3D")
+            .replace(b"property float nx", b"property float thing")
         )
         ply.read_gaussians(tmp_path / "b.ply")
-        assert "b.ply: unknown properties are left out: filter_3D" in caplog.text
+        assert "b.ply: unknown properties are left out: thing" in caplog.text
 
     def test_what_is_missing_is_named(self, tmp_path):
         ply.write_points(tmp_path / "points.ply", cloud())
         with pytest.raises(UserError, match="lack f_dc_0.*plain points"):
             ply.read_gaussians(tmp_path / "points.ply")
-        two_dimensional = [f"float {name}" for name in ply.GAUSSIAN if name != "scale_2"]
-        with pytest.raises(UserError, match="lack scale_2"):
-            ply.read_gaussians(saved(tmp_path, header("ascii", 0, two_dimensional)))
+        without = [f"float {name}" for name in ply.GAUSSIAN if name != "scale_1"]
+        with pytest.raises(UserError, match="lack scale_1"):
+            ply.read_gaussians(saved(tmp_path, header("ascii", 0, without)))
+
+    def test_2d_gaussians_are_flat(self, tmp_path, caplog):
+        names = [f"float {name}" for name in ply.GAUSSIAN if name != "scale_2"]
+        path = saved(tmp_path, header("ascii", 1, names) + "1 2 3 0 0 0 4 5 6 1 0 0 0")
+        assert ply.is_gaussian_ply(path)
+        np.testing.assert_allclose(ply.read_gaussians(path).log_scales, [[5, 6, np.log(1e-6)]])
+        arrays = gaussians(5)
+        arrays.log_scales[:, 2] = -np.inf
+        write_raw_gaussians(tmp_path / "inf.ply", arrays)
+        read = ply.read_gaussians(tmp_path / "inf.ply")
+        np.testing.assert_allclose(read.log_scales[:, 2], np.log(1e-6))
+        np.testing.assert_array_equal(read.log_scales[:, :2], arrays.log_scales[:, :2])
+        assert "inf.ply: 2D Gaussians, without a third scale: read as flat ones" in caplog.text
+
+    def test_the_3d_filter_is_applied(self, tmp_path):
+        """Variances grow by the filter's; the integral of a Gaussian stays."""
+        names = [f"float {name}" for name in (*ply.GAUSSIAN, "filter_3D")]
+        row = f"0 0 0 0 0 0 0 {np.log(3)} {np.log(2)} {np.log(6)} 1 0 0 0 4"
+        read = ply.read_gaussians(saved(tmp_path, header("ascii", 1, names) + row))
+        sizes = np.sqrt([3**2 + 4**2, 2**2 + 4**2, 6**2 + 4**2])
+        np.testing.assert_allclose(np.exp(read.log_scales), [sizes], rtol=1e-6)
+        opacity = 0.5 * 3 * 2 * 6 / sizes.prod()
+        np.testing.assert_allclose(1 / (1 + np.exp(-read.logit_opacities)), [opacity], rtol=1e-5)
+
+    def test_bytes_stand_for_the_constant_harmonics(self, tmp_path):
+        """As nerfstudio's exporter writes with --ply-color-mode rgb."""
+        others = [f"float {name}" for name in ply.GAUSSIAN if not name.startswith("f_dc")]
+        colors = [f"uchar {name}" for name in ply.COLORS]
+        path = saved(
+            tmp_path, header("ascii", 1, others + colors) + "0 0 0 1 2 3 4 1 0 0 0 255 0 51"
+        )
+        assert ply.is_gaussian_ply(path)
+        read = ply.read_gaussians(path)
+        np.testing.assert_allclose(0.5 + 0.28209479 * read.sh[0, 0], [1, 0, 0.2], atol=1e-6)
+        np.testing.assert_array_equal(read.log_scales, [[2, 3, 4]])
+
+    def test_rows_of_zeros_are_left_out(self, tmp_path, caplog):
+        arrays = gaussians(6, degree=1)
+        for values in arrays:
+            values[[1, 4]] = 0
+        arrays.means[2] = arrays.quats[3] = 0  # not all of the row
+        write_raw_gaussians(tmp_path / "a.ply", arrays)
+        assert_same(ply.read_gaussians(tmp_path / "a.ply"), arrays.rows([0, 2, 3, 5]))
+        assert "a.ply: 2 of 6 rows hold nothing but zeros: left out" in caplog.text
 
     def test_a_compressed_ply_is_named_in_the_message(self, tmp_path):
         """PlayCanvas' layout: chunks of bounds, then four packed numbers per Gaussian."""

@@ -36,6 +36,8 @@ logger = logging.getLogger(__name__)
 
 UP, PRUNED = "up:", "pruned to the likeness, dB:"
 """Keys of the comments in files; the second is the PSNR to the original cloud."""
+VERTICAL_AXIS = "Vertical Axis:"
+"""Nerfstudio's key for the up axis."""
 ANTIALIASED = "SplatRenderMode: mip"
 """The comment by which Brush, SuperSplat and splat-transform tag clouds trained with antialiasing.
 """
@@ -201,7 +203,7 @@ def read_stored(file: Path, *, up: Optional[str] = None) -> StoredCloud:
 
 def stated_up(notes: list[str]) -> Optional[str]:
     """Return the up axis in a file's comments, or None if they have none that is known."""
-    stated = _note(notes, UP)
+    stated = (_note(notes, UP) or _note(notes, VERTICAL_AXIS)).lower()
     if stated and stated not in AXES:
         logger.warning(
             "the up axis in the file's comment %r is none of %s: it is ignored",

@@ -3,11 +3,13 @@
 Gaussians are written in the usual layout of 3D Gaussian splatting (little-endian float32):
 ``x y z nx ny nz f_dc_0..2 f_rest_0.. opacity scale_0..2 rot_0..3``, where ``f_dc``/``f_rest`` are
 spherical harmonics (``f_rest`` channel by channel), ``opacity`` is a logit, ``scale`` a logarithm
-and ``rot`` a quaternion wxyz. When reading, ``f_rest`` may be missing."""
+and ``rot`` a quaternion wxyz. When reading, ``f_rest`` may be missing; so may ``scale_2``, of 2D
+Gaussians, and ``f_dc`` where ``red green blue`` are there, as nerfstudio's exporter writes. The
+3D filter of Mip-Splatting, ``filter_3D``, is applied; rows of nothing but zeros are left out."""
 
 import logging
 import os
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 from jaxtyping import Float
@@ -15,7 +17,8 @@ from jaxtyping import Float
 from ..core.errors import UserError
 from ..gaussians.gaussians import Gaussians, finite, usable
 from ..gaussians.point_cloud import PointCloud
-from ..gaussians.sh import sh0_colors
+from ..gaussians.sh import rgb_to_sh0, sh0_colors
+from . import packing
 from .ply_table import (
     MAX_HEADER_BYTES,
     NUMBER_TYPES,
@@ -35,6 +38,9 @@ QUATS = ("rot_0", "rot_1", "rot_2", "rot_3")
 GAUSSIAN = (*MEANS, *SH_CONSTANT, "opacity", *LOG_SCALES, *QUATS)
 COLORS = ("red", "green", "blue")
 EXACT_COLORS = ("float_red", "float_green", "float_blue")
+FILTER = "filter_3D"
+FLAT_LOG_SCALE = float(np.log(1e-6))
+"""Logarithm of the third scale of 2D Gaussians, which files leave out or store as -inf."""
 MIN_UNIT, MAX_UNIT = -0.01, 2.0
 """Range of colours that are taken for numbers in [0, 1], to which they are clipped: interpolation
 and high dynamic range exceed it a little.
@@ -181,9 +187,9 @@ def read_gaussians(path: str | os.PathLike, *, allow_non_finite: bool = False) -
     """
     table = PlyTable.read(path)
     _require_gaussians(table)
-    arrays = Gaussians(
-        table[MEANS], table[QUATS], table[LOG_SCALES], table["opacity"], _read_sh(table)
-    )
+    scales, opacities = _filtered(table, _read_log_scales(table), table["opacity"])
+    arrays = Gaussians(table[MEANS], table[QUATS], scales, opacities, _read_sh(table))
+    arrays = _without_zeros(arrays, table)
     if not allow_non_finite:
         table.require_valid(usable(arrays), "values")
     return arrays
@@ -226,19 +232,67 @@ def is_gaussian_ply(path: str | os.PathLike) -> bool:
         if element.name == "vertex"
         for entry in element.properties
     }
-    return names.issuperset(GAUSSIAN)
+    return not _lacking(names)
+
+
+def _lacking(names: Collection[str]) -> list[str]:
+    """Return the properties without which vertices with these ``names`` are no Gaussians."""
+    colors = SH_CONSTANT if set(names) >= {*COLORS, "opacity"} else ()
+    return [name for name in GAUSSIAN if name not in {*names, *LOG_SCALES[2:], *colors}]
 
 
 def _require_gaussians(table: PlyTable) -> None:
     """Raise UserError if a property of Gaussians is missing; warn about unknown ones."""
-    if missing := [name for name in GAUSSIAN if name not in table]:
+    if missing := _lacking(table.names):
         table.fail(f"the Gaussians lack {', '.join(missing)}.{_format_hint(table)}")
-    known = {*GAUSSIAN, *NORMALS, *COLORS}
+    known = {*GAUSSIAN, *NORMALS, *COLORS, FILTER}
     unknown = [n for n in table.names if n not in known and not n.startswith("f_rest_")]
     if unknown:
         more = f" and {len(unknown) - 5} more" if len(unknown) > 5 else ""
         names = ", ".join(unknown[:5])
         logger.warning("%s: unknown properties are left out: %s%s", table.path, names, more)
+
+
+def _read_log_scales(table: PlyTable) -> Float[np.ndarray, "N 3"]:
+    """Read the logarithms of the scales; the third one of 2D Gaussians is ``FLAT_LOG_SCALE``."""
+    names = [name for name in LOG_SCALES if name in table]
+    scales = table[tuple(names)]
+    if scales.shape[1] == 3 and not (len(scales) and (scales[:, 2] == -np.inf).all()):
+        return scales
+    logger.warning("%s: 2D Gaussians, without a third scale: read as flat ones", table.path)
+    return np.pad(scales[:, :2], ((0, 0), (0, 1)), constant_values=FLAT_LOG_SCALE)
+
+
+def _filtered(
+    table: PlyTable, log_scales: Float[np.ndarray, "N 3"], logits: Float[np.ndarray, " N"]
+) -> tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, " N"]]:
+    """Apply Mip-Splatting's 3D filter: the variances grow by its square, and opacities shrink by
+    the ratio of the volumes.
+    """
+    if FILTER not in table:
+        return log_scales, logits
+    logger.warning("%s: its 3D filter is applied to scales and opacities", table.path)
+    with np.errstate(divide="ignore", invalid="ignore"):  # filters that are 0 or NaN
+        filters = np.log(table[FILTER].astype(np.float64))[:, None]
+        larger = np.logaddexp(2 * log_scales, 2 * filters) / 2
+        ratios = np.exp((log_scales - larger).sum(axis=1))
+    opacities = packing.opacities(logits) * ratios
+    return larger.astype(np.float32), packing.logits(opacities, packing.FLOAT_OPACITY_MARGIN)
+
+
+def _without_zeros(arrays: Gaussians, table: PlyTable) -> Gaussians:
+    """Leave out rows in which everything is zero, the quaternion too: buffers that a program has
+    not filled, which would be Gaussians of size 1 at the origin.
+    """
+    empty = (arrays.quats == 0).all(axis=1) & (arrays.means == 0).all(axis=1)
+    empty &= (arrays.log_scales == 0).all(axis=1) & (arrays.logit_opacities == 0)
+    empty &= (arrays.sh[:, 0] == 0).all(axis=1)
+    if not empty.any():
+        return arrays
+    logger.warning(
+        "%s: %d of %d rows hold nothing but zeros: left out", table.path, empty.sum(), len(empty)
+    )
+    return arrays.rows(~empty)
 
 
 def _format_hint(table: PlyTable) -> str:
@@ -268,7 +322,10 @@ def _read_sh(table: PlyTable) -> Float[np.ndarray, "N K 3"]:
             f"{count} properties f_rest_* fit no degree of spherical harmonics: 0, 9, 24 or 45 "
             "were expected."
         )
-    constant = table[SH_CONSTANT][:, None]
+    if set(SH_CONSTANT) <= set(table.names):
+        constant = table[SH_CONSTANT][:, None]
+    else:
+        constant = rgb_to_sh0(_read_colors(table))[:, None].astype(np.float32)
     if not count:
         return constant
     rest = table[rest_names].reshape(len(constant), 3, harmonics - 1).transpose(0, 2, 1)
