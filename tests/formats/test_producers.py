@@ -8,7 +8,11 @@ import pytest
 
 from tests.helpers.object_clouds import ball
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.formats.gaussian_files import StoredCloud
+from threestudio_gaussiandreamer.formats.gaussian_files import (
+    StoredCloud,
+    read_cloud,
+    write_cloud,
+)
 from threestudio_gaussiandreamer.formats.producers import (
     GAUSSIANS,
     MESH,
@@ -87,6 +91,24 @@ def test_up_and_front_of_a_producer_become_ours(name):
     cloud.means[:] = [VECTORS[axes.up], 2 * VECTORS[axes.front]]
     world = from_producer(StoredCloud(cloud), name).in_axes("z").gaussians
     np.testing.assert_allclose(world.means, [[0, 0, 1], [2, 0, 0]], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "suffix"), [("3dgs", ".spz"), ("supersplat", ".glb"), ("lgm", ".glb")]
+)
+def test_formats_with_axes_of_their_own_come_from_a_turned_ply(tmp_path, name, suffix):
+    source = StoredCloud(ball(300), "-y")
+    write_cloud(str(tmp_path / ("a" + suffix)), source)
+    found = from_producer(read_cloud(str(tmp_path / ("a" + suffix))), name, suffix)
+    expected = from_producer(source, name).gaussians.means
+    nearest = np.linalg.norm(found.gaussians.means[:, None] - expected, axis=2).min(axis=1)
+    assert nearest.max() < 1e-3
+
+
+def test_an_spz_of_supersplat_has_the_axes_of_its_ply():
+    raw = StoredCloud(ball(9), "y")
+    found = from_producer(raw, "supersplat", ".spz").gaussians.means
+    np.testing.assert_allclose(found, raw.gaussians.means * [1, -1, -1], atol=1e-6)
 
 
 @pytest.mark.parametrize(("name", "up"), [("3dgs", "-y"), ("lgm", "y"), ("nerfstudio", "z")])

@@ -1,5 +1,6 @@
 """SPZ of version 4: laid out as published, and no damage does harm."""
 
+import gzip
 import struct
 import sys
 import tracemalloc
@@ -63,10 +64,58 @@ def test_an_empty_cloud(tmp_path):
     assert len(read_spz(tmp_path / "a.spz").means) == 0
 
 
-def test_extensions_are_skipped_with_a_warning(tmp_path, caplog):
+def test_other_extensions_are_skipped_with_a_warning(tmp_path, caplog):
     data = by_hand(flags=2, extension=struct.pack("<II4s", 0xADBE0002, 4, b"abcd"))
     assert len(read_spz(stored(tmp_path, data)).means) == 2
-    assert "vendor extensions, which are ignored" in caplog.text
+    assert "vendor extension 0xadbe0002, which is ignored" in caplog.text
+
+
+def axes(number):
+    """SPZ_ADOBE_coordinate_system after another record."""
+    return struct.pack("<IIBIII", 0xADBE0002, 1, 0, 0xADBE0003, 4, number)
+
+
+@pytest.mark.parametrize(
+    ("number", "matrix"),
+    [
+        (4, np.eye(3)),
+        (6, np.diag([1, -1, -1])),  # RDF, the axes of a PLY
+        (8, np.diag([1, 1, -1])),  # RUF, Unity's, mirrored
+        (12, [[1, 0, 0], [0, 0, 1], [0, -1, 0]]),  # RFU, z up
+    ],
+)
+def test_the_record_of_the_axes_is_honoured(tmp_path, number, matrix):
+    """Positions, covariances and colours turn alike."""
+    plain = read_spz(stored(tmp_path, by_hand()))
+    turned = read_spz(stored(tmp_path, by_hand(flags=2, extension=axes(number))))
+    matrix = np.array(matrix, float)
+    np.testing.assert_allclose(turned.means, plain.means @ matrix.T, atol=1e-6)
+    for ours, old in zip(covariances(turned), covariances(plain), strict=True):
+        np.testing.assert_allclose(ours, matrix @ old @ matrix.T, atol=1e-5)
+    # degree 1 is (-y, z, -x): a vector
+    ours, old = (cloud.sh[:, [3, 1, 2]] * [[-1], [-1], [1]] for cloud in (turned, plain))
+    np.testing.assert_allclose(ours, matrix @ old, atol=1e-5)
+
+
+def covariances(cloud):
+    from scipy.spatial.transform import Rotation
+
+    frames = Rotation.from_quat(cloud.quats[:, [1, 2, 3, 0]]).as_matrix()
+    return frames * np.exp(2 * cloud.log_scales)[:, None] @ frames.transpose(0, 2, 1)
+
+
+def test_the_record_in_the_gzip_versions_is_honoured(tmp_path):
+    raw = bytearray(gzip.decompress(spz_bytes(cloud(5))))
+    raw[14] |= 2
+    read = read_spz(stored(tmp_path, gzip.compress(bytes(raw) + axes(6))))
+    raw[14] = 0
+    plain = read_spz(stored(tmp_path, gzip.compress(bytes(raw))))
+    np.testing.assert_array_equal(read.means, plain.means * np.float32([1, -1, -1]))
+
+
+def test_an_unknown_number_of_the_axes_is_refused(tmp_path):
+    with pytest.raises(UserError, match="record of the axes has the number 17: 1 to 16"):
+        read_spz(stored(tmp_path, by_hand(flags=2, extension=axes(17))))
 
 
 @pytest.mark.parametrize(

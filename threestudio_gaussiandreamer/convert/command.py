@@ -181,7 +181,7 @@ def _read(source: Path, args: argparse.Namespace) -> StoredCloud:
     if args.antialiased is not None:
         stored = stored._replace(antialiased=args.antialiased)
     if args.producer:
-        stored = from_producer(stored, args.producer)
+        stored = from_producer(stored, args.producer, suffix_of(source.name))
     stored = stored.in_axes(args.up_out or VIEWER_UP)
     return stored._replace(gaussians=finite(stored.gaussians, args.source))
 

@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Float
 
 from ..core.errors import UserError, unknown
-from ..gaussians.axes import rotate
-from .gaussian_files import StoredCloud
+from ..gaussians.axes import VIEWER_UP, rotate
+from .gaussian_files import FORMATS, StoredCloud
 
 Y_UP = "y"
 VECTORS = {f"{sign}{axis}": s * np.eye(3)[i]
@@ -76,6 +76,8 @@ PRODUCERS = {
     "supersplat": Producer(CAMERA, None, "it undoes its half turn about z when it saves"),
 }  # fmt: skip
 """By name. The sources are in docs/formats.md."""
+UNTURNED = {("supersplat", ".spz")}
+"""Formats that a producer writes in the axes of its PLY, against their definition."""
 
 
 def producers_of(kind: str) -> list[str]:
@@ -94,13 +96,22 @@ def producer_axes(name: str, kind: str) -> Axes:
     return PRODUCERS[name].axes(kind, name)
 
 
-def from_producer(cloud: StoredCloud, name: str) -> StoredCloud:
+def from_producer(cloud: StoredCloud, name: str, suffix: str = ".ply") -> StoredCloud:
     """Return the cloud of a producer's file with y up and its front towards +z.
+
+    The producer's axes are those of its PLYs. Formats with axes of their own were turned on the
+    way from a PLY by their definition, except those that the producer writes in a PLY's axes.
+
+    Args:
+        suffix: the file's extension.
 
     Raises:
         UserError: the producer is unknown, or doesn't write Gaussians.
     """
     rotation = to_y_up(producer_axes(name, GAUSSIANS))
+    known = FORMATS.get(suffix, FORMATS[".ply"])
+    if known.up != VIEWER_UP and (name, suffix) not in UNTURNED:
+        cloud = cloud.in_axes(VIEWER_UP)
     return cloud._replace(gaussians=rotate(cloud.gaussians, rotation), up=Y_UP)
 
 

@@ -4,7 +4,7 @@
 The format is Niantic's (github.com/nianticlabs/spz, MIT). Versions 3 and 4 are written, 2 to 4 are
 read: a header and one block for each attribute, packed by gzip or, in version 4, by Zstandard
 (``spz_container.py``). Integers are little-endian, quaternions in the order xyzw, axes right, up,
-back:
+back unless a record says others (SPZ_ADOBE_coordinate_system), which are turned when read:
 
 ==========  ========================================================================================
 header      ``NGSP``, version u32, N u32, degree of the harmonics u8, fractional bits u8, flags u8
@@ -31,9 +31,10 @@ from jaxtyping import Bool, Float, Integer
 
 from ..core.errors import UserError
 from ..core.files import atomic_file, existing_file
+from ..gaussians.axes import rotate
 from ..gaussians.gaussians import Gaussians, finite, usable
 from . import packing
-from .spz_container import ANTIALIASED, MAGIC, SpzHeader, pack, unpack
+from .spz_container import ANTIALIASED, MAGIC, OWN_SYSTEM, SpzHeader, pack, unpack
 
 logger = logging.getLogger(__name__)
 VERSION = 3
@@ -50,6 +51,8 @@ median size, positions beyond ``OUTLIER_FACTOR`` times the ``INLIER_QUANTILE`` q
 are clipped.
 """
 COLOR_SCALE = 0.15
+DIRECTIONS = dict(zip("RUBLDF", np.concatenate([np.eye(3), -np.eye(3)]), strict=True))
+"""Right, up, back and their opposites, in the file's usual axes."""
 MAX_FIXED = 2**23 - 1
 COLOR_REACH = 0.5 / COLOR_SCALE
 """Largest absolute value of a stored constant harmonic: colours from -0.44 to 1.44."""
@@ -155,10 +158,10 @@ def load_spz(path: str | os.PathLike) -> tuple[Gaussians, bool]:
     """Read an SPZ file as :func:`read_spz`; also return whether it was trained antialiased."""
     path = existing_file(path, "SPZ file")
     try:
-        header, blocks = unpack(path.read_bytes(), str(path))
+        header, blocks, system = unpack(path.read_bytes(), str(path))
     except OSError as error:
         raise UserError(f"cannot read {str(path)!r}: {error.strerror or error}.") from error
-    return _decoded(header, blocks), header.antialiased
+    return _decoded(header, blocks, system), header.antialiased
 
 
 def spz_arrays(packed: bytes, name: str = "") -> Gaussians:
@@ -166,16 +169,21 @@ def spz_arrays(packed: bytes, name: str = "") -> Gaussians:
     return _decoded(*unpack(packed, name))
 
 
-def _decoded(header: SpzHeader, blocks: list[Integer[np.ndarray, "N B"]]) -> Gaussians:
+def _decoded(
+    header: SpzHeader, blocks: list[Integer[np.ndarray, "N B"]], system: str
+) -> Gaussians:
     positions, alphas, colors, scales, rotations, harmonics = blocks
     read_quats = _from_first_three if header.version == 2 else _from_smallest_three
-    return Gaussians(
+    gaussians = Gaussians(
         means=_positions(positions, header.fractional_bits),
         quats=read_quats(rotations),
         log_scales=scales / np.float32(16) + np.float32(MIN_LOG_SCALE),
         logit_opacities=packing.logits_of_bytes(alphas[:, 0]),
         sh=_harmonics(colors, harmonics),
     )
+    if system == OWN_SYSTEM:
+        return gaussians
+    return rotate(gaussians, np.stack([DIRECTIONS[letter] for letter in system], axis=1))
 
 
 def read_spz_comment(path: str | os.PathLike) -> str:

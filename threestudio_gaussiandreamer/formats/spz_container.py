@@ -29,6 +29,14 @@ VERSIONS = (3, 4)
 GZIP_VERSIONS, ZSTD_VERSION = (2, 3), 4
 ANTIALIASED, HAS_EXTENSIONS = 1, 2
 """Bits of the header's flags."""
+RECORD = struct.Struct("<II")
+"""Type and length of an extension, which its content follows."""
+COORDINATES = 0xADBE0003
+"""Type of SPZ_ADOBE_coordinate_system, the record of the axes."""
+SYSTEMS = ("", *"LDB RDB LUB RUB LDF RDF LUF RUF LFD RFD LFU RFU LBD RBD LBU RBU".split())
+"""Directions of x, y and z by the number in that record: left, right, down, up, back, front."""
+OWN_SYSTEM = "RUB"
+MAX_EXTENSION_BYTES = 1 << 16
 MOST_DEFLATE_SAVES = 1032
 """Bytes that one byte of a deflate stream stands for at most (zlib's technical notes)."""
 MIN_WINDOW = 8 << 20
@@ -79,8 +87,9 @@ def pack(header: SpzHeader, blocks: Sequence[bytes], comment: str = "") -> bytes
     return b"".join([head, TABLE_OFFSET.pack(offset), table, *packed])
 
 
-def unpack(packed: bytes, name: str) -> tuple[SpzHeader, list[Integer[np.ndarray, "N B"]]]:
-    """Unpack header and blocks, and no more than the header's counts require.
+def unpack(packed: bytes, name: str) -> tuple[SpzHeader, list[Integer[np.ndarray, "N B"]], str]:
+    """Unpack header and blocks, and no more than the header's counts require; also return the
+    axes, one of ``SYSTEMS``.
 
     Args:
         name: the file, for messages.
@@ -90,14 +99,31 @@ def unpack(packed: bytes, name: str) -> tuple[SpzHeader, list[Integer[np.ndarray
     """
     try:
         unpack_version = _unpack_zstd if packed[:4] == MAGIC else _unpack_gzip
-        header, blocks = unpack_version(packed, name)
+        header, blocks, extensions = unpack_version(packed, name)
     except (zlib.error, struct.error) as error:
         fail(name, f"it isn't an SPZ file, or damaged ({error}).")
-    if header.flags & HAS_EXTENSIONS:
-        logger.warning("SPZ file %r has vendor extensions, which are ignored", name)
+    system = _system(extensions, name) if header.flags & HAS_EXTENSIONS else OWN_SYSTEM
     shapes = [(header.count, size) for size in header.blocks]
     arrays = [np.frombuffer(data, "u1") for data in blocks]
-    return header, [array.reshape(shape) for array, shape in zip(arrays, shapes, strict=True)]
+    blocks = [array.reshape(shape) for array, shape in zip(arrays, shapes, strict=True)]
+    return header, blocks, system
+
+
+def _system(extensions: bytes, name: str) -> str:
+    """Return the axes that the extensions record; warn about other extensions."""
+    system, at = OWN_SYSTEM, 0
+    while at + RECORD.size <= len(extensions):
+        kind, length = RECORD.unpack_from(extensions, at)
+        content = extensions[at + RECORD.size :][:length]
+        at += RECORD.size + length
+        number = int.from_bytes(content, "little")
+        if kind != COORDINATES:
+            logger.warning("SPZ file %r has vendor extension %#x, which is ignored", name, kind)
+        elif length == 4 and 0 < number < len(SYSTEMS):
+            system = SYSTEMS[number]
+        else:
+            fail(name, f"its record of the axes has the number {number}: 1 to 16 were expected.")
+    return system
 
 
 def require_version(version: int) -> None:
@@ -126,7 +152,7 @@ def _check_header(header: SpzHeader, versions: tuple[int, ...], size: int, name:
 # ---- versions 2 and 3 ----------------------------------------------------------------------------
 
 
-def _unpack_gzip(packed: bytes, name: str) -> tuple[SpzHeader, list[memoryview]]:
+def _unpack_gzip(packed: bytes, name: str) -> tuple[SpzHeader, list[memoryview], bytes]:
     stream = zlib.decompressobj(16 + zlib.MAX_WBITS)
     header = SpzHeader._make(HEADER.unpack(stream.decompress(packed, HEADER.size)))
     sizes = [size * header.count for size in header.blocks]
@@ -135,15 +161,16 @@ def _unpack_gzip(packed: bytes, name: str) -> tuple[SpzHeader, list[memoryview]]
         fail(name, f"{what}, but {len(packed)} bytes can't hold them.")
     _check_header(header, GZIP_VERSIONS, len(packed), name)
     data = stream.decompress(stream.unconsumed_tail, sum(sizes)) if sum(sizes) else b""
-    while not stream.eof and stream.decompress(stream.unconsumed_tail, 1 << 16):
-        # read on to the checksum at the end: extensions may follow the blocks
-        pass
+    extensions = rest = stream.decompress(stream.unconsumed_tail, MAX_EXTENSION_BYTES)
+    while not stream.eof and rest:  # read on to the checksum at the end
+        rest = stream.decompress(stream.unconsumed_tail, MAX_EXTENSION_BYTES)
     if len(data) < sum(sizes):
         _fail_truncated(name, header, sum(sizes), len(data))
     if not stream.eof:
         fail(name, "its checksum at the end is missing: it is truncated.")
     view, ends = memoryview(data), np.cumsum(sizes)
-    return header, [view[end - size : end] for end, size in zip(ends, sizes, strict=True)]
+    blocks = [view[end - size : end] for end, size in zip(ends, sizes, strict=True)]
+    return header, blocks, extensions
 
 
 def _fail_truncated(name: str, header: SpzHeader, size: int, found: int) -> NoReturn:
@@ -171,13 +198,15 @@ def _gzip(data: bytes, comment: str) -> bytes:
 # ---- version 4 -----------------------------------------------------------------------------------
 
 
-def _unpack_zstd(packed: bytes, name: str) -> tuple[SpzHeader, list[bytes]]:
+def _unpack_zstd(packed: bytes, name: str) -> tuple[SpzHeader, list[bytes], bytes]:
     header = SpzHeader._make(HEADER.unpack_from(packed))
     _check_header(header, (ZSTD_VERSION,), len(packed), name)
     sizes = [size * header.count for size in header.blocks]
     frames = _frames(packed, header, [size for size in sizes if size], name)
     blocks = (_unpack_frame(*frame, name) for frame in frames)
-    return header, [next(blocks) if size else b"" for size in sizes]
+    (table,) = TABLE_OFFSET.unpack_from(packed, HEADER.size)
+    extensions = packed[HEADER.size + TABLE_OFFSET.size : table][:MAX_EXTENSION_BYTES]
+    return header, [next(blocks) if size else b"" for size in sizes], extensions
 
 
 def _frames(

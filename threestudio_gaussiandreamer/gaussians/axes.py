@@ -40,7 +40,8 @@ def rotation_between(up: str, other: str) -> Float[np.ndarray, "3 3"]:
 
 
 def rotate(gaussians: Gaussians, rotation: Float[np.ndarray, "3 3"]) -> Gaussians:
-    """Rotate Gaussians (arrays) about the origin: positions, quaternions and harmonics.
+    """Rotate Gaussians (arrays) about the origin, or mirror them, by an orthogonal matrix:
+    positions, quaternions and harmonics.
 
     Raises:
         UserError: spherical harmonics above degree 3.
@@ -79,10 +80,12 @@ def placed(gaussians: Gaussians, world: Float[np.ndarray, "4 4"], name: str) -> 
 def _rotate_quats(
     quats: Float[np.ndarray, "N 4"], rotation: Float[np.ndarray, "3 3"]
 ) -> Float[np.ndarray, "N 4"]:
-    """Multiply quaternions (wxyz) from the left by that of the rotation."""
+    """Multiply quaternions (wxyz) from the left by that of the rotation; of a mirroring, by that
+    of its negative, since an ellipsoid doesn't change when it is mirrored at its centre.
+    """
     from scipy.spatial.transform import Rotation
 
-    x, y, z, w = Rotation.from_matrix(rotation).as_quat()
+    x, y, z, w = Rotation.from_matrix(rotation * np.linalg.det(rotation)).as_quat()
     product = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
     return (quats @ product.T).astype(np.float32)
 

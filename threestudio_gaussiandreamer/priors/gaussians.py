@@ -119,7 +119,7 @@ class GaussiansPrior(Prior):
         harmonics = stored.gaussians.sh[:, : COEFFICIENTS[-1]]  # more can't be drawn
         stored = stored._replace(gaussians=stored.gaussians._replace(sh=harmonics))
         if self.cfg.producer:
-            stored = from_producer(stored, self.cfg.producer)
+            stored = from_producer(stored, self.cfg.producer, suffix_of(path.name))
         arrays = stored.in_axes(WORLD_UP).gaussians
         keep = usable(arrays)
         if bad := int((~keep).sum()):
