@@ -98,6 +98,16 @@ def test_mistakes(tmp_path):
         read_cloud(str(tmp_path / "b.ply"))
 
 
+@pytest.mark.parametrize("name", ["lod-meta.json", "scene.LCC"])
+def test_scenes_in_levels_of_detail_are_refused_with_what_converts_them(tmp_path, name):
+    (tmp_path / name).write_text("{}")
+    said = f"{name}'.*levels of detail aren't read: .* @playcanvas/splat-transform {name} cloud.ply"
+    with pytest.raises(UserError, match=said):
+        read_cloud(str(tmp_path / name))
+    with pytest.raises(UserError, match=said):
+        find("gaussians-prior")({"path": str(tmp_path / name)}).preflight()
+
+
 def test_harmonics_above_degree_3_are_refused_when_read(tmp_path):
     path = str(tmp_path / "a.ply")
     write_raw_gaussians(path, cloud(degree=4))

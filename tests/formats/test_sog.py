@@ -12,6 +12,7 @@ from PIL import Image
 
 from tests.helpers.object_clouds import assert_close, ball, in_order_of
 from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.formats.gaussian_files import read_cloud
 from threestudio_gaussiandreamer.formats.sog import load_sog, read_sog, write_sog
 
 
@@ -117,7 +118,7 @@ def test_names_of_members_lead_nowhere(path, tmp_path):
         ({"meta": {"count": 70}}, "has 8 x 8 pixels, too few for 70 Gaussians"),
         ({"meta": {"count": -1}}, "count should be 0 or more"),
         ({"meta": {"count": "9"}}, "count should be 0 or more"),
-        ({"meta": {"version": 1}}, "it is of version 1; version 2 was expected"),
+        ({"meta": {"version": 3}}, "it is of version 3; version 1 or 2 was expected"),
         ({"meta": {"means": None}}, "no section 'means'"),
         ({"meta": {"sh0": {"codebook": [0.0] * 255, "files": ["sh0.webp"]}}}, "256 numbers"),
         ({"meta": {"quats": {"files": []}}}, "names no image 0 of 'quats'"),
@@ -183,3 +184,65 @@ def test_a_damaged_member_is_seen_by_its_checksum(path):
     path.write_bytes(bytes(data))
     with pytest.raises(UserError, match="can't be unpacked"):
         read_sog(path)
+
+
+def unpacked(path, folder, version=2):
+    """The file as a folder, in version 1 with mins and maxs in place of codebooks."""
+    content = members(path)
+    meta = json.loads(content["meta.json"])
+    if version == 1:
+        count, high = meta.pop("count"), {"sh0": 2.0, "scales": -1.0}
+        del meta["version"]
+        meta["means"]["shape"] = [count, 3]
+        for key, channels in (("sh0", 4), ("scales", 3)):
+            files = meta[key]["files"]
+            meta[key] = {"mins": [-3] * channels, "maxs": [high[key]] * channels, "files": files}
+        meta["shN"] = {"mins": -0.5, "maxs": 0.5, "files": meta["shN"]["files"]}
+    folder.mkdir(exist_ok=True)
+    for name, data in (content | {"meta.json": json.dumps(meta).encode()}).items():
+        (folder / name).write_bytes(data)
+    return folder / "meta.json"
+
+
+def test_a_folder_without_an_archive_is_read_by_its_json(path, tmp_path):
+    read = read_cloud(str(unpacked(path, tmp_path / "folder")))
+    stored = read_cloud(str(path))
+    assert all(np.array_equal(a, b) for a, b in zip(read.gaussians, stored.gaussians, strict=True))
+    assert (read.up, read.pruned_to) == ("-y", 40)
+
+
+def test_version_1_is_read(path, tmp_path):
+    """Steps between mins and maxs, by the formulas of PlayCanvas' reader of version 1."""
+    file = unpacked(path, tmp_path / "folder", 1)
+    read, stored = read_sog(file), read_sog(path)
+    for name in ("means", "quats"):
+        np.testing.assert_array_equal(getattr(read, name), getattr(stored, name))
+
+    def pixels(name):
+        with Image.open(file.with_name(name)) as picture:
+            return np.asarray(picture.convert("RGBA"), np.float64)
+
+    colors = -3 + 5 * pixels("sh0.webp").reshape(-1, 4)[:50] / 255
+    scales = -3 + 2 * pixels("scales.webp").reshape(-1, 4)[:50, :3] / 255
+    palette = pixels("shN_centroids.webp")[..., :3].reshape(-1, 3, 3) / 255 - 0.5
+    labels = pixels("shN_labels.webp").reshape(-1, 4)[:50, 0].astype(int)
+    np.testing.assert_allclose(read.log_scales, scales, atol=1e-6)
+    np.testing.assert_allclose(read.sh[:, 0], colors[:, :3], atol=1e-6)
+    np.testing.assert_allclose(read.logit_opacities, colors[:, 3], atol=1e-6)
+    np.testing.assert_allclose(read.sh[:, 1:], palette[labels], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("section", "value", "said"),
+    [
+        ("means", {"files": FILES}, "count should be 0 or more, not None"),
+        ("scales", {"mins": [0], "maxs": [1], "files": ["scales.webp"]}, "mins should be 3 num"),
+        ("sh0", {"files": ["../folder/sh0.webp"]}, "'../folder/sh0.webp', which should lie"),
+        ("shN", {"files": ["sh0.webp"]}, "palette of 8 pixels in width isn't of degree 1 to 3"),
+    ],
+)
+def test_damaged_folders_are_refused(path, tmp_path, section, value, said):
+    file = unpacked(path, tmp_path / "folder", 1)
+    file.write_text(json.dumps(json.loads(file.read_text()) | {section: value}))
+    with pytest.raises(UserError, match=said):
+        read_sog(file)

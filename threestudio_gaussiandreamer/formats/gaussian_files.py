@@ -125,10 +125,13 @@ FORMATS = {
     ".usdz": CloudFormat(USDA_UP, read_usd, write_usdz),
     ".usdc": CloudFormat(USDA_UP, read_usd, None),
     ".usd": CloudFormat(USDA_UP, read_usd, None),
+    "meta.json": CloudFormat(SOG_UP, _read_sog, None),
     ".splat": CloudFormat(VIEWER_UP, lambda path: (read_splat(path), []), None),
 }
 """By extension."""
 READ = tuple(FORMATS)
+LEVELS = ("lod-meta.json", ".lcc")
+"""Scenes in levels of detail, spread over many files: SuperSplat's streamed SOG, XGRIDS' LCC."""
 WRITTEN = tuple(suffix for suffix, known in FORMATS.items() if known.write)
 ALWAYS_GAUSSIANS = (".spz", ".sog", ".compressed.ply", ".spz.glb")
 """Formats in which a run exports nothing but Gaussians; a PLY can be a mesh or points."""
@@ -140,8 +143,15 @@ def suffix_of(name: str) -> str:
     """Return the longest known extension of a file name in lower case, or what follows its last
     dot.
     """
-    known = [suffix for suffix in FORMATS if name.lower().endswith(suffix)]
+    known = [suffix for suffix in (*FORMATS, *LEVELS) if name.lower().endswith(suffix)]
     return max(known, key=len, default=Path(name).suffix.lower())
+
+
+def conversion(name: str) -> str:
+    """Return the end of a message about a file in ``LEVELS``: what converts it; else nothing."""
+    tool = f"npx @playcanvas/splat-transform {name} cloud.ply"
+    levels = f"; scenes in levels of detail aren't read: convert it first, with {tool}"
+    return levels if suffix_of(name) in LEVELS else ""
 
 
 def holds_gaussians(path: Path) -> bool:
@@ -166,6 +176,7 @@ def require_format(name: str, option: str, formats: Collection[str] = WRITTEN) -
         *others, last = formats
         raise UserError(
             f"{option}: expected the name of a {', '.join(others)} or {last} file, got {name!r}"
+            f"{conversion(name)}"
         )
     return suffix
 

@@ -1,4 +1,4 @@
-"""SOG version 2 (Spatially Ordered Gaussians), PlayCanvas' format for the web: lossless WebP images
+"""SOG (Spatially Ordered Gaussians), PlayCanvas' format for the web: lossless WebP images
 in a zip archive, about 15 bytes for a Gaussian of degree 0.
 
 Gaussians are sorted along a Morton curve. Gaussian i is pixel i of each image but the palette's.
@@ -18,8 +18,11 @@ shN_centroids      the palette, 64 entries a row, a pixel for each coefficient: 
 
 ``model`` is "antialiased" where the Gaussians were trained with antialiasing. The axes are those of
 the PLY, as splat-transform writes and reads them (-y up), though the specification says y up
-(developer.playcanvas.com, "The SOG Format"). Other tools write the same files without an archive,
-or version 1; those aren't read."""
+(developer.playcanvas.com, "The SOG Format").
+
+Version 2 is written. Also read is version 1, which has no codebooks: the bytes of scales, sh0 and
+shN are steps between ``mins`` and ``maxs``, those of sh0's alpha of the logit of the opacity; and
+files without an archive, by their ``meta.json``."""
 
 import io
 import json
@@ -84,24 +87,27 @@ def read_sog(path: str | os.PathLike) -> Gaussians:
 
 
 def load_sog(path: str | os.PathLike) -> tuple[Gaussians, bool, list[str]]:
-    """Read an SOG file.
+    """Read an SOG file, or by its ``meta.json`` one without an archive.
 
     Returns:
         the Gaussians, whether they were trained with antialiasing, and the notes of our writer.
 
     Raises:
-        UserError: there is no such file, it is no SOG archive of version 2, it is damaged, or it
+        UserError: there is no such file, it is no SOG of version 1 or 2, it is damaged, or it
             would take more memory than the budget of its size.
     """
     with SogArchive(path) as archive:
         low, high = (archive.rows("means", index).astype(np.uint16) for index in (0, 1))
         quats, sh0 = archive.rows("quats"), archive.rows("sh0")
+        colors = archive.values("sh0", sh0, 4)
         gaussians = Gaussians(
             means=_positions((low | high << 8)[:, :3], *archive.bounds()),
             quats=_quats(quats, archive),
-            log_scales=archive.codebook("scales")[archive.rows("scales")[:, :3]],
-            logit_opacities=packing.logits_of_bytes(sh0[:, 3]),
-            sh=_harmonics(archive.codebook("sh0")[sh0[:, :3]], archive),
+            log_scales=archive.values("scales", archive.rows("scales")[:, :3]),
+            logit_opacities=(
+                colors[:, 3] if archive.version == 1 else packing.logits_of_bytes(sh0[:, 3])
+            ),
+            sh=_harmonics(colors[:, :3], archive),
         )
         return gaussians, archive.meta.get("model") == ANTIALIASED, archive.notes()
 
@@ -235,8 +241,8 @@ def _harmonics(
     labels = pixels[:, 0] | pixels[:, 1] << 8
     if len(labels) and labels.max() >= len(entries):
         archive.fail(f"a Gaussian has entry {labels.max()} of a palette of {len(entries)}")
-    book = archive.codebook("shN")
+    entries = archive.values("shN", entries, 1)
     sh = np.empty((len(constant), 1 + entries.shape[1], 3), np.float32)
     sh[:, 0] = constant
-    sh[:, 1:] = book[entries[labels]]
+    sh[:, 1:] = entries[labels]
     return sh

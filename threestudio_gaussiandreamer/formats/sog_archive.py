@@ -1,7 +1,7 @@
-"""The archive of an SOG file: its JSON and images, checked before anything is unpacked.
+"""The archive of an SOG file, or its folder: JSON and images, checked before they are unpacked.
 
-Members are read into memory by the names in ``meta.json``; nothing is written to the disk, so the
-names of members can't lead anywhere."""
+Members are read into memory by the names in ``meta.json``; nothing is written to the disk, and the
+images of a folder lie beside its ``meta.json``, so names can't lead anywhere."""
 
 import io
 import json
@@ -21,6 +21,7 @@ from ..core.file_memory import require_file_memory
 from ..core.files import existing_file
 from ..gaussians.sh import COEFFICIENTS
 
+VERSIONS = 1, 2
 CODEBOOK = 256
 PALETTE_COLUMNS = 64
 FIRST_TAG = 252
@@ -42,22 +43,28 @@ DAMAGED = (
 
 
 class SogArchive:
-    """An open SOG file.
+    """An open SOG file, or the ``meta.json`` of an unpacked one.
 
     Raises:
-        UserError: there is no such file, it is no SOG archive of version 2, it is damaged, or it
+        UserError: there is no such file, it is no SOG of version 1 or 2, it is damaged, or it
             announces more than the memory budget of its size.
     """
 
     def __init__(self, path: str | os.PathLike) -> None:
         self.path = existing_file(path, "SOG file")
-        self.size = self.path.stat().st_size
+        self._zip: Optional[zipfile.ZipFile] = None
+        unpacked = self.path.suffix.lower() == ".json"
+        files = [self.path, *(self.path.parent.glob("*.webp") if unpacked else ())]
+        self.size = sum(file.stat().st_size for file in files)
         try:
-            self._zip = zipfile.ZipFile(self.path)
+            self._zip = None if unpacked else zipfile.ZipFile(self.path)
         except (*DAMAGED, OSError, ValueError) as error:
             self.fail(f"it isn't a zip archive, or damaged ({error})")
         self.meta = self._read_meta()
-        self.count: int = self._number(self.meta, "count")
+        self.version: int = self.meta.get("version", 1)
+        shape = self._section("means").get("shape") if self.version == 1 else None
+        counted = {"count": shape[0]} if isinstance(shape, list) and shape else self.meta
+        self.count: int = self._number(counted, "count")
         harmonics = COEFFICIENTS[self._bands()]
         needed = self.count * (DECODED_BYTES + DECODED_BYTES_PER_HARMONIC * harmonics)
         self._require_memory(needed, f"{self.count} Gaussians")
@@ -71,7 +78,8 @@ class SogArchive:
         error: Optional[BaseException],
         trace: Optional[TracebackType],
     ) -> None:
-        self._zip.close()
+        if self._zip is not None:
+            self._zip.close()
 
     def fail(self, problem: str) -> NoReturn:
         """Raise UserError about this file."""
@@ -89,20 +97,32 @@ class SogArchive:
         means = self._section("means")
         return self._floats(means, "mins", 3), self._floats(means, "maxs", 3)
 
-    def codebook(self, section: str) -> Float[np.ndarray, "256"]:
-        """Return the values that the bytes of an image stand for."""
-        return self._floats(self._section(section), "codebook", CODEBOOK).astype(np.float32)
+    def values(
+        self, section: str, pixels: Integer[np.ndarray, "*N C"], channels: int = 3
+    ) -> Float[np.ndarray, "*N C"]:
+        """Return what the bytes of an image stand for: entries of a codebook, in version 1 steps
+        between ``mins`` and ``maxs`` of each of the section's ``channels`` (1: of all).
+        """
+        about = self._section(section)
+        if self.version == 1:
+            low, high = (self._floats(about, key, channels) for key in ("mins", "maxs"))
+            book = np.linspace(low, high, CODEBOOK)
+        else:
+            book = self._floats(about, "codebook", CODEBOOK)[:, None]
+        columns = np.arange(pixels.shape[-1]) % book.shape[1]
+        return book.astype(np.float32)[pixels, columns]
 
     def _read_meta(self) -> dict[str, Any]:
         try:
-            meta = json.loads(self._member("meta.json", MAX_META_BYTES).decode("utf-8"))
+            name = "meta.json" if self._zip else self.path.name
+            meta = json.loads(self._member(name, MAX_META_BYTES).decode("utf-8"))
         except (ValueError, RecursionError) as error:
             if isinstance(error, UserError):
                 raise
             self.fail(f"its meta.json isn't valid JSON ({str(error)[:100]})")
-        if not isinstance(meta, dict) or meta.get("version") != 2:
-            version = meta.get("version", 1) if isinstance(meta, dict) else None
-            self.fail(f"it is of version {str(version)[:20]}; version 2 was expected")
+        version = meta.get("version", 1) if isinstance(meta, dict) else None
+        if version not in VERSIONS:
+            self.fail(f"it is of version {str(version)[:20]}; version 1 or 2 was expected")
         return meta
 
     def _section(self, name: str) -> dict[str, Any]:
@@ -119,6 +139,7 @@ class SogArchive:
 
     def _floats(self, section: dict[str, Any], key: str, count: int) -> Float[np.ndarray, " C"]:
         values = section.get(key)
+        values = [values] if count == 1 and not isinstance(values, list) else values
         usual = isinstance(values, list) and len(values) == count
         if not usual or not all(type(value) in (int, float) for value in values):
             self.fail(f"{key} should be {count} numbers, not {str(values)[:80]}")
@@ -131,6 +152,12 @@ class SogArchive:
         """Return the degree of the harmonics."""
         if self.meta.get("shN") is None:
             return 0
+        if self.version == 1:
+            width = self._image_size(*self._image("shN", 0))[0]
+            known = {PALETTE_COLUMNS * (K - 1): K for K in COEFFICIENTS[1:]}
+            if width not in known:
+                self.fail(f"a palette of {width} pixels in width isn't of degree 1 to 3")
+            return COEFFICIENTS.index(known[width])
         bands = self._number(self._section("shN"), "bands")
         if bands not in range(len(COEFFICIENTS)):
             self.fail(f"harmonics of degree {bands} are announced: 0 to 3 were expected")
@@ -151,22 +178,28 @@ class SogArchive:
         """Return the entries of the palette of harmonics, K for each; None without any."""
         if not (bands := self._bands()):
             return None
-        count, coefficients = self._number(self._section("shN"), "count"), COEFFICIENTS[bands] - 1
-        pixels = self._pixels("shN", 0)
+        coefficients, pixels = COEFFICIENTS[bands] - 1, self._pixels("shN", 0)
         height, width = pixels.shape[:2]
+        count = height * PALETTE_COLUMNS
+        if self.version != 1:
+            count = self._number(self._section("shN"), "count")
         if width != PALETTE_COLUMNS * coefficients or height * PALETTE_COLUMNS < count:
             size = f"{width} x {height} pixels"
             self.fail(f"the palette of {count} entries of degree {bands} can't have {size}")
         return pixels[..., :3].reshape(-1, coefficients, 3)[:count]
 
-    def _pixels(self, section: str, index: int) -> Integer[np.ndarray, "H W 4"]:
+    def _image(self, section: str, index: int) -> tuple[bytes, str]:
+        """Return the content of an image, and its name."""
         files = self._section(section).get("files")
         if not isinstance(files, list) or len(files) <= index or not isinstance(files[index], str):
             self.fail(f"its meta.json names no image {index} of {section!r}")
-        data = self._member(files[index], self.size)
-        width, height = self._image_size(data, files[index])
+        return self._member(files[index], self.size), files[index]
+
+    def _pixels(self, section: str, index: int) -> Integer[np.ndarray, "H W 4"]:
+        data, name = self._image(section, index)
+        width, height = self._image_size(data, name)
         self._require_memory(BYTES_PER_PIXEL * width * height, f"{width} x {height} pixels")
-        return self._decoded(data, (width, height), files[index])
+        return self._decoded(data, (width, height), name)
 
     def _image_size(self, data: bytes, name: str) -> tuple[int, int]:
         """Return width and height in the header of a lossless WebP."""
@@ -201,6 +234,8 @@ class SogArchive:
 
     def _member(self, name: str, most: int) -> bytes:
         """Return the content of a member, at most ``most`` bytes."""
+        if self._zip is None:
+            return self._beside(name, most)
         try:
             info = self._zip.getinfo(name)
         except KeyError:
@@ -213,6 +248,17 @@ class SogArchive:
             return self._zip.read(info)  # compares the checksum too
         except (*DAMAGED, OSError, ValueError) as error:
             self.fail(f"{name[:40]!r} can't be unpacked ({error})")
+
+    def _beside(self, name: str, most: int) -> bytes:
+        """Return the content of a file in the folder of ``meta.json``."""
+        try:
+            with self.path.with_name(name).open("rb") as file:
+                data = file.read(most + 1)
+        except (OSError, ValueError) as error:  # a name with a folder in it is a ValueError
+            self.fail(f"{name[:40]!r}, which should lie beside it, can't be read ({error})")
+        if len(data) > most:
+            self.fail(f"{name[:40]!r} has more than the {most} bytes that were expected")
+        return data
 
     def _require_memory(self, needed: float, content: str) -> None:
         needed = math.ceil(needed)

@@ -30,7 +30,7 @@ from ..core.errors import UserError
 from ..core.files import existing_file
 from ..core.options import in_range, one_of
 from ..formats.compressed_ply import is_compressed_ply
-from ..formats.gaussian_files import READ, read_stored, suffix_of
+from ..formats.gaussian_files import READ, conversion, read_stored, suffix_of
 from ..formats.ply import is_gaussian_ply
 from ..formats.producers import GAUSSIANS, from_producer, producer_axes
 from ..gaussians.axes import AXES, WORLD_UP
@@ -148,7 +148,7 @@ def gaussian_file(path: str) -> Path:
         advice = (
             "; it is a checkpoint: export it first, with --export and resume=" + repr(str(file))
             if file.suffix.lower() == ".ckpt"
-            else ""
+            else conversion(file.name)
         )
         raise UserError(
             f"file of Gaussians {str(file)!r}: {file.suffix or 'a name without extension'} isn't "
