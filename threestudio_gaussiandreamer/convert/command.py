@@ -1,9 +1,9 @@
 """Convert a file of Gaussians: ``python -m threestudio_gaussiandreamer.convert IN OUT``.
 
 The formats are those of the extensions: .ply, .compressed.ply, .spz, .sog, .glb, .usda and .usdz
-are read and written, .splat, meta.json (SOG), .gltf, .usd and .usdc are read; IN may also be a
-checkpoint. The command says what OUT can't hold of IN, and ``--check`` measures the PSNR between
-them.
+are read and written, .splat, .ksplat, meta.json (SOG), .gltf, .usd and .usdc are read; IN may also
+be a checkpoint. The command says what OUT can't hold of IN, and ``--check`` measures the PSNR
+between them.
 
 A .glb or .obj is a textured mesh of the cloud's surface; ``--gaussians`` writes the Gaussians
 themselves into a .glb, and a .spz.glb holds them always, as SPZ, which CesiumJS needs."""

@@ -19,6 +19,7 @@ from ..gaussians.gaussians import Gaussians, drawable
 from . import spz
 from .compressed_ply import is_compressed_ply, read_compressed_ply, write_compressed_ply
 from .glb import GLB_UP, load_glb, write_glb, write_spz_glb
+from .ksplat import read_ksplat
 from .ply import (
     gaussians_size,
     is_gaussian_ply,
@@ -126,6 +127,7 @@ FORMATS = {
     ".usdc": CloudFormat(USDA_UP, read_usd, None),
     ".usd": CloudFormat(USDA_UP, read_usd, None),
     "meta.json": CloudFormat(SOG_UP, _read_sog, None),
+    ".ksplat": CloudFormat(VIEWER_UP, lambda path: (read_ksplat(path), []), None),
     ".splat": CloudFormat(VIEWER_UP, lambda path: (read_splat(path), []), None),
 }
 """By extension."""

@@ -169,9 +169,7 @@ def spz_arrays(packed: bytes, name: str = "") -> Gaussians:
     return _decoded(*unpack(packed, name))
 
 
-def _decoded(
-    header: SpzHeader, blocks: list[Integer[np.ndarray, "N B"]], system: str
-) -> Gaussians:
+def _decoded(header: SpzHeader, blocks: list[Integer[np.ndarray, "N B"]], system: str) -> Gaussians:
     positions, alphas, colors, scales, rotations, harmonics = blocks
     read_quats = _from_first_three if header.version == 2 else _from_smallest_three
     gaussians = Gaussians(
