@@ -10,6 +10,7 @@ import platform
 from pathlib import Path
 
 from setuptools import Extension, setup
+from setuptools.command.bdist_wheel import bdist_wheel
 from setuptools.command.build_ext import build_ext
 
 PACKAGE = "threestudio_gaussiandreamer.splatting.cpu"
@@ -73,4 +74,14 @@ class BuildLibraries(build_ext):
         return os.path.join(*fullname.split(".")) + ".so"
 
 
-setup(ext_modules=extensions(), cmdclass={"build_ext": BuildLibraries})
+class PlatformWheel(bdist_wheel):
+    """A wheel for any Python 3 of one platform: the libraries don't use Python's own interface."""
+
+    def get_tag(self):
+        return ("py3", "none", super().get_tag()[2])
+
+
+setup(
+    ext_modules=extensions(),
+    cmdclass={"build_ext": BuildLibraries, "bdist_wheel": PlatformWheel},
+)

@@ -289,3 +289,14 @@ def test_the_formulas_need_no_standard_header_and_work_on_single_floats(tmp_path
         ],
         check=True,
     )
+
+
+@pytest.mark.slow
+def test_the_kernel_compiles_for_windows(tmp_path):
+    """With MinGW-w64; its threads are those of POSIX."""
+    compiler = shutil.which("x86_64-w64-mingw32-g++-posix")
+    if compiler is None:
+        pytest.skip("needs the cross compiler x86_64-w64-mingw32-g++-posix")
+    source = pathlib.Path(cpu.__file__).with_name("rasterize.cpp")
+    options = ["-std=c++17", "-O0", "-shared", f"-I{source.parents[1] / 'shared'}"]
+    subprocess.run([compiler, *options, str(source), "-o", str(tmp_path / "a.dll")], check=True)

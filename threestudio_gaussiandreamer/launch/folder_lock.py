@@ -24,7 +24,7 @@ from ..core.errors import UserError
 
 SUBFOLDERS = ("ckpts", "configs", "code", "save", "tb_logs", "csv_logs")
 FILES = ("ckpts/last.ckpt", "configs/parsed.yaml", "cmd.txt")
-LONGEST_RESULT = 200
+LONGEST_RESULT = 80
 """Upper bound of the length of paths that a run writes below its folder, bytes."""
 LOCK_FILE = ".lock"
 """Name of the lock file."""

@@ -59,7 +59,7 @@ def read_bvh(path: Path, frame: int) -> dict[str, Float[np.ndarray, "3"]]:
         UserError: the file is damaged, has no such frame, numbers that aren't finite, or lacks
             joints that a pose needs.
     """
-    hierarchy, _, motion = path.read_text("utf-8", errors="replace").partition("MOTION")
+    hierarchy, _, motion = path.read_text(encoding="utf-8", errors="replace").partition("MOTION")
     joints = list(_hierarchy(hierarchy, path))
     names = joint_names([joint.name for joint in joints], path)
     values = _frame_values(motion, sum(len(joint.channels) for joint in joints), frame, path)

@@ -180,7 +180,10 @@ def read_text(path: Path) -> PointCloud:
     and lines with #, are skipped.
     """
     lines = (
-        path.read_text("utf-8", errors="replace").replace(",", " ").replace(";", " ").splitlines()
+        path.read_text(encoding="utf-8", errors="replace")
+        .replace(",", " ")
+        .replace(";", " ")
+        .splitlines()
     )
     if lines and not _is_row(lines[0]):
         lines = lines[1:]  # a count, or the names of the columns

@@ -168,8 +168,9 @@ def library() -> ctypes.CDLL:
         raise unknown("instruction set in GAUSSIANDREAMER_ISA", forced, BUILDS)
     if not usable:
         raise OSError(
-            "the kernel library isn't built: install the package with a C++ compiler at hand "
-            "(g++ 11 or later)"
+            "the kernel library isn't built, so plain torch draws: install the package again with "
+            "g++ 11 or later or clang at hand (on Windows MinGW-w64 with POSIX threads; "
+            "Microsoft's compiler can't build it)"
         )
     if forced and forced not in usable:
         raise UserError(

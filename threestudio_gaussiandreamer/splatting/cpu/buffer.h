@@ -9,7 +9,11 @@
 #include <mutex>
 #include <vector>
 
+#if defined(_WIN32)
+#include <malloc.h>
+#else
 #include <pthread.h>
+#endif
 #if defined(__linux__)
 #include <sys/mman.h>
 #endif
@@ -32,12 +36,23 @@ inline void check_memory(int64_t bytes) {
   if (bytes > memory_of_machine() / 4 * 3) throw OutOfMemory{bytes};
 }
 
+#if defined(_WIN32)
+inline void* aligned(size_t alignment, size_t bytes) { return _aligned_malloc(bytes, alignment); }
+inline void free_aligned(void* memory) { _aligned_free(memory); }
+#else
+inline void* aligned(size_t alignment, size_t bytes) {
+  void* fresh = nullptr;
+  return posix_memalign(&fresh, alignment, bytes) ? nullptr : fresh;
+}
+inline void free_aligned(void* memory) { std::free(memory); }
+#endif
+
 template <class T> class Buffer {
  public:
   Buffer() = default;
   Buffer(const Buffer&) = delete;
   Buffer& operator=(const Buffer&) = delete;
-  ~Buffer() { std::free(data_); }
+  ~Buffer() { free_aligned(data_); }
 
   // Room for `count` items; the old contents are lost when it grows.
   T* reserve(size_t count) {
@@ -52,10 +67,10 @@ template <class T> class Buffer {
  private:
   void grow(size_t count) {
     const size_t bytes = sizeof(T) * count, huge_page = size_t(1) << 21;
-    std::free(data_);
+    free_aligned(data_);
     data_ = nullptr, capacity_ = 0;
-    void* fresh = nullptr;
-    if (posix_memalign(&fresh, bytes >= huge_page ? huge_page : 64, bytes)) throw OutOfMemory{int64_t(bytes)};
+    void* fresh = aligned(bytes >= huge_page ? huge_page : 64, bytes);
+    if (!fresh) throw OutOfMemory{int64_t(bytes)};
 #if defined(__linux__)
     if (bytes >= huge_page) madvise(fresh, bytes, MADV_HUGEPAGE);
 #endif
@@ -70,7 +85,9 @@ template <class T> class Buffer {
 // and a lock that one of them held would stay locked: it gets a T of its own.
 template <class T> T& of_process() {
   static T* instance = [] {
+#if !defined(_WIN32)
     pthread_atfork(nullptr, nullptr, [] { instance = new T; });
+#endif
     return new T;
   }();
   return *instance;
