@@ -169,7 +169,7 @@ def test_a_lock_file_that_cannot_be_read_or_written_is_one_message(folder, no_fl
         claim(folder)
     (folder / ".lock").rmdir()
 
-    def disk_full(*arguments):
+    def disk_full(*arguments, **options):
         raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as patch:

@@ -179,10 +179,11 @@ _looked_at: set[torch.device] = set()
 
 def check_activated(tensors: dict[str, Tensor]) -> None:
     """Refuse logarithms in place of scales and logits in place of opacities: on a CPU always, on
-    another device in the first call only, since looking waits for it.
+    another device in the first call only, since looking waits for it. A few values below 0, as
+    an optimiser of scales or opacities themselves makes them, are drawn as the specification says.
 
     Raises:
-        UserError: a scale is negative, or an opacity outside [0, 1].
+        UserError: an opacity is above 1, or more than half of the scales or opacities below 0.
     """
     device = tensors["means"].device
     if device.type != "cpu" and device in _looked_at:
@@ -193,8 +194,9 @@ def check_activated(tensors: dict[str, Tensor]) -> None:
         ("opacities", 1 + 1e-4, "sigmoid() of logits"),
     ):
         values = tensors[name].detach()
-        bad = values.isfinite() & ((values < 0) | (values > high))
-        if bad.any():
+        below, above = values < 0, (values > high) & values.isfinite()
+        bad = below | above
+        if above.any() or 2 * below.sum() > values.numel():
             wanted = "0 or more" if high == math.inf else "in [0, 1]"
             raise UserError(
                 f"{name} must be {wanted}, got {values[bad][0].item():g}, one of {int(bad.sum())} "

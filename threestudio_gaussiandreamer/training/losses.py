@@ -103,7 +103,8 @@ def require_gradients(geometry: torch.nn.Module, losses: Mapping[str, Tensor]) -
     """Raise UserError if no gradient of the losses has reached the cloud, as when a guidance
     computes its loss from a copy of the renders, or from parameters of its own alone.
     """
-    if all(parameter.grad is None for parameter in geometry.parameters()):
+    gradients = [parameter.grad for parameter in geometry.parameters()]
+    if gradients and all(gradient is None for gradient in gradients):
         names = ", ".join(f"loss_{name}" for name in losses)
         raise UserError(
             f"no gradient of {names} reaches the Gaussians, so that they wouldn't be trained: "
