@@ -9,7 +9,7 @@ PYTEST  = $(ENVIRON) OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --d
 # without the CPU kernel (no C++ compiler) plain torch renders, and the exact demo is smaller
 SMALLER = $$($(BIN)/python -c 'from threestudio_gaussiandreamer.splatting import available_backends as b; print("--config configs/demo-small.yaml" if b()["cpu"] else "")')
 
-.PHONY: demo demo-exact test test-slow test-all test-farm docs stability fuzz long-run ablations bench gpu-check train-toybox toybox-sheet charts measure-charts measure-toybox clean
+.PHONY: demo demo-exact test test-slow test-all test-farm test-lowest docs stability fuzz long-run ablations bench gpu-check train-toybox toybox-sheet charts measure-charts measure-toybox clean
 
 PROMPT =
 MODELS = toybox
@@ -33,6 +33,15 @@ test-all: $(VENV)/ready-for-tests  ## both, as CI runs them
 
 test-farm: $(VENV)/ready-for-farm  ## the farm's tests on Ray and on an S3 server, which test and test-slow skip where Ray isn't installed
 	$(PYTEST) tests/farm
+
+LOWEST = .venv-lowest/bin/python
+test-lowest: $(VENV)/ready-for-tests ## the lowest declared version of every dependency but torch: a run of every stage, then the tests that read files
+	$(PYTHON) -m venv .venv-lowest
+	$(BIN)/python -m tests.lowest mesh > .venv-lowest/requirements.txt
+	$(LOWEST) -m pip install --quiet -r .venv-lowest/requirements.txt
+	$(LOWEST) -m pip install --quiet --no-deps -e .
+	$(ENVIRON) $(LOWEST) launch.py --config smoke.yaml --train
+	$(ENVIRON) OMP_NUM_THREADS=1 $(LOWEST) -m pytest -n $(WORKERS) -m "not slow" tests/core tests/launch tests/formats tests/meshes tests/gaussians tests/host
 
 stability: $(VENV)/ready-for-tests          ## every known failure, provoked and measured: docs/stability.md
 	$(ENVIRON) $(BIN)/python -m pytest tests/stability --stability-report stability.json; status=$$?; \
