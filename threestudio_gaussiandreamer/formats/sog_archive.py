@@ -109,8 +109,10 @@ class SogArchive:
             book = np.linspace(low, high, CODEBOOK)
         else:
             book = self._floats(about, "codebook", CODEBOOK)[:, None]
-        columns = np.arange(pixels.shape[-1]) % book.shape[1]
-        return book.astype(np.float32)[pixels, columns]
+        book = book.astype(np.float32)
+        if book.shape[1] == 1:  # indices by a second axis take memory
+            return book[:, 0][pixels]
+        return book[pixels, np.arange(pixels.shape[-1]) % book.shape[1]]
 
     def _read_meta(self) -> dict[str, Any]:
         try:
