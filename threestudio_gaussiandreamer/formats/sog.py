@@ -241,8 +241,7 @@ def _harmonics(
     labels = pixels[:, 0] | pixels[:, 1] << 8
     if len(labels) and labels.max() >= len(entries):
         archive.fail(f"a Gaussian has entry {labels.max()} of a palette of {len(entries)}")
-    entries = archive.values("shN", entries, 1)
     sh = np.empty((len(constant), 1 + entries.shape[1], 3), np.float32)
     sh[:, 0] = constant
-    sh[:, 1:] = entries[labels]
+    sh[:, 1:] = archive.values("shN", entries[labels], 1)
     return sh
