@@ -165,4 +165,9 @@ def test_without_webgl2_the_page_gives_a_message_and_shows_the_poster(tmp_path):
         box = "document.getElementById('poster').getBoundingClientRect().width"
         assert page.evaluate(box) > 100
         assert page.evaluate("document.getElementById('poster').naturalWidth") == 320
+        shown_ids = "[...document.querySelectorAll('footer > *')].filter(x => x.offsetWidth)"
+        assert page.evaluate(f"{shown_ids}.map(x => x.id)") == ["save-spz"]
+        page.evaluate("window.saveFile = (name, parts) => { window.saved = parts[0].length }")
+        page.evaluate("document.getElementById('save-spz').click()")
+        assert page.evaluate("window.saved") > 100
         assert requests_that_leave(page) == [(tmp_path / "view.html").as_uri()]

@@ -176,9 +176,6 @@ function wireButtons(viewer) {
   on("save-ply", "click", () => {
     saveFile(`${meta.name}.ply`, plyParts(meta.plyHeader, viewer.clouds[0].columns));
   });
-  on("save-spz", "click", () => {
-    saveFile(`${meta.name}.spz`, [base64Bytes(byId("spz").textContent.trim())]);
-  });
 }
 
 function wireWindow(viewer) {
@@ -199,6 +196,11 @@ async function start() {
   byId("background").value = meta.background;
   fillChoice(meta);
   describe(meta, 0);
+  // needs no drawing
+  byId("save-spz").addEventListener("click", () => {
+    saveFile(`${meta.name}.spz`, [base64Bytes(byId("spz").textContent.trim())]);
+  });
+  document.querySelector("footer").hidden = false;
   if (!byId("canvas").getContext("webgl2", { alpha: false, antialias: false, depth: false })) {
     explain("This browser doesn't offer WebGL2, which turning the object needs. "
       + "This is a picture of it.");
