@@ -11,14 +11,18 @@ from ..cameras import orbit_c2w, to_opencv
 from ..core.errors import UserError
 from ..formats.gaussian_files import StoredCloud
 from ..gaussians.axes import WORLD_UP, rotation_between
+from ..gaussians.gaussians import Gaussians
 from ..gaussians.sh import bounded_colors, sh_to_unclamped_colors
-from ..gaussians.views import EPS2D, FOVY, NEAR, bounds, require_renderable
+from ..gaussians.views import EPS2D, FOVY, NEAR, Ball, bounds, require_renderable
 from ..splatting import PRESETS, rasterize
 
 ELEVATION, AZIMUTH = 15.0, 30.0
 """The first view, degrees: the front, from slightly above and to the right."""
-MARGIN = 1.15
-"""Distance of the first view, relative to the one at which the bounding sphere just fits."""
+MARGIN = 1.1
+"""Distance of the first view, relative to the one at which the whole cloud just fits."""
+FAINT, GAP = 0.05, 0.1
+"""What may lie outside the first view: Gaussians of a smaller opacity, and those that are further
+from the others than this share of the cloud's radius."""
 
 
 class RenderSettings(NamedTuple):
@@ -74,11 +78,34 @@ def first_pose(cloud: StoredCloud) -> Pose:
         UserError: the cloud is too large for float32.
     """
     gaussians = cloud.gaussians.tensors()
-    centre, radius = bounds(gaussians)
-    require_renderable(gaussians, radius)
+    ball = bounds(gaussians)
+    require_renderable(gaussians, ball[1])
+    centre, radius = _whole(gaussians, ball)
     to_world = torch.from_numpy(rotation_between(cloud.up, WORLD_UP)).float()
     target = (to_world @ centre).tolist()
     return Pose(tuple(target), MARGIN * radius / math.sin(FOVY / 2))
+
+
+def _whole(cloud: Gaussians, ball: Ball) -> Ball:
+    """Extend the ball of :func:`bounds` to all that is connected with it, such as a thin hat.
+
+    From that ball outwards, a Gaussian belongs to the cloud unless there is a gap before it, so
+    that nothing connected is left out and a floater is. Gaussians end at two standard deviations.
+    """
+    centre, radius = ball
+    deviation = cloud.log_scales.exp().amax(1)
+    distances = (cloud.means - centre).norm(dim=1)
+    plain = (cloud.logit_opacities.sigmoid() >= FAINT) & (deviation <= radius)
+    counted = plain | (distances + deviation <= radius)
+    means, distances, reach = cloud.means[counted], distances[counted], 2 * deviation[counted]
+    inner, order = (distances - reach).sort()
+    outer = (distances + reach)[order].cummax(0).values.clamp_min(radius)
+    after_gap = inner[1:] > outer[:-1] + GAP * radius
+    kept = order[: 1 + int((after_gap.cumsum(0) == 0).sum())]
+    means, reach = means[kept], reach[kept]
+    lowest, highest = (means - reach[:, None]).amin(0), (means + reach[:, None]).amax(0)
+    middle = (lowest + highest) / 2
+    return middle, float(((means - middle).norm(dim=1) + reach).max())
 
 
 def render(
