@@ -9,7 +9,6 @@ import re
 from collections.abc import Callable
 
 from benchmarks.markdown import markdown
-from benchmarks.models import loading, memory, precision, training_rate
 from benchmarks.quality import (
     default_against,
     failure_table,
@@ -85,12 +84,10 @@ SECTIONS: dict[str, dict[str, Callable[[], str]]] = {
         "overhead": variant_tables.overhead,
         "learned": toybox_variants.distillations,
         "looks": toybox_variants.looks,
-        "precision": precision.table,
     },
     "docs/failures.md": {"tables": failure_table.tables},
     "docs/formats.md": {"formats": formats.table, "producers": formats.producers},
-    "docs/mesh.md": {"front": mesh_quality.front, "conversion": start.conversion},
-    "docs/models.md": {"memory of models": memory.table},
+    "docs/mesh.md": {"front": mesh_quality.front},
     "docs/pruning.md": {"large prune": large_prune.table},
     "docs/rasteriser.md": {
         "presets": splatting.presets,
@@ -104,8 +101,6 @@ SECTIONS: dict[str, dict[str, Callable[[], str]]] = {
     "docs/step_time.md": {
         "step": start.step_parts,
         "start": start.first_step,
-        "imports": start.imports,
-        "stages": start.demo_stages,
         "default": default_against.table,
     },
     "docs/robustness.md": {"fuzz": robustness.fuzz, "long run": robustness.long_run},
@@ -120,9 +115,6 @@ SECTIONS: dict[str, dict[str, Callable[[], str]]] = {
         "toybox": toybox.results,
         "seeds": toybox.seeds,
         "judges": toybox.judges,
-        "training rate": training_rate.table,
-        "loading": loading.table,
-        "whole runs": start.whole_runs,
         "settings": toybox_variants.settings,
         "ablations": toybox_variants.ablations,
         "settings on a GPU": toybox_variants.settings_on_gpu,

@@ -46,7 +46,7 @@ ABLATIONS = ("growing", "counts", "prior_quality")
 PAPER_TITLES = {f"{name.upper()} {x:g}" for name, x in toybox_options.PAPER_SCALES.items()}
 """Lines at the guidance scale of their paper."""
 DISTILLED = "toybox_distilled"
-"""Runs of toybox.py with the models of distil_guidance.py."""
+"""Runs of toybox.py with a U-Net that takes the scale as an input."""
 DIVERSITY = "toybox_diversity"
 """Written by toybox_diversity.py."""
 ENOUGH = 8
@@ -75,7 +75,7 @@ def distillations() -> str:
 
 
 def distilled() -> list[tuple[str, ...]]:
-    """Return the line of toybox.yaml with the U-Net of benchmarks/models/distil_guidance.py; none
+    """Return the line of toybox.yaml with the U-Net that guidance was distilled into; none
     if it wasn't measured.
     """
     default = [row for row in all_runs() if row["variant"] == toybox_jobs.DEFAULT]

@@ -4,8 +4,7 @@
 
 Runs both checkouts alternately, each time in a new process and an empty folder, up to the end of
 the first step. Seconds are of all threads of the process, which other programs on the machine
-change little. Writes ``benchmarks/results/start.csv``. What the imports consist of:
-``benchmarks/start/import_times.py``."""
+change little. Writes ``benchmarks/results/start.csv``."""
 
 import statistics
 from pathlib import Path

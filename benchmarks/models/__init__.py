@@ -1,1 +1,0 @@
-"""The memory of published models, computed from their sizes."""
