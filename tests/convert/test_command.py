@@ -7,6 +7,7 @@ import pytest
 
 from tests.helpers.object_clouds import assert_close, ball
 from tests.helpers.ply_files import write_raw_gaussians
+from tests.helpers.pruning import FAST
 from threestudio_gaussiandreamer.convert.command import main
 from threestudio_gaussiandreamer.formats.gaussian_files import (
     WRITTEN,
@@ -14,6 +15,8 @@ from threestudio_gaussiandreamer.formats.gaussian_files import (
     read_cloud,
     write_cloud,
 )
+from threestudio_gaussiandreamer.prune import command as prune
+from threestudio_gaussiandreamer.view import command as view
 
 GAUSSIANS = {".glb": ["--gaussians"]}
 """Without it a .glb is a mesh."""
@@ -118,6 +121,8 @@ def test_rows_that_cant_be_drawn_are_left_out(tmp_path, caplog):
         (["none.ply", "a.glb"], "'none.ply' does not exist; near names"),
         (["in.ply", "nowhere/a.glb"], "OUT: there is no folder 'nowhere'"),
         (["in.ply", "in.ply"], "OUT is IN"),
+        (["in.ply", "device.ply"], "or .obj file, got '/dev/null'"),
+        (["in.ply", "lost.ply"], "OUT: there is no folder"),
         (["in.ply", "a.glb", "--spz-version", "4"], "--spz-version: OUT is a .glb file"),
         (["in.ply", "a.glb", "--from", "lgm", "--up", "z"], "--from and --up both say"),
         (["in.ply", "a.glb", "--view-size", "1"], "--view-size: expected a whole number"),
@@ -147,11 +152,28 @@ def test_errors_are_found_before_anything_is_written(
     write_cloud("empty.ply", StoredCloud(ball(0)))
     for name in ("text", "text.ply"):
         (tmp_path / name).write_text("hello")
+    (tmp_path / "device.ply").symlink_to("/dev/null")
+    (tmp_path / "lost.ply").symlink_to(tmp_path / "unplugged/a.ply")
     before = sorted(tmp_path.iterdir())
     assert main(arguments) == 2
     error = capsys.readouterr().err
     assert "invalid choice" in error if said is None else _matches(said, error)
     assert sorted(tmp_path.iterdir()) == before
+
+
+@pytest.mark.parametrize("command", [main, prune.main, view.main], ids=["convert", "prune", "view"])
+@pytest.mark.parametrize("exists", [True, False])
+def test_a_link_is_written_through(source, tmp_path, monkeypatch, command, exists):
+    """As someone does whose files are on another disk."""
+    suffix = ".html" if command is view.main else ".ply"
+    other, link = tmp_path / f"disk/cloud{suffix}", tmp_path / f"out{suffix}"
+    other.parent.mkdir()
+    link.symlink_to(other)
+    if exists:
+        other.write_text("earlier")
+    options = {prune.main: ["--count", "40", *FAST], view.main: ["--html"]}.get(command, [])
+    assert command([str(source), *options, str(link)]) == 0
+    assert link.is_symlink() and link.resolve() == other and other.stat().st_size > 100
 
 
 def _matches(pattern, text):

@@ -17,7 +17,7 @@ from typing import Any, Optional
 
 from ..core.command import joined_values, run_command
 from ..core.errors import UserError
-from ..core.files import existing_file, require_other_file, require_writable
+from ..core.files import existing_file, require_other_file, require_writable, through_link
 from ..core.memory import size_text
 from ..core.options import check_options, in_range
 from ..formats.gaussian_files import (
@@ -122,6 +122,7 @@ def run(args: argparse.Namespace) -> None:
     Raises:
         UserError: an option is invalid, a file can't be read or written, or it holds no Gaussians.
     """
+    args.output = str(through_link(args.output))
     mesh = to_mesh.writes_mesh(args)
     formats = WRITTEN if args.gaussians else tuple(dict.fromkeys((*WRITTEN, *WRITERS)))
     suffix = suffix_of(args.output) if mesh else require_format(args.output, "OUT", formats)

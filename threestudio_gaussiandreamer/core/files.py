@@ -159,6 +159,14 @@ def _shortened(name: str, size: int = 100) -> str:
     return name.encode(errors="surrogateescape")[:size].decode(errors="ignore")
 
 
+def through_link(path: str | os.PathLike) -> Path:
+    """Return the file that a user names for writing: where a link leads to, if ``path`` is one, as
+    :func:`atomic_file` would replace the link. Names that a program makes itself aren't followed:
+    a link in a folder of results may lead to a file that has to be kept.
+    """
+    return Path(os.path.realpath(path) if os.path.islink(path) else path)
+
+
 def require_writable(path: str | os.PathLike, what: str) -> None:
     """Check that a file can be written, before the work that makes its content.
 

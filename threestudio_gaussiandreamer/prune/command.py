@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, Optional
 
 from ..core.command import run_command
-from ..core.files import require_other_file, require_writable
+from ..core.files import require_other_file, require_writable, through_link
 from ..core.options import check_options
 from ..formats.gaussian_files import PRUNED_FORMATS, require_format, write_cloud
 from ..gaussians.axes import AXES, VIEWER_UP
@@ -94,6 +94,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         **{option.name: getattr(args, option.name) for option in fields(PruneOptions)}
     )
     check_options(PruneOptions, options, "--")
+    args.output = str(through_link(args.output))
     suffix = require_format(args.output, "OUT", PRUNED_FORMATS)
     for ending in ("", *REPORTS):
         require_writable(args.output + ending, f"OUT{ending}")

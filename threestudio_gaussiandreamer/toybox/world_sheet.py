@@ -12,7 +12,7 @@ from jaxtyping import UInt8
 
 from ..core.command import run_command
 from ..core.errors import UserError
-from ..core.files import require_writable
+from ..core.files import require_writable, through_link
 from ..core.images import write
 from ..core.options import shown
 from ..core.streams import numpy_generator
@@ -46,6 +46,7 @@ def run(args: argparse.Namespace) -> None:
     """Check the options, draw, and write the file."""
     if not 1 <= args.count <= MAX_COUNT:
         raise UserError(f"--count {shown(args.count)}: expected 1 to {MAX_COUNT} objects")
+    args.file = through_link(args.file)
     if args.file.suffix.lower() != ".png":
         raise UserError(f"FILE: expected the name of a PNG, got {shown(str(args.file))}")
     require_writable(args.file, "FILE")

@@ -17,7 +17,13 @@ from typing import Any, Optional
 
 from ..core.command import joined_values, run_command
 from ..core.errors import UserError
-from ..core.files import existing_file, is_folder, require_other_file, require_writable
+from ..core.files import (
+    existing_file,
+    is_folder,
+    require_other_file,
+    require_writable,
+    through_link,
+)
 from ..gaussians.axes import AXES
 from ..gaussians.views import EPS2D
 from ..splatting import PRESETS
@@ -102,7 +108,7 @@ def run(args: argparse.Namespace) -> None:
         run_folder(Path(args.path).expanduser(), args)
         return
     source = existing_file(args.path, "file of Gaussians or checkpoint")
-    out = Path(args.html) if args.html else source.with_suffix(".html")
+    out = through_link(args.html) if args.html else source.with_suffix(".html")
     require_writable(out, "--html")
     require_other_file(out, source, "--html OUT is PATH")
     if out.suffix.lower() not in PAGE_SUFFIXES:
