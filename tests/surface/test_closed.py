@@ -41,11 +41,14 @@ def test_small_parts_and_cavities_are_dropped():
     kept = without_small_parts(*joined(ball(0.05, 1, (2, 0, 0)), cavity, (vertices, faces)), 0.01)
     np.testing.assert_array_equal(kept[0], vertices)
     np.testing.assert_array_equal(kept[1], faces)
+    assert kept[2] == 1  # a cavity can't be seen
 
 
-def test_parts_above_the_share_stay():
-    two = joined(ball(), ball(0.5, 2, (2, 0, 0)))
-    assert len(without_small_parts(*two, 0.1)[1]) == len(two[1])
+@pytest.mark.parametrize(("radius", "dropped"), [(0.5, 0), (0.11, 0), (0.095, 1)])
+def test_parts_above_the_share_stay(radius, dropped):
+    two = joined(ball(), ball(radius, 2, (2, 0, 0)))
+    _, faces, count = without_small_parts(*two, 0.01)
+    assert count == dropped and (len(faces) == len(two[1])) == (not dropped)
 
 
 @pytest.mark.parametrize("factor", [2.0**-20, 2.0**20])

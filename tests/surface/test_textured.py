@@ -6,9 +6,11 @@ import sys
 import numpy as np
 import pytest
 import torch
+import trimesh
 
-from tests.helpers.painted_ball import painted_ball
+from tests.helpers.painted_ball import painted_ball, sphere_points
 from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
 from threestudio_gaussiandreamer.gaussians.views import FOVY, rasterize_views, views_around
 from threestudio_gaussiandreamer.meshes.raycast import MeshCaster
 from threestudio_gaussiandreamer.meshes.write import welded
@@ -47,11 +49,41 @@ def test_a_ball_becomes_a_closed_mesh_that_looks_like_it(method):
     assert psnr_to_cloud(mesh, gaussians) > 24
 
 
-def test_small_parts_are_dropped():
-    ball, speck = painted_ball(300), painted_ball(30, radius=0.03)
-    speck = speck._replace(means=speck.means + np.float32([1.2, 0, 0]))
-    both = type(ball)(*(np.concatenate(pair) for pair in zip(ball, speck, strict=True)))
-    assert mesh_from_gaussians(both, SMALL).vertices[:, 0].max() < 1
+def clouds_together(*clouds):
+    return Gaussians(*(np.concatenate(values) for values in zip(*clouds, strict=True)))
+
+
+def moved(cloud, offset):
+    return cloud._replace(means=cloud.means + np.float32(offset))
+
+
+def parts(mesh):
+    """Return the areas of the connected parts, relative to the whole, largest first."""
+    pieces = trimesh.Trimesh(mesh.vertices, mesh.faces).split(only_watertight=False)
+    areas = sorted((piece.area for piece in pieces), reverse=True)
+    return np.array(areas) / sum(areas)
+
+
+def test_a_speck_is_dropped_and_a_hat_stays(caplog):
+    ball, hat = painted_ball(300), moved(painted_ball(60, radius=0.13), [0, 0, 1.15])
+    speck = moved(painted_ball(30, radius=0.03), [1.2, 0, 0])
+    options = dataclasses.replace(SMALL, resolution=48)
+    mesh = mesh_from_gaussians(clouds_together(ball, hat, speck), options)
+    assert len(parts(mesh)) == 2 and parts(mesh)[1] < 0.04
+    assert mesh.vertices[:, 0].max() < 1 < mesh.vertices[:, 2].max()
+    assert caplog.text.count("loose parts below 1.00% of the area are left out") == 1
+
+
+def test_tips_that_simplification_cuts_off_are_dropped(caplog):
+    """Thin spikes break where fewer faces are left, and their tips float."""
+    ball, directions = painted_ball(300), sphere_points(20)
+    means = directions[:, None] * np.linspace(0.8, 1.3, 24)[:, None]
+    spikes = painted_ball(20 * 24)._replace(means=means.reshape(-1, 3).astype(np.float32))
+    spikes = spikes._replace(log_scales=np.full((20 * 24, 3), np.log(0.035), np.float32))
+    options = dataclasses.replace(SMALL, faces=200, resolution=48)
+    mesh = mesh_from_gaussians(clouds_together(ball, spikes), options)
+    assert len(parts(mesh)) == 1 and closed(mesh)
+    assert "loose parts below" in caplog.text
 
 
 def test_the_same_cloud_gives_the_same_mesh():

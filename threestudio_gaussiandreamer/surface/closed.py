@@ -22,21 +22,22 @@ APART = 0.05
 """Fraction of the way to their neighbours by which vertices at one position are moved apart."""
 
 
-def without_small_parts(vertices: Vertices, faces: Faces, share: float) -> tuple[Vertices, Faces]:
-    """Drop connected parts with less than ``share`` of the area, and surfaces of inner cavities."""
-    label = _parts(len(vertices), faces)[faces[:, 0]]
+def without_small_parts(
+    vertices: Vertices, faces: Faces, share: float
+) -> tuple[Vertices, Faces, int]:
+    """Drop connected parts with less than ``share`` of the area, and surfaces of inner cavities.
+
+    Returns:
+        the vertices and faces that are left, and the number of dropped parts that aren't cavities.
+    """
+    label = _labels(half_edges(faces), len(vertices))[faces[:, 0]]
     a, b, c = np.moveaxis(vertices[faces], 1, 0)
     normals = np.cross(b - a, c - a)
     area = np.bincount(label, np.linalg.norm(normals, axis=1))
     volume = np.bincount(label, np.einsum("fk,fk->f", a, normals))
     keep = (area >= share * area.sum()) & (volume > 0)
-    return used(vertices, faces[keep[label]])
-
-
-def used(vertices: Vertices, faces: Faces) -> tuple[Vertices, Faces]:
-    """Drop the vertices that no face uses."""
-    rows, index = np.unique(faces, return_inverse=True)
-    return vertices[rows], index.reshape(-1, 3)
+    rows, index = np.unique(faces[keep[label]], return_inverse=True)
+    return vertices[rows], index.reshape(-1, 3), int((~keep & (volume > 0)).sum())
 
 
 def simplified(vertices: Vertices, faces: Faces, count: int) -> tuple[Vertices, Faces]:
@@ -261,11 +262,6 @@ def _moved_apart(vertices: Vertices, faces: Faces, touching: Bool[np.ndarray, " 
     sums = [np.bincount(edges[:, 0], x[edges[:, 1]], len(vertices)) for x in vertices.T]
     toward = np.stack(sums, axis=1) / count[:, None] - vertices
     return vertices + APART * touching[:, None] * toward
-
-
-def _parts(count: int, faces: Faces) -> Int[np.ndarray, " V"]:
-    """Return the connected part of each of ``count`` vertices."""
-    return _labels(half_edges(faces), count)
 
 
 def _labels(links: Int[np.ndarray, "L 2"], count: int) -> Int[np.ndarray, " N"]:

@@ -8,6 +8,7 @@ from jaxtyping import Float, Int
 
 from ..core.errors import UserError
 from ..core.extras import require_extra
+from ..core.logs import warn
 from ..core.options import check_options
 from ..gaussians.gaussians import Gaussians, finite, opaque
 from ..gaussians.surface import MIN_OPACITY, gaussian_surface
@@ -53,10 +54,16 @@ def mesh_from_gaussians(
     fusion = DepthFusion(*_box(cloud), options.resolution) if options.method == "fusion" else None
     renders = render_around(cloud, options, fusion)
     vertices, faces = _extracted(gaussians, fusion, options)
-    vertices, faces = without_small_parts(vertices, faces, options.min_component)
+    vertices, faces, specks = without_small_parts(vertices, faces, options.min_component)
     if not len(faces):
         raise _no_surface(gaussians)
-    vertices, faces = simplified(vertices, faces, options.faces)
+    # simplification cuts through thin parts and opens cavities, so there are small ones again
+    vertices, faces, tips = without_small_parts(
+        *simplified(vertices, faces, options.faces), options.min_component
+    )
+    if specks + tips:
+        share = f"{options.min_component:.2%}"
+        warn(f"mesh: {specks + tips} loose parts below {share} of the area are left out")
     atlas = unwrap(vertices, faces, options.texture)
     mesh = Mesh(vertices[atlas.rows], atlas.faces, uv=atlas.uv)
     return mesh._replace(texture=bake(mesh, renders, options.texture))
