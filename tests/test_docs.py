@@ -94,7 +94,7 @@ def test_a_launch_that_is_shown_is_accepted(arguments, tmp_path, monkeypatch):
     overrides = [
         override
         for override in args.overrides
-        if not re.search("spiral-prior|front-first|variant.behind|extent", override)
+        if not re.search("spiral-prior|front-first|variant.behind|extent|density", override)
     ]  # extensions, tried below
     monkeypatch.chdir(tmp_path)
     check_config(load_config(*paths, cli_args=overrides))
@@ -122,6 +122,12 @@ PARTS = {
         "system.guidance.variant.behind=0.2",
     ],
     "custom/smooth_depth.py": ["system.loss.lambda_smooth_depth=1000"],
+    "custom/relocate.py": [
+        "system.geometry.density_type=relocate-density",
+        "system.geometry.density.every=1",
+        "system.geometry.density.min_opacity=0.1",
+        "system.geometry.budget=none",
+    ],
     "custom/extent.py": ["system.exporter.formats=[ply,extent]"],
     "custom/sky.py": [
         "system.background_type=sky-background",

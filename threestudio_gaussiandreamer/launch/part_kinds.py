@@ -22,6 +22,7 @@ from ..host import (
 )
 from ..priors.base import Prior
 from ..prompts.prompt_processors import TextEncoderPromptProcessor
+from ..training.density import DensityRule
 
 KINDS: dict[str, type] = {
     "data": pl.LightningDataModule,
@@ -32,6 +33,7 @@ KINDS: dict[str, type] = {
     "renderer": Rasterizer,
     "exporter": Exporter,
     "prior": Prior,
+    "density": DensityRule,
     "guidance": ScoreDistillation,
     "variant": Variant,
     "prompt_processor": TextEncoderPromptProcessor,

@@ -6,6 +6,7 @@ MODULES = (
     "training.data",
     "training.background",
     "training.renderer",
+    "training.density",
     "training.geometry",
     "priors.mesh",
     "priors.point_cloud",

@@ -1,8 +1,9 @@
-"""Density control: clone, split and prune Gaussians during training.
+"""Density control ``gaussiandreamer-density``: clone, split and prune Gaussians during training.
 
-As gsplat's ``Strategy``, one object is called around every optimiser step:
+As gsplat's ``Strategy``, one object is called around every optimiser step; another one is chosen by
+``system.geometry.density_type``:
 
-    control = DensityControl(cloud)
+    control = density_rule(cloud)
     pictures = renderer(**batch)
     control.before_backward(pictures, step)                    samples the removal error
     loss.backward()
@@ -17,6 +18,7 @@ budget: ``gaussians/importance.py``; the options: ``density_options.py``.
 
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple, Optional
 
@@ -25,12 +27,15 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..core.distributed import all_max, all_sum, draw_shared
+from ..core.errors import UserError
 from ..core.host_copies import to_device
+from ..core.methods import require_method
+from ..core.options import checked_options
 from ..core.streams import generator
 from ..gaussians import densify, importance
 from ..gaussians.densify import Change, Rules, Statistics
 from ..gaussians.importance import AddedBackground
-from ..host import run_seed
+from ..host import find, parse_structured, register, run_seed
 from ..metrics import psnr
 from ..splatting import Rasterized
 from .density_options import AUTO, min_count, rounds_of
@@ -70,17 +75,84 @@ class DensityOutcome(NamedTuple):
         )
 
 
-class DensityControl:
-    """Densification and pruning of one cloud.
+class DensityRule:
+    """Base class of density rules, whose hooks are called around every optimiser step; ``cfg`` are
+    its options, ``system.geometry.density``.
 
     Args:
-        cloud: a :class:`.geometry.GaussianCloud`, whose ``options`` are ``densify``,
-            ``prune``, ``budget``, ``min_gaussians`` and ``max_gaussians`` among others, and whose
-            buffers are the statistics.
+        cloud: a :class:`.geometry.GaussianCloud`, which :meth:`after_step` may change, by
+            ``cloud.apply_change`` where the number of Gaussians changes.
+
+    Raises:
+        UserError: an option isn't valid, or a hook takes other arguments.
     """
+
+    @dataclass
+    class Config:
+        pass
+
+    cfg: Any
 
     def __init__(self, cloud: Any) -> None:
         self.cloud, self.options = cloud, cloud.options
+        given = parse_structured(self.Config, cloud.cfg.density)
+        self.cfg = checked_options(self.Config, given, "system.geometry.density.")
+
+    def schedule_problem(self, step: int, max_steps: int) -> Optional[str]:
+        """Describe what keeps the rule from its aim between ``step`` and ``max_steps`` (-1:
+        unlimited), for a warning; None if nothing does.
+        """
+        if not self.options.densify.enabled and self.options.budget is None:
+            return None
+        return (
+            f"{type(self).__name__} reads neither system.geometry.densify nor budget: they are of "
+            "gaussiandreamer-density"
+        )
+
+    def before_backward(self, pictures: Mapping[str, Any], step: int) -> None:
+        """Look at the output of the renderer after ``step`` finished optimiser steps."""
+
+    def after_backward(
+        self, out: Rasterized, width: int, height: int, loss_scale: float = 1.0
+    ) -> None:
+        """Look at the gradients of a step, see :meth:`DensityControl.after_backward`."""
+
+    def after_step(
+        self, optimizer: torch.optim.Optimizer, step: int, check: Optional[QualityCheck] = None
+    ) -> Optional[DensityOutcome]:
+        """Change the cloud after ``step`` finished optimiser steps."""
+
+
+HOOKS = {
+    "schedule_problem": ("step", "max_steps"),
+    "before_backward": ("pictures", "step"),
+    "after_backward": ("out", "width", "height", "loss_scale"),
+    "after_step": ("optimizer", "step", "check"),
+}
+
+
+def density_rule(cloud: Any) -> DensityRule:
+    """Build the rule that ``density_type`` of a cloud names.
+
+    Raises:
+        UserError: there is none of that name, or it can't be used as one.
+    """
+    rule = find(cloud.cfg.density_type)
+    if not (isinstance(rule, type) and issubclass(rule, DensityRule)):
+        raise UserError(
+            f"system.geometry.density_type is {cloud.cfg.density_type!r}: expected a class that is "
+            f"derived from {DensityRule.__module__}.DensityRule"
+        )
+    for name, arguments in HOOKS.items():
+        require_method(rule, name, *arguments)
+    return rule(cloud)
+
+
+@register("gaussiandreamer-density")
+class DensityControl(DensityRule):
+    """Densification and pruning of one cloud, by the options ``densify``, ``prune``, ``budget``,
+    ``min_gaussians`` and ``max_gaussians`` of the cloud, whose buffers are the statistics.
+    """
 
     # -- schedules ---------------------------------------------------------------------------------
 

@@ -36,6 +36,8 @@ prune               how the budget is met (``importance.py``): start, stop, ever
                     first half of the rounds, since early in training importance changes much
 max_gaussians       largest count: those with the least importance are dropped (of untrained points:
                     a uniform choice); min_gaussians: the least count that pruning leaves
+density_type,       the rule that changes the number of Gaussians, and its options; densify, budget
+density             and prune are those of the default one, ``density.py``
 keep_attributes     with gaussians-prior: start from all attributes of that cloud, not only from
                     points and colours
 ==================  ================================================================================
@@ -110,6 +112,8 @@ class GaussianCloud(BaseGeometry):
         prune: PruneConfig = field(default_factory=PruneConfig)
         max_gaussians: int = field(default=500_000, metadata=at_least(1))
         min_gaussians: int = field(default=64, metadata=at_least(1))
+        density_type: str = "gaussiandreamer-density"
+        density: dict = field(default_factory=dict)
 
         def __post_init__(self) -> None:
             adopt_nested(self)

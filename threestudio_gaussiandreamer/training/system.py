@@ -53,7 +53,7 @@ from ..host import BaseLift3DSystem, C, find, info, register, validate_schedule,
 from ..metrics import psnr, psnr_of_error
 from ..priors.cache import cached_cloud
 from ..prune import PruneOptions
-from .density import DensityControl, RenderedQuality
+from .density import RenderedQuality, density_rule
 from .events import StepLog, log_scores
 from .export import GaussianSavers, export, exported_files
 from .finite import CHECK_EVERY, RecentLosses, require_finite, training_tensors, warn_if_invisible
@@ -133,7 +133,7 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         self.loss_weights = weight_schedules(self.options.loss)
         self.part_rates = PartRates(self.cfg.optimizer)
         super().configure()
-        self.density = DensityControl(self.geometry)
+        self.density = density_rule(self.geometry)
         self.image_targets = ImageTargets(self.options.image_targets)
         self.automatic_optimization = False
         self.__dict__["guidance"] = self.measurements = self.prompt_utils = None
@@ -271,7 +271,7 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         # The rows of the optimiser's state are changed with the Gaussians, so pass the torch
         # optimiser in Lightning's wrapper.
         outcome = self.density.after_step(optimizer.optimizer, self.global_step, check)
-        if outcome.measured:
+        if outcome and outcome.measured:
             self.step_log.write(self.trainer, outcome.measured)
             info(f"step {self.global_step}: {outcome}")
 

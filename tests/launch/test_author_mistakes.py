@@ -1,0 +1,93 @@
+"""Mistakes in a part of the user's own: one line that names the part and what was expected."""
+
+from pathlib import Path
+
+import pytest
+
+from threestudio_gaussiandreamer.launch.experiment import main
+
+TINY = [
+    "trainer.max_steps=3", "trainer.val_check_interval=3", "data.width=16", "data.height=16",
+    "data.eval_width=16", "data.eval_height=16", "data.n_test_views=2",
+    "system.geometry.prior.num_points=100", "system.geometry.budget=none",
+    "system.geometry.densify.enabled=false", "use_timestamp=false", "tag=t", "system.pages=false",
+]  # fmt: skip
+
+
+def run(source, *options):
+    """Train with ``custom/part.py`` in the working folder; return the exit code."""
+    Path("custom").mkdir(exist_ok=True)
+    Path("custom/part.py").write_text(source)
+    return main(["--config", "smoke.yaml", "--train", "--gpu", "cpu", *TINY, *options])
+
+
+DENSITY = """
+import torch
+from threestudio_gaussiandreamer.gaussians.densify import Change, prune_to
+from threestudio_gaussiandreamer.host import BaseObject, register
+from threestudio_gaussiandreamer.training.density import DensityRule
+
+@register("own-density")
+class Own(DensityRule):
+"""
+OWN_DENSITY = "system.geometry.density_type=own-density"
+
+
+def test_an_own_density_rule_is_called_around_every_step(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    source = """
+    def before_backward(self, pictures, step):
+        self.calls = [pictures["comp_rgb"].requires_grad, step]
+    def after_backward(self, out, width, height, loss_scale):
+        self.calls += [out.means2d.grad is not None, width]
+    def after_step(self, optimizer, step, check=None):
+        self.calls += [step]
+        open("calls", "a").write(f"{self.calls}\\n")
+        count = len(self.cloud) - 10
+        highest = prune_to(self.cloud.parameters_by_name(), self.cloud.opacities(), count)
+        self.cloud.apply_change(highest, optimizer)
+"""
+    assert run(DENSITY + source, OWN_DENSITY) == 0
+    expected = [f"[True, {n}, True, 16, {n + 1}]" for n in range(3)]
+    assert Path("calls").read_text().splitlines() == expected
+    ply = next(Path("outputs").rglob("gaussians.ply")).read_bytes()
+    assert f"element vertex {200 - 30}".encode() in ply[:200]
+
+
+MISTAKES = {
+    "density rule: misspelt name": (
+        DENSITY + "    pass",
+        ["system.geometry.density_type=own-densty"],
+        "system.geometry.density_type: unknown part 'own-densty': did you mean 'own-density'?",
+    ),
+    "density rule: misspelt option": (
+        DENSITY + "    pass",
+        [OWN_DENSITY, "system.geometry.density.evry=5"],
+        "unknown key 'system.geometry.density.evry'",
+    ),
+    "density rule: a part of another kind": (
+        DENSITY + "    pass",
+        ["system.geometry.density_type=mesh-prior"],
+        "choose from gaussiandreamer-density, own-density",
+    ),
+    "density rule: no base class": (
+        DENSITY.replace("Own(DensityRule)", "Own(BaseObject)") + "    pass",
+        [OWN_DENSITY],
+        "expected a class that is derived from threestudio_gaussiandreamer.training.density.",
+    ),
+    "density rule: a hook with other arguments": (
+        DENSITY + "    def after_step(self, optimizer): pass",
+        [OWN_DENSITY],
+        "Own has after_step(self, optimizer), which is called as after_step(optimizer, step",
+    ),
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_a_mistake_is_one_line_that_names_the_part(mistake, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    source, options, message = MISTAKES[mistake]
+    assert run(source, *options) == 2
+    errors = capsys.readouterr().err
+    assert message in errors and "Traceback" not in errors, errors
+    assert sum(line.startswith("error: ") for line in errors.splitlines()) == 1
