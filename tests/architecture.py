@@ -5,6 +5,7 @@ the markers of ``docs/architecture.md``; ``tests/test_structure.py`` fails if ei
 """
 
 import ast
+import functools
 import re
 import textwrap
 from collections.abc import Iterator
@@ -74,6 +75,13 @@ def sources() -> list[Path]:
     return [path for path in sorted(PACKAGE.rglob("*.py")) if path != PACKAGE / "__init__.py"]
 
 
+@functools.cache
+def modules() -> frozenset[str]:
+    """Return the absolute names of the package's modules and folders."""
+    paths = [path.relative_to(ROOT).with_suffix("") for path in sources()]
+    return frozenset(".".join(p.parts) for path in paths for p in (path, path.parent))
+
+
 def ring_of() -> dict[str, int]:
     """Map each room to the index of its ring."""
     return {room: index for index, ring in enumerate(RINGS) for room in ring.rooms}
@@ -81,20 +89,24 @@ def ring_of() -> dict[str, int]:
 
 def imports(path: Path) -> Iterator[tuple[str, bool]]:
     """Yield (absolute module, whether at module level) for every import statement of a file."""
-    package = [NAME, *path.relative_to(PACKAGE).parent.parts]
     tree = ast.parse(path.read_text())
     top_level = {id(node) for node in tree.body}
     for node in ast.walk(tree):
-        if isinstance(node, ast.Import):
-            yield from ((alias.name, id(node) in top_level) for alias in node.names)
-        elif isinstance(node, ast.ImportFrom):
-            base = package[: len(package) - node.level + 1] if node.level else []
-            module = ".".join([*base, *filter(None, [node.module])])
-            # "from .. import x" names a room, or a name of the package itself
-            names = [module]
-            if module == NAME:
-                names = [f"{NAME}.{x.name}" for x in node.names if x.name in ring_of()]
-            yield from ((name, id(node) in top_level) for name in names)
+        yield from ((name, id(node) in top_level) for name in imported(node, path))
+
+
+def imported(node: ast.AST, path: Path) -> list[str]:
+    """Return the absolute modules that a statement of the file ``path`` imports."""
+    if isinstance(node, ast.Import):
+        return [alias.name for alias in node.names]
+    if not isinstance(node, ast.ImportFrom):
+        return []
+    package = [NAME, *path.relative_to(PACKAGE).parent.parts]
+    base = package[: len(package) - node.level + 1] if node.level else []
+    module = ".".join([*base, *filter(None, [node.module])])
+    # "from .. import x" names a room, a module, or a name of the package itself
+    names = {f"{module}.{alias.name}" for alias in node.names}
+    return sorted(names & modules() or {module} - {NAME})
 
 
 def arrows() -> dict[tuple[str, str], int]:

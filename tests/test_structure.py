@@ -58,7 +58,9 @@ MOST_EQUAL_LINES = 5
 PUNCTUATION = "()[]{}<>*,;:'\" "
 KERNEL_SOURCES = {".cpp", ".cu", ".cuh", ".h"}
 CODE = [
-    path for top in (NAME, "tests", "benchmarks") for path in sorted((ROOT / top).rglob("*.py"))
+    path
+    for top in (NAME, "tests", "benchmarks", "tools")
+    for path in sorted((ROOT / top).rglob("*.py"))
 ]
 
 
