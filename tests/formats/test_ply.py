@@ -147,9 +147,7 @@ class TestGaussians:
         ply.read_gaussians(tmp_path / "a.ply")
         assert not caplog.text
         (tmp_path / "b.ply").write_bytes(
-            (tmp_path / "a.ply")
-            .read_bytes()
-            .replace(b"property float nx", b"property float thing")
+            (tmp_path / "a.ply").read_bytes().replace(b"property float nx", b"property float thing")
         )
         ply.read_gaussians(tmp_path / "b.ply")
         assert "b.ply: unknown properties are left out: thing" in caplog.text

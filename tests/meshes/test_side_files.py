@@ -97,6 +97,34 @@ def test_options_of_a_texture_are_no_part_of_its_name(before, tmp_path, caplog):
     assert not caplog.text
 
 
+@pytest.mark.parametrize(
+    ("file", "written", "encoding"),
+    [
+        ("my toy/grün 1.png", "my toy/grün 1.png", "utf-8"),
+        ("grün.png", "grün.png", "latin-1"),
+        ("木头.png", "木头.png", "gbk"),
+        ("текстура.png", "текстура.png", "cp1251"),
+        ("テクスチャ.png", "テクスチャ.png", "shift_jis"),
+        ("gru\u0308n.png", "gr\u00fcn.png", "utf-8"),
+        ("gr\u00fcn.png", "gru\u0308n.png", "utf-8"),
+        ("my tex.png", '"my tex.png"', "utf-8"),
+        ("my tex.png", r"my\ tex.png", "utf-8"),
+        ("my tex.png", "my%20tex.png", "utf-8"),
+        ("T.PNG", "t.png", "utf-8"),
+    ],
+)
+def test_names_with_spaces_and_other_letters_are_found(file, written, encoding, tmp_path, caplog):
+    """As Windows, macOS and converters write them, in the OBJ and in its MTL."""
+    place = tmp_path / file
+    place.parent.mkdir(exist_ok=True)
+    place.write_bytes(png(np.uint8([[0x80]])))
+    library = place.with_suffix(".mtl").relative_to(tmp_path)
+    (tmp_path / library).write_bytes(f"newmtl m\nmap_Kd {written}\n".encode(encoding))
+    stem = written.replace(".PNG", ".png").replace(".png", ".mtl")
+    (tmp_path / "a.obj").write_bytes(f"mtllib {stem}\n{TRIANGLE}".encode(encoding))
+    assert load_mesh(tmp_path / "a.obj").texture is not None and not caplog.text
+
+
 @pytest.mark.parametrize("name", ["p.png", "p.exr", "P.PNG "])
 @pytest.mark.parametrize("content", [b"", b"not a picture"])
 def test_a_texture_of_an_obj_that_is_no_picture_is_refused(name, content, tmp_path):

@@ -6,11 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from threestudio_gaussiandreamer.formats.ply import read_points
 from threestudio_gaussiandreamer.gaussians.point_cloud import PointCloud
 from threestudio_gaussiandreamer.host import BaseObject
 from threestudio_gaussiandreamer.priors.cache import cache_key, cached_cloud
+from threestudio_gaussiandreamer.priors.mesh import MeshPrior
 
 
 class CountingPrior(BaseObject):
@@ -83,6 +85,25 @@ def test_a_changed_file_runs_the_prior_again(tmp_path):
         os.utime(file, ns=(1, 1))  # as long as before
         cached_cloud(FilePrior({"source": str(source)}), "a fox", tmp_path / f"save {source.name}")
         assert FilePrior.calls == 3
+
+
+def test_a_changed_texture_beside_a_mesh_runs_the_prior_again(tmp_path, monkeypatch):
+    """Also one that was missing, and one that a material file names."""
+    corners = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\n"
+    (tmp_path / "a.obj").write_text(f"mtllib a.mtl\n{corners}usemtl m\nf 1/1 2/2 3/3\n")
+    (tmp_path / "a.mtl").write_text("newmtl m\nmap_Kd textures/t.png\n")
+    (tmp_path / "textures").mkdir()
+    colors = []
+    for shade in (None, 40, 200, 200):
+        if shade is not None:
+            image = Image.new("RGB", (1, 1), (shade, 0, 0))
+            image.save(tmp_path / "textures" / "t.png")
+            os.utime(tmp_path / "textures" / "t.png", ns=(shade, shade))
+        prior = MeshPrior({"path": str(tmp_path / "a.obj")})
+        colors.append(cached_cloud(prior, "a fox", tmp_path / "save").colors[0, 0] * 255)
+    np.testing.assert_allclose(colors, [127.5, 40, 200, 200], atol=0.5)
+    monkeypatch.setattr(MeshPrior, "generate", lambda self, prompt, generator: pytest.fail())
+    cached_cloud(MeshPrior({"path": str(tmp_path / "a.obj")}), "a fox", tmp_path / "save")
 
 
 @pytest.mark.parametrize("source", ["grey", "", "no\0name", "~no-such-user/x", 300 * "x"])

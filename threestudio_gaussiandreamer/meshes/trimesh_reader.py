@@ -14,7 +14,7 @@ from .check import check_mesh_file
 from .colors import linear_to_srgb, unit_rgb
 from .gltf import LARGEST_UV
 from .mesh import Mesh
-from .side_files import SideFiles
+from .side_files import SideFiles, utf8
 from .textures import decode_image, open_texture
 
 MATERIALS = ".mtl"
@@ -52,6 +52,7 @@ def _parts(path: Path, budget: Budget) -> list[Mesh]:
     import trimesh
 
     files, content = _Resolver(path, budget), path.read_bytes()
+    content = utf8(content) if path.suffix.lower() == ".obj" else content
     scene = trimesh.load_scene(
         io.BytesIO(content),
         file_type=path.suffix.lower().lstrip("."),
@@ -120,7 +121,8 @@ class _Resolver:
     def get(self, name: str) -> bytes:
         try:
             content = self._files.read(name, TEXTURE_OPTIONS.sub("", name))
-            if content is not None and not name.strip().lower().endswith(MATERIALS):
+            is_library = name.strip("\"' \t").lower().endswith(MATERIALS)
+            if content is not None and not is_library:
                 # trimesh would read the part without a texture that can't be opened
                 open_texture(content, repr(name[:80]), self.budget)
         except UserError as error:
@@ -128,7 +130,7 @@ class _Resolver:
             raise
         if content is None:
             raise FileNotFoundError(name)
-        return content
+        return utf8(content) if is_library else content
 
     __getitem__ = get
 

@@ -18,6 +18,7 @@ from ..formats.array_files import read_arrays
 from ..formats.ply import write_points
 from ..gaussians.point_cloud import PointCloud
 from ..host import info, run_seed, warn
+from ..meshes.side_files import consulted, stamp
 from .base import points_of
 from .turntable import save_turntable
 
@@ -28,7 +29,8 @@ MAX_FILES = 1000
 
 def cached_cloud(prior: Any, prompt: str, save_dir: Optional[str]) -> PointCloud:
     """Return ``prior(prompt)``, read from ``save/prior/points.npz`` if that file is of the same
-    prior, options, files, prompt and seed.
+    prior, options, files, prompt and seed, and the files beside a mesh (textures, materials) are
+    as they were.
 
     ``points.ply`` and ``turntable.gif`` are written beside it, for inspection. If ``save_dir`` is
     None, nothing is read or written."""
@@ -39,12 +41,14 @@ def cached_cloud(prior: Any, prompt: str, save_dir: Optional[str]) -> PointCloud
     if cloud is not None:
         info(f"the prior's points come from {path}")
         return cloud
+    consulted.clear()
     cloud = points_of(prior, prompt)
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_file(path) as file:
         np.savez_compressed(
             file,
             key=np.array(key),
+            beside=np.array(json.dumps(list(consulted.items()))),
             **{name: value for name, value in cloud._asdict().items() if value is not None},
         )
     write_points(path.with_suffix(".ply"), cloud)
@@ -57,8 +61,7 @@ def cached_cloud(prior: Any, prompt: str, save_dir: Optional[str]) -> PointCloud
 
 def cache_key(prior: Any, prompt: str) -> str:
     """Return a digest of what the prior's output depends on: also of the files that its options
-    name (but not of those that these name, such as textures) and of the code of its class, which
-    may have changed between two runs.
+    name and of the code of its class, which may have changed between two runs.
     """
     options = (
         OmegaConf.to_container(prior.cfg) if OmegaConf.is_config(prior.cfg) else vars(prior.cfg)
@@ -104,11 +107,16 @@ def _code(kind: type) -> Iterator[tuple[str, str]]:
 
 
 def read_cache(path: Path, key: str) -> Optional[PointCloud]:
-    """Return the cached cloud; None if there is none, its key differs, or the file is damaged."""
+    """Return the cached cloud; None if there is none, its key or a file beside the mesh differs, or
+    the file is damaged.
+    """
     if not path.is_file():
         return None
+    names = ["key", "beside", "points", "colors"]
     try:
-        data = read_arrays(path, "cache", ["key", "points", "colors"], ["normals", "faces"])
-    except UserError:
+        data = read_arrays(path, "cache", names, ["normals", "faces"])
+        beside = json.loads(str(data.pop("beside")))
+    except (UserError, ValueError):
         return None
-    return None if str(data.pop("key")) != key else PointCloud(**data)
+    changed = any(stamp(file) != (found and tuple(found)) for file, found in beside)
+    return None if str(data.pop("key")) != key or changed else PointCloud(**data)
