@@ -23,8 +23,6 @@ from benchmarks.quality import tables as quality
 from benchmarks.quality import toybox_tables as toybox
 from benchmarks.quality.runs import ROOT
 from benchmarks.quality.tables import DIFFERENCES, difference_row, last_rows, medians, named
-from benchmarks.robustness import ddp
-from benchmarks.robustness import scale_tables as scale
 from benchmarks.robustness import tables as robustness
 from benchmarks.splatting import block_pairs, growth, half_precision, kernel_tables
 from benchmarks.splatting import tables as splatting
@@ -81,7 +79,6 @@ SECTIONS: dict[str, dict[str, Callable[[], str]]] = {
         "blind": variant_tables.blind,
         "from a ball": variant_tables.from_ball,
         "cheaper": variant_tables.cheaper,
-        "overhead": variant_tables.overhead,
         "learned": toybox_variants.distillations,
         "looks": toybox_variants.looks,
     },
@@ -108,7 +105,6 @@ SECTIONS: dict[str, dict[str, Callable[[], str]]] = {
     "docs/viewing.md": {
         "quality": viewers.page_quality,
         "speed": viewers.page_speed,
-        "live": viewers.live_view,
     },
     "docs/toybox.md": {
         "models": toybox.card,
@@ -120,15 +116,7 @@ SECTIONS: dict[str, dict[str, Callable[[], str]]] = {
         "settings on a GPU": toybox_variants.settings_on_gpu,
         "wrong priors": toybox_variants.wrong_priors,
     },
-    "docs/several_processes.md": {"ddp": ddp.table},
     "docs/tried.md": {"tried": tried.table},
-    "docs/scale.md": {
-        "units": scale.unit_costs,
-        "stated": scale.stated,
-        "runs": scale.runs,
-        "storage": scale.storage,
-        "limits": scale.limits,
-    },
 }
 
 

@@ -63,7 +63,6 @@ CONSTANTS = {
     ],
 }
 PUBLISHED = {
-    "docs/scale.md": ["The 15 minutes of GaussianDreamer"],
     "docs/evaluation.md": ["100 times the cosine", "428 M, 1.7 GB", "2.5 G, 10 GB"],
     "docs/models.md": [
         "1.7 + 0.2 GB, text encoder 1.4 GB",

@@ -4,10 +4,9 @@ import math
 from collections.abc import Iterable
 from typing import Optional
 
-from benchmarks.markdown import markdown, read
+from benchmarks.markdown import markdown
 from benchmarks.quality.chart_runs import PAPER, Row, ends, grouped, median, objects_of
 from benchmarks.quality.runs import rows_of
-from benchmarks.quality.tables import RESULTS
 from benchmarks.quality.variant_charts import DIVERSITY, at_best, of_one_machine
 from benchmarks.quality.variants import (
     BINNED,
@@ -25,21 +24,6 @@ from benchmarks.quality.variants import (
 
 LENGTHS = ("SDS, a quarter of the steps", "SDS, half the steps", SDS, "SDS, twice the steps")
 """SDS at several numbers of evaluations, to compare the others with."""
-
-
-def overhead() -> str:
-    """Return the CPU time of each variant beside its calls of the score model, at each size."""
-    rows = read(RESULTS / "variant_overhead.csv")
-    setting = "{gaussians} Gaussians, {views} views, an empty score model, {machine}"
-    sizes = list(dict.fromkeys(row["size"] for row in rows))
-    lines = [
-        [name, own[-1]["evaluations"]]
-        + [cell for row in own for cell in (row["extra_ms"], row["percent"])]
-        for name, own in grouped(rows, lambda row: row["variant"]).items()
-    ]
-    heads = ["variant", "calls per view"]
-    heads += [head for size in sizes for head in (f"{size}²: ms more than SDS", "% of a step")]
-    return f"{setting.format(**rows[0])}:\n\n{markdown(heads, lines)}"
 
 
 def last(rows: Iterable[Row]) -> list[Row]:
