@@ -1,11 +1,14 @@
 """The page's text: its size, what it may load, and prompts that look like code."""
 
+import base64
 import html
+import io
 import json
 import re
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from tests.view.clouds import PROMPT, cloud, options
 from threestudio_gaussiandreamer.core.errors import UserError
@@ -48,6 +51,32 @@ def test_the_page_knows_how_the_cloud_was_trained():
     text = page(Shown(cloud(3), "result"), options(eps2d=0.1, antialias=True, alpha_min=1 / 255))
     settings = meta(text)["settings"]
     assert settings["eps2d"] == 0.1 and settings["antialias"] and settings["alphaMin"] == 1 / 255
+
+
+@pytest.mark.parametrize(
+    "color, background, keep, expected",
+    [
+        ("white", "#ffffff", False, "#202020"),
+        ("white", "#ffffff", True, "#ffffff"),
+        ("black", "#000000", False, "#ffffff"),
+        ("orange", "#ffffff", False, "#ffffff"),
+        ("orange", "#00ff00", False, "#00ff00"),
+        ("black and white", "#ffffff", False, "#808080"),
+    ],
+)
+def test_an_object_does_not_vanish_on_the_background(color, background, keep, expected):
+    """Unless the user has chosen the background."""
+    colors = {"white": [1, 1, 1], "black": [0, 0, 0], "orange": [1, 0.5, 0]}
+    shown = cloud(2000, size=0.05, stretch=0.0, logit=9.0)
+    drawn = np.array([colors[color.split()[i % 2 and -1]] for i in range(2000)], np.float32)
+    shown.gaussians.sh[:, 0] = (drawn - 0.5) / 0.28209479
+    rgb = tuple(x / 255 for x in bytes.fromhex(background[1:]))
+    how = options()._replace(background=rgb, keep_background=keep)
+    text = page(Shown(shown, "result"), how)
+    assert meta(text)["background"] == expected
+    poster = re.search(r'src="data:image/webp;base64,([^"]*)"', text)[1]
+    corner = Image.open(io.BytesIO(base64.b64decode(poster))).convert("RGB").getpixel((2, 2))
+    assert np.allclose(corner, list(bytes.fromhex(expected[1:])), atol=3)
 
 
 def test_gaussians_with_nan_are_left_out_with_a_warning(caplog):

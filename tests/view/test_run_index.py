@@ -17,6 +17,7 @@ from benchmarks.viewers.browser import chromium
 from benchmarks.viewers.devtools import open_page
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.core.images import write
+from threestudio_gaussiandreamer.view.cloud_page import cloud_page
 from threestudio_gaussiandreamer.view.gallery import write_gallery
 from threestudio_gaussiandreamer.view.run_index import note_time, write_index
 
@@ -98,6 +99,21 @@ def test_numbers_are_written_as_in_the_terminal(full_run):
     assert ">10,000<" in text and ">123,456<" in text
     assert "<td>25 %</td><td>12,345,678</td>" in text and "e+0" not in text
     assert "sides look alike" in text
+
+
+def test_a_background_that_a_command_has_set_is_kept(full_run):
+    source = full_run / "save" / "it7-export" / "gaussians.spz"
+    assert not cloud_page(source)[1].keep_background
+    (full_run / "cmd.txt").write_text("--train system.background.color=[0,1,0]\n")
+    assert cloud_page(source)[1].keep_background
+
+
+def test_a_white_object_does_not_vanish_on_the_page(full_run):
+    poster = np.zeros((8, 8, 4), np.uint8)
+    poster[2:6, 2:6] = 255
+    write(full_run / "save" / "it7-export" / "poster.png", poster)
+    for page in (write_index(full_run), write_gallery(full_run.parent)):
+        assert re.search(r'<img [^>]*poster.png"[^>]*style="background: #202020"', page.read_text())
 
 
 @pytest.mark.skipif(chromium() is None, reason="no Chromium is installed")

@@ -24,13 +24,12 @@ from ..gaussians.gaussians import Gaussians
 from ..host import warn
 from ..view.page import (
     MAX_GAUSSIANS,
-    WHITE,
     PageOptions,
     Shown,
     decibels,
     page,
 )
-from ..view.poster import picture
+from ..view.poster import WHITE, picture
 from ..view.render import RenderSettings, first_pose
 from ..view.run_files import RunFiles
 from .background import FlatBackground
@@ -120,6 +119,7 @@ def _page_options(system: Any, run: RunFiles) -> PageOptions:
         name="gaussians",
         settings=settings,
         background=_background(system.background),
+        keep_background=run.background_is_given,
     )
 
 

@@ -9,7 +9,8 @@ from ..formats.gaussian_files import StoredCloud
 from ..gaussians.axes import AXES
 from ..gaussians.views import NEAR, bounds
 from ..splatting import PRESETS
-from .page import WHITE, PageOptions, Shown, decibels, require_page_size
+from .page import PageOptions, Shown, decibels, require_page_size
+from .poster import WHITE
 from .reading import read_any
 from .render import RenderSettings
 from .run_files import RunFiles
@@ -34,7 +35,7 @@ def cloud_page(
         title: by default the prompt of the run, or the file's name.
         eps2d: screen-space dilation, square pixels.
         preset: of the rasteriser, for the smallest alpha that is drawn.
-        background: RRGGBB.
+        background: RRGGBB; by default the run's or white, unless the object would vanish on it.
         up: the axis of the file that is up; by default from the file or its format's convention.
 
     Raises:
@@ -59,6 +60,7 @@ def cloud_page(
         name=source.stem,
         settings=settings._replace(**{name: x for name, x in given.items() if x is not None}),
         background=color or (run_files and run_files.background) or WHITE,
+        keep_background=bool(color or (run_files and run_files.background_is_given)),
     )
     quality = decibels(run_files.psnr("result")) if _is_result(source, run_files) else ""
     return Shown(stored, "result", quality), options

@@ -9,7 +9,7 @@ from ..core.logs import warn
 from .page import decibels
 from .run_files import RunFiles, is_run, step_of
 from .run_index import NAME, write_index
-from .static_page import address, document, element, is_own_page, media
+from .static_page import address, backdrop_style, document, element, is_own_page, media
 
 MAX_DEPTH = 3
 """Folders between the gallery's and a run's: an experiment's, and a sweep's above it."""
@@ -69,4 +69,6 @@ def _picture(run: RunFiles, folder: Path) -> str:
     found = [path for path in (*poster, *reversed(views)) if path.is_file()]
     if not found:
         return ""
-    return media("img", src=address(found[0], folder), alt="", loading="lazy")
+    return media(
+        "img", src=address(found[0], folder), alt="", loading="lazy", **backdrop_style(found[0])
+    )

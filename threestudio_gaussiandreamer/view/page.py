@@ -29,7 +29,7 @@ from ..gaussians.axes import WORLD_UP, rotation_between
 from ..gaussians.gaussians import finite
 from ..splatting.options import RasterizeOptions
 from .page_data import coarse, packed
-from .poster import picture
+from .poster import WHITE, Color, backdrop, hex_color, picture
 from .render import Pose, RenderSettings, first_pose, require_gaussians
 
 WEB = Path(__file__).with_name("web")
@@ -39,7 +39,6 @@ MAX_GAUSSIANS = 2_000_000
 """A browser takes minutes to open a page with more, or runs out of memory."""
 POSTER_SIZE = 320
 """Width and height in pixels of the picture that a browser without WebGL2 shows."""
-WHITE = (1.0, 1.0, 1.0)
 
 
 class Shown(NamedTuple):
@@ -59,8 +58,9 @@ class PageOptions(NamedTuple):
     name: str
     """Name, without extension, of the files that the page saves."""
     settings: RenderSettings
-    background: tuple[float, float, float] = WHITE
-    """RGB in [0, 1]."""
+    background: Color = WHITE
+    keep_background: bool = False
+    """Whether the object may vanish on it, since the user has chosen it."""
 
 
 def write_page(
@@ -89,6 +89,9 @@ def page(shown: Shown, options: PageOptions, before: Optional[Shown] = None) -> 
         before = _checked(before, before.label)
         clouds.append(before._replace(cloud=_coarse(before.cloud)))
     pose = first_pose(shown.cloud)
+    poster = picture(shown.cloud, options.settings, pose, POSTER_SIZE)
+    if not options.keep_background:
+        options = options._replace(background=backdrop(poster, options.background))
     script = sources(SCRIPTS)
     style = sources(["page.css"])
     fields = {
@@ -97,7 +100,7 @@ def page(shown: Shown, options: PageOptions, before: Optional[Shown] = None) -> 
         "style": style,
         "script": script,
         "meta": _script_json(_meta(clouds, options, pose)),
-        "poster": _poster(shown.cloud, options.settings, pose),
+        "poster": _poster(poster, options.background),
         "data": _data_blocks(clouds),
         **{name: sources([name]) for name in SHADERS},
     }
@@ -136,7 +139,7 @@ def _meta(clouds: Sequence[Shown], options: PageOptions, pose: Pose) -> dict[str
     return {
         "title": options.title,
         "name": options.name,
-        "background": "#" + bytes(round(255 * x) for x in options.background).hex(),
+        "background": hex_color(options.background),
         "camera": pose._asdict(),
         "clouds": [_facts(shown) for shown in clouds],
         "plyHeader": header.decode("ascii"),
@@ -177,10 +180,12 @@ def _data_blocks(clouds: Sequence[Shown]) -> str:
     )
 
 
-def _poster(cloud: StoredCloud, settings: RenderSettings, pose: Pose) -> str:
-    """Return the first view as the address of an embedded WebP picture with transparency."""
-    file = io.BytesIO()
-    picture(cloud, settings, pose, POSTER_SIZE).save(file, "webp", quality=75)
+def _poster(poster: Any, background: Color) -> str:
+    """Return the first view as the address of an embedded WebP picture."""
+    file, opaque = io.BytesIO(), poster.copy()
+    opaque.paste(hex_color(background), (0, 0, *poster.size))
+    opaque.alpha_composite(poster)
+    opaque.convert("RGB").save(file, "webp", quality=75)
     return "data:image/webp;base64," + base64.b64encode(file.getvalue()).decode()
 
 

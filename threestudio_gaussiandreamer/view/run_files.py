@@ -96,6 +96,11 @@ class RunFiles:
         return as_color(color)
 
     @property
+    def background_is_given(self) -> bool:
+        """Whether a command of the run has set the background."""
+        return "system.background.color=" in read_text(self.folder / "cmd.txt")
+
+    @property
     def export(self) -> Optional[Path]:
         """The folder of the exports of the latest step; None if there are none."""
         found = [(step_of(path), path) for path in self.save.glob("it*-export") if path.is_dir()]

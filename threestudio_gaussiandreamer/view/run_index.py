@@ -11,7 +11,7 @@ from ..core.files import atomic_file, json_text
 from .config_changes import config_changes
 from .curves import number, read_curves, svg
 from .run_files import RunFiles, read_json, read_text, step_of
-from .static_page import address, document, element, link, media, section, table
+from .static_page import address, backdrop_style, document, element, link, media, section, table
 
 NAME = "index.html"
 CURVES = {
@@ -131,7 +131,7 @@ def _pictures(run: RunFiles) -> Iterator[str]:
 
 def _figure(path: Path, run: RunFiles) -> str:
     where = address(path, run.folder)
-    picture = media("img", src=where, alt=path.name, loading="lazy")
+    picture = media("img", src=where, alt=path.name, loading="lazy", **backdrop_style(path))
     caption = element("figcaption", str(path.relative_to(run.save)))
     return f'<figure><a href="{where}">{picture}</a>{caption}</figure>'
 

@@ -7,6 +7,8 @@ from functools import cache
 from pathlib import Path
 from urllib.parse import quote
 
+from .poster import backdrop_of_file, hex_color
+
 WEB = Path(__file__).with_name("web")
 POLICY = "script-src 'none'; object-src 'none'; base-uri 'none'; form-action 'none'"
 
@@ -65,6 +67,12 @@ def address(path: Path, page_folder: Path) -> str:
     """Return the relative address of a file from a page in ``page_folder``."""
     # as bytes, since a name needn't be UTF-8
     return quote(os.fsencode(os.path.relpath(path, page_folder).replace(os.sep, "/")))
+
+
+def backdrop_style(picture: Path) -> dict[str, str]:
+    """Return the attribute that keeps a picture's object from vanishing on the page's white."""
+    color = backdrop_of_file(picture)
+    return {"style": f"background: {hex_color(color)}"} if color else {}
 
 
 def link(path: Path, page_folder: Path, text: str) -> str:
