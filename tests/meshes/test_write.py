@@ -72,6 +72,31 @@ class TestBothFormats:
         assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize(
+    ("file", "given", "name"),
+    [
+        ("a red fox", "", "a_red_fox"),
+        ("mesh", "a DSLR photo of\na 狐", "a_DSLR_photo_of_a_狐"),
+        ("grün", "x" * 80, "x" * 63),
+    ],
+)
+def test_everything_has_the_name_of_the_asset(file, given, name, tmp_path):
+    """Blender and others show these names; trimesh calls what has none geometry_0."""
+    for suffix in (".glb", ".obj"):
+        write_textured_mesh(tmp_path / f"{file}{suffix}", MESH, name=given)
+        scene = trimesh.load_scene(tmp_path / f"{file}{suffix}")
+        (geometry,) = scene.geometry.values()
+        assert geometry.visual.material.name == name and geometry.visual.uv is not None
+        if suffix == ".glb":
+            assert list(scene.geometry) == list(scene.graph.nodes_geometry) == [name]
+    kinds = ("nodes", "meshes", "materials", "textures", "images")
+    found = document(tmp_path / f"{file}.glb")
+    assert [found[kind][0]["name"] for kind in kinds] == [name] * 5
+    library, named, used, *_ = (tmp_path / f"{file}.obj").read_text("utf-8").splitlines()
+    assert (library.count(" "), named, used) == (1, f"o {name}", f"usemtl {name}")
+    assert load_mesh(tmp_path / f"{file}.obj").texture.shape == (64, 64, 3)
+
+
 def test_another_format_is_refused(tmp_path):
     with pytest.raises(UserError, match=r"\.glb or \.obj"):
         write_textured_mesh(tmp_path / "box.fbx", MESH)

@@ -210,6 +210,9 @@ def test_a_mesh_is_exported_beside_the_cloud_as_the_run_draws(tmp_path, painted_
     files = {"gaussians.ply", "mesh.glb", "mesh.obj", "mesh.mtl", "mesh.png"}
     assert files <= {path.name for path in export.iterdir()}
     assert (seen[0].eps2d, seen[0].antialias, seen[0].faces) == (0.2, True, 200)
+    name = (export / "mesh.obj").read_text("utf-8").splitlines()[1].removeprefix("o ")
+    assert f'"name":"{name}"' in (export / "mesh.glb").read_bytes().decode(errors="ignore")
+    assert name not in ("", "mesh")  # but the prompt's
 
 
 @pytest.mark.parametrize(

@@ -22,8 +22,10 @@ from .mesh import Mesh
 UNLIT = "KHR_materials_unlit"
 FLOAT, UNSIGNED_INT, LINEAR, CLAMP_TO_EDGE = 5126, 5125, 9729, 33071
 ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER = 34962, 34963
+NAME_BYTES = 63
+"""Longest name that Blender keeps."""
 MTL = """# threestudio-gaussiandreamer
-newmtl baked
+newmtl {name}
 Ka 0 0 0
 Kd 1 1 1
 Ks 0 0 0
@@ -58,8 +60,14 @@ def welded(mesh: Mesh) -> Welded:
     return Welded(positions, normals, rows)
 
 
-def write_textured_mesh(path: str | os.PathLike, mesh: Mesh, *, unlit: bool = False) -> None:
+def write_textured_mesh(
+    path: str | os.PathLike, mesh: Mesh, *, unlit: bool = False, name: str = ""
+) -> None:
     """Write a mesh with ``uv`` and ``texture`` as GLB or OBJ, by the extension.
+
+    Args:
+        unlit: ask viewers to show the texture without lighting.
+        name: of the object, its material and its texture; by default the file's.
 
     Raises:
         UserError: the extension is another one, a value isn't finite, or the file can't be written.
@@ -67,18 +75,23 @@ def write_textured_mesh(path: str | os.PathLike, mesh: Mesh, *, unlit: bool = Fa
     suffix = Path(path).suffix.lower()
     if suffix not in WRITERS:
         raise UserError(f"expected the name of a {' or '.join(WRITERS)} file, got {str(path)!r}")
-    WRITERS[suffix](path, mesh, unlit=unlit)
+    WRITERS[suffix](path, mesh, unlit, _clean(name or Path(path).stem))
+
+
+def _clean(name: str) -> str:
+    """Return a name without spaces, which some readers of OBJ end a name at."""
+    printable = "".join(c if c.isprintable() else " " for c in name)
+    return "_".join(printable.split()).encode(errors="ignore")[:NAME_BYTES].decode(errors="ignore")
 
 
 # ---- GLB -----------------------------------------------------------------------------------------
 
 
-def write_textured_glb(path: str | os.PathLike, mesh: Mesh, *, unlit: bool = False) -> None:
+def write_textured_glb(
+    path: str | os.PathLike, mesh: Mesh, unlit: bool = False, name: str = "mesh"
+) -> None:
     """Write a mesh with ``uv`` and ``texture`` as GLB: its texture as base colour, metallic 0,
-    roughness 1.
-
-    Args:
-        unlit: also ask viewers to show the texture without lighting (KHR_materials_unlit).
+    roughness 1; ``unlit`` by KHR_materials_unlit.
 
     Raises:
         UserError: a value isn't finite, or the file can't be written.
@@ -92,10 +105,10 @@ def write_textured_glb(path: str | os.PathLike, mesh: Mesh, *, unlit: bool = Fal
         "TEXCOORD_0": (mesh.uv * [1, -1] + [0, 1]).astype("<f4"),
     }
     blocks = [values.tobytes() for values in arrays.values()]
-    write_glb_file(path, _document(arrays, unlit), [*blocks, png_bytes(mesh.texture)])
+    write_glb_file(path, _document(arrays, unlit, name), [*blocks, png_bytes(mesh.texture)])
 
 
-def _document(arrays: Mapping[str, np.ndarray], unlit: bool) -> dict[str, Any]:
+def _document(arrays: Mapping[str, np.ndarray], unlit: bool, name: str) -> dict[str, Any]:
     """Return the JSON of a GLB with one mesh; the arrays and the picture are its buffer views."""
     targets = [ELEMENT_ARRAY_BUFFER] + [ARRAY_BUFFER] * (len(arrays) - 1)
     accessors = [_accessor(view, values) for view, values in enumerate(arrays.values())]
@@ -104,6 +117,7 @@ def _document(arrays: Mapping[str, np.ndarray], unlit: bool) -> dict[str, Any]:
         "max": arrays["POSITION"].max(axis=0).tolist(),
     }
     material: dict[str, Any] = {
+        "name": name,
         "pbrMetallicRoughness": {
             "baseColorTexture": {"index": 0},
             "metallicFactor": 0.0,
@@ -120,12 +134,12 @@ def _document(arrays: Mapping[str, np.ndarray], unlit: bool) -> dict[str, Any]:
         **({"extensionsUsed": [UNLIT]} if unlit else {}),
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0}],
-        "meshes": [{"primitives": [primitive]}],
+        "nodes": [{"name": name, "mesh": 0}],
+        "meshes": [{"name": name, "primitives": [primitive]}],
         "materials": [material | ({"extensions": {UNLIT: {}}} if unlit else {})],
-        "textures": [{"sampler": 0, "source": 0}],
+        "textures": [{"name": name, "sampler": 0, "source": 0}],
         "samplers": [sampler],
-        "images": [{"bufferView": len(arrays), "mimeType": "image/png"}],
+        "images": [{"name": name, "bufferView": len(arrays), "mimeType": "image/png"}],
         "accessors": accessors,
         "bufferViews": [*({"target": target} for target in targets), {}],
     }
@@ -145,7 +159,9 @@ def _accessor(view: int, values: np.ndarray) -> dict[str, Any]:
 # ---- OBJ -----------------------------------------------------------------------------------------
 
 
-def write_textured_obj(path: str | os.PathLike, mesh: Mesh, *, unlit: bool = False) -> None:
+def write_textured_obj(
+    path: str | os.PathLike, mesh: Mesh, unlit: bool = False, name: str = "mesh"
+) -> None:
     """Write a mesh with ``uv`` and ``texture`` as OBJ, and its MTL and PNG of the same name beside
     it.
 
@@ -157,12 +173,14 @@ def write_textured_obj(path: str | os.PathLike, mesh: Mesh, *, unlit: bool = Fal
     with atomic_file(texture) as file:
         file.write(png_bytes(mesh.texture))
     with atomic_file(material) as file:
-        file.write(MTL.format(illum=0 if unlit else 1, texture=texture.name).encode())
+        text = MTL.format(name=name, illum=0 if unlit else 1, texture=texture.name)
+        file.write(text.encode(errors="surrogateescape"))
     joined = welded(mesh)
     position, coordinate = joined.rows[mesh.faces] + 1, mesh.faces + 1
     corners = np.stack([position, coordinate, position], axis=2).reshape(-1, 9)
     with atomic_file(path) as file:
-        file.write(f"mtllib {material.name}\nusemtl baked\n".encode())
+        head = f"mtllib {material.name}\no {name}\nusemtl {name}\n"
+        file.write(head.encode(errors="surrogateescape"))
         np.savetxt(file, joined.positions, fmt="v %.7g %.7g %.7g")
         np.savetxt(file, mesh.uv, fmt="vt %.6f %.6f")
         np.savetxt(file, joined.normals, fmt="vn %.4f %.4f %.4f")
@@ -173,9 +191,12 @@ def write_textured_obj(path: str | os.PathLike, mesh: Mesh, *, unlit: bool = Fal
 
 
 def companions(path: str | os.PathLike) -> tuple[Path, ...]:
-    """Return the files that are written beside a mesh: the PNG and the MTL of an OBJ."""
+    """Return the files that are written beside a mesh: the PNG and the MTL of an OBJ, with ``_``
+    for spaces, at which some readers end a file's name.
+    """
     path = Path(path)
     beside = path.suffix.lower() == ".obj"
+    path = path.with_name("_".join(path.name.split()))
     return (path.with_suffix(".png"), path.with_suffix(".mtl")) if beside else ()
 
 

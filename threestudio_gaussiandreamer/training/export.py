@@ -23,7 +23,7 @@ from ..meshes.mesh import Mesh
 from ..meshes.write import write_textured_mesh
 from ..prune import PruneOptions, prune_to_budget, write_report
 from ..view.render import RenderSettings
-from .pages import write_pages
+from .pages import prompt_of, write_pages
 from .renderer import SplattingRenderer
 
 SUMMARY = ("held_out/compare.png", "it*-test.*", "it*-export/*.*", "it*-export/pruned/*.*")
@@ -73,7 +73,7 @@ class GaussianSavers:
 
     def save_textured_mesh(self, filename: str, mesh: Mesh, unlit: bool) -> str:
         path = self.get_save_path(filename)
-        write_textured_mesh(path, mesh, unlit=unlit)
+        write_textured_mesh(path, mesh, unlit=unlit, name=prompt_of(self))
         return path
 
     def save_surface(self, filename: str, surface: Surface) -> str:

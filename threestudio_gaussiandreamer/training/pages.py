@@ -115,7 +115,7 @@ def _page_options(system: Any, run: RunFiles) -> PageOptions:
         bound = getattr(system.geometry.cfg, "bound_colors", True)
         settings = RenderSettings.of(renderer.cfg, bound_colors=bound)
     return PageOptions(
-        title=_prompt(system) or run.folder.name,
+        title=prompt_of(system) or run.folder.name,
         name="gaussians",
         settings=settings,
         background=_background(system.background),
@@ -123,7 +123,7 @@ def _page_options(system: Any, run: RunFiles) -> PageOptions:
     )
 
 
-def _prompt(system: Any) -> str:
+def prompt_of(system: Any) -> str:
     """Return the prompt of a training run, else the text in the configuration."""
     prompt = getattr(system.prompt_utils, "prompt", None)
     return str(prompt or system.cfg.prompt_processor.get("prompt") or "")
