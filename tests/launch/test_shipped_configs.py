@@ -242,3 +242,27 @@ def test_every_accepted_key_is_read_by_somebody():
         if field.name not in read
     ]
     assert not unread, unread
+
+
+@pytest.mark.parametrize(
+    "overlay, overrides, prompt",
+    [
+        (None, [], "a painted toy"),
+        (None, ["system.guidance.mesh=models/my fox.obj"], "my fox"),
+        (None, ["system.guidance.mesh=a.obj", "system.prompt_processor.prompt=a fox"], "a fox"),
+        ("polish.yaml", ["system.geometry.prior.path=fox.ply"], "fox"),
+        ("system: {guidance: {mesh: b.glb}}", ["seed=3"], "b"),
+        ("system: {guidance: {mesh: b.glb}, prompt_processor: {prompt: a bee}}", [], "a bee"),
+    ],
+)
+def test_the_prompt_of_an_own_object_is_its_files_name(overlay, overrides, prompt, tmp_path):
+    paths = [ROOT / "configs" / "demo.yaml"]
+    if overlay:
+        paths.append(
+            ROOT / "configs" / overlay if overlay.endswith(".yaml") else tmp_path / "o.yaml"
+        )
+        if overlay.startswith("system"):
+            paths[-1].write_text(overlay)
+    cfg = load_config(*paths, cli_args=overrides)
+    assert cfg.system.prompt_processor.prompt == prompt
+    assert cfg.tag == prompt.replace(" ", "_")

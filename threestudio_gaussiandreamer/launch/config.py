@@ -9,6 +9,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from itertools import combinations
+from pathlib import Path
 from typing import Any, Optional
 
 import omegaconf
@@ -89,6 +90,7 @@ def load_config(*paths: str | os.PathLike, cli_args: Sequence[str] = (), n_gpus:
             "--gpu or trainer.devices for the GPUs"
         )
     merged = _merge(sources)
+    _name_own_object(merged, sources)
     trainer = {name: _trainer_option(merged, name) for name in ("devices", "num_nodes")}
     merged.n_gpus = planned_processes(n_gpus, trainer).total
     _require_mandatory(merged)
@@ -136,6 +138,31 @@ def _with_prompt_from_file(source: DictConfig) -> DictConfig:
     text = read_prompt(section.pop("prompt_file"))
     OmegaConf.update(source, "system.prompt_processor.prompt", protect(text), force_add=True)
     return source
+
+
+def _name_own_object(merged: DictConfig, sources: list[DictConfig]) -> None:
+    """Let a prompt that no model reads be the name of the mesh or cloud that a later file or the
+    command line gives, instead of what the earlier file says of its own object.
+    """
+    system = merged.get("system")
+    if not system or system.get("prompt_processor_type") != "plain-prompt-processor":
+        return
+    place, keys = "system.prompt_processor.prompt", ("guidance.mesh", "geometry.prior.path")
+    for source in reversed(sources):
+        if _own_text(source, place) is not None:
+            return
+        if path := next(filter(None, (_own_text(source, f"system.{key}") for key in keys)), None):
+            OmegaConf.update(merged, place, protect(Path(path).stem), force_add=True)
+            return
+
+
+def _own_text(source: DictConfig, key: str) -> Optional[str]:
+    """Return the text at a dotted key; None for a missing value and one that refers to another."""
+    node: Any = source
+    for name in key.split("."):
+        node = node._get_node(name) if isinstance(node, DictConfig) and name in node else None
+    known = node is not None and not node._is_interpolation() and not node._is_missing()
+    return node._value() if known and isinstance(node._value(), str) else None
 
 
 def _merge(sources: list[DictConfig]) -> DictConfig:
