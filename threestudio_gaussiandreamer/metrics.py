@@ -53,6 +53,11 @@ def ssim(
     return (luminance * structure).mean(dim=(-3, -2, -1))
 
 
+MULTI_FACE_NOTE = (
+    "multi-face says nothing of an object whose sides look alike, such as a ball or a box"
+)
+
+
 def multi_face_rate(
     renders: Float[Tensor, "V H W 3"],
     bank_images: Float[Tensor, "K h w 3"],

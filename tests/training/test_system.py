@@ -108,6 +108,7 @@ def test_training_against_a_known_truth_improves_on_held_out_views(tmp_path, pai
         and "test.mp4" in printed
         and ".ply" in printed
         and "multi-face" in printed
+        and "sides look alike" in printed
     )
     rows = list(
         csv.DictReader(open(run_folder(tmp_path) / "csv_logs" / "version_0" / "metrics.csv"))

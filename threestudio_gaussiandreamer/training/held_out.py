@@ -296,7 +296,7 @@ class Measurements:
                     f"{key:<10}{v['psnr']:6.2f}   {v['ssim']:6.4f}   {face:>10}   "
                     f"{v['gaussians']:9d}   {v['seconds']:7.1f}"
                 )
-        return "\n".join(lines)
+        return "\n".join([*lines, metrics.MULTI_FACE_NOTE])
 
 
 def _now() -> np.ndarray:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ..core.files import atomic_file, json_text
+from ..metrics import MULTI_FACE_NOTE
 from .config_changes import config_changes
 from .curves import number, read_curves, svg
 from .run_files import RunFiles, read_json, read_text, step_of
@@ -102,8 +103,8 @@ def _scores(run: RunFiles) -> str:
         found = run.scores.get(key)
         if isinstance(found, dict):
             rows.append([key, *(_shown(found.get(name), name) for name in SCORES)])
-    note = "multi-face says nothing of an object whose sides look alike, such as a ball or a box"
-    return table(("", *SCORES.values()), rows) + (element("p", note) if rows else "")
+    note = element("p", MULTI_FACE_NOTE) if rows else ""
+    return table(("", *SCORES.values()), rows) + note
 
 
 def _shown(value: Any, name: str = "") -> str:
