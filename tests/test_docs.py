@@ -13,7 +13,6 @@ from threestudio_gaussiandreamer.launch import experiment
 from threestudio_gaussiandreamer.launch.config import load_config
 from threestudio_gaussiandreamer.launch.config_check import check_config
 from threestudio_gaussiandreamer.launch.options import find_config, parse_arguments
-from threestudio_gaussiandreamer.training import losses
 
 register_parts()
 ROOT = Path(__file__).parent.parent
@@ -94,7 +93,8 @@ def test_a_launch_that_is_shown_is_accepted(arguments, tmp_path, monkeypatch):
     overrides = [
         override
         for override in args.overrides
-        if not re.search("spiral-prior|front-first|variant.behind|extent|density", override)
+        if not any(override in options for options in PARTS.values())
+        and not re.search("spiral-prior|density.every", override)
     ]  # extensions, tried below
     monkeypatch.chdir(tmp_path)
     check_config(load_config(*paths, cli_args=overrides))
@@ -121,7 +121,7 @@ PARTS = {
         "system.guidance.variant_type=front-first-variant",
         "system.guidance.variant.behind=0.2",
     ],
-    "custom/smooth_depth.py": ["system.loss.lambda_smooth_depth=1000"],
+    "custom/smooth.py": ["system.loss.lambda_smooth_depth=1000", "system.loss.lambda_needles=10"],
     "custom/relocate.py": [
         "system.geometry.density_type=relocate-density",
         "system.geometry.density.every=1",
@@ -143,8 +143,6 @@ def test_every_extension_that_is_shown_is_tried():
 @pytest.mark.parametrize(("name", "source"), python_blocks())
 def test_an_extension_that_is_shown_trains(name, source, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    # a regulariser that is shown must not stay for the tests behind this one
-    monkeypatch.setattr(losses, "REGULARISERS", dict(losses.REGULARISERS))
     Path("custom").mkdir()
     Path(name).write_text(source)
     code = experiment.main(

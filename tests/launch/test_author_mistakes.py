@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import pytest
+import torch
 
 from threestudio_gaussiandreamer.launch.experiment import main
 
@@ -54,7 +55,74 @@ def test_an_own_density_rule_is_called_around_every_step(tmp_path, monkeypatch):
     assert f"element vertex {200 - 30}".encode() in ply[:200]
 
 
+REGULARISER = """
+import torch
+from threestudio_gaussiandreamer.host import register
+
+@register("mine-regulariser")
+"""
+OWN_REGULARISER = "system.loss.lambda_mine=1"
+
+
+def test_gradients_of_a_regulariser_reach_what_it_reads_of_the_cloud(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    source = """
+def own(out):
+    sums = {name: out[name].sum() for name in ("means", "scales", "opacities")}
+    open("shapes", "w").write(" ".join(str(tuple(out[name].shape)) for name in sums))
+    return sum(sums.values())
+"""
+    # against the guidance's far smaller gradients: every opacity and size falls, x + y + z too
+    rates = [f"system.geometry.lr_{name}=0.5" for name in ("means", "scales", "opacities")]
+    assert run(REGULARISER + source, "system.loss.lambda_mine=1e6", *rates) == 0
+    assert Path("shapes").read_text() == "(200, 3) (200, 3) (200,)"
+    state = torch.load(next(Path("outputs").rglob("last.ckpt")), weights_only=True)["state_dict"]
+    assert (state["geometry.logit_opacities"] < torch.logit(torch.tensor(0.1)) - 1).all()
+    assert (state["geometry.means"].sum(1) < -3).all()
+    assert state["geometry.log_scales"].median() < -3.9  # about -2.9 at the start
+
+
 MISTAKES = {
+    "regulariser: NaN": (
+        REGULARISER + "def own(out): return out['means'].mean() * float('nan')",
+        [OWN_REGULARISER],
+        "mine-regulariser returned nan: expected a finite number",
+    ),
+    "regulariser: a vector": (
+        REGULARISER + "def own(out): return out['opacities']",
+        [OWN_REGULARISER],
+        "mine-regulariser returned a tensor of shape (200,); expected one number",
+    ),
+    "regulariser: no gradient": (
+        REGULARISER + "def own(out): return out['opacities'].detach().mean()",
+        [OWN_REGULARISER],
+        "mine-regulariser returned a tensor of shape () without a gradient",
+    ),
+    "regulariser: number of arguments": (
+        REGULARISER + "def own(out, cloud): return out['opacities'].mean()",
+        [OWN_REGULARISER],
+        "mine-regulariser is a function of (out, cloud), which is called as (out)",
+    ),
+    "regulariser: a class": (
+        REGULARISER + "class own:\n    def __call__(self, out): return out['opacities'].mean()",
+        [OWN_REGULARISER],
+        "mine-regulariser is the class own; register a function of (out)",
+    ),
+    "regulariser: a name that is taken": (
+        REGULARISER.replace("mine-", "tv-") + "def own(out): return out['opacities'].mean()",
+        [OWN_REGULARISER],
+        "the name 'tv-regulariser' is taken by threestudio_gaussiandreamer.training.losses.",
+    ),
+    "regulariser: registered under another name": (
+        REGULARISER.replace("mine-regulariser", "smooth") + "def own(out): return 0",
+        ["system.loss.lambda_smooth=1"],
+        "a regulariser of your own is a function below @register('smooth-regulariser')",
+    ),
+    "regulariser: an output that there isn't": (
+        REGULARISER + "def own(out): return out['scale'].mean()",
+        [OWN_REGULARISER],
+        "output that mine-regulariser reads: 'scale': did you mean 'scales'?",
+    ),
     "density rule: misspelt name": (
         DENSITY + "    pass",
         ["system.geometry.density_type=own-densty"],

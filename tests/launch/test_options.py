@@ -181,5 +181,6 @@ def test_parts_are_listed_by_kind_with_those_in_custom(tmp_path, monkeypatch, ca
         kinds.setdefault(kind, []).append(line.strip())
     assert {"mock-guidance", "exact-score-guidance"} <= {*kinds["guidance"]}
     assert {"listed-exporter", "ply-exporter"} <= {*kinds["exporter"]}
+    assert "tv-regulariser" in kinds["regulariser"]
     Path("custom/broken.py").write_text("1 / 0")
     assert main(["--list-parts"]) == 2 and "custom/broken.py" in capsys.readouterr().err

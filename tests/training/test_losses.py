@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.host import find, register
 from threestudio_gaussiandreamer.training.losses import (
     REGULARISERS,
     check_losses,
@@ -17,28 +18,35 @@ from threestudio_gaussiandreamer.training.losses import (
 )
 
 
+def own(function, name="own"):
+    """Register a regulariser under a name of these tests, in place of that of an earlier test."""
+    function.__module__, function.__qualname__ = __name__, name
+    register(f"{name}-regulariser")(function)
+
+
 def test_total_variation_of_a_step_edge():
     image = torch.zeros(1, 4, 5, 3)
     image[:, :, 2:] = 0.5  # one of the four differences of a row is at the edge
-    assert float(total_variation(image)) == pytest.approx(0.5 / 4)
+    assert float(total_variation({"comp_rgb": image})) == pytest.approx(0.5 / 4)
 
 
 def test_total_variation_smooths_noise_and_leaves_flat_pictures_alone():
     noise = torch.rand(2, 8, 8, 3, requires_grad=True)
-    before = total_variation(noise)
+    before = total_variation({"comp_rgb": noise})
     before.backward()
-    assert total_variation(noise.detach() - 0.1 * noise.grad.sign()) < before
-    assert float(total_variation(torch.full((1, 8, 8, 3), 0.3))) == 0
+    assert total_variation({"comp_rgb": noise.detach() - 0.1 * noise.grad.sign()}) < before
+    assert float(total_variation({"comp_rgb": torch.full((1, 8, 8, 3), 0.3)})) == 0
 
 
 def test_each_regulariser_is_weighted_and_computed_only_where_it_has_a_weight():
+    ours = {name: REGULARISERS[name] for name in ("sparsity", "opaque", "tv")}
     out = {"opacity": torch.full((1, 4, 4, 1), 0.5), "comp_rgb": torch.rand(1, 4, 4, 3)}
     out = {name: picture.requires_grad_() for name, picture in out.items()}
     guided = {"loss_sds": torch.tensor(2.0), "grad_norm": torch.tensor(1.0)}
-    weights = {"sds": 0.5, **dict.fromkeys(REGULARISERS, 3.0)}
+    weights = {"sds": 0.5, **dict.fromkeys(ours, 3.0)}
     losses = weighted_losses(guided, out, weights)
     assert float(losses.pop("sds")) == 1.0
-    assert losses == {name: 3 * call(out) for name, call in REGULARISERS.items()}
+    assert losses == {name: 3 * call(out) for name, call in ours.items()}
     assert losses["sparsity"].item() == pytest.approx(3 * math.sqrt(0.26))
     assert float(losses["opaque"]) == pytest.approx(3 * math.log(2))
     assert set(weighted_losses(guided, {}, {"sds": 1.0, "tv": 0.0})) == {"sds"}
@@ -99,32 +107,32 @@ def test_losses_declared_by_a_string_are_refused():
         (lambda out: None, "NoneType"),
     ],
 )
-def test_what_an_own_regulariser_returns_is_checked(monkeypatch, returned, message):
-    monkeypatch.setitem(REGULARISERS, "own", returned)
+def test_what_an_own_regulariser_returns_is_checked(returned, message):
+    own(returned)
     out = {"comp_rgb": torch.rand(1, 2, 2, 3, requires_grad=True)}
-    with pytest.raises(UserError, match=rf"REGULARISERS\['own'\] returned {message}"):
+    with pytest.raises(UserError, match=rf"own-regulariser returned {message}"):
         weighted_losses({"loss_sds": torch.ones(())}, out, {"sds": 1, "own": 2})
 
 
-def test_an_output_that_there_is_not_is_named(monkeypatch):
-    monkeypatch.setitem(REGULARISERS, "own", lambda out: out["comp_rbg"].mean())
-    with pytest.raises(UserError, match="'own'. reads: 'comp_rbg': did you mean 'comp_rgb'"):
+def test_an_output_that_there_is_not_is_named():
+    own(lambda out: out["comp_rbg"].mean())
+    with pytest.raises(UserError, match="own-regulariser reads: 'comp_rbg': did you mean"):
         weighted_losses({"loss_sds": torch.ones(())}, {"comp_rgb": 0}, {"sds": 1, "own": 2})
-    monkeypatch.setitem(REGULARISERS, "own", lambda out: {}["a table of its own"])
+    own(lambda out: {}["a table of its own"])
     with pytest.raises(KeyError, match="a table of its own"):
         weighted_losses({"loss_sds": torch.ones(())}, {"comp_rgb": 0}, {"sds": 1, "own": 2})
 
 
-def test_an_own_regulariser_has_another_name_than_the_guidances_losses(monkeypatch):
-    monkeypatch.setitem(REGULARISERS, "sds", lambda out: out["comp_rgb"].mean())
-    with pytest.raises(UserError, match="the name of the guidance's loss_sds"):
-        weighted_losses({"loss_sds": torch.ones(())}, {}, {"sds": 1})
+def test_an_own_regulariser_has_another_name_than_the_guidances_losses():
+    own(lambda out: out["comp_rgb"].mean(), "shared")
+    with pytest.raises(UserError, match="shared-regulariser has the name of the guidance's loss_s"):
+        weighted_losses({"loss_shared": torch.ones(())}, {}, {"shared": 1})
 
 
-def test_a_regulariser_that_is_not_finite_is_named_at_once(monkeypatch):
-    monkeypatch.setitem(REGULARISERS, "own", lambda out: out["comp_rgb"].mean() / 0)
+def test_a_regulariser_that_is_not_finite_is_named_at_once():
+    own(lambda out: out["comp_rgb"].mean() / 0)
     out = {"comp_rgb": torch.ones(1, 2, 2, 3, requires_grad=True)}
-    with pytest.raises(UserError, match=r"REGULARISERS\['own'\] returned inf: expected a finite"):
+    with pytest.raises(UserError, match=r"own-regulariser returned inf: expected a finite"):
         weighted_losses({"loss_sds": torch.ones(())}, out, {"sds": 1, "own": 2})
 
 
@@ -142,3 +150,19 @@ def test_gradients_that_reach_no_gaussian_are_named():
         require_gradients(cloud, losses)
     cloud(torch.ones(2)).sum().backward()
     require_gradients(cloud, losses)
+
+
+def test_a_name_that_is_taken_is_an_error_for_a_regulariser_too():
+    with pytest.raises(UserError, match="the name 'tv-regulariser' is taken by .*total_variation"):
+        own(lambda out: out["comp_rgb"].mean(), "tv")
+
+
+def test_the_table_of_earlier_versions_registers_and_names_the_new_way(caplog):
+    def earlier(out):
+        return out["comp_rgb"].mean()
+
+    REGULARISERS["earlier"] = earlier
+    assert "write @register('earlier-regulariser')" in caplog.text
+    assert find("earlier-regulariser") is REGULARISERS["earlier"] is earlier
+    with pytest.raises(UserError, match="the name 'tv-regulariser' is taken"):
+        REGULARISERS["tv"] = earlier

@@ -23,6 +23,7 @@ from ..host import (
 from ..priors.base import Prior
 from ..prompts.prompt_processors import TextEncoderPromptProcessor
 from ..training.density import DensityRule
+from ..training.losses import SUFFIX
 
 KINDS: dict[str, type] = {
     "data": pl.LightningDataModule,
@@ -94,8 +95,10 @@ def parts_by_kind() -> dict[str, list[str]]:
     """
     found: dict[str, list[str]] = {}
     for name in names():
-        found.setdefault(_kind_of(find(name)) or "other", []).append(name)
-    return {kind: found[kind] for kind in (*KINDS, "other") if kind in found}
+        is_loss = name.endswith(SUFFIX)
+        kind = "regulariser" if is_loss else _kind_of(find(name)) or "other"
+        found.setdefault(kind, []).append(name)
+    return {kind: found[kind] for kind in (*KINDS, "regulariser", "other") if kind in found}
 
 
 def _require_call(path: str, kind: str, part: type) -> None:

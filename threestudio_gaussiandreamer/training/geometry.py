@@ -55,6 +55,7 @@ from torch import Tensor, nn
 
 from ..core.errors import UserError
 from ..core.host_copies import DelayedReads
+from ..core.lazy_mapping import LazyMapping
 from ..core.methods import require_method
 from ..core.nested import adopt_nested
 from ..core.options import (
@@ -202,6 +203,13 @@ class GaussianCloud(BaseGeometry):
 
     def opacities(self) -> Float[Tensor, " N"]:
         return torch.sigmoid(self.logit_opacities)
+
+    def drawn(self) -> LazyMapping:
+        """Return ``means``, ``quats``, ``scales`` and ``opacities`` as they are drawn, by name;
+        with their gradients, and computed when they are read.
+        """
+        computed = {"scales": self.scales, "opacities": self.opacities}
+        return LazyMapping({"means": self.means, "quats": self.quats}, computed)
 
     @property
     def sh(self) -> Float[Tensor, "N K 3"]:

@@ -1,4 +1,5 @@
-"""The weighted losses of a step: those that the guidance returns, and regularisers of the renders;
+"""The weighted losses of a step: those that the guidance returns, and regularisers of the renders
+and the cloud, which are functions registered as ``<name>-regulariser``;
 ``system.loss.lambda_<name>`` is the weight of each, a number or a schedule.
 
 ========  ==========================================================================================
@@ -12,7 +13,9 @@ proportion to height x width.
 """
 
 import functools
-from collections.abc import Callable, Iterable, Mapping
+import inspect
+from collections import ChainMap
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any, Optional
 
 import torch
@@ -22,6 +25,9 @@ from torch import Tensor
 from ..core.errors import UserError, unknown
 from ..core.schedule import Schedule, parse_schedule
 from ..guidance.base import ScoreDistillation
+from ..host import find, names, register, warn
+
+SUFFIX = "-regulariser"
 
 
 def weighted_losses(
@@ -30,7 +36,7 @@ def weighted_losses(
     """Compute the weighted ``loss_*`` of a guidance, and the weighted regularisers.
 
     Args:
-        out: the renderer's outputs; the regularisers use ``opacity`` and ``comp_rgb``.
+        out: what the regularisers see: the renderer's outputs, and the cloud as it is drawn.
 
     Raises:
         UserError: there is no loss, a weight without a loss, or a loss without a weight.
@@ -44,19 +50,19 @@ def weighted_losses(
     return {name: value * weights[name] for name, value in raw.items()}
 
 
-class _Outputs(dict):
-    """The renderer's outputs for a regulariser; a missing one is named."""
+class _Outputs(ChainMap):
+    """What a regulariser sees, computed when it is read; what is missing is named."""
 
-    def __init__(self, reader: str, out: Mapping[str, Any]) -> None:
+    def __init__(self, reader: str, out: Any) -> None:
         super().__init__(out)
         self.reader = reader
 
     def __missing__(self, name: str) -> None:
-        raise unknown(f"output that REGULARISERS[{self.reader!r}] reads:", name, self)
+        raise unknown(f"output that {self.reader}{SUFFIX} reads:", name, self)
 
 
 def _of_renders(name: str, out: Mapping[str, Any]) -> Float[Tensor, ""]:
-    """Return a regulariser of the renderer's outputs.
+    """Return a regulariser of a step's outputs.
 
     Raises:
         UserError: it reads an output that there isn't, or doesn't return one number with a
@@ -69,12 +75,12 @@ def _of_renders(name: str, out: Mapping[str, Any]) -> Float[Tensor, ""]:
             found = f"a tensor of shape {tuple(value.shape)}"
             found += "" if value.requires_grad else " without a gradient"
         raise UserError(
-            f"REGULARISERS[{name!r}] returned {found}; expected one number that is computed from "
-            "the renders, as from .mean()"
+            f"{name}{SUFFIX} returned {found}; expected one number that is computed from the "
+            "renders or the cloud, as from .mean()"
         )
     # on a GPU, looking would wait for it: there finite.py names it at its next check
     if value.device.type == "cpu" and not value.isfinite():
-        raise UserError(f"REGULARISERS[{name!r}] returned {value.item()}: expected a finite number")
+        raise UserError(f"{name}{SUFFIX} returned {value.item()}: expected a finite number")
     return value.reshape(())
 
 
@@ -158,8 +164,9 @@ def check_losses(guidance: type, options: Mapping[str, Any]) -> None:
     """Check the keys of ``system.loss``, if the class of the guidance declares its losses.
 
     Raises:
-        UserError: a key isn't ``lambda_*``, no weight is other than 0, the losses are declared by a
-            string, or see :func:`check_weights`.
+        UserError: a key isn't ``lambda_*``, no weight is other than 0, a regulariser isn't a
+            function of one argument, the losses are declared by a string, or see
+            :func:`check_weights`.
     """
     for name in options:
         if not name.startswith("lambda_"):
@@ -172,6 +179,9 @@ def check_losses(guidance: type, options: Mapping[str, Any]) -> None:
             "system.loss: every weight is 0, so that nothing would be trained: give one, such as "
             "system.loss.lambda_sds=1"
         )
+    for name, function in REGULARISERS.items():
+        if not _is_none_or_zero(options.get(f"lambda_{name}")):
+            _require_function(name + SUFFIX, function)
     known = getattr(guidance, "LOSSES", None)  # also of guidances that aren't ScoreDistillation
     if isinstance(known, str):
         raise UserError(f"{guidance.__name__}.LOSSES is a string: write ({known!r},), a tuple")
@@ -192,13 +202,15 @@ def check_weights(weights: Mapping[str, Any], losses: Iterable[str]) -> None:
         if name not in losses and name not in REGULARISERS and not _is_none_or_zero(weight):
             known = [f"lambda_{n}" for n in (*losses, *REGULARISERS)]
             error = unknown("weight system.loss.lambda_*", f"lambda_{name}", known)
-            way_out = f"to leave it out: system.loss.lambda_{name}=0"
+            way_out = (
+                f"to leave it out: system.loss.lambda_{name}=0; a regulariser of your own is a "
+                f"function below @register({name + SUFFIX!r})"
+            )
             raise UserError(f"{str(error).removesuffix('.')} ({way_out})")
     for name in losses:
         if name in REGULARISERS:
             raise UserError(
-                f"REGULARISERS[{name!r}] has the name of the guidance's loss_{name}; choose "
-                "another one"
+                f"{name}{SUFFIX} has the name of the guidance's loss_{name}; choose another one"
             )
         if name not in weights:
             raise UserError(
@@ -222,27 +234,58 @@ def foreign_weights(options: Iterable[str], guidance: Any) -> list[str]:
     return [key for key in options if key.startswith("lambda_") and key not in known]
 
 
-def sparsity(alpha: Float[Tensor, "B H W 1"]) -> Float[Tensor, ""]:
+def _require_function(name: str, function: Any) -> None:
+    """Raise UserError unless a regulariser is a function that is called with one argument."""
+    if isinstance(function, type):
+        raise UserError(f"{name} is the class {function.__name__}; register a function of (out)")
+    try:
+        inspect.signature(function).bind("out")
+    except TypeError as error:
+        raise UserError(
+            f"{name} is a function of {inspect.signature(function)}, which is called as (out): "
+            f"{error}"
+        ) from error
+
+
+@register("sparsity-regulariser")
+def sparsity(out: Mapping[str, Any]) -> Float[Tensor, ""]:
     """Return the mean of sqrt(alpha^2 + 0.01), as in threestudio."""
-    return (alpha**2 + 0.01).sqrt().mean()
+    return (out["opacity"] ** 2 + 0.01).sqrt().mean()
 
 
-def entropy(alpha: Float[Tensor, "B H W 1"]) -> Float[Tensor, ""]:
+@register("opaque-regulariser")
+def opaque(out: Mapping[str, Any]) -> Float[Tensor, ""]:
     """Return the mean entropy of alpha, clamped to [1e-3, 1 - 1e-3], as in threestudio."""
-    clamped = alpha.clamp(1e-3, 1 - 1e-3)
+    clamped = out["opacity"].clamp(1e-3, 1 - 1e-3)
     # torch forbids its binary_cross_entropy under mixed precision
     return -(clamped * clamped.log() + (1 - clamped) * (1 - clamped).log()).mean()
 
 
-def total_variation(images: Float[Tensor, "B H W 3"]) -> Float[Tensor, ""]:
+@register("tv-regulariser")
+def total_variation(out: Mapping[str, Any]) -> Float[Tensor, ""]:
     """Return the mean absolute difference of vertical neighbours plus that of horizontal ones."""
-    differences = images.diff(dim=1), images.diff(dim=2)
+    differences = out["comp_rgb"].diff(dim=1), out["comp_rgb"].diff(dim=2)
     return sum(found.abs().sum() / max(found.numel(), 1) for found in differences)
 
 
-REGULARISERS: dict[str, Callable[[Mapping[str, Any]], Tensor]] = {
-    "sparsity": lambda out: sparsity(out["opacity"]),
-    "opaque": lambda out: entropy(out["opacity"]),
-    "tv": lambda out: total_variation(out["comp_rgb"]),
-}
-"""Functions of the renderer's outputs; extensions may add their own."""
+class _Regularisers(Mapping[str, Callable[[Mapping[str, Any]], Tensor]]):
+    """The registered regularisers by the names of their losses."""
+
+    def __getitem__(self, name: str) -> Callable[[Mapping[str, Any]], Tensor]:
+        if name + SUFFIX not in names():
+            raise KeyError(name)
+        return find(name + SUFFIX)
+
+    def __setitem__(self, name: str, function: Callable[[Mapping[str, Any]], Tensor]) -> None:
+        """Register a function, as was documented once."""
+        warn(f"REGULARISERS[{name!r}] = ...: write @register({name + SUFFIX!r}) above the function")
+        register(name + SUFFIX)(function)
+
+    def __iter__(self) -> Iterator[str]:
+        return (name.removesuffix(SUFFIX) for name in names() if name.endswith(SUFFIX))
+
+    def __len__(self) -> int:
+        return len(list(iter(self)))
+
+
+REGULARISERS = _Regularisers()

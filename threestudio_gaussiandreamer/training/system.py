@@ -27,6 +27,7 @@ pages          write a page that shows the cloud in a browser, and more: see ``p
 """
 
 import contextlib
+from collections import ChainMap
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -281,10 +282,13 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         self.part_rates.set(self, optimizer, *now)
 
     def losses(self, guided: dict[str, Any], out: Mapping[str, Any]) -> dict[str, Tensor]:
-        """Return the weighted losses of the guidance and the regularisers of the renders."""
+        """Return the weighted losses of the guidance and the regularisers, which see the renders
+        and the cloud.
+        """
         now = self.true_current_epoch, self.true_global_step
         weights = {name: C(weight, *now) for name, weight in self.loss_weights.items()}
-        return weighted_losses(guided, out, self.image_targets.loss_weights(weights, now[1]))
+        weights = self.image_targets.loss_weights(weights, now[1])
+        return weighted_losses(guided, ChainMap(out, self.geometry.drawn()), weights)
 
     def supervise(self, out: Mapping[str, Any], batch: dict[str, Any]) -> dict[str, Any]:
         """Return the losses of this step's renders, and what is logged with them."""

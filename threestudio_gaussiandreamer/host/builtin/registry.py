@@ -8,11 +8,11 @@ _parts: dict[str, type] = {}
 
 
 def register(name: str) -> Callable[[type], type]:
-    """Return a class decorator that enters the class under ``name``; entering the same class twice
-    is harmless.
+    """Return a decorator that enters a class, or of a regulariser the function, under ``name``;
+    entering the same one twice is harmless.
 
     Raises:
-        UserError: another class has that name already.
+        UserError: another one has that name already.
     """
 
     def enter(cls: type) -> type:
