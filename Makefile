@@ -76,13 +76,8 @@ toybox-sheet: $(VENV)/ready-for-models       ## docs/images/toybox-world.png: 10
 
 charts: $(VENV)/ready-for-charts   ## docs/charts/*.png from the committed numbers beside them
 	$(ENVIRON) $(BIN)/python -m benchmarks.splatting.chart_splatting --from-csv
-	$(ENVIRON) $(BIN)/python -m benchmarks.splatting.growth --from-csv
 	$(ENVIRON) $(BIN)/python -m benchmarks.quality.chart_runs
-	$(ENVIRON) $(BIN)/python -m benchmarks.quality.attributes --objects
-	$(ENVIRON) $(BIN)/python -m benchmarks.quality.variant_charts
-	$(ENVIRON) $(BIN)/python -m benchmarks.quality.toybox_charts
 	$(ENVIRON) $(BIN)/python -m benchmarks.quality.mesh --objects
-	$(ENVIRON) $(BIN)/python -m benchmarks.quality.polish --objects
 
 # the meshes to measure on: make measure-charts OBJECTS="toy.glb path/to/spot.glb path/to/duck.glb"
 OBJECTS = toy.glb
@@ -91,13 +86,7 @@ measure-charts: $(VENV)/ready-for-charts     ## repeat the measurements, about t
 	$(ENVIRON) $(BIN)/python -m benchmarks.splatting.chart_splatting
 	$(ENVIRON) $(BIN)/python -m benchmarks.quality.runs --objects $(OBJECTS)
 	$(ENVIRON) $(BIN)/python -m benchmarks.quality.chart_runs
-	$(ENVIRON) $(BIN)/python -m benchmarks.quality.attributes --objects $(OBJECTS) --seeds 0 1 2 3 4
-	$(ENVIRON) $(BIN)/python -m benchmarks.quality.after_run --objects $(OBJECTS) --seeds 0 1 2 3 4
-	$(ENVIRON) $(BIN)/python -m benchmarks.quality.viewers --objects $(OBJECTS)
 	$(ENVIRON) $(BIN)/python -m benchmarks.quality.mesh --objects $(OBJECTS)
-	$(ENVIRON) $(BIN)/python -m benchmarks.quality.known_answer
-	$(ENVIRON) $(BIN)/python -m benchmarks.quality.known_answer --count 1000
-	$(ENVIRON) $(BIN)/python -m benchmarks.quality.bench_prune
 
 measure-toybox: $(VENV)/ready-for-models     ## text to 3D with the bundled models over their settings; runs that are in the CSV are skipped
 	$(ENVIRON) $(BIN)/python -m benchmarks.quality.toybox --seeds 0 1 2 3 4

@@ -9,22 +9,13 @@ import re
 from collections.abc import Callable
 
 from benchmarks.markdown import markdown
-from benchmarks.quality import (
-    default_against,
-    failure_table,
-    formats,
-    large_prune,
-    toybox_variants,
-    tried,
-    variant_tables,
-)
+from benchmarks.quality import default_against, formats, large_prune
 from benchmarks.quality import mesh as mesh_quality
 from benchmarks.quality import tables as quality
 from benchmarks.quality import toybox_tables as toybox
 from benchmarks.quality.runs import ROOT
 from benchmarks.quality.tables import DIFFERENCES, difference_row, last_rows, medians, named
 from benchmarks.robustness import tables as robustness
-from benchmarks.splatting import block_pairs, growth, half_precision, kernel_tables
 from benchmarks.splatting import tables as splatting
 from benchmarks.start import tables as start
 from benchmarks.viewers import tables as viewers
@@ -74,15 +65,6 @@ def readme_table() -> str:
 SECTIONS: dict[str, dict[str, Callable[[], str]]] = {
     "README.md": {"measured": readme_table},
     "docs/cuda.md": {"gpu": splatting.gpu},
-    "docs/distillation.md": {
-        "quality": variant_tables.quality,
-        "blind": variant_tables.blind,
-        "from a ball": variant_tables.from_ball,
-        "cheaper": variant_tables.cheaper,
-        "learned": toybox_variants.distillations,
-        "looks": toybox_variants.looks,
-    },
-    "docs/failures.md": {"tables": failure_table.tables},
     "docs/formats.md": {"formats": formats.table, "producers": formats.producers},
     "docs/mesh.md": {"front": mesh_quality.front},
     "docs/pruning.md": {"large prune": large_prune.table},
@@ -90,10 +72,6 @@ SECTIONS: dict[str, dict[str, Callable[[], str]]] = {
         "presets": splatting.presets,
         "thresholds": splatting.thresholds,
         "contenders": splatting.contenders,
-        "kernel": kernel_tables.kernel,
-        "block pairs": block_pairs.table,
-        "growth": growth.table,
-        "half precision": half_precision.table,
     },
     "docs/step_time.md": {
         "step": start.step_parts,
@@ -111,12 +89,7 @@ SECTIONS: dict[str, dict[str, Callable[[], str]]] = {
         "toybox": toybox.results,
         "seeds": toybox.seeds,
         "judges": toybox.judges,
-        "settings": toybox_variants.settings,
-        "ablations": toybox_variants.ablations,
-        "settings on a GPU": toybox_variants.settings_on_gpu,
-        "wrong priors": toybox_variants.wrong_priors,
     },
-    "docs/tried.md": {"tried": tried.table},
 }
 
 

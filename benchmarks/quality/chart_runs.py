@@ -31,19 +31,10 @@ class Chart(NamedTuple):
     x_label: str
     curves: bool
     """Whether each run is a curve over its steps, or a point at its end."""
-    per_variant: str = "variant"
-    """The column by which rows are grouped into lines."""
-    log_x: bool = True
-    marks_paper: bool = False
-    """Whether the end of the paper's recipe is drawn from the chart ``count``."""
     size: int = SIZE
     """Width and height of the renders, pixels."""
     chosen_on: tuple[str, ...] = (TUNED_ON,)
     """The objects that settings were chosen on."""
-    labels_x: bool = False
-    """Whether the points are labelled with the column ``x``."""
-    common: str = ""
-    """The variant that is also a point of every line without one at its position."""
     front: tuple[str, ...] = ()
     """Variants whose medians a line connects."""
 
@@ -66,41 +57,6 @@ RUNS = {
     "count": Chart(
         "How many Gaussians a scene needs", "gaussians", "Gaussians at the end", curves=False
     ),
-    "size": Chart(
-        "Effect of the rendered size",
-        "cpu_seconds",
-        SECONDS,
-        curves=False,
-        marks_paper=True,
-        labels_x=True,
-    ),
-    "large": Chart(
-        "Effect of rendering at 1024² and shrinking to 512²",
-        "cpu_seconds",
-        SECONDS,
-        curves=False,
-        size=512,
-    ),
-    "batch": Chart(
-        "Views per step, at equal seconds",
-        "cpu_seconds",
-        "CPU seconds of training, one thread",
-        True,
-        per_variant="x",
-        marks_paper=True,
-    ),
-    "iterations": Chart("Effect of the number of steps", "x", "steps", curves=False),
-    "rates": Chart(
-        "Effect of the learning rates",
-        "x",
-        "times the learning rates of the base recipe",
-        curves=False,
-        marks_paper=True,
-        common="the base recipe",
-    ),
-    "dilation": Chart(
-        "Effect of a smaller screen-space dilation", "x", "dilation, square pixels", curves=False
-    ),
     "quality": Chart(
         "Draft, default and best",
         "cpu_seconds",
@@ -109,9 +65,6 @@ RUNS = {
         size=256,
         chosen_on=(TUNED_ON, "spot", "duck"),
         front=("draft", "default", "best"),
-    ),
-    "preset": Chart(
-        "Effect of the rasteriser's presets", "cpu_seconds", SECONDS, curves=True, marks_paper=True
     ),
 }
 UNSEEN = RUNS["quality"]._replace(title="Draft, default and best on other objects", chosen_on=())
@@ -127,18 +80,7 @@ def main() -> None:
     for name in parser.parse_args().charts or DRAWN:
         rows = rows_of(name)
         if rows:
-            print(draw(name, DRAWN[name], rows + papers_own(DRAWN[name])))
-
-
-def papers_own(chart: Chart) -> list[Row]:
-    """Return the end of the paper's recipe, for charts without runs of it; at 1 if the axis is a
-    multiple of the demo's value.
-    """
-    return [row | {"x": "1"} for row in papers_ends()] if chart.marks_paper else []
-
-
-def papers_ends() -> list[Row]:
-    return [row for row in rows_of("count") if row["variant"] == PAPER and row["step"] != "0"]
+            print(draw(name, DRAWN[name], rows))
 
 
 def draw(name: str, chart: Chart, rows: list[Row]) -> Any:
@@ -153,7 +95,7 @@ def draw(name: str, chart: Chart, rows: list[Row]) -> Any:
         sharey=True,
         squeeze=False,
     )
-    labels = list(dict.fromkeys(label_of(chart, row) for row in rows))
+    labels = list(dict.fromkeys(row["variant"] for row in rows))
     for panel, name_of_object in zip(panels[0], objects, strict=True):
         draw_panel(panel, chart, labels, [row for row in rows if row["object"] == name_of_object])
         panel.set_title(title_of(name_of_object, chart.chosen_on), fontsize=10)
@@ -187,13 +129,11 @@ def title_of(name: str, chosen_on: tuple[str, ...] = (TUNED_ON,)) -> str:
 
 def draw_panel(panel: Any, chart: Chart, labels: list[str], rows: list[Row]) -> None:
     """Draw all lines of one object, in the order and colours of their labels."""
-    lines = grouped(rows, lambda row: label_of(chart, row))
-    common = lines.get(chart.common, [])
+    lines = grouped(rows, lambda row: row["variant"])
     for index, label in enumerate(labels):
         chosen = lines.get(label, [])
-        chosen = chosen + [row for row in common if row["x"] not in {own["x"] for own in chosen}]
-        paper = label.endswith(PAPER)
-        style = {"color": "0.15" if paper else COLOURS[index % len(COLOURS)], "label": label}
+        color = "0.15" if label.endswith(PAPER) else COLOURS[index % len(COLOURS)]
+        style = {"color": color, "label": label}
         (draw_curve if chart.curves else draw_points)(
             panel, chart, chosen, style, "*" if PAPER in label else "o"
         )
@@ -201,8 +141,7 @@ def draw_panel(panel: Any, chart: Chart, labels: list[str], rows: list[Row]) -> 
     places = [(median(runs, chart.x), spread(runs)[1]) for runs in front]
     if places:
         panel.plot(*zip(*places, strict=True), color="0.7", linewidth=1, zorder=0)
-    if chart.log_x:
-        set_log_x(panel)
+    set_log_x(panel)
     panel.set_xlabel(chart.x_label)
     panel.grid(alpha=0.25)
     panel.spines[["top", "right"]].set_visible(False)
@@ -216,14 +155,6 @@ def set_log_x(panel: Any) -> None:
     panel.xaxis.set_major_locator(ticker.LogLocator(subs=(1, 2, 5)))
     panel.xaxis.set_major_formatter(ticker.FuncFormatter(lambda value, _: f"{value:g}"))
     panel.xaxis.set_minor_formatter(ticker.NullFormatter())
-
-
-def label_of(chart: Chart, row: Row) -> str:
-    return (
-        row["variant"]
-        if chart.per_variant == "variant" or row["variant"] == PAPER
-        else f"{row['x']} views a step"
-    )
 
 
 def draw_curve(
@@ -258,16 +189,6 @@ def draw_points(
     for at in places:
         values = [float(row[chart.x]) for row in at]
         panel.hlines(spread(at)[1], min(values), max(values), color=style["color"], linewidth=1.4)
-        if chart.labels_x and PAPER not in at[0]["variant"]:
-            place = median(at, chart.x), spread(at)[1]
-            panel.annotate(
-                f"{at[0]['x']}²",
-                place,
-                xytext=(4, -11),
-                textcoords="offset points",
-                fontsize=8,
-                color=style["color"],
-            )
 
 
 def ends(rows: Iterable[Row]) -> list[Row]:

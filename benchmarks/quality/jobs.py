@@ -2,16 +2,12 @@
 which `runs.py` runs.
 """
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple, Optional
 
 from benchmarks.quality.ablations import (
-    CLIPPED,
-    LATENT,
-    NO_ANNEALING,
     PAPER_RATES,
     RANDOM_START,
-    STRONG,
     VIEW_BLIND,
 )
 from threestudio_gaussiandreamer.gaussians.simplify import rounds_to
@@ -47,13 +43,6 @@ SLOWER_MEANS = {"slower means": 0.5, "means at 0.8": 0.8}
 surface.
 """
 BINS = VIEW_BLIND | {"system.guidance.mode": "direction-bins"}
-GREY = {"system.geometry.prior.color": "grey"}
-BALL = {
-    "system.geometry.prior_type": "random-prior",
-    "system.geometry.prior": {"num_points": 8000, "shape": "sphere", "color": "grey"},
-}
-SMALL = {"data.width": 96, "data.height": 96}
-BLURRED = {"system.guidance.latent_size": 4}
 
 
 class Job(NamedTuple):
@@ -70,17 +59,6 @@ class Job(NamedTuple):
     """
 
 
-def fixed_timestep(share: float) -> dict[str, Any]:
-    """Return the options of the same timestep in all steps, a share of all timesteps."""
-    return {f"system.guidance.{end}_step_percent": share for end in ("min", "max")}
-
-
-def held(count: int) -> dict[str, Any]:
-    """Return the options of a run with one prediction of the score model per ``count`` steps."""
-    keys = ("system.guidance.reuse_steps", "data.hold_steps", "system.background.hold_steps")
-    return dict.fromkeys(keys, count)
-
-
 def steps(count: int) -> dict[str, Any]:
     """Return the options of a run of ``count`` steps, with its schedules in proportion."""
     second = SECOND_STAGE * count // STEPS
@@ -89,19 +67,9 @@ def steps(count: int) -> dict[str, Any]:
         f"system.geometry.prune.{name}": step * count // STEPS
         for name, step in (("start", 100), ("every", 50), ("stop", 900))
     }
-    return (
-        rounds
-        | falling(RATES, count)
-        | {"trainer.max_steps": count, "system.guidance.max_step_percent": schedule}
-    )
-
-
-def falling(names: Iterable[str], count: int, factor: float = 1.0) -> dict[str, str]:
-    """Return some of the recipe's learning rates, ``factor`` times as high, for ``count`` steps."""
-    return {
-        f"system.geometry.{name}": falling_rate(*(factor * rate for rate in RATES[name]), count)
-        for name in names
-    }
+    rates = {f"system.geometry.{name}": falling_rate(*both, count) for name, both in RATES.items()}
+    own = {"trainer.max_steps": count, "system.guidance.max_step_percent": schedule}
+    return rounds | rates | own
 
 
 def falling_rate(start: float, end: float, count: int) -> str:
@@ -162,114 +130,6 @@ def other_ways(count: int) -> Iterator[Job]:
     yield Job("count", "after the run, with recovery", count, trained | pruned)
 
 
-def grown_jobs() -> Iterator[Job]:
-    """Half of COUNTS[1] grown to all of it by gradients; thresholds were chosen on the toy."""
-    few = scratch(COUNTS[1] // 2) | {
-        "system.geometry.max_gaussians": 10000,
-        "system.geometry.budget": COUNTS[1],
-    }
-    rounds = {"enabled": "true", "start": 100, "stop": 800, "every": 50}
-    for absgrad, threshold, name in (
-        ("false", 3, "plain gradients"),
-        ("true", 5, "absolute gradients"),
-    ):
-        densify = rounds | {"absgrad": absgrad, "grad_threshold": threshold}
-        yield Job(
-            "grown",
-            name,
-            COUNTS[1],
-            few | {f"system.geometry.densify.{key}": value for key, value in densify.items()},
-        )
-
-
-def size_jobs() -> Iterator[Job]:
-    """Sizes of the renders, and rendering twice as large and shrinking."""
-    for size in (64, 128, 256):
-        own = {"data.width": size, "data.height": size}
-        yield Job("size", "rendered and guided at the same size", size, own)
-    for size in (64, 128):
-        large = {"data.width": 2 * size, "data.height": 2 * size, "system.renderer.downsample": 2}
-        yield Job("size", "rendered twice as large, shrunk", size, large)
-
-
-def large_jobs() -> Iterator[Job]:
-    """The same at 512^2 with 20,000 Gaussians; the smaller dilation that shrinking implies, and the
-    same seconds spent on more steps, each alone.
-    """
-    own = {"data.width": 512, "data.height": 512, "system.evaluation.size": 512}
-    many = own | scratch(20000)
-    yield Job("large", "rendered at 512²", 0, many)
-    yield Job(
-        "large", "rendered at 512², dilation 0.025", 0, many | {"system.renderer.eps2d": 0.025}
-    )
-    yield Job("large", "rendered at 512², 2,000 steps", 0, many | steps(2000))
-    yield Job(
-        "large",
-        "rendered at 1024², shrunk",
-        0,
-        many | {"data.width": 1024, "data.height": 1024, "system.renderer.downsample": 2},
-    )
-
-
-def batch_jobs() -> Iterator[Job]:
-    """Views per step, with as many steps as fit into the recipe's seconds."""
-    for batch, count in ((1, 2200), (2, 1650), (4, STEPS), (8, 750)):
-        yield Job(
-            "batch",
-            "equal seconds",
-            batch,
-            {"data.batch_size": batch, "system.evaluation.every": count // 12} | steps(count),
-        )
-
-
-def iteration_jobs() -> Iterator[Job]:
-    """Separate runs: a longer run doesn't continue a shorter one, because schedules differ."""
-    for rates, name in (({}, "the base recipe"), (PAPER, "the paper's recipe")):
-        for count in (150, 300, 600, 1200):
-            yield Job("iterations", name, count, steps(count) | rates)
-
-
-def rate_jobs() -> Iterator[Job]:
-    """Each learning rate of the recipe a third and three times as high, all of them, and all
-    held instead of falling.
-    """
-    yield Job("rates", "the base recipe", 1, {})
-    for names in (*([name] for name in RATES), list(RATES)):
-        line = names[0].removeprefix("lr_") if len(names) == 1 else "all"
-        for factor in (0.3, 3):
-            yield Job("rates", line, factor, falling(names, STEPS, factor))
-    for factor in (0.1, 0.3, 1):
-        held = {f"system.geometry.{name}": factor * start for name, (start, _) in RATES.items()}
-        yield Job("rates", "all, held at their start", factor, held)
-    yield Job("rates", "the paper's rates", 1, PAPER_RATES)
-
-
-def preset_jobs() -> Iterator[Job]:
-    for preset in ("fast", "balanced", "accurate"):
-        yield Job("preset", preset, 0, {"system.renderer.preset": preset})
-
-
-def dilation_jobs() -> Iterator[Job]:
-    """Dilations between the usual 0.3 square pixels and less than a pixel's own box (1/12)."""
-    for dilation in (0.03, 0.1, 0.3):
-        for antialias, name in ((False, "plain"), (True, "antialiased")):
-            yield Job(
-                "dilation",
-                name,
-                dilation,
-                {
-                    "system.renderer.eps2d": dilation,
-                    "system.renderer.antialias": str(antialias).lower(),
-                },
-            )
-        yield Job(
-            "dilation",
-            "the paper's recipe",
-            dilation,
-            SHARP_PAPER | {"system.renderer.eps2d": dilation},
-        )
-
-
 NOT_ANTIALIASED = "best, not antialiased, dilation 0.1"
 DEMOS = {"draft": ("demo-draft", 255), "default": ("", 500), "best": ("demo-best", 3000)}
 """The demo's variants: the overlay and the steps of each."""
@@ -298,65 +158,11 @@ def unseen_jobs() -> Iterator[Job]:
     return demo_jobs("unseen", *DEMOS)
 
 
-def failure_jobs() -> Iterator[Job]:
-    """Each failure of the method, and each remedy: 96^2 and 600 steps, so that 15 runs of each are
-    affordable.
-    """
-    # bounded colours can't be out of gamut, which is what over-saturation is measured by
-    unbounded = {"system.geometry.bound_colors": "false"}
-    strong = STRONG | unbounded
-    plain_timesteps = LATENT | strong | NO_ANNEALING
-    variants = {
-        "multi-face: random start": VIEW_BLIND | RANDOM_START,
-        "multi-face: random start + view-dependent score": BINS | RANDOM_START,
-        "multi-face: prior": VIEW_BLIND,
-        "grey prior": VIEW_BLIND | GREY,
-        "grey prior + view-dependent score": BINS | GREY,
-        "blur: timesteps up to 0.98 throughout": VIEW_BLIND | NO_ANNEALING,
-        "blur: coarse latent": VIEW_BLIND | BLURRED,
-        "over-saturation: guidance 100": plain_timesteps,
-        "over-saturation: annealed": LATENT | strong,
-        "over-saturation: annealed, clipped": LATENT | strong | CLIPPED,
-        "over-saturation: guidance 7.5, annealed, clipped": LATENT
-        | CLIPPED
-        | unbounded
-        | {"system.guidance.guidance_scale": 8.5},
-        "wrong shape: a grey sphere": BALL,
-        "right shape": {},
-    }
-    for name, options in variants.items():
-        yield Job("failures", name, 0, SMALL | steps(600) | options)
-
-
-def front_back_jobs() -> Iterator[Job]:
-    """The paper's limit: an object whose front and back differ little in shape."""
-    variants = {
-        "same shape: grey prior": VIEW_BLIND | GREY,
-        "same shape: grey prior + view-dependent score": BINS | GREY,
-        "same shape: coloured prior": VIEW_BLIND,
-        "same shape: coloured prior + view-dependent score": BINS,
-    }
-    for name, options in variants.items():
-        yield Job("front_back", name, 0, SMALL | steps(600) | options)
-
-
 JOBS: dict[str, Callable[[], Iterator[Job]]] = {
     "time": time_jobs,
     "count": count_jobs,
-    "grown": grown_jobs,
-    "size": size_jobs,
-    "large": large_jobs,
-    "batch": batch_jobs,
-    "iterations": iteration_jobs,
-    "rates": rate_jobs,
-    "preset": preset_jobs,
-    "dilation": dilation_jobs,
     "quality": quality_jobs,
-    "failures": failure_jobs,
-    "front_back": front_back_jobs,
     "unseen": unseen_jobs,
 }
 WITHOUT_OBJECTS = ("unseen",)
 """Charts whose objects are always given by path."""
-OWN_OBJECTS = {"front_back": ["benchmarks/scenes/ball.ply"]}
-"""What a chart is made on, where it isn't the objects that are asked for."""

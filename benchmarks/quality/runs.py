@@ -28,7 +28,7 @@ from typing import Any, Optional
 
 from tqdm import tqdm
 
-from benchmarks.quality.jobs import JOBS, OWN_OBJECTS, STEPS, WITHOUT_OBJECTS, Job
+from benchmarks.quality.jobs import JOBS, STEPS, WITHOUT_OBJECTS, Job
 from benchmarks.quality.recipe import CONFIGS, RECIPE, recipe
 from benchmarks.start.launched import commit_of
 from threestudio_gaussiandreamer.splatting.cpu import backend as cpu
@@ -38,7 +38,7 @@ CHARTS = ROOT / "docs/charts"
 RENDERER = recipe()["system"]["renderer"]
 """The recipe's options of the renderer."""
 SIZE, EVERY = 128, 100
-WITH_CURVES = ("time", "batch", "preset")
+WITH_CURVES = ("time",)
 MEASURED = ("psnr", "ssim", "multi_face", "floater_mass", "out_of_gamut")
 COLUMNS = ["variant", "x", "object", "seed", "step", "cpu_seconds", "gaussians", *MEASURED]
 COLUMNS += ["machine", "commit"]
@@ -56,7 +56,7 @@ def main() -> None:
         for chart in arguments.charts
         for job in JOBS[chart]()
         if arguments.variants is None or job.variant in arguments.variants
-        for mesh in OWN_OBJECTS.get(chart, arguments.objects)
+        for mesh in arguments.objects
         if (job.variant, f"{job.x:g}", object_name(mesh), str(seed)) not in measured[chart]
     ]
     if arguments.list:

@@ -34,55 +34,27 @@ quantity that is varied within a variant, named above each table; it is empty wh
 sees (`mode: direction-bins`), a *view-blind* one neither (`mode: view-agnostic`).
 
 The runs of the base recipe were measured before colours were kept in [0, 1] (the effect is
-under "Colours that viewers show"). Those of the paper's recipe, which doesn't bound colours, were
-repeated after its growing radius became a share of the longest side; their seconds are those of the
+[recorded](../reports/answered.md#colours-that-viewers-show)). Those of the paper's recipe, which
+doesn't bound colours, were repeated after its growing radius became a share of the longest side;
+their seconds are those of the
 first measurement, on the same processor as the other rows', with as many Gaussians and steps. All
 seconds of direction bins and view-blind scores were measured before the distances to their pictures
 became [scalar products](../threestudio_gaussiandreamer/guidance/picture_bank.py), and are longer
 than now.
+
+What was measured to choose these settings: [answered questions](../reports/answered.md#quality).
 """
 NOTES = {
     "count": "Pruned in the loop to that count, trained with it from the start, or ranked "
     "otherwise.",
-    "dilation": "Variance that splatting adds to each projected Gaussian; a pixel's own is 1/12.",
-    "large": "20,000 Gaussians.",
-    "batch": "As many steps as take the time of the base recipe.",
-    "rates": "Multiples of the base recipe's learning rates.",
-    "grown": "1,250 Gaussians grown to 2,500 by cloning and splitting.",
-    "colors": "Ways to keep colours in the range of viewers. `psnr`: rendered with each Gaussian's "
-    "colour clamped to [0, 1], as viewers do; `unclamped`: rendered as stored; `above_1`: share of "
-    "Gaussians with a channel above 1. Only the first and the chosen one are in the code.",
     "quality": "The three are the configurations as they are, with their own steps, all on one "
     "AMD EPYC without AVX-512, beside other work. The base recipe was the default before; it and "
     "the paper's were timed on another AMD EPYC, before the CPU kernel became faster, so only dB "
     "can be compared with theirs, and with those of best without antialiasing, as it was before.",
-    "tried": "One change each, seed 0, 256². `gain`: dB above the row with the letter `base`; "
-    "`floaters` in %. A, B and C are the base recipe with what they name; the demo, D, is C with "
-    "500 steps. Flat first Gaussians, steps by curvature, merging in a run and splitting by error "
-    "aren't in the code. [What was tried](tried.md) elsewhere.",
     "unseen": "CC0 meshes with palette textures, a figure and a car, which aren't bundled: "
     "`Barbarian.glb` of KayKit's Adventurers 1.0, `car_police.gltf` of its City Builder Bits 1.0.",
-    "polish": "262,144 Gaussians on the surface of a mesh, by `benchmarks/quality/polish.py`, "
-    "pruned in rounds to 40 dB to the dense cloud on validation views of 128² (lower bound). "
-    "*Prior* and *refined*: `polish.yaml` over `demo.yaml` with the remaining count as its budget, "
-    "dB to ray-cast views of the mesh. Median and range over seeds.",
-    "spark": "Held-out PSNR of this package's render and of Spark 2.2 in Chromium, and between the "
-    "two, by `benchmarks/viewers/spark.py`. `up`: the file's axis; unbounded clouds are from "
-    "before `bound_colors`, in z-up files. Seed 0 unless another is named.",
 }
-X = {
-    "count": "Gaussians to keep, or to train with",
-    "size": "width and height of the pictures that are guided, pixels",
-    "batch": "views per step",
-    "iterations": "steps",
-    "rates": "factor of the learning rates that the variant names",
-    "dilation": "`renderer.eps2d`, square pixels",
-    "grown": "Gaussians at the end",
-    "after_run": "Gaussians to keep, of 10,000",
-    "attributes": "Gaussians for `trained`, bits per number for `rounded`, unused for `file`",
-    "viewers": "the viewer's dilation, square pixels",
-    "prune": "Gaussians before pruning",
-}
+X = {"count": "Gaussians to keep, or to train with"}
 """What the column ``x`` of a chart is."""
 
 
@@ -120,15 +92,6 @@ DIFFERENCES = (
     Difference("the demo − the base recipe", "quality", "default", "the base recipe"),
     Difference("draft − default", "quality", "draft", "default"),
     Difference("best − default", "quality", "best", "default"),
-    Difference("dilation 0.1 − 0.3", "dilation", "plain 0.1", "plain 0.3"),
-    Difference("rendered at 1024² and shrunk − at 512²", "large",
-               "rendered at 1024², shrunk", "rendered at 512²"),
-    Difference("dilation 0.025 at 512² − 0.1", "large",
-               "rendered at 512², dilation 0.025", "rendered at 512²"),
-    Difference("rates that fall − the best that are held", "rates",
-               "the base recipe", "all, held at their start 0.3"),
-    Difference("the base recipe's rates − the paper's", "rates",
-               "the base recipe", "the paper's rates"),
     Difference("view-exact score − view-blind", "time",
                "view-exact, the base recipe", "view-blind, prior"),
     Difference("view-blind, prior − random start", "time",
@@ -233,40 +196,6 @@ def ending(runs: list[Row]) -> tuple[str, ...]:
     return db, f"{gaussians:,.0f}", f"{100 * floaters:.1f}", f"{seconds:.0f}"
 
 
-def other_table(chart: str, columns: Sequence[str]) -> str:
-    """A chart that isn't made of runs: one row per group of columns, dB per object."""
-    groups = grouped(rows_of(chart), lambda row: tuple(row[column] for column in columns))
-    rows = [
-        (*place, *of_objects(same, lambda here: spread([float(row["psnr"]) for row in here])))
-        for place, same in groups.items()
-    ]
-    return markdown((*columns, *OBJECTS), rows)
-
-
-def polish_table() -> str:
-    """The ends of pruning and refinement per object."""
-    ends = {(row["object"], row["seed"], row["method"]): row for row in rows_of("polish")}
-
-    def of_seeds(name: str, method: str, column: str, digits: int) -> str:
-        rows = [row for key, row in ends.items() if (key[0], key[2]) == (name, method)]
-        return spread([float(row[column]) for row in rows], digits)
-
-    cells = [
-        ("Gaussians that remain", "pruned", "gaussians", 0),
-        ("CPU seconds of pruning", "pruned", "cpu_seconds", 0),
-        ("prior, dB", "prior", "psnr", 2),
-        ("refined, dB", "refined", "psnr", 2),
-        ("CPU seconds of refinement", "refined", "cpu_seconds", 0),
-    ]
-    lines = [(name, *(of_seeds(name, *where) for _, *where in cells)) for name in OBJECTS]
-    return markdown(("object", *(title for title, *_ in cells)), lines)
-
-
-def plain_table(chart: str, columns: Sequence[str]) -> str:
-    """The rows of a CSV as they are."""
-    return markdown(columns, ([row[column] for column in columns] for row in rows_of(chart)))
-
-
 def section(title: str, chart: str, table: str) -> str:
     picture = f"![{title}](charts/{chart}.png)\n\n"
     shown = picture if (ROOT / f"docs/charts/{chart}.png").is_file() else ""
@@ -293,25 +222,8 @@ def page() -> str:
     head = ("dB of … minus dB of …", *OBJECTS, "pairs above 0")
     differences = markdown(head, map(difference_row, DIFFERENCES))
     runs = [section(chart.title, name, run_table(name)) for name, chart in RUNS.items()]
-    attributes = other_table("attributes", ("experiment", "variant", "x"))
-    known = ("method", "truth", "start", "seed", "gaussians", "psnr")
-    colors = ("variant", "config", "object", "above_1", "largest", "unclamped", "psnr")
-    spark = ("variant", "drawn", "object", "up", "above_1", "ours", "spark", "spark_to_ours")
-    seconds = ("scene", "x", "budget", "gaussians", "psnr", "seconds", "threads")
-    tried = ("change", "base", "object", "steps", "psnr", "gain", "cpu_seconds", "floaters")
     others = [
         section("Objects that nothing was tuned on", "unseen", unseen_table()),
-        section("Changes of the demo that were tried", "tried", plain_table("tried", tried)),
-        section("Growing by gradients", "grown", run_table("grown")),
-        section("Pruning after the run", "after_run", other_table("after_run", ("variant", "x"))),
-        section("Attributes and precision", "attributes", attributes),
-        section("A scene of known size", "known_answer", plain_table("known_answer", known)),
-        section("Effect of a viewer's dilation", "viewers",
-                other_table("viewers", ("variant", "x", "size"))),
-        section("Colours that viewers show", "colors", plain_table("colors", colors)),
-        section("Rendering in Spark", "spark", plain_table("spark", spark)),
-        section("Seconds of the prune command", "prune", plain_table("prune", seconds)),
-        section("Polishing a dense cloud", "polish", polish_table()),
         ablation("The paper's ablations", "ablations"),
         ablation("Faces under a view-blind score", "faces"),
         ablation("Guidance scale 100", "guidance"),

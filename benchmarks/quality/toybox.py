@@ -1,8 +1,7 @@
-"""Text to 3D with the toybox's models: what guidance scale, schedule, start and view prompts do
-under a learned score.
+"""Text to 3D with the toybox's models: toybox.yaml, what it is compared with, and other options.
 
     python -m benchmarks.quality.toybox                                     # all missing runs
-    python -m benchmarks.quality.toybox --charts default starts --prompts withheld --count 20
+    python -m benchmarks.quality.toybox --charts default paper --prompts withheld --count 20
     python -m benchmarks.quality.toybox --variant "wide 0 system.geometry.scale_factor=2"
     python -m benchmarks.quality.toybox --models FOLDER --jobs 16 --seconds 340 --out DIR
     python -m benchmarks.quality.toybox --keep RUNS --only-score            # by another judge
@@ -23,6 +22,7 @@ are of combinations that no training had.
 
 import argparse
 import contextlib
+import csv
 import hashlib
 import io
 import json
@@ -56,13 +56,11 @@ from benchmarks.quality.toybox_jobs import (
     Prompt,
     Variant,
     judge_of,
-    options_of,
     prompts,
     setup,
     setup_of_samples,
 )
 from benchmarks.quality.toybox_options import CHARTS as VARIANTS
-from benchmarks.quality.variants import evaluations_per_step
 from threestudio_gaussiandreamer.guidance.half_precision import cpu_multiplies_bfloat16
 
 KEY = ("variant", "x", "withheld", "index", "seed", "setup", "judge")
@@ -128,7 +126,6 @@ def prepare() -> None:
     """Import the package, limit this process to one thread, and keep its networks loaded."""
     import torch
 
-    from benchmarks.quality import feature_reuse  # noqa: F401, registers a guidance
     from threestudio_gaussiandreamer import register_parts
     from threestudio_gaussiandreamer.models.loaded import keep_loaded
 
@@ -201,11 +198,19 @@ def scored(task: Task, folder: Path) -> dict[str, float]:
     return found | {"cpu_seconds": json.loads(record.read_text())}
 
 
+def evaluations_per_step(folder: Path) -> float:
+    """Return the mean of the logged evaluations of the score model."""
+    (log,) = folder.glob("csv_logs/version_*/metrics.csv")
+    with open(log, newline="") as file:
+        values = [row.get("train/evaluations") for row in csv.DictReader(file)]
+    return statistics.mean(float(value) for value in values if value)
+
+
 def run(task: Task, folder: Path) -> None:
     """Run the launcher in this process."""
     from threestudio_gaussiandreamer.launch.experiment import main as launch
 
-    options = QUICK | options_of(task.variant, task.prompt.text)
+    options = QUICK | task.variant.options
     options |= {
         "exp_root_dir": folder,
         "seed": task.seed,

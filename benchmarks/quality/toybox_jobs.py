@@ -21,9 +21,8 @@ from threestudio_gaussiandreamer.models.bundled import (
     read_digests,
 )
 from threestudio_gaussiandreamer.toybox import recognition
-from threestudio_gaussiandreamer.toybox.prompt_attributes import attributes_in
 from threestudio_gaussiandreamer.toybox.words import describe
-from threestudio_gaussiandreamer.toybox.world import KINDS, VERSION, draw_attributes
+from threestudio_gaussiandreamer.toybox.world import VERSION, draw_attributes
 
 CHART = "toybox"
 GPU_CHART = "toybox_gpu"
@@ -34,12 +33,6 @@ RECOGNIZED = (*ATTRIBUTES, "multi_face")
 CONFIG = yaml.safe_load((ROOT / "configs/toybox.yaml").read_text())
 STEPS = CONFIG["trainer"]["max_steps"]
 GUIDANCE = CONFIG["system"]["guidance"]["guidance_scale"]
-CONTRAST = CONFIG["system"]["guidance"]["view_contrast"]
-COUNT = sum(
-    CONFIG["system"]["geometry"][stage][name]
-    for stage, name in (("prior", "num_points"), ("grow", "max_points"))
-)
-"""Gaussians."""
 DEFAULT, PAPER_RECIPE = "toybox.yaml", "the paper's recipe"
 RANDOM_STARTS = "grey ball", "grey ball, no view prompts"
 SAMPLES, TRUTH = "the 2D model's samples", "ground truth"
@@ -56,7 +49,6 @@ MODELS_BESIDE_GUIDANCE = (
 """The options that take the models from the guidance, for one without models."""
 PROMPT_SEED = 5000
 """Of the attributes and words of prompts; trainings use others."""
-WRONG_PRIOR = "another kind's prior"
 
 
 class Variant(NamedTuple):
@@ -66,8 +58,6 @@ class Variant(NamedTuple):
     x: float = 0.0
     """The number that a chart varies; 0 if it varies none."""
     options: dict[str, Any] = {}
-    wrong_prior: bool = False
-    """Whether the prior's prompt has the next kind of object in place of its own."""
 
     @property
     def key(self) -> tuple[str, str]:
@@ -131,17 +121,3 @@ def prompts(sort: str, count: int) -> list[Prompt]:
         rng = numpy_generator(PROMPT_SEED, "benchmark-prompt", int(held_out), index)
         found.append(Prompt(describe(attributes, rng), index, held_out))
     return found
-
-
-def options_of(variant: Variant, prompt: str) -> dict[str, Any]:
-    """Return the options of a variant's run for a prompt."""
-    if not variant.wrong_prior:
-        return variant.options
-    return variant.options | {"system.geometry.prior.prompt": of_another_kind(prompt)}
-
-
-def of_another_kind(prompt: str) -> str:
-    """Describe a plain object of the same colour and of the kind that follows in KINDS."""
-    wanted, kinds = attributes_in(prompt), list(KINDS)
-    kind = kinds[(kinds.index(wanted.kind) + 1) % len(kinds)]
-    return f"a {wanted.color} {kind}"

@@ -6,9 +6,8 @@ its own, so that its memory can be measured; contenders alternate, so that all h
 Prints a table and writes ``benchmarks/results/splatting.csv``.
 
 Contenders: ``cpu`` (the best build for this processor), ``cpu-v3`` and ``cpu-base`` (builds for
-older ones), ``torch``, ``gsplat`` (its plain-torch functions, see gsplat_reference.py), and
-``prototype``, the AVX-512 program that shows what a CPU can reach (where $GAUSSIANDREAMER_SHARED or
-``../shared`` has it). gsplat's functions keep every pair of Gaussian and pixel (3 GB at 100,000 and
+older ones), ``torch``, and ``gsplat`` (its plain-torch functions, see
+gsplat_reference.py). gsplat's functions keep every pair of Gaussian and pixel (3 GB at 100,000 and
 512^2), so that pictures larger than --gsplat-size are left to the others."""
 
 import argparse
@@ -33,10 +32,7 @@ from benchmarks.quality.runs import machine
 from benchmarks.splatting.bench_scenes import Scene, make_camera, make_cotangents, make_scene
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
-SHARED = pathlib.Path(os.environ.get("GAUSSIANDREAMER_SHARED", ROOT.parent / "shared"))
-PROTOTYPE = SHARED / "prototype"
-PROTOTYPE_FLAGS = "-DTS=32 -DCH=512 -DDEG=4 -DPF=48"
-CONTENDERS = ("cpu", "cpu-v3", "cpu-base", "torch", "gsplat", "prototype")
+CONTENDERS = ("cpu", "cpu-v3", "cpu-base", "torch", "gsplat")
 COLUMNS = (
     "gaussians",
     "size",
@@ -57,8 +53,6 @@ def contender(
 ) -> Callable[[Scene], tuple[Tensor, ...]]:
     """Return a function that renders a scene: image, depth, alpha."""
     viewmat, K = make_camera(size)
-    if name == "prototype":
-        return _prototype(viewmat, K, size, threads)
     if name == "gsplat":
         from benchmarks.splatting.gsplat_reference import drawer
 
@@ -80,17 +74,6 @@ def contender(
         return out.image, out.depth, out.alpha
 
     return draw
-
-
-def _prototype(
-    viewmat: Tensor, K: Tensor, size: int, threads: int
-) -> Callable[[Scene], tuple[Tensor, ...]]:
-    sys.path.insert(0, str(PROTOTYPE))
-    from binding import Fn, Raster, build
-
-    raster = Raster(build(PROTOTYPE_FLAGS, "best"), threads)
-    camera = {"viewmat": viewmat, "K": K, "width": size, "height": size}
-    return lambda scene: tuple(x[None] for x in Fn.apply(raster, camera, *scene))
 
 
 def measure(
@@ -253,8 +236,6 @@ def available(names: list[str]) -> list[str]:
         for name in names
         if name.startswith("cpu") and name.partition("-")[2] not in ("", *builds)
     }
-    if "prototype" in names and not ((PROTOTYPE / "proto.cpp").exists() and "v4" in builds):
-        missing["prototype"] = f"needs AVX-512 and {PROTOTYPE}"
     if "gsplat" in names and importlib.util.find_spec("gsplat") is None:
         missing["gsplat"] = "pip install gsplat"
     if not builds:
@@ -295,9 +276,7 @@ def parse(argv: list[str]) -> argparse.Namespace:
         default=list(CONTENDERS),
         help="the first one is the unit of the ratios",
     )
-    parser.add_argument(
-        "--preset", default="fast", help="fast: the threshold of the prototype and other libraries"
-    )
+    parser.add_argument("--preset", default="fast", help="fast: the threshold of other libraries")
     parser.add_argument(
         "--gsplat-size", type=int, default=512, help="largest image for gsplat's functions"
     )

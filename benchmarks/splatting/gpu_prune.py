@@ -11,14 +11,14 @@ def prune(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def prune_twice(args: argparse.Namespace) -> dict[str, Any]:
-    from benchmarks.quality.bench_prune import torus_and_sphere
+    from benchmarks.quality.large_prune import surface
     from threestudio_gaussiandreamer.formats.gaussian_files import StoredCloud
     from threestudio_gaussiandreamer.gaussians.views import psnr_to_original, render_all
     from threestudio_gaussiandreamer.host import get_device
     from threestudio_gaussiandreamer.prune import PruneOptions, prune_to_budget
     from threestudio_gaussiandreamer.prune.pipeline import views_of
 
-    stored = StoredCloud(torus_and_sphere(800 if args.small else 100_000).arrays())
+    stored = StoredCloud(surface(800 if args.small else 100_000))
     options = PruneOptions(
         count=len(stored.gaussians.means) // 4,
         size=48 if args.small else 256,

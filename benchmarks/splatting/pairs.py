@@ -1,4 +1,4 @@
-"""Two builds of the CPU kernel, and the AVX-512 prototype, in turns in one process.
+"""Two builds of the CPU kernel in turns in one process.
 
     python -m benchmarks.splatting.pairs --against another/checkout [--rounds 20] [--threads 1 2]
         [--cases "demo's settings 256"]
@@ -7,8 +7,7 @@ Reports processor seconds of one thread, so that other programs on the machine m
 seconds of several, and ratios of the smallest of all rounds. `surface` is the scene of
 bench_splatting.py; `demo` is four views of 256² of a small trained cloud; `demo's settings` is as
 many views with the settings of configs/demo.yaml, of that cloud split twice, so that it has about
-as many Gaussians as the demo in the middle of its pruning. Appends to
-``benchmarks/results/kernel.csv``.
+as many Gaussians as the demo in the middle of its pruning.
 
 Both checkouts must have been built: ``python setup.py build_ext --inplace``."""
 
@@ -27,11 +26,9 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 
 from benchmarks.quality.recipe import CONFIGS
-from benchmarks.quality.runs import append_rows
 from benchmarks.splatting.bench_scenes import Scene, make_camera, make_cotangents, make_scene
-from benchmarks.splatting.bench_splatting import PROTOTYPE, contender, processor
+from benchmarks.splatting.bench_splatting import processor
 from benchmarks.splatting.scenes import trained
-from benchmarks.start.launched import commit_of
 from threestudio_gaussiandreamer.core.streams import generator
 from threestudio_gaussiandreamer.gaussians.densify import clone_and_split
 from threestudio_gaussiandreamer.splatting.cpu import backend as cpu
@@ -40,20 +37,6 @@ from threestudio_gaussiandreamer.splatting.validation import smallest_alpha
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = "threestudio_gaussiandreamer"
-RESULTS = ROOT / "benchmarks/results/kernel.csv"
-COLUMNS = [
-    "scene",
-    "gaussians",
-    "views",
-    "size",
-    "threads",
-    "build",
-    "contender",
-    "commit",
-    "forward_ms",
-    "both_ms",
-    "machine",
-]
 DEMO = "demo's settings"
 CASES = ("surface 512", "surface 1024", "demo 256", f"{DEMO} 256")
 Pass = Callable[[], object]
@@ -71,7 +54,7 @@ class Case(NamedTuple):
 
 
 def make_case(name: str) -> Case:
-    """Return one of ``CASES``; alphas below 1/255 are skipped, as by the prototype."""
+    """Return one of ``CASES``; alphas below 1/255 are skipped."""
     scene, _, text = name.rpartition(" ")
     size = int(text)
     if scene == "surface":
@@ -162,17 +145,6 @@ def kernel_passes(checkout: Path, build: str, case: Case, threads: int) -> tuple
     return forward, backward
 
 
-def prototype_passes(case: Case, threads: int) -> tuple[Pass, Pass]:
-    """Return the same of the prototype, which draws one view."""
-    draw, drawn = contender("prototype", case.size, "fast", threads), []
-    leaves = Scene(*(x.clone().requires_grad_() for x in case.cloud))
-    cotangents = make_cotangents(case.size)
-    return (
-        lambda: drawn.__setitem__(slice(None), draw(leaves)),
-        lambda: torch.autograd.grad(drawn, leaves, cotangents),
-    )
-
-
 def best_times(
     contenders: dict[str, tuple[Pass, Pass]], rounds: int, clock: Callable[[], float]
 ) -> dict[str, tuple]:
@@ -191,32 +163,19 @@ def best_times(
     }
 
 
-def measure(
-    name: str, build: str, threads: int, checkouts: dict[str, Path], rounds: int
-) -> list[dict]:
-    """Measure one case; return rows of the CSV."""
+def measure(name: str, build: str, threads: int, checkouts: dict[str, Path], rounds: int) -> None:
+    """Measure one case and print it."""
     case = make_case(name)
     contenders = {
         label: kernel_passes(checkout, build, case, threads)
         for label, checkout in checkouts.items()
     }
-    runs = "v4" in cpu.usable_builds() and (PROTOTYPE / "proto.cpp").exists()
-    if runs and case.name == "surface":
-        contenders["prototype"] = prototype_passes(case, threads)
     clock = time.thread_time if threads == 1 else time.perf_counter
     best = best_times(contenders, rounds, clock)
     first = next(iter(best.values()))[1]
-    for label, (_, both) in best.items():
+    for label, (forward, both) in best.items():
         place = f"{name:20} {threads} {build:4} {label:9}"
-        print(f"{place} {both:7.2f} ms   {both / first:.2f}", flush=True)
-    where = (case.name, len(case.cloud.means), len(case.viewmats), case.size, threads, build)
-    commits = {label: commit_of(checkout) for label, checkout in checkouts.items()}
-    return [
-        dict(
-            zip(COLUMNS, (*where, label, commits.get(label, ""), *found, processor()), strict=True)
-        )
-        for label, found in best.items()
-    ]
+        print(f"{place} {forward:7.2f} {both:7.2f} ms   {both / first:.2f}", flush=True)
 
 
 def main() -> None:
@@ -231,15 +190,11 @@ def main() -> None:
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     torch.set_num_threads(1)
     checkouts = {"before": args.against.resolve(), "now": ROOT}
-    builds = [build for build in cpu.usable_builds() if build != "base"]
-    rows = [
-        row
-        for build in builds
-        for name in args.cases
-        for threads in args.threads
-        for row in measure(name, build, threads, checkouts, args.rounds)
-    ]
-    append_rows(RESULTS.stem, COLUMNS, rows, RESULTS.parent)
+    print(processor())
+    for build in (build for build in cpu.usable_builds() if build != "base"):
+        for name in args.cases:
+            for threads in args.threads:
+                measure(name, build, threads, checkouts, args.rounds)
 
 
 if __name__ == "__main__":

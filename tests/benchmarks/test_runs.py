@@ -1,29 +1,42 @@
-"""Measurements of benchmarks: which are missing, and where they are appended."""
+"""The configurations of the benchmarks' runs: each is accepted by the launcher."""
 
-from benchmarks.quality import runs
+import itertools
+
+import pytest
+from omegaconf import OmegaConf
+
+from benchmarks.quality import jobs, runs, toybox, toybox_options
+from benchmarks.quality.toybox_jobs import SAMPLES, TRUTH
+from threestudio_gaussiandreamer import register_parts
+from threestudio_gaussiandreamer.launch.config import load_config
+from threestudio_gaussiandreamer.launch.config_check import check_config
+
+register_parts()
+JOBS = list(itertools.chain.from_iterable(make() for make in jobs.JOBS.values()))
+TOYBOX = [
+    variant
+    for variant in itertools.chain.from_iterable(make() for make in toybox_options.CHARTS.values())
+    if variant.name not in (SAMPLES, TRUTH)
+]
 
 
-def test_only_what_a_chart_does_not_have_is_measured(tmp_path, monkeypatch):
-    monkeypatch.setattr(runs, "CHARTS", tmp_path)
-    measured = []
+def words(options):
+    return [f"{key}={value}" for key, value in options.items()]
 
-    def measure(mesh, seed):
-        measured.append((mesh, seed))
-        yield {"object": runs.object_name(mesh), "seed": seed, "psnr": 30 + seed}
 
-    columns = ["object", "seed", "psnr", "machine", "commit"]
-    parser = runs.argument_parser("What is measured.\n")
-    for arguments in (
-        ["--seeds", "1"],
-        ["--objects", "toy.glb", "b/spot.glb", "--seeds", "0", "1"],
-    ):
-        runs.measure_missing("chart", columns, parser.parse_args(arguments), measure)
-    assert measured == [("toy.glb", 1), ("toy.glb", 0), ("b/spot.glb", 0), ("b/spot.glb", 1)]
-    rows = runs.rows_of("chart")
-    assert [(row["object"], row["psnr"]) for row in rows] == [
-        ("toy", "31"),
-        ("toy", "30"),
-        ("spot", "30"),
-        ("spot", "31"),
-    ]
-    assert all(row["machine"] and row["commit"] for row in rows)
+@pytest.mark.parametrize("job", JOBS, ids=lambda job: f"{job.chart}-{job.variant}-{job.x:g}")
+def test_the_options_of_every_chart_are_accepted(job):
+    check_config(load_config(*runs.configs_of(job.overlay), cli_args=words(job.options)))
+
+
+@pytest.mark.parametrize("variant", TOYBOX, ids=lambda variant: variant.name)
+def test_the_options_of_every_run_with_learned_models_are_accepted(variant):
+    prompt = {"system.prompt_processor.prompt": "a red fox"}
+    options = words(toybox.QUICK | variant.options | prompt)
+    check_config(load_config(runs.ROOT / "configs/toybox.yaml", cli_args=options))
+
+
+def test_the_demos_variants_run_for_as_many_steps_as_their_configurations():
+    for overlay, steps in jobs.DEMOS.values():
+        parts = [OmegaConf.load(path) for path in runs.configs_of(overlay)]
+        assert OmegaConf.merge(*parts).trainer.max_steps == steps
