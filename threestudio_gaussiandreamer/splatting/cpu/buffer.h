@@ -10,6 +10,9 @@
 #include <vector>
 
 #if defined(_WIN32)
+#if !defined(_GLIBCXX_HAS_GTHREADS)
+#error "std::mutex is missing: use MinGW-w64 with POSIX threads (x86_64-w64-mingw32-g++-posix)"
+#endif
 #include <malloc.h>
 #else
 #include <pthread.h>
