@@ -1,13 +1,14 @@
 """Every command without the optional dependencies: one message that names the extra."""
 
+import re
 import sys
-from importlib import import_module
+from importlib import import_module, metadata
 from pathlib import Path
 
 import pytest
 
 from tests.helpers.object_clouds import ball
-from threestudio_gaussiandreamer.core.extras import EXTRAS
+from threestudio_gaussiandreamer.core.extras import error_of_extra, extras
 from threestudio_gaussiandreamer.formats.gaussian_files import StoredCloud, write_cloud
 
 PROMPT = "system.prompt_processor.prompt=a red fox"
@@ -30,7 +31,7 @@ COMMANDS = [
 @pytest.fixture
 def without_extras(monkeypatch):
     # not s3fs, which Lightning imports where its distribution is installed
-    names = {name for modules in EXTRAS.values() for name in modules.split()} - {"s3fs"}
+    names = set().union(*extras().values()) - {"s3fs"}
     for name in list(sys.modules):
         if name.partition(".")[0] in names:
             monkeypatch.delitem(sys.modules, name)
@@ -41,6 +42,25 @@ def without_extras(monkeypatch):
                 raise ModuleNotFoundError(f"No module named {name!r}", name=name)
 
     monkeypatch.setattr(sys, "meta_path", [Blocker(), *sys.meta_path])
+
+
+@pytest.mark.parametrize(
+    ("module", "extra"),
+    [("pxr", "usd"), ("anny", "body"), ("skimage.measure", "mesh"), ("tokenizers", "diffusion")],
+)
+def test_the_extra_of_a_module_is_that_of_pyproject_toml(module, extra, monkeypatch):
+    """As the metadata of an installed package has it."""
+    text = Path(__file__).parents[2].joinpath("pyproject.toml").read_text(encoding="utf-8")
+    lists = re.search(r"\[project.optional-dependencies\]\n(.*?)\n\n", text, re.DOTALL)[1]
+    requirements = [
+        f'{requirement}; extra == "{name}"'
+        for name, found in re.findall(r"^([\w-]+) = \[(.*)\]", lists, re.MULTILINE)
+        for requirement in re.findall(r'"([^"]+)"', found)
+    ]
+    monkeypatch.setattr(metadata, "requires", lambda name: requirements)
+    error = error_of_extra(ModuleNotFoundError(f"No module named {module!r}", name=module))
+    assert f"[{extra}]'" in str(error)
+    assert error_of_extra(ModuleNotFoundError("No module named 'pytest'", name="pytest")) is None
 
 
 @pytest.mark.parametrize(("module", "arguments", "extra"), COMMANDS)

@@ -273,7 +273,7 @@ def test_a_second_run_in_a_folder_is_refused_while_the_first_one_trains(launch_d
     first = folder_lock.claim(TRIAL)
     code, err = launch_demo()
     first.release()
-    assert code == 2 and f"another run is training in {TRIAL}" in err and not list(TRIAL.iterdir())
+    assert code == 2 and f"another run is training in {TRIAL}" in err and not list(TRIAL.glob("*"))
     assert launch_demo()[0] == 0
 
 

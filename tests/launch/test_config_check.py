@@ -2,7 +2,7 @@
 
 import copy
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import pytest
@@ -35,6 +35,16 @@ class FooGuidance(BaseObject):
         return {"loss_foo": rgb.sum()}
 
 
+@register("table-part")
+class TablePart(BaseObject):
+    @dataclass
+    class Config(BaseObject.Config):
+        weights: dict = field(
+            default_factory=lambda: {"depth": 0.1, "on": True, "kind": {"name": "l1"}}
+        )
+        free: dict = field(default_factory=dict)
+
+
 # -- the check -------------------------------------------------------------------------------------
 
 
@@ -46,6 +56,23 @@ def keys_of(node: dict, prefix: str = "") -> list[str]:
         for key in keys_of(value, f"{prefix}{name}.")
     ]
     return [prefix + name for name in node] + inner
+
+
+@pytest.mark.parametrize(
+    ("weights", "message"),
+    [
+        ({"depht": 1}, r"unknown key 'part.weights.depht': did you mean 'part.weights.depth'\?"),
+        ({"kind": {"nam": "l2"}}, "unknown key 'part.weights.kind.nam'"),
+        ({"depth": "x"}, "part.weights.depth: expected a number, got 'x'"),
+        ({"on": 1}, "part.weights.on: expected true or false, got 1"),
+        ({"kind": 1}, "part.weights.kind is 1; expected keys and values"),
+    ],
+)
+def test_a_dictionary_of_a_part_is_checked_by_its_default(weights, message):
+    with pytest.raises(UserError, match=message):
+        check_part("part", "table-part", {"weights": weights})
+    valid = {"depth": [0, 1, 0.1, 9], "on": False, "kind": {"name": "l2"}}
+    check_part("part", "table-part", {"weights": valid, "free": {"anything": "x"}})
 
 
 # without references, so that only the misspelling is wrong

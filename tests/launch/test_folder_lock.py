@@ -1,5 +1,6 @@
 """The folder of a run is created by one process, locked, and removed only by its creator."""
 
+import contextlib
 import fcntl
 import multiprocessing
 import os
@@ -17,6 +18,7 @@ from threestudio_gaussiandreamer.launch.folder_lock import (
     RunFolder,
     claim,
     claim_new,
+    holder,
     make_folder,
     require_writable,
 )
@@ -114,22 +116,56 @@ def test_parents_of_another_run_stay(folder):
     assert other.first_made == other.path and os.listdir("outputs/tiny") == []
 
 
-@pytest.fixture(params=["unsupported", "no fcntl"])
+def test_the_message_names_the_process_that_holds_the_folder(folder, monkeypatch):
+    monkeypatch.setattr("sys.argv", ["launch.py", "--train", "tag=a b"])
+
+    def hold():
+        claim(folder)
+        os.kill(os.getpid(), signal.SIGSTOP)
+
+    other = stopped_child(hold)
+    command = "launch.py --train 'tag=a b'"
+    held = rf"tiny/run \(process {other} on {socket.gethostname()}: {command}\): wait until"
+    with pytest.raises(FolderInUse, match=held):
+        claim(folder)
+    os.kill(other, signal.SIGKILL)
+    os.waitpid(other, 0)
+    assert holder(folder) == ""  # of a process that has ended
+    claim(folder).release()
+    assert list(folder.iterdir()) == []
+
+
+@pytest.fixture(params=["unsupported", "Windows"])
 def no_flock(request, monkeypatch):
-    """Simulate a file system, or an operating system, without locks of folders."""
+    """Simulate a file system without locks of folders, or Windows, which also renames no file that
+    a process has open.
+    """
 
     def unsupported(*arguments):
         raise OSError(95, "Operation not supported")
 
     if request.param == "unsupported":
         monkeypatch.setattr(fcntl, "flock", unsupported)
-    else:
-        monkeypatch.setattr(folder_lock, "fcntl", None)
+        return
+    monkeypatch.setattr(folder_lock, "fcntl", None)
+    rename, unlink = Path.rename, Path.unlink
+
+    def require_closed(path: Path) -> None:
+        for link in Path("/proc").glob("[0-9]*/fd/*"):
+            with contextlib.suppress(OSError):
+                if os.readlink(link) == str(path.absolute()):
+                    break
+        else:
+            return
+        raise PermissionError(13, "The process cannot access the file", str(path))
+
+    monkeypatch.setattr(Path, "rename", lambda p, to: require_closed(p) or rename(p, to))
+    monkeypatch.setattr(Path, "unlink", lambda p, **o: require_closed(p) or unlink(p, **o))
 
 
 def test_without_flock_a_file_keeps_a_second_run_away(folder, no_flock):
     first = claim(folder)
-    assert (folder / ".lock").read_text() == f"{socket.gethostname()} {os.getpid()}"
+    assert (folder / ".lock").read_text().startswith(f"{socket.gethostname()} {os.getpid()} ")
     with pytest.raises(FolderInUse, match="another run is training in outputs/tiny/run.*remove"):
         claim(folder)
     assert claim_new(folder)[0].path == folder.with_name("run-2")
@@ -144,16 +180,17 @@ def test_without_flock_the_file_of_a_killed_run_is_replaced(folder, no_flock):
         os.kill(os.getpid(), signal.SIGSTOP)
 
     killed = stopped_child(die)
-    with pytest.raises(FolderInUse):
+    with pytest.raises(FolderInUse, match=rf"process {killed} on {socket.gethostname()}: .*pytest"):
         claim(folder)
     os.kill(killed, signal.SIGKILL)
     os.waitpid(killed, 0)
     second = claim(folder)
     assert os.listdir(folder) == [".lock"]
-    assert (folder / ".lock").read_text().endswith(f" {os.getpid()}")
+    assert (folder / ".lock").read_text().split()[1] == str(os.getpid())
     second.release()
 
 
+@pytest.mark.parametrize("no_flock", ["unsupported"], indirect=True)
 @pytest.mark.parametrize("owner", ["another-machine 1", "", "x", f"{socket.gethostname()} 1"])
 def test_a_lock_file_whose_process_may_run_is_kept(folder, no_flock, owner):
     folder.mkdir(parents=True)
@@ -173,12 +210,13 @@ def test_a_lock_file_that_cannot_be_read_or_written_is_one_message(folder, no_fl
         raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as patch:
-        patch.setattr("builtins.open", disk_full)
+        patch.setattr("os.write", disk_full)
         with pytest.raises(UserError, match="can't be written: No space left on device"):
             claim(folder)
     assert os.listdir(folder) == []
 
 
+@pytest.mark.parametrize("no_flock", ["unsupported"], indirect=True)
 def test_a_lock_taken_while_a_stale_one_is_removed_is_put_back(folder, no_flock, monkeypatch):
     """Another run replaces the stale file between reading and renaming it."""
     folder.mkdir(parents=True)

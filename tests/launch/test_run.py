@@ -336,6 +336,17 @@ def test_a_file_that_another_stage_removes_is_named_in_one_line(launch, trained,
     assert code == 2 and "another command works in" in err and "it6-test/0.png" in err
 
 
+def test_a_second_test_in_a_folder_is_refused_and_a_training_is_not(launch, trained):
+    options = ("--test", f"resume={trained}/ckpts/last.ckpt")
+    config = f"{trained}/configs/parsed.yaml"
+    training, other = claim(trained), claim(trained / ".test")
+    code, _, err = launch(*options, config=config)
+    assert code == 2 and f"another --test is at work in {trained}/.test" in err
+    other.discard()
+    assert launch(*options, config=config)[0] == 0 and not (trained / ".test").exists()
+    training.release()
+
+
 def test_an_index_lists_what_is_left(trained, monkeypatch):
     class Vanishing(type(Path())):
         def stat(self, **options):

@@ -1,21 +1,36 @@
 """Optional dependencies: the check that they are installed."""
 
-from importlib import import_module
+import re
+from importlib import import_module, metadata
 from typing import Optional
 
 from .errors import UserError
 
-EXTRAS = {
-    "diffusion": "accelerate diffusers huggingface_hub safetensors sentencepiece tokenizers "
-    "transformers",
-    "mesh": "fast_simplification skimage xatlas",
-    "smpl": "smplx",
-    "viewer": "viser",
-    "cluster": "pyarrow ray s3fs",
-    "formats": "zstandard",
-    "charts": "matplotlib",
+MODULES = {
+    "scikit-image": "skimage",
+    "usd-core": "pxr",
+    "transformers": "transformers tokenizers huggingface_hub",
 }
-"""Modules of each extra."""
+"""Modules of a package, or what it brings, where they have other names than it."""
+FOR_TESTS = ("test", "farm-test")
+
+
+def extras() -> dict[str, list[str]]:
+    """Return the modules of each extra, by the installed package's metadata; nothing where it runs
+    from a folder without having been installed.
+    """
+    found: dict[str, list[str]] = {}
+    try:
+        requirements = metadata.requires("threestudio-gaussiandreamer") or []
+    except metadata.PackageNotFoundError:
+        return found
+    for line in requirements:
+        extra = re.search(r"extra == ['\"](.+?)['\"]", line)
+        if extra and extra[1] not in FOR_TESTS:
+            name = re.match(r"[\w.-]+", line)[0]
+            modules = MODULES.get(name, name.replace("-", "_")).split()
+            found.setdefault(extra[1], []).extend(modules)
+    return found
 
 
 def require_extra(extra: str, *modules: str) -> None:
@@ -41,6 +56,5 @@ def error_of_extra(error: BaseException) -> Optional[UserError]:
     if not isinstance(error, ModuleNotFoundError):
         return None
     module = (error.name or "").partition(".")[0]
-    found = (extra for extra, modules in EXTRAS.items() if module in modules.split())
-    extra = next(found, None)
+    extra = next((extra for extra, modules in extras().items() if module in modules), None)
     return extra and missing_extra(extra, module, str(error))

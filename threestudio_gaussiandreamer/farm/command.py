@@ -13,11 +13,10 @@ from pathlib import Path
 from typing import Any, Optional
 
 from ..core.command import run_command
-from ..core.errors import UserError
 from ..core.launcher import train_alone
 from ..core.signals import raised_signals
 from ..launch.experiment import configure_logging
-from ..launch.folder_lock import FolderInUse, claim, require_writable
+from ..launch.folder_lock import claim, require_writable
 from ..launch.options import add_config, parse_with_overrides
 from . import cluster
 from .assets import Recipe
@@ -210,13 +209,7 @@ def report(args: argparse.Namespace, place: Place, ledger: Ledger) -> int:
 @contextmanager
 def claimed(place: Place) -> Iterator[None]:
     """Lock the farm's folder, or its scratch folder on this machine, against other commands."""
-    try:
-        folder = claim(place.folder)
-    except FolderInUse as error:
-        raise UserError(
-            f"another farm command is at work in {place}: wait until it ends, or choose another "
-            "--out"
-        ) from error
+    folder = claim(place.folder, "another farm command is at work", ", or choose another --out")
     try:
         yield
     finally:

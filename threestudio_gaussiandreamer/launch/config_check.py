@@ -132,12 +132,38 @@ def _default(config_class: type, key: str) -> Any:
 
 
 def _check_keys(path: str, values: Any, config_class: type) -> None:
-    fields = {field.name: field.type for field in dataclasses.fields(config_class)}
+    fields = {field.name: field for field in dataclasses.fields(config_class)}
     for key in _mapping(path, values):
         if key not in fields:
             raise unknown("key", key, fields, prefix=f"{path}.")
-        if dataclasses.is_dataclass(fields[key]):
-            _check_keys(f"{path}.{key}", values[key], fields[key])
+        make = fields[key].default_factory
+        if dataclasses.is_dataclass(fields[key].type):
+            _check_keys(f"{path}.{key}", values[key], fields[key].type)
+        elif make is not dataclasses.MISSING:
+            _check_table(f"{path}.{key}", values[key], make())
+
+
+def _check_table(path: str, values: Any, default: Any) -> None:
+    """Check an option that is a dictionary by its default, which names its keys and shows their
+    types; one whose default is empty may have any.
+
+    Raises:
+        UserError: an unknown key, or a text, number or switch in place of another of these.
+    """
+    if not isinstance(default, Mapping) or not default:
+        return
+    for key, value in _mapping(path, values).items():
+        if key not in default:
+            raise unknown("key", key, default, prefix=f"{path}.")
+        _check_table(f"{path}.{key}", value, default[key])
+        given, expected = _scalar(value), _scalar(default[key])
+        if None not in (given, expected) and given != expected:
+            raise UserError(f"{path}.{key}: expected {expected}, got {value!r}")
+
+
+def _scalar(value: Any) -> typing.Optional[str]:
+    kinds = {"true or false": bool, "a number": (int, float), "a text": str}
+    return next((name for name, kind in kinds.items() if isinstance(value, kind)), None)
 
 
 def _typed(path: str, values: Any, config_class: type) -> DictConfig:

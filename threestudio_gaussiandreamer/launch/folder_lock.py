@@ -1,14 +1,17 @@
 """Create, lock and remove the folder of a run: exactly one process creates it, one uses it at a
 time, and only the process that created it and still holds the lock removes it.
 
-The lock is the operating system's lock of the folder, which ends with the process. File systems
-without such locks get a lock file with the host name and the process ID."""
+The lock is the operating system's lock of the folder, which ends with the process. The file
+``.lock`` names the host, the process and its command; on file systems without such locks, and on
+Windows, it is itself the lock."""
 
 import contextlib
 import errno
 import os
+import shlex
 import shutil
 import socket
+import sys
 import tempfile
 from collections.abc import Iterator
 from itertools import count
@@ -31,16 +34,21 @@ LOCK_FILE = ".lock"
 
 
 class Lock(NamedTuple):
-    """A lock on a folder: the folder's open descriptor, or a lock file in it."""
+    """A lock on a folder."""
 
-    descriptor: Optional[int] = None
-    file: Optional[Path] = None
+    descriptor: int
+    """Of the folder, or of the lock file."""
+    file: Path
+    by_file: bool = False
+    """Whether the file is the lock."""
 
     def release(self) -> None:
-        if self.descriptor is not None:
+        if fcntl is None:  # Windows, where no open file is removed
             os.close(self.descriptor)
-        if self.file is not None:
-            self.file.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            self.file.unlink()
+        if fcntl is not None:
+            os.close(self.descriptor)
 
 
 class RunFolder:
@@ -74,13 +82,17 @@ class RunFolder:
                     folder.rmdir()
 
     def _remove(self) -> None:
-        """Remove the folder. If it has a lock file it is renamed first, since other runs could lock
+        """Remove the folder. If a file is its lock it is renamed first, since other runs could lock
         it as soon as that file is removed.
         """
         doomed = self.path
-        if self.lock.file is not None:
+        if self.lock.by_file:
             doomed = self.path.with_name(f".{self.path.name}-{os.getpid()}")
+            if fcntl is None:
+                self.release()
             self.path.rename(doomed)
+            if self.lock is not None:
+                os.close(self.lock.descriptor)
             self.lock = None  # the file is gone; one of this name is another run's
         shutil.rmtree(doomed, ignore_errors=True)
 
@@ -114,16 +126,31 @@ def numbered(path: Path) -> Iterator[Path]:
     yield from (path.with_name(f"{path.name}-{number}") for number in count(2))
 
 
-def claim(path: Path) -> RunFolder:
+def claim(
+    path: Path,
+    busy: str = "another run is training",
+    advice: str = ", or choose another tag",
+) -> RunFolder:
     """Create ``path`` unless it exists, and lock it.
 
+    Args:
+        busy: what the message says of a process that uses it.
+        advice: what can be done about it beside waiting.
+
     Raises:
-        UserError: another run uses it, or no folder can be made there.
+        FolderInUse: another process uses it.
+        UserError: no folder can be made there.
     """
     while True:
         first_made = make_folder(path)
-        with contextlib.suppress(FileNotFoundError):  # the run that created it has just removed it
+        try:
             return RunFolder(path, first_made, _lock(path))
+        except FileNotFoundError:  # the run that created it has just removed it
+            continue
+        except FolderInUse as error:
+            raise FolderInUse(
+                f"{busy} in {path}{holder(path)}: wait until it ends{advice}{error}"
+            ) from error
 
 
 def free_number(folder: Path) -> int:
@@ -276,79 +303,95 @@ class FolderInUse(UserError):
     """Raised if another process has locked the folder."""
 
 
+def holder(folder: Path) -> str:
+    """Return, in brackets, which other process has locked a folder; "" if that isn't known."""
+    try:
+        text = (folder / LOCK_FILE).read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        return ""
+    host, process, command = [*text.split(" ", 2), "", "", ""][:3]
+    ours = (host, process) == (socket.gethostname(), str(os.getpid()))
+    if ours or not process.isdecimal() or (fcntl is not None and _has_ended(text)):
+        return ""
+    return f" (process {process} on {host}: {command})"
+
+
 def _lock(path: Path) -> Lock:
     """Lock a folder.
 
     Raises:
-        FolderInUse: another process has locked it.
+        FolderInUse: another process has locked it; the message is further advice.
         FileNotFoundError: it was removed before it was locked.
         UserError: it can't be opened, or no lock file can be written.
     """
+    file = path / LOCK_FILE
     try:
         descriptor = os.open(path, os.O_RDONLY) if fcntl is not None else None
     except PermissionError as error:
         raise unwritable(path, error) from error
     if descriptor is None:
-        return _lock_by_file(path)
+        return _lock_by_file(file)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        if os.path.samestat(os.fstat(descriptor), os.stat(path)):
-            return Lock(descriptor)
-        raise FileNotFoundError(errno.ENOENT, "replaced by another folder", str(path))
+        if not os.path.samestat(os.fstat(descriptor), os.stat(path)):
+            raise FileNotFoundError(errno.ENOENT, "replaced by another folder", str(path))
     except (BlockingIOError, FileNotFoundError) as error:
         os.close(descriptor)
         if isinstance(error, FileNotFoundError):
             raise
-        raise in_use(path) from error
+        raise FolderInUse("") from error
     except OSError:  # a file system without locks
         os.close(descriptor)
-        return _lock_by_file(path)
+        return _lock_by_file(file)
+    with contextlib.suppress(OSError):  # it is only for messages
+        file.write_text(_owner(), encoding="utf-8")
+    return Lock(descriptor, file)
 
 
-def in_use(path: Path, advice: str = "") -> FolderInUse:
-    return FolderInUse(
-        f"another run is training in {path}: wait until it ends, or choose another tag{advice}"
-    )
+def _owner() -> str:
+    """Return the content of a lock file: host, process and command."""
+    return f"{socket.gethostname()} {os.getpid()} {shlex.join(sys.argv)[:500]}"
 
 
 # -- lock files ------------------------------------------------------------------------------------
 
 
-def _lock_by_file(path: Path) -> Lock:
-    """Create the lock file, with ``O_EXCL``, so that exactly one process succeeds. A lock file is
-    replaced if its process ran on this machine and has ended.
+def _lock_by_file(file: Path) -> Lock:
+    """Create the lock file, with ``O_EXCL``, so that exactly one process succeeds. The file of a
+    process of this machine that has ended is replaced.
 
     Raises:
         FolderInUse: another process has created it, and may still run.
         FileNotFoundError: the folder was removed.
         UserError: the file can't be created.
     """
-    file = path / LOCK_FILE
     while True:
         try:
-            _create(file, f"{socket.gethostname()} {os.getpid()}")
-            return Lock(file=file)
+            return Lock(_create(file, _owner()), file, by_file=True)
         except FileExistsError:
             _remove_stale(file)
         except FileNotFoundError:
             raise
         except OSError as error:
-            raise unwritable(path, error) from error
+            raise unwritable(file.parent, error) from error
 
 
-def _create(file: Path, content: str) -> None:
-    """Create a file that must not exist; it is removed if the content can't be written."""
+def _create(file: Path, content: str) -> int:
+    """Create a file that must not exist and return its descriptor; it is removed if the content
+    can't be written. Windows removes and renames no open file, so it stays open.
+    """
     descriptor = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL)
     try:
-        with open(descriptor, "w", encoding="utf-8") as opened:
-            opened.write(content)
+        os.write(descriptor, content.encode())
+        return descriptor
     except OSError:  # the disk is full
+        os.close(descriptor)
         file.unlink(missing_ok=True)
         raise
 
 
 def _remove_stale(file: Path) -> None:
-    """Remove the lock file of a process of this machine that has ended.
+    """Remove the lock file of a process that has ended.
 
     The file is renamed first, in which only one of several processes succeeds. If it isn't the file
     that was read, since another process has taken the lock in between, it is put back.
@@ -364,10 +407,10 @@ def _remove_stale(file: Path) -> None:
             file.rename(renamed)
     except FileNotFoundError:  # released, or removed by another process
         return
-    except OSError:  # unreadable, or a folder
+    except OSError:  # unreadable, a folder, or a file that is open on Windows
         ended = False
     if not ended:
-        raise in_use(file.parent, f". If none is, here or on another machine, remove {file}")
+        raise FolderInUse(f". If none is, here or on another machine, remove {file}")
     if renamed.read_bytes() != found:
         with contextlib.suppress(OSError):
             os.link(renamed, file)
@@ -375,9 +418,13 @@ def _remove_stale(file: Path) -> None:
 
 
 def _has_ended(owner: str) -> bool:
-    """Return whether the owner in a lock file is a process of this machine that has ended."""
-    host, _, process = owner.rpartition(" ")
-    if host != socket.gethostname() or not process.isdecimal() or os.name != "posix":
+    """Return whether the owner in a lock file is a process of this machine that has ended; True on
+    Windows, where the file of a process that runs can't be renamed.
+    """
+    if fcntl is None:
+        return True
+    host, process = [*owner.split(" ", 2), ""][:2]
+    if host != socket.gethostname() or not process.isdecimal():
         return False
     try:
         os.kill(int(process), 0)

@@ -72,6 +72,7 @@ class Run:
         self.callbacks, self.records_code = list(callbacks), records_code
         self.sources, self.command = sources, command
         self.claimed = RunFolder(Path(cfg.trial_dir))
+        self.stage_lock: Optional[RunFolder] = None
         self.checkpoint_io = AtomicCheckpointIO(self.first_checkpoint)
         self.resumed_step = -1
         self.has_trained = False
@@ -116,6 +117,8 @@ class Run:
             raise
         finally:
             self.claimed.release()
+            if self.stage_lock is not None:
+                self.stage_lock.discard()
             if self.view is not None:
                 self.view.close()
         return 0
@@ -315,16 +318,20 @@ class Run:
     def claim_folder(self) -> None:
         """Create the run's folder if it doesn't exist, and lock it against other training runs.
 
-        Only the first process of a run does so. Stages other than training don't lock an existing
-        folder, so they may write pictures into it while another run trains there.
+        Only the first process of a run does so. In a folder that is there, stages other than
+        training lock a folder of their own: they may write pictures while another run trains there,
+        but not while the same stage does.
 
         Raises:
             UserError: another run trains in the folder, or it can't be created.
         """
-        evaluates_there = self.args.stage != "train" and self.folder.is_dir()
-        if get_rank() or evaluates_there:
+        stage = self.args.stage
+        if get_rank():
             return
-        if self.cfg.new_folder:
+        if stage != "train" and self.folder.is_dir():
+            busy = f"another --{stage} is at work"
+            self.stage_lock = claim(self.folder / f".{stage}", busy, "")
+        elif self.cfg.new_folder:
             self.claimed, number = claim_new(self.folder)
             if number > 1:
                 renumber(self.cfg, number)

@@ -2,6 +2,7 @@
 
 import contextlib
 import errno
+import re
 import threading
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -11,6 +12,7 @@ from ..core.errors import UserError, raised_in
 from ..host import pl, warn
 from .config_check import MisconfigurationException
 from .ddp import is_lost_process
+from .folder_lock import holder
 
 # errors of the file system that end a run with a message instead of a traceback
 WRITE_ERRORS = (
@@ -61,8 +63,21 @@ def lightning_errors(checkpoint: Optional[str], changes: Sequence[str] = ()) -> 
             raise
         raise UserError(
             f"the checkpoint {checkpoint} was made by another configuration: "
-            f"{'; '.join(changes) or str(error).strip()}"
+            f"{'; '.join(changes) or _differences(str(error))}"
         ) from error
+
+
+def _differences(message: str) -> str:
+    """Return torch's message about a state that doesn't match in one line: the names of parameters
+    that only the configuration or only the checkpoint has, else its words.
+    """
+    said = {"Missing": "it has no {}", "Unexpected": "its {} is in no part of this run"}
+    names = [
+        text.format(found[1].replace('"', ""))
+        for kind, text in said.items()
+        if (found := re.search(rf"{kind} key\(s\).*?: (.+?)\.\s*$", message, re.MULTILINE))
+    ]
+    return ", ".join(names) or " ".join(message.split())
 
 
 @contextlib.contextmanager
@@ -95,7 +110,7 @@ def write_errors(folder: Path) -> Iterator[None]:
             raise
         raise UserError(
             f"{error.filename} has been removed or replaced while it was needed: another command "
-            f"works in {folder}; run this one again when that has ended"
+            f"works in {folder}{holder(folder)}; run this one again when that has ended"
         ) from error
     except OSError as error:
         if not _is_write_error(error):

@@ -31,7 +31,7 @@ from ..core.files import atomic_file, json_text, output_folder
 from ..core.signals import interrupt, raised_signals
 from ..evaluation.asset_metrics import Asset, rendered
 from ..evaluation.text_to_3d import ATTRIBUTES, Scores, prior_of, result_of
-from ..launch.folder_lock import FolderInUse, RunFolder, claim, claim_new
+from ..launch.folder_lock import RunFolder, claim, claim_new
 from ..models.bundled import NAME, is_export
 from ..view.run_files import read_json
 from . import recognition
@@ -127,23 +127,11 @@ def open_folder(root: Path, record: dict[str, Any]) -> RunFolder:
     for path in sorted(root.glob(f"*/{RECORD}"), reverse=True):
         if read_json(path, dict) == record and not (path.parent / SHEET).exists():
             print(f"continuing {path.parent}", flush=True)
-            return locked(path.parent)
+            return claim(path.parent, "another demo is working", "")
     claimed, _ = claim_new(root / datetime.now().strftime("%Y%m%d-%H%M%S"))
     with atomic_file(claimed.path / RECORD) as file:
         file.write(json_text(record, indent=1).encode())
     return claimed
-
-
-def locked(folder: Path) -> RunFolder:
-    """Keep other demos out of a folder.
-
-    Raises:
-        UserError: one works there.
-    """
-    try:
-        return claim(folder)
-    except FolderInUse as error:
-        raise UserError(f"another demo is working in {folder}: wait until it ends") from error
 
 
 # ---- training ------------------------------------------------------------------------------------

@@ -25,7 +25,7 @@ from ..core.errors import UserError, unknown
 from ..core.files import output_folder
 from ..core.options import is_number, shown
 from ..core.signals import interrupt
-from ..launch.folder_lock import FolderInUse, claim
+from ..launch.folder_lock import claim
 from .autoencoder_stage import AutoencoderStage
 from .checkpoints import is_trained
 from .clip_stage import ClipStage
@@ -201,13 +201,8 @@ def locked(folder: Path, name: str) -> Iterator[None]:
     Raises:
         UserError: another process trains it.
     """
-    try:
-        claimed = claim(folder / "locks" / name)
-    except FolderInUse as error:
-        raise UserError(
-            f"another process trains the stage {name!r} in {folder}: wait until it ends, or give "
-            "another folder"
-        ) from error
+    busy = f"another process trains the stage {name!r}"
+    claimed = claim(folder / "locks" / name, busy, ", or give another folder")
     try:
         yield
     finally:

@@ -154,7 +154,7 @@ def _times(run: RunFiles) -> str:
 
 def _files(folder: Path) -> Iterator[str]:
     """Yield a list of links for every folder at the top, closed where it is long."""
-    files = sorted(path for path in folder.rglob("*") if path.is_file() and path.name != NAME)
+    files = sorted(path for path in folder.rglob("[!.]*") if path.is_file() and path.name != NAME)
     for name, group in groupby(files[:MAX_FILES], lambda path: path.relative_to(folder).parts[0]):
         items = [_file(path, folder) for path in group]
         text = f"{name} ({len(items)})" if (folder / name).is_dir() else name
