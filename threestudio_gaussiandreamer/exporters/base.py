@@ -1,8 +1,9 @@
 """The base class of exporters.
 
-Each exporter has its own module: a subclass of the host's ``Exporter``, registered as
-``<format>-exporter``. A call returns a list of ``ExporterOutput(save_name, save_type, params)``,
-and the system writes each with its method ``save_<save_type>(name, **params)``.
+An exporter is a subclass of the host's ``Exporter``, registered as ``<format>-exporter``; most are
+rows of the table of ``exporters/files.py``. A call returns a list of ``ExporterOutput(save_name,
+save_type, params)``, and the system writes each with its method ``save_<save_type>(name,
+**params)``.
 
 ===========  ==================================================================================
 option       meaning (all exporters that write one file have these)
@@ -14,12 +15,11 @@ save_video   also render the turntable
 
 import os
 from dataclasses import dataclass, field
-from typing import List, NamedTuple, Optional
+from typing import NamedTuple, Optional
 
 from ..core.errors import UserError
 from ..core.methods import find_method, require_method
 from ..core.options import check_options, one_of, rule
-from ..formats.gaussian_files import FORMATS, StoredCloud, suffix_of
 from ..gaussians.axes import AXES
 from ..gaussians.densify import LOG_SCALE_RANGE
 from ..gaussians.gaussians import Gaussians, finite
@@ -118,22 +118,3 @@ def read_gaussians(geometry: BaseGeometry) -> Gaussians:
     """
     found = finite(Gaussians.of(geometry).arrays(), "export")
     return found._replace(log_scales=found.log_scales.clip(*LOG_SCALE_RANGE))  # as they are drawn
-
-
-class CloudExporter(FileExporter):
-    """Base class of exporters that write all attributes of the Gaussians to one file."""
-
-    suffix = ""
-    """The format, a key of ``formats.gaussian_files.FORMATS``."""
-    variants: tuple[str, ...] = ()
-    """Formats that the extension of ``save_name`` selects instead."""
-
-    def __call__(self) -> List[ExporterOutput]:
-        """Return one file of save_type "gaussians"; its params are ``{"stored": StoredCloud,
-        "suffix": str}``.
-        """
-        named = suffix_of(self.cfg.save_name)
-        suffix = named if named in self.variants else self.suffix
-        stored = StoredCloud(self.gaussians()).in_axes(FORMATS[suffix].up)
-        params = {"stored": stored, "suffix": suffix}
-        return [ExporterOutput(save_name=self.cfg.save_name, save_type="gaussians", params=params)]
