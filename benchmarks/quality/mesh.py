@@ -80,7 +80,7 @@ def rows(mesh: str, seed: int) -> Iterator[dict[str, Any]]:
 
 
 def jobs() -> Iterator[tuple[str, int, MeshOptions]]:
-    default = MeshOptions(eps2d=RENDERER["eps2d"])
+    default = MeshOptions(eps2d=RENDERER["eps2d"], resolution=96)
     for option, values in VARIANTS.items():
         yield from ((option, value, replace(default, **{option: value})) for value in values)
     for value in DENSITY:

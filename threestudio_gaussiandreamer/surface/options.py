@@ -31,7 +31,7 @@ class MeshOptions:
     texture: int = field(default=1024, metadata=whole(64, 8192, "texels each way"))
     method: str = field(default="fusion", metadata=one_of(METHODS))
     """``fusion`` of rendered depths, or a level set of the summed ``density`` of the Gaussians."""
-    resolution: int = field(default=96, metadata=whole(16, 256, "cells"))
+    resolution: int = field(default=144, metadata=whole(16, 256, "cells"))
     """Cells along the longest side of the cloud, from which the surface is extracted."""
     views: int = field(default=64, metadata=whole(8, 1024, "renders"))
     """Renders on a sphere around the cloud, for depths and colours."""
