@@ -25,6 +25,9 @@ PROMPT = 'a <img src=x onerror="alert(1)"> & </title><script>alert(1)</script>'
 LOG = "dB,loss,gaussians,step\n10.0,5.0,200,1\n,,,2\n20.0,0.01,150,3\nnan,x,,4\n"
 
 
+PHONE = {"width": 320, "height": 600, "deviceScaleFactor": 1, "mobile": True}
+
+
 class Tags(HTMLParser):
     """Collects tags, and the files that they name."""
 
@@ -120,9 +123,19 @@ def test_a_white_object_does_not_vanish_on_the_page(full_run):
 def test_a_phone_shows_the_gallery_without_scrolling_sideways(full_run):
     full_run.rename(full_run.with_name("a_long_path_" * 12))
     with open_page(write_gallery(full_run.parent).as_uri()) as page:
-        size = {"width": 320, "height": 600, "deviceScaleFactor": 1, "mobile": True}
-        page.call("Emulation.setDeviceMetricsOverride", **size)
+        page.call("Emulation.setDeviceMetricsOverride", **PHONE)
         assert page.evaluate("document.documentElement.scrollWidth") <= 320
+
+
+@pytest.mark.skipif(chromium() is None, reason="no Chromium is installed")
+def test_a_phone_shows_a_runs_numbers_in_one_line(full_run):
+    with open_page(write_index(full_run).as_uri(), size=(320, 600)) as page:
+        page.call("Emulation.setDeviceMetricsOverride", **PHONE)
+        assert page.evaluate("document.documentElement.scrollWidth") <= 320
+        cells = (
+            "[...document.querySelector('table').querySelectorAll('td')].map(x => x.offsetHeight)"
+        )
+        assert max(page.evaluate(cells)) < 35
 
 
 def test_every_file_is_linked_and_every_link_leads_to_a_file(full_run):
