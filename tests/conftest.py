@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from hypothesis import settings
 
+from threestudio_gaussiandreamer.core import logs
 from threestudio_gaussiandreamer.gaussians.point_cloud import PointCloud
 
 # a busy machine exceeds any deadline; the same inputs every time
@@ -34,9 +35,12 @@ def default_signals():
 
 
 @pytest.fixture(autouse=True)
-def same_seed(monkeypatch):
-    """Unset the seed that runs put into the environment."""
+def no_traces_of_runs(monkeypatch):
+    """Undo what a run in an earlier test left: the seed in the environment, and that pytest's
+    ``caplog`` doesn't see our messages.
+    """
     monkeypatch.setenv("PL_GLOBAL_SEED", "0")
+    monkeypatch.setattr(logs.logger, "propagate", True)
 
 
 @pytest.fixture(autouse=True, scope="session")

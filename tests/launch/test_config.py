@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 
 from tests.helpers import tiny_parts
 from tests.launch.config_cases import load
-from threestudio_gaussiandreamer.core import logs
 from threestudio_gaussiandreamer.core.checkpoint_file import save_file
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.launch.config import dump_config, load_config
@@ -328,8 +327,7 @@ def test_resume_auto_takes_the_newest_run_of_the_tag(folder):
     assert load("resume=auto").resume == cfg.trial_dir + "/ckpts/last-prev.ckpt"
 
 
-def test_resume_auto_names_the_checkpoints_of_an_earlier_run(folder, caplog, monkeypatch):
-    monkeypatch.setattr(logs.logger, "propagate", True)  # the launcher stops it
+def test_resume_auto_names_the_checkpoints_of_an_earlier_run(folder, caplog):
     save_file("outputs/tiny/run/ckpts-2/epoch=0-step=3.ckpt", {"epoch": 0, "global_step": 3})
     with caplog.at_level("INFO"):
         assert load("resume=auto", "use_timestamp=false", "tag=run").resume is None

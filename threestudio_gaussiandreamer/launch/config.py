@@ -171,13 +171,10 @@ def _merge(sources: list[DictConfig]) -> DictConfig:
         merged = functools.reduce(_overlaid, files, OmegaConf.create({}))
         _require_values(merged, overrides)
         merged = _overlaid(merged, overrides)
-    except OmegaConfBaseException as error:
-        raise UserError(f"the configurations can't be merged: {_explain(error)}") from error
-    except TypeError as error:
-        clash = next(filter(None, (_clash(a, b) for a, b in combinations(sources, 2))), "a key")
-        raise UserError(
-            f"the configurations can't be merged: {clash} is a list in one and a section in another"
-        ) from error
+    except (OmegaConfBaseException, TypeError) as error:
+        clash = next(filter(None, (_clash(a, b) for a, b in combinations(sources, 2))), None)
+        reason = f"{clash} is a list in one and a section in another" if clash else _explain(error)
+        raise UserError(f"the configurations can't be merged: {reason}") from error
     for section in ("data", "system", "trainer", "checkpoint", "viewer"):
         # YAML reads "trainer:" without content as null
         if section in merged and merged._get_node(section)._is_none():
@@ -323,6 +320,7 @@ def _missing_keys(node: DictConfig, section: str = "") -> list[str]:
 def _resolve(cfg: DictConfig) -> None:
     register_resolvers()
     try:
+        OmegaConf.to_container(cfg, resolve=True)  # unlike omegaconf 2.3's resolve, names the key
         OmegaConf.resolve(cfg)
     except OmegaConfBaseException as error:
         raise UserError(f"an interpolation can't be resolved: {_explain(error)}") from error
@@ -333,9 +331,9 @@ def _resolve(cfg: DictConfig) -> None:
     map_strings(cfg, unprotect)
 
 
-def _explain(error: OmegaConfBaseException) -> str:
-    message = str(error).splitlines()[0]
-    return f"{error.full_key}: {message}" if error.full_key else message
+def _explain(error: Exception) -> str:
+    message, key = str(error).splitlines()[0], getattr(error, "full_key", None)
+    return f"{key}: {message}" if key else message
 
 
 def register_resolvers() -> None:
@@ -351,7 +349,7 @@ def register_resolvers() -> None:
         "idiv": lambda a, b: a // b,
         "basename": os.path.basename,
         "rmspace": lambda text, substitute: str(text).replace(" ", substitute),
-        "tuple2": lambda value: [float(value), float(value)],
+        "tuple2": lambda value: ListConfig([float(value), float(value)]),  # 2.3: no list
         "gt0": lambda value: value > 0,
         "cmaxgt0": lambda value: C_max(value) > 0,
         "not": lambda value: not value,
