@@ -70,7 +70,7 @@ FORMATS = (
         True,
         True,
         "all attributes, rounded; antialiasing",
-        "Niantic, PlayCanvas, Babylon.js",
+        "Niantic, Babylon.js, splat-transform 3",
     ),
     Format(
         "SOG 2",
@@ -100,6 +100,8 @@ FORMATS = (
         "OpenUSD 26.03 on: Omniverse, Houdini",
     ),
     Format(".splat", "", 3, False, True, "no harmonics, 8 bits", "read only"),
+    Format(".ksplat", "", 3, False, True, "levels 0 to 2, harmonics up to degree 2", "read only"),
+    Format("SOG folder, `meta.json`", "", 3, False, True, "versions 1 and 2", "read only"),
 )
 
 
@@ -171,7 +173,7 @@ def table_row(known: Format, measured: list[dict[str, str]]) -> list[str]:
     if ours:
         sizes, quality = ((cell(trained), cell(synthetic)) for cell in (size, decibels))
     else:
-        sizes, quality = ("32",), ("",)
+        sizes, quality = ("32" if known.name == ".splat" else "",), ("",)
     yes = {True: "yes", False: "no"}
     name = f"`{known.name}`" if known.name.startswith(".") else known.name
     figures = ["; ".join(sizes), "; ".join(quality)]

@@ -108,11 +108,11 @@ def test_scenes_in_levels_of_detail_are_refused_with_what_converts_them(tmp_path
         find("gaussians-prior")({"path": str(tmp_path / name)}).preflight()
 
 
-def test_harmonics_above_degree_3_are_refused_when_read(tmp_path):
-    path = str(tmp_path / "a.ply")
-    write_raw_gaussians(path, cloud(degree=4))
-    with pytest.raises(UserError, match="harmonics of degree 4; expected 0 to 3"):
-        read_cloud(path)
+def test_harmonics_above_degree_3_are_left_out(tmp_path, caplog):
+    path, whole = str(tmp_path / "a.ply"), cloud(degree=4)
+    write_raw_gaussians(path, whole)
+    np.testing.assert_array_equal(read_cloud(path).gaussians.sh, whole.sh[:, :16])
+    assert "harmonics of degree 4 a part is left out: 3 is the highest" in caplog.text
 
 
 @pytest.mark.parametrize(

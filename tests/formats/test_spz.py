@@ -81,13 +81,19 @@ def test_a_file_put_together_by_hand_is_read(tmp_path):
     np.testing.assert_array_equal(read.sh[0, 1:], [[0, 0.0625, -0.5], [0, 0, 0], [0.5, 0.5, 0.5]])
 
 
-def test_version_2_is_read(tmp_path):
-    header = BY_HAND[:4] + bytes([2]) + BY_HAND[5:16]
+@pytest.mark.parametrize("version", [1, 2])
+def test_versions_1_and_2_are_read(tmp_path, version):
+    """Three components of the quaternion as bytes; version 1 has positions of float16."""
+    header = BY_HAND[:4] + bytes([version]) + BY_HAND[5:16]
+    halves = np.float16([[1, -0.5, 513 / 256], [0, 0.25, 65504]])
+    positions = halves.tobytes() if version == 1 else POSITIONS
     rotations = bytes([255, 128, 128]) + bytes(
         [128, 0, 128]
     )  # x = 1 and y = -1, as (byte / 127.5) - 1
-    data = header + POSITIONS + ALPHAS + COLORS + SCALES + rotations + HARMONICS
+    data = header + positions + ALPHAS + COLORS + SCALES + rotations + HARMONICS
     read = read_spz(stored(tmp_path, packed(data)))
+    np.testing.assert_array_equal(read.means[0], [1, -0.5, 513 / 256])
+    np.testing.assert_array_equal(read.means[1], halves[1] if version == 1 else 0)
     np.testing.assert_allclose(read.quats, [[0, 1, 0, 0], [0, 0, -1, 0]], atol=0.005)
     np.testing.assert_array_equal(read.sh[0, 3], [0.5, 0.5, 0.5])
 
@@ -230,6 +236,14 @@ def test_what_the_format_cant_hold_is_refused(change, said):
         spz_bytes(cloud(1)._replace(**change))
 
 
+def test_harmonics_of_degree_4_are_read(tmp_path):
+    rest = np.arange(144, dtype=np.uint8)
+    data = with_header(degree=4)
+    body = gzip.decompress(data)[: -len(HARMONICS)] + rest.tobytes()
+    read = read_spz(stored(tmp_path, packed(body)))
+    np.testing.assert_array_equal(128 * read.sh[:, 1:].ravel() + 128, rest)
+
+
 def with_header(version=3, count=2, degree=1, magic=b"NGSP"):
     return packed(struct.pack("<4sIIBBBB", magic, version, count, degree, 8, 0, 0) + BY_HAND[16:])
 
@@ -243,10 +257,10 @@ def with_header(version=3, count=2, degree=1, magic=b"NGSP"):
         (packed(BY_HAND)[:-20], "truncated or damaged"),
         (packed(BY_HAND)[:-1], "its checksum at the end is missing"),
         (packed(BY_HAND)[:-8] + bytes(8), "incorrect data check"),
-        (b"NGSP" + bytes(40), "isn't an SPZ file of version 2 to 4"),
-        (with_header(magic=b"NGSX"), "isn't an SPZ file of version 2 to 4"),
-        (with_header(version=1), "isn't an SPZ file of version 2 to 4"),
-        (with_header(degree=4), "degree 4 are announced"),
+        (b"NGSP" + bytes(40), "isn't an SPZ file of version 1 to 4"),
+        (with_header(magic=b"NGSX"), "isn't an SPZ file of version 1 to 4"),
+        (with_header(version=0), "isn't an SPZ file of version 1 to 4"),
+        (with_header(degree=5), "degree 5 are announced"),
         (with_header(count=3), "3 Gaussians need"),
         (with_header(count=2**32 - 1), "bytes can't hold them"),
     ],

@@ -20,6 +20,7 @@ from tests.formats.test_spz import (
 )
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.formats import spz_container
+from threestudio_gaussiandreamer.formats.gaussian_files import StoredCloud, write_cloud
 from threestudio_gaussiandreamer.formats.spz import load_spz, read_spz, spz_bytes, write_spz
 
 zstandard = pytest.importorskip("zstandard", reason="zstandard isn't installed")
@@ -113,6 +114,19 @@ def test_the_record_in_the_gzip_versions_is_honoured(tmp_path):
     np.testing.assert_array_equal(read.means, plain.means * np.float32([1, -1, -1]))
 
 
+@pytest.mark.parametrize(("up", "number"), [("y", 4), ("-y", 6)])
+def test_the_record_of_the_axes_is_written(tmp_path, up, number):
+    """By version 4: the same cloud is read whichever axes it is stored in."""
+    write_cloud(str(tmp_path / "a.spz"), StoredCloud(cloud(), "z"), spz_version=4, spz_up=up)
+    write_cloud(str(tmp_path / "b.spz"), StoredCloud(cloud(), "z"))
+    data = (tmp_path / "a.spz").read_bytes()
+    assert data[14] & 2 and struct.unpack_from("<I12xIII", data, 16) == (44, 0xADBE0003, 4, number)
+    ours, plain = (read_spz(tmp_path / name) for name in ("a.spz", "b.spz"))
+    order, other = (np.lexsort(np.rint(300 * found.means.T)) for found in (ours, plain))
+    np.testing.assert_allclose(ours.means[order], plain.means[other], atol=2e-3)
+    np.testing.assert_allclose(ours.sh[order], plain.sh[other], atol=0.07)
+
+
 def test_an_unknown_number_of_the_axes_is_refused(tmp_path):
     with pytest.raises(UserError, match="record of the axes has the number 17: 1 to 16"):
         read_spz(stored(tmp_path, by_hand(flags=2, extension=axes(17))))
@@ -127,7 +141,7 @@ def test_an_unknown_number_of_the_axes_is_refused(tmp_path):
         (by_hand() + b"\0", "1 bytes follow its last block"),
         (by_hand(streams=5), "its table of 5 blocks is damaged"),
         (by_hand(count=2**32 - 1), "of memory"),
-        (by_hand(degree=4), "degree 4 are announced"),
+        (by_hand(degree=5), "degree 5 are announced"),
         (by_hand(sizes=[18, 2, 6, 6, 8, 17]), "truncated or damaged"),
         (by_hand([*BLOCKS[:-1], HARMONICS + b"\0"], sizes=[18, 2, 6, 6, 8, 18]), "another size"),
         (by_hand([*BLOCKS[:-1], HARMONICS[1:]], sizes=[18, 2, 6, 6, 8, 18]), "another size"),
@@ -164,8 +178,8 @@ def test_what_is_written_has_the_published_header():
     data = spz_bytes(cloud(5, 1), version=4)
     head = spz_container.SpzHeader._make(spz_container.HEADER.unpack_from(data))
     assert head.magic == b"NGSP" and head[1:4] == (4, 5, 1) and head.streams == 6
-    assert struct.unpack_from("<I12x", data, 16)[0] == 32 and data[20:32] == bytes(12)
-    first = struct.unpack_from("<QQ", data, 32)
+    assert struct.unpack_from("<I12x", data, 16)[0] == 44 and data[20:32] == bytes(12)
+    first = struct.unpack_from("<QQ", data, 44)
     assert first[1] == 45  # positions: 9 bytes for each of 5
-    means = zstandard.ZstdDecompressor().decompress(data[128 : 128 + first[0]])
+    means = zstandard.ZstdDecompressor().decompress(data[140 : 140 + first[0]])
     assert len(means) == 45

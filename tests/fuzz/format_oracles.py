@@ -54,6 +54,35 @@ def sog_means(data: bytes) -> np.ndarray:
     return np.sign(logs) * (np.exp(np.abs(logs)) - 1)
 
 
+def ksplat_means(data: bytes) -> np.ndarray:
+    """The positions (N, 3) in the records of a .ksplat file."""
+    sections, level = struct.unpack_from("<I", data, 4)[0], struct.unpack_from("<H", data, 20)[0]
+    at, means = 4096 + 1024 * sections, []
+    for index in range(sections):
+        count, room, bucket, buckets, block, stride = struct.unpack_from(
+            "<IIIIfH", data, 4096 + 1024 * index
+        )
+        steps, _, full, partial = struct.unpack_from("<4I", data, 4096 + 1024 * index + 24)
+        degree = struct.unpack_from("<H", data, 4096 + 1024 * index + 40)[0]
+        harmonics = 3 * ((degree + 1) ** 2 - 1)
+        size = (44 + 4 * harmonics, 24 + 2 * harmonics, 24 + harmonics)[level]
+        lengths = [bucket] * full + list(struct.unpack_from(f"<{partial}I", data, at))
+        owners = [place for place, length in enumerate(lengths) for _ in range(length)]
+        rows = at + 4 * partial + stride * buckets
+        for row in range(count):
+            if level == 0:
+                means.append(struct.unpack_from("<3f", data, rows + size * row))
+                continue
+            center = struct.unpack_from("<3f", data, at + 4 * partial + 12 * owners[row])
+            numbers = struct.unpack_from("<3H", data, rows + size * row)
+            far = steps or 32767
+            means.append(
+                [(n - far) * (block / 2 / far) + c for n, c in zip(numbers, center, strict=True)]
+            )
+        at = rows + size * room
+    return np.array(means, np.float64).reshape(-1, 3)
+
+
 def usda_means(data: bytes) -> np.ndarray:
     """The positions (N, 3) in the one line of a USDA layer that gives them."""
     declared = rb"^\s*(?:custom )?(?:uniform )?point3f\[\] positions = \[(.*)\]"

@@ -11,9 +11,12 @@ import numpy as np
 import zstandard
 from PIL import Image
 
+from tests.formats.test_ksplat import stored as ksplat_file
 from tests.fuzz import mutations, oracles
 from tests.fuzz.cloud_targets import some_gaussians
 from tests.fuzz.target import cloud_of, require, require_picture, same, strictly
+from tests.helpers.object_clouds import ball
+from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.formats.gaussian_files import StoredCloud, read_cloud, write_cloud
 from threestudio_gaussiandreamer.formats.splat import RECORD, read_splat
 from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
@@ -83,6 +86,28 @@ def exercise_means(
     return exercise
 
 
+def unpacked(path: Path) -> Path:
+    """Unpack an archive beside itself; return its meta.json, which may be missing.
+
+    Raises:
+        UserError: it is no archive, or has names that aren't a file's.
+    """
+    try:
+        for name, content in mutations.ZIP.unpack(path.read_bytes()):
+            (path.parent / Path(name).name).write_bytes(content)
+    except Exception as error:
+        raise UserError(f"it can't be unpacked: {error}") from error
+    return path.with_name("meta.json")
+
+
+def ksplats() -> list[bytes]:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "a.ksplat")
+        return [
+            ksplat_file(path, level, [ball(50, 1 + level % 2)]).read_bytes() for level in range(3)
+        ]
+
+
 def spz_count(data: bytes) -> int:
     """Return the count in the plain header of SPZ 4; versions before are gzip."""
     plain = data if data[:4] == b"NGSP" else oracles.gunzipped(data)
@@ -130,10 +155,11 @@ def _sog(pieces: list[tuple[str, bytes]]) -> bytes:
 
 
 def _unspz(data: bytes) -> list[tuple[str, bytes]]:
-    """Split SPZ 4 into its header and unpacked blocks."""
-    pieces, at = [("header", data[:32])], 32 + 16 * data[15]
+    """Split SPZ 4 into its header, with the record of the axes, and unpacked blocks."""
+    table = int.from_bytes(data[16:20], "little")
+    pieces, at = [("header", data[:table])], table + 16 * data[15]
     for index in range(data[15]):
-        size, unpacked = struct.unpack_from("<QQ", data, 32 + 16 * index)
+        size, unpacked = struct.unpack_from("<QQ", data, table + 16 * index)
         frame = zstandard.ZstdDecompressor().decompressobj().decompress(data[at : at + size])
         pieces.append((str(unpacked), frame))
         at += size

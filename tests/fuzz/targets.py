@@ -25,7 +25,7 @@ from tests.fuzz.cloud_targets import (
     gaussian_plys,
     point_plys,
 )
-from tests.fuzz.format_oracles import compressed_means, sog_means, usda_means
+from tests.fuzz.format_oracles import compressed_means, ksplat_means, sog_means, usda_means
 from tests.fuzz.format_targets import (
     SOG,
     SPZ_4,
@@ -34,8 +34,10 @@ from tests.fuzz.format_targets import (
     exercise_splat,
     files,
     glb_count,
+    ksplats,
     splats,
     spz_count,
+    unpacked,
 )
 from tests.fuzz.mesh_targets import (
     exercise_glb,
@@ -57,6 +59,7 @@ from tests.fuzz.run_targets import (
 )
 from tests.fuzz.target import Target, require_picture
 from threestudio_gaussiandreamer.formats.compressed_ply import read_compressed_ply
+from threestudio_gaussiandreamer.formats.ksplat import read_ksplat
 from threestudio_gaussiandreamer.formats.sog import read_sog
 from threestudio_gaussiandreamer.formats.usda_reader import read_usda
 
@@ -130,6 +133,13 @@ TARGETS: dict[str, Target] = {
         exercise_means(read_sog, sog_means),
         packing=SOG,
     ),
+    "sog-folder": Target(
+        ".sog",
+        lambda: files(".sog", [(12, 0), (9, 1)]),
+        exercise_means(lambda path: read_sog(unpacked(path)), sog_means),
+        packing=SOG,
+    ),
+    "ksplat": Target(".ksplat", ksplats, exercise_means(read_ksplat, ksplat_means)),
     "glb-gaussians": Target(
         ".glb",
         lambda: files(".glb", [(12, 0), (9, 1)]),

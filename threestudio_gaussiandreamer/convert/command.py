@@ -10,7 +10,7 @@ themselves into a .glb, and a .spz.glb holds them always, as SPZ, which CesiumJS
 
 import argparse
 import os
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Optional
@@ -30,8 +30,8 @@ from ..formats.gaussian_files import (
     write_cloud,
 )
 from ..formats.producers import GAUSSIANS, from_producer, producers_of
-from ..formats.spz import VERSION
-from ..formats.spz_container import VERSIONS, require_version
+from ..formats.spz import SPZ_UP, SYSTEM_OF, VERSION
+from ..formats.spz_container import VERSIONS, ZSTD_VERSION, require_version
 from ..gaussians.axes import AXES, VIEWER_UP
 from ..gaussians.gaussians import finite
 from ..gaussians.sh import COEFFICIENTS, MAX_DEGREE
@@ -65,7 +65,8 @@ OPTIONS: dict[str, dict[str, Any]] = {
     },
     "--up-out": {
         "choices": AXES,
-        "help": f"which axis of OUT is up, for PLYs (default: {VIEWER_UP}, as viewers expect)",
+        "help": f"which axis of OUT is up, for PLYs (default: {VIEWER_UP}, as viewers expect) and "
+        f"SPZ of version 4 ({' or '.join(SYSTEM_OF)}; default: {SPZ_UP})",
     },
     "--gaussians": {
         "action": "store_true",
@@ -137,7 +138,8 @@ def run(args: argparse.Namespace) -> None:
     size = args.size or SIZE
     # before anything is written, since it refuses clouds that can't be rendered
     truth = reference(whole, size) if args.check else None
-    write_cloud(args.output, stored, suffix, spz_version=args.spz_version)
+    spz_up = args.up_out or SPZ_UP
+    write_cloud(args.output, stored, suffix, spz_version=args.spz_version, spz_up=spz_up)
     count, written = len(stored.gaussians.means), os.path.getsize(args.output)
     print(
         f"{args.output}: {count:,} Gaussians of degree {stored.gaussians.sh_degree}, "
@@ -161,14 +163,24 @@ def _check_options(args: argparse.Namespace, suffix: str, mesh: bool) -> None:
         require_version(args.spz_version)
     elif args.spz_version != VERSION:
         raise UserError(f"--spz-version: OUT is a {suffix} file")
-    if args.up_out and (mesh or not FORMATS[suffix].any_up):
-        raise UserError(f"--up-out: OUT is a {suffix} file, whose axes are fixed; it is for PLYs")
+    if args.up_out and args.up_out not in _axes_of(suffix, args.spz_version, mesh):
+        raise UserError(
+            f"--up-out: OUT is a {suffix} file, whose axes are fixed; it is for PLYs, and y or -y "
+            "with --spz-version 4"
+        )
     check_options(ConvertOptions, ConvertOptions(args.harmonics, args.size), "--")
     if args.size is not None and not args.check:
         raise UserError("--size: has no effect without --check")
     if args.gaussians and suffix != ".glb":
         raise UserError(f"--gaussians: OUT is a {suffix} file, which always holds Gaussians")
     to_mesh.check_mesh_options(args)
+
+
+def _axes_of(suffix: str, spz_version: int, mesh: bool) -> Collection[str]:
+    """Return the up axes that OUT can have."""
+    if suffix == ".spz" and spz_version == ZSTD_VERSION:
+        return SYSTEM_OF
+    return AXES if not mesh and FORMATS[suffix].any_up else ()
 
 
 def _read(source: Path, args: argparse.Namespace) -> StoredCloud:

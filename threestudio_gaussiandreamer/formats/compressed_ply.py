@@ -58,7 +58,7 @@ def write_compressed_ply(
         comments: ASCII lines for the header.
 
     Raises:
-        UserError: harmonics above degree 3, or the file can't be written.
+        UserError: the file can't be written.
     """
     gaussians = finite(gaussians, str(path))
     gaussians = gaussians.rows(packing.morton_order(gaussians.means))

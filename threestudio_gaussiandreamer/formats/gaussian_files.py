@@ -8,9 +8,8 @@ Gaussian splatting and its viewers. The same axes are written by default."""
 import logging
 import re
 from collections.abc import Callable, Collection, Sequence
-from functools import partial
 from pathlib import Path
-from typing import NamedTuple, Optional
+from typing import Any, NamedTuple, Optional
 
 from ..core.errors import UserError, unknown
 from ..core.files import existing_file
@@ -102,11 +101,9 @@ def _read_sog(path: Path) -> Content:
     return gaussians, notes + ([ANTIALIASED] if antialiased else [])
 
 
-def _write_spz(
-    path: str, gaussians: Gaussians, notes: Sequence[str], version: int = spz.VERSION
-) -> None:
+def _write_spz(path: str, gaussians: Gaussians, notes: Sequence[str], **options: Any) -> None:
     antialiased, comment = ANTIALIASED in notes, _without_mode(notes)
-    write_spz(path, gaussians, comment=comment, version=version, antialiased=antialiased)
+    write_spz(path, gaussians, comment=comment, antialiased=antialiased, **options)
 
 
 def _write_sog(path: str, gaussians: Gaussians, notes: Sequence[str]) -> None:
@@ -263,12 +260,14 @@ def write_cloud(
     suffix: Optional[str] = None,
     *,
     spz_version: int = spz.VERSION,
+    spz_up: str = SPZ_UP,
 ) -> None:
     """Write a cloud: a PLY in the cloud's axes, other formats in their own.
 
     Args:
         suffix: one of ``WRITTEN``; by default the extension of ``path``.
         spz_version: 3 or 4.
+        spz_up: the axis that is up in an SPZ, y or, in version 4, -y.
 
     Raises:
         UserError: the format is unknown or doesn't support the harmonics' degree, or the file can't
@@ -276,9 +275,9 @@ def write_cloud(
     """
     suffix = suffix or require_format(path, "OUT")
     known = FORMATS[suffix]
-    stored = cloud if known.any_up else cloud.in_axes(known.up)
-    write = partial(known.write, version=spz_version) if suffix == ".spz" else known.write
-    write(path, stored.gaussians, _notes(stored, known))
+    options = {"version": spz_version, "up": spz_up} if suffix == ".spz" else {}
+    stored = cloud if known.any_up else cloud.in_axes(options.get("up", known.up))
+    known.write(path, stored.gaussians, _notes(stored, known), **options)
 
 
 def _notes(cloud: StoredCloud, known: CloudFormat) -> list[str]:

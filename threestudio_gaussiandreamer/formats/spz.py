@@ -1,21 +1,22 @@
 """SPZ, the compact file of Gaussians that web viewers read: about 17 bytes for a Gaussian of degree
 0, where a PLY takes 68.
 
-The format is Niantic's (github.com/nianticlabs/spz, MIT). Versions 3 and 4 are written, 2 to 4 are
+The format is Niantic's (github.com/nianticlabs/spz, MIT). Versions 3 and 4 are written, 1 to 4 are
 read: a header and one block for each attribute, packed by gzip or, in version 4, by Zstandard
 (``spz_container.py``). Integers are little-endian, quaternions in the order xyzw, axes right, up,
-back unless a record says others (SPZ_ADOBE_coordinate_system), which are turned when read:
+back unless a record says others (SPZ_ADOBE_coordinate_system), which are turned when read, and
+which version 4 can have when written:
 
 ==========  ========================================================================================
 header      ``NGSP``, version u32, N u32, degree of the harmonics u8, fractional bits u8, flags u8
             (1: antialiased), number of packed blocks u8 (version 4)
-positions   N x 3 fixed point of 24 bits, signed
+positions   N x 3 fixed point of 24 bits, signed (version 1: float16)
 alphas      N u8: 255 opacity, written up to 254: Niantic's reader takes the logit of the byte over
             255, which is infinite at 255
 colors      N x 3 u8: 255 (0.15 sh + 0.5)
 scales      N x 3 u8: 16 (log scale + 10), so sizes from e^-10 to e^5.9 world units
-rotations   N u32: the index of the largest component, and sign and 9 bits of each other (version 2:
-            x y z u8)
+rotations   N u32: the index of the largest component, and sign and 9 bits of each other (versions 1
+            and 2: x y z u8)
 harmonics   N x (K - 1) x 3 u8: 128 sh + 128, of which 5 bits are used at degree 1, 4 above
 ==========  ========================================================================================
 
@@ -40,6 +41,8 @@ logger = logging.getLogger(__name__)
 VERSION = 3
 """The version that is written by default."""
 SPZ_UP = "y"
+SYSTEM_OF = {SPZ_UP: OWN_SYSTEM, "-y": "RDF"}
+"""Axes that can be written, by the axis that is up."""
 STEPS_PER_SIZE = 32
 """Resolution of positions: steps per median size of the Gaussians. More steps hardly improve the
 PSNR (docs/results.md).
@@ -68,6 +71,7 @@ def write_spz(
     comment: str = "",
     version: int = VERSION,
     antialiased: bool = False,
+    up: str = SPZ_UP,
 ) -> None:
     """Write :func:`spz_bytes` atomically.
 
@@ -75,10 +79,11 @@ def write_spz(
     clipped, with a warning for positions and for scales above the range.
 
     Raises:
-        UserError: harmonics above degree 3, or the file can't be written.
+        UserError: the file can't be written.
     """
     gaussians = finite(gaussians, str(path))
-    data = spz_bytes(gaussians, comment=comment, version=version, antialiased=antialiased)
+    options = {"comment": comment, "version": version, "antialiased": antialiased, "up": up}
+    data = spz_bytes(gaussians, **options)
     if clipped := int(out_of_range(gaussians).sum()):
         logger.warning(
             "%s: %d of %d Gaussians are farther away or larger than SPZ can hold: clipped to its "
@@ -97,6 +102,7 @@ def spz_bytes(
     comment: str = "",
     version: int = VERSION,
     antialiased: bool = False,
+    up: str = SPZ_UP,
 ) -> bytes:
     """Encode Gaussians as an SPZ file.
 
@@ -104,11 +110,12 @@ def spz_bytes(
     beyond the format's range are clipped.
 
     Args:
-        gaussians: in the axes right, up, back.
+        gaussians: in the axes right, up, back, or with another axis ``up``.
         comment: ASCII text for the gzip header, which other readers ignore; version 4 has no place
             for it.
         version: 3 or 4.
         antialiased: whether the Gaussians were trained with antialiasing.
+        up: a key of ``SYSTEM_OF``, which version 4 records; version 3 can only have the default.
 
     Raises:
         UserError: values are NaN or infinite, harmonics are above degree 3, or version 4 is asked
@@ -130,7 +137,8 @@ def spz_bytes(
     ]
     flags, degree = ANTIALIASED if antialiased else 0, gaussians.sh_degree
     header = SpzHeader(MAGIC, version, len(gaussians.means), degree, fractional, flags, 0)
-    return pack(header, [np.ascontiguousarray(block).tobytes() for block in blocks], comment)
+    packed = [np.ascontiguousarray(block).tobytes() for block in blocks]
+    return pack(header, packed, comment, SYSTEM_OF[up])
 
 
 def position_step(gaussians: Gaussians) -> float:
@@ -146,7 +154,7 @@ def out_of_range(gaussians: Gaussians) -> Bool[np.ndarray, " N"]:
 
 
 def read_spz(path: str | os.PathLike) -> Gaussians:
-    """Read the Gaussians of an SPZ file of version 2 to 4, in its axes: right, up, back.
+    """Read the Gaussians of an SPZ file of version 1 to 4, in its axes: right, up, back.
 
     Raises:
         UserError: there is no such file, it is no SPZ file of these versions, or it is damaged.
@@ -171,9 +179,9 @@ def spz_arrays(packed: bytes, name: str = "") -> Gaussians:
 
 def _decoded(header: SpzHeader, blocks: list[Integer[np.ndarray, "N B"]], system: str) -> Gaussians:
     positions, alphas, colors, scales, rotations, harmonics = blocks
-    read_quats = _from_first_three if header.version == 2 else _from_smallest_three
+    read_quats = _from_first_three if header.version < 3 else _from_smallest_three
     gaussians = Gaussians(
-        means=_positions(positions, header.fractional_bits),
+        means=_positions(positions, header),
         quats=read_quats(rotations),
         log_scales=scales / np.float32(16) + np.float32(MIN_LOG_SCALE),
         logit_opacities=packing.logits_of_bytes(alphas[:, 0]),
@@ -224,10 +232,12 @@ def _fixed_point(
     return low_bytes.reshape(-1, 9)
 
 
-def _positions(block: Integer[np.ndarray, "N 9"], fractional_bits: int) -> Float[np.ndarray, "N 3"]:
+def _positions(block: Integer[np.ndarray, "N B"], header: SpzHeader) -> Float[np.ndarray, "N 3"]:
+    if header.version == 1:
+        return block.view("<f2").astype(np.float32)
     low, middle, high = block.reshape(-1, 3, 3).transpose(2, 0, 1).astype(np.int32)
     fixed = low | middle << 8 | (high ^ 0x80) - 0x80 << 16
-    return (fixed * 2.0**-fractional_bits).astype(np.float32)
+    return (fixed * 2.0**-header.fractional_bits).astype(np.float32)
 
 
 def _smallest_three(quats: Float[np.ndarray, "N 4"]) -> Integer[np.ndarray, " N"]:

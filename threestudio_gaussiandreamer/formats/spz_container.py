@@ -1,8 +1,9 @@
 """Containers of SPZ files: headers, packing of the blocks, and the checks before they are unpacked.
 
-Versions 2 and 3 are one gzip member around header and blocks. Version 4 has a plain header of 32
-bytes, a table of the packed and unpacked size of each block (u64 each), and the blocks as
-Zstandard frames; a block without bytes is left out."""
+Versions 1 to 3 are one gzip member around header and blocks. Version 4 has a plain header of 32
+bytes, extensions, of which only the record of the axes is written, a table of the packed and
+unpacked size of each block (u64 each), and the blocks as Zstandard frames; a block without bytes is
+left out."""
 
 import io
 import logging
@@ -26,7 +27,8 @@ HEADER, TABLE_OFFSET, ENTRY = (
 MAGIC = b"NGSP"
 VERSIONS = (3, 4)
 """Versions that can be written."""
-GZIP_VERSIONS, ZSTD_VERSION = (2, 3), 4
+GZIP_VERSIONS, ZSTD_VERSION = (1, 2, 3), 4
+MAX_STORED_DEGREE = 4
 ANTIALIASED, HAS_EXTENSIONS = 1, 2
 """Bits of the header's flags."""
 RECORD = struct.Struct("<II")
@@ -61,7 +63,8 @@ class SpzHeader(NamedTuple):
     @property
     def blocks(self) -> list[int]:
         """Bytes per Gaussian of positions, alphas, colours, scales, rotations and harmonics."""
-        return [9, 1, 3, 3, 3 if self.version == 2 else 4, 3 * ((self.degree + 1) ** 2 - 1)]
+        position, rotation = 6 if self.version == 1 else 9, 3 if self.version < 3 else 4
+        return [position, 1, 3, 3, rotation, 3 * ((self.degree + 1) ** 2 - 1)]
 
     @property
     def antialiased(self) -> bool:
@@ -69,22 +72,28 @@ class SpzHeader(NamedTuple):
         return bool(self.flags & ANTIALIASED)
 
 
-def pack(header: SpzHeader, blocks: Sequence[bytes], comment: str = "") -> bytes:
+def pack(
+    header: SpzHeader, blocks: Sequence[bytes], comment: str = "", system: str = OWN_SYSTEM
+) -> bytes:
     """Pack the blocks of a file of version 3 or 4.
 
     Args:
         comment: ASCII text for the gzip header, which other readers ignore; version 4 has no place
             for it.
+        system: the axes, one of ``SYSTEMS``, which version 4 records; version 3 has no others than
+            the default.
     """
     if header.version != ZSTD_VERSION:
         return _gzip(HEADER.pack(*header) + b"".join(blocks), comment)
     compressor = _zstandard().ZstdCompressor(level=ZSTD_LEVEL, write_checksum=True)
     filled = [block for block in blocks if block]
     packed = [compressor.compress(block) for block in filled]
-    head = HEADER.pack(*header._replace(streams=len(packed)))
+    flags = header.flags | HAS_EXTENSIONS
+    head = HEADER.pack(*header._replace(flags=flags, streams=len(packed)))
+    record = RECORD.pack(COORDINATES, 4) + SYSTEMS.index(system).to_bytes(4, "little")
     table = b"".join(ENTRY.pack(len(a), len(b)) for a, b in zip(packed, filled, strict=True))
-    offset = HEADER.size + TABLE_OFFSET.size
-    return b"".join([head, TABLE_OFFSET.pack(offset), table, *packed])
+    offset = HEADER.size + TABLE_OFFSET.size + len(record)
+    return b"".join([head, TABLE_OFFSET.pack(offset), record, table, *packed])
 
 
 def unpack(packed: bytes, name: str) -> tuple[SpzHeader, list[Integer[np.ndarray, "N B"]], str]:
@@ -95,7 +104,7 @@ def unpack(packed: bytes, name: str) -> tuple[SpzHeader, list[Integer[np.ndarray
         name: the file, for messages.
 
     Raises:
-        UserError: no SPZ file of version 2 to 4, damaged, or more memory than the file's budget.
+        UserError: no SPZ file of version 1 to 4, damaged, or more memory than the file's budget.
     """
     try:
         unpack_version = _unpack_zstd if packed[:4] == MAGIC else _unpack_gzip
@@ -141,22 +150,22 @@ def fail(name: str, problem: str) -> NoReturn:
 
 def _check_header(header: SpzHeader, versions: tuple[int, ...], size: int, name: str) -> None:
     if header.magic != MAGIC or header.version not in versions:
-        fail(name, "it isn't an SPZ file of version 2 to 4.")
-    if header.degree > 3:
-        fail(name, f"harmonics of degree {header.degree} are announced: 0 to 3 were expected.")
+        fail(name, "it isn't an SPZ file of version 1 to 4.")
+    if header.degree > MAX_STORED_DEGREE:
+        fail(name, f"harmonics of degree {header.degree} are announced: 0 to 4 were expected.")
     each = DECODED_BYTES + DECODED_BYTES_PER_HARMONIC * (header.degree + 1) ** 2
     what = f"{header.count} Gaussians"
     require_file_memory(each * header.count, size, f"SPZ file {name!r}", what)
 
 
-# ---- versions 2 and 3 ----------------------------------------------------------------------------
+# ---- versions 1 to 3 -----------------------------------------------------------------------------
 
 
 def _unpack_gzip(packed: bytes, name: str) -> tuple[SpzHeader, list[memoryview], bytes]:
     stream = zlib.decompressobj(16 + zlib.MAX_WBITS)
     header = SpzHeader._make(HEADER.unpack(stream.decompress(packed, HEADER.size)))
     sizes = [size * header.count for size in header.blocks]
-    if header.degree <= 3 and sum(sizes) > MOST_DEFLATE_SAVES * len(packed):
+    if header.degree <= MAX_STORED_DEGREE and sum(sizes) > MOST_DEFLATE_SAVES * len(packed):
         what = f"{header.count} Gaussians are announced"
         fail(name, f"{what}, but {len(packed)} bytes can't hold them.")
     _check_header(header, GZIP_VERSIONS, len(packed), name)

@@ -11,7 +11,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from ..core.errors import UserError
-from .sh import MAX_DEGREE
+from .sh import COEFFICIENTS, MAX_DEGREE
 
 logger = logging.getLogger(__name__)
 Array = np.ndarray | Tensor
@@ -101,17 +101,13 @@ def joined(parts: Sequence[Gaussians]) -> Gaussians:
 
 
 def drawable(gaussians: Gaussians, name: str) -> Gaussians:
-    """Remove the Gaussians that can't be drawn, with a warning; ``name`` names their file in
-    messages.
-
-    Raises:
-        UserError: harmonics above degree 3, which neither the rasteriser nor SPZ supports.
+    """Remove the Gaussians that can't be drawn, and harmonics above degree 3, with a warning;
+    ``name`` names their file in messages.
     """
-    if gaussians.sh_degree > MAX_DEGREE:
-        raise UserError(
-            f"{name}: the Gaussians have harmonics of degree {gaussians.sh_degree}; expected 0 to "
-            f"{MAX_DEGREE}"
-        )
+    if (degree := gaussians.sh_degree) > MAX_DEGREE:
+        most = f"{MAX_DEGREE} is the highest that can be drawn"
+        logger.warning("%s: of harmonics of degree %d a part is left out: %s", name, degree, most)
+        gaussians = gaussians._replace(sh=gaussians.sh[:, : COEFFICIENTS[-1]])
     keep = usable(gaussians)
     if keep.all():
         return gaussians
