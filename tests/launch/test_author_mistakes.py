@@ -10,7 +10,7 @@ from threestudio_gaussiandreamer.launch.experiment import main
 TINY = [
     "trainer.max_steps=3", "trainer.val_check_interval=3", "data.width=16", "data.height=16",
     "data.eval_width=16", "data.eval_height=16", "data.n_test_views=2",
-    "system.geometry.prior.num_points=100", "system.geometry.budget=none",
+    "system.geometry.budget=none",
     "system.geometry.densify.enabled=false", "use_timestamp=false", "tag=t", "system.pages=false",
 ]  # fmt: skip
 
@@ -82,6 +82,20 @@ def own(out):
     assert state["geometry.log_scales"].median() < -3.9  # about -2.9 at the start
 
 
+PART = """
+import numpy as np
+from threestudio_gaussiandreamer.gaussians.point_cloud import PointCloud
+from threestudio_gaussiandreamer.host import register
+from threestudio_gaussiandreamer.{1} import {2}
+
+@register("own-{0}")
+class Own{0}({2}):
+"""
+FORGOTTEN = """
+    def configure(self, *parts, **more):
+        self.mine = 1
+"""
+
 MISTAKES = {
     "regulariser: NaN": (
         REGULARISER + "def own(out): return out['means'].mean() * float('nan')",
@@ -122,6 +136,92 @@ MISTAKES = {
         REGULARISER + "def own(out): return out['scale'].mean()",
         [OWN_REGULARISER],
         "output that mine-regulariser reads: 'scale': did you mean 'scales'?",
+    ),
+    "density rule: removes all Gaussians": (
+        DENSITY
+        + """
+    def after_step(self, optimizer, step, check=None):
+        none = prune_to(self.cloud.parameters_by_name(), self.cloud.opacities(), 0)
+        self.cloud.apply_change(none, optimizer)
+""",
+        [OWN_DENSITY],
+        "the change of the cloud leaves no Gaussian",
+    ),
+    "density rule: forgets a parameter": (
+        DENSITY
+        + """
+    def after_step(self, optimizer, step, check=None):
+        rows = torch.arange(50)
+        values = {"means": self.cloud.means.detach()[rows]}
+        self.cloud.apply_change(Change(rows, rows < 0, values), optimizer)
+""",
+        [OWN_DENSITY],
+        "the change of the cloud has log_scales of shape None; expected (50, 3)",
+    ),
+    "density rule: rows that there aren't": (
+        DENSITY
+        + """
+    def after_step(self, optimizer, step, check=None):
+        rows = torch.arange(200)
+        values = {name: v.detach()[rows] for name, v in self.cloud.parameters_by_name().items()}
+        self.cloud.apply_change(Change(rows + 1, rows < 0, values), optimizer)
+""",
+        [OWN_DENSITY],
+        "parents of the change of the cloud: expected 200 integers from 0 to 199",
+    ),
+    "density rule: changes parameters without the optimiser": (
+        DENSITY
+        + """
+    def after_step(self, optimizer, step, check=None):
+        self.cloud.means = torch.nn.Parameter(self.cloud.means.detach())
+""",
+        [OWN_DENSITY],
+        "geometry.means isn't among the optimiser's parameters",
+    ),
+    "density rule: returns something else": (
+        DENSITY + "    def after_step(self, optimizer, step, check=None): return len(self.cloud)",
+        [OWN_DENSITY],
+        "Own.after_step returned int; expected None or a DensityOutcome",
+    ),
+    "prior: an empty cloud": (
+        PART.format("prior", "priors.base", "Prior")
+        + """
+    def generate(self, prompt, generator):
+        return PointCloud(np.zeros((0, 3)), np.zeros((0, 3)))
+""",
+        ["system.geometry.prior_type=own-prior"],
+        "Ownprior gave no points",
+    ),
+    "prior: no cloud": (
+        PART.format("prior", "priors.base", "Prior")
+        + "    def generate(self, prompt, generator): pass",
+        ["system.geometry.prior_type=own-prior"],
+        "Ownprior returned NoneType; expected a PointCloud",
+    ),
+    "exporter: returns nothing": (
+        PART.format("exporter", "host", "Exporter") + "    def __call__(self): pass",
+        ["system.exporter.formats=[own]"],
+        "Ownexporter returned NoneType; expected a list of ExporterOutput",
+    ),
+    "renderer: forgot super().configure": (
+        PART.format("renderer", "training.renderer", "SplattingRenderer") + FORGOTTEN,
+        ["system.renderer_type=own-renderer"],
+        "Ownrenderer.configure must call super().configure",
+    ),
+    "geometry: forgot super().configure": (
+        PART.format("geometry", "training.geometry", "GaussianCloud") + FORGOTTEN,
+        ["system.geometry_type=own-geometry"],
+        "whose configure calls super().configure()",
+    ),
+    "guidance: forgot super().configure": (
+        PART.format("guidance", "guidance.mock", "MockGuidance") + FORGOTTEN,
+        ["system.guidance_type=own-guidance"],
+        "Ownguidance.configure must call super().configure",
+    ),
+    "background: forgot super().configure": (
+        PART.format("background", "training.background", "FlatBackground") + FORGOTTEN,
+        ["system.background_type=own-background"],
+        "Ownbackground.configure must call super().configure",
     ),
     "density rule: misspelt name": (
         DENSITY + "    pass",

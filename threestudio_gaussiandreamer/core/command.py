@@ -13,6 +13,7 @@ from typing import Any, Optional
 from .errors import Terminated, UserError
 from .extras import error_of_extra
 from .launcher import require_numbers
+from .methods import error_of_configure
 from .output import tolerant_output
 from .signals import raised_signals
 
@@ -94,9 +95,9 @@ def exit_code(error: Exception, verbose: bool = False) -> int:
 
     Raises:
         Exception: ``error`` itself, unless it is a UserError, a BrokenPipeError, or about a missing
-            module of an extra.
+            module of an extra or a part without ``super().configure``.
     """
-    error = error_of_extra(error) or error
+    error = error_of_extra(error) or error_of_configure(error) or error
     if not isinstance(error, (UserError, BrokenPipeError)):
         raise error
     if verbose:

@@ -1,7 +1,7 @@
 """Check that the class of a user's part has what is used of it."""
 
 import inspect
-from typing import Any
+from typing import Any, Optional
 
 from .errors import UserError
 
@@ -49,6 +49,25 @@ def require_class_method(owner: type, name: str) -> None:
     """Raise UserError if a class has a method of this name that needs an instance."""
     if inspect.isfunction(find_method(owner, name)):
         raise UserError(f"{owner.__name__}.{name} needs @classmethod above it")
+
+
+def error_of_configure(error: Exception) -> Optional[UserError]:
+    """Return the error that names the ``configure`` of a part without ``super().configure``, if
+    that is why an attribute is missing; else None.
+    """
+    part, name = getattr(error, "obj", None), getattr(error, "name", None)
+    if not isinstance(error, AttributeError) or isinstance(part, type):
+        return None
+    found = [vars(base)["configure"] for base in type(part).__mro__ if "configure" in vars(base)]
+    names = [call.__code__.co_names for call in found if inspect.isfunction(call)]
+    # set by the configure of a base class, or a property that reads what it sets
+    missing = any(name in known for known in names[1:]) or hasattr(type(part), name or "")
+    if not names or "configure" in names[0] or not missing:
+        return None
+    return UserError(
+        f"{found[0].__qualname__} must call super().configure with the arguments that it gets: "
+        f"{type(part).__name__} has no {name!r}"
+    )
 
 
 def _is_untyped(config: type, name: str, value: Any) -> bool:

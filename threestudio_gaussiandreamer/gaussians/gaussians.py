@@ -71,7 +71,8 @@ def require_attributes(source: Any, names: Iterable[str]) -> None:
     if missing := [name for name in names if not hasattr(source, name)]:
         raise UserError(
             f"{type(source).__name__} is no cloud of Gaussians: it has no {', '.join(missing)}; "
-            "set system.geometry_type to gaussiandreamer-cloud, or to a geometry derived from it"
+            "set system.geometry_type to gaussiandreamer-cloud, or to a geometry derived from it "
+            "whose configure calls super().configure()"
         )
 
 

@@ -1,5 +1,5 @@
-"""Stop a run whose parameters or optimiser state aren't finite, before they are saved; warn of one
-whose first renders are empty.
+"""Stop a run whose parameters or optimiser state aren't finite, or whose parameters the optimiser
+doesn't have, before they are saved; warn of one whose first renders are empty.
 
 Adam's moments stay NaN once they are, and the rasteriser skips Gaussians with NaN. Without this
 check such a run would end without an error, and with holes in the object.
@@ -109,6 +109,22 @@ def require_finite(tensors: Named, step: int, losses: Optional[RecentLosses] = N
         "large learning rates (system.geometry.lr_*) and, at the start, sizes in the options of "
         "system.geometry.prior and grow"
     )
+
+
+def require_optimised(
+    geometry: torch.nn.Module, optimizers: Iterable[torch.optim.Optimizer]
+) -> None:
+    """Raise UserError if a parameter of the cloud was replaced without the optimiser, if there is
+    one: it wouldn't be trained.
+    """
+    groups = [group for optimizer in optimizers for group in optimizer.param_groups]
+    trained = {id(parameter) for group in groups for parameter in group["params"]}
+    for name, parameter in geometry.named_parameters():
+        if trained and parameter.numel() and id(parameter) not in trained:
+            raise UserError(
+                f"geometry.{name} isn't among the optimiser's parameters, so that it isn't "
+                "trained: a density rule replaces them by cloud.apply_change(change, optimizer)"
+            )
 
 
 def _limit(name: str) -> float:

@@ -379,11 +379,34 @@ class GaussianCloud(BaseGeometry):
     def apply_change(self, change: Change, optimizer: torch.optim.Optimizer) -> None:
         """Apply ``change`` to the cloud and to the rows of the optimiser's state, and reset the
         statistics.
+
+        Raises:
+            UserError: no Gaussian is left, or parents and values don't fit the cloud.
         """
         old = self.parameters_by_name()
+        self._require_fit(change)
         new = {name: nn.Parameter(value) for name, value in change.values.items()}
         densify.update_optimizer(optimizer, old, new, change)
         for name, parameter in new.items():
             setattr(self, name, parameter)
         for name in STATISTICS:
             self.register_buffer(name, torch.zeros(len(change.parents), device=self.means.device))
+
+    def _require_fit(self, change: Change) -> None:
+        """Raise UserError if a density rule's change leaves nothing, or doesn't fit the cloud."""
+        rows, count = change.parents, len(change.parents)
+        if not count:
+            raise UserError("the change of the cloud leaves no Gaussian: keep some, or all")
+        if rows.is_floating_point() or not 0 <= int(rows.min()) <= int(rows.max()) < len(self):
+            raise UserError(
+                f"parents of the change of the cloud: expected {count} integers from 0 to "
+                f"{len(self) - 1}, the rows of the Gaussians that they come from"
+            )
+        for name, old in self.parameters_by_name().items():
+            expected = (count, *old.shape[1:])
+            found = getattr(change.values.get(name), "shape", None)
+            if found != expected:
+                found = found if found is None else tuple(found)
+                raise UserError(
+                    f"the change of the cloud has {name} of shape {found}; expected {expected}"
+                )

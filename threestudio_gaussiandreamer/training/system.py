@@ -37,6 +37,7 @@ import torch
 from torch import Tensor
 
 from ..core.distributed import average_gradients, from_first, rank
+from ..core.errors import UserError
 from ..core.host_copies import flush_reads
 from ..core.nested import adopt_nested
 from ..core.options import checked_options
@@ -54,10 +55,17 @@ from ..host import BaseLift3DSystem, C, find, info, register, validate_schedule,
 from ..metrics import psnr, psnr_of_error
 from ..priors.cache import cached_cloud
 from ..prune import PruneOptions
-from .density import RenderedQuality, density_rule
+from .density import DensityOutcome, RenderedQuality, density_rule
 from .events import StepLog, log_scores
 from .export import GaussianSavers, export, exported_files
-from .finite import CHECK_EVERY, RecentLosses, require_finite, training_tensors, warn_if_invisible
+from .finite import (
+    CHECK_EVERY,
+    RecentLosses,
+    require_finite,
+    require_optimised,
+    training_tensors,
+    warn_if_invisible,
+)
 from .held_out import EvaluationConfig, HeldOut, Measurements
 from .image_targets import ImageTargets, ImageTargetsConfig, check_image_targets
 from .loss_scale import LossScale
@@ -181,7 +189,8 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         self._learnt = checkpoint.get("guidance")
 
     def require_finite(self) -> None:
-        """Check parameters and optimiser state; see :func:`.finite.require_finite`."""
+        """Check parameters and optimiser state; see :mod:`.finite`."""
+        require_optimised(self.geometry, self.trainer.optimizers)
         tensors = training_tensors(self, self.trainer.optimizers)
         require_finite(tensors, self.true_global_step, self.recent_losses)
 
@@ -272,6 +281,11 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         # The rows of the optimiser's state are changed with the Gaussians, so pass the torch
         # optimiser in Lightning's wrapper.
         outcome = self.density.after_step(optimizer.optimizer, self.global_step, check)
+        if not isinstance(outcome, DensityOutcome | None):
+            raise UserError(
+                f"{type(self.density).__name__}.after_step returned {type(outcome).__name__}; "
+                "expected None or a DensityOutcome"
+            )
         if outcome and outcome.measured:
             self.step_log.write(self.trainer, outcome.measured)
             info(f"step {self.global_step}: {outcome}")
