@@ -4,10 +4,9 @@ posts the pixels back.
 Install outside the repository:
 
     apt-get install chromium
-    npm install @sparkjsdev/spark three @playcanvas/splat-transform     # in a folder of your own
+    npm install @sparkjsdev/spark three     # in a folder of your own
 """
 
-import io
 import json
 import os
 import shutil
@@ -29,11 +28,9 @@ SPARK_PAGE = Path(__file__).with_name("spark.html")
 THREE_PAGE = Path(__file__).with_name("three.html")
 DRAWING = Path(__file__).with_name("page.js")
 """What both pages import."""
-SCREENSHOT_SCRIPT = Path(__file__).with_name("screenshot.html")
 CHROMIUM_NAMES = ("chromium", "chromium-browser", "google-chrome")
-SPLAT_TRANSFORM = "@playcanvas/splat-transform/bin/cli.mjs"
 THREE = "three/build/three.module.js"
-MODULES = ("@sparkjsdev/spark/dist/spark.module.js", THREE, SPLAT_TRANSFORM)
+MODULES = ("@sparkjsdev/spark/dist/spark.module.js", THREE)
 FLAGS = (
     "--headless=new",
     "--no-sandbox",
@@ -140,27 +137,6 @@ def _canvases(exchange: "Exchange", size: int) -> UInt8[np.ndarray, "V S S 3"]:
     """Return the pictures of a page that posts the rows of its canvas from the bottom up."""
     rows = [np.frombuffer(posted, np.uint8) for posted in pictures_of(exchange, size)]
     return np.stack([values.reshape(size, size, 4) for values in rows])[:, ::-1, :, :3]
-
-
-def draw_with_splat_transform(cloud: Path, size: int, modules: Path) -> UInt8[np.ndarray, "S S 3"]:
-    """Draw the first frame of the page that splat-transform makes of the file ``cloud``, cut to a
-    square.
-
-    Raises:
-        RuntimeError: as :func:`draw_with_spark`.
-    """
-    from PIL import Image
-
-    with tempfile.TemporaryDirectory() as folder:
-        page = Path(folder) / "page.html"
-        convert = ["node", str(modules / SPLAT_TRANSFORM), "-q", "-g", "cpu"]
-        subprocess.run([*convert, str(cloud), str(page)], check=True, capture_output=True)
-        html = page.read_bytes().replace(b"<head>", b"<head>" + SCREENSHOT_SCRIPT.read_bytes(), 1)
-    (png,) = pictures_of(Exchange({"/": html}, modules, 1), size)
-    picture = Image.open(io.BytesIO(png)).convert("RGB")
-    side = min(picture.size)
-    left, top = (picture.width - side) // 2, (picture.height - side) // 2
-    return np.asarray(picture.crop((left, top, left + side, top + side)).resize((size, size)))
 
 
 # ---- the server and the browser ------------------------------------------------------------------
