@@ -40,15 +40,8 @@ class Chart(NamedTuple):
 
 
 DECIBEL = "held-out PSNR, dB"
-COLOURS = [f"C{index}" for index in range(7)] + [
-    "C8",
-    "C9",
-    "navy",
-    "gold",
-    "lime",
-    "indigo",
-    "salmon",
-]
+COLOURS = [f"C{index}" for index in (0, 1, 2, 3, 4, 5, 6, 8, 9)]
+COLOURS += ["navy", "gold", "lime", "indigo", "salmon"]
 NARROWEST = 8.6
 """Width of a chart of one object, inches: its caption needs that."""
 SECONDS = "CPU seconds of training, one thread"

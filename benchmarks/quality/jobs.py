@@ -5,11 +5,7 @@ which `runs.py` runs.
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple, Optional
 
-from benchmarks.quality.ablations import (
-    PAPER_RATES,
-    RANDOM_START,
-    VIEW_BLIND,
-)
+from benchmarks.quality.ablations import PAPER_RATES, RANDOM_START, VIEW_BLIND
 from threestudio_gaussiandreamer.gaussians.simplify import rounds_to
 from threestudio_gaussiandreamer.prune import PruneOptions
 

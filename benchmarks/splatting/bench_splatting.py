@@ -33,16 +33,8 @@ from benchmarks.splatting.bench_scenes import Scene, make_camera, make_cotangent
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 CONTENDERS = ("cpu", "cpu-v3", "cpu-base", "torch", "gsplat")
-COLUMNS = (
-    "gaussians",
-    "size",
-    "threads",
-    "contender",
-    "forward_ms",
-    "both_ms",
-    "memory_mb",
-    "load",
-)
+COLUMNS = ("gaussians", "size", "threads", "contender", "forward_ms", "both_ms", "memory_mb")
+COLUMNS += ("load",)
 
 
 # ---- one cell, in its own process ----------------------------------------------------------------
