@@ -14,7 +14,7 @@ from torch import Tensor
 from tests.fuzz.target import require_picture
 from threestudio_gaussiandreamer.gaussians.densify import Change
 from threestudio_gaussiandreamer.splatting import Rasterized
-from threestudio_gaussiandreamer.training.density import DensityControl, QualityResult
+from threestudio_gaussiandreamer.training.density import DensityControl
 from threestudio_gaussiandreamer.training.geometry import STATISTICS, GaussianCloud
 
 EXTREMES = {
@@ -123,16 +123,10 @@ class CloudSequence(RuleBasedStateMachine):
     def prune(self, budget: int, keep: float, score: str) -> None:
         self._round(budget=budget, prune={"keep": keep, "score": score})
 
-    @rule(keep=st.floats(0.01, 0.99), answers=st.integers(0, 255))
-    def prune_as_far_as_it_holds(self, keep: float, answers: int) -> None:
-        asked = iter(range(10_000))
-        self._round(
-            budget="auto",
-            prune={"keep": keep},
-            check=lambda kept: QualityResult(
-                torch.tensor((answers >> next(asked) % 8 & 1) - 0.5), {}
-            ),
-        )
+    @rule(keep=st.floats(0.01, 0.99), gain=st.floats(0.01, 5.9), error=st.floats(0, 1e30))
+    def prune_as_far_as_it_pays(self, keep: float, gain: float, error: float) -> None:
+        self.cloud.error.fill_(error)
+        self._round(budget="auto", prune={"keep": keep, "gain": gain})
 
     @rule(seed=SEEDS, budget=st.sampled_from([64, 70, "auto"]))
     def densify_and_prune(self, seed: int, budget: Any) -> None:
@@ -212,7 +206,6 @@ class CloudSequence(RuleBasedStateMachine):
         budget: Any,
         densify: dict | None = None,
         prune: dict | None = None,
-        check: Any = None,
     ) -> None:
         """Run one round of densification, pruning or both, and check its bounds."""
         CloudSequence.steps += 1
@@ -225,7 +218,7 @@ class CloudSequence(RuleBasedStateMachine):
             vars(section).update(options or {})
         rules.prune.start, rules.prune.stop, rules.prune.every = 0, 10, 1
         self.changes.clear()
-        DensityControl(self.cloud).after_step(self.optimizer, 5, check)
+        DensityControl(self.cloud).after_step(self.optimizer, 5)
         assert min(before, rules.min_gaussians) <= len(self.cloud), "below the floor"
         assert len(self.cloud) <= (before if densify is None else rules.max_gaussians), (
             "above the cap"

@@ -2,6 +2,8 @@
 suffers.
 """
 
+import math
+
 import pytest
 import torch
 
@@ -10,7 +12,7 @@ from threestudio_gaussiandreamer.core.streams import generator
 from threestudio_gaussiandreamer.gaussians import importance
 from threestudio_gaussiandreamer.gaussians.densify import Rules, Statistics, densify_and_prune
 from threestudio_gaussiandreamer.splatting import rasterize
-from threestudio_gaussiandreamer.training.density import DensityControl, QualityResult
+from threestudio_gaussiandreamer.training.density import DensityControl
 from threestudio_gaussiandreamer.training.geometry import GaussianCloud
 
 
@@ -44,18 +46,13 @@ def optimizer(geometry):
     return torch.optim.Adam(geometry.parameter_groups())
 
 
-def accepts(holds):
-    """Return a check of ``auto`` that accepts a round if ``holds(kept)``."""
-    return lambda kept: QualityResult(torch.tensor(1.0 if holds(kept) else -1.0), {})
-
-
-def rounds(geometry, steps, holds=None):
+def rounds(geometry, steps):
     """Return the counts after each step of a schedule with a round at every step."""
     adam, control, counts = optimizer(geometry), DensityControl(geometry), []
     for step in range(steps):
         geometry.gradient_sum += 1.0
         geometry.gradient_count += 1
-        control.after_step(adam, step, None if holds is None else accepts(holds))
+        control.after_step(adam, step)
         counts.append(len(geometry))
         geometry.contribution += torch.rand(len(geometry))
     return counts
@@ -264,23 +261,6 @@ def test_a_gaussian_over_its_own_colour_has_no_removal_error():
     assert removal[0] < 1e-3 * removal[2]
 
 
-def test_auto_leaves_out_the_first_half_of_its_rounds():
-    schedule = {"start": 100, "stop": 900, "every": 50}
-    assert list(DensityControl(cloud(1, prune=schedule)).prune_rounds) == list(range(100, 900, 50))
-    auto = DensityControl(cloud(1, budget="auto", prune=schedule | {"quality": 0.4}))
-    assert list(auto.prune_rounds) == list(
-        range(500, 900, 50)
-    ) and auto.affordable_loss == pytest.approx(0.05)
-    assert (
-        list(
-            DensityControl(
-                cloud(1, budget="auto", prune={"start": 1, "stop": 50, "every": 50})
-            ).prune_rounds
-        )
-        == []
-    )
-
-
 DENSIFY_EVERY_STEP = {
     "enabled": True,
     "start": 0,
@@ -318,7 +298,7 @@ def test_pruning_after_densifying_keeps_track_of_rows():
 
 
 @pytest.mark.parametrize("needed", [1, 79, 80, 81, 90, 99, 100])
-def test_auto_finds_the_smallest_count_that_holds(needed):
+def test_bisection_finds_the_smallest_count_that_holds(needed):
     contribution = torch.linspace(0.0, 0.4, 100)
     asked = []
 
@@ -332,52 +312,49 @@ def test_auto_finds_the_smallest_count_that_holds(needed):
     assert len(asked) <= importance.BISECTIONS + 1
 
 
-def test_auto_by_contribution_never_drops_the_top_gaussian_of_a_pixel():
-    geometry = cloud(100, budget="auto", prune=ONE_ROUND | {"score": "contribution"})
-    geometry.contribution.copy_(torch.cat([torch.full((95,), 0.6), torch.full((5,), 0.1)]))
-    assert rounds(geometry, 1, lambda kept: True) == [95]
+@pytest.mark.parametrize(
+    ("saved", "count"),
+    [
+        (0.0, 80),  # a whole round costs nothing
+        (0.5, 80),
+        (0.95, 95),
+        (1.5, 100),  # it costs more than it may
+    ],
+)
+def test_a_round_of_auto_drops_fewer_the_more_it_costs(saved, count):
+    """``saved``: the cost of a whole round, in units of that where rounds end."""
+    removal, error = torch.ones(100), 7.0
+    removal[:20] = (10 ** (0.1 * saved * importance.SLOPE * math.log2(100 / 80)) - 1) * error / 20
+    need = importance.needed_count(torch.arange(100.0), removal, error, 0.5, 0.8)
+    assert need.count == pytest.approx(count, abs=1)
+    assert need.gain == pytest.approx(0.5 * saved**importance.POWER, rel=1e-3)
 
 
-def one_view():
-    """View matrix and intrinsics of 24^2 pixels."""
-    c2w = orbit_c2w(torch.tensor([20.0]), torch.tensor([30.0]), torch.tensor([2.0]))
-    return to_opencv(c2w, torch.tensor([0.8]), 24, 24)
+def test_auto_drops_idle_gaussians_also_where_a_round_costs_too_much():
+    """The ten that save less than a hundredth of their part of the error, and no more than a round
+    may drop.
+    """
+    removal = torch.ones(100)
+    removal[:10] = 1e-4
+    assert importance.needed_count(torch.arange(100.0), removal, 7.0, 0.5, 0.8).count == 90
+    removal[:50] = 1e-4
+    assert importance.needed_count(torch.arange(100.0), removal, 7.0, 0.5, 0.8).count == 80
 
 
-def test_a_weight_above_one_half_is_the_largest_of_its_pixel():
-    geometry = cloud(60)
-    viewmats, Ks = one_view()
-    inputs = geometry.means, geometry.quats, geometry.scales(), geometry.opacities()
-    # a colour of its own for each Gaussian shows every weight of every pixel
-    weights = rasterize(*inputs, torch.eye(60), viewmats, Ks, 24, 24, backend="torch")
-    top = torch.zeros(60, dtype=torch.bool)
-    top[weights.image.argmax(-1).unique()] = True
-    above = weights.contribution[0] > importance.TOP_OF_A_PIXEL
-    assert above.any() and (top | ~above).all()
+def test_a_smaller_gain_keeps_more():
+    removal = torch.linspace(1e-3, 1e-1, 100)
+    counts = [
+        importance.needed_count(removal, removal, 100.0, gain, 0.5).count
+        for gain in (0.01, 0.25, 0.5, 1.0, 5.0)
+    ]
+    assert counts == sorted(counts, reverse=True) and counts[0] > counts[-1]
 
 
-def test_auto_in_the_loop_ends_where_the_quality_ends():
-    geometry = cloud(100, budget="auto", prune=ONE_ROUND | {"keep": 0.5})
-    geometry.contribution *= 0.1
-    counts = rounds(geometry, 1, lambda kept: int(kept.sum()) >= 70)
-    assert 70 <= counts[0] <= 74
-
-
-def test_hidden_gaussians_render_as_if_absent_and_are_restored():
-    geometry = cloud(50)
-    viewmats, Ks = one_view()
-
-    def image(rows=slice(None)):
-        inputs = (
-            geometry.means,
-            geometry.quats,
-            geometry.scales(),
-            geometry.opacities(),
-            geometry.colors(torch.zeros(1, 3)),
-        )
-        return rasterize(*(value[rows].detach() for value in inputs), viewmats, Ks, 24, 24).image
-
-    kept, before = torch.arange(50) % 2 == 0, image()
-    with geometry.showing_only(kept):
-        assert torch.equal(image(), image(kept))
-    assert torch.equal(image(), before)
+@pytest.mark.parametrize(("count", "keep"), [(1, 0.8), (2, 0.99), (3, 1e-6)])
+def test_very_few_gaussians_never_become_none(count, keep):
+    removal = torch.zeros(count)
+    need = importance.needed_count(removal, removal, 1.0, 0.5, keep)
+    assert 0 <= need.count <= count
+    geometry = cloud(count, budget="auto", prune=ONE_ROUND | {"keep": keep})
+    geometry.error.fill_(1.0)
+    assert 1 <= rounds(geometry, 1)[0] <= count

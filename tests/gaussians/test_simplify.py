@@ -7,7 +7,7 @@ from tests.helpers.pruning import ball
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.gaussians import recover
 from threestudio_gaussiandreamer.gaussians import simplify as simplifying
-from threestudio_gaussiandreamer.gaussians.recover import LR_SCALES, Recovery
+from threestudio_gaussiandreamer.gaussians.recover import LR_SCALES, Recovery, Round
 from threestudio_gaussiandreamer.gaussians.simplify import (
     Budget,
     keep_best,
@@ -48,6 +48,26 @@ def test_any_quality_ends_the_search():
     )
     for psnr, count in ((1.0, 1), (99.0, 12)):
         assert len(simplify(apart, Budget(psnr=psnr), recovery(apart, 48)).means) == count
+
+
+def test_a_gain_ends_the_search_where_more_would_pay():
+    """Hidden Gaussians go, and a smaller gain keeps more; the error of the input counts."""
+    cloud = ball()
+    budgets = (Budget(gain=5.0), Budget(gain=0.5), Budget(gain=0.01), Budget(gain=0.5, error=0.1))
+    most, some, least, rough = (
+        len(simplify(cloud, budget, recovery(cloud, 48)).means) for budget in budgets
+    )
+    assert 0 < most <= some <= least <= 600 and rough < some < 600
+
+
+@pytest.mark.parametrize(("before", "after", "met"), [(50, 40, False), (60, 54, True)])
+def test_a_gain_counts_the_error_of_the_input(before, after, met):
+    """A fifth fewer, a third of a doubling, may lose a sixth of a dB of 40 dB to the truth."""
+    rounds = (
+        Round(keep_best(ball(), torch.arange(600.0), 500), before),
+        Round(keep_best(ball(), torch.arange(600.0), 400), after),
+    )
+    assert Budget(gain=0.5).met_by(rounds[1], rounds[0]) == met
 
 
 def test_a_round_that_failed_is_not_tried_again(monkeypatch):

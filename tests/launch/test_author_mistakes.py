@@ -37,11 +37,11 @@ OWN_DENSITY = "system.geometry.density_type=own-density"
 def test_an_own_density_rule_is_called_around_every_step(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     source = """
-    def before_backward(self, pictures, step):
+    def before_backward(self, pictures, step, error):
         self.calls = [pictures["comp_rgb"].requires_grad, step]
     def after_backward(self, out, width, height, loss_scale):
         self.calls += [out.means2d.grad is not None, width]
-    def after_step(self, optimizer, step, check=None):
+    def after_step(self, optimizer, step):
         self.calls += [step]
         open("calls", "a").write(f"{self.calls}\\n")
         count = len(self.cloud) - 10
@@ -52,7 +52,7 @@ def test_an_own_density_rule_is_called_around_every_step(tmp_path, monkeypatch):
     expected = [f"[True, {n}, True, 16, {n + 1}]" for n in range(3)]
     assert Path("calls").read_text().splitlines() == expected
     ply = next(Path("outputs").rglob("gaussians.ply")).read_bytes()
-    assert f"element vertex {200 - 30}".encode() in ply[:200]
+    assert f"element vertex {300 - 30}".encode() in ply[:200]
 
 
 REGULARISER = """
@@ -75,7 +75,7 @@ def own(out):
     # against the guidance's far smaller gradients: every opacity and size falls, x + y + z too
     rates = [f"system.geometry.lr_{name}=0.5" for name in ("means", "scales", "opacities")]
     assert run(REGULARISER + source, "system.loss.lambda_mine=1e6", *rates) == 0
-    assert Path("shapes").read_text() == "(200, 3) (200, 3) (200,)"
+    assert Path("shapes").read_text() == "(300, 3) (300, 3) (300,)"
     state = torch.load(next(Path("outputs").rglob("last.ckpt")), weights_only=True)["state_dict"]
     assert (state["geometry.logit_opacities"] < torch.logit(torch.tensor(0.1)) - 1).all()
     assert (state["geometry.means"].sum(1) < -3).all()
@@ -105,7 +105,7 @@ MISTAKES = {
     "regulariser: a vector": (
         REGULARISER + "def own(out): return out['opacities']",
         [OWN_REGULARISER],
-        "mine-regulariser returned a tensor of shape (200,); expected one number",
+        "mine-regulariser returned a tensor of shape (300,); expected one number",
     ),
     "regulariser: no gradient": (
         REGULARISER + "def own(out): return out['opacities'].detach().mean()",
@@ -140,7 +140,7 @@ MISTAKES = {
     "density rule: removes all Gaussians": (
         DENSITY
         + """
-    def after_step(self, optimizer, step, check=None):
+    def after_step(self, optimizer, step):
         none = prune_to(self.cloud.parameters_by_name(), self.cloud.opacities(), 0)
         self.cloud.apply_change(none, optimizer)
 """,
@@ -150,7 +150,7 @@ MISTAKES = {
     "density rule: forgets a parameter": (
         DENSITY
         + """
-    def after_step(self, optimizer, step, check=None):
+    def after_step(self, optimizer, step):
         rows = torch.arange(50)
         values = {"means": self.cloud.means.detach()[rows]}
         self.cloud.apply_change(Change(rows, rows < 0, values), optimizer)
@@ -161,7 +161,7 @@ MISTAKES = {
     "density rule: rows that there aren't": (
         DENSITY
         + """
-    def after_step(self, optimizer, step, check=None):
+    def after_step(self, optimizer, step):
         rows = torch.arange(200)
         values = {name: v.detach()[rows] for name, v in self.cloud.parameters_by_name().items()}
         self.cloud.apply_change(Change(rows + 1, rows < 0, values), optimizer)
@@ -172,14 +172,14 @@ MISTAKES = {
     "density rule: changes parameters without the optimiser": (
         DENSITY
         + """
-    def after_step(self, optimizer, step, check=None):
+    def after_step(self, optimizer, step):
         self.cloud.means = torch.nn.Parameter(self.cloud.means.detach())
 """,
         [OWN_DENSITY],
         "geometry.means isn't among the optimiser's parameters",
     ),
     "density rule: returns something else": (
-        DENSITY + "    def after_step(self, optimizer, step, check=None): return len(self.cloud)",
+        DENSITY + "    def after_step(self, optimizer, step): return len(self.cloud)",
         [OWN_DENSITY],
         "Own.after_step returned int; expected None or a DensityOutcome",
     ),
@@ -226,7 +226,7 @@ MISTAKES = {
     "density rule: misspelt name": (
         DENSITY + "    pass",
         ["system.geometry.density_type=own-densty"],
-        "system.geometry.density_type: unknown part 'own-densty': did you mean 'own-density'?",
+        "system.geometry.density_type: unknown part 'own-densty': did you mean 'own-density'",
     ),
     "density rule: misspelt option": (
         DENSITY + "    pass",

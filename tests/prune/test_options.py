@@ -7,6 +7,8 @@ import pytest
 
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.prune.options import (
+    PruneOptions,
+    budget_of,
     combined_psnr,
     parse_bytes,
     parse_number,
@@ -56,6 +58,21 @@ def test_a_size_that_is_none_is_named_in_a_short_message(text, message):
     with pytest.raises(UserError, match=re.escape(message)) as caught:
         parse_bytes(text, "bytes")
     assert len(str(caught.value)) < 200
+
+
+@pytest.mark.parametrize(
+    ("given", "gain", "error"),
+    [({"auto": "0.25dB"}, 0.25, 1e-4), ({"auto": 1, "quality": 30.0}, 1.0, 1e-3)],
+)
+def test_a_gain_is_a_budget(given, gain, error):
+    budget = budget_of(PruneOptions(**given), "--")
+    assert budget.gain == gain and budget.error == pytest.approx(error)
+
+
+@pytest.mark.parametrize("text", ["0", "-1", "100", "6", "nan", "much"])
+def test_a_gain_that_is_none_is_named(text):
+    with pytest.raises(UserError, match="--auto: expected a"):
+        budget_of(PruneOptions(auto=text), "--")
 
 
 @pytest.mark.parametrize("text", ["40", " 40dB ", "40 db", 40.0])

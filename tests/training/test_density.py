@@ -2,15 +2,15 @@
 ``tests/gaussians/test_importance.py`` and ``tests/stability/test_densification.py``.
 """
 
+import math
+
 import pytest
 import torch
 
 from threestudio_gaussiandreamer.training.density import (
+    DECAY,
     DensityControl,
     DensityOutcome,
-    QualityResult,
-    RenderedQuality,
-    smallest_passing_count,
 )
 from threestudio_gaussiandreamer.training.geometry import GaussianCloud
 
@@ -32,14 +32,16 @@ def control(count=10, **options):
     return DensityControl(cloud)
 
 
-def after_step(density, step=0, check=None):
-    return density.after_step(torch.optim.Adam(density.cloud.parameter_groups()), step, check)
+def after_step(density, step=0):
+    return density.after_step(torch.optim.Adam(density.cloud.parameter_groups()), step)
 
 
 def test_a_step_without_a_round_leaves_the_cloud():
     density = control(budget=None)
     means = density.cloud.means
-    assert after_step(density) == DensityOutcome(10, 10, False, {}) and density.cloud.means is means
+    assert (
+        after_step(density) == DensityOutcome(10, 10, False, None) and density.cloud.means is means
+    )
 
 
 def test_a_cloud_larger_than_max_gaussians_is_reported():
@@ -53,50 +55,78 @@ def test_a_cloud_larger_than_max_gaussians_is_reported():
 
 
 def test_a_round_says_how_many_it_left():
-    assert after_step(control(budget=5)) == DensityOutcome(10, 8, True, {})
+    assert after_step(control(budget=5)) == DensityOutcome(10, 8, True, None)
 
 
-def test_a_round_of_auto_says_what_the_accepted_count_cost():
-    """Not the loss of the last count that was tried."""
-
-    def check(kept):
-        count = int(kept.sum())
-        return QualityResult(torch.tensor(count - 94.5), {"prune/lost": float(100 - count)})
-
-    density = control(100, budget="auto", prune={**EACH_STEP, "stop": 2})
-    outcome = after_step(density, 1, check)
-    assert 95 <= outcome.after <= 96 and outcome.measured == {"prune/lost": 100.0 - outcome.after}
+def sampled(density, removal, error):
+    """Set the statistics of the views since the last round."""
+    density.cloud.removal.copy_(removal)
+    density.cloud.error.fill_(error)
+    return density
 
 
-@pytest.mark.parametrize("margin", [-1.0, float("nan")])
-def test_quality_that_is_lost_or_unknown_never_holds(margin):
-    result = QualityResult(torch.tensor(margin), {"prune/lost": 1.0})
-    assert smallest_passing_count(torch.arange(10.0), 5, lambda kept: result) == (10, {})
+def test_a_round_of_auto_says_what_more_would_gain_and_so_does_the_end():
+    """Those that a round drops save a fortieth of the error: at this cost the round keeps all. The
+    end of the run has the gain of the last round that dropped some, if there was one.
+    """
+    density = sampled(control(budget="auto"), torch.full((10,), 0.0125), 1.0)
+    density.cloud.started_with.fill_(10)
+    outcome = after_step(density)
+    cost = 10 * math.log10(1.025) / math.log2(10 / 8)
+    assert outcome.needed.gain == pytest.approx(0.5 * (cost / 0.12) ** 3) and outcome.after == 10
+    assert str(outcome) == "10 -> 10 Gaussians: half as many would lose 1 dB or more"
+    assert density.summary() == "10 of 10 Gaussians: twice as many would gain 1 dB or more"
+    density.cloud.gain.fill_(0.25)
+    after_step(sampled(density, torch.full((10,), 0.0125), 1.0))
+    assert density.summary() == "10 of 10 Gaussians: twice as many would gain 0.2 dB"
+
+
+def test_a_run_says_how_many_it_kept_and_why():
+    density = control(budget=5)
+    density.cloud.started_with.fill_(1200)
+    after_step(density)
+    assert density.summary() == "8 of 1,200 Gaussians: the budget is 5"
+    assert control().summary() == "10 Gaussians: no budget"  # of a checkpoint without the number
+    assert "wasn't measured" in control(budget="auto").summary()
+
+
+@pytest.mark.parametrize("error", [0.0, math.nan, math.inf])
+def test_auto_drops_nothing_without_a_sample_or_with_nan_among_the_views(error):
+    density = sampled(control(budget="auto"), torch.zeros(10), error)
+    assert after_step(density).after == 10
+
+
+def test_opacities_decay_only_between_the_rounds_of_auto():
+    for budget, step, decays in (("auto", 5, True), ("auto", 10, False), (5, 5, False)):
+        density = control(budget=budget, lr_opacities=0.02)
+        adam = torch.optim.Adam(density.cloud.parameter_groups())
+        density.cloud.set_learning_rates(adam, 0, 0)
+        before = density.cloud.logit_opacities.detach().clone()
+        density.options.prune.keep = 0.999  # nothing is dropped
+        density.after_step(adam, step)
+        fallen = before[: len(density.cloud)] - density.cloud.logit_opacities.detach()
+        rate = 0.02 if decays else 0.0
+        assert torch.allclose(fallen, torch.full_like(fallen, DECAY * rate))
 
 
 @pytest.mark.parametrize("known", [True, False])
-def test_quality_is_measured_against_the_truth_or_between_renders(known):
-    """All Gaussians are rendered once for all counts that a round tries."""
-    density = control(budget="auto", prune={**EACH_STEP, "quality": 4.0, "likeness": 19.0})
-    rendered = []
-
-    def render():
-        missing = float((density.cloud.logit_opacities == -100).sum())
-        rendered.append(missing)
-        return {"comp_rgb": torch.full((1, 4, 4, 3), 0.01 + 0.01 * missing)}
-
-    truth = torch.zeros(1, 4, 4, 3) if known else None
-    check = RenderedQuality(density, render, lambda whole: truth)
-    kept = torch.arange(10) != 3
-    for _ in range(2):
-        result = check(kept)
-    assert rendered == [0.0, 1.0, 1.0]
-    lost, similarity = 10 * torch.tensor(4.0).log10(), torch.tensor(40.0)
-    affordable = 4.0 / len(density.prune_rounds)
-    expected = affordable - lost if known else similarity - 19.0
-    assert torch.allclose(result.margin, expected, atol=1e-4)
-    names = ("lost", "affordable") if known else ("likeness", "asked_for")
-    assert set(result.measured) == {f"prune/{name}" for name in names}
+def test_the_error_of_a_round_is_that_of_its_views_or_of_the_likeness(known):
+    """An error below that of ``likeness`` counts as that."""
+    density = control(budget="auto", prune={**EACH_STEP, "likeness": 20.0})
+    image = torch.rand(2, 4, 4, 3, requires_grad=True)
+    opacities = density.cloud.opacities()
+    pictures = {
+        "comp_rgb": image * opacities.mean(),
+        "opacity": image[..., :1] * opacities.mean(),
+        "comp_rgb_bg": torch.zeros(2, 1, 1, 3),
+        "gaussian_opacities": opacities,
+    }
+    for error, expected in ((0.25, 0.25 if known else 0.01), (1e-6, 0.01)):
+        density.cloud.error.zero_()
+        mean = (lambda error=error: torch.tensor(error)) if known else None
+        density.before_backward(pictures, 3, mean)
+        assert float(density.cloud.error) == pytest.approx(expected * 2 * 4 * 4 * 3)
+    assert density.cloud.removal.amin() > 0
 
 
 @pytest.mark.parametrize(

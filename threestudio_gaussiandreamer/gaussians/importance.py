@@ -12,12 +12,12 @@ removed ones. Two quantities are collected between rounds:
 The score ``removal`` is the square root of the removal error times the contribution. Each term
 alone ranks some redundant Gaussians high; their product does not.
 
-The score ``contribution`` protects the Gaussian with the largest weight in a pixel: it is pruned
-last, and with the budget ``auto`` never (SafeguardGS, Lee et al. 2024). Since the weights of a
-pixel sum to at most 1, a weight above 1/2 is the largest. The score ``removal`` doesn't protect
-these Gaussians: their neighbours can often render that pixel as well, and keeping
-all of them lowers the PSNR."""
+How many Gaussians a scene needs follows from the removal error too: it is the squared error that a
+Gaussian saves, so pruning ends where those that a round would drop save more of the error to the
+ground truth than they are worth: :func:`needed_count`.
+"""
 
+import math
 from collections.abc import Callable, Mapping
 from typing import NamedTuple, Optional
 
@@ -34,8 +34,13 @@ SCORES = ("removal", "contribution", "opacity", "random")
 """Scores by which Gaussians can be ranked; the last two are baselines for comparison."""
 SAMPLES = 12
 """Approximate number of samples of the removal error per round; each costs a backward pass."""
-TOP_OF_A_PIXEL = 0.5
-"""A weight above this is the largest of its pixel."""
+SLOPE, POWER = 0.12, 3
+"""What a round costs where twice as many Gaussians gain 0.5 dB, dB per doubling and before training
+recovers any of it; and the power of that cost with which the gain grows. Measured on eight objects
+(reports/how_many_gaussians.md).
+"""
+IDLE = 0.01
+"""Share of an equal part of the error, E / N, that a Gaussian must save to be worth keeping."""
 BISECTIONS = 4
 """Bisection steps of :func:`smallest_count`: the count is found to within 1/16 of its range."""
 
@@ -126,9 +131,55 @@ def next_count(count: int, keep: float, budget: int) -> int:
     return min(count, max(budget, int(keep * count)))
 
 
-def top_count(contribution: Float[Tensor, " N"]) -> int:
-    """Count the Gaussians with a weight above ``TOP_OF_A_PIXEL`` in some pixel."""
-    return int((contribution > TOP_OF_A_PIXEL).sum())
+class Need(NamedTuple):
+    """How many Gaussians a scene needs, as :func:`needed_count` found it."""
+
+    count: int
+    gain: float
+    """The dB per doubling of their number, around it; NaN if that isn't known."""
+    enough: bool = False
+    """Whether fewer would lose more than asked for, so that only idle Gaussians are dropped."""
+
+    def __str__(self) -> str:
+        if math.isnan(self.gain):
+            return "what more would gain wasn't measured"
+        gain = "1 dB or more" if self.gain >= 1 else f"{self.gain:.1g} dB"
+        return f"{'half as many would lose' if self.enough else 'twice as many would gain'} {gain}"
+
+
+def needed_count(
+    scores: Float[Tensor, " N"],
+    removal: Float[Tensor, " N"],
+    error: float,
+    gain: float,
+    keep: float,
+) -> Need:
+    """Return how many Gaussians the next round keeps, so that rounds end where twice as many would
+    gain ``gain`` dB.
+
+    If k of N Gaussians with the removal errors e_i are dropped, the squared error E grows by about
+    the sum of e_i: a cost of 10 log10(1 + sum e_i / E) dB for log2(N / (N - k)) halvings. Training
+    recovers most of it, so the cost where rounds should end is much smaller than ``gain``:
+    ``SLOPE`` (gain / 0.5 dB)^(1 / ``POWER``), as measured. From ``keep`` times that cost on, a
+    round drops fewer Gaussians; at that cost only idle ones.
+
+    Args:
+        scores: those with the lowest are dropped first.
+        removal: removal errors, in the unit of ``error``.
+        error: squared error of the same views; 0 if no view was sampled: nothing is dropped.
+        keep: smallest fraction that a round keeps, since Gaussians that hide each other seem idle.
+    """
+    here, wanted = len(scores), SLOPE * (gain / 0.5) ** (1 / POWER)
+    drop = here - int(keep * here)
+    if not (drop and math.isfinite(error) and error > 0):
+        return Need(here, math.nan)
+    lowest = torch.argsort(scores, stable=True)[:drop]
+    cost = 10 * math.log10(1 + float(removal[lowest].double().sum()) / error)
+    cost /= math.log2(here / (here - drop)) if drop < here else 1.0
+    busy = int((removal * here >= IDLE * error).sum())
+    share = min(max(cost / wanted, keep), 1.0)
+    count = max(here - drop, min(int(share * here), busy))
+    return Need(count, 0.5 * (cost / SLOPE) ** POWER, share == 1.0)
 
 
 def smallest_count(

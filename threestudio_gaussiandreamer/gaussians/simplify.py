@@ -9,6 +9,7 @@ original (``recover.py``). Pruning many more at once gives worse results than tr
 smaller number from the start."""
 
 import functools
+import math
 from collections.abc import Callable
 from typing import NamedTuple, Optional
 
@@ -40,15 +41,25 @@ Ranking = Callable[[Gaussians, Views, int], Float[Tensor, " N"]]
 
 
 class Budget(NamedTuple):
-    """Where to stop: at a number of Gaussians, or before the PSNR of the validation views, in dB,
-    falls below a bound; at most one of the two is given.
+    """Where to stop: at a number of Gaussians, before the PSNR of the validation views, in dB,
+    falls below a bound, or where twice as many would gain ``gain`` dB; at most one of the three is
+    given.
     """
 
     count: Optional[int] = None
     psnr: Optional[float] = None
+    gain: Optional[float] = None
+    error: float = 1e-4
+    """Mean squared error of the input to the ground truth, to which that of pruning is added for
+    ``gain``. Where nothing is known of it, 40 dB.
+    """
 
-    def met_by(self, done: Round) -> bool:
-        """Return whether the quality after a round is within the budget."""
+    def met_by(self, done: Round, before: Round) -> bool:
+        """Return whether a round, which began with ``before``, is within the budget."""
+        if self.gain is not None:
+            errors = [self.error + 10 ** (-0.1 * one.psnr) for one in (before, done)]
+            lost = 10 * math.log10(errors[1] / errors[0])
+            return lost < self.gain * math.log2(before.count / done.count)
         return self.psnr is None or done.psnr >= self.psnr
 
 
@@ -90,7 +101,9 @@ def simplify(
 
 
 class _Search:
-    """State of :func:`simplify`: the smallest cloud so far, and its Gaussians' importance."""
+    """State of :func:`simplify`: the round with the smallest cloud so far, and its Gaussians'
+    importance.
+    """
 
     def __init__(
         self,
@@ -103,7 +116,9 @@ class _Search:
         self.rounds = 0
 
     def run(self, cloud: Gaussians) -> Gaussians:
-        self.cloud = cloud
+        # the rounding of the file isn't a cost of the first round
+        start = math.inf if self.budget.gain is None else self.recovery.quality(cloud)
+        self._take(Round(cloud, start))
         self._reduce(self.recovery.contribution)
         if not self.scores.any():
             raise UserError(
@@ -121,14 +136,18 @@ class _Search:
         """The importance of the Gaussians, ranked when it is first needed."""
         return self.rank(self.cloud, self.recovery.train_views, self.recovery.seed)
 
-    def _take(self, cloud: Gaussians) -> None:
-        self.cloud = cloud
+    @property
+    def cloud(self) -> Gaussians:
+        return self.best.cloud
+
+    def _take(self, best: Round) -> None:
+        self.best = best
         self.__dict__.pop("scores", None)
 
     def _fit_within_reach(self) -> None:
         """Run a recovery before the first round if some colours exceed the file's range."""
         if float(self.cloud.sh[:, 0].abs().amax()) > self.recovery.sh_reach:
-            self._take(self.recovery(self.cloud, self.rounds).cloud)
+            self._take(self.recovery(self.cloud, self.rounds))
 
     def _reduce(self, scores: Float[Tensor, " N"]) -> None:
         """Prune a large cloud at once, as far as its images stay the same without a recovery."""
@@ -140,7 +159,8 @@ class _Search:
             return self.recovery.quality(self.cloud.rows(kept.nonzero()[:, 0])) >= least
 
         count = smallest_count(scores, self.budget.count or 1, same)
-        self._take(keep_best(self.cloud, scores, count))
+        fewer = keep_best(self.cloud, scores, count)
+        self._take(Round(fewer, self.recovery.quality(fewer)))
 
     def _merge(self) -> None:
         values = self.cloud._asdict()
@@ -163,9 +183,9 @@ class _Search:
     def _try(self, fewer: Gaussians) -> bool:
         """Recover; keep the result if it is within the budget, and return whether it is."""
         done = self.recovery(fewer, self.rounds)
-        if not self.budget.met_by(done):
+        if not self.budget.met_by(done, self.best):
             return False
-        self._take(done.cloud)
+        self._take(done)
         self.rounds += 1
         self.report(done)
         return True

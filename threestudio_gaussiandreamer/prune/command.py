@@ -33,10 +33,12 @@ BUDGETS = {
     "--psnr": "smallest PSNR of the pruned cloud's views to the unpruned one's, dB, such as 40",
     "--within": "what the pruned cloud may lose against the truth, such as 0.1dB: see --quality",
 }
+AUTO = "as many as are needed, so that twice as many would gain less than DB (default: 0.5)"
 OPTIONS: dict[str, dict[str, Any]] = {
     "--quality": {
         "type": float,
-        "help": "dB of the unpruned cloud to the truth, which --within needs, such as 35",
+        "help": "dB of the unpruned cloud to the truth, such as 35: --within needs it, and for "
+        "--auto it is 40 if it isn't given",
     },
     "--size": {
         "type": int,
@@ -78,6 +80,7 @@ def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
     budget = group.add_mutually_exclusive_group(required=True)
     for name, text in BUDGETS.items():
         budget.add_argument(name, help=text)
+    budget.add_argument("--auto", metavar="DB", nargs="?", const="0.5", help=AUTO)
     for name, settings in OPTIONS.items():
         parser.add_argument(name, **settings)
     return parser.parse_args(argv)

@@ -13,14 +13,14 @@ from ..core.options import INT64_MAX, at_least, in_range, shown
 from ..gaussians.simplify import Budget
 from ..gaussians.views import LEAST_ERROR
 
-BUDGETS = ("count", "bytes", "psnr", "within")
+BUDGETS = ("count", "bytes", "psnr", "within", "auto")
 LOSSES = (1e-3, 30.0)
 """Range of ``within``, dB."""
 
 
 @dataclass
 class PruneOptions:
-    """A budget, which is at most one of the first four options, and how pruning meets it."""
+    """A budget, which is at most one of the first five options, and how pruning meets it."""
 
     count: Any = None
     """How many Gaussians to keep."""
@@ -30,6 +30,8 @@ class PruneOptions:
     """The smallest PSNR to the original, dB."""
     within: Any = None
     """The largest loss of PSNR to the ground truth, dB; the original's PSNR is ``quality``."""
+    auto: Any = None
+    """As many Gaussians as are needed: twice as many would gain less than this, dB."""
     quality: Optional[float] = field(default=None, metadata=in_range(-200, 200, "dB"))
     size: int = field(default=256, metadata=in_range(16, 4096, "pixels"))
     """Height and width of the views in which PSNR is measured, pixels."""
@@ -59,8 +61,8 @@ class PruneOptions:
                 "within: give quality (--quality) too, the PSNR of the unpruned cloud to the "
                 "ground truth in dB, such as 35"
             )
-        if cfg.quality is not None and given != ["within"]:
-            raise UserError("quality: has no effect without the budget within")
+        if cfg.quality is not None and given not in (["within"], ["auto"]):
+            raise UserError("quality: has no effect without the budget within or auto")
         budget_of(cfg, "")
 
 
@@ -88,6 +90,12 @@ def budget_of(
         return Budget(psnr=psnr)
     if options.within is not None:
         return Budget(psnr=psnr_for_loss(parse_loss(options.within, where), options.quality))
+    if options.auto is not None:
+        gain = parse_number(options.auto, f"{where}auto", "dB")
+        if not 0 < gain < 6:
+            raise UserError(f"{where}auto: expected a gain between 0 and 6 dB, got {gain:g}")
+        error = Budget().error if options.quality is None else error_of(options.quality)
+        return Budget(gain=gain, error=error)
     return Budget()
 
 

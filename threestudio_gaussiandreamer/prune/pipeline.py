@@ -134,9 +134,12 @@ def _psnr_note(
 
 def _remaining_budget(asked: Budget, stored: StoredCloud) -> Budget:
     """Return the part of a PSNR budget that earlier pruning has not used; if all of it is used, a
-    budget that keeps all Gaussians.
+    budget that keeps all Gaussians. The error of earlier pruning counts for a gain, too.
     """
-    if asked.psnr is None or stored.pruned_to is None:
+    if stored.pruned_to is None:
+        return asked
+    asked = asked._replace(error=asked.error + error_of(stored.pruned_to))
+    if asked.psnr is None:
         return asked
     left = remaining_psnr_budget(asked.psnr, stored.pruned_to)
     if left is not None:

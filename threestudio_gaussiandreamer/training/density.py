@@ -5,11 +5,11 @@ As gsplat's ``Strategy``, one object is called around every optimiser step; anot
 
     control = density_rule(cloud)
     pictures = renderer(**batch)
-    control.before_backward(pictures, step)                    samples the removal error
+    control.before_backward(pictures, step, error)      samples the removal error
     loss.backward()
-    control.after_backward(rasterized, width, height)          adds to the statistics
+    control.after_backward(rasterized, width, height)   adds to the statistics
     optimizer.step()
-    outcome = control.after_step(optimizer, step + 1, check)   densifies and prunes when it is due
+    outcome = control.after_step(optimizer, step + 1)   densifies and prunes when it is due
 
 ``step`` counts finished optimiser steps. The statistics are buffers of the cloud, so that they are
 in its checkpoint. What is cloned and split: ``gaussians/densify.py``; what is dropped to meet a
@@ -19,11 +19,10 @@ budget: ``gaussians/importance.py``; the options: ``density_options.py``.
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any, NamedTuple, Optional
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from ..core.distributed import all_max, all_sum, draw_shared
@@ -34,26 +33,18 @@ from ..core.options import checked_options
 from ..core.streams import generator
 from ..gaussians import densify, importance
 from ..gaussians.densify import Change, Rules, Statistics
-from ..gaussians.importance import AddedBackground
+from ..gaussians.importance import AddedBackground, Need
 from ..host import find, parse_structured, register, run_seed
-from ..metrics import psnr
 from ..splatting import Rasterized
 from .density_options import AUTO, min_count, rounds_of
 
 SET_ROUNDS = "set system.geometry.{}.start, stop and every accordingly"
-
-
-class QualityResult(NamedTuple):
-    """The quality of one batch of views if some of the Gaussians are removed."""
-
-    margin: Float[Tensor, ""]
-    """The allowed loss minus the actual loss, dB; negative if too much is lost."""
-    measured: dict[str, float]
-    """dB by their name in the logs."""
-
-
-QualityCheck = Callable[[Bool[Tensor, " N"]], QualityResult]
-"""Measures the quality if only the marked Gaussians are rendered."""
+DECAY = 0.1
+"""How much the logits of the opacities fall in each step while ``budget: auto`` prunes, in units of
+their learning rate: a Gaussian that the loss doesn't hold up fades until it can go (after natural
+selection, Deng et al. 2025, arXiv 2511.16980).
+"""
+MeanError = Callable[[], Float[Tensor, ""]]
 
 
 class DensityOutcome(NamedTuple):
@@ -64,15 +55,11 @@ class DensityOutcome(NamedTuple):
     """Number of Gaussians after the changes."""
     replaced: bool
     """Whether the parameters of the cloud were replaced."""
-    measured: dict[str, float]
-    """dB that a round of ``budget: auto`` cost, by their name in the logs; empty for any other."""
+    needed: Optional[Need]
+    """What a round of ``budget: auto`` found; None for any other."""
 
     def __str__(self) -> str:
-        costs = (f"{name.partition('/')[2]} {dB:.3g}" for name, dB in self.measured.items())
-        return (
-            f"{self.before} -> {self.after} Gaussians; dB on the views of this step: "
-            f"{', '.join(costs)}"
-        )
+        return f"{self.before} -> {self.after} Gaussians: {self.needed}"
 
 
 class DensityRule:
@@ -109,25 +96,33 @@ class DensityRule:
             "gaussiandreamer-density"
         )
 
-    def before_backward(self, pictures: Mapping[str, Any], step: int) -> None:
-        """Look at the output of the renderer after ``step`` finished optimiser steps."""
+    def before_backward(
+        self, pictures: Mapping[str, Any], step: int, error: Optional[MeanError] = None
+    ) -> None:
+        """Look at the output of the renderer after ``step`` finished optimiser steps; ``error``
+        computes its mean squared error to the ground truth, where there is one.
+        """
 
     def after_backward(
         self, out: Rasterized, width: int, height: int, loss_scale: float = 1.0
     ) -> None:
         """Look at the gradients of a step, see :meth:`DensityControl.after_backward`."""
 
-    def after_step(
-        self, optimizer: torch.optim.Optimizer, step: int, check: Optional[QualityCheck] = None
-    ) -> Optional[DensityOutcome]:
+    def after_step(self, optimizer: torch.optim.Optimizer, step: int) -> Optional[DensityOutcome]:
         """Change the cloud after ``step`` finished optimiser steps."""
+
+    def summary(self) -> str:
+        """Say how many Gaussians there are, and why; printed at the end of a run."""
+        count, start = len(self.cloud), int(self.cloud.started_with)
+        return f"{count:,} of {start:,} Gaussians" if start else f"{count:,} Gaussians"
 
 
 HOOKS = {
     "schedule_problem": ("step", "max_steps"),
-    "before_backward": ("pictures", "step"),
+    "before_backward": ("pictures", "step", "error"),
     "after_backward": ("out", "width", "height", "loss_scale"),
-    "after_step": ("optimizer", "step", "check"),
+    "after_step": ("optimizer", "step"),
+    "summary": (),
 }
 
 
@@ -159,8 +154,7 @@ class DensityControl(DensityRule):
     @property
     def prune_rounds(self) -> range:
         """The steps after which a round of pruning takes place."""
-        rounds = rounds_of(self.options.prune)
-        return rounds[len(rounds) // 2 :] if self.options.budget == AUTO else rounds
+        return rounds_of(self.options.prune)
 
     def kept_share(self, count: int, step: int) -> float:
         """Return the fraction of ``count`` Gaussians that the round at ``step`` keeps:
@@ -171,12 +165,12 @@ class DensityControl(DensityRule):
             return self.options.prune.keep
         return min(self.options.prune.keep, (min_count(self.options) / max(count, 1)) ** (1 / left))
 
-    @property
-    def affordable_loss(self) -> float:
-        """The loss that one round of ``auto`` is allowed, dB. All rounds share ``prune.quality``
-        equally, since later steps may not recover what a round loses.
+    def pruning_at(self, step: int) -> bool:
+        """Return whether the step after ``step`` finished ones is before a round of pruning, or
+        between two.
         """
-        return self.options.prune.quality / max(1, len(self.prune_rounds))
+        rounds = self.prune_rounds
+        return bool(rounds) and rounds[0] - self.options.prune.every <= step < rounds[-1]
 
     def schedule_problem(self, step: int, max_steps: int) -> Optional[str]:
         """Describe why the rounds between ``step`` and ``max_steps`` (-1: unlimited) can't meet the
@@ -246,16 +240,29 @@ class DensityControl(DensityRule):
 
     # -- statistics --------------------------------------------------------------------------------
 
-    def before_backward(self, pictures: dict[str, Any], step: int) -> None:
+    def before_backward(
+        self,
+        pictures: dict[str, Any],
+        step: int,
+        error: Optional[MeanError] = None,
+    ) -> None:
         """Add a sample of the removal error in these renders to the statistics, if the next round
         of pruning uses it.
 
         Args:
             pictures: output of the renderer.
             step: number of finished optimiser steps.
+            error: computes the mean squared error of the renders to the ground truth, with which
+                ``budget: auto`` compares the removal error; ``prune.likeness`` is its lower bound,
+                and stands for it where there is no ground truth.
         """
         if not self.samples_removal(step):
             return
+        if self.options.budget == AUTO:
+            mean = self.cloud.error.new_tensor(10 ** (-0.1 * self.options.prune.likeness))
+            if error:
+                mean = torch.maximum(mean, error().detach().to(mean))
+            self.cloud.error += all_sum(mean * pictures["comp_rgb"].numel())
         rng = generator(run_seed(), "removal", step)
         image = pictures["comp_rgb"]
         # Composite over a random background per view, so that Gaussians of the background's colour
@@ -272,12 +279,11 @@ class DensityControl(DensityRule):
 
     def samples_removal(self, step: int) -> bool:
         """Return whether a sample of the removal error is due after ``step`` finished steps."""
-        cfg, rounds = self.options.prune, self.prune_rounds
-        if self.options.budget is None or cfg.score != "removal" or not rounds:
+        cfg = self.options.prune
+        budget = self.options.budget
+        if budget is None or (cfg.score != "removal" and budget != AUTO):
             return False
-        if not rounds[0] - cfg.every <= step < rounds[-1] or len(self.cloud) <= min_count(
-            self.options
-        ):
+        if not self.pruning_at(step) or len(self.cloud) <= min_count(self.options):
             return False
         return step % max(1, round(cfg.every / importance.SAMPLES)) == 0
 
@@ -303,23 +309,29 @@ class DensityControl(DensityRule):
 
     # -- changes of the cloud ----------------------------------------------------------------------
 
-    def after_step(
-        self, optimizer: torch.optim.Optimizer, step: int, check: Optional[QualityCheck] = None
-    ) -> DensityOutcome:
+    def after_step(self, optimizer: torch.optim.Optimizer, step: int) -> DensityOutcome:
         """Densify and prune if the schedules have a round at ``step``.
 
         Args:
             optimizer: its parameters and rows of its state are updated with the Gaussians.
             step: number of finished optimiser steps.
-            check: required for ``budget: auto``, which prunes nothing without it.
         """
-        before, measured = len(self.cloud), {}
+        before, needed = len(self.cloud), None
+        if self.options.budget == AUTO and self.pruning_at(step - 1):
+            self.decay_opacities(optimizer)
         change = self._densify(step)
         if self.options.budget is not None and step in self.prune_rounds:
-            change, measured = self._prune(step, change, check)
+            change, needed = self._prune(step, change)
         if change is not None:
             self.cloud.apply_change(change, optimizer)
-        return DensityOutcome(before, len(self.cloud), change is not None, measured)
+        return DensityOutcome(before, len(self.cloud), change is not None, needed)
+
+    @torch.no_grad()
+    def decay_opacities(self, optimizer: torch.optim.Optimizer) -> None:
+        """Lower all opacities by ``DECAY`` of their learning rate."""
+        for group in optimizer.param_groups:
+            if group.get("name") == "logit_opacities":
+                self.cloud.logit_opacities.sub_(DECAY * group["lr"])
 
     def _densify(self, step: int) -> Optional[Change]:
         """Return the change by a round of densification at ``step``; None if there is no round or
@@ -360,16 +372,14 @@ class DensityControl(DensityRule):
             return self.options.max_gaussians
         return min(self.options.max_gaussians, count if budget == AUTO else max(budget, count))
 
-    def _prune(
-        self, step: int, first: Optional[Change], check: Optional[QualityCheck]
-    ) -> tuple[Change, dict[str, float]]:
+    def _prune(self, step: int, first: Optional[Change]) -> tuple[Change, Optional[Need]]:
         """Prune once towards the budget.
 
         Args:
             first: the change by densification at the same step, to which pruning is applied.
 
         Returns:
-            the combined change of the current cloud, and the values that ``auto`` has measured.
+            the combined change of the current cloud, and what ``auto`` has found.
         """
         cloud, cfg = self.cloud, self.options.prune
         values = cloud.parameters_by_name() if first is None else first.values
@@ -378,14 +388,19 @@ class DensityControl(DensityRule):
         rng = generator(run_seed(), "prune", step)
         scores = importance.importance_by(cfg.score, values["logit_opacities"], stats, rng)
         share = self.kept_share(len(scores), step)
-        count, measured = importance.next_count(len(scores), share, min_count(self.options)), {}
-        if self.options.budget == AUTO and (first is not None or check is None):
-            count = len(scores)  # new Gaussians haven't been rendered: their loss is unknown
-        elif self.options.budget == AUTO:
-            # never prune the Gaussians that this score protects, see importance.py
-            top = importance.top_count(stats.contribution) if cfg.score == "contribution" else 0
-            count, measured = smallest_passing_count(scores, max(count, top), check)
-        return importance.keep_highest(values, scores, count, first), measured
+        count, needed = importance.next_count(len(scores), share, min_count(self.options)), None
+        if self.options.budget == AUTO:
+            error = float(cloud.error)
+            needed = importance.needed_count(scores, stats.removal, error, cfg.gain, cfg.keep)
+            count = max(count, needed.count)
+            if not needed.enough or cloud.gain.isnan():
+                cloud.gain.fill_(needed.gain)
+        return importance.keep_highest(values, scores, count, first), needed
+
+    def summary(self) -> str:
+        budget, gain = self.options.budget, float(self.cloud.gain)
+        why = {None: "no budget", AUTO: str(Need(len(self.cloud), gain))}
+        return f"{super().summary()}: {why.get(budget, f'the budget is {budget}')}"
 
 
 def late_rounds(what: str, option: str, rounds: range, end: float) -> Optional[str]:
@@ -397,68 +412,3 @@ def late_rounds(what: str, option: str, rounds: range, end: float) -> Optional[s
         f"{late} of the {len(rounds)} rounds of {what} would come after step {end}, the last: "
         f"{SET_ROUNDS.format(option)}"
     )
-
-
-def smallest_passing_count(
-    scores: Float[Tensor, " N"], least: int, check: QualityCheck
-) -> tuple[int, dict[str, float]]:
-    """Find the smallest number of Gaussians, at least ``least``, that passes ``check``.
-
-    Returns:
-        the number, and the values that were measured with it (empty if all Gaussians are kept).
-    """
-    measured: dict[int, dict[str, float]] = {}
-
-    def passes(kept: Bool[Tensor, " N"]) -> bool:
-        result = check(kept)
-        # processes render different views, but must make the same decision
-        if not all_sum(result.margin) >= 0:
-            return False
-        measured[int(kept.sum())] = result.measured
-        return True
-
-    count = importance.smallest_count(scores, least, passes)
-    return count, measured.get(count, {})
-
-
-class RenderedQuality:
-    """A :data:`QualityCheck` that renders one batch of views. It measures the loss of PSNR to the
-    ground truth if there is one, else the PSNR between the renders.
-
-    Args:
-        control: has the cloud to render, and the options for the allowed loss.
-        render: renders the current cloud.
-        truth: given the renders, returns the ground truth (B, H, W, 3), or None.
-    """
-
-    def __init__(
-        self,
-        control: DensityControl,
-        render: Callable[[], Mapping[str, Any]],
-        truth: Callable[[Mapping[str, Any]], Optional[Tensor]],
-    ) -> None:
-        self.control, self.render, self._truth = control, render, truth
-
-    @cached_property
-    def whole(self) -> Mapping[str, Any]:
-        """The renders with all Gaussians."""
-        return self.render()
-
-    @cached_property
-    def truth(self) -> Optional[Float[Tensor, "B H W 3"]]:
-        return self._truth(self.whole)
-
-    @torch.no_grad()
-    def __call__(self, kept: Bool[Tensor, " N"]) -> QualityResult:
-        """Measure the quality of renders with only the ``kept`` Gaussians."""
-        whole = self.whole["comp_rgb"]
-        with self.control.cloud.showing_only(kept):
-            fewer = self.render()["comp_rgb"]
-        if self.truth is None:
-            similarity, wanted = psnr(fewer, whole).mean(), self.control.options.prune.likeness
-            measured = {"prune/likeness": float(similarity), "prune/asked_for": wanted}
-            return QualityResult(similarity - wanted, measured)
-        loss = (psnr(whole, self.truth) - psnr(fewer, self.truth)).mean()
-        affordable = self.control.affordable_loss
-        measured = {"prune/lost": float(loss), "prune/affordable": affordable}
-        return QualityResult(affordable - loss, measured)

@@ -3,15 +3,17 @@ describes them.
 """
 
 import contextlib
+import logging
 import math
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Optional
 
 from ..core.errors import UserError
 from ..core.options import at_least, between, in_range, is_whole, one_of, positive, shown
 from ..gaussians import importance
 
 AUTO = "auto"
+logger = logging.getLogger(__name__)
 
 
 @dataclass
@@ -39,12 +41,15 @@ class PruneConfig:
     every: int = field(default=50, metadata=at_least(1))
     keep: float = field(default=0.8, metadata=between(0, 1))
     score: str = field(default="removal", metadata=one_of(importance.SCORES))
-    quality: float = field(default=0.1, metadata=at_least(0, "dB"))
+    gain: float = field(default=0.5, metadata=between(0, 6, "dB"))
     likeness: float = field(default=40.0, metadata=at_least(0, "dB"))
+    quality: Optional[float] = None
 
     @staticmethod
     def check(cfg: Any) -> None:
         require_order(cfg)
+        if cfg.quality is not None:
+            logger.warning("prune.quality is no longer used: budget=auto goes by prune.gain")
 
 
 def require_order(cfg: Any) -> None:

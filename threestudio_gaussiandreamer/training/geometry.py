@@ -25,15 +25,14 @@ densify             enabled, start, stop, every (steps), grad_threshold, split_s
                     gradients, in which opposite signs don't cancel (AbsGS, Ye et al. 2024), with
                     the threshold; it is several times larger
 budget              how many Gaussians a run ends with: a number, null or none (no limit but
-                    ``max_gaussians``), or ``auto``: each round drops as many as cost no more than
-                    its share of ``prune.quality`` or, where no truth is known, ``prune.likeness``;
-                    under a budget, duplicates in the start are merged (``merge.py``)
+                    ``max_gaussians``), or ``auto``: as many as the scene needs, so that twice as
+                    many would gain less than ``prune.gain`` dB; under a budget, duplicates in the
+                    start are merged (``merge.py``)
 prune               how the budget is met (``importance.py``): start, stop, every (steps), keep (the
                     share that a round keeps; less only where there are too few rounds for a budget
                     that is a number), score (removal, contribution; opacity, random: to compare
-                    with), quality (dB that all rounds may lose against the truth), likeness (dB
-                    between the renders before and after a round, at least); ``auto`` leaves out the
-                    first half of the rounds, since early in training importance changes much
+                    with), gain (dB, of ``auto``), likeness (dB, of ``auto`` where no truth is
+                    known: the error of the renders is taken to be that of this PSNR)
 max_gaussians       largest count: those with the least importance are dropped (of untrained points:
                     a uniform choice); min_gaussians: the least count that pruning leaves
 density_type,       the rule that changes the number of Gaussians, and its options; densify, budget
@@ -43,9 +42,8 @@ keep_attributes     with gaussians-prior: start from all attributes of that clou
 ==================  ================================================================================
 """
 
-import contextlib
 import logging
-from collections.abc import Iterator
+import math
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -79,6 +77,11 @@ from .initialization import GrowConfig, gaussians_on_points, grow_points, most_v
 
 logger = logging.getLogger(__name__)
 STATISTICS = ("gradient_sum", "gradient_count", "contribution", "removal")
+AUTO_STATE = {"error": 0.0, "gain": math.nan, "started_with": 0.0}
+"""Numbers of a run and their first values: squared error of the views in which ``removal`` was
+sampled, dB that twice as many Gaussians would gain (see ``importance.Need``), and their number at
+the start.
+"""
 LEARNING_RATES = {
     "means": "lr_means",
     "log_scales": "lr_scales",
@@ -169,6 +172,9 @@ class GaussianCloud(BaseGeometry):
             setattr(self, name, nn.Parameter(torch.zeros(shape, device=device)))
         for name in STATISTICS:
             self.register_buffer(name, torch.zeros(n, device=device))
+        for name, start in AUTO_STATE.items():
+            value = torch.tensor(start, dtype=torch.float64, device=device)
+            self.register_buffer(name, value)
 
     def _load_from_state_dict(
         self, state_dict: dict[str, Tensor], prefix: str, *args: Any, **kwargs: Any
@@ -182,9 +188,10 @@ class GaussianCloud(BaseGeometry):
         if prefix + "means" in state_dict:
             if len(self):
                 require_cloud(state_dict, {name: prefix + name for name in SHAPES}, "the state")
-            state_dict.setdefault(
-                prefix + "removal", torch.zeros(len(self))
-            )  # older checkpoints have none
+            # older checkpoints have none of these
+            state_dict.setdefault(prefix + "removal", torch.zeros(len(self)))
+            for name, start in AUTO_STATE.items():
+                state_dict.setdefault(prefix + name, torch.tensor(start))
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
 
     # -- derived quantities ------------------------------------------------------------------------
@@ -270,8 +277,10 @@ class GaussianCloud(BaseGeometry):
             cloud = make_cloud(prior, prompt) if make_cloud else prior(prompt)
             ground = prior.ground_count() if hasattr(prior, "ground_count") else 0
             self.start_from(grow_points(cloud, self.cfg.grow, ground))
+        start = len(self)
         if self.cfg.budget is not None:
             self.merge_duplicates()
+        self.started_with.fill_(start)
         return cloud
 
     def warn_of_dropped_bands(self, sh: Any) -> None:
@@ -364,18 +373,6 @@ class GaussianCloud(BaseGeometry):
         """Whether densification reads absolute gradients, which the rasteriser then collects."""
         return self.options.densify.enabled and self.options.densify.absgrad
 
-    @contextlib.contextmanager
-    def showing_only(self, kept: Bool[Tensor, " N"]) -> Iterator[None]:
-        """Render only the marked Gaussians in this context, by setting other opacities to 0."""
-        logits = self.logit_opacities.detach().clone()
-        with torch.no_grad():
-            self.logit_opacities[~kept] = -100.0
-        try:
-            yield
-        finally:
-            with torch.no_grad():
-                self.logit_opacities.copy_(logits)
-
     def apply_change(self, change: Change, optimizer: torch.optim.Optimizer) -> None:
         """Apply ``change`` to the cloud and to the rows of the optimiser's state, and reset the
         statistics.
@@ -391,6 +388,7 @@ class GaussianCloud(BaseGeometry):
             setattr(self, name, parameter)
         for name in STATISTICS:
             self.register_buffer(name, torch.zeros(len(change.parents), device=self.means.device))
+        self.error.zero_()
 
     def _require_fit(self, change: Change) -> None:
         """Raise UserError if a density rule's change leaves nothing, or doesn't fit the cloud."""

@@ -19,7 +19,8 @@ evaluation     views, size (pixels), supersample, every (steps; 0: only at start
                SSIM on held-out views
 prune          options of a second, pruned export. Its budget is one of count; bytes (of the SPZ
                file if it is exported, else of the PLY); psnr (dB, to the unpruned cloud); within
-               (dB that may be lost against the ground truth). quality, size and steps are as in
+               (dB that may be lost against the ground truth); auto (dB: twice as many would gain
+               less). quality, size and steps are as in
                the prune command; eps2d and antialias by default the renderer's
 image_targets  a stage of training towards a few pictures of the 2D model: see ``image_targets.py``
 pages          write a page that shows the cloud in a browser, and more: see ``pages.py``
@@ -52,10 +53,10 @@ from ..guidance.foreign import (
 )
 from ..guidance.known_truth import truth_of
 from ..host import BaseLift3DSystem, C, find, info, register, validate_schedule, warn
-from ..metrics import psnr, psnr_of_error
+from ..metrics import psnr_of_error
 from ..priors.cache import cached_cloud
 from ..prune import PruneOptions
-from .density import DensityOutcome, RenderedQuality, density_rule
+from .density import DensityOutcome, MeanError, density_rule
 from .events import StepLog, log_scores
 from .export import GaussianSavers, export, exported_files
 from .finite import (
@@ -253,8 +254,8 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         batch = self.image_targets.batch(batch, step, self.background)
         out = self(batch)
         warn_if_invisible(out["opacity"], step)
-        self.density.before_backward(out, step)
         guided = self.supervise(out, batch)
+        self.density.before_backward(out, step, self.error_of(out, batch, guided))
         losses = self.losses(guided, out)
         self.recent_losses.add(step, losses)
         self.manual_backward(total(losses, self.options.guidance_type))
@@ -270,25 +271,35 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         if self.global_step % CHECK_EVERY == 0:
             self.require_finite()
         drop_gradients(optimizer)
-        self.control_density(optimizer, batch)
+        self.control_density(optimizer)
         self.report(out, batch, guided, losses)
 
-    def control_density(self, optimizer: torch.optim.Optimizer, batch: dict[str, Any]) -> None:
-        """Densify and prune on schedule; log the quality that a round of ``budget: auto`` lost."""
-        check = RenderedQuality(
-            self.density, lambda: self(batch), lambda out: true_views(self.guidance, batch, out)
-        )
+    def control_density(self, optimizer: torch.optim.Optimizer) -> None:
+        """Densify and prune on schedule; log what a round of ``budget: auto`` found."""
         # The rows of the optimiser's state are changed with the Gaussians, so pass the torch
         # optimiser in Lightning's wrapper.
-        outcome = self.density.after_step(optimizer.optimizer, self.global_step, check)
+        outcome = self.density.after_step(optimizer.optimizer, self.global_step)
         if not isinstance(outcome, DensityOutcome | None):
             raise UserError(
                 f"{type(self.density).__name__}.after_step returned {type(outcome).__name__}; "
                 "expected None or a DensityOutcome"
             )
-        if outcome and outcome.measured:
-            self.step_log.write(self.trainer, outcome.measured)
+        if outcome and outcome.needed:
+            self.step_log.write(self.trainer, {"prune/gain": outcome.needed.gain})
             info(f"step {self.global_step}: {outcome}")
+
+    def error_of(
+        self, out: Mapping[str, Any], batch: dict[str, Any], guided: dict[str, Any]
+    ) -> Optional[MeanError]:
+        """Return what computes the mean squared error of renders to the ground truth; None if there
+        is none.
+        """
+        if "error_to_truth" in guided:
+            return lambda: torch.tensor(guided["error_to_truth"], dtype=torch.float64)
+        if truth_of(self.guidance) is None:
+            return None
+        rgb = out["comp_rgb"].detach()
+        return lambda: (rgb - true_views(self.guidance, batch, out)).square().mean()
 
     def set_learning_rates(self, optimizer: torch.optim.Optimizer) -> None:
         now = self.true_current_epoch, self.true_global_step
@@ -338,10 +349,8 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
             return
         numbers, loss = loggable(guided, losses), sum(losses.values()).detach()
         shown = {"loss": loss, "gaussians": len(self.geometry)}
-        if "error_to_truth" in guided:
-            shown["dB"] = psnr_of_error(torch.tensor(guided["error_to_truth"], dtype=torch.float64))
-        elif (truth := true_views(self.guidance, batch, out)) is not None:
-            shown["dB"] = psnr(out["comp_rgb"].detach(), truth)
+        if error := self.error_of(out, batch, guided):
+            shown["dB"] = psnr_of_error(error())
         self.step_log.write(self.trainer, numbers | shown, shown)
         self.geometry.warn_of_clamped_sizes()
 
@@ -374,7 +383,7 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
 
     def summary(self) -> str:
         """List the files of results and the scores; printed at the end of a run."""
-        lines = exported_files(Path(self._save_dir or "."))
+        lines = [*exported_files(Path(self._save_dir or ".")), "", self.density.summary()]
         return "\n".join([*lines, *(["", self.measurements.table()] if self.measurements else [])])
 
     # -- pictures ----------------------------------------------------------------------------------
