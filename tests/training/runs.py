@@ -18,7 +18,7 @@ SMALL = [
     "system.geometry.prior.color_smoothing=0", "system.geometry.grow.num_candidates=20000",
     "system.geometry.grow.radius=0.05", "system.geometry.grow.max_points=50",
     "system.evaluation.size=24", "system.evaluation.views=2", "trainer.enable_progress_bar=false",
-    "trainer.log_every_n_steps=1", "use_timestamp=false", "tag=t",
+    "trainer.log_every_n_steps=1", "use_timestamp=false", "tag=t", "system.geometry.budget=null",
 ]  # fmt: skip
 
 

@@ -136,12 +136,12 @@ class Need(NamedTuple):
 
     count: int
     gain: float
-    """The dB per doubling of their number, around it; NaN if that isn't known."""
+    """The dB per doubling of their number, around it; negative if that isn't known."""
     enough: bool = False
     """Whether fewer would lose more than asked for, so that only idle Gaussians are dropped."""
 
     def __str__(self) -> str:
-        if math.isnan(self.gain):
+        if self.gain < 0:
             return "what more would gain wasn't measured"
         gain = "1 dB or more" if self.gain >= 1 else f"{self.gain:.1g} dB"
         return f"{'half as many would lose' if self.enough else 'twice as many would gain'} {gain}"
@@ -172,7 +172,7 @@ def needed_count(
     here, wanted = len(scores), SLOPE * (gain / 0.5) ** (1 / POWER)
     drop = here - int(keep * here)
     if not (drop and math.isfinite(error) and error > 0):
-        return Need(here, math.nan)
+        return Need(here, -1.0)
     lowest = torch.argsort(scores, stable=True)[:drop]
     cost = 10 * math.log10(1 + float(removal[lowest].double().sum()) / error)
     cost /= math.log2(here / (here - drop)) if drop < here else 1.0

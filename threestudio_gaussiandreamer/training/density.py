@@ -393,7 +393,7 @@ class DensityControl(DensityRule):
             error = float(cloud.error)
             needed = importance.needed_count(scores, stats.removal, error, cfg.gain, cfg.keep)
             count = max(count, needed.count)
-            if not needed.enough or cloud.gain.isnan():
+            if not needed.enough or cloud.gain < 0:
                 cloud.gain.fill_(needed.gain)
         return importance.keep_highest(values, scores, count, first), needed
 

@@ -43,7 +43,6 @@ keep_attributes     with gaussians-prior: start from all attributes of that clou
 """
 
 import logging
-import math
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -77,7 +76,7 @@ from .initialization import GrowConfig, gaussians_on_points, grow_points, most_v
 
 logger = logging.getLogger(__name__)
 STATISTICS = ("gradient_sum", "gradient_count", "contribution", "removal")
-AUTO_STATE = {"error": 0.0, "gain": math.nan, "started_with": 0.0}
+AUTO_STATE = {"error": 0.0, "gain": -1.0, "started_with": 0.0}
 """Numbers of a run and their first values: squared error of the views in which ``removal`` was
 sampled, dB that twice as many Gaussians would gain (see ``importance.Need``), and their number at
 the start.
