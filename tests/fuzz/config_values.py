@@ -117,7 +117,8 @@ def exercise(path: Path) -> None:
 @cache
 def small_demo() -> Any:
     """The demo's configuration, small; reading YAML is what another generator tries."""
-    return OmegaConf.merge(config.read_yaml(DEMO), config.parse_overrides(SMALL))
+    demo = OmegaConf.merge(config.read_yaml(DEMO), config.parse_overrides(SMALL))
+    return OmegaConf.to_container(demo)
 
 
 def pixels(cfg: Any) -> int:

@@ -6,14 +6,14 @@ makes no folder, and what is text stays text (see ``config_source.py``). The sou
 
 import functools
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, fields
 from itertools import combinations
 from pathlib import Path
 from typing import Any, Optional
 
 import omegaconf
-from omegaconf import DictConfig, ListConfig, OmegaConf
+from omegaconf import MISSING, DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from ..core.errors import UserError
@@ -93,10 +93,10 @@ def load_config(*paths: str | os.PathLike, cli_args: Sequence[str] = (), n_gpus:
     _name_own_object(merged, sources)
     trainer = {name: _trainer_option(merged, name) for name in ("devices", "num_nodes")}
     merged.n_gpus = planned_processes(n_gpus, trainer).total
-    _require_mandatory(merged)
-    _resolve(merged)
-    _zero_null_weights(merged.get("system"))
-    cfg = parse_structured(ExperimentConfig, merged)
+    _require_mandatory(OmegaConf.to_container(merged))
+    resolved = _resolve(merged)
+    _zero_null_weights(resolved.get("system"))
+    cfg = parse_structured(ExperimentConfig, resolved)
     name_folders(cfg, paths)
     return cfg
 
@@ -123,24 +123,27 @@ def dump_config(path: str | os.PathLike, cfg: Any) -> None:
         file.write(OmegaConf.to_yaml(plain).encode())
 
 
-def _with_prompt_from_file(source: DictConfig) -> DictConfig:
+def _with_prompt_from_file(source: dict[str, Any]) -> dict[str, Any]:
     """Replace ``prompt_processor.prompt_file`` by a ``prompt`` with the file's text, so that the
     tag can refer to it.
     """
-    try:
-        section = OmegaConf.select(source, "system.prompt_processor")
-    except OmegaConfBaseException:  # system is a list, or leads to another section
-        return source
-    if not isinstance(section, DictConfig) or section.get("prompt_file") is None:
+    section = _value_at(source, "system.prompt_processor")
+    if not isinstance(section, dict) or section.get("prompt_file") is None:
         return source
     if "prompt" in section:
         raise UserError("system.prompt_processor has both prompt and prompt_file: give one of them")
-    text = read_prompt(section.pop("prompt_file"))
-    OmegaConf.update(source, "system.prompt_processor.prompt", protect(text), force_add=True)
+    section["prompt"] = protect(read_prompt(section.pop("prompt_file")))
     return source
 
 
-def _name_own_object(merged: DictConfig, sources: list[DictConfig]) -> None:
+def _value_at(source: Any, key: str) -> Any:
+    """Return the value at a dotted key; None if there is none."""
+    for name in key.split("."):
+        source = source.get(name) if isinstance(source, dict) else None
+    return source
+
+
+def _name_own_object(merged: DictConfig, sources: list[dict[str, Any]]) -> None:
     """Let a prompt that no model reads be the name of the mesh or cloud that a later file or the
     command line gives, instead of what the earlier file says of its own object.
     """
@@ -156,66 +159,60 @@ def _name_own_object(merged: DictConfig, sources: list[DictConfig]) -> None:
             return
 
 
-def _own_text(source: DictConfig, key: str) -> Optional[str]:
+def _own_text(source: dict[str, Any], key: str) -> Optional[str]:
     """Return the text at a dotted key; None for a missing value and one that refers to another."""
-    node: Any = source
-    for name in key.split("."):
-        node = node._get_node(name) if isinstance(node, DictConfig) and name in node else None
-    known = node is not None and not node._is_interpolation() and not node._is_missing()
-    return node._value() if known and isinstance(node._value(), str) else None
+    value = _value_at(source, key)
+    return value if isinstance(value, str) and not _is_open(value) else None
 
 
-def _merge(sources: list[DictConfig]) -> DictConfig:
+def _is_open(value: Any) -> bool:
+    """Return whether a value is missing or refers to another one."""
+    return isinstance(value, str) and (value == MISSING or "${" in value)
+
+
+def _merge(sources: list[dict[str, Any]]) -> DictConfig:
     *files, overrides = sources
     try:
-        merged = functools.reduce(_overlaid, files, OmegaConf.create({}))
+        merged: dict[str, Any] = functools.reduce(_overlaid, files, {})
         _require_values(merged, overrides)
         merged = _overlaid(merged, overrides)
     except (OmegaConfBaseException, TypeError) as error:
         clash = next(filter(None, (_clash(a, b) for a, b in combinations(sources, 2))), None)
         reason = f"{clash} is a list in one and a section in another" if clash else _explain(error)
         raise UserError(f"the configurations can't be merged: {reason}") from error
-    for section in ("data", "system", "trainer", "checkpoint", "viewer"):
-        # YAML reads "trainer:" without content as null
-        if section in merged and merged._get_node(section)._is_none():
-            merged[section] = {}
-        _require_section(merged, section)
-    return merged
+    for name in ("data", "system", "trainer", "checkpoint", "viewer"):
+        if merged.get(name, {}) is None:  # YAML reads "trainer:" without content as null
+            merged[name] = {}
+        section = merged.get(name, {})
+        if not isinstance(section, dict) and not _is_open(section):  # that is reported later
+            raise UserError(
+                f"{name} must be a section of keys and values, got {section!r}: set a key, such "
+                f"as {name}.<key>=<value>"
+            )
+    return OmegaConf.create(merged)
 
 
-def _overlaid(earlier: DictConfig, later: DictConfig) -> DictConfig:
+def _overlaid(earlier: dict[str, Any], later: dict[str, Any]) -> dict[str, Any]:
     _forget_replaced_parts(earlier, later)
-    return OmegaConf.merge(earlier, later)
+    return OmegaConf.to_container(OmegaConf.merge(earlier, later))
 
 
-def _require_values(merged: DictConfig, overrides: DictConfig, path: str = "") -> None:
+def _require_values(merged: dict[str, Any], overrides: dict[str, Any], path: str = "") -> None:
     """Check that no override empties the section of a part or of the launcher, as ``trainer=``."""
-    for key in overrides:
-        section, override = merged._get_node(key), overrides._get_node(key)
-        if not isinstance(section, DictConfig) or not len(section):
+    for key, override in overrides.items():
+        section = merged.get(key)
+        if not isinstance(section, dict) or not section:
             continue
-        if isinstance(override, DictConfig):
+        if isinstance(override, dict):
             _require_values(section, override, f"{path}{key}.")
-        elif override._value() is None and (not path or f"{key}_type" in merged):
+        elif override is None and (not path or f"{key}_type" in merged):
             raise UserError(
                 f"{path}{key} is empty, which would remove its {len(section)} keys: set one of "
                 f"them, such as {path}{key}.{next(iter(section))}=<value>"
             )
 
 
-def _require_section(merged: DictConfig, name: str) -> None:
-    node = merged._get_node(name)
-    if node is None or isinstance(node, DictConfig):
-        return
-    if node._is_interpolation() or node._is_missing():  # reported later
-        return
-    raise UserError(
-        f"{name} must be a section of keys and values, got {node._value()!r}: set a key, such "
-        f"as {name}.<key>=<value>"
-    )
-
-
-def _forget_replaced_parts(earlier: DictConfig, later: DictConfig, path: str = "") -> None:
+def _forget_replaced_parts(earlier: dict[str, Any], later: dict[str, Any], path: str = "") -> None:
     """Remove options from ``earlier`` that are invalid after a merge with ``later``, in place.
 
     If ``later`` changes a part (``x_type``), the options in ``earlier``'s section ``x`` that the
@@ -223,76 +220,72 @@ def _forget_replaced_parts(earlier: DictConfig, later: DictConfig, path: str = "
     to select another prior; so are the arguments that a new optimiser doesn't take. If ``later``
     has a mandatory value (``???``), ``earlier``'s value is removed too, which OmegaConf's merge
     would keep."""
-    for key in later:
-        if OmegaConf.is_missing(later, key):
-            earlier._content.pop(key, None)
+    for key, theirs in later.items():
+        if theirs == MISSING:
+            earlier.pop(key, None)
             continue
         section = key.removesuffix("_type")
-        mine, theirs = earlier._get_node(key), later._get_node(key)
-        if isinstance(mine, DictConfig) and isinstance(theirs, DictConfig):
+        mine = earlier.get(key)
+        if isinstance(mine, dict) and isinstance(theirs, dict):
             _forget_replaced_parts(mine, theirs, f"{path}{key}.")
             continue
-        if mine is None or mine._value() == theirs._value():
+        if key not in earlier or mine == theirs:
             continue
         if f"{path}{key}" == "system.optimizer.name":
-            _keep_arguments_of(earlier._get_node("args"), theirs._value())
+            _keep_arguments_of(earlier.get("args"), theirs)
         if section != key:
-            _keep_options_of(earlier._get_node(section), theirs._value(), f"{path}{section}")
+            _keep_options_of(earlier.get(section), theirs, f"{path}{section}")
             if f"{path}{section}" == "system.guidance":
-                _keep_weights_of(earlier._get_node("loss"), theirs._value())
+                _keep_weights_of(earlier.get("loss"), theirs)
 
 
 def _keep_options_of(section: Any, type_name: Any, path: str) -> None:
     config_class = getattr(find(type_name), "Config", None) if type_name in names() else None
-    if config_class is None or not isinstance(section, DictConfig):
+    if config_class is None or not isinstance(section, dict):
         return
     known = {field.name for field in fields(config_class)}
     _leave_out([key for key in section if key not in known], section, type_name, path)
 
 
 def _keep_arguments_of(arguments: Any, optimizer: Any) -> None:
-    if isinstance(arguments, DictConfig):
+    if isinstance(arguments, dict):
         foreign = foreign_arguments(optimizer, arguments)
         _leave_out(foreign, arguments, optimizer, "system.optimizer.args")
 
 
 def _keep_weights_of(loss: Any, guidance: Any) -> None:
     """Remove the weights of losses that belong to the replaced guidance."""
-    if guidance in names() and isinstance(loss, DictConfig):
+    if guidance in names() and isinstance(loss, dict):
         _leave_out(foreign_weights(loss, find(guidance)), loss, guidance, "system.loss")
 
 
-def _leave_out(foreign: list[str], section: DictConfig, type_name: str, path: str) -> None:
+def _leave_out(foreign: list[str], section: dict[str, Any], type_name: str, path: str) -> None:
     for key in foreign:
-        section._content.pop(key)
+        section.pop(key)
     if foreign:
         info(f"{path}: {type_name} has no {', '.join(foreign)}; left out")
 
 
 def _zero_null_weights(system: Any) -> None:
     """Replace null among the weights of losses by 0, which parts of the system can compute with."""
-    loss = system.get("loss") if isinstance(system, DictConfig) else None
-    for key in loss if isinstance(loss, DictConfig) else ():
-        if loss[key] is None:
-            loss[key] = 0
+    loss = system.get("loss") if isinstance(system, dict) else None
+    if isinstance(loss, dict):
+        loss |= {key: 0 for key, weight in loss.items() if weight is None}
 
 
-def _clash(a: DictConfig, b: DictConfig, section: str = "") -> Optional[str]:
+def _clash(a: dict[str, Any], b: dict[str, Any], section: str = "") -> Optional[str]:
     """Return the first key that is a list in one of the two and a section in the other."""
-    for key in a:
-        one, other = a._get_node(key), b._get_node(key) if key in b else None
-        if isinstance(one, (DictConfig, ListConfig)) and isinstance(
-            other, (DictConfig, ListConfig)
-        ):
-            if type(one) is not type(other):
-                return f"{section}{key}"
-            found = _clash(one, other, f"{section}{key}.") if isinstance(one, DictConfig) else None
-            if found:
+    for key, one in a.items():
+        other = b.get(key)
+        if {type(one), type(other)} == {dict, list}:
+            return f"{section}{key}"
+        if isinstance(one, dict) and isinstance(other, dict):
+            if found := _clash(one, other, f"{section}{key}."):
                 return found
     return None
 
 
-def _require_mandatory(cfg: DictConfig) -> None:
+def _require_mandatory(cfg: dict[str, Any]) -> None:
     missing = sorted(_missing_keys(cfg))
     if missing:
         example = "a corgi" if is_text(missing[0]) else "..."
@@ -301,34 +294,26 @@ def _require_mandatory(cfg: DictConfig) -> None:
         )
 
 
-def _missing_keys(node: DictConfig, section: str = "") -> list[str]:
+def _missing_keys(values: dict[str, Any], section: str = "") -> Iterator[str]:
     # not OmegaConf.missing_keys, which resolves interpolations and fails if one refers to "???"
-    if node._is_none() or node._is_interpolation():
-        return []
-    children = {f"{section}{key}": node._get_node(key) for key in node}
-    missing = [key for key, child in children.items() if child._is_missing()]
-    inner = {
-        key: child
-        for key, child in children.items()
-        if isinstance(child, DictConfig) and key not in missing
-    }
-    return missing + [
-        found for key, child in inner.items() for found in _missing_keys(child, f"{key}.")
-    ]
+    for key, value in values.items():
+        if value == MISSING:
+            yield f"{section}{key}"
+        elif isinstance(value, dict):
+            yield from _missing_keys(value, f"{section}{key}.")
 
 
-def _resolve(cfg: DictConfig) -> None:
+def _resolve(cfg: DictConfig) -> dict[str, Any]:
     register_resolvers()
     try:
-        OmegaConf.to_container(cfg, resolve=True)  # unlike omegaconf 2.3's resolve, names the key
-        OmegaConf.resolve(cfg)
+        values = OmegaConf.to_container(cfg, resolve=True)
     except OmegaConfBaseException as error:
         raise UserError(f"an interpolation can't be resolved: {_explain(error)}") from error
     except (TypeError, ValueError, ArithmeticError, AttributeError) as error:
         raise UserError(f"a resolver failed: {error}") from error
     except RecursionError as error:
         raise UserError("an interpolation leads to itself") from error
-    map_strings(cfg, unprotect)
+    return map_strings(values, unprotect)
 
 
 def _explain(error: Exception) -> str:

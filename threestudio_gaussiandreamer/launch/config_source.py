@@ -1,5 +1,5 @@
-"""Read the sources of a configuration, YAML files and ``key=value`` overrides, as OmegaConf
-mappings.
+"""Read the sources of a configuration, YAML files and ``key=value`` overrides, as dictionaries in
+which interpolations and ``???`` are still text.
 
 Keys for text are read verbatim: on the command line ``system.prompt_processor.prompt=1984`` is the
 text "1984", and ``prompt=${x}`` isn't an interpolation."""
@@ -11,11 +11,10 @@ from pathlib import Path
 from typing import Any, Optional
 
 import yaml
-from omegaconf import MISSING, DictConfig, ListConfig, OmegaConf
+from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from ..core.errors import UserError
-from ..core.interpolation import escape
 
 # keys whose value is text, never YAML
 TOP_LEVEL_TEXT = ("name", "tag", "description")
@@ -37,7 +36,7 @@ MOST_NODES = 10_000
 MOST_BYTES = 1 << 20
 
 
-def read_yaml(path: str | os.PathLike) -> DictConfig:
+def read_yaml(path: str | os.PathLike) -> dict[str, Any]:
     """Read a YAML file as a mapping. Prompts that look like numbers or booleans (``prompt: 1984``)
     are text.
 
@@ -61,10 +60,10 @@ def read_yaml(path: str | os.PathLike) -> DictConfig:
         raise UserError(
             f"the configuration {path} must hold sections and keys, such as 'name: demo'"
         )
-    _require_words(content, f"the configuration {path}")
-    _restore_text(content, node)
-    map_strings(content, _protect_escaped)
-    return content
+    values = OmegaConf.to_container(content)
+    _require_words(values, f"the configuration {path}")
+    _restore_text(values, node)
+    return map_strings(values, _protect_escaped)
 
 
 def _read_text(path: Path) -> str:
@@ -81,7 +80,7 @@ def _read_text(path: Path) -> str:
     return content.decode("utf-8-sig")
 
 
-def parse_overrides(arguments: Iterable[str]) -> DictConfig:
+def parse_overrides(arguments: Iterable[str]) -> dict[str, Any]:
     """Parse ``section.key=value`` arguments into a mapping. Values are YAML, except texts and
     paths, which are read verbatim.
 
@@ -104,8 +103,9 @@ def parse_overrides(arguments: Iterable[str]) -> DictConfig:
             raise UserError(
                 f"the value of {key} isn't valid YAML: {_yaml_problem(error)}"
             ) from error
-    _require_words(overrides, "the command line")
-    return overrides
+    values = OmegaConf.to_container(overrides)
+    _require_words(values, "the command line")
+    return values
 
 
 def is_text(key: str) -> bool:
@@ -179,18 +179,15 @@ def _extent(source: str) -> Iterator[tuple[int, int]]:
         yield max(len(sections), getattr(event, "value", "").count("${")), sections[-1][1]
 
 
-def _require_words(content: DictConfig | ListConfig, what: str) -> None:
+def _require_words(content: Any, what: str) -> None:
     """Raise UserError for a key that isn't a string, such as ``on``, which is ``true`` in YAML."""
-    if content._is_none() or content._is_missing() or content._is_interpolation():
-        return
-    for key in content if isinstance(content, DictConfig) else range(len(content)):
-        if isinstance(content, DictConfig) and not isinstance(key, str):
+    for key, child in content.items() if isinstance(content, dict) else enumerate(content):
+        if isinstance(content, dict) and not isinstance(key, str):
             raise UserError(
                 f"{what} has the key {key!r}, which isn't a word: put it in quotes if it is "
                 "meant so"
             )
-        child = content._get_node(key)
-        if isinstance(child, (DictConfig, ListConfig)):
+        if isinstance(child, (dict, list)):
             _require_words(child, what)
 
 
@@ -200,7 +197,7 @@ def _yaml_problem(error: Exception) -> str:
     return place + (getattr(error, "problem", None) or str(error).splitlines()[0])
 
 
-def _restore_text(content: DictConfig, node: Any, section: str = "") -> None:
+def _restore_text(content: dict[str, Any], node: Any, section: str = "") -> None:
     """Replace values of text keys that YAML has converted to numbers or booleans by the characters
     in the file.
 
@@ -217,9 +214,7 @@ def _restore_text(content: DictConfig, node: Any, section: str = "") -> None:
         key = f"{section}{key_node.value}"
         if isinstance(value_node, yaml.MappingNode):
             _restore_text(content[key_node.value], value_node, f"{key}.")
-        elif is_text(key) and isinstance(
-            content._get_node(key_node.value)._value(), (bool, int, float)
-        ):
+        elif is_text(key) and isinstance(content[key_node.value], (bool, int, float)):
             content[key_node.value] = value_node.value
 
 
@@ -257,17 +252,13 @@ def _protect_escaped(text: str) -> str:
 
 
 def unprotect(text: str) -> str:
-    # all interpolations have been resolved, so a remaining "${" is literal
-    return escape(text.replace(PROTECTED, "${"))
+    return text.replace(PROTECTED, "${")
 
 
-def map_strings(node: DictConfig | ListConfig, change: Callable[[str], str]) -> None:
-    """Replace every string below ``node`` by ``change(string)``; interpolations stay unresolved."""
-    if node._is_none() or node._is_missing() or node._is_interpolation():
-        return
-    for key in node if isinstance(node, DictConfig) else range(len(node)):
-        child = node._get_node(key)
-        if isinstance(child, (DictConfig, ListConfig)):
-            map_strings(child, change)
-        elif isinstance(child._value(), str):
-            child._set_value(change(child._value()))
+def map_strings(value: Any, change: Callable[[str], str]) -> Any:
+    """Return a copy of dictionaries and lists in which every string is ``change(string)``."""
+    if isinstance(value, dict):
+        return {key: map_strings(child, change) for key, child in value.items()}
+    if isinstance(value, list):
+        return [map_strings(child, change) for child in value]
+    return change(value) if isinstance(value, str) else value
