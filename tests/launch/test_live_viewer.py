@@ -27,9 +27,6 @@ class Watched:
     def show(self, gaussians, status=""):
         self.shown.append((len(gaussians.means), status))
 
-    def server_seconds(self):
-        return 0.0
-
     def look_from_front(self, pose):
         pass
 
@@ -120,21 +117,6 @@ def test_updates_take_at_most_their_share_of_the_time(viewer, monkeypatch):
     now.value = 100 + 0.5 / 0.02 - 0.01
     assert not made._show_if_due(trainer, system)
     now.value += 0.02
-    assert made._show_if_due(trainer, system)
-
-
-def test_the_servers_threads_are_counted_too(viewer, monkeypatch):
-    made, trainer, system = viewer
-    now, server = SimpleNamespace(value=100.0), SimpleNamespace(seconds=5.0)
-    monkeypatch.setattr(live_viewer.time, "monotonic", lambda: now.value)
-    made.budget.server_seconds = lambda: server.seconds
-    assert made._show_if_due(trainer, system)
-    server.seconds += 0.1
-    now.value += 0.1 / 0.02 - 0.01
-    assert not made._show_if_due(trainer, system)
-    now.value += 0.02
-    assert made._show_if_due(trainer, system)
-    now.value += 1.01  # the next update counts from there on
     assert made._show_if_due(trainer, system)
 
 

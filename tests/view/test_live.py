@@ -3,7 +3,6 @@
 import io
 import socket
 import sys
-import threading
 import time
 from types import SimpleNamespace
 
@@ -185,7 +184,7 @@ def test_a_server_that_cannot_be_guarded_is_not_used(monkeypatch):
     assert stopped
 
 
-def test_updates_replace_the_cloud_and_the_cameras_and_are_counted():
+def test_updates_replace_the_cloud_and_the_cameras():
     pytest.importorskip("viser")
     view = live.LiveView("127.0.0.1", 0, "cloud")
     try:
@@ -200,15 +199,8 @@ def test_updates_replace_the_cloud_and_the_cameras_and_are_counted():
             assert view._frustums[0].fov == 0.5 and view._frustums[0].aspect == 1.5
         view.remove_cameras()
         assert not view._frustums
-        assert view.server_seconds() > 0
     finally:
         view.close()
-    assert view.server_seconds() >= 0
-
-
-def test_clocks_are_optional(monkeypatch):
-    monkeypatch.delattr(live.time, "pthread_getcpuclockid", raising=False)
-    assert live.cpu_clocks([threading.current_thread()]) == []
 
 
 def test_without_viser_the_extra_is_named(monkeypatch, port):

@@ -15,8 +15,7 @@ so only while a browser is connected.
 """
 
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Optional
 
@@ -32,8 +31,7 @@ from ..view.live import Controls, LiveView
 from ..view.render import first_pose
 
 SHARE_OF_TIME = 0.02
-"""Largest share of the training's time that is spent on updates, in its own thread and in those of
-the server."""
+"""Largest share of the training's time that its thread spends on updates."""
 POLL = 0.05
 """Seconds between two checks of the buttons while the training is paused."""
 
@@ -47,37 +45,6 @@ class ViewerConfig:
     keep_serving: bool = True
 
 
-class UpdateBudget:
-    """Decides when an update is due.
-
-    Args:
-        per_second: most updates in a second.
-        server_seconds: returns the CPU seconds of the server's threads so far.
-    """
-
-    def __init__(self, per_second: float, server_seconds: Callable[[], float]) -> None:
-        self.shortest, self.server_seconds = 1 / per_second, server_seconds
-        self._start, self._spent, self._server = float("-inf"), 0.0, 0.0
-
-    def is_due(self) -> bool:
-        """Return whether the time since the last update is long enough, for the rate and for what
-        that update has cost so far.
-        """
-        waited = time.monotonic() - self._start
-        if waited < self.shortest:
-            return False
-        return waited >= (self._spent + self.server_seconds() - self._server) / SHARE_OF_TIME
-
-    @contextmanager
-    def update(self) -> Iterator[None]:
-        """Count the time of this context, and of the server's threads from now on, as those of one
-        update.
-        """
-        self._start, self._server = time.monotonic(), self.server_seconds()
-        yield
-        self._spent = time.monotonic() - self._start
-
-
 class LiveViewer(pl.Callback):
     """Update a :class:`LiveView` from the training, and act on its buttons.
 
@@ -88,7 +55,7 @@ class LiveViewer(pl.Callback):
     def __init__(self, view: LiveView, cfg: ViewerConfig, stopping: Callable[[], bool]) -> None:
         self.view, self.cfg, self.stopping = view, cfg, stopping
         self.controls: Optional[Controls] = None
-        self.budget = UpdateBudget(cfg.updates_per_second, view.server_seconds)
+        self._due = 0.0
 
     def on_train_start(self, trainer: Any, pl_module: Any) -> None:
         cloud = current_cloud(pl_module)
@@ -127,14 +94,16 @@ class LiveViewer(pl.Callback):
         """Show the cloud, and the cameras of ``batch``, if that is due and a browser is connected;
         return whether they were shown.
         """
-        if not (self.budget.is_due() and self.view.watched):
+        start = time.monotonic()
+        if start < self._due or not self.view.watched:
             return False
-        with self.budget.update():
-            cloud = current_cloud(pl_module)
-            self.view.show(cloud, status(trainer, cloud))
-            if batch is not None and self.controls.cameras.value:
-                pose, fovy = (batch[name].detach().cpu().numpy() for name in ("c2w", "fovy"))
-                self.view.show_cameras(pose, fovy, batch["width"] / batch["height"])
+        cloud = current_cloud(pl_module)
+        self.view.show(cloud, status(trainer, cloud))
+        if batch is not None and self.controls.cameras.value:
+            pose, fovy = (batch[name].detach().cpu().numpy() for name in ("c2w", "fovy"))
+            self.view.show_cameras(pose, fovy, batch["width"] / batch["height"])
+        spent = time.monotonic() - start
+        self._due = start + max(1 / self.cfg.updates_per_second, spent / SHARE_OF_TIME)
         return True
 
 

@@ -5,7 +5,6 @@ Adam's moments stay NaN once they are, and the rasteriser skips Gaussians with N
 check such a run would end without an error, and with holes in the object.
 """
 
-import math
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Optional
@@ -89,17 +88,15 @@ def require_finite(tensors: Named, step: int, losses: Optional[RecentLosses] = N
         NonFiniteParameters: the message has the name of the first tensor that isn't finite, and the
             number of its bad values.
     """
-    named = list(tensors)
-    # a float64 sum of float32 values can't overflow, so it is finite if and only if all of them are
-    sums = [values.sum(dtype=torch.float64).to(named[0][1].device) for _, values in named]
-    sums += [_beyond(name, values).sum().to(sums[0]) for name, values in named]
-    if not sums or torch.stack(sums).isfinite().all():
+    named = [(name, values) for name, values in tensors if values.numel()]
+    ranges = [torch.stack(values.aminmax()) for _, values in named]
+    fits = [_fits(name, found).all() for (name, _), found in zip(named, ranges, strict=True)]
+    if not fits or torch.stack([found.to(fits[0].device) for found in fits]).all():
         return
-    name, values = next((n, v) for n, v in named if not (v + _beyond(n, v)).isfinite().all())
-    bad = ~values.isfinite()
-    what = "NaN or infinite"
+    name, values = next(pair for pair, fit in zip(named, fits, strict=True) if not fit)
+    bad, what = ~values.isfinite(), "NaN or infinite"
     if not bad.any():
-        bad, what = ~_beyond(name, values).isfinite(), f"beyond {_limit(name):g}"
+        bad, what = ~_fits(name, values), f"beyond {LIMITS[name.rpartition('.')[2]]:g}"
     raise NonFiniteParameters(
         f"step {step}: {int(bad.sum())} of the {values.numel()} numbers of {name} "
         f"are {what}{losses.first_bad() if losses else ''}: the run stops, and nothing of "
@@ -127,15 +124,10 @@ def require_optimised(
             )
 
 
-def _limit(name: str) -> float:
-    return LIMITS.get(name.rpartition(".")[2], math.inf)
-
-
-def _beyond(name: str, values: Tensor) -> Tensor:
-    """Return infinity where the values of a tensor are beyond its limit, else 0."""
-    if (limit := _limit(name)) == math.inf:
-        return values.new_zeros(())
-    return torch.where(values.abs() > limit, math.inf, values.new_zeros(()))
+def _fits(name: str, values: Tensor) -> Tensor:
+    """Return where the values of a tensor are finite and within its limit; NaN is in no range."""
+    limit = LIMITS.get(name.rpartition(".")[2], torch.finfo(values.dtype).max)
+    return values.abs() <= limit
 
 
 def warn_if_invisible(opacity: Float[Tensor, "B H W 1"], step: int) -> None:

@@ -13,7 +13,7 @@ from .page import PageOptions, Shown, decibels, require_page_size
 from .poster import WHITE
 from .reading import read_any
 from .render import RenderSettings
-from .run_files import RunFiles
+from .run_files import RunFiles, step_of
 
 
 def cloud_page(
@@ -62,7 +62,8 @@ def cloud_page(
         background=color or (run_files and run_files.background) or WHITE,
         keep_background=bool(color or (run_files and run_files.background_is_given)),
     )
-    quality = decibels(run_files.psnr("result")) if _is_result(source, run_files) else ""
+    step = step_of(source.resolve().parent)  # the scores are those of the last export
+    quality = decibels(run_files.psnr("result", step)) if run_files else ""
     return Shown(stored, "result", quality), options
 
 
@@ -70,15 +71,6 @@ def _default_settings(stored: StoredCloud) -> RenderSettings:
     """Return the settings for a cloud of unknown units."""
     near = NEAR * bounds(stored.gaussians.tensors())[1]
     return RenderSettings(near=near, far=math.inf, antialias=stored.antialiased)
-
-
-def _is_result(source: Path, run_files: Optional[RunFiles]) -> bool:
-    """Return whether the scores of a run are those of this file: an export of its last step."""
-    if run_files is None:
-        return False
-    steps = run_files.scores.get("result")
-    step = steps.get("step") if isinstance(steps, dict) else None
-    return source.resolve().parent == (run_files.save / f"it{step}-export").resolve()
 
 
 def _color(text: str) -> tuple[float, float, float]:

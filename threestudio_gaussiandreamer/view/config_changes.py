@@ -48,8 +48,5 @@ def _refers(value: Any) -> bool:
 
 
 def _shown(value: Any) -> str:
-    try:
-        text = str(value)
-    except ValueError:  # an integer of more digits than Python converts
-        return "a large number"
+    text = str(value)
     return text if len(text) <= 200 else f"{text[:200]}..."

@@ -7,11 +7,9 @@ that ``--html`` writes draws them with the options of the run.
 import contextlib
 import http
 import ipaddress
-import math
 import socket
 import threading
-import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from typing import Any, Optional
 from urllib.parse import urlsplit
 
@@ -26,7 +24,7 @@ from ..gaussians.axes import WORLD_UP
 from ..gaussians.gaussians import Gaussians
 from ..gaussians.sh import sh0_colors
 from ..gaussians.surface import covariance_matrices
-from .render import AZIMUTH, ELEVATION, Pose, first_pose, require_gaussians
+from .render import Pose, camera_of, first_pose, require_gaussians
 
 LARGEST_HALF = 6e4
 """Covariances are clipped to this, since viser stores them in half precision (65504 at most)."""
@@ -69,13 +67,11 @@ class LiveView:
         require_server(host, port)
         import viser
 
-        before = set(threading.enumerate())
         with own_pages_only(host) as guards:
             self.server = viser.ViserServer(host=host, port=port, verbose=False)
         if not guards:
             self.server.stop()
             raise UserError("viewer: this version of viser isn't known: pip install 'viser==1.1.*'")
-        self._clocks = cpu_clocks(set(threading.enumerate()) - before)
         self.server.scene.set_up_direction("+z")
         name = "localhost" if host == "0.0.0.0" else host
         self.address = f"http://{name}:{self.server.get_port()}"
@@ -87,28 +83,10 @@ class LiveView:
         """Whether a browser is connected."""
         return bool(self.server.get_clients())
 
-    def server_seconds(self) -> float:
-        """Return the CPU seconds of the server's threads so far; 0 on systems that don't count them
-        by thread.
-        """
-        seconds = 0.0
-        for clock in self._clocks:
-            with contextlib.suppress(OSError):  # the thread has ended
-                seconds += time.clock_gettime(clock)
-        return seconds
-
     def look_from_front(self, pose: Pose) -> None:
         """Set the first view of browsers that connect from now on, as the page's is set."""
-        elevation, azimuth = math.radians(ELEVATION), math.radians(AZIMUTH)
-        away = np.array(
-            [
-                math.cos(elevation) * math.cos(azimuth),
-                math.cos(elevation) * math.sin(azimuth),
-                math.sin(elevation),
-            ]
-        )
         camera = self.server.initial_camera
-        camera.position = tuple(np.array(pose.target) + pose.distance * away)
+        camera.position = tuple(camera_of(pose, WORLD_UP)[0, :3, 3].tolist())
         camera.look_at = pose.target
 
     def show(self, gaussians: Gaussians, status: str = "") -> None:
@@ -268,15 +246,6 @@ def own_pages_only(host: str) -> Iterator[list[Any]]:
         yield guards
     finally:
         sockets.serve = serve_all
-
-
-def cpu_clocks(threads: Iterable[threading.Thread]) -> list[int]:
-    """Return the CPU clocks of running threads, for ``time.clock_gettime``; none where the system
-    has no such clocks.
-    """
-    if not hasattr(time, "pthread_getcpuclockid"):
-        return []
-    return [time.pthread_getcpuclockid(thread.ident) for thread in threads]
 
 
 def splats(gaussians: Gaussians) -> dict[str, np.ndarray]:

@@ -124,7 +124,7 @@ def _render_view(
     cloud: StoredCloud, settings: RenderSettings, pose: Pose, size: int
 ) -> Float[Tensor, "1 size size 4"]:
     gaussians = cloud.gaussians.tensors()
-    c2w = _camera(pose, cloud.up)
+    c2w = camera_of(pose, cloud.up)
     fovy = torch.tensor([math.radians(pose.fovy)])
     colors = sh_to_unclamped_colors(gaussians.sh, gaussians.means - c2w[:, :3, 3])
     out = rasterize(
@@ -145,7 +145,7 @@ def _render_view(
     return torch.cat([out.image, out.alpha], -1)
 
 
-def _camera(pose: Pose, up: str) -> Float[Tensor, "1 4 4"]:
+def camera_of(pose: Pose, up: str) -> Float[Tensor, "1 4 4"]:
     """Return the OpenGL camera of a pose in the axes of a cloud whose up axis is ``up``."""
     target = torch.tensor([pose.target])
     angles = [torch.tensor([x]) for x in (pose.elevation, pose.azimuth, pose.distance)]
