@@ -113,31 +113,6 @@ def test_a_damaged_score_file_is_measured_again(tmp_path):
         assert evaluate.Measurements(None, tmp_path).values == {}
 
 
-GOOD = {"psnr": 30.0, "ssim": 0.9, "multi_face": 0.0, "gaussians": 3, "seconds": 1.0}
-
-
-@pytest.mark.parametrize(
-    "entry",
-    [
-        {"seconds": "x"},
-        {"seconds": [1]},
-        {"cpu_seconds": None},
-        {"seconds": -1},
-        {"curve": 5},
-        {"prior": 5},
-        {"result": {}},
-        {"prior": GOOD | {"psnr": None}},
-        {"prior": GOOD | {"gaussians": 0.5}},
-    ],
-)
-def test_an_entry_of_the_score_file_that_no_run_writes_is_left_out(tmp_path, entry):
-    (tmp_path / "metrics.json").write_text(json.dumps({"result": GOOD, "seconds": 2.5} | entry))
-    found = evaluate.Measurements(None, tmp_path)
-    assert not found.values.keys() & entry.keys()
-    assert found.seconds.tolist() == [0.0 if "seconds" in entry else 2.5, 0.0]
-    assert ("30.00" in found.table()) == ("result" not in entry)
-
-
 @pytest.mark.parametrize("content", [b"", b"\x89PNG\r\n\x1a\nxx"])
 def test_a_damaged_picture_of_an_earlier_run_is_left_out(tmp_path, content):
     (tmp_path / "held_out").mkdir()

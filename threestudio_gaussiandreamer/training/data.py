@@ -279,10 +279,8 @@ class GaussianDreamerDataModule(pl.LightningDataModule):
     def setup(self, stage: str | None = None) -> None:
         if stage in (None, "fit"):
             self.train_dataset = TrainCameras(self.options)
-        self.val_dataset, self.test_dataset = (
-            EvalCameras(self.options, "val"),
-            EvalCameras(self.options, "test"),
-        )
+        self.val_dataset = EvalCameras(self.options, "val")
+        self.test_dataset = EvalCameras(self.options, "test")
 
     def train_dataloader(self) -> DataLoader:
         trainer = self.trainer
@@ -318,17 +316,12 @@ class GaussianDreamerDataModule(pl.LightningDataModule):
         return views
 
     def val_dataloader(self) -> DataLoader:
-        return DataLoader(
-            self.val_dataset,
-            batch_size=self.cfg.eval_batch_size,
-            collate_fn=self.val_dataset.collate,
-        )
+        return self._in_order(self.val_dataset)
 
     def test_dataloader(self) -> DataLoader:
-        return DataLoader(
-            self.test_dataset,
-            batch_size=self.cfg.eval_batch_size,
-            collate_fn=self.test_dataset.collate,
-        )
+        return self._in_order(self.test_dataset)
+
+    def _in_order(self, views: EvalCameras) -> DataLoader:
+        return DataLoader(views, batch_size=self.cfg.eval_batch_size, collate_fn=views.collate)
 
     predict_dataloader = test_dataloader

@@ -27,7 +27,7 @@ from ..core.files import atomic_file, json_text
 from ..core.images import read as read_image
 from ..core.images import write as write_image
 from ..core.memory import require_memory
-from ..core.options import at_least, in_range, is_number, is_whole
+from ..core.options import at_least, in_range
 from ..meshes.mesh import SurfaceDistance
 from ..meshes.raycast import over_background
 from .camera_options import MAX_SIDE
@@ -145,8 +145,6 @@ class HeldOut:
 
 
 CLOCKS = ("seconds", "cpu_seconds")
-TABLE = ("psnr", "ssim", "multi_face", "gaussians", "seconds")
-"""The scores that the last message of a run shows."""
 
 
 class Snapshot(NamedTuple):
@@ -304,24 +302,12 @@ def _now() -> np.ndarray:
 
 
 def _read_scores(path: Path) -> dict[str, Any]:
-    """Read what an earlier run has stored, without entries that no run writes; empty if the file is
-    missing or damaged.
-    """
+    """Read what an earlier run has stored; empty if the file is missing or damaged."""
     try:
         values = json.loads(path.read_bytes()) if path.is_file() else {}
     except (OSError, ValueError, RecursionError):
         return {}
-    stored = values if isinstance(values, dict) else {}
-    return {name: value for name, value in stored.items() if _is_stored(name, value)}
-
-
-def _is_stored(name: str, value: Any) -> bool:
-    if name in CLOCKS:
-        return is_number(value) and value >= 0
-    if name == "curve":
-        return isinstance(value, list)
-    shown = {} if not isinstance(value, dict) else value
-    return all(is_number(shown.get(column)) for column in TABLE) and is_whole(shown["gaussians"])
+    return values if isinstance(values, dict) else {}
 
 
 def _row(images: Float[Tensor, "V H W 3"], count: int = 6) -> np.ndarray:

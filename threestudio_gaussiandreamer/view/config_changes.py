@@ -21,7 +21,7 @@ def config_changes(folder: Path) -> list[tuple[str, str, str]]:
     """
     base = dict(leaves(read_yaml(folder / "raw.yaml")))
     run = dict(leaves(read_yaml(folder / "parsed.yaml")))
-    keys = [key for key in run if _is_users(key) and not _refers(base.get(key))]
+    keys = [key for key in run if _is_users(key) and "${" not in _shown(base.get(key))]
     return [
         (key, _shown(base[key]) if key in base else MISSING, _shown(run[key]))
         for key in keys
@@ -41,10 +41,6 @@ def leaves(content: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
 
 def _is_users(key: str) -> bool:
     return key in USERS or key.partition(".")[0] in SECTIONS
-
-
-def _refers(value: Any) -> bool:
-    return "${" in _shown(value)
 
 
 def _shown(value: Any) -> str:
