@@ -43,7 +43,7 @@ test-lowest: $(VENV)/ready-for-tests ## the lowest declared version of every dep
 	$(ENVIRON) $(LOWEST) launch.py --config smoke.yaml --train
 	$(ENVIRON) OMP_NUM_THREADS=1 $(LOWEST) -m pytest -n $(WORKERS) -m "not slow" tests/core tests/launch tests/formats tests/meshes tests/gaussians tests/host
 
-stability: $(VENV)/ready-for-tests          ## every known failure, provoked and measured: docs/stability.md
+stability: $(VENV)/ready-for-tests          ## every known failure, provoked and measured: reports/stability.md
 	$(ENVIRON) $(BIN)/python -m pytest tests/stability --stability-report stability.json; status=$$?; \
 	$(BIN)/python -m tests.stability.report stability.json; rm -f stability.json; exit $$status
 

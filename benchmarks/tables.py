@@ -1,8 +1,8 @@
-"""Write the tables of README.md and docs/ from the committed CSVs: ``python -m benchmarks.tables``.
+"""Write the tables of README.md, docs/ and reports/ from the committed CSVs.
 
-docs/results.md and docs/stability.md are written whole; in other pages the text between
-``<!-- name -->`` and ``<!-- end -->`` is replaced. ``tests/test_docs.py`` fails when a page is
-stale.
+Run as ``python -m benchmarks.tables``. reports/results.md and reports/stability.md are written
+whole; in other pages the text between ``<!-- name -->`` and ``<!-- end -->`` is replaced.
+``tests/test_docs.py`` fails when a page is stale.
 """
 
 import re
@@ -64,31 +64,26 @@ def readme_table() -> str:
 
 SECTIONS: dict[str, dict[str, Callable[[], str]]] = {
     "README.md": {"measured": readme_table},
-    "docs/cuda.md": {"gpu": splatting.gpu},
     "docs/formats.md": {"formats": formats.table, "producers": formats.producers},
-    "docs/mesh.md": {"front": mesh_quality.front},
     "docs/pruning.md": {"large prune": large_prune.table},
-    "docs/rasteriser.md": {
-        "presets": splatting.presets,
-        "thresholds": splatting.thresholds,
-        "contenders": splatting.contenders,
-    },
-    "docs/step_time.md": {
-        "step": start.step_parts,
-        "start": start.first_step,
-        "default": default_against.table,
-    },
-    "docs/robustness.md": {"fuzz": robustness.fuzz, "long run": robustness.long_run},
-    "docs/farm.md": {"farm": robustness.farm},
-    "docs/viewing.md": {
-        "quality": viewers.page_quality,
-        "speed": viewers.page_speed,
-    },
-    "docs/toybox.md": {
-        "models": toybox.card,
+    "docs/rasteriser.md": {"presets": splatting.presets},
+    "docs/toybox.md": {"models": toybox.card},
+    "reports/exports.md": {"front": mesh_quality.front, "quality": viewers.page_quality},
+    "reports/robustness.md": {"fuzz": robustness.fuzz, "long run": robustness.long_run},
+    "reports/small_models.md": {
         "toybox": toybox.results,
         "seeds": toybox.seeds,
         "judges": toybox.judges,
+    },
+    "reports/speed.md": {
+        "thresholds": splatting.thresholds,
+        "contenders": splatting.contenders,
+        "gpu": splatting.gpu,
+        "step": start.step_parts,
+        "start": start.first_step,
+        "default": default_against.table,
+        "farm": robustness.farm,
+        "speed": viewers.page_speed,
     },
 }
 
@@ -103,7 +98,7 @@ def filled(text: str, sections: dict[str, Callable[[], str]]) -> str:
     return text
 
 
-WHOLE = {"docs/results.md": quality.page, "docs/stability.md": stability.page}
+WHOLE = {"reports/results.md": quality.page, "reports/stability.md": stability.page}
 PAGES = (*SECTIONS, *WHOLE)
 """The pages with generated parts."""
 

@@ -18,6 +18,7 @@ register_parts()
 ROOT = Path(__file__).parent.parent
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 TEXTS = {str(path.relative_to(ROOT)): path.read_text() for path in DOCUMENTS}
+LINKED = [*DOCUMENTS, *sorted((ROOT / "reports").glob("*.md"))]
 TINY = [
     "data.width=16", "data.height=16", "data.eval_width=16", "data.eval_height=16",
     "data.n_test_views=2", "data.train_views=4", "system.geometry.grow.num_candidates=200",
@@ -50,15 +51,15 @@ def anchors(text: str) -> set[str]:
     return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
 
-@pytest.mark.parametrize("name", TEXTS)
-def test_links_lead_somewhere(name):
-    for target in re.findall(r"\]\(([^)\s]+)\)", TEXTS[name]):
+@pytest.mark.parametrize("page", LINKED, ids=lambda page: page.name)
+def test_links_lead_somewhere(page):
+    for target in re.findall(r"\]\(([^)\s]+)\)", page.read_text()):
         if re.match(r"https?:|mailto:", target):
             continue
         path, _, anchor = target.partition("#")
-        file = (ROOT / name).parent / path if path else ROOT / name
-        assert file.exists(), f"{name} links to {target}"
-        assert not anchor or anchor in anchors(file.read_text()), f"{name} links to {target}"
+        file = page.parent / path if path else page
+        assert file.exists(), f"{page} links to {target}"
+        assert not anchor or anchor in anchors(file.read_text()), f"{page} links to {target}"
 
 
 @pytest.mark.parametrize("name", TEXTS)

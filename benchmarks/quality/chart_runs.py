@@ -62,7 +62,7 @@ RUNS = {
 }
 UNSEEN = RUNS["quality"]._replace(title="Draft, default and best on other objects", chosen_on=())
 DRAWN = RUNS | {"unseen": UNSEEN}
-"""With a chart whose table in docs/results.md has other columns than the others'."""
+"""With a chart whose table in reports/results.md has other columns than the others'."""
 
 
 def main() -> None:

@@ -145,7 +145,7 @@ NAMES = {
 
 
 def front() -> str:
-    """Return the table of docs/mesh.md."""
+    """Return the table of reports/exports.md."""
     found = rows_of("mesh")
     names = list(dict.fromkeys((row["variant"], row["x"]) for row in found))
     lines = []

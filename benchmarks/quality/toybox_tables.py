@@ -1,5 +1,5 @@
-"""The tables of docs/toybox.md, from docs/charts/toybox.csv and the bundled models' record of their
-training.
+"""The tables of docs/toybox.md and reports/small_models.md, from docs/charts/toybox.csv and the
+bundled models' record of their training.
 
 Values are means over prompts with bootstrap intervals; several seeds of a prompt count as one.
 Pattern and accessory are those of prompts that ask for one, since a plain object is easily right.

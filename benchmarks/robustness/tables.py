@@ -1,5 +1,5 @@
-"""The measured parts of docs/robustness.md, from benchmarks/results/fuzz.csv and long_run.json,
-and of docs/farm.md, from farm.csv and farm_chaos.csv.
+"""The measured parts of reports/robustness.md, from benchmarks/results/fuzz.csv and long_run.json,
+and of the farm in reports/speed.md, from farm.csv and farm_chaos.csv.
 """
 
 import json

@@ -1,5 +1,5 @@
-"""The tables of docs/rasteriser.md from docs/charts/rasteriser.csv and splatting.csv, and that of
-docs/cuda.md, from gpu-<device>.json, both in benchmarks/results.
+"""The tables of the rasteriser in docs/rasteriser.md and reports/speed.md, from
+docs/charts/rasteriser.csv and, in benchmarks/results, splatting.csv and gpu-<device>.json.
 """
 
 import functools

@@ -1,4 +1,4 @@
-"""The measured parts of docs/step_time.md."""
+"""The measured parts of starts and steps in reports/speed.md."""
 
 import statistics
 from collections.abc import Iterable

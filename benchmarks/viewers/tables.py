@@ -1,4 +1,4 @@
-"""The measured parts of docs/viewing.md, from docs/charts/page.csv."""
+"""The measured parts of pages in reports/exports.md and speed.md, from docs/charts/page.csv."""
 
 from benchmarks.markdown import markdown, read
 from benchmarks.quality.runs import CHARTS

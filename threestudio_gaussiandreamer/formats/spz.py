@@ -21,7 +21,7 @@ harmonics   N x (K - 1) x 3 u8: 128 sh + 128, of which 5 bits are used at degree
 ==========  ========================================================================================
 
 The size in the header is checked against the file's size before anything is unpacked. The loss by
-rounding is measured in docs/results.md."""
+rounding is measured in reports/answered.md."""
 
 import logging
 import os
@@ -45,7 +45,7 @@ SYSTEM_OF = {SPZ_UP: OWN_SYSTEM, "-y": "RDF"}
 """Axes that can be written, by the axis that is up."""
 STEPS_PER_SIZE = 32
 """Resolution of positions: steps per median size of the Gaussians. More steps hardly improve the
-PSNR (docs/results.md).
+PSNR (reports/answered.md).
 """
 MIN_STEPS_PER_SIZE = 2
 INLIER_QUANTILE, OUTLIER_FACTOR = 0.99, 256
