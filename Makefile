@@ -62,7 +62,8 @@ bench: $(VENV)/ready-for-tests     ## the rasteriser's speed and memory, beside 
 gpu-check: $(VENV)/ready-for-tests ## what needs an NVIDIA GPU: correctness, speed beside gsplat, a training step
 	$(ENVIRON) $(BIN)/python -m benchmarks.splatting.gpu_check
 
-docs: $(VENV)/ready-for-tests      ## the generated parts of README and docs/: architecture, measured tables
+docs: $(VENV)/ready-for-tests      ## the generated parts of README, docs/ and reports/: architecture, options, measured tables
+	$(BIN)/python -m tools.options
 	$(BIN)/python -m tests.architecture
 	$(BIN)/python -m benchmarks.tables
 

@@ -13,6 +13,7 @@ from threestudio_gaussiandreamer.launch import experiment
 from threestudio_gaussiandreamer.launch.config import load_config
 from threestudio_gaussiandreamer.launch.config_check import check_config
 from threestudio_gaussiandreamer.launch.options import find_config, parse_arguments
+from tools import options
 
 register_parts()
 ROOT = Path(__file__).parent.parent
@@ -174,3 +175,7 @@ def test_the_command_of_the_example_for_ci_is_accepted(tmp_path, monkeypatch):
 @pytest.mark.parametrize("page", tables.PAGES)
 def test_the_measured_tables_are_of_these_numbers(page):
     assert (ROOT / page).read_text() == tables.text_of(page), "it is stale: run make docs"
+
+
+def test_the_page_of_options_is_of_this_code():
+    assert (ROOT / "docs/options.md").read_text() == options.text(), "it is stale: run make docs"
