@@ -3,7 +3,6 @@ code stands twice.
 """
 
 import ast
-import re
 import subprocess
 import sys
 from collections.abc import Iterable, Iterator
@@ -48,11 +47,6 @@ HEAVY = HOST | {
     "zstandard",
 }
 HEAVY |= {"skimage", "fast_simplification", "xatlas"}
-PRIVATE_WORDS = re.compile(
-    r"\b(anew|nobody|whoever|strangers?|handmade|aright|parsimony|assured_likeness|unspent"
-    r"|by_views|whole_steps|spin_briefly|spelt_out)\b",
-    re.IGNORECASE,
-)
 LONGEST_LINE, MODULES_AT_THE_TOP = 100, 5
 MOST_EQUAL_LINES = 5
 PUNCTUATION = "()[]{}<>*,;:'\" "
@@ -129,18 +123,6 @@ def test_importing_the_package_is_cheap():
 
 
 # ---- texts --------------------------------------------------------------------------------------
-
-
-def test_texts_use_standard_terms():
-    """Words of an earlier private vocabulary don't return."""
-    texts = [*CODE, ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-    found = [
-        f"{named(path)}: {word}"
-        for path in texts
-        if path != Path(__file__)
-        for word in PRIVATE_WORDS.findall(path.read_text())
-    ]
-    assert not found, found
 
 
 def test_lines_are_short():
