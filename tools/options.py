@@ -17,7 +17,7 @@ PLACES = {
     "system.prompt_processor": ["prompts/prompts.py", "prompts/*.py"],
     "system.guidance": ["guidance/base.py", "guidance/*.py"],
     "system.guidance.variant": ["guidance/variants/*.py"],
-    "system.exporter": ["exporters/bundle.py", "exporters/*.py", "surface/textured.py"],
+    "system.exporter": ["exporters/files.py", "surface/textured.py"],
     "viewer": ["launch/live_viewer.py"],
 }
 """The modules whose tables describe a section of a configuration."""

@@ -46,8 +46,7 @@ from threestudio_gaussiandreamer.meshes.raycast import MeshCaster, over_backgrou
 from threestudio_gaussiandreamer.meshes.write import welded
 from threestudio_gaussiandreamer.metrics import psnr
 from threestudio_gaussiandreamer.surface.closed import is_closed
-from threestudio_gaussiandreamer.surface.options import MeshOptions
-from threestudio_gaussiandreamer.surface.textured import mesh_from_gaussians
+from threestudio_gaussiandreamer.surface.textured import MeshOptions, mesh_from_gaussians
 
 CLOUDS = ROOT / "outputs/mesh"
 STEPS, SIZE, VIEWS = 600, 256, 24

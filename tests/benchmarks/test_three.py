@@ -19,8 +19,7 @@ from threestudio_gaussiandreamer.gaussians.axes import WORLD_UP, rotation_betwee
 from threestudio_gaussiandreamer.meshes.raycast import MeshCaster, over_background
 from threestudio_gaussiandreamer.meshes.write import write_textured_glb
 from threestudio_gaussiandreamer.metrics import psnr
-from threestudio_gaussiandreamer.surface.options import MeshOptions
-from threestudio_gaussiandreamer.surface.textured import mesh_from_gaussians
+from threestudio_gaussiandreamer.surface.textured import MeshOptions, mesh_from_gaussians
 
 MODULES = Path(os.environ.get("VIEWER_NODE_MODULES", "node_modules"))
 SIZE, FOVY = 192, math.radians(40)

@@ -13,7 +13,7 @@ import torch
 
 from threestudio_gaussiandreamer import exporters, register_parts
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.exporters.base import outputs_of
+from threestudio_gaussiandreamer.exporters.files import outputs_of
 from threestudio_gaussiandreamer.formats import ply
 from threestudio_gaussiandreamer.formats.gaussian_files import read_cloud, write_cloud
 from threestudio_gaussiandreamer.formats.obj import write_obj

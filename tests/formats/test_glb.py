@@ -15,9 +15,9 @@ from threestudio_gaussiandreamer.formats.glb import load_glb, read_glb, write_gl
 from threestudio_gaussiandreamer.formats.spz import spz_arrays
 from threestudio_gaussiandreamer.gaussians.axes import rotate
 from threestudio_gaussiandreamer.gaussians.sh import C0, rgb_to_sh0, sh0_colors, sh0_to_rgb
-from threestudio_gaussiandreamer.meshes.colors import linear_to_srgb, srgb_to_linear
 from threestudio_gaussiandreamer.meshes.gltf import read_gltf
 from threestudio_gaussiandreamer.meshes.load import load_mesh
+from threestudio_gaussiandreamer.meshes.mesh import linear_to_srgb, srgb_to_linear
 
 PRIMITIVE = ("meshes", 0, "primitives", 0)
 SPLATTING = (*PRIMITIVE, "extensions", "KHR_gaussian_splatting")

@@ -8,6 +8,7 @@ import pytest
 from tests.helpers.ply_files import cloud, gaussians, header, rng, saved, write_raw_gaussians
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.formats import ply
+from threestudio_gaussiandreamer.formats.ply_table import write_table
 from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians, usable
 
 
@@ -159,6 +160,16 @@ class TestGaussians:
         without = [f"float {name}" for name in ply.GAUSSIAN if name != "scale_1"]
         with pytest.raises(UserError, match="lack scale_1"):
             ply.read_gaussians(saved(tmp_path, header("ascii", 0, without)))
+
+    @pytest.mark.parametrize("prefix", ["scalar_", "scalar_scal_"])
+    def test_names_of_cloudcompare_are_known(self, tmp_path, prefix):
+        """A cloud that was edited there, also one that 3dgsconverter prepared for it."""
+        arrays = gaussians(5, 1)
+        properties = ply.gaussian_properties(4)
+        names = [(name if name[0] in "xyzn" else prefix + name, kind) for name, kind in properties]
+        write_table(tmp_path / "a.ply", names, ply.gaussian_columns(arrays))
+        assert ply.is_gaussian_ply(tmp_path / "a.ply")
+        assert_same(ply.read_gaussians(tmp_path / "a.ply"), arrays)
 
     def test_2d_gaussians_are_flat(self, tmp_path, caplog):
         names = [f"float {name}" for name in ply.GAUSSIAN if name != "scale_2"]

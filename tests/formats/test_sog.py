@@ -128,7 +128,7 @@ def test_names_of_members_lead_nowhere(path, tmp_path):
         ({"quats__webp": None}, "it has no 'quats.webp'"),
         ({"meta__json": b"{"}, "isn't valid JSON"),
         ({"meta__json": b"[" * 100_000}, "isn't valid JSON"),
-        ({"sh0__webp": b"RIFF"}, "isn't a WebP image"),
+        ({"sh0__webp": b"RIFF"}, "isn't a WebP or PNG image"),
         ({"sh0__webp": image((8, 8), lossless=False, mode="RGB")}, "isn't a lossless WebP"),
         ({"sh0__webp": image((8, 8), frames=2)[:-9]}, "'sh0.webp' can't be decoded"),
         ({"sh0__webp": image((4, 4))}, "4 x 4 pixels, too few for 50 Gaussians"),
@@ -209,6 +209,23 @@ def test_a_folder_without_an_archive_is_read_by_its_json(path, tmp_path):
     stored = read_cloud(str(path))
     assert all(np.array_equal(a, b) for a, b in zip(read.gaussians, stored.gaussians, strict=True))
     assert (read.up, read.pruned_to) == ("-y", 40)
+
+
+def test_a_folder_may_hold_png_and_lie_in_the_archive(path, tmp_path):
+    """PNG as glTF-Transform converts them; a folder that was zipped by hand."""
+    file, stored = unpacked(path, tmp_path / "folder"), read_sog(path)
+    with pytest.raises(UserError, match="is a folder, .* give the meta.json in it"):
+        read_cloud(str(file.parent))
+    with zipfile.ZipFile(tmp_path / "b.sog", "w") as archive:
+        for member in (*file.parent.glob("*.webp"), file):
+            archive.write(member, f"scene/{member.name}")
+    for picture in file.parent.glob("*.webp"):
+        with Image.open(picture) as image:
+            image.convert("RGBA").save(picture.with_suffix(".png"))
+        picture.unlink()
+    file.write_text(file.read_text().replace(".webp", ".png"))
+    for read in (read_sog(file), read_sog(tmp_path / "b.sog")):
+        assert all(np.array_equal(a, b) for a, b in zip(read, stored, strict=True))
 
 
 def test_version_1_is_read(path, tmp_path):

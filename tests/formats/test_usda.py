@@ -18,7 +18,7 @@ from threestudio_gaussiandreamer.formats.usda import HARMONICS, write_usda, writ
 from threestudio_gaussiandreamer.formats.usda_reader import read_usd, read_usda
 from threestudio_gaussiandreamer.gaussians.axes import rotate
 from threestudio_gaussiandreamer.gaussians.sh import rgb_to_sh0, sh0_colors
-from threestudio_gaussiandreamer.meshes.colors import srgb_to_linear
+from threestudio_gaussiandreamer.meshes.mesh import srgb_to_linear
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
@@ -115,6 +115,28 @@ def test_texts_of_several_lines_and_z_up_are_read(tmp_path):
     (tmp_path / "b.usda").write_text(text.replace('upAxis = "Y"', 'upAxis = "Z"'))
     in_z = StoredCloud(read_usda(tmp_path / "b.usda")[0], "y").in_axes("z").gaussians
     assert_close(cloud, in_z, opacities=1e-6)
+
+
+MINIMAL = """def ParticleField3DGaussianSplat "G"
+{
+    point3f[] positions = [(0, 0, 0), (1, 0, 0)]
+    float3[] scales = [(1, 1, 1), (1, 1, 1)]
+    color3f[] primvars:displayColor = [(1, 0, 0), (0, 0.5, 0)]
+}
+"""
+
+
+@pytest.mark.parametrize("layer", ["%s", 'def Xform "X" {\n%s}\n'], ids=["text", "OpenUSD"])
+def test_attributes_that_are_left_out_have_defaults(tmp_path, layer):
+    """As Houdini's Karma Bake GSplat leaves out the harmonics."""
+    (tmp_path / "a.usda").write_text("#usda 1.0\n" + layer % MINIMAL)
+    read, _ = read_usd(tmp_path / "a.usda")
+    np.testing.assert_array_equal(read.quats, [[1, 0, 0, 0]] * 2)
+    assert (read.logit_opacities > 10).all()
+    np.testing.assert_allclose(sh0_colors(read.sh[:, 0]), [[1, 0, 0], [0, 0.7354, 0]], atol=1e-4)
+    other = MINIMAL.replace("displayColor", "others")
+    (tmp_path / "b.usda").write_text("#usda 1.0\n" + layer % other)
+    np.testing.assert_allclose(sh0_colors(read_usd(tmp_path / "b.usda")[0].sh[:, 0]), 0.5)
 
 
 @pytest.mark.parametrize("place", ["prim", "array"])

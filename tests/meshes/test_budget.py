@@ -8,7 +8,7 @@ import pytest
 
 from tests.helpers.gltf_builder import FOUR, png, textured_quad
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.meshes import budget
+from threestudio_gaussiandreamer.meshes import side_files as budget
 from threestudio_gaussiandreamer.meshes.load import load_mesh
 
 

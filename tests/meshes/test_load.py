@@ -260,6 +260,26 @@ def test_objects_as_programs_write_them_are_read(tmp_path):
     assert len(load_mesh(tmp_path / "b.obj").faces) == 2
 
 
+def test_faces_of_an_obj_that_count_backwards(tmp_path):
+    """From vertices that others follow, as generators write one part after the other."""
+    first, second = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvn 0 0 1\n", "v 0 0 1\nv 1 0 1\nvt 1 1\n"
+    backwards, absolute = ("-3/-1/-1 -2/-1 -1", "-2/-1 2 -4"), ("1/1/1 2/1 3", "4/2 2 2")
+    found = []
+    for one, two in (backwards, absolute):
+        (tmp_path / "a.obj").write_text(f"{first}f {one}\n{second}f {two}\n")
+        found.append(load_mesh(tmp_path / "a.obj"))
+    np.testing.assert_array_equal(found[0].vertices, found[1].vertices)
+    np.testing.assert_array_equal(found[0].faces, found[1].faces)
+
+
+@pytest.mark.parametrize("header", [b"", b"solid base"])
+def test_a_binary_stl_may_begin_like_text_and_have_more_bytes(tmp_path, header):
+    """As SolidWorks and scanners write it."""
+    triangle = np.array([0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1, 0], "<f4").tobytes() + b"\0\0"
+    (tmp_path / "a.stl").write_bytes(header.ljust(80, b"\0") + b"\1\0\0\0" + triangle + bytes(30))
+    assert len(load_mesh(tmp_path / "a.stl").faces) == 1
+
+
 def test_many_bad_vertices_are_an_error(tmp_path):
     source = trimesh.creation.icosphere(2)
     vertices = source.vertices.copy()
@@ -289,7 +309,8 @@ def test_many_bad_vertices_are_an_error(tmp_path):
             "line 4 is no vertex or face: 'f 0 2 3'",
         ),
         ("two.obj", b"v 0 0\nv 1 0\nv 0 1\nf 1 2 3\n", "line 1 is no vertex or face"),
-        ("relative.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf -3 -2 -1\nv 0 0 1\n", "absolute indices"),
+        ("back.obj", b"v 0 0 0\nv 1 0 0\nf -3 -2 -1\nv 0 0 1\n", "names number -3 of 2 vertices"),
+        ("cut.stl", bytes(80) + b"\2\0\0\0" + bytes(60), "184 bytes were expected, not 144"),
         (
             "accessor.gltf",
             b'{"asset": {"version": "2.0"}, "meshes": [{}], "scenes": [{}]}',

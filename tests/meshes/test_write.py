@@ -11,7 +11,7 @@ from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.meshes.load import load_mesh
 from threestudio_gaussiandreamer.meshes.mesh import Mesh, surface_colors
 from threestudio_gaussiandreamer.meshes.write import welded, write_textured_mesh
-from threestudio_gaussiandreamer.surface.unwrap import in_grid
+from threestudio_gaussiandreamer.surface.bake import in_grid
 
 
 def textured_box():

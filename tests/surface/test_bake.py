@@ -10,9 +10,8 @@ import trimesh
 from threestudio_gaussiandreamer.cameras import Orbit
 from threestudio_gaussiandreamer.meshes.mesh import Mesh, surface_colors
 from threestudio_gaussiandreamer.meshes.raycast import MeshCaster
-from threestudio_gaussiandreamer.surface.bake import bake, filled
-from threestudio_gaussiandreamer.surface.renders import Renders
-from threestudio_gaussiandreamer.surface.unwrap import in_charts, in_grid
+from threestudio_gaussiandreamer.surface.bake import bake, filled, in_charts, in_grid
+from threestudio_gaussiandreamer.surface.fusion import Renders
 
 FOVY = math.radians(50)
 

@@ -16,9 +16,8 @@ from threestudio_gaussiandreamer.meshes.raycast import MeshCaster
 from threestudio_gaussiandreamer.meshes.write import welded
 from threestudio_gaussiandreamer.surface import textured
 from threestudio_gaussiandreamer.surface.closed import is_closed
-from threestudio_gaussiandreamer.surface.options import MeshOptions
-from threestudio_gaussiandreamer.surface.renders import opengl
-from threestudio_gaussiandreamer.surface.textured import mesh_from_gaussians
+from threestudio_gaussiandreamer.surface.fusion import opengl
+from threestudio_gaussiandreamer.surface.textured import MeshOptions, mesh_from_gaussians
 
 SMALL = MeshOptions(faces=600, texture=128, views=16, view_size=128, resolution=32)
 
@@ -103,7 +102,7 @@ def test_rows_with_nan_are_left_out(caplog):
     "gaussians", [painted_ball(300).rows(slice(0)), painted_ball(300, opacity=0.01)]
 )
 def test_a_cloud_without_visible_gaussians_is_refused_before_rendering(gaussians, monkeypatch):
-    monkeypatch.setattr(textured, "render_around", None)
+    monkeypatch.setattr(textured, "render", None)
     with pytest.raises(UserError, match="form no surface"):
         mesh_from_gaussians(gaussians, SMALL)
 

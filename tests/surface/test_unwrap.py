@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from threestudio_gaussiandreamer.surface.unwrap import (
+from threestudio_gaussiandreamer.surface.bake import (
     SMALLEST_CELL,
     XATLAS_FACES,
     faces_that_fit,

@@ -8,7 +8,7 @@ import pytest
 
 from tests.helpers.painted_ball import painted_ball
 from tests.training.runs import cloud_of, launch, run_folder
-from threestudio_gaussiandreamer.exporters import mesh as mesh_exporter
+from threestudio_gaussiandreamer.exporters import files as mesh_exporter
 from threestudio_gaussiandreamer.formats.gaussian_files import read_cloud
 from threestudio_gaussiandreamer.formats.ply import read_gaussians
 from threestudio_gaussiandreamer.formats.spz import read_spz

@@ -13,8 +13,7 @@ from ..formats.gaussian_files import StoredCloud, suffix_of
 from ..gaussians.axes import WORLD_UP, rotation_between
 from ..gaussians.views import EPS2D
 from ..meshes.write import WRITERS, companions, write_textured_mesh
-from ..surface.options import METHODS, MeshOptions
-from ..surface.textured import mesh_from_gaussians, require_mesh_libraries
+from ..surface.textured import METHODS, MeshOptions, mesh_from_gaussians, require_mesh_libraries
 
 MESH_UP = "y"
 OPTIONS: dict[str, dict[str, Any]] = {

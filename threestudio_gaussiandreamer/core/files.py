@@ -45,6 +45,8 @@ def existing_file(path: str | os.PathLike, kind: str, bundled: Collection[str] =
             reason = ""
         elif path.exists():
             reason = "is a folder, not a file" if path.is_dir() else "is no regular file"
+            if (path / "meta.json").is_file():
+                reason += "; of an unpacked SOG give the meta.json in it"
         else:
             reason = f"does not exist{near_names(path, bundled)}"
     except (OSError, ValueError, RuntimeError) as error:

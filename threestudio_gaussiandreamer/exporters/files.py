@@ -1,59 +1,178 @@
-"""The exporters that write one file in a known format, registered as ``<format>-exporter``.
+"""Exporters, which write the cloud of a run to files.
 
-==============  =====================  ============================================================
-format          file                   for
-==============  =====================  ============================================================
-ply             gaussians.ply          viewers of 3D Gaussian splatting
-spz             gaussians.spz          web viewers and phones, a quarter of the PLY's size; y up
-compressed-ply  gaussians.compressed…  SuperSplat and PlayCanvas, a quarter of the PLY's size; -y up
-sog             gaussians.sog          PlayCanvas and SuperSplat, the smallest; -y up
-glb             gaussians.glb          KHR_gaussian_splatting: Babylon.js, PlayCanvas; y up, nothing
-                                       rounded. ``save_name=x.spz.glb`` has SPZ inside, the only
-                                       kind that CesiumJS reads
-usda            gaussians.usda         OpenUSD 26.03: Omniverse, Houdini; y up, nothing rounded.
-                                       ``save_name=x.usdz`` makes a USDZ, which phones open
-points          points.ply             programs without Gaussians: their centres, in the world's
-                                       axes, z up
-surface         model.obj              the surface with vertex colours, which T3Bench reads
-==============  =====================  ============================================================
+An exporter is a subclass of the host's ``Exporter``, registered as ``<format>-exporter``. A call
+returns a list of ``ExporterOutput(save_name, save_type, params)``, and the system writes each with
+its method ``save_<save_type>(name, **params)``. ``gaussiandreamer-exporter`` writes several
+formats.
+
+==============  ========================  =========================================================
+format          file                      for
+==============  ========================  =========================================================
+ply             gaussians.ply             viewers of 3D Gaussian splatting
+spz             gaussians.spz             web viewers and phones, a quarter of the PLY's size; y up
+compressed-ply  gaussians.compressed.ply  SuperSplat, PlayCanvas, a quarter of the PLY's size; -y up
+sog             gaussians.sog             PlayCanvas and SuperSplat, the smallest; -y up
+glb             gaussians.glb             KHR_gaussian_splatting: Babylon.js, PlayCanvas; y up
+usda            gaussians.usda            OpenUSD 26.03: Omniverse, Houdini; y up
+points          points.ply                programs without Gaussians: their centres; z up
+surface         model.obj                 the surface with vertex colours, which T3Bench reads
+mesh            mesh.glb, mesh.obj        a closed mesh with a texture, with its MTL and PNG
+==============  ========================  =========================================================
+
+``save_name=x.spz.glb`` has SPZ inside, the only kind that CesiumJS reads, and ``x.usdz`` makes a
+USDZ, which phones open. GLB and USDA round nothing. The full name of ``mesh`` is
+``gaussiandreamer-mesh``, since threestudio has a ``mesh-exporter`` too.
 
 ==============  ===================================================================================
 option          meaning
 ==============  ===================================================================================
-save_name       name of the file in the export folder
-save_video      also render the turntable
-up              (ply, surface) the file's up axis: ``-y`` for viewers of PLY, ``y`` (the front faces
-                +z) for programs that read OBJ, or ``z`` for this package's world and T3Bench
+formats         (gaussiandreamer) names of registered exporters without their ``-exporter``
+options         (gaussiandreamer) options of single formats, such as ``{ply: {pad_sh_degree: 3}}``
+save_video      (all) also render the turntable
+save_name       name of the file in the export folder; a mesh's OBJ, MTL and PNG have its stem
+up              (ply, surface, mesh, and gaussiandreamer for these) the file's up axis: ``-y`` for
+                viewers of PLY, ``y`` (the front faces +z) for programs that read OBJ, or ``z`` for
+                this package's world and T3Bench; a GLB has y up by definition
 pad_sh_degree   (ply) append zero harmonics up to this degree, for importers that require degree 3
 version         (spz) 3, which all readers know, or 4, which is 4 to 9 % smaller and needs
                 zstandard
 min_opacity     (points) skip Gaussians with a lower opacity; 0 keeps all. The order is preserved
-resolution      (surface) cells along the longest side of the object
+resolution      (surface, mesh) cells along the longest side of the object
 level           (surface) isovalue, as a fraction of the median of the summed opacity at the centres
                 of the Gaussians; lower values make the object thicker
+obj             (mesh) also write the OBJ with its MTL and PNG
+unlit           (mesh) ask viewers to show the texture without lighting
+faces, ...      (mesh) the options of ``surface/textured.py``
 ==============  ===================================================================================
 
-docs/formats.md has sizes and the PSNR that is lost by rounding. A surface can't represent hair,
-smoke and glass as Gaussians do."""
+docs/formats.md has sizes and the PSNR that is lost by rounding, docs/mesh.md the PSNR between mesh
+and cloud. A surface can't represent hair, smoke and glass as Gaussians do."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import field, make_dataclass
-from typing import Any, List, NamedTuple, Optional
+import functools
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, make_dataclass
+from pathlib import Path
+from typing import Any, Dict, List, NamedTuple, Optional
 
 import numpy as np
 
-from ..core.options import in_range
+from ..core.errors import UserError
+from ..core.methods import find_method, require_dataclass, require_method
+from ..core.options import Rule, check_options, each, in_range, one_of, rule
 from ..formats.gaussian_files import FORMATS, StoredCloud, suffix_of
+from ..formats.glb import GLB_UP
 from ..formats.ply import padded_sh
 from ..formats.spz import VERSION
 from ..formats.spz_container import VERSIONS, require_version
-from ..gaussians.axes import VIEWER_UP, WORLD_UP, rotation_between
-from ..gaussians.gaussians import Gaussians, opaque
+from ..gaussians.axes import AXES, VIEWER_UP, WORLD_UP, rotation_between
+from ..gaussians.densify import LOG_SCALE_RANGE
+from ..gaussians.gaussians import Gaussians, finite, opaque
 from ..gaussians.point_cloud import PointCloud
 from ..gaussians.sh import sh0_colors
 from ..gaussians.surface import gaussian_surface
-from ..host import ExporterOutput, register, warn
-from .base import SAVE_NAME, UP, FileExporter
+from ..gaussians.views import EPS2D
+from ..host import (
+    Exporter,
+    ExporterOutput,
+    find,
+    names,
+    parse_structured,
+    register,
+    register_builtin,
+    warn,
+)
+from ..surface.textured import MeshOptions, mesh_from_gaussians, require_mesh_libraries
+
+SUFFIX = "-exporter"
+NAME_BYTES = 255
+"""The longest file name on common file systems, bytes."""
+RESERVED = ("pruned", "report.json", "report.png", "view.html", "poster.png")
+"""Names of other files that a run writes into the export folder."""
+
+
+def require_file_name(option: str, name: str) -> None:
+    """Raise UserError unless ``name``, the value of ``option``, is a valid name of a file directly
+    in the export folder.
+    """
+    if not name or name != os.path.basename(name) or name in (os.curdir, os.pardir):
+        raise UserError(f"{option}: expected the name of a file, without folders, got {name!r}")
+    if "\0" in name or len(name.encode(errors="surrogateescape")) > NAME_BYTES:
+        most = f"at most {NAME_BYTES} bytes and no NUL"
+        raise UserError(f"{option}: expected {most}, got {name[:80]!r}")
+    if name.casefold() in RESERVED:
+        raise UserError(f"{option}: {name!r} is a name that a run uses itself; choose another one")
+
+
+SAVE_NAME = rule(require_file_name)
+UP = one_of(AXES)
+"""The rule for the option ``up``, the axis of the file that points up."""
+
+
+class Drawing(NamedTuple):
+    """The options of a run's renderer that its exports need."""
+
+    eps2d: float = EPS2D
+    """Screen-space dilation in square pixels of the final image."""
+    antialias: bool = False
+
+
+class FileExporter(Exporter):
+    """Base class of exporters that write one file, or one in several formats."""
+
+    @dataclass
+    class Config(Exporter.Config):
+        save_name: str = field(default="", metadata=SAVE_NAME)
+
+    cfg: Config
+    shared: Optional[Gaussians] = None
+    """Set by the bundle exporter, which reads the Gaussians once for all formats."""
+    drawing: Drawing = Drawing()
+    """Set by the system before it calls the exporter."""
+
+    def configure(self, **parts: Any) -> None:
+        check_options(self.Config, self.cfg)
+        super().configure(**parts)
+
+    def gaussians(self) -> Gaussians:
+        """Return the Gaussians to export, in the world's axes; all values are finite."""
+        return read_gaussians(self.geometry) if self.shared is None else self.shared
+
+
+def read_gaussians(geometry: Any) -> Gaussians:
+    """Read the Gaussians of a geometry as float32 arrays. Those with values that aren't finite are
+    skipped with a warning.
+    """
+    found = finite(Gaussians.of(geometry).arrays(), "export")
+    return found._replace(log_scales=found.log_scales.clip(*LOG_SCALE_RANGE))  # as they are drawn
+
+
+def require_export(exporter: type) -> None:
+    """Raise UserError for a class of exporters that can't be called."""
+    if not isinstance(exporter, type):
+        raise UserError(f"an exporter is a {type(exporter).__name__}; register a class")
+    # the host's only raises an error
+    if find_method(exporter, "__call__") is find_method(Exporter, "__call__"):
+        raise UserError(f"{exporter.__name__} has no __call__(), which returns the files to write")
+    require_method(exporter, "__call__")
+
+
+def outputs_of(exporter: Exporter) -> list[ExporterOutput]:
+    """Call an exporter.
+
+    Raises:
+        UserError: it returns something else than a list of ExporterOutput.
+    """
+    found, name = exporter(), type(exporter).__name__
+    is_list = isinstance(found, (list, tuple))
+    for entry in found if is_list else [found]:
+        if not isinstance(entry, ExporterOutput):
+            what = f"{'entries of type ' if is_list else ''}{type(entry).__name__}"
+            raise UserError(f"{name} returned {what}; expected a list of ExporterOutput")
+    return list(found)
+
+
+# ---- formats -------------------------------------------------------------------------------------
 
 Params = Callable[[Gaussians, Any], dict[str, Any]]
 """From Gaussians in the world's axes and an exporter's options to the arguments of the system's
@@ -81,6 +200,10 @@ def ply(gaussians: Gaussians, cfg: Any) -> dict[str, Any]:
     return {"stored": cloud}
 
 
+def spz(gaussians: Gaussians, cfg: Any) -> dict[str, Any]:
+    return {"stored": StoredCloud(gaussians), "version": cfg.version}
+
+
 def points(gaussians: Gaussians, cfg: Any) -> dict[str, Any]:
     gaussians = gaussians.rows(opaque(gaussians, cfg.min_opacity))
     return {"cloud": PointCloud(gaussians.means, sh0_colors(gaussians.sh[:, 0]))}
@@ -93,79 +216,171 @@ def surface(gaussians: Gaussians, cfg: Any) -> dict[str, Any]:
     return {"surface": found.rotated(rotation_between(WORLD_UP, cfg.up))}
 
 
-class Format(NamedTuple):
-    """A row of the table of formats."""
+def add(
+    name: str,
+    save_name: str,
+    params: Params,
+    save_type: str = "gaussians",
+    options: Sequence[tuple[str, Any, Any]] = (),
+    check: Callable[[Any], None] = lambda cfg: None,
+) -> None:
+    """Register the exporter of a format.
 
-    save_name: str
-    """Default of the option."""
-    params: Params
-    save_type: str = "gaussians"
-    options: Sequence[tuple[str, Any, Any]] = ()
-    """Name, type and field of options beside ``save_name`` and ``save_video``."""
-    check: Callable[[Any], None] = lambda cfg: None
-    """Raises UserError for options that can't be had."""
+    Args:
+        save_name: default of the option.
+        options: name, type and field of options beside ``save_name`` and ``save_video``.
+        check: raises UserError for options that can't be had.
+    """
 
+    def call(self: FileExporter) -> List[ExporterOutput]:
+        return [ExporterOutput(self.cfg.save_name, save_type, params(self.gaussians(), self.cfg))]
 
-TABLE = {
-    "ply": Format(
-        "gaussians.ply",
-        ply,
-        "ply",
-        [
-            ("up", str, field(default=VIEWER_UP, metadata=UP)),
-            ("pad_sh_degree", Optional[int], field(default=None, metadata=in_range(0, 3))),
-        ],
-    ),
-    "spz": Format(
-        "gaussians.spz",
-        lambda gaussians, cfg: {"stored": StoredCloud(gaussians), "version": cfg.version},
-        "spz",
-        [("version", int, field(default=VERSION, metadata=in_range(*VERSIONS)))],
-        lambda cfg: require_version(cfg.version),
-    ),
-    "compressed-ply": Format("gaussians.compressed.ply", stored(".compressed.ply")),
-    "sog": Format("gaussians.sog", stored(".sog")),
-    "glb": Format("gaussians.glb", stored(".glb", ".spz.glb")),
-    "usda": Format("gaussians.usda", stored(".usda", ".usdz")),
-    "points": Format(
-        "points.ply",
-        points,
-        "points",
-        [("min_opacity", float, field(default=0.0, metadata=in_range(0, 1)))],
-    ),
-    "surface": Format(
-        "model.obj",
-        surface,
-        "surface",
-        [
-            ("up", str, field(default="y", metadata=UP)),
-            ("resolution", int, field(default=128, metadata=in_range(8, 512, "cells"))),
-            ("level", float, field(default=0.5, metadata=in_range(1e-6, 1))),
-        ],
-    ),
-}
-"""By name of the format."""
+    given = [option("save_name", str, save_name, SAVE_NAME), *options]
+    space = {"check": staticmethod(check), "__module__": __name__}
+    config = make_dataclass("Config", given, bases=(FileExporter.Config,), namespace=space)
+    title = name.title().replace("-", "") + "Exporter"
+    register(name + SUFFIX)(type(title, (FileExporter,), {"__call__": call, "Config": config}))
 
 
-class TableExporter(FileExporter):
-    """Base class of the exporters of ``TABLE``."""
+def option(name: str, kind: Any, default: Any, rule: Rule) -> tuple[str, Any, Any]:
+    return name, kind, field(default=default, metadata=rule)
 
-    format: Format
+
+PADDING = option("pad_sh_degree", Optional[int], None, in_range(0, 3))
+CELLS = option("resolution", int, 128, in_range(8, 512, "cells"))
+LEVEL = option("level", float, 0.5, in_range(1e-6, 1))
+LEAST = option("min_opacity", float, 0.0, in_range(0, 1))
+WRITTEN = option("version", int, VERSION, in_range(*VERSIONS))
+add("ply", "gaussians.ply", ply, "ply", [option("up", str, VIEWER_UP, UP), PADDING])
+add("spz", "gaussians.spz", spz, "spz", [WRITTEN], lambda cfg: require_version(cfg.version))
+add("compressed-ply", "gaussians.compressed.ply", stored(".compressed.ply"))
+add("sog", "gaussians.sog", stored(".sog"))
+add("glb", "gaussians.glb", stored(".glb", ".spz.glb"))
+add("usda", "gaussians.usda", stored(".usda", ".usdz"))
+add("points", "points.ply", points, "points", [LEAST])
+add("surface", "model.obj", surface, "surface", [option("up", str, "y", UP), CELLS, LEVEL])
+
+
+@register("gaussiandreamer-mesh-exporter")
+@register_builtin("mesh-exporter")
+class MeshExporter(FileExporter):
+    """Files of save_type "textured_mesh"; their params are ``{"mesh": Mesh, "unlit": bool}``."""
+
+    @dataclass
+    class Config(FileExporter.Config, MeshOptions):
+        save_name: str = field(default="mesh.glb", metadata=SAVE_NAME)
+        up: str = field(default="y", metadata=UP)
+        obj: bool = True
+        unlit: bool = False
+
+        @staticmethod
+        def check(cfg: "MeshExporter.Config") -> None:
+            """Raise UserError unless name and options are right and the libraries are there."""
+            if Path(cfg.save_name).suffix.lower() != ".glb":
+                raise UserError(f"save_name: expected the name of a .glb, got {cfg.save_name!r}")
+            MeshOptions.check(cfg)
+            require_mesh_libraries()
+
+    cfg: Config
 
     def __call__(self) -> List[ExporterOutput]:
-        params = self.format.params(self.gaussians(), self.cfg)
-        return [
-            ExporterOutput(
-                save_name=self.cfg.save_name, save_type=self.format.save_type, params=params
-            )
-        ]
+        given = {option.name: getattr(self.cfg, option.name) for option in fields(MeshOptions)}
+        given |= {key: x for key, x in self.drawing._asdict().items() if given[key] is None}
+        mesh = mesh_from_gaussians(self.gaussians(), MeshOptions(**given))
+        files = [(self.cfg.save_name, GLB_UP)]
+        files += [(str(Path(self.cfg.save_name).with_suffix(".obj")), self.cfg.up)] * self.cfg.obj
+        outputs = []
+        for name, up in files:
+            turned = mesh._replace(vertices=mesh.vertices @ rotation_between(WORLD_UP, up).T)
+            params = {"mesh": turned, "unlit": self.cfg.unlit}
+            outputs.append(ExporterOutput(name, "textured_mesh", params))
+        return outputs
 
 
-for name, row in TABLE.items():
-    title = name.title().replace("-", "") + "Exporter"
-    space = {"check": staticmethod(row.check), "__module__": __name__}
-    named = ("save_name", str, field(default=row.save_name, metadata=SAVE_NAME))
-    config = make_dataclass(
-        "Config", [named, *row.options], bases=(FileExporter.Config,), namespace=space
-    )
-    register(f"{name}-exporter")(type(title, (TableExporter,), {"format": row, "Config": config}))
+# ---- several formats -----------------------------------------------------------------------------
+
+
+def available_formats() -> list[str]:
+    """Return the formats: every registered exporter but the bundle itself."""
+    exporters = [name.removesuffix(SUFFIX) for name in names() if name.endswith(SUFFIX)]
+    return [name for name in exporters if name != "gaussiandreamer"]
+
+
+@register("gaussiandreamer-exporter")
+class BundleExporter(Exporter):
+    """Export the files of all formats, in the order of ``formats``."""
+
+    @dataclass
+    class Config(Exporter.Config):
+        formats: List[str] = field(
+            default_factory=lambda: ["ply", "spz", "points"],
+            metadata=each(one_of(available_formats)),
+        )
+        options: Dict[str, Any] = field(default_factory=dict)
+        up: Optional[str] = field(default=None, metadata=UP)
+        save_video: bool = True
+
+        @staticmethod
+        def check(cfg: "BundleExporter.Config") -> None:
+            """Raise UserError if options of a format are invalid, there are options of a format
+            that isn't in ``formats``, or two formats write the same file (names that differ only in
+            case count as the same, as on some file systems).
+            """
+            if unused := [name for name in cfg.options if name not in cfg.formats]:
+                raise UserError(
+                    f"options.{unused[0]}: {unused[0]} isn't in formats "
+                    f"({', '.join(cfg.formats)}), so its options have no effect"
+                )
+            writers: dict[str, str] = {}
+            for name in cfg.formats:
+                file = getattr(options_of(name, cfg), "save_name", f"{name}/")
+                if (other := writers.setdefault(file.casefold(), name)) != name:
+                    raise UserError(
+                        f"options.{name}.save_name: {file!r} is the file of the format {other}; "
+                        "choose another name"
+                    )
+
+    cfg: Config
+    drawing: Drawing = Drawing()
+    """As in :class:`FileExporter`."""
+
+    def configure(self, **parts: Any) -> None:
+        super().configure(**parts)
+        check_options(self.Config, self.cfg)
+        self.parts = parts
+
+    def __call__(self) -> List[ExporterOutput]:
+        return [output for outputs in self.by_format().values() for output in outputs()]
+
+    def by_format(self) -> Dict[str, Callable[[], List[ExporterOutput]]]:
+        """Return a function for each format that builds and calls its exporter, so that one that
+        fails leaves the others. The Gaussians are read once for all of them.
+        """
+        shared = functools.cache(lambda: read_gaussians(self.geometry))
+
+        def outputs(name: str) -> List[ExporterOutput]:
+            exporter = find(name + SUFFIX)(options_of(name, self.cfg), **self.parts)
+            if isinstance(exporter, FileExporter):
+                exporter.shared, exporter.drawing = shared(), self.drawing
+            return outputs_of(exporter)
+
+        return {name: functools.partial(outputs, name) for name in self.cfg.formats}
+
+
+def options_of(name: str, cfg: Any) -> Any:
+    """Parse and check the options of one format, in which the bundle's ``up`` is the default of an
+    option of that name.
+    """
+    options, exporter = cfg.options.get(name, {}), find(name + SUFFIX)
+    if not isinstance(options, Mapping):
+        raise UserError(f"options.{name}: expected keys and values, got {options!r}")
+    require_export(exporter)
+    require_dataclass(exporter)
+    if cfg.up is not None and "up" in exporter.Config.__dataclass_fields__:
+        options = {"up": cfg.up, **options}
+    try:
+        parsed = parse_structured(exporter.Config, options)
+    except UserError as error:
+        raise UserError(f"options.{name}: {error}") from error
+    check_options(exporter.Config, parsed, f"options.{name}.")
+    return parsed

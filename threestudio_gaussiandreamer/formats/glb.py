@@ -27,11 +27,10 @@ from ..core.files import existing_file
 from ..gaussians.axes import placed, rotate
 from ..gaussians.gaussians import Gaussians, finite, joined
 from ..gaussians.sh import COEFFICIENTS, sh0_colors
-from ..meshes.colors import srgb_to_linear
-from ..meshes.glb_file import write_glb_file
-from ..meshes.gltf import parse_errors
+from ..meshes.gltf import parse_errors, world_matrices
 from ..meshes.gltf_document import Document
-from ..meshes.gltf_poses import world_matrices
+from ..meshes.mesh import srgb_to_linear
+from ..meshes.write import write_glb_file
 from .packing import (
     FLOAT_OPACITY_MARGIN,
     displayed,

@@ -8,7 +8,7 @@ from jaxtyping import Float, Integer
 
 from ..gaussians.gaussians import Gaussians
 from ..gaussians.sh import rgb_to_sh0, sh0_to_rgb
-from ..meshes.colors import linear_to_srgb
+from ..meshes.mesh import linear_to_srgb
 
 log = logging.getLogger(__name__)
 OPACITY_MARGIN = 1 / 2040
@@ -22,11 +22,14 @@ MAX_OPACITY_BYTE = 254
 """Other readers take the logit of the byte over 255, which is infinite at 255."""
 
 
-def morton_order(means: Float[np.ndarray, "N 3"]) -> Integer[np.ndarray, " N"]:
-    """Return the rows in Morton order: by the interleaved bits of positions, 10 bits per axis."""
+def morton_order(means: Float[np.ndarray, "N 3"], cube: bool = False) -> Integer[np.ndarray, " N"]:
+    """Return the rows in Morton order: by the interleaved bits of positions, 10 bits per axis of
+    their box, or of a ``cube`` around it.
+    """
     means = means.astype(np.float64)
     low, high = means.min(axis=0, initial=np.inf), means.max(axis=0, initial=-np.inf)
-    cells = ((means - low) / np.maximum(high - low, 1e-12) * 1023).astype(np.int64)
+    size = (high - low).max() if cube else high - low
+    cells = ((means - low) / np.maximum(size, 1e-12) * 1023).astype(np.int64)
     bits = cells[:, :, None] >> np.arange(10) & 1
     return (
         (bits << (3 * np.arange(10) + np.arange(3)[:, None]))

@@ -302,7 +302,7 @@ def _format_hint(table: PlyTable) -> str:
             " It is a compressed PLY: convert it by `python -m threestudio_gaussiandreamer.convert "
             "in.compressed.ply out.ply`."
         )
-    if set(MEANS) <= set(table.names) and not set(SH_CONSTANT) & set(table.names):
+    if set(MEANS) <= set(table.names) and not {*SH_CONSTANT, "opacity"} & set(table.names):
         return " It holds plain points: read it as a point cloud."
     return ""
 

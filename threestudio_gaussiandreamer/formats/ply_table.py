@@ -6,6 +6,7 @@ size accounts for, whatever count the header states."""
 
 import logging
 import os
+import re
 import struct
 import warnings
 from collections.abc import Sequence
@@ -40,6 +41,8 @@ NUMBER_TYPES = {
 }
 BYTE_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 MAX_HEADER_BYTES = 1 << 20
+PREFIX = re.compile("^(scalar_)?(scal_)?")
+"""What CloudCompare and 3dgsconverter put before the names of properties."""
 
 
 class Property(NamedTuple):
@@ -216,7 +219,7 @@ def _parse_element(words: list[str], path: str) -> Element:
 
 def _add_property(words: list[str], elements: list[Element], path: str) -> None:
     is_list = words[1:2] == ["list"]
-    types, name = words[2 if is_list else 1 : -1], words[-1]
+    types, name = words[2 if is_list else 1 : -1], PREFIX.sub("", words[-1])
     if (
         len(types) != (2 if is_list else 1)
         or any(kind not in NUMBER_TYPES for kind in types)
@@ -227,6 +230,8 @@ def _add_property(words: list[str], elements: list[Element], path: str) -> None:
             f"the header line {' '.join(words)[:80]!r} is not a property of an element with a "
             "known number type.",
         )
+    if name in [entry.name for entry in elements[-1].properties]:
+        name = words[-1]
     codes = [NUMBER_TYPES[kind] for kind in types]
     elements[-1].properties.append(Property(name, codes[-1], codes[0] if is_list else None))
 

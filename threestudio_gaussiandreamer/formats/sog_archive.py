@@ -31,6 +31,8 @@ DECODED_BYTES, DECODED_BYTES_PER_HARMONIC = 200, 24
 """Bytes of memory that reading takes per Gaussian, and per harmonic of it, with a safety margin."""
 BYTES_PER_PIXEL = 24
 """Memory for a pixel of an image while it is decoded."""
+FORMATS = {b"RIFF": "WEBP", b"\x89PNG": "PNG"}
+"""Of images, by their first bytes."""
 PACKINGS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 DAMAGED = (
     zipfile.BadZipFile,
@@ -54,12 +56,17 @@ class SogArchive:
         self.path = existing_file(path, "SOG file")
         self._zip: Optional[zipfile.ZipFile] = None
         unpacked = self.path.suffix.lower() == ".json"
-        files = [self.path, *(self.path.parent.glob("*.webp") if unpacked else ())]
+        beside = self.path.parent.iterdir() if unpacked else ()
+        files = [self.path, *(file for file in beside if file.suffix in (".webp", ".png"))]
         self.size = sum(file.stat().st_size for file in files)
         try:
             self._zip = None if unpacked else zipfile.ZipFile(self.path)
         except (*DAMAGED, OSError, ValueError) as error:
             self.fail(f"it isn't a zip archive, or damaged ({error})")
+        names = self._zip.namelist() if self._zip else []
+        found = [name for name in names if name.split("/")[-1] == "meta.json"]
+        # a folder that was packed by hand is in the names of its files
+        self._folder = min(found, key=len, default="meta.json").removesuffix("meta.json")
         self.meta = self._read_meta()
         self.version: int = self.meta.get("version", 1)
         shape = self._section("means").get("shape") if self.version == 1 else None
@@ -204,10 +211,12 @@ class SogArchive:
         return self._decoded(data, (width, height), name)
 
     def _image_size(self, data: bytes, name: str) -> tuple[int, int]:
-        """Return width and height in the header of a lossless WebP."""
+        """Return width and height in the header of a lossless WebP, or of a PNG."""
         kind, at = data[12:16], 20
+        if FORMATS.get(data[:4]) == "PNG" and kind == b"IHDR" and len(data) >= 24:
+            return struct.unpack_from(">II", data, 16)
         if data[:4] != b"RIFF" or data[8:12] != b"WEBP" or len(data) < 30:
-            self.fail(f"{name[:40]!r} isn't a WebP image")
+            self.fail(f"{name[:40]!r} isn't a WebP or PNG image")
         if kind == b"VP8X":
             canvas = data[at + 4 : at + 7], data[at + 7 : at + 10]
             width, height = (int.from_bytes(value, "little") + 1 for value in canvas)
@@ -223,7 +232,7 @@ class SogArchive:
         from PIL import Image
 
         try:
-            with Image.open(io.BytesIO(data), formats=["WEBP"]) as image:
+            with Image.open(io.BytesIO(data), formats=[FORMATS[data[:4]]]) as image:
                 if image.size != size or getattr(image, "n_frames", 1) != 1:
                     self.fail(f"{name[:40]!r} is of another size than its header says")
                 return np.asarray(image.convert("RGBA"))
@@ -239,7 +248,7 @@ class SogArchive:
         if self._zip is None:
             return self._beside(name, most)
         try:
-            info = self._zip.getinfo(name)
+            info = self._zip.getinfo(self._folder + name)
         except KeyError:
             self.fail(f"it has no {name[:40]!r}")
         if info.compress_type not in PACKINGS or info.flag_bits & 1:

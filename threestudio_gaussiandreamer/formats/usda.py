@@ -23,6 +23,8 @@ USDA_UP = "y"
 MAGIC, PRIM, SCHEMA = "#usda 1.0", "Gaussians", "ParticleField3DGaussianSplat"
 DEGREE = "radiance:sphericalHarmonicsDegree"
 HARMONICS = "radiance:sphericalHarmonicsCoefficients"
+COLORS = "primvars:displayColor"
+"""Read where there are no harmonics."""
 TYPES = {
     "positions": "point3f[]",
     "orientations": "quatf[]",
@@ -30,6 +32,7 @@ TYPES = {
     "opacities": "float[]",
     DEGREE: "int",
     HARMONICS: "float3[]",
+    COLORS: "color3f[]",
 }
 """Of the prim's attributes."""
 REACH = 3.0

@@ -20,9 +20,10 @@ from ..core.errors import UserError
 from ..core.files import existing_file
 from ..gaussians.axes import placed, rotate, rotation_between
 from ..gaussians.gaussians import Gaussians, joined
-from ..gaussians.sh import COEFFICIENTS, MAX_DEGREE
+from ..gaussians.sh import COEFFICIENTS, MAX_DEGREE, rgb_to_sh0
+from ..meshes.mesh import linear_to_srgb
 from .packing import FLOAT_OPACITY_MARGIN, displayed, is_linear, logits
-from .usda import DEGREE, HARMONICS, MAGIC, SCHEMA, TYPES, USDA_UP
+from .usda import COLORS, DEGREE, HARMONICS, MAGIC, SCHEMA, TYPES, USDA_UP
 
 PRIM = re.compile(rb'def %b "\w+"( \()?' % SCHEMA.encode())
 HEAD = re.compile(rb"(?:custom )?(?:uniform )?([\w\[\]]+) ([\w:]+)")
@@ -34,9 +35,11 @@ COLOR_SPACE_OF_ARRAY = re.compile(rb"^colorSpace = (.*)", re.MULTILINE)
 TRANSFORM = "xformOpOrder"
 UP_AXIS = re.compile(rb'upAxis = "(\w+)"')
 NOTES = re.compile(rb'string\[\] notes = \[((?:"[^"\\]*"(?:, )?)*)\]')
-WIDTHS = {"point3f[]": 3, "float3[]": 3, "quatf[]": 4, "float[]": 1}
+WIDTHS = {"point3f[]": 3, "float3[]": 3, "color3f[]": 3, "quatf[]": 4, "float[]": 1}
 """Numbers of one value, by the type of an array."""
 ARRAYS = tuple(name for name in TYPES if name != DEGREE)
+DEFAULTS = {"orientations": [1.0, 0, 0, 0], "opacities": [1.0]}
+"""Of all Gaussians, in files that leave an attribute out."""
 OF_NUMBERS = b"0123456789+-.eEinfa "
 """Bytes that numbers consist of, inf and nan included."""
 TO_SPACES = bytes.maketrans(b"()", b"  ")
@@ -164,7 +167,7 @@ class _Attribute(NamedTuple):
     value: bytes
 
 
-EMPTY = _Attribute(b"token[]", b"[]")
+EMPTY, USUAL_DEGREE = _Attribute(b"token[]", b"[]"), _Attribute(b"int", b"3")
 
 
 class _Lines:
@@ -275,7 +278,7 @@ def _shown(line: bytes) -> str:
 
 
 def _gaussians(attributes: dict[str, _Attribute], lines: _Lines) -> Gaussians:
-    degree = _value(attributes, DEGREE, lines).decode("ascii", "replace")
+    degree = attributes.get(DEGREE, USUAL_DEGREE).value.decode("ascii", "replace")
     arrays = {name: _array(attributes, name, lines) for name in ARRAYS}
     linear = is_linear(attributes.get(COLOR_SPACE, EMPTY).value)
     return _built(degree, arrays, linear, str(lines.path), lines.fail)
@@ -294,9 +297,17 @@ def _built(
         linear: whether its colours are of linear light.
         name: the file, for messages.
     """
+    count, colors = len(arrays["positions"]), arrays.pop(COLORS)
+    for attribute, value in DEFAULTS.items():
+        if not len(arrays[attribute]):
+            arrays[attribute] = np.tile(np.float32(value), (count, 1))
+    if count and not len(arrays[HARMONICS]):
+        colors = linear_to_srgb(colors) if len(colors) in (1, count) else np.full((1, 3), 0.5)
+        degree, sh = "0", rgb_to_sh0(colors).astype(np.float32)
+        arrays[HARMONICS] = np.broadcast_to(sh, (count, 3))
     if degree not in map(str, range(MAX_DEGREE + 1)):
         fail(f"{DEGREE} should be 0 to {MAX_DEGREE}, not {degree[:60]!r}")
-    count, harmonics = len(arrays["positions"]), COEFFICIENTS[int(degree)]
+    harmonics = COEFFICIENTS[int(degree)]
     for attribute, values in arrays.items():
         expected = count * (harmonics if attribute == HARMONICS else 1)
         if len(values) != expected:
@@ -327,8 +338,11 @@ def _value(attributes: dict[str, _Attribute], name: str, lines: _Lines) -> bytes
 def _array(
     attributes: dict[str, _Attribute], name: str, lines: _Lines
 ) -> Float[np.ndarray, "N width"]:
-    """Parse an array of tuples, or of numbers as tuples of one, as float32."""
-    text, width = _value(attributes, name, lines), WIDTHS[TYPES[name]]
+    """Parse an array of tuples, or of numbers as tuples of one, as float32; empty if missing."""
+    width = WIDTHS[TYPES[name]]
+    if name in (*DEFAULTS, HARMONICS, COLORS) and name not in attributes:
+        return np.empty((0, width), np.float32)
+    text = _value(attributes, name, lines)
     if not (text.startswith(b"[") and text.endswith(b"]")):
         lines.fail(f"{name} should be an array in brackets on one line")
     text = text[1:-1]

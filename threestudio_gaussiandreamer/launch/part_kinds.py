@@ -7,7 +7,7 @@ from torch import nn
 
 from ..core.errors import UserError
 from ..core.methods import find_method, require_method
-from ..exporters.base import require_export
+from ..exporters.files import require_export
 from ..guidance.base import ScoreDistillation
 from ..guidance.variants import Variant
 from ..host import (

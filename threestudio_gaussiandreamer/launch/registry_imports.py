@@ -28,8 +28,6 @@ MODULES = (
     "prompts.pooled_prompt_processors",
     "prompts.prompt_processors",
     "exporters.files",
-    "exporters.mesh",
-    "exporters.bundle",
     "training.system",
 )
 

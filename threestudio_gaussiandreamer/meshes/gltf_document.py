@@ -13,8 +13,7 @@ from typing import Any, NamedTuple, NoReturn, Optional
 import numpy as np
 from jaxtyping import Float
 
-from .budget import Budget, fail
-from .side_files import SideFiles
+from .side_files import Budget, SideFiles, fail
 
 COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}

@@ -19,8 +19,7 @@ import numpy as np
 from ..core.errors import UserError, unknown
 from ..core.files import existing_file
 from .gltf import read_gltf
-from .merge import merged
-from .mesh import MAX_NON_FINITE, Mesh, face_areas
+from .mesh import MAX_NON_FINITE, Mesh, face_areas, merged
 from .ply_mesh import read_ply_mesh
 from .trimesh_reader import read_with_trimesh
 
@@ -96,7 +95,7 @@ def read_parts(path: Path) -> list[Mesh]:
     consist of points have no faces.
 
     Raises:
-        UserError: the format is unknown, or the file is damaged or too large (``budget.py``).
+        UserError: the format is unknown, or the file is damaged or too large (``side_files.py``).
     """
     extension = _extension(path)
     if extension in GLTF_FORMATS:

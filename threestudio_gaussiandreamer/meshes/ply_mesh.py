@@ -15,12 +15,9 @@ from jaxtyping import Float, Int
 from ..core.errors import UserError
 from ..formats.ply import COLORS, MEANS, read_comments, unit_colors
 from ..formats.ply_table import Lists, PlyTable, read_faces
-from .budget import Budget, fail
-from .colors import unit_rgb
 from .gltf import LARGEST_UV
-from .mesh import GREY, MAX_NON_FINITE, Mesh
-from .side_files import SideFiles
-from .textures import decode_texture
+from .mesh import GREY, MAX_NON_FINITE, Mesh, unit_rgb
+from .side_files import Budget, SideFiles, decode_texture, fail
 
 INDICES = ("vertex_indices", "vertex_index")
 COORDINATES = (("s", "t"), ("u", "v"), ("texture_u", "texture_v"))

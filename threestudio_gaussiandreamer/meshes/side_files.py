@@ -1,24 +1,96 @@
-"""Files that a mesh file references: buffers of glTF, materials of OBJ, textures of both."""
+"""Files that a mesh file references, buffers of glTF, materials of OBJ, textures of both, and the
+memory that loading may allocate, by the sizes in the headers.
+
+A small file can expand to a large size: a PNG of one colour, a thousand nodes that instance one
+mesh, an accessor of a billion zeros. There is one budget for a mesh file and the files that it
+references."""
 
 import contextlib
+import io
 import logging
 import os
 import stat
+import struct
 import unicodedata
 import urllib.parse
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Optional
+from typing import Any, NoReturn, Optional
 
-from .budget import Budget, fail
+import numpy as np
+from jaxtyping import UInt8
+
+from ..core.errors import UserError
+from ..core.file_memory import BYTES_PER_FILE_BYTE
 
 log = logging.getLogger(__name__)
 
+FIXED_BYTES = 640 << 20
+"""Budget of every file: one texture of 8192 x 8192, or three million triangles. There are
+``BYTES_PER_FILE_BYTE`` per byte of the file in addition.
+"""
+BYTES_PER_TEXEL = 8
+BYTES_PER_VERTEX = 200
+BYTES_PER_FACE = 150
+"""Peak memory while a part is decoded, merged, cleaned and transformed."""
+FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "GIF", "TGA", "TIFF")
+UNREADABLE = (OSError, ValueError, SyntaxError, EOFError, OverflowError, struct.error)
+"""Exceptions that Pillow raises for damaged files."""
+ROWS_AT_ONCE = 256
+"""Rows converted at a time, which limits the peak memory to two copies of the image, not four."""
 ENCODINGS = ("latin-1", "cp1252", "cp1250", "cp1251", "gb18030", "shift_jis", "cp949", "big5")
 """Of names in files that aren't UTF-8."""
 consulted: dict[str, Optional[tuple[int, int]]] = {}
 """The ``stamp`` of every file that a mesh has named, by path; the prior's cache reads and clears
 it."""
+
+
+def fail(path: Path, problem: str) -> NoReturn:
+    """Raise UserError with the reason why ``path``, of a mesh or of Gaussians in glTF, can't be
+    read.
+    """
+    raise UserError(f"can't read {str(path)!r}: {problem}")
+
+
+class Budget:
+    """The remaining memory budget of the mesh ``path``, bytes: increased by the size of every file
+    that is read, reduced by decoded content.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.left = FIXED_BYTES
+        self.total = FIXED_BYTES
+        self.add_file(path.stat().st_size)
+
+    def add_file(self, size: int) -> None:
+        """Increase the budget for a file of ``size`` bytes."""
+        self.left += BYTES_PER_FILE_BYTE * size
+        self.total += BYTES_PER_FILE_BYTE * size
+
+    def spend(self, size: int, what: str) -> None:
+        """Deduct ``size`` bytes; ``what`` names the content in the message.
+
+        Raises:
+            UserError: the budget is exceeded.
+        """
+        self.left -= size
+        if self.left < 0:
+            fail(
+                self.path,
+                f"{what} is too large: textures, vertices and faces of a file of this size may "
+                f"take {self.total >> 20} MiB of memory together",
+            )
+
+    def spend_geometry(self, vertices: int, faces: int) -> None:
+        """Deduct the bytes of one part of the scene.
+
+        Raises:
+            UserError: the budget is exceeded.
+        """
+        size = BYTES_PER_VERTEX * vertices + BYTES_PER_FACE * faces
+        self.spend(size, f"a part with {vertices} vertices and {faces} faces")
 
 
 def stamp(path: str | Path) -> Optional[tuple[int, int]]:
@@ -59,20 +131,18 @@ class SideFiles:
     def __init__(self, path: Path, budget: Budget) -> None:
         self.path, self.budget = path, budget
 
-    def read(self, name: str, otherwise: Optional[str] = None) -> Optional[bytes]:
-        """Return the content of the file ``name``; log a warning and return None if there is none.
+    def read(self, name: str, *others: str) -> Optional[bytes]:
+        """Return the content of the first of these files that exists; log a warning that has
+        ``name`` and return None if there is none.
 
-        The name is relative to the mesh's folder and may have the separators of Windows, quotes
-        and escaped spaces. If there is no such file, one with the same base name next to the mesh
-        is read, else one whose name differs in case, accents' form, percent-encoding or encoding.
-
-        Args:
-            otherwise: another name to try.
+        Names are relative to the mesh's folder and may have the separators of Windows, quotes and
+        escaped spaces. If there is no such file, one with the same base name next to the mesh is
+        read, else one whose name differs in case, accents' form, percent-encoding or encoding.
 
         Raises:
             UserError: it is no regular file (a FIFO would block), or can't be read.
         """
-        for place in self._places(name, otherwise or name):
+        for place in self._places(name, *others):
             try:
                 return self._content(place)
             except (FileNotFoundError, NotADirectoryError):
@@ -85,7 +155,7 @@ class SideFiles:
     def _places(self, *names: str) -> Iterator[Path]:
         plain = [x.strip().strip("\"'").replace("\\ ", " ").replace("\\", "/") for x in names]
         relative = [x.lstrip("/") for x in plain]
-        found = [self.path.parent / x for y in relative for x in (y, y.rpartition("/")[2])]
+        found = [self.path.parent / x for x in (*relative, *(y.split("/")[-1] for y in relative))]
         yield from found
         for place in found:
             with contextlib.suppress(OSError, ValueError):
@@ -102,3 +172,70 @@ class SideFiles:
                 raise OSError(f"{str(path)!r} is not a regular file")
             self.budget.add_file(status.st_size)
             return file.read()
+
+
+# ---- textures ------------------------------------------------------------------------------------
+
+
+def decode_texture(data: bytes, name: str, budget: Budget) -> UInt8[np.ndarray, "H W 3"]:
+    """Decode an image file; alpha is ignored, 16-bit values are rounded to 8 bits.
+
+    Args:
+        data: content of a file in one of ``FORMATS``.
+        name: names the texture in messages.
+
+    Raises:
+        UserError: it can't be decoded, or exceeds the budget.
+    """
+    return decode_image(open_texture(data, name, budget), name, budget)
+
+
+def open_texture(data: bytes, name: str, budget: Budget) -> Any:
+    """Open an image file with Pillow, without loading its texels.
+
+    Raises:
+        UserError: it isn't an image in one of ``FORMATS``.
+    """
+    from PIL import Image, UnidentifiedImageError
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # see budget.spend
+            return Image.open(io.BytesIO(data), formats=FORMATS)
+    except UnidentifiedImageError:  # Pillow's message names a Python object
+        fail(budget.path, f"the texture {name} is in none of the formats {', '.join(FORMATS)}")
+    except (*UNREADABLE, Image.DecompressionBombError) as error:
+        fail(budget.path, f"the texture {name} can't be read: {error}")
+
+
+def decode_image(image: Any, name: str, budget: Budget) -> UInt8[np.ndarray, "H W 3"]:
+    """Decode an image that Pillow has opened but not yet loaded.
+
+    Raises:
+        UserError: its format isn't one of ``FORMATS``, it is damaged, or it exceeds the budget.
+    """
+    if image.format not in FORMATS:
+        fail(budget.path, f"the texture {name} is {image.format}, not one of {', '.join(FORMATS)}")
+    size = f"the texture {name} of {image.width} x {image.height} texels"
+    budget.spend(BYTES_PER_TEXEL * image.width * image.height, size)
+    try:
+        image.load()
+        return _rgb_rows(image)
+    except UNREADABLE as error:
+        fail(budget.path, f"the texture {name} is damaged: {error}")
+
+
+def _rgb_rows(image: Any) -> UInt8[np.ndarray, "H W 3"]:
+    texels = np.empty((image.height, image.width, 3), np.uint8)
+    for top in range(0, image.height, ROWS_AT_ONCE):
+        bottom = min(top + ROWS_AT_ONCE, image.height)
+        texels[top:bottom] = _rgb(image.crop((0, top, image.width, bottom)))
+    return texels
+
+
+def _rgb(image: Any) -> np.ndarray:
+    """Return (H, W, 3), or (H, W, 1) for one channel of 16 bits, which Pillow would clip at 255."""
+    if image.mode.startswith("I"):
+        values = np.asarray(image).astype(np.int64).clip(0, 65535)
+        return ((values * 255 + 32767) // 65535)[..., None]
+    return np.asarray(image.convert("RGB"))

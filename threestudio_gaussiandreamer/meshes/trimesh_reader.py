@@ -1,5 +1,6 @@
 """Parts of mesh files in the formats that trimesh reads: OBJ, STL, OFF, ..."""
 
+import functools
 import io
 import logging
 import re
@@ -9,24 +10,30 @@ from typing import Any, Optional
 import numpy as np
 
 from ..core.errors import UserError
-from .budget import Budget, fail
-from .check import check_mesh_file
-from .colors import linear_to_srgb, unit_rgb
 from .gltf import LARGEST_UV
-from .mesh import Mesh
-from .side_files import SideFiles, utf8
-from .textures import decode_image, open_texture
+from .mesh import Mesh, linear_to_srgb, unit_rgb
+from .side_files import Budget, SideFiles, decode_image, fail, open_texture, utf8
 
-MATERIALS = ".mtl"
-"""Ending of an OBJ's material libraries; all other files that trimesh asks for are textures."""
-
+MATERIALS = "materials"
+"""The name by which trimesh asks for the joined material libraries of an OBJ; all other files that
+it asks for are textures.
+"""
 UNSET_COLOR = (102, 102, 102)
 """trimesh's default for materials without a colour; ignored, since it would darken the texture."""
 
-TEXTURE_OPTIONS = re.compile(
-    r"^\s*(-[a-z]+\s+((on|off|[rgbmlz]|sphere|cube_[a-z]+|[-+.\dex]+)\s+){1,3})+", re.IGNORECASE
-)
-"""Options in front of the name of a texture in an OBJ's material, such as ``-clamp on``."""
+LIBRARIES = re.compile(rb"^[ \t]*mtllib[ \t]+(.*)$", re.MULTILINE)
+END_OF_NAME = re.compile(r"(?<=\.mtl)[\"']?\s+", re.IGNORECASE)
+"""Between the names of libraries on one line; names may have spaces."""
+MATERIAL = re.compile(rb"^[ \t]*newmtl[ \t]+(.*?)\s*$", re.MULTILINE)
+MATERIAL_USED = re.compile(rb"^[ \t]*usemtl\b", re.MULTILINE)
+# No text matches one of these patterns in two ways: backtracking on a long line would take
+# quadratic time.
+NUMBER = rb"[-+]?(?:\d+(?:\.\d*)?(?:[eE][-+]?\d+)?|\.\d+(?:[eE][-+]?\d+)?|nan|inf)"
+CORNER = rb"-?[1-9]\d*(?:/(?:-?[1-9]\d*)?){0,2}"
+ENTRY = rb"(?:[ \t]+%b)" % NUMBER
+FIRST_VERTEX = re.compile(rb"^v (.*)$", re.MULTILINE)
+ROWS_AND_FACES = re.compile(rb"^(v|vt|vn|f) (.*)$", re.MULTILINE)
+RELATIVE_FACE = re.compile(rb"^f .*-", re.MULTILINE)
 
 log = logging.getLogger(__name__)
 
@@ -40,7 +47,6 @@ def read_with_trimesh(path: Path) -> list[Mesh]:
             regular file.
     """
     try:
-        check_mesh_file(path)
         return [_require_fitting(part, path) for part in _parts(path, Budget(path))]
     except UserError:
         raise
@@ -52,7 +58,10 @@ def _parts(path: Path, budget: Budget) -> list[Mesh]:
     import trimesh
 
     files, content = _Resolver(path, budget), path.read_bytes()
-    content = utf8(content) if path.suffix.lower() == ".obj" else content
+    if path.suffix.lower() == ".obj":
+        content = files.with_libraries(_checked_obj(utf8(content), path))
+    elif path.suffix.lower() == ".stl":
+        content = _exact_stl(content, path)
     scene = trimesh.load_scene(
         io.BytesIO(content),
         file_type=path.suffix.lower().lstrip("."),
@@ -71,6 +80,67 @@ def _parts(path: Path, budget: Budget) -> list[Mesh]:
             part = _colored(_surface(geometry, path, budget), geometry, files)
             parts.append(part._replace(vertices=_placed(part.vertices, world)))
     return parts
+
+
+def _checked_obj(data: bytes, path: Path) -> bytes:
+    """Return an OBJ whose lines of vertices and faces are valid, since trimesh stops reading at the
+    first text that isn't a number, and whose faces count from the first vertex.
+    """
+    text = data.replace(b"\\\r\n", b"").replace(b"\\\n", b"")
+    first = FIRST_VERTEX.search(text)
+    if wrong := _wrong_obj_line(len(first[1].split()) if first else 3).search(text):
+        number = text.count(b"\n", 0, wrong.start()) + 1
+        fail(
+            path, f"line {number} is no vertex or face: {wrong[0][:80].decode(errors='replace')!r}"
+        )
+    if not RELATIVE_FACE.search(text):
+        return text
+    counts = {b"v": 0, b"vt": 0, b"vn": 0}
+
+    def absolute(number: bytes, count: int) -> bytes:
+        if not number.startswith(b"-"):
+            return number
+        if int(number) < -count:
+            fail(path, f"a face names number {int(number)} of {count} vertices")
+        return b"%d" % (count + 1 + int(number))
+
+    def line(found: re.Match[bytes]) -> bytes:
+        if found[1] in counts:
+            counts[found[1]] += 1
+            return found[0]
+        corners = (zip(x.split(b"/"), counts.values(), strict=False) for x in found[2].split())
+        return b"f " + b" ".join(b"/".join(absolute(*x) for x in corner) for corner in corners)
+
+    return ROWS_AND_FACES.sub(line, text)
+
+
+@functools.cache
+def _wrong_obj_line(width: int) -> re.Pattern[bytes]:
+    """Return a pattern of lines that begin like a vertex or face but are not valid.
+
+    A vertex has 3 numbers, or 6 with its colour. If the first vertex has 4 (with a weight) or 7
+    (with alpha), all must have as many: trimesh splits the numbers of all vertices into rows of the
+    first one's width without checking each line."""
+    vertex = b"%b{%d}" % (ENTRY, width) if width in (4, 7) else b"%b{3}(?:%b{3})?" % (ENTRY, ENTRY)
+    right = rb"v(?= )%b|vt(?= )%b{2,3}|vn(?= )%b{3}|vp .*|f(?= )(?:[ \t]+%b){3,}" % (
+        vertex,
+        ENTRY,
+        ENTRY,
+        CORNER,
+    )
+    return re.compile(
+        rb"^(?=[ \t]*[vf])(?!(?:%b)[ \t]*\r?$).*$" % right, re.MULTILINE | re.IGNORECASE
+    )
+
+
+def _exact_stl(data: bytes, path: Path) -> bytes:
+    """Return a binary STL without what follows its last triangle, and an STL of text as it is."""
+    if b"facet" in data[:1024] or b"endsolid" in data[:1024]:
+        return data
+    size = 84 + 50 * int.from_bytes(data[80:84], "little")
+    if len(data) < size:
+        fail(path, f"it is truncated or damaged: {size} bytes were expected, not {len(data)}")
+    return data[:size]
 
 
 def _add_off_colors(scene: Any, text: str, path: Path) -> None:
@@ -117,12 +187,29 @@ class _Resolver:
         self.refused: Optional[UserError] = None
         self._files = SideFiles(path, budget)
         self._pictures: dict[int, tuple[Any, np.ndarray]] = {}
+        self._materials = b""
+
+    def with_libraries(self, content: bytes) -> bytes:
+        """Read all material libraries of an OBJ, of which trimesh reads one; return the OBJ with
+        the joined one. A single material that no line uses is that of all faces.
+        """
+        lines = [utf8(line).decode() for line in LIBRARIES.findall(content)]
+        names = [name for line in lines for name in END_OF_NAME.split(line.strip())]
+        found = [self._files.read(name) for name in names]
+        self._materials = b"\n".join(utf8(text) for text in found if text is not None)
+        head, known = f"mtllib {MATERIALS}\n".encode(), MATERIAL.findall(self._materials)
+        if len(known) == 1 and not MATERIAL_USED.search(content):
+            head += b"usemtl " + known[0] + b"\n"
+        return head + LIBRARIES.sub(b"", content)
 
     def get(self, name: str) -> bytes:
+        if name == MATERIALS:
+            return self._materials
+        # options stand before the name of a texture, which may have spaces: -clamp on a 1.png
+        ends = [word.end() for word in re.finditer(r"\s+", name) if name.startswith("-")]
         try:
-            content = self._files.read(name, TEXTURE_OPTIONS.sub("", name))
-            is_library = name.strip("\"' \t").lower().endswith(MATERIALS)
-            if content is not None and not is_library:
+            content = self._files.read(name, *(name[end:] for end in ends))
+            if content is not None:
                 # trimesh would read the part without a texture that can't be opened
                 open_texture(content, repr(name[:80]), self.budget)
         except UserError as error:
@@ -130,7 +217,7 @@ class _Resolver:
             raise
         if content is None:
             raise FileNotFoundError(name)
-        return utf8(content) if is_library else content
+        return content
 
     __getitem__ = get
 
@@ -182,10 +269,10 @@ def _colored(part: Mesh, geometry: Any, files: _Resolver) -> Mesh:
 
 def _with_material(part: Mesh, visual: Any, files: _Resolver) -> Mesh:
     """Return the part with its texture multiplied by the material's colour, or with that colour
-    alone.
+    alone. Black with a texture is ignored, as programs write it that don't multiply.
     """
     texture, tint = _texture(visual.material, files), _tint(visual.material)
-    if tint is not None:
+    if tint is not None and (texture is None or tint.any()):
         part = part._replace(vertex_colors=np.broadcast_to(tint, part.vertices.shape))
     if texture is None or visual.uv is None:
         return part

@@ -6,8 +6,10 @@ position once however often a seam repeats it, so the file is as closed as the m
 it, as glTF requires."""
 
 import io
+import json
 import os
-from collections.abc import Mapping
+import struct
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,12 +18,12 @@ from jaxtyping import Float, Int, UInt8
 
 from ..core.errors import UserError
 from ..core.files import atomic_file
-from .glb_file import write_glb_file
 from .mesh import Mesh
 
 UNLIT = "KHR_materials_unlit"
 FLOAT, UNSIGNED_INT, LINEAR, CLAMP_TO_EDGE = 5126, 5125, 9729, 33071
 ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER = 34962, 34963
+ALIGNMENT = 4
 NAME_BYTES = 63
 """Longest name that Blender keeps."""
 MTL = """# threestudio-gaussiandreamer
@@ -85,6 +87,35 @@ def _clean(name: str) -> str:
 
 
 # ---- GLB -----------------------------------------------------------------------------------------
+
+
+def write_glb_file(
+    path: str | os.PathLike, document: Mapping[str, Any], blocks: Sequence[bytes]
+) -> None:
+    """Write a GLB atomically.
+
+    Args:
+        document: the JSON without ``buffers``; its ``bufferViews``, one for each block, lack
+            buffer, offset and length.
+        blocks: the binary content; padded to multiples of 4 bytes.
+
+    Raises:
+        UserError: the file can't be written.
+    """
+    padded = [block + b"\0" * (-len(block) % ALIGNMENT) for block in blocks]
+    starts = np.cumsum([0, *map(len, padded)]).tolist()
+    views = [
+        {"buffer": 0, "byteOffset": start, "byteLength": len(block), **view}
+        for start, block, view in zip(starts, blocks, document.get("bufferViews", ()), strict=False)
+    ]
+    content = {"bufferViews": views, "buffers": [{"byteLength": starts[-1]}]} if views else {}
+    text = json.dumps({**document, **content}, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % ALIGNMENT)
+    with atomic_file(path) as file:
+        file.write(struct.pack("<4sII", b"glTF", 2, 28 + len(text) + starts[-1]))
+        file.write(struct.pack("<I4s", len(text), b"JSON") + text)
+        file.write(struct.pack("<I4s", starts[-1], b"BIN\0"))
+        file.writelines(padded)
 
 
 def write_textured_glb(

@@ -47,9 +47,8 @@ from ..core.options import (
 )
 from ..gaussians.point_cloud import PointCloud
 from ..host import register
-from ..meshes.budget import Budget
 from ..meshes.mesh import Mesh
-from ..meshes.textures import decode_texture
+from ..meshes.side_files import Budget, decode_texture
 from .base import COLOR, SCALE, Prior, points
 from .body_pose import POSES, named_pose, posed
 from .makehuman import Body, Person, data_folder, load_body

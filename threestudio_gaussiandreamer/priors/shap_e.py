@@ -57,7 +57,7 @@ from ..core.memory import count_of, require_memory
 from ..core.options import in_range, one_of, positive
 from ..gaussians.point_cloud import PointCloud
 from ..host import info, register
-from ..meshes.colors import linear_to_srgb
+from ..meshes.mesh import linear_to_srgb
 from ..models.clip import load_text_encoder, load_tokenizer, text_condition
 from ..models.hub import Source, locate
 from ..models.loaded import loaded

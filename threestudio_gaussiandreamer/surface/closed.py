@@ -12,12 +12,12 @@ from ..core.errors import UserError
 
 Vertices = Float[np.ndarray, "V 3"]
 Faces = Int[np.ndarray, "F 3"]
+Pairs = tuple[Int[np.ndarray, " P"], Int[np.ndarray, " P"]]
+"""Half-edges that run from the lower vertex index to the higher, and their partners."""
 AGGRESSIVENESS = (7, 5, 3, 1)
 """Values of fast_simplification's ``agg`` in the order of trial; lower ones keep more of the shape.
 """
 ATTEMPTS = 4
-MIN_FACES = 4
-"""Of the smallest closed mesh, a tetrahedron."""
 APART = 0.05
 """Fraction of the way to their neighbours by which vertices at one position are moved apart."""
 
@@ -53,7 +53,7 @@ def simplified(vertices: Vertices, faces: Faces, count: int) -> tuple[Vertices, 
             if found is None or len(found[1]) <= count:
                 break
             target -= len(found[1]) - count  # splitting edges has added faces
-            if target < MIN_FACES:
+            if target < 4:  # of a tetrahedron, the smallest closed mesh
                 break
         if found is not None and 0 < len(found[1]) <= count:
             return found
@@ -63,9 +63,7 @@ def simplified(vertices: Vertices, faces: Faces, count: int) -> tuple[Vertices, 
     )
 
 
-def _fewer(
-    vertices: Vertices, faces: Faces, count: int, aggressiveness: int
-) -> tuple[Vertices, Faces]:
+def _fewer(vertices: Vertices, faces: Faces, count: int, agg: int) -> tuple[Vertices, Faces]:
     import fast_simplification
 
     if len(faces) <= count:
@@ -75,7 +73,7 @@ def _fewer(
     scale = 2.0 ** -round(math.log2(extent / 2)) if extent > 0 else 1.0
     scaled = (vertices * scale).astype(np.float32)
     found, faces = fast_simplification.simplify(
-        scaled, faces.astype(np.int32), target_count=count, agg=aggressiveness
+        scaled, faces.astype(np.int32), target_count=count, agg=agg
     )
     return found / scale, faces
 
@@ -142,15 +140,14 @@ def separated(vertices: Vertices, faces: Faces) -> tuple[Vertices, Faces] | None
     return None
 
 
-def _split(
-    faces: Faces, pairs: tuple[Int[np.ndarray, " P"], Int[np.ndarray, " P"]]
-) -> tuple[Int[np.ndarray, " U"], Faces]:
-    """Give each fan, the faces around a vertex that pairs connect, a vertex of its own.
-
-    Returns:
-        for each new vertex the old one that it replaces, and the faces of new vertices.
+def _split(faces: Faces, pairs: Pairs) -> tuple[Int[np.ndarray, " U"], Faces]:
+    """Give each fan, the faces around a vertex that pairs connect, a vertex of its own; return for
+    each new vertex the old one that it replaces, and the faces of new vertices.
     """
-    (start, end), (other_start, other_end) = (_corners(edges, len(faces)) for edges in pairs)
+    places = [np.divmod(edges, len(faces)) for edges in pairs]  # corner and face of half-edges
+    (start, end), (other_start, other_end) = (
+        (3 * face + corner, 3 * face + (corner + 1) % 3) for corner, face in places
+    )
     links = [np.stack([start, other_end], axis=1), np.stack([end, other_start], axis=1)]
     label = _labels(np.concatenate(links), faces.size)
     old = np.zeros(label.max() + 1, np.int64)
@@ -158,9 +155,7 @@ def _split(
     return old, label.reshape(-1, 3)
 
 
-def _with_middles(
-    vertices: Vertices, faces: Faces, pairs: tuple[Int[np.ndarray, " P"], Int[np.ndarray, " P"]]
-) -> tuple[Vertices, Faces]:
+def _with_middles(vertices: Vertices, faces: Faces, pairs: Pairs) -> tuple[Vertices, Faces]:
     """Where an edge has several pairs of faces, split all pairs but the first at a new vertex near
     the middle of the edge. A pair with a face that is split already waits for the next attempt.
     """
@@ -183,22 +178,8 @@ def _with_middles(
     return np.concatenate([vertices, places]), np.concatenate([kept, *added])
 
 
-def _corners(
-    edges: Int[np.ndarray, " P"], count: int
-) -> tuple[Int[np.ndarray, " P"], Int[np.ndarray, " P"]]:
-    """Return the corners, as indices into ``faces.ravel()``, at which half-edges start and end."""
-    first, face = np.divmod(edges, count)
-    return 3 * face + first, 3 * face + (first + 1) % 3
-
-
-def _paired(
-    vertices: Vertices, faces: Faces
-) -> tuple[Int[np.ndarray, " P"], Int[np.ndarray, " P"]] | None:
-    """Pair each half-edge with one in the opposite direction; None if some have no partner.
-
-    Returns:
-        the half-edges that run from the lower vertex index to the higher, and their partners.
-    """
+def _paired(vertices: Vertices, faces: Faces) -> Pairs | None:
+    """Pair each half-edge with one in the opposite direction; None if some have no partner."""
     edges = half_edges(faces)
     ahead = edges[:, 0] < edges[:, 1]
     key = edges.min(axis=1) * len(vertices) + edges.max(axis=1)
@@ -208,25 +189,13 @@ def _paired(
     first, second = (side[np.lexsort((angle[side], key[side]))] for side in (first, second))
     if len(first) != len(second) or (key[first] != key[second]).any():
         return None
-    return first, _next_below(key, angle, first, second)
-
-
-def _next_below(
-    key: Int[np.ndarray, " E"],
-    angle: Float[np.ndarray, " E"],
-    first: Int[np.ndarray, " P"],
-    second: Int[np.ndarray, " P"],
-) -> Int[np.ndarray, " P"]:
-    """Rotate ``second`` within each edge, so that the face of each entry is the next one below that
-    of ``first`` by angle. Both are sorted by edge and angle.
-    """
-    second = second.copy()
+    # rotated within each edge to the next face below that of ``first`` by angle
     _, start, count = np.unique(key[first], return_index=True, return_counts=True)
     for begin, size in zip(start[count > 1], count[count > 1], strict=True):
         rows = slice(begin, begin + size)
         below = np.searchsorted(angle[second[rows]], angle[first[begin]]) - 1
         second[rows] = np.roll(second[rows], -below)
-    return second
+    return first, second
 
 
 def _angles(
@@ -246,10 +215,10 @@ def _angles(
     if not len(crowded):
         return angles
     low, high = vertices[edges[crowded].min(axis=1)], vertices[edges[crowded].max(axis=1)]
-    axis = _unit(high - low)
+    axis = unit(high - low)
     other = faces[crowded % len(faces), (crowded // len(faces) + 2) % 3]
     across = vertices[other] - low
-    side = _unit(np.cross(axis, np.eye(3)[np.abs(axis).argmin(axis=1)]))
+    side = unit(np.cross(axis, np.eye(3)[np.abs(axis).argmin(axis=1)]))
     up = np.cross(axis, side)
     angles[crowded] = np.arctan2((across * up).sum(1), (across * side).sum(1))
     return angles
@@ -273,5 +242,5 @@ def _labels(links: Int[np.ndarray, "L 2"], count: int) -> Int[np.ndarray, " N"]:
     return connected_components(graph, directed=False)[1]
 
 
-def _unit(vectors: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
+def unit(vectors: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
     return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-30)

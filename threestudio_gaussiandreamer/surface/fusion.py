@@ -1,4 +1,5 @@
-"""Fuse rendered depths of Gaussians to a signed distance on a grid (Curless and Levoy 1996).
+"""Render Gaussians from all sides, and fuse their depths to a signed distance on a grid (Curless
+and Levoy 1996).
 
 A render gives each pixel the mean and the standard deviation of the depths of its Gaussians,
 weighted by their blending weights. The surface that a pixel shows is assumed to lie one standard
@@ -12,12 +13,17 @@ mesh has the outlines of the renders. Points that no view sees are inside, so th
 holes."""
 
 import math
+from typing import NamedTuple, Optional
 
 import numpy as np
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from torch import Tensor
+from tqdm import tqdm
+
+from ..gaussians.gaussians import Gaussians
+from ..gaussians.views import FOVY, Views, rasterize_views, row_batches
 
 BAND = 3.0
 """Distance at which the signed distance is truncated, cells."""
@@ -62,7 +68,9 @@ class DepthFusion:
         # interpolate weighted depths, so that uncertain pixels count less than their neighbours
         maps = torch.stack([(depth - FRONT * deviation) * weight, weight, alpha])
         points = (self._undecided * self.cell + self.origin) @ viewmat[:3, :3].T + viewmat[:3, 3]
-        coordinates = _image_coordinates(points, K, alpha.shape)
+        ends = torch.tensor([alpha.shape[1], alpha.shape[0]], device=points.device)
+        pixels = points[:, :2] / points[:, 2:].clamp_min(1e-9) * K[[0, 1], [0, 1]] + K[:2, 2]
+        coordinates = 2 * pixels / ends - 1  # -1 and 1 at the edges of the image
         weighted_depth, weight, alpha = F.grid_sample(
             maps[None], coordinates[None, None], padding_mode="border", align_corners=False
         )[0, :, 0]
@@ -73,7 +81,9 @@ class DepthFusion:
         self._sums[0] += weight * distance.clamp(-1, 1)
         self._sums[1] += weight
         self._sums[2] = torch.maximum(self._sums[2], torch.where(in_image, 1 - 2 * alpha, -1))
-        self._forget_empty()
+        keep = self._sums[2] < EMPTY
+        if keep.float().mean() < 0.9:
+            self._undecided, self._sums = self._undecided[keep], self._sums[:, keep]
 
     def field(self) -> Float[np.ndarray, "X Y Z"]:
         """Return the signed distances, in [-1, 1] bands; the grid's border is set to outside."""
@@ -81,21 +91,63 @@ class DepthFusion:
         distance = torch.where(weight > 0, total / weight.clamp_min(1e-12), -1)
         values = torch.ones(self.shape, device=total.device)
         values[tuple(self._undecided.T)] = torch.maximum(distance, empty)
-        closed = torch.ones_like(values)
-        closed[1:-1, 1:-1, 1:-1] = values[1:-1, 1:-1, 1:-1]
-        return closed.cpu().numpy()
-
-    def _forget_empty(self) -> None:
-        """Drop the empty points from the sums when they are more than a tenth."""
-        keep = self._sums[2] < EMPTY
-        if keep.float().mean() < 0.9:
-            self._undecided, self._sums = self._undecided[keep], self._sums[:, keep]
+        return F.pad(values[1:-1, 1:-1, 1:-1], (1,) * 6, value=1.0).cpu().numpy()
 
 
-def _image_coordinates(
-    points: Float[Tensor, "P 3"], K: Float[Tensor, "3 3"], size: torch.Size
-) -> Float[Tensor, "P 2"]:
-    """Project points in camera coordinates to (x, y), -1 and 1 at the edges of the image."""
-    ends = torch.tensor([size[1], size[0]], device=points.device)
-    pixels = points[:, :2] / points[:, 2:].clamp_min(1e-9) * K[[0, 1], [0, 1]] + K[:2, 2]
-    return 2 * pixels / ends - 1
+class Renders(NamedTuple):
+    """V renders of size x size pixels."""
+
+    c2w: Float[np.ndarray, "V 4 4"]
+    """OpenGL."""
+    rgba: UInt8[np.ndarray, "V S S 4"]
+    """Display colour, not multiplied by the opacity, and opacity."""
+    fovy: float = FOVY
+    """Radians."""
+
+
+def render(cloud: Gaussians, views: Views, fusion: Optional[DepthFusion]) -> Renders:
+    """Render views of a cloud (tensors), and add the depths to ``fusion``.
+
+    Raises:
+        UserError: the cloud is too large to be rendered in float32.
+    """
+    count = len(views.viewmats)
+    rgba = np.empty((count, views.size, views.size, 4), np.uint8)
+    with tqdm(desc="surface", unit="view", total=count, disable=None, leave=False) as bar:
+        for rows in row_batches(views, len(cloud.means)):
+            rgba[rows] = _render(cloud, views, rows, fusion)
+            bar.update(len(rows))
+    return Renders(opengl(views), rgba)
+
+
+@torch.no_grad()
+def _render(
+    cloud: Gaussians, views: Views, rows: Tensor, fusion: Optional[DepthFusion]
+) -> UInt8[np.ndarray, "B S S 4"]:
+    """Return the pictures of some of the views, after adding their depths to ``fusion``."""
+    viewmats = views.viewmats[rows]
+    # relative to the views' centre, since squares of large depths lose the digits of the deviation
+    depths = torch.einsum("bj,nj->bn", viewmats[:, 2, :3], cloud.means - cloud.means.mean(0))
+    black = torch.zeros(len(rows), 5, device=depths.device)
+    moments = torch.stack([depths, depths.square()], dim=-1)
+    out = rasterize_views(cloud, views, rows, black, channels=moments)
+    colors, mean, square = (out.image / out.alpha.clamp_min(1e-6)).split([3, 1, 1], dim=-1)
+    if fusion is not None:
+        origin = (
+            torch.einsum("bj,j->b", viewmats[:, 2, :3], cloud.means.mean(0)) + viewmats[:, 2, 3]
+        )
+        deviation = (square - mean.square()).clamp_min(0).sqrt()
+        pictures = (mean + origin[:, None, None, None], deviation, out.alpha)
+        for row, *maps in zip(rows, *pictures, strict=True):
+            fusion.add(views.viewmats[row], views.Ks[row], *(values[..., 0] for values in maps))
+    rgba = torch.cat([colors, out.alpha], dim=-1).clamp(0, 1)
+    return (255 * rgba).round().byte().cpu().numpy()
+
+
+def opengl(views: Views) -> Float[np.ndarray, "V 4 4"]:
+    """Return the camera-to-world matrices of the views."""
+    c2w = torch.zeros_like(views.viewmats)
+    flip = torch.tensor([1.0, -1.0, -1.0], device=c2w.device)
+    c2w[:, :3, :3] = views.viewmats[:, :3, :3].transpose(1, 2) * flip
+    c2w[:, :3, 3], c2w[:, 3, 3] = views.positions, 1
+    return c2w.double().cpu().numpy()

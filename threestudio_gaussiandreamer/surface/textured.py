@@ -1,29 +1,87 @@
-"""Convert Gaussians to a closed triangle mesh with a texture."""
+"""Convert Gaussians to a closed triangle mesh with a texture.
 
+=============  ===================================================================================
+option         meaning
+=============  ===================================================================================
+faces          largest number of triangles
+texture        width and height of the texture, texels
+method         ``fusion`` of rendered depths, or a level set of the summed ``density``
+resolution     cells along the longest side of the grid that the surface is extracted from
+views          number of renders, on a sphere around the cloud, for depths and colours
+view_size      width and height of a render, pixels
+min_component  connected parts with a smaller share of the surface's area than this are dropped
+eps2d          screen-space dilation of the renders, square pixels; null: the run's, or 0.3
+antialias      whether the renders are antialiased; null: as in the run, or not
+=============  ===================================================================================
+"""
+
+from dataclasses import dataclass, field
 from typing import Optional
 
 import numpy as np
-import torch
-from jaxtyping import Float, Int
 
 from ..core.errors import UserError
 from ..core.extras import require_extra
 from ..core.logs import warn
-from ..core.options import check_options
+from ..core.memory import require_memory
+from ..core.options import Rule, at_least, check_options, in_range, one_of, satisfies
 from ..gaussians.gaussians import Gaussians, finite, opaque
 from ..gaussians.surface import MIN_OPACITY, gaussian_surface
+from ..gaussians.views import EPS2D, views_around
 from ..meshes.mesh import Mesh
-from .bake import bake
-from .closed import simplified, without_small_parts
-from .fusion import DepthFusion
-from .options import MeshOptions
-from .renders import render_around
-from .unwrap import unwrap
+from .bake import bake, faces_that_fit, unwrap
+from .closed import Faces, Vertices, simplified, without_small_parts
+from .fusion import DepthFusion, render
 
-NO_SURFACE = (
-    "the Gaussians form no surface: no view is covered to more than half; of {count} Gaussians "
-    "{visible} have an opacity of {least} or more"
-)
+METHODS = ("fusion", "density")
+VIEW_BYTES = 5
+"""Memory per pixel of a view: colour and opacity, and one byte of work."""
+TEXEL_BYTES = 150
+"""Memory per texel while its colours are averaged and gaps are filled."""
+SINES = (-0.9, 0.95)
+"""Of the elevations of the first and the last view: undersides are looked at too."""
+DISTANCE = 1.2
+"""Of the views, relative to where the ball of 99 % of the opacity fills them; the rest is outside.
+"""
+
+
+def whole(low: int, high: int, unit: str) -> Rule:
+    """Accept whole numbers from ``low`` to ``high``."""
+    return satisfies(
+        f"a whole number from {low} to {high} ({unit})",
+        lambda v: isinstance(v, int) and not isinstance(v, bool) and low <= v <= high,
+    )
+
+
+@dataclass
+class MeshOptions:
+    """Size of the mesh and of its texture, and the renders of the cloud that both are made from."""
+
+    faces: int = field(default=5000, metadata=whole(100, 100_000, "triangles"))
+    texture: int = field(default=1024, metadata=whole(64, 8192, "texels each way"))
+    method: str = field(default="fusion", metadata=one_of(METHODS))
+    resolution: int = field(default=144, metadata=whole(16, 256, "cells"))
+    views: int = field(default=64, metadata=whole(8, 1024, "renders"))
+    view_size: int = field(default=512, metadata=whole(64, 2048, "pixels each way"))
+    min_component: float = field(default=0.01, metadata=in_range(0, 0.5))
+    eps2d: Optional[float] = field(default=None, metadata=at_least(0, "square pixels"))
+    antialias: Optional[bool] = None
+
+    @staticmethod
+    def check(cfg: "MeshOptions") -> None:
+        """Raise UserError unless the texture has room for the faces, and renders and texture fit
+        into memory.
+        """
+        fit = faces_that_fit(cfg.texture)
+        if cfg.faces > fit:
+            raise UserError(
+                f"faces: a texture of {cfg.texture} x {cfg.texture} texels has room for {fit} "
+                f"faces, not {cfg.faces}; take fewer faces or a larger texture"
+            )
+        pictures = f"{cfg.views} renders of {cfg.view_size} x {cfg.view_size} pixels"
+        require_memory("view_size", VIEW_BYTES * cfg.views * cfg.view_size**2, pictures)
+        texels = f"a texture of {cfg.texture} x {cfg.texture} texels"
+        require_memory("texture", TEXEL_BYTES * cfg.texture**2, texels)
 
 
 def require_mesh_libraries() -> None:
@@ -49,62 +107,53 @@ def mesh_from_gaussians(
     options = MeshOptions() if options is None else options
     check_options(MeshOptions, options, where)
     require_mesh_libraries()
-    gaussians = _visible(finite(gaussians.arrays(), "mesh"))
-    cloud = gaussians.tensors()
-    fusion = DepthFusion(*_box(cloud), options.resolution) if options.method == "fusion" else None
-    renders = render_around(cloud, options, fusion)
+    whole_cloud = finite(gaussians.arrays(), "mesh")
+    gaussians = whole_cloud.rows(opaque(whole_cloud, MIN_OPACITY))
+    if not len(gaussians.means):
+        raise _no_surface(whole_cloud)
+    cloud, fusion = gaussians.tensors(), None
+    if options.method == "fusion":
+        reach = cloud.log_scales.exp().amax(dim=1, keepdim=True)  # one deviation
+        low, high = (cloud.means - reach).amin(dim=0), (cloud.means + reach).amax(dim=0)
+        fusion = DepthFusion(low, high, options.resolution)
+    count, size = options.views, options.view_size
+    views = views_around(cloud, count, size, sines=SINES, distances=(DISTANCE,))
+    eps2d = EPS2D if options.eps2d is None else options.eps2d
+    renders = render(cloud, views._replace(eps2d=eps2d, antialias=bool(options.antialias)), fusion)
     vertices, faces = _extracted(gaussians, fusion, options)
-    vertices, faces, specks = without_small_parts(vertices, faces, options.min_component)
+    least = options.min_component
+    vertices, faces, specks = without_small_parts(vertices, faces, least)
     if not len(faces):
         raise _no_surface(gaussians)
     # simplification cuts through thin parts and opens cavities, so there are small ones again
-    vertices, faces, tips = without_small_parts(
-        *simplified(vertices, faces, options.faces), options.min_component
-    )
+    vertices, faces, tips = without_small_parts(*simplified(vertices, faces, options.faces), least)
     if specks + tips:
-        share = f"{options.min_component:.2%}"
-        warn(f"mesh: {specks + tips} loose parts below {share} of the area are left out")
+        warn(f"mesh: {specks + tips} loose parts below {least:.2%} of the area are left out")
     atlas = unwrap(vertices, faces, options.texture)
     mesh = Mesh(vertices[atlas.rows], atlas.faces, uv=atlas.uv)
     return mesh._replace(texture=bake(mesh, renders, options.texture))
 
 
-def _visible(gaussians: Gaussians) -> Gaussians:
-    """Drop Gaussians that are too faint to be seen.
-
-    Raises:
-        UserError: all are, or there are none.
-    """
-    visible = opaque(gaussians, MIN_OPACITY)
-    if not visible.any():
-        raise _no_surface(gaussians)
-    return gaussians.rows(visible)
-
-
 def _no_surface(gaussians: Gaussians) -> UserError:
-    visible = int(opaque(gaussians, MIN_OPACITY).sum())
-    count = len(gaussians.means)
-    return UserError(NO_SURFACE.format(count=count, visible=visible, least=MIN_OPACITY))
-
-
-def _box(cloud: Gaussians) -> tuple[Float[torch.Tensor, "3"], Float[torch.Tensor, "3"]]:
-    """Return the lowest and the highest corner of the Gaussians' box, to one deviation."""
-    reach = cloud.log_scales.exp().amax(dim=1, keepdim=True)
-    return (cloud.means - reach).amin(dim=0), (cloud.means + reach).amax(dim=0)
+    visible, count = int(opaque(gaussians, MIN_OPACITY).sum()), len(gaussians.means)
+    return UserError(
+        "the Gaussians form no surface: no view is covered to more than half; of "
+        f"{count} Gaussians {visible} have an opacity of {MIN_OPACITY} or more"
+    )
 
 
 def _extracted(
     gaussians: Gaussians, fusion: Optional[DepthFusion], options: MeshOptions
-) -> tuple[Float[np.ndarray, "V 3"], Int[np.ndarray, "F 3"]]:
+) -> tuple[Vertices, Faces]:
     """Return the closed surface with all its parts, normals outwards; empty where there is none."""
     if fusion is None:
         surface = gaussian_surface(gaussians, resolution=options.resolution)
         return surface.vertices, surface.faces
     from skimage.measure import marching_cubes
 
-    field = fusion.field()
-    if not (field < 0).any():
+    distances = fusion.field()
+    if not (distances < 0).any():
         return np.zeros((0, 3)), np.zeros((0, 3), np.int64)
-    vertices, faces, _, _ = marching_cubes(field, 0.0, gradient_direction="ascent")
+    vertices, faces, _, _ = marching_cubes(distances, 0.0, gradient_direction="ascent")
     origin = fusion.origin.double().cpu().numpy()
     return vertices * fusion.cell + origin, faces[:, ::-1].astype(np.int64)

@@ -10,8 +10,14 @@ from pathlib import Path
 from typing import Any, Optional
 
 from ..core.errors import UserError, unknown
-from ..exporters.base import RESERVED, Drawing, FileExporter, outputs_of, read_gaussians
-from ..exporters.bundle import BundleExporter
+from ..exporters.files import (
+    RESERVED,
+    BundleExporter,
+    Drawing,
+    FileExporter,
+    outputs_of,
+    read_gaussians,
+)
 from ..formats.gaussian_files import StoredCloud, write_cloud
 from ..formats.obj import write_obj
 from ..formats.ply import write_points

@@ -17,7 +17,7 @@ from typing import Any, Optional
 from ..core.errors import UserError
 from ..core.files import atomic_file
 from ..core.images import write_animation
-from ..exporters.base import read_gaussians
+from ..exporters.files import read_gaussians
 from ..formats.gaussian_files import StoredCloud, read_cloud, write_cloud
 from ..gaussians.axes import VIEWER_UP
 from ..gaussians.gaussians import Gaussians
