@@ -61,8 +61,8 @@ def text() -> str:
         "selects the part whose options are in `x`.",
     ]
     for section, patterns in PLACES.items():
-        lines += ["", f"## `{section}`"]
         paths = [path for pattern in patterns for path in sorted(PACKAGE.glob(pattern))]
+        lines += ["", f"## `{section}`"] if paths else []
         for path in dict.fromkeys(paths):
             tree = ast.parse(path.read_text(encoding="utf-8"))
             rows = described(ast.get_docstring(tree) or "")
