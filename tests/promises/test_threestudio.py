@@ -22,9 +22,6 @@ SMALL = [
     "system.geometry.grow.max_points=100",
     "system.evaluation.size=32",
     "system.evaluation.views=2",
-    "system.image_targets.start=1",
-    "system.image_targets.stop=3",
-    "system.image_targets.views=2",
 ]
 
 
