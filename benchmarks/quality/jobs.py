@@ -154,11 +154,24 @@ def unseen_jobs() -> Iterator[Job]:
     return demo_jobs("unseen", *DEMOS)
 
 
+def needed_jobs() -> Iterator[Job]:
+    """Fixed numbers of Gaussians in the demo, and what ``budget: auto`` chooses by its dial."""
+    own = {"data.width": 256, "data.height": 256, "system.evaluation.size": 256}
+    own["trainer.max_steps"] = DEMOS["default"][1]
+    for count in (500, 1000, 2000, 2828, 4000, 5657, 8000, 11314, 16000):
+        fixed = {"system.geometry.budget": count, "system.geometry.prune.keep": 0.8}
+        yield Job("needed", "a fixed number", count, own | fixed, "")
+    for gain in (0.5, 0.25, 1):
+        chosen = {"system.geometry.prune.gain": gain}
+        yield Job("needed", f"auto, {gain:g} dB", gain, own | chosen, "")
+
+
 JOBS: dict[str, Callable[[], Iterator[Job]]] = {
     "time": time_jobs,
     "count": count_jobs,
     "quality": quality_jobs,
     "unseen": unseen_jobs,
+    "needed": needed_jobs,
 }
-WITHOUT_OBJECTS = ("unseen",)
+WITHOUT_OBJECTS = ("unseen", "needed")
 """Charts whose objects are always given by path."""

@@ -22,7 +22,7 @@ OVERLAYS = (
         f"gaussiandreamer-{name}.yaml": "gaussiandreamer.yaml"
         for name in (
             *("if", "sdxl", "sd3", "mvdream", "pointe"),
-            *("avatar", "avatar-smpl", "ground", "lowmem"),
+            *("avatar", "avatar-smpl", "ground", "lowmem", "paper"),
         )
     }
     | {"polish.yaml": "gaussiandreamer.yaml"}

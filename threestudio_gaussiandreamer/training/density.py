@@ -44,6 +44,9 @@ DECAY = 0.1
 their learning rate: a Gaussian that the loss doesn't hold up fades until it can go (after natural
 selection, Deng et al. 2025, arXiv 2511.16980).
 """
+LEAST_ERROR = 1e-4
+"""Smallest mean squared error to the ground truth that ``budget: auto`` reckons with: 40 dB. From
+there on, more Gaussians don't pay."""
 MeanError = Callable[[], Float[Tensor, ""]]
 
 
@@ -253,15 +256,15 @@ class DensityControl(DensityRule):
             pictures: output of the renderer.
             step: number of finished optimiser steps.
             error: computes the mean squared error of the renders to the ground truth, with which
-                ``budget: auto`` compares the removal error; ``prune.likeness`` is its lower bound,
-                and stands for it where there is no ground truth.
+                ``budget: auto`` compares the removal error; where there is none,
+                ``prune.likeness`` stands for it.
         """
         if not self.samples_removal(step):
             return
         if self.options.budget == AUTO:
             mean = self.cloud.error.new_tensor(10 ** (-0.1 * self.options.prune.likeness))
             if error:
-                mean = torch.maximum(mean, error().detach().to(mean))
+                mean = error().detach().to(mean).clamp_min(LEAST_ERROR)
             self.cloud.error += all_sum(mean * pictures["comp_rgb"].numel())
         rng = generator(run_seed(), "removal", step)
         image = pictures["comp_rgb"]
