@@ -2,7 +2,7 @@
 per chart.
 
     python -m benchmarks.quality.runs                               # all missing runs
-    python -m benchmarks.quality.runs --charts count --seeds 0 1 2  # one chart, fewer seeds
+    python -m benchmarks.quality.runs --charts time --seeds 0 1 2   # one chart, fewer seeds
     python -m benchmarks.quality.runs --list                        # print what would run
 
 Each run is `launch.py` with the base recipe (`recipe.py`) at 128^2 and a few options changed, on
@@ -136,36 +136,10 @@ def parse_arguments() -> argparse.Namespace:
 def run(
     mesh: str, seed: int, options: dict[str, Any], overlay: Optional[str] = None
 ) -> dict[str, Any]:
-    """Run one training in a process of its own; return its metrics, with those of the pruned cloud
-    if ``system.prune`` is given.
-    """
+    """Run one training in a process of its own; return its metrics."""
     with tempfile.TemporaryDirectory() as folder:
         save = train(Path(folder), mesh, seed, options, overlay=overlay)
-        metrics = json.loads((save / "metrics.json").read_text())
-        for pruned in save.glob("it*-export/pruned/gaussians.ply"):
-            start = {
-                "system.geometry.prior_type": "gaussians-prior",
-                "system.geometry.prior": {"path": str(pruned)},
-            }
-            same = {
-                name: value
-                for name, value in options.items()
-                if not name.startswith(("system.prune.", "system.geometry."))
-            }
-            again = train(
-                Path(folder) / "again",
-                mesh,
-                seed,
-                same | start | {"system.geometry.budget": "null", "trainer.max_steps": 1},
-            )
-            scores = json.loads((again / "metrics.json").read_text())["prior"]
-            # seconds of pruning are not part of training
-            metrics["result"] |= {
-                name: value
-                for name, value in scores.items()
-                if name not in ("step", "seconds", "cpu_seconds")
-            }
-        return metrics
+        return json.loads((save / "metrics.json").read_text())
 
 
 def train(

@@ -244,10 +244,7 @@ class DensityControl(DensityRule):
     # -- statistics --------------------------------------------------------------------------------
 
     def before_backward(
-        self,
-        pictures: dict[str, Any],
-        step: int,
-        error: Optional[MeanError] = None,
+        self, pictures: dict[str, Any], step: int, error: Optional[MeanError] = None
     ) -> None:
         """Add a sample of the removal error in these renders to the statistics, if the next round
         of pruning uses it.
@@ -262,10 +259,10 @@ class DensityControl(DensityRule):
         if not self.samples_removal(step):
             return
         if self.options.budget == AUTO:
-            mean = self.cloud.error.new_tensor(10 ** (-0.1 * self.options.prune.likeness))
-            if error:
-                mean = error().detach().to(mean).clamp_min(LEAST_ERROR)
-            self.cloud.error += all_sum(mean * pictures["comp_rgb"].numel())
+            likely = 10 ** (-0.1 * self.options.prune.likeness)
+            mean = max(float(error()), LEAST_ERROR) if error else likely
+            pixels = pictures["comp_rgb"].numel()
+            self.cloud.error += all_sum(torch.full_like(self.cloud.error, mean * pixels))
         rng = generator(run_seed(), "removal", step)
         image = pictures["comp_rgb"]
         # Composite over a random background per view, so that Gaussians of the background's colour

@@ -172,8 +172,7 @@ class GaussianCloud(BaseGeometry):
         for name in STATISTICS:
             self.register_buffer(name, torch.zeros(n, device=device))
         for name, start in AUTO_STATE.items():
-            value = torch.tensor(start, dtype=torch.float64, device=device)
-            self.register_buffer(name, value)
+            self.register_buffer(name, torch.tensor(start, dtype=torch.float64, device=device))
 
     def _load_from_state_dict(
         self, state_dict: dict[str, Tensor], prefix: str, *args: Any, **kwargs: Any
