@@ -90,18 +90,19 @@ def test_a_video_of_odd_pictures_has_even_size_and_numeric_order(saver):
     )
 
 
-def test_a_video_is_decoded_to_its_colours_with_the_matrix_that_it_names(saver):
+@pytest.mark.parametrize("height", [64, 736])  # without tags players take BT.709 above 720 lines
+def test_a_video_is_decoded_to_its_colours_with_the_matrix_that_it_names(saver, height):
     ffmpeg = pytest.importorskip("imageio_ffmpeg").get_ffmpeg_exe()
     color = np.array([200, 40, 90])
     for i in range(2):
-        saver.save_rgb_image(f"frames/{i}.png", np.full((64, 64, 3), color / 255))
+        saver.save_rgb_image(f"frames/{i}.png", np.full((height, 64, 3), color / 255))
     path = saver.save_img_sequence("colours", "frames", r"(\d+)\.png", fps=10)
     decode = ["-vf", "scale=in_color_matrix=bt709:in_range=tv", "-pix_fmt", "rgb24"]
     command = [ffmpeg, "-i", path, *decode, "-f", "rawvideo", "-"]
     decoded = subprocess.run(command, capture_output=True, check=True)
     stream = next(x for x in decoded.stderr.decode().splitlines() if "Video: h264" in x)
     assert "(tv, bt709" in stream
-    frames = np.frombuffer(decoded.stdout, np.uint8).reshape(2, 64, 64, 3)
+    frames = np.frombuffer(decoded.stdout, np.uint8).reshape(2, height, 64, 3)
     assert np.abs(frames.astype(int) - color).max() <= 3
 
 

@@ -5,6 +5,7 @@ import html
 import io
 import json
 import re
+from html.parser import HTMLParser
 
 import numpy as np
 import pytest
@@ -36,6 +37,34 @@ def test_a_prompt_is_text_wherever_it_stands():
     assert html.escape(PROMPT) in text and PROMPT not in text
     assert meta(text)["title"] == PROMPT
     assert text.count("<script") == text.count("</script>") == 8  # four shaders, meta, data x 2
+
+
+class Controls(HTMLParser):
+    """Collects the controls that a browser shows before any script has run."""
+
+    VOID = ("meta", "link", "img", "input", "br")
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.open: list[tuple[str, bool]] = [("", False)]
+        self.shown: list[str] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attributes):
+        hidden = self.open[-1][1] or "hidden" in dict(attributes)
+        if tag in ("button", "select", "input", "textarea") and not hidden:
+            self.shown.append(tag)
+        if tag not in self.VOID:
+            self.open.append((tag, hidden))
+
+    def handle_endtag(self, tag):
+        assert self.open.pop()[0] == tag
+
+
+def test_without_javascript_there_is_no_control():
+    text = page(Shown(cloud(3), "result"), options())
+    assert Controls(text).shown == []
+    assert len(Controls(text.replace("<footer hidden>", "<footer>")).shown) == 6
 
 
 def test_the_policy_forbids_requests_and_foreign_scripts():

@@ -5,6 +5,7 @@ write, asks for nothing, and runs no code of a prompt.
 import base64
 import json
 import math
+import time
 from contextlib import contextmanager
 
 import numpy as np
@@ -156,6 +157,43 @@ def test_dragging_turns_and_the_wheel_zooms(tmp_path):
         after = Pose(**page.evaluate("viewer.then(v => v.pose)"))
     assert math.isclose(after.azimuth, before.azimuth + 35, abs_tol=0.01)
     assert after.distance < 0.95 * before.distance
+
+
+def test_every_control_works(tmp_path):
+    """By the keyboard's focus, which is seen, and by a press."""
+    with shown(tmp_path, cloud(50), before=cloud(20)) as (page, _):
+        focused = {}
+        for _ in range(8):
+            for kind in ("keyDown", "keyUp"):
+                key = {"key": "Tab", "code": "Tab", "windowsVirtualKeyCode": 9}
+                page.call("Input.dispatchKeyEvent", type=kind, **key)
+            place = "(x => [x.id, getComputedStyle(x.closest('footer > *') || x).outlineStyle])"
+            name, style = page.evaluate(f"{place}(document.activeElement)")
+            focused[name] = style
+        expected = {"canvas", "cloud-choice", "turntable", "reset", "background"}
+        assert expected | {"save-ply", "save-spz"} <= set(focused)
+        assert {style for name, style in focused.items() if name} == {"solid"}
+
+        def press(name, action="click()"):
+            page.evaluate(f"document.getElementById('{name}').{action}; null")
+            return page.evaluate(
+                "new Promise(done => setTimeout(done, 300)).then(() => viewer).then(v => "
+                "[v.turning, v.pose.azimuth, v.background, v.shown])"
+            )
+
+        start = page.evaluate("viewer.then(v => v.meta.camera.azimuth)")
+        assert press("turntable")[0]
+        turned = f"viewer.then(v => v.pose.azimuth !== {start})"
+        assert any(page.evaluate(turned) or time.sleep(0.2) for _ in range(50))
+        assert not press("turntable")[0]
+        before = press("reset")
+        assert before[1] == start and before[3] == 0
+        changed = "new Event('{}', {{bubbles: true}})"
+        page.evaluate("document.getElementById('background').value = '#ff0000'; null")
+        assert press("background", f"dispatchEvent({changed.format('input')})")[2] != before[2]
+        page.evaluate("document.getElementById('cloud-choice').value = '1'; null")
+        assert press("cloud-choice", f"dispatchEvent({changed.format('change')})")[3] == 1
+        assert page.problems == []
 
 
 def test_without_webgl2_the_page_gives_a_message_and_shows_the_poster(tmp_path):

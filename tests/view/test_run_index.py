@@ -82,6 +82,7 @@ def test_the_index_shows_what_the_run_has(full_run):
     found = Tags(full_run / "index.html")
     assert found.tags.count("svg") == 3 and "iframe" in found.tags and "video" in found.tags
     assert found.tags.count("img") == 3  # poster, comparison, validation
+    assert not {"button", "select", "input", "script"} & set(found.tags)  # none that needs a script
 
 
 def test_the_downloads_come_first(full_run):
@@ -206,6 +207,7 @@ def test_the_gallery_shows_prompt_poster_and_scores(full_run):
     page = write_gallery(full_run.parent)
     assert "31.2 dB" in page.read_text()
     assert {"run/index.html", "run/save/it7-export/poster.png"} <= set(Tags(page).files)
+    assert not {"button", "select", "input", "script"} & set(Tags(page).tags)
     assert (full_run / "index.html").is_file()
 
 
