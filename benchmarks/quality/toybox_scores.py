@@ -24,7 +24,7 @@ from threestudio_gaussiandreamer.evaluation.text_to_3d import (
 from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
 from threestudio_gaussiandreamer.meshes.mesh import Mesh
 from threestudio_gaussiandreamer.toybox import recognition
-from threestudio_gaussiandreamer.toybox.samples import samples
+from threestudio_gaussiandreamer.toybox.demo import samples
 from threestudio_gaussiandreamer.toybox.views import BACKGROUND, SIZE, render
 from threestudio_gaussiandreamer.toybox.world import RADIUS, draw_attributes, object_mesh
 

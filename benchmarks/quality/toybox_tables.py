@@ -32,7 +32,7 @@ from benchmarks.quality.toybox_jobs import (
 )
 from threestudio_gaussiandreamer.evaluation.intervals import Estimate, bootstrap, per_prompt
 from threestudio_gaussiandreamer.models.bundled import FOLDER, RECORD
-from threestudio_gaussiandreamer.toybox.prompt_attributes import attributes_in
+from threestudio_gaussiandreamer.toybox.words import attributes_in
 
 TITLES = {"colors": "colours", "multi_face": "multi-face"}
 HEAD = [f"{TITLES.get(name, name)}, %" for name in RECOGNIZED]

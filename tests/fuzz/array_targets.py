@@ -12,7 +12,7 @@ from tests.fuzz.cloud_targets import some_gaussians
 from tests.fuzz.target import cloud_of, require, require_picture, require_points, strictly
 from threestudio_gaussiandreamer.formats.spz import read_spz, spz_bytes
 from threestudio_gaussiandreamer.gaussians.gaussians import usable
-from threestudio_gaussiandreamer.priors.motion_files import read_motions
+from threestudio_gaussiandreamer.priors.motion import read_motions
 from threestudio_gaussiandreamer.priors.point_cloud import PointCloudPrior
 
 

@@ -13,7 +13,7 @@ from tests.helpers.tiny_guidance import Recorder, relative, renders
 from threestudio_gaussiandreamer.core import streams
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.guidance import text_to_image
-from threestudio_gaussiandreamer.models.pooled_embeddings import unpack
+from threestudio_gaussiandreamer.models.text_encoders import unpack
 
 pytest.importorskip("diffusers")
 KIND = "stable-diffusion-xl"

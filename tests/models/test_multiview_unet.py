@@ -7,9 +7,7 @@ from tests.helpers import tiny_large_models
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.models.multiview_unet import (
     attend_across_views,
-    joined,
     load_multiview_unet,
-    parted,
     unet_options,
     views_attended_together,
 )
@@ -74,12 +72,6 @@ def test_the_order_of_the_views_does_not_matter(folder):
     values, order = inputs(VIEWS), [2, 0, 3, 1]
     there = predict(unet, *(value[order] for value in values))
     torch.testing.assert_close(there, predict(unet, *values)[order], rtol=1e-5, atol=1e-5)
-
-
-def test_joining_and_parting_are_inverse():
-    tokens = torch.arange(6 * 2 * 3.0).reshape(6, 2, 3)
-    assert joined(tokens, 3)[0, :, 0].tolist() == tokens[:3, :, 0].flatten().tolist()
-    assert torch.equal(parted(joined(tokens, 3), 3), tokens)
 
 
 def test_another_camera_is_another_prediction(folder):

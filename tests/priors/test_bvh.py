@@ -8,7 +8,7 @@ import pytest
 from tests.priors.pose_cases import MIXAMO, bvh_text, limb_angles, random_local, walked
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.priors.body_pose import INDEX
-from threestudio_gaussiandreamer.priors.bvh import joint_names, read_bvh, split_name
+from threestudio_gaussiandreamer.priors.pose_files import joint_names, read_bvh, split_name
 from threestudio_gaussiandreamer.priors.skeleton import JOINTS
 
 CMU = (

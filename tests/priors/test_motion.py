@@ -17,14 +17,14 @@ from tests.priors.motion_cases import joints_of
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.host import find
 from threestudio_gaussiandreamer.meshes.mesh import Mesh
-from threestudio_gaussiandreamer.models.clip import clip_source, picture_similarities
+from threestudio_gaussiandreamer.models.clip import PictureText, clip_source
 from threestudio_gaussiandreamer.priors import motion as module
 from threestudio_gaussiandreamer.priors.motion import (
     MotionPrior,
+    Motions,
     body_pictures,
     offered_frames,
 )
-from threestudio_gaussiandreamer.priors.motion_files import Motions
 from threestudio_gaussiandreamer.priors.motion_text import reduced_prompt
 from threestudio_gaussiandreamer.priors.skeleton import facing, z_up
 
@@ -163,9 +163,8 @@ def test_similarities_are_those_of_transformers(clip):
             **tokenizer("a fox", return_tensors="pt"),
             pixel_values=torch.from_numpy(pixels).float().permute(0, 3, 1, 2),
         )
-    scores = picture_similarities(
-        clip_source(clip), pictures, "a fox", device=torch.device("cpu"), batch=2
-    )
+    compared = PictureText(clip_source(clip), torch.device("cpu"))
+    scores = compared.similarities(pictures, "a fox", batch=2)
     np.testing.assert_allclose(
         scores, (output.logits_per_text[0] / model.logit_scale.exp()).detach().numpy(), atol=1e-5
     )

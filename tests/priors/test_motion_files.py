@@ -5,7 +5,7 @@ import pytest
 
 from tests.priors.motion_cases import walk
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.priors.motion_files import read_motions
+from threestudio_gaussiandreamer.priors.motion import read_motions
 
 # --------------------------------------------------------------------------------------------------
 # files of motions

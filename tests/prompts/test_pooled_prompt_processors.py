@@ -9,7 +9,7 @@ from tests.helpers import tiny_large_models as tiny
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.host import find
 from threestudio_gaussiandreamer.models import model_files
-from threestudio_gaussiandreamer.models.pooled_embeddings import T5_LENGTH, pack, unpack
+from threestudio_gaussiandreamer.models.text_encoders import T5_LENGTH, pack, unpack
 from threestudio_gaussiandreamer.prompts import pooled_prompt_processors  # noqa: F401
 
 diffusers = pytest.importorskip("diffusers")

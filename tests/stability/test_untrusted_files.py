@@ -23,7 +23,7 @@ from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
 from threestudio_gaussiandreamer.models import model_files
 from threestudio_gaussiandreamer.models.embedding_cache import EmbeddingCache
 from threestudio_gaussiandreamer.priors.cache import read_cache
-from threestudio_gaussiandreamer.priors.motion_files import read_motions
+from threestudio_gaussiandreamer.priors.motion import read_motions
 from threestudio_gaussiandreamer.priors.point_cloud import load_points
 from threestudio_gaussiandreamer.priors.smpl_fit import load_body_model
 from threestudio_gaussiandreamer.priors.weights import read_state_dict

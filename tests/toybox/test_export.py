@@ -18,10 +18,10 @@ from threestudio_gaussiandreamer.models.bundled import DIGESTS, digest_of, read_
 from threestudio_gaussiandreamer.models.clip import PictureText, clip_source
 from threestudio_gaussiandreamer.priors.point_e import PointEPrior
 from threestudio_gaussiandreamer.prompts import prompt_processors  # noqa: F401
-from threestudio_gaussiandreamer.toybox import checkpoints, export, loop, models, warm_start
-from threestudio_gaussiandreamer.toybox.checkpoints import averaged_weights
+from threestudio_gaussiandreamer.toybox import loop, models, warm_start
 from threestudio_gaussiandreamer.toybox.export import main
-from threestudio_gaussiandreamer.toybox.text_batches import open_tokenizer, token_ids
+from threestudio_gaussiandreamer.toybox.loop import averaged_weights, is_trained
+from threestudio_gaussiandreamer.toybox.tokens import open_tokenizer, token_ids
 from threestudio_gaussiandreamer.toybox.train import STAGES
 
 PROMPT = "a red fox with a green scarf"
@@ -36,6 +36,11 @@ def unet_stage(trained):
     stage = STAGES["unet"](options(trained))
     stage.model.load_state_dict(averaged_weights(trained, "unet"))
     return stage
+
+
+@torch.no_grad()
+def hidden_states(stage, texts):
+    return stage.text_model(token_ids(stage.tokenizer, texts)).last_hidden_state
 
 
 @pytest.fixture
@@ -55,7 +60,7 @@ def guidance(exported):
 
 def test_the_prompt_processor_gives_the_tokens_of_the_training(prompts, unet_stage):
     texts = [PROMPT, "", f"{PROMPT}, side view", f"{PROMPT}, overhead view"]
-    expected = unet_stage.tokens(texts)
+    expected = hidden_states(unet_stage, texts)
     found = [prompts.text_embeddings, prompts.uncond_text_embeddings]
     found += [prompts.text_embeddings_vd[:1], prompts.text_embeddings_vd[3:]]
     assert torch.allclose(torch.cat(found), expected, **HALF)
@@ -67,7 +72,7 @@ def test_the_guidance_sees_what_the_training_saw(guidance, prompts, unet_stage):
     assert torch.allclose(guidance.alphas_cumprod, unet_stage.alphas_cumprod)
     z = torch.randn(2, 4, 16, 16, generator=torch.Generator().manual_seed(0))
     t = torch.tensor([50, 900])
-    tokens = unet_stage.tokens([PROMPT] * 2)
+    tokens = hidden_states(unet_stage, [PROMPT] * 2)
     v = unet_stage.model(z, t, encoder_hidden_states=tokens).sample
     abar = unet_stage.alphas_cumprod[t].float().reshape(-1, 1, 1, 1)
     expected = abar.sqrt() * v + (1 - abar).sqrt() * z
@@ -111,15 +116,8 @@ def test_the_point_e_prior_loads_the_points_model(exported, trained):
 
 def test_the_record_lists_what_was_tested(exported):
     record = json.loads((exported / "training.json").read_text())
-    assert set(record) == set(export.STAGES)
+    assert set(record) == set(STAGES)
     assert record["clip"]["images"] == 8 and record["unet"]["steps"] == 1
-
-
-def test_the_record_keeps_earlier_trainings():
-    earlier = [{"device": "another", "hours": 0.1}]
-    content = {"seconds": 7200.0, "device": "cpu", "earlier": earlier}
-    assert export.trainings(content) == [*earlier, {"device": "cpu", "hours": 2.0}]
-    assert export.trainings({"seconds": 0.0, "earlier": earlier}) == earlier
 
 
 def test_digests_of_all_files_are_written(exported):
@@ -139,7 +137,7 @@ def test_a_training_continues_from_the_weights(exported, trained, tmp_path):
     tokenizer_before = (trained / "tokenizer" / "vocab.json").read_bytes()
     warm_start.start_from(weights, there, STAGES)
     assert (tmp_path / "tokenizer" / "vocab.json").read_bytes() == tokenizer_before
-    for name in export.STAGES:
+    for name in STAGES:
         expected, found = averaged_weights(trained, name), averaged_weights(tmp_path, name)
         for key, value in expected.items():
             if "heads" not in key or name == "judge":
@@ -215,7 +213,7 @@ def test_a_full_disk_at_the_start_from_weights_is_mended_by_a_second_call(export
     with largest_file(size), pytest.raises(UserError, match="cannot write"):
         warm_start.start_from(*start)
     warm_start.start_from(*start)
-    assert checkpoints.is_trained(tmp_path, "text") and open_tokenizer(tmp_path)
+    assert is_trained(tmp_path, "text") and open_tokenizer(tmp_path)
 
 
 @pytest.mark.parametrize("content", [b"{", b"[]", b'{"text": 3}', b"\xff"])

@@ -3,8 +3,9 @@
 import pytest
 import torch
 
+from threestudio_gaussiandreamer.priors.point_e_model import BaseModel
 from threestudio_gaussiandreamer.toybox import models, words
-from threestudio_gaussiandreamer.toybox.text_batches import open_tokenizer
+from threestudio_gaussiandreamer.toybox.tokens import open_tokenizer
 
 LARGEST = 20e6
 """Bytes of all shipped models together."""
@@ -22,7 +23,8 @@ def size(network) -> int:
 
 
 def test_all_models_together_are_small_enough(clip):
-    others = (models.autoencoder(), models.unet(), models.points_model(), models.Judge())
+    sizes = (models.POINTS_WIDTH, models.POINTS_LAYERS, models.FEATURES)
+    others = (models.autoencoder(), models.unet(), BaseModel(*sizes), models.Judge())
     twice = clip.text_model  # it lies in the Stable Diffusion folder too
     assert size(clip) + size(twice) + sum(map(size, others)) < 0.99 * LARGEST
 

@@ -1,7 +1,6 @@
 """Trainings that continue from weights whose vocabulary lacks words of the toybox."""
 
 import json
-import shutil
 
 import numpy as np
 import pytest
@@ -9,12 +8,10 @@ import torch
 from transformers import CLIPModel, CLIPTokenizer
 
 from tests.toybox.helpers import options
-from threestudio_gaussiandreamer.core.checkpoint_file import load_file
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.toybox import new_words, warm_start, words
-from threestudio_gaussiandreamer.toybox.checkpoints import checkpoint_path
-from threestudio_gaussiandreamer.toybox.text_batches import open_tokenizer, token_ids
-from threestudio_gaussiandreamer.toybox.text_stage import frozen_text
+from threestudio_gaussiandreamer.toybox import warm_start, words
+from threestudio_gaussiandreamer.toybox.clip_stage import trained_clip
+from threestudio_gaussiandreamer.toybox.tokens import open_tokenizer, token_ids
 from threestudio_gaussiandreamer.toybox.train import STAGES
 
 pytestmark = pytest.mark.usefixtures("small_world")
@@ -24,14 +21,10 @@ TEXTS = ["a red fox with a green scarf, front view", "", "a mug"]
 @pytest.fixture
 def grown(exported, tmp_path, monkeypatch):
     """A training that started from weights without two of the words."""
-    monkeypatch.setattr(new_words, "SEPARATION_STEPS", 5)
+    monkeypatch.setattr(warm_start, "SEPARATION_STEPS", 5)
     monkeypatch.setitem(words.NOUNS, "fox", ("fox", "wombat", "aardvark"))
-    weights, folder = tmp_path / "weights", tmp_path / "training"
-    shutil.copytree(exported, weights)
-    record = json.loads((weights / "training.json").read_text())
-    record["text"]["withheld"] = {"kind": 0.9, "quadrant": 0.8}
-    (weights / "training.json").write_text(json.dumps(record))
-    warm_start.start_from(weights, options(folder), {name: STAGES[name] for name in CHANGED})
+    folder = tmp_path / "training"
+    warm_start.start_from(exported, options(folder), {name: STAGES[name] for name in CHANGED})
     return folder
 
 
@@ -42,10 +35,8 @@ def test_new_words_are_tokens(grown):
     tokenizer = open_tokenizer(grown)
     assert [len(tokenizer(word).input_ids) for word in ("wombat", "aardvark", "fox")] == [3] * 3
     ids = token_ids(tokenizer, ["a wombat", "an aardvark"])
-    wombat, aardvark = frozen_text(grown, len(tokenizer)).text_model(ids).pooler_output
+    wombat, aardvark = trained_clip(grown, len(tokenizer), "text").text_model(ids).pooler_output
     assert not torch.allclose(wombat, aardvark, atol=1e-3)
-    record = load_file(checkpoint_path(grown, "text"))
-    assert record["measured"] == {"kind": 0.9}  # what new words can't change
 
 
 def test_a_tokenizer_without_the_words_is_refused(trained, monkeypatch):
@@ -59,14 +50,14 @@ def test_texts_of_known_words_are_encoded_as_before(grown, exported):
     known = CLIPTokenizer.from_pretrained(exported / "clip")
     expected = before.text_model(token_ids(known, TEXTS)).last_hidden_state
     tokenizer = open_tokenizer(grown)
-    text_model = frozen_text(grown, len(tokenizer)).text_model
+    text_model = trained_clip(grown, len(tokenizer), "text").text_model
     found = text_model(token_ids(tokenizer, TEXTS)).last_hidden_state
     torch.testing.assert_close(found, expected)
 
 
 def test_a_known_vocabulary_is_kept(exported, tmp_path):
     source = exported / "stable-diffusion" / "tokenizer"
-    assert new_words.grow_tokenizer(source, tmp_path / "tokenizer") == []
+    assert warm_start.grow_tokenizer(source, tmp_path / "tokenizer") == []
     kept, given = (
         json.loads((f / "vocab.json").read_text())
         for f in (tmp_path / "tokenizer", exported / "clip")
@@ -75,9 +66,11 @@ def test_a_known_vocabulary_is_kept(exported, tmp_path):
 
 
 def test_prompts_that_differ_in_a_new_word_are_moved_apart(trained, monkeypatch):
-    monkeypatch.setattr(new_words, "SEPARATION_STEPS", 20)
+    monkeypatch.setattr(warm_start, "SEPARATION_STEPS", 20)
     tokenizer = open_tokenizer(trained)
-    model = torch.nn.ModuleDict({"text_model": frozen_text(trained, len(tokenizer)).text_model})
+    model = torch.nn.ModuleDict(
+        {"text_model": trained_clip(trained, len(tokenizer), "text").text_model}
+    )
     left, right = (token_ids(tokenizer, [f"a fox, {side} side view"]) for side in ("left", "right"))
 
     def distance():
@@ -86,10 +79,10 @@ def test_prompts_that_differ_in_a_new_word_are_moved_apart(trained, monkeypatch)
         return float((states[0] - states[1]).norm())
 
     before, weights = distance(), {k: v.clone() for k, v in model.state_dict().items()}
-    new_words.separate(model, tokenizer, ["left", "right"], seed=0)
+    warm_start.separate(model, tokenizer, ["left", "right"], seed=0)
     assert distance() > 2 * before
     rows = tokenizer.convert_tokens_to_ids(["left</w>", "right</w>"])
-    weights[new_words.EMBEDDINGS][rows] = model.state_dict()[new_words.EMBEDDINGS][rows]
+    weights[warm_start.EMBEDDINGS][rows] = model.state_dict()[warm_start.EMBEDDINGS][rows]
     assert all(torch.equal(value, weights[key]) for key, value in model.state_dict().items())
 
 
@@ -98,7 +91,7 @@ def test_prompts_that_differ_in_a_new_word_are_moved_apart(trained, monkeypatch)
     [(["left", "right"], {"left": "right", "right": "left"}), (["left"], {"left": ""})],
 )
 def test_pairs_of_prompts_differ_in_a_new_word(new, replaced):
-    pairs = new_words.pairs_of_prompts(new, np.random.default_rng(0))
+    pairs = warm_start.pairs_of_prompts(new, np.random.default_rng(0))
     assert pairs
     for text, other in pairs:
         word = next(word for word in new if word in text.split())

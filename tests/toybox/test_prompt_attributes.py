@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from threestudio_gaussiandreamer.toybox.prompt_attributes import attributes_in
-from threestudio_gaussiandreamer.toybox.words import describe
+from threestudio_gaussiandreamer.toybox.words import attributes_in, describe
 from threestudio_gaussiandreamer.toybox.world import Attributes, draw_attributes
 
 

@@ -1,5 +1,7 @@
 """Renders of imperfect Gaussians, which the judge is trained on."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -15,7 +17,7 @@ def drawn_and_cast(seed=0):
     """Return a mushroom as Gaussians and ray cast, premultiplied RGBA of the same views."""
     rng = np.random.default_rng(seed)
     mesh, orbit = object_mesh(MUSHROOM, rng), views.draw_orbit(4, rng)
-    return SplatShards("unused", 0)._pictures(mesh, orbit, rng), views.render(mesh, orbit)
+    return SplatShards(Path(), 0).pictures(mesh, orbit, rng), views.render(mesh, orbit)
 
 
 def difference(drawn, cast):

@@ -13,14 +13,9 @@ from tests.toybox.helpers import copied, options, training
 from threestudio_gaussiandreamer.core.checkpoint_file import load_file
 from threestudio_gaussiandreamer.core.devices import torch_threads
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.toybox import (
-    checkpoints,
-    judge_stage,
-    loop,
-    points_stage,
-    train,
-    unet_stage,
-)
+from threestudio_gaussiandreamer.launch.folder_lock import claim
+from threestudio_gaussiandreamer.toybox import judge_stage, loop, points_stage, train, unet_stage
+from threestudio_gaussiandreamer.toybox.loop import averaged_weights
 from threestudio_gaussiandreamer.toybox.train import STAGES, main, render_shards
 
 pytestmark = pytest.mark.usefixtures("small_world")
@@ -69,15 +64,6 @@ def test_a_stage_learns_one_batch(folder, name, tmp_path):
     assert losses[-1] < 0.97 * losses[0]
 
 
-@pytest.mark.parametrize("name", ["autoencoder", "unet-small", "unet", "points"])
-def test_a_sheet_is_drawn(folder, name, monkeypatch):
-    monkeypatch.setattr(unet_stage, "SAMPLE_STEPS", 2)
-    monkeypatch.setattr(points_stage, "SAMPLE_STEPS", 2)
-    stage = STAGES[name](options(folder))
-    picture = stage.sheet(stage.model.eval())
-    assert picture.dtype == np.uint8 and picture.shape[2] == 3 and picture.std() > 0
-
-
 @pytest.mark.parametrize("name", ["text", "clip", "judge", "autoencoder", "unet"])
 def test_a_stage_is_measured_on_withheld_objects(folder, name):
     stage = STAGES[name](options(folder))
@@ -121,23 +107,17 @@ def test_after_a_stop_signal_no_other_stage_begins(tmp_path, monkeypatch, capsys
     assert begun == ["a"] and capsys.readouterr().err == "stopped\n"
 
 
-def test_a_stage_is_trained_by_one_process_at_a_time(folder, tmp_path, capsys, monkeypatch):
-    place = copied(folder, tmp_path / "run")
-    monkeypatch.setattr(train, "options_of", lambda args: options(place))
-    monkeypatch.setattr(loop.Training, "_show", lambda self: None)
-    arguments = [str(place), "--stages", "judge", "--images", "4"]
-    with train.locked(place, "judge"):
-        assert main(arguments) == 2 and not (place / "judge.pt").exists()
-        assert "another process trains the stage 'judge'" in capsys.readouterr().err
-        with train.locked(place, "unet"):  # other stages may be trained
-            pass
-    assert main(arguments) == 0
+def test_a_stage_is_trained_by_one_process_at_a_time(tmp_path, capsys):
+    claimed = claim(tmp_path / "locks" / "judge")
+    assert main([str(tmp_path), "--stages", "judge"]) == 2 and not (tmp_path / "judge.pt").exists()
+    assert "another process trains the stage 'judge'" in capsys.readouterr().err
+    claimed.release()
 
 
 def test_a_full_device_as_standard_output_stops_no_training(folder, tmp_path, monkeypatch, capfd):
     place = copied(folder, tmp_path / "run")
     monkeypatch.setattr(train, "options_of", lambda args: options(place))
-    monkeypatch.setattr(loop.Training, "_show", lambda self: None)
+    monkeypatch.setattr(judge_stage.JudgeStage, "evaluate", lambda self, model: {})
     with open("/dev/full", "w") as full:
         monkeypatch.setattr(sys, "stdout", full)
         assert main([str(place), "--stages", "judge", "--images", "4"]) == 0
@@ -175,27 +155,6 @@ def test_a_gradient_that_is_not_finite_stops_before_it_is_saved(folder, tmp_path
     assert all(value.isfinite().all() for value in run.model.parameters())
 
 
-def test_the_unet_of_small_pictures_is_not_trained_after_the_other(folder, tmp_path, capsys):
-    place = copied(folder, tmp_path / "run")
-    training(place, "unet").run(4)
-    train.train(options(place), ["unet-small"], 4)
-    assert "unet-small: not trained, since unet has begun" in capsys.readouterr().out
-    assert not (place / "unet-small.pt").exists()
-
-
-def test_incomplete_latents_are_made_again(folder, tmp_path):
-    """A power failure may leave an empty file."""
-    place = copied(folder, tmp_path / "run")
-    training(place, "unet").run(4)
-    files = list((place / "latents").iterdir())
-    contents = {path: path.read_bytes() for path in files}
-    for path in files:
-        path.write_bytes(b"")
-    training(place, "unet").run(8)
-    made = [path for path in files if path.stat().st_size]
-    assert made and all(path.read_bytes() == contents[path] for path in made)
-
-
 def test_a_time_limit_ends_a_stage_and_lowers_the_rate_before(folder, tmp_path):
     run = training(copied(folder, tmp_path / "run"), "judge")
     rates = []
@@ -210,29 +169,17 @@ def test_a_time_limit_ends_a_stage_and_lowers_the_rate_before(folder, tmp_path):
     assert len(rates) == 10 and rates[0] == 1 and 0 < rates[9] < rates[8] < 1
 
 
-def test_the_unet_starts_from_the_one_of_small_pictures(folder, tmp_path):
-    place = copied(folder, tmp_path / "run")
-    small = training(place, "unet-small")
-    assert next(small.stage.batches(0)).latents.shape[-1] == 8
-    small.run(8)
-    weights = training(place, "unet").model.state_dict()
-    for name, value in checkpoints.averaged_weights(place, "unet-small").items():
-        assert torch.equal(weights[name], value), name
-
-
 def test_curves_are_written(folder):
     rows = (folder / "clip.csv").read_text().splitlines()
     assert rows[0].startswith("images,seconds,loss") and len(rows) == 3
-    assert (folder / "clip.png").read_bytes().startswith(b"\x89PNG")
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (["--stages", "unett"], "did you mean 'unet'"),
-        (["--batch", "6"], "give a multiple of 4, or less for single views"),
-        (["--images", "0"], "--images 0: expected at least 1"),
-        (["--pool", "-3"], "--pool -3: expected at least 1"),
+        (["--images", "0"], "--images 0: expected 1 or more"),
+        (["--pool", "-3"], "--pool -3: expected 1 or more"),
         (["--device", "cuda"], "sees no GPU"),
         (["--device", "cpuu"], "unknown device 'cpuu': did you mean 'cpu'"),
         (["--only", "attentions"], "--stages, e.g. unet"),
@@ -243,8 +190,6 @@ def test_curves_are_written(folder):
         (["--seed", "1000"], "--seed 1000: expected 0 to 999"),
         (["--seed", "-1"], "--seed -1: expected 0 to 999"),
         (["--workers", "-1"], "--workers -1: expected 0 or more"),
-        (["--save-minutes", "nan"], "--save-minutes nan: expected minutes"),
-        (["--sheet-minutes", "-1"], "--sheet-minutes -1.0: expected minutes"),
     ],
 )
 def test_bad_options_are_one_message(tmp_path, capsys, arguments, message):
@@ -261,10 +206,10 @@ def test_a_folder_that_can_not_be_made_is_one_message(tmp_path, capsys):
 @pytest.mark.slow  # starts processes
 def test_workers_render_the_same_shards_as_a_training(tmp_path):
     there = loop.Options(folder=tmp_path, pool=2, shard_objects=1)
-    sorts = there.shards(), *judge_stage.judge_shards(there)
+    sorts = there.shards, *judge_stage.judge_shards(there)
     render_shards(sorts, count=2, workers=1)
     paths = {one.path(index) for one in sorts for index in (0, 1)}
-    assert set(there.shards_folder().iterdir()) == paths
+    assert set(there.shards.folder.iterdir()) == paths
     for one in sorts:
         assert np.array_equal(one.get(1).rgba, one.make(1).rgba)
 
@@ -283,7 +228,7 @@ def test_the_judge_has_data_of_its_own(tmp_path):
     """Its seeds are no other stage's, and most of its batches show Gaussians."""
     there = loop.Options(folder=tmp_path, seed=3, pool=1, shard_objects=1)
     casts, splats = judge_stage.judge_shards(there)
-    assert len({there.shards().seed, casts.seed, splats.seed}) == 3
+    assert len({there.shards.seed, casts.seed, splats.seed}) == 3
     data = STAGES["judge"](there).data()
     for step, (own, place) in enumerate([(data.first, 0), (data.second, 0), (data.second, 1)]):
         assert torch.equal(data[step].images, own[place].images)
@@ -301,15 +246,6 @@ def test_the_judge_is_measured_on_both_sorts_of_pictures(folder):
 # Formulas -----------------------------------------------------------------------------------
 
 
-def test_the_ema_starts_short():
-    average = [torch.zeros(1)]
-    loop._average(average, [torch.ones(1)], torch.tensor(1))
-    assert average[0] == pytest.approx(1 - 2 / 11)
-    average = [torch.zeros(1)]
-    loop._average(average, [torch.ones(1)], torch.tensor(10**6))
-    assert average[0] == pytest.approx(1 - loop.EMA_DECAY)
-
-
 def test_the_weight_of_v_is_truncated():
     abar = torch.tensor([0.01, 0.5, 0.99], dtype=torch.float64)
     expected = torch.tensor([1, 1, 0.06], dtype=torch.float64)
@@ -323,34 +259,10 @@ def test_latents_are_scaled_to_unit_variance():
     assert unet_stage.latent_scale(moments) == pytest.approx(1 / 5, rel=0.01)
 
 
-def test_points_go_to_point_es_units_and_back():
-    points = torch.rand(1, 10, 6) * 1.6 - 0.8
-    units = points_stage.network_units(points)
-    assert torch.allclose(points_stage.world_units(units[0]), points[0], atol=1e-5)
+def test_points_go_to_point_es_units():
     front = torch.tensor([[[0.8, 0, 0, 1.0, 0, 0]]])
     expected = torch.tensor([0, -1.0, 0, 1, -1, -1])  # Point-E's front is -y
     assert torch.allclose(points_stage.network_units(front)[0, :, 0], expected, atol=1e-6)
-
-
-@pytest.mark.parametrize("degradation", judge_stage.DEGRADATIONS)
-def test_degraded_pictures_stay_pictures_of_the_object(degradation):
-    """The pictures of a batch differ from the clean ones, but little enough to be recognised."""
-    images = torch.full((6, 3, 64, 64), 0.5)
-    images[:, :, 16:48, 16:48] = torch.tensor([0.9, 0.1, 0.1])[:, None, None]
-    for seed in range(8):
-        found = degradation(images, np.random.default_rng(seed))
-        assert found.shape == images.shape and found.min() >= 0 and found.max() <= 1
-        assert 0 < (found - images).abs().mean() < 0.12
-        middle = found[:, :, 24:40, 24:40].mean(dim=(2, 3))
-        assert (middle - images[:, :, 32, 32]).abs().max() < 0.12
-
-
-@pytest.mark.parametrize("count, clean", [(1, 1), (3, 1), (9, 3)])
-def test_a_quarter_of_the_judges_pictures_stays_clean(count, clean):
-    images = torch.rand(count, 3, 64, 64)
-    found = judge_stage.degraded(images, np.random.default_rng(0))
-    assert found.shape == images.shape and torch.equal(found[:clean], images[:clean])
-    assert all(not torch.equal(a, b) for a, b in zip(found[clean:], images[clean:], strict=True))
 
 
 @pytest.mark.parametrize(
@@ -364,10 +276,10 @@ def test_a_quarter_of_the_judges_pictures_stays_clean(count, clean):
 def test_networks_that_others_depend_on_are_frozen(folder, tmp_path, name, user, prefix, free):
     place = copied(folder, tmp_path / "run")
     training(place, user).run(4)
-    before = checkpoints.averaged_weights(place, name)
+    before = averaged_weights(place, name)
     run = training(place, name)
     run.run(run.progress.images + 8)
-    after = checkpoints.averaged_weights(place, name)
+    after = averaged_weights(place, name)
     assert all(torch.equal(before[key], after[key]) for key in before if key.startswith(prefix))
     assert any(not torch.equal(before[key], after[key]) for key in before if key.startswith(free))
     training(place, user)  # which would be refused if its text encoder or its latents had changed

@@ -9,13 +9,8 @@ import torch
 
 from tests.toybox.helpers import copied, options, training
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.toybox import (
-    checkpoints,
-    text_batches,
-    views,
-    warm_start,
-    words,
-)
+from threestudio_gaussiandreamer.toybox import tokens, views, warm_start, words
+from threestudio_gaussiandreamer.toybox.loop import averaged_weights
 from threestudio_gaussiandreamer.toybox.train import STAGES
 
 pytestmark = pytest.mark.usefixtures("small_world")
@@ -46,7 +41,7 @@ def test_most_batches_are_all_views_of_objects_at_one_timestep(folder):
 def test_joined_prompts_have_the_same_words_and_the_directions_of_their_pictures(folder):
     shard = STAGES["unet"](options(folder)).shards.get_light(0)
     objects, rng = np.array([2, 0, 3, 1] * 50), np.random.default_rng(0)
-    texts = text_batches.joined_prompts(shard, objects, views.VIEWS, rng)
+    texts = tokens.joined_prompts(shard, objects, views.VIEWS, rng)
     sorts = collections.Counter()
     for row, own in zip(objects, np.reshape(texts, (-1, views.VIEWS)).tolist(), strict=True):
         if own[0].endswith(" view"):
@@ -64,10 +59,10 @@ def test_joined_prompts_have_the_same_words_and_the_directions_of_their_pictures
 def test_only_named_parameters_are_trained(folder, tmp_path):
     place = copied(folder, tmp_path / "run")
     training(place, "unet").run(4)
-    before = checkpoints.averaged_weights(place, "unet")
+    before = averaged_weights(place, "unet")
     run = training(place, "unet", only="attentions")
     run.run(run.progress.images + 4)
-    after = checkpoints.averaged_weights(place, "unet")
+    after = averaged_weights(place, "unet")
     changed = {key for key in before if not torch.equal(before[key], after[key])}
     assert changed and all("attentions" in key for key in changed)
     with pytest.raises(UserError, match="--only 'attention_layers'.*down_blocks"):

@@ -3,15 +3,13 @@
 import numpy as np
 import pytest
 import torch
-from PIL import Image
 
 from threestudio_gaussiandreamer.meshes.load import AXES
 from threestudio_gaussiandreamer.prompts.view_prompts import view_directions
 from threestudio_gaussiandreamer.toybox import views, words, world
-from threestudio_gaussiandreamer.toybox.kinds import ACCESSORIES, KINDS, ORIENTED
-from threestudio_gaussiandreamer.toybox.sheet import LINE, contact_sheet
-from threestudio_gaussiandreamer.toybox.tokenizer import LENGTH, write_tokenizer
-from threestudio_gaussiandreamer.toybox.world_sheet import main
+from threestudio_gaussiandreamer.toybox.kinds import ACCESSORIES, KINDS
+from threestudio_gaussiandreamer.toybox.tokens import LENGTH, write_tokenizer
+from threestudio_gaussiandreamer.toybox.world_sheet import LINE, contact_sheet, main, world_sheet
 
 MANY = 400
 
@@ -26,7 +24,7 @@ def mesh_of(attributes, seed=0):
 
 
 def test_the_world_is_as_large_as_it_should_be(drawn):
-    assert len(KINDS) >= 16 and len(ORIENTED) >= 8
+    assert len(KINDS) >= 16
     assert len(world.COLORS) == 12 and len(world.PATTERNS) == 5
     assert {a.kind for a in drawn} == set(KINDS) == set(words.NOUNS) == set(words.PARTS)
     assert {a.pattern for a in drawn} == set(world.PATTERNS)
@@ -46,9 +44,7 @@ def test_colors_of_one_object_differ(drawn):
         assert (a.second is None) == (a.pattern == "plain")
 
 
-def test_withheld_combinations_are_many_and_never_drawn(drawn):
-    combinations = world.withheld_combinations()
-    assert len(combinations) >= 100 and len(set(combinations)) == len(combinations)
+def test_withheld_combinations_are_never_drawn(drawn):
     assert not any(world.withheld(a) for a in drawn)
     assert all(world.withheld(world.draw_attributes(0, i, held_out=True)) for i in range(20))
     # every kind, colour and pattern is learnt from other objects
@@ -226,14 +222,6 @@ def test_a_shard_is_a_function_of_seed_and_index(shards):
     ]
 
 
-def test_a_truncated_shard_is_rendered_again(shards):
-    expected = shards.get(0)
-    content = shards.path(0).read_bytes()
-    shards.path(0).write_bytes(content[: len(content) // 2])
-    again = views.Shards(shards.folder, 0, objects=6, views=4).get(0)
-    assert np.array_equal(expected.rgba, again.rgba)
-
-
 def test_a_shard_can_be_read_without_its_pictures(shards):
     light, whole = shards.get_light(0), shards.get(0)
     assert light.rgba.size == 0
@@ -291,9 +279,8 @@ def test_a_batch_is_a_function_of_its_step(shards):
 # The sheet ----------------------------------------------------------------------------------
 
 
-def test_the_sheet_shows_every_object_with_its_prompt(tmp_path):
-    assert main([str(tmp_path / "world.png"), "--count", "12"]) == 0
-    sheet = np.asarray(Image.open(tmp_path / "world.png"))
+def test_the_sheet_shows_every_object_with_its_prompt():
+    sheet = world_sheet(12)
     cell = views.SIZE + 5 * LINE + 3  # five lines of the longest prompt
     assert sheet.shape == (2 * cell, 10 * views.SIZE, 3)
     texts = sheet[views.SIZE : cell, : 10 * views.SIZE]
@@ -311,8 +298,6 @@ def test_texts_below_pictures_are_whole():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["sheet.png", "--count", "0"], "--count 0: expected 1 to"),
-        (["sheet.png", "--count", "1000000000"], "--count 1000000000: expected 1 to"),
         (["sheet.txt"], "expected the name of a PNG"),
         (["none/sheet.png"], "there is no folder"),
     ],

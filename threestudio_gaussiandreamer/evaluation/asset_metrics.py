@@ -40,8 +40,8 @@ from ..prompts.view_prompts import view_directions
 from ..toybox import recognition
 from ..toybox.kinds import KINDS
 from ..toybox.models import Judge
-from ..toybox.prompt_attributes import attributes_in
 from ..toybox.views import BACKGROUND, SIZE
+from ..toybox.words import attributes_in
 from . import t3bench
 from .clip_similarity import Protocol, open_clip, protocol_for, score
 from .image_reward import ImageReward

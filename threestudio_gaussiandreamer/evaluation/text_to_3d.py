@@ -13,8 +13,8 @@ from ..formats.array_files import read_arrays
 from ..gaussians.gaussians import Gaussians
 from ..gaussians.point_cloud import PointCloud
 from ..toybox import recognition
-from ..toybox.prompt_attributes import attributes_in
 from ..toybox.views import SIZE
+from ..toybox.words import attributes_in
 from ..training.initialization import gaussians_on_points
 from .asset_metrics import Asset, Clip, Janus, Metric, Recognized, shared_judge
 from .results import find_result, read_result

@@ -38,7 +38,7 @@ from ..diffusion import sds
 from ..host import register
 from ..models.families import MULTI_VIEW
 from ..models.multiview_unet import CAMERA, attend_across_views, load_multiview_unet
-from ..models.pooled_embeddings import pack, unpack
+from ..models.text_encoders import pack, unpack
 from .base import GUIDANCE_SCALE
 from .stable_diffusion import StableDiffusionGuidance
 from .text_condition import Condition, Embeddings, Latents, Timesteps, view_of_row

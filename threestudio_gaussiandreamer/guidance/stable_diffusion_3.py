@@ -32,7 +32,7 @@ from ..diffusion import rectified_flow, sds
 from ..host import register
 from ..models.families import STABLE_DIFFUSION_3 as FAMILY
 from ..models.model_files import load_settings
-from ..models.pooled_embeddings import unpack
+from ..models.text_encoders import unpack
 from ..prompts.pooled_prompt_processors import STABLE_DIFFUSION_3
 from .base import GUIDANCE_SCALE
 from .stable_diffusion import StableDiffusionGuidance

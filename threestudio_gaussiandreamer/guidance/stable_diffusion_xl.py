@@ -19,7 +19,7 @@ from ..core.errors import UserError
 from ..host import register
 from ..models.families import STABLE_DIFFUSION_XL as FAMILY
 from ..models.model_files import pipeline_settings
-from ..models.pooled_embeddings import unpack
+from ..models.text_encoders import unpack
 from ..prompts.pooled_prompt_processors import STABLE_DIFFUSION_XL
 from .stable_diffusion import StableDiffusionGuidance
 from .text_condition import Embeddings, Latents, Timesteps

@@ -23,18 +23,13 @@ files in the format of ``sha256sum``.
 """
 LINE = re.compile(rb"([0-9a-f]{64})  (.+)")
 """A line of the list of digests."""
-DIFFUSION, CLIP, POINTS, JUDGE = (
-    "stable-diffusion",
-    "clip",
-    "points.safetensors",
-    "judge.safetensors",
-)
+DIFFUSION, CLIP = "stable-diffusion", "clip"
+POINTS, JUDGE = "points.safetensors", "judge.safetensors"
 REINSTALL = (
     "install the package again (pip install --force-reinstall --no-deps "
     "threestudio-gaussiandreamer; in a clone: git checkout -- "
     f"threestudio_gaussiandreamer/assets/{NAME})"
 )
-
 EXPORT_AGAIN = (
     "write the folder again (python -m threestudio_gaussiandreamer.toybox.export); if you changed "
     f"it yourself, delete its {DIGESTS}"
@@ -78,13 +73,20 @@ def require_intact(folder: Path, part: str) -> None:
     Raises:
         UserError: one is missing or differs; or the list of digests, or a bundled part in it.
     """
-    digests = read_digests(folder)
+    digests, remedy = read_digests(folder), _remedy(folder)
     files = [name for name in digests if name.partition("/")[0] == part]
     for name in files:
-        _require_file(folder, name, digests[name])
+        path = folder / name
+        try:
+            found = digest_of(path)
+        except OSError as error:
+            reason = error.strerror or error
+            raise UserError(f"the file {str(path)!r}: {reason}; {remedy}") from error
+        if found != digests[name]:
+            raise UserError(f"the file {str(path)!r} is damaged: {remedy}")
     if folder == FOLDER and not files:
         missing = part if digests else DIGESTS
-        raise UserError(f"{str(folder / missing)!r} is missing: {REINSTALL}")
+        raise UserError(f"{str(folder / missing)!r} is missing: {remedy}")
 
 
 def read_digests(folder: Path) -> dict[str, str]:
@@ -95,12 +97,10 @@ def read_digests(folder: Path) -> dict[str, str]:
     """
     path = folder / DIGESTS
     lines = path.read_bytes().splitlines() if path.is_file() else []
-    digests = {}
-    for line in lines:
-        if not (found := LINE.fullmatch(line)):
-            raise UserError(f"{str(path)!r} is damaged: {_remedy(folder)}")
-        digests[os.fsdecode(found[2])] = found[1].decode()
-    return digests
+    found = [LINE.fullmatch(line) for line in lines]
+    if not all(found):
+        raise UserError(f"{str(path)!r} is damaged: {_remedy(folder)}")
+    return {os.fsdecode(line[2]): line[1].decode() for line in found}
 
 
 def write_digests(folder: Path) -> None:
@@ -114,17 +114,6 @@ def write_digests(folder: Path) -> None:
 def digest_of(path: Path) -> str:
     """Return the SHA-256 of a file's content."""
     return hashlib.sha256(path.read_bytes()).hexdigest()
-
-
-def _require_file(folder: Path, name: str, expected: str) -> None:
-    path = folder / name
-    try:
-        found = digest_of(path)
-    except OSError as error:
-        reason = error.strerror or error
-        raise UserError(f"the file {str(path)!r}: {reason}; {_remedy(folder)}") from error
-    if found != expected:
-        raise UserError(f"the file {str(path)!r} is damaged: {_remedy(folder)}")
 
 
 def _remedy(folder: Path) -> str:

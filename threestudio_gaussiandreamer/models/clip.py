@@ -72,9 +72,8 @@ def token_ids(tokenizer: Any, text: str) -> Tensor:
 
     They aren't padded: CLIP's attention is causal, so padding would not change the features.
     """
-    return tokenizer(
-        text, truncation=True, max_length=min(tokenizer.model_max_length, 77), return_tensors="pt"
-    ).input_ids
+    length = min(tokenizer.model_max_length, 77)
+    return tokenizer(text, truncation=True, max_length=length, return_tensors="pt").input_ids
 
 
 @torch.no_grad()
@@ -90,9 +89,7 @@ def text_condition(tokenizer: Any, encoder: Any, text: str) -> Float[Tensor, "1 
 class PictureText:
     """Load a CLIP with both encoders and compute similarities of pictures and texts."""
 
-    def __init__(
-        self, source: Source, device: torch.device, *, allow_bin: Optional[bool] = None
-    ) -> None:
+    def __init__(self, source: Source, device: torch.device, *, allow_bin=None) -> None:
         require_extra("diffusion", "transformers")
         from transformers import CLIPModel
 
@@ -105,50 +102,29 @@ class PictureText:
         self, pictures: Float[np.ndarray, "N H W 3"], text: str, *, batch: int = 32
     ) -> Float[np.ndarray, "N"]:
         """Return the cosine similarity of each picture (values in [0, 1]) and ``text``."""
-        wanted = _unit(
-            _features(
-                self._model.get_text_features(token_ids(self._tokenizer, text).to(self._device))
-            )
-        )
-        size = self._model.config.vision_config.image_size
-        chunks = [
-            preprocessed(pictures[start : start + batch], size).to(self._device)
-            for start in range(0, len(pictures), batch)
-        ]
-        return (
-            torch.cat(
-                [
-                    _unit(_features(self._model.get_image_features(chunk))) @ wanted[0]
-                    for chunk in chunks
-                ]
-            )
-            .cpu()
-            .numpy()
-        )
+        ids = token_ids(self._tokenizer, text).to(self._device)
+        (wanted,) = _unit_features(self._model.get_text_features(ids))
+        size, found = self._model.config.vision_config.image_size, []
+        for start in range(0, len(pictures), batch):
+            chunk = preprocessed(pictures[start : start + batch], size).to(self._device)
+            found.append(_unit_features(self._model.get_image_features(chunk)) @ wanted)
+        return torch.cat(found).cpu().numpy()
 
 
 def picture_similarities(
-    source: Source,
-    pictures: Float[np.ndarray, "N H W 3"],
-    text: str,
-    *,
-    device: torch.device,
-    batch: int = 32,
+    source: Source, pictures: Float[np.ndarray, "N H W 3"], text: str, *, device: torch.device
 ) -> Float[np.ndarray, "N"]:
     """Return the cosine similarity of each picture (values in [0, 1]) and ``text``; the model is
     loaded for this call and freed.
     """
-    scores = PictureText(source, device).similarities(pictures, text, batch=batch)
+    scores = PictureText(source, device).similarities(pictures, text)
     free_memory()
     return scores
 
 
-def _features(output: Any) -> Tensor:
-    """Return the features as a tensor: transformers 4 returns it, 5 an object that contains it."""
-    return output if isinstance(output, Tensor) else output.pooler_output
-
-
-def _unit(features: Tensor) -> Tensor:
+def _unit_features(output: Any) -> Tensor:
+    """Return features of length 1: transformers 4 returns a tensor, 5 an object that has it."""
+    features = output if isinstance(output, Tensor) else output.pooler_output
     return features / features.norm(dim=-1, keepdim=True)
 
 
@@ -158,7 +134,6 @@ def preprocessed(pictures: Float[np.ndarray, "N H W 3"], size: int) -> Float[Ten
     """
     pixels = torch.from_numpy(np.ascontiguousarray(pictures, np.float32)).permute(0, 3, 1, 2)
     if pixels.shape[-2:] != (size, size):
-        pixels = torch.nn.functional.interpolate(
-            pixels, (size, size), mode="bicubic", antialias=True
-        ).clamp(0, 1)
+        smooth = {"mode": "bicubic", "antialias": True}
+        pixels = torch.nn.functional.interpolate(pixels, (size, size), **smooth).clamp(0, 1)
     return (pixels - torch.tensor(MEAN)[:, None, None]) / torch.tensor(STD)[:, None, None]

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..core.errors import UserError
-from ..core.files import atomic_file
+from ..core.files import atomic_file, output_folder
 from ..host import debug
 
 FORMAT = 1
@@ -31,19 +31,16 @@ def require_cache_folder(folder: Path) -> None:
     """
     try:
         existing = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+        read_only = "" if os.access(existing, os.W_OK | os.X_OK) else "is read-only"
+        reason = read_only if existing.is_dir() else "is no folder"
+        reason = reason and f"{str(existing)!r} {reason}"
     except OSError as error:  # the name is too long
-        raise _unwritable(folder, error.strerror) from error
-    if not existing.is_dir():
-        raise _unwritable(folder, f"{str(existing)!r} is no folder")
-    if not os.access(existing, os.W_OK | os.X_OK):
-        raise _unwritable(folder, f"{str(existing)!r} is read-only")
-
-
-def _unwritable(folder: Path, reason: Optional[str]) -> UserError:
-    return UserError(
-        f"the folder of text embeddings {str(folder)!r} can't be written ({reason}): set "
-        "system.prompt_processor.cache_dir to another one, or use_cache=false"
-    )
+        reason = error.strerror
+    if reason:
+        raise UserError(
+            f"the folder of text embeddings {str(folder)!r} can't be written ({reason}): set "
+            "system.prompt_processor.cache_dir to another one, or use_cache=false"
+        )
 
 
 class EmbeddingCache:
@@ -83,14 +80,10 @@ class EmbeddingCache:
         """
         from safetensors.torch import save
 
-        try:
-            self.folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise _unwritable(self.folder, error.strerror) from error
+        output_folder(self.folder, "system.prompt_processor.cache_dir")
+        content = {"embedding": embedding.float().cpu().contiguous()}
         with atomic_file(self.path(text)) as file:
-            file.write(
-                save({"embedding": embedding.float().cpu().contiguous()}, metadata={"text": text})
-            )
+            file.write(save(content, metadata={"text": text}))
 
     def embed(self, texts: list[str], encode: Encode) -> list[Float[Tensor, "N F"]]:
         """Return the embeddings of ``texts``; those that aren't cached are encoded and stored."""

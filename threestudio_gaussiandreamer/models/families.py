@@ -5,6 +5,7 @@ The family is read from the settings of the network that predicts the noise, sin
 pipeline in ``model_index.json`` is missing or another one in many fine-tuned models. A model on the
 hub is known by the names of its files until it is downloaded."""
 
+import contextlib
 import json
 from collections.abc import Collection
 from pathlib import Path
@@ -25,11 +26,11 @@ class Family(NamedTuple):
     """Name of the prompt processor, where it isn't ``parts``."""
 
     def __str__(self) -> str:
+        processor = f"{self.processor or self.parts}-prompt-processor"
         return (
             f"{self.title}, which --config {self.config} uses "
             f"(system.guidance_type=gaussiandreamer-{self.parts}-guidance and "
-            f"system.prompt_processor_type=gaussiandreamer-{self.processor or self.parts}"
-            "-prompt-processor)"
+            f"system.prompt_processor_type=gaussiandreamer-{processor})"
         )
 
 
@@ -53,9 +54,7 @@ def require_family(family: Family, folder: Path) -> None:
     elsewhere.
     """
     settings = _network_settings(folder)
-    if settings is None:
-        return
-    found = family_of(settings)
+    found = family_of(settings) if settings else family
     if found is None:
         known = ", ".join(each.title for each in FAMILIES)
         raise UserError(
@@ -72,10 +71,8 @@ def family_of(settings: dict[str, Any]) -> Optional[Family]:
     if name == "UNet2DConditionModel":
         if settings.get("addition_embed_type") == "text_time":
             return STABLE_DIFFUSION_XL
-        in_pixels = (
-            settings.get("addition_embed_type") == "text" or settings.get("in_channels") == 3
-        )
-        return DEEP_FLOYD if in_pixels else STABLE_DIFFUSION
+        in_pixels = settings.get("addition_embed_type"), settings.get("in_channels")
+        return DEEP_FLOYD if in_pixels[0] == "text" or in_pixels[1] == 3 else STABLE_DIFFUSION
     if name == "MultiViewUNetModel":
         # ImageDream's network also takes a picture, through ip_dim tokens
         return None if settings.get("ip_dim") else MULTI_VIEW
@@ -84,28 +81,22 @@ def family_of(settings: dict[str, Any]) -> Optional[Family]:
 
 def require_names(family: Family, names: Collection[str]) -> None:
     """Raise UserError if the file names of a model show that it is of another family."""
-    found = _family_by_names(names)
-    if found not in (None, family) and not {found, family} <= set(SAME_FILES):
+    components, found = {name.split("/")[0] for name in names if "/" in name}, family
+    if "transformer" in components:
+        found = STABLE_DIFFUSION_3 if "text_encoder_3" in components else family
+    elif "unet" in components and "text_encoder_2" in components:
+        found = STABLE_DIFFUSION_XL
+    elif "unet" in components:
+        found = STABLE_DIFFUSION if "vae" in components else DEEP_FLOYD
+    if found != family and not {found, family} <= set(SAME_FILES):
         raise UserError(f"it isn't {family.title}, but {found}")
 
 
-def _family_by_names(names: Collection[str]) -> Optional[Family]:
-    components = {name.split("/")[0] for name in names if "/" in name}
-    if "transformer" in components:
-        return STABLE_DIFFUSION_3 if "text_encoder_3" in components else None
-    if "unet" not in components:
-        return None
-    if "text_encoder_2" in components:
-        return STABLE_DIFFUSION_XL
-    return STABLE_DIFFUSION if "vae" in components else DEEP_FLOYD
-
-
-def _network_settings(folder: Path) -> Optional[dict[str, Any]]:
+def _network_settings(folder: Path) -> dict[str, Any]:
     for component in ("transformer", "unet"):
-        try:
+        # missing or damaged ones are reported by what loads them
+        with contextlib.suppress(OSError, ValueError):
             settings = json.loads((folder / component / "config.json").read_text(encoding="utf-8"))
-        except (OSError, ValueError):  # missing or damaged, which loading it reports
-            continue
-        if isinstance(settings, dict):
-            return settings
-    return None
+            if isinstance(settings, dict):
+                return settings
+    return {}

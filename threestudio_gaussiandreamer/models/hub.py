@@ -4,19 +4,20 @@ No network request is made if the disk has the needed files, so ``HF_HUB_OFFLINE
 are downloaded. Only needed files are downloaded; ``model_files.py`` selects them. If a model isn't
 available, UserError is raised within seconds; its message says what to do."""
 
+import contextlib
 import errno
 import os
 import re
 import threading
 from collections.abc import Callable, Collection
+from concurrent.futures import Future, wait
 from difflib import get_close_matches
 from pathlib import Path
-from queue import Empty, SimpleQueue
 from typing import Any, NamedTuple, Optional
 
 from ..core.errors import UserError
 from ..core.extras import require_extra
-from ..core.files import require_content
+from ..core.files import is_folder, require_content
 from ..host import info
 from .bundled import DIFFUSION, model_part
 from .families import Family, require_family, require_names
@@ -35,6 +36,8 @@ MOVED = {
     "runwayml/stable-diffusion-v1-5": "stable-diffusion-v1-5/stable-diffusion-v1-5",
 }
 """Models that their publishers removed from the hub, and copies of them."""
+HUB_ID = re.compile(r"(?!.*\.\.)[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*")
+"""owner/model"""
 DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS)
 
 
@@ -104,31 +107,20 @@ def locate(source: Source, *, download: bool = True) -> Optional[Path]:
             reached; the message says what to do.
     """
     folder = Path(source.name).expanduser()
-    if _is_folder(folder):
+    if is_folder(folder):
         return _checked(folder, source)
-    if not is_hub_id(source.name):
+    if not HUB_ID.fullmatch(source.name):
         raise UserError(
             f"{source}: there is no such folder{_near_folders(folder)}, and a hub id has "
             "the form owner/model."
         )
     require_extra("diffusion", "huggingface_hub")
-    cached = cached_snapshot(source)
-    if cached is not None and _is_complete(cached, source):
-        return cached
+    if cached := cached_snapshot(source):
+        with contextlib.suppress(UserError):  # files are missing, which can be downloaded
+            source.picks(files_below(cached))
+            return cached
     sizes = _files_on_hub(source)
     return _downloaded(source, sizes) if download else None
-
-
-def is_hub_id(name: str) -> bool:
-    """Return whether ``name`` has the form "owner/model"."""
-    return (
-        re.fullmatch(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*", name) is not None
-        and ".." not in name
-    )
-
-
-# Folders
-# --------------------------------------------------------------------------------------------------
 
 
 def _checked(folder: Path, source: Source) -> Path:
@@ -140,48 +132,18 @@ def _checked(folder: Path, source: Source) -> Path:
         for name in source.picks(names):
             require_content(folder / name, name)
     except UserError as error:
+        hint = " Is it a model in the format of diffusers (with model_index.json) or transformers?"
         known = "model_index.json" in names or "config.json" in names
-        hint = (
-            ""
-            if known
-            else " Is it a model in the format of diffusers (with model_index.json) or "
-            "transformers?"
-        )
-        raise UserError(f"{source} can't be used: {error}.{hint}") from error
+        raise UserError(f"{source} can't be used: {error}.{'' if known else hint}") from error
     return folder
-
-
-def _is_complete(folder: Path, source: Source) -> bool:
-    """Return whether the cache has all needed files. Missing ones aren't an error here, since they
-    can be downloaded.
-    """
-    try:
-        source.picks(files_below(folder))
-    except UserError:
-        return False
-    return True
-
-
-def _is_folder(path: Path) -> bool:
-    try:
-        return path.is_dir()
-    except (OSError, ValueError):  # the name is too long, or contains a NUL
-        return False
 
 
 def _near_folders(folder: Path) -> str:
     parent = folder.parent
-    names = (
-        [entry.name for entry in parent.iterdir() if _is_folder(entry)]
-        if _is_folder(parent)
-        else []
-    )
+    entries = parent.iterdir() if is_folder(parent) else ()
+    names = [entry.name for entry in entries if is_folder(entry)]
     near = get_close_matches(folder.name, names, n=3, cutoff=0.5)
     return f" (near: {', '.join(str(parent / name) for name in near)})" if near else ""
-
-
-# The hub
-# --------------------------------------------------------------------------------------------------
 
 
 def cached_snapshot(source: Source) -> Optional[Path]:
@@ -192,37 +154,31 @@ def cached_snapshot(source: Source) -> Optional[Path]:
     from huggingface_hub.errors import HFValidationError
 
     # The pattern matches no file, so that snapshot_download doesn't check for completeness;
-    # _is_complete does, for the needed files only.
+    # ``locate`` does, for the needed files only.
+    options = {"revision": source.revision, "local_files_only": True, "allow_patterns": ["-"]}
     try:
-        return Path(
-            snapshot_download(
-                source.name, revision=source.revision, local_files_only=True, allow_patterns=["-"]
-            )
-        )
+        return Path(snapshot_download(source.name, **options))
     except HFValidationError as error:
-        raise UserError(
-            f"{source}: there is no such folder, and it is no hub id: {error}"
-        ) from error
+        message = f"{source}: there is no such folder, and it is no hub id: {error}"
+        raise UserError(message) from error
     except OSError:
         return None
 
 
 def _files_on_hub(source: Source) -> dict[str, int]:
     """Return the needed files of a model on the hub and their sizes in bytes."""
-    from huggingface_hub import HfApi
+    from huggingface_hub import HfApi, constants
 
-    if offline():
+    said = os.environ.get("HF_HUB_OFFLINE", "").upper()
+    if constants.HF_HUB_OFFLINE or said in ("1", "ON", "YES", "TRUE"):
         raise UserError(
             f"{source} is not on this disk, or not all of it, and HF_HUB_OFFLINE is "
             f"set.{_how_to_get(source)}"
         )
+    options = {"revision": source.revision, "timeout": TIMEOUT, "files_metadata": True}
     try:
-        api = HfApi(endpoint=_endpoint())
-        model = _with_timeout(
-            lambda: api.model_info(
-                source.name, revision=source.revision, timeout=TIMEOUT, files_metadata=True
-            )
-        )
+        api = HfApi(endpoint=os.environ.get("HF_ENDPOINT") or None)
+        model = _with_timeout(lambda: api.model_info(source.name, **options))
     except Exception as error:  # from huggingface_hub, its HTTP library or sockets
         raise UserError(explain(source, error)) from error
     sizes = {file.rfilename: file.size or 0 for file in model.siblings or ()}
@@ -238,25 +194,20 @@ def _with_timeout(ask: Callable[[], Any]) -> Any:
     The library's own timeout doesn't cover the DNS lookup, which can take a minute.
 
     Raises:
-        TimeoutError: ``ask`` hasn't returned in time; its thread continues, and its result is
-            ignored.
+        TimeoutError: ``ask`` hasn't returned in time; its thread continues.
     """
-    answers: SimpleQueue = SimpleQueue()
+    answers: Future = Future()
 
     def work() -> None:
         try:
-            answers.put((ask(), None))
+            answers.set_result(ask())
         except Exception as error:  # raised in the thread that waits for the answer
-            answers.put((None, error))
+            answers.set_exception(error)
 
     threading.Thread(target=work, daemon=True).start()
-    try:
-        answer, error = answers.get(timeout=TIMEOUT)
-    except Empty:
-        raise TimeoutError(f"no answer within {TIMEOUT:g} seconds") from None
-    if error is not None:
-        raise error
-    return answer
+    if not wait([answers], TIMEOUT).done:
+        raise TimeoutError(f"no answer within {TIMEOUT:g} seconds")
+    return answers.result()
 
 
 def _downloaded(source: Source, sizes: dict[str, int]) -> Path:
@@ -264,29 +215,12 @@ def _downloaded(source: Source, sizes: dict[str, int]) -> Path:
     from huggingface_hub import snapshot_download
 
     info(f"downloading {source.name}: up to {sum(sizes.values()) / 1e9:.1f} GB, once")
+    options = {"revision": source.revision, "endpoint": os.environ.get("HF_ENDPOINT") or None}
     try:
-        folder = snapshot_download(
-            source.name, revision=source.revision, endpoint=_endpoint(), allow_patterns=list(sizes)
-        )
+        folder = snapshot_download(source.name, allow_patterns=list(sizes), **options)
     except Exception as error:  # as above, or from the file system
         raise UserError(explain(source, error)) from error
     return _checked(Path(folder), source)
-
-
-def _endpoint() -> Optional[str]:
-    return os.environ.get("HF_ENDPOINT") or None
-
-
-def offline() -> bool:
-    """Return whether the environment forbids requests to the hub."""
-    from huggingface_hub import constants
-
-    return constants.HF_HUB_OFFLINE or os.environ.get("HF_HUB_OFFLINE", "").upper() in (
-        "1",
-        "ON",
-        "YES",
-        "TRUE",
-    )
 
 
 def explain(source: Source, error: Exception) -> str:
@@ -295,50 +229,37 @@ def explain(source: Source, error: Exception) -> str:
 
     if isinstance(error, errors.GatedRepoError):
         return (
-            f"{source} is gated: accept its licence on https://huggingface.co/{source.name} "
-            "while logged in, "
-            "then run `hf auth login` here with a token of that account, and start again."
+            f"{source} is gated: accept its licence on https://huggingface.co/{source.name} while "
+            "logged in, then run `hf auth login` here with a token of that account and start again."
         )
     if isinstance(error, errors.RevisionNotFoundError):
-        return (
-            f"{source} has no revision {source.revision!r}: leave `revision` out for its "
-            "main branch."
+        what = f"has no revision {source.revision!r}: leave `revision` out for its main branch."
+    elif isinstance(error, errors.RepositoryNotFoundError):
+        what = "is not on the hub, or is private and needs `hf auth login`." + _how_to_get(source)
+    elif isinstance(error, OSError) and error.errno in DISK_ERRORS:
+        what = f"could not be written to the cache: {error}. HF_HOME says where the cache is."
+    else:
+        reason = [*str(error).strip().splitlines(), type(error).__name__][0][:200]
+        what = (
+            f"is not on this disk, or not all of it, and the hub could not be reached ({reason})."
+            + _how_to_get(source)
         )
-    if isinstance(error, errors.RepositoryNotFoundError):
-        return (
-            f"{source} is not on the hub, or is private and needs `hf auth "
-            f"login`.{_how_to_get(source)}"
-        )
-    if isinstance(error, OSError) and error.errno in DISK_ERRORS:
-        return (
-            f"{source} could not be written to the cache: {error}. HF_HOME says where the cache is."
-        )
-    reason = (
-        str(error).strip().splitlines()[0][:200] if str(error).strip() else type(error).__name__
-    )
-    return (
-        f"{source} is not on this disk, or not all of it, and the hub could not be reached "
-        f"({reason}).{_how_to_get(source)}"
-    )
+    return f"{source} {what}"
 
 
 def _how_to_get(source: Source) -> str:
     """Return sentences for a message that say how to get the model, beginning with a space."""
     folder = Path(source.name)
     # if the part before the slash is a local folder, a path such as "models/mine" was meant
-    if _is_folder(folder.parent):
+    if is_folder(folder.parent):
         return f" The folder {str(folder.parent)!r} has no {folder.name!r}{_near_folders(folder)}."
     name = MOVED.get(source.name, source.name)
-    moved = (
-        f" Its publisher removed it from the hub; {name!r} is a copy."
-        if source.name in MOVED
-        else ""
-    )
-    local = f"models/{name.split('/')[-1]}"
+    removed = f" Its publisher removed it from the hub; {name!r} is a copy."
+    moved = removed if source.name in MOVED else ""
     revision = f"--revision {source.revision}" if source.revision else ""
-    command = " ".join(
-        filter(None, ["hf download", name, revision, source.download_options, "--local-dir", local])
-    )
+    local = f"--local-dir models/{name.split('/')[-1]}"
+    words = ["hf download", name, revision, source.download_options, local]
+    command = " ".join(filter(None, words))
     return (
         f"{moved} With a network connection: `{command}`; then set {source.option} to that folder."
         " Where the hub is out of reach, HF_ENDPOINT names a mirror of it, and ModelScope has many "

@@ -2,14 +2,13 @@
 
 By default each run loads its networks and drops them at its end. After :func:`keep_loaded` each
 network is loaded only once per process. The next run must get the same network as if it had loaded
-it: the key must contain everything that the result of ``load`` depends on, and changes of a network
-(its device, compilation) must happen inside ``load``."""
+it: changes of a network (its device, compilation) must happen inside ``load``."""
 
 from collections import Counter
 from collections.abc import Callable, Hashable
 from typing import Any
 
-from ..core.errors import UserError
+from ..core.extras import require_extra
 
 _kept: dict[Hashable, Any] = {}
 _counts: Counter = Counter()
@@ -44,16 +43,10 @@ def loaded(key: tuple[Hashable, ...], load: Callable[[], Any]) -> Any:
 def keep_on_cpu(network: Any, device: Any) -> None:
     """Keep the weights in the CPU's memory, and copy those of each layer to ``device`` while it
     computes.
-
-    Raises:
-        UserError: accelerate isn't installed.
     """
-    try:
-        from accelerate import cpu_offload
-    except ImportError as error:
-        raise UserError(
-            "enable_sequential_cpu_offload needs accelerate: pip install accelerate"
-        ) from error
+    require_extra("diffusion", "accelerate")
+    from accelerate import cpu_offload
+
     cpu_offload(network, execution_device=device)
 
 

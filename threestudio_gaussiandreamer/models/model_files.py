@@ -46,17 +46,12 @@ class Weights(NamedTuple):
 
 def files_below(folder: Path) -> list[str]:
     """List the files of a model's folder, as paths relative to it ("unet/config.json")."""
-    return sorted(
-        path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()
-    )
+    files = (path for path in folder.rglob("*") if path.is_file())
+    return sorted(path.relative_to(folder).as_posix() for path in files)
 
 
 def needed_files(
-    names: Collection[str],
-    components: Iterable[str],
-    *,
-    half: bool = False,
-    allow_bin: Optional[bool] = None,
+    names: Collection[str], components: Iterable[str], *, half=False, allow_bin=None
 ) -> list[str]:
     """Return the files that are read to load these components; see :func:`component_weights`.
 
@@ -89,11 +84,9 @@ def component_files(
         raise UserError(f"{prefix}{needed} is missing")
     if component.startswith("tokenizer"):
         require_vocabulary(names, component)
-    return (
-        small
-        if component in WITHOUT_WEIGHTS
-        else small + component_weights(names, component, half=half, allow_bin=allow_bin).files
-    )
+    if component in WITHOUT_WEIGHTS:
+        return small
+    return small + component_weights(names, component, half=half, allow_bin=allow_bin).files
 
 
 def require_vocabulary(names: Collection[str], component: str) -> None:
@@ -142,17 +135,13 @@ def _own(names: Collection[str], component: str) -> tuple[str, list[str]]:
 
 def _complete_set(own: list[str], variant: Optional[str]) -> list[str]:
     """Return the single weight file, or all shards; an empty list if some are missing."""
-    matches = {name: WEIGHTS.fullmatch(name) for name in own}
-    found = {
-        name: match
-        for name, match in matches.items()
-        if match and (match["early"] or match["late"]) == variant
-    }
-    single = [name for name, match in found.items() if match["shards"] is None]
-    if single:
+    matches = [match for match in map(WEIGHTS.fullmatch, own) if match]
+    found = [match for match in matches if (match["early"] or match["late"]) == variant]
+    single = [match.string for match in found if match["shards"] is None]
+    if single or not found:
         return single[:1]
-    shards = sorted(found)
-    return shards if shards and len(shards) == int(found[shards[0]]["shards"]) else []
+    whole = len(found) == int(found[0]["shards"])
+    return sorted(match.string for match in found) if whole else []
 
 
 def _missing_weights(prefix: str, own: list[str], allow_bin: Optional[bool]) -> str:
@@ -160,14 +149,10 @@ def _missing_weights(prefix: str, own: list[str], allow_bin: Optional[bool]) -> 
     if any(name.endswith(".safetensors") for name in own):
         return f"some of {prefix}*.safetensors are missing"
     if any(name.endswith((".bin", ".pt", ".pth", ".ckpt")) for name in own):
-        hint = (
-            ""
-            if allow_bin is None
-            else ", or set allow_bin: true, which reads a .bin with PyTorch's weights_only loader"
-        )
+        hint = ", or set allow_bin: true, which reads a .bin with PyTorch's weights_only loader"
         return (
             f"{prefix} has pickled weights only, which could run code: save it again with "
-            f"safe_serialization=True{hint}"
+            f"safe_serialization=True{'' if allow_bin is None else hint}"
         )
     return f"{prefix}*.safetensors, the weights, are missing"
 
@@ -187,10 +172,8 @@ def fingerprint(folder: Path, components: Iterable[str]) -> str:
     digest = hashlib.sha256()
     for component in sorted(components):
         for path in sorted(path for path in (folder / component).rglob("*") if path.is_file()):
-            size = path.stat().st_size
-            digest.update(
-                f"{component}/{path.relative_to(folder / component).as_posix()}/{size}\0".encode()
-            )
+            size, name = path.stat().st_size, path.relative_to(folder / component).as_posix()
+            digest.update(f"{component}/{name}/{size}\0".encode())
             with open(path, "rb") as file:
                 for start in range(0, size, max(SAMPLE, size // 16)):
                     file.seek(start)
@@ -198,18 +181,8 @@ def fingerprint(folder: Path, components: Iterable[str]) -> str:
     return digest.hexdigest()
 
 
-# Loading
-# --------------------------------------------------------------------------------------------------
-
-
 def load_network(
-    loader: Any,
-    folder: Path,
-    component: str = "",
-    *,
-    half: bool = False,
-    allow_bin: Optional[bool] = None,
-    **options: Any,
+    loader: Any, folder: Path, component: str = "", *, half=False, allow_bin=None, **options: Any
 ) -> Any:
     """Load a network with ``from_pretrained`` of diffusers or transformers from local files.
 
@@ -223,18 +196,23 @@ def load_network(
     Raises:
         UserError: its files are damaged, lack weights, or are not what the libraries expect.
     """
+    from transformers.utils import logging
+
     weights = component_weights(files_below(folder), component, half=half, allow_bin=allow_bin)
-    options |= {
-        "use_safetensors": weights.safe,
-        "variant": weights.variant,
-        "output_loading_info": True,
-    }
-    with _quiet_transformers():
-        network, report = _from_pretrained(loader, folder, component, options)
+    options |= {"use_safetensors": weights.safe, "variant": weights.variant}
+    level = logging.get_verbosity()
+    # no report of weights that the network doesn't have, as those of CLIP's other encoder
+    logging.set_verbosity_error()
+    try:
+        network, report = load_settings(
+            loader, folder, component, output_loading_info=True, **options
+        )
+    finally:
+        logging.set_verbosity(level)
     # if weights are missing, both libraries only warn and initialise them at random
     if missing := sorted(report["missing_keys"]):
         raise UserError(
-            f"{_name(loader, folder, component)} lacks weights: "
+            f"{component or loader.__name__} of the model in {str(folder)!r} lacks weights: "
             f"{', '.join(missing[:3])}{', ...' if missing[3:] else ''}"
         )
     return network.eval()
@@ -246,14 +224,9 @@ def load_settings(loader: Any, folder: Path, component: str = "", **options: Any
     Raises:
         UserError: its files are damaged or not what the libraries expect.
     """
-    return _from_pretrained(loader, folder, component, options)
-
-
-def _from_pretrained(loader: Any, folder: Path, component: str, options: dict[str, Any]) -> Any:
-    with loading_errors(_name(loader, folder, component)):
-        return loader.from_pretrained(
-            str(folder), subfolder=component, local_files_only=True, **options
-        )
+    options |= {"subfolder": component, "local_files_only": True}
+    with loading_errors(f"{component or loader.__name__} of the model in {str(folder)!r}"):
+        return loader.from_pretrained(str(folder), **options)
 
 
 @contextmanager
@@ -268,25 +241,6 @@ def loading_errors(name: str) -> Iterator[None]:
             f"{name} can't be loaded: {type(error).__name__}: {str(error).strip()[:500]}. "
             "If a file is damaged, delete it and download it again."
         ) from error
-
-
-def _name(loader: Any, folder: Path, component: str) -> str:
-    return f"{component or loader.__name__} of the model in {str(folder)!r}"
-
-
-@contextmanager
-def _quiet_transformers() -> Iterator[None]:
-    """Suppress transformers' report of weights in the file that the loaded network doesn't have,
-    such as those of CLIP's image encoder when only its text encoder is loaded.
-    """
-    from transformers.utils import logging
-
-    level = logging.get_verbosity()
-    logging.set_verbosity_error()
-    try:
-        yield
-    finally:
-        logging.set_verbosity(level)
 
 
 def free_memory() -> None:

@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Float
 from torch import Tensor, nn
 from torch.utils.hooks import RemovableHandle
 
@@ -48,11 +47,12 @@ def load_multiview_unet(
         options = unet_options(settings)
         with torch.device("meta"):
             unet = unet_class(**options)
-        named = {
-            _ldm_name(name): value.to(torch_dtype)
-            for file in weights.files
-            for name, value in load_file(folder / file).items()
-        }
+        named = {}
+        for file in weights.files:
+            for name, value in load_file(folder / file).items():
+                # the camera's embedding is the class embedding, which diffusers converts
+                name = LDM_PREFIX + name.replace("camera_embed.", "label_emb.0.")
+                named[name] = value.to(torch_dtype)
         unet.load_state_dict(convert_ldm_unet_checkpoint(named, options), assign=True)
     return unet.eval()
 
@@ -69,36 +69,23 @@ def unet_options(settings: dict[str, Any]) -> dict[str, Any]:
         )
     channels = [settings["model_channels"] * factor for factor in settings["channel_mult"]]
     attends = [2**level in settings["attention_resolutions"] for level in range(len(channels))]
+    kinds, width = [a * "CrossAttn" for a in attends], settings.get("num_head_channels", -1)
+    heads = [settings["num_heads"] if width == -1 else channel // width for channel in channels]
     return {
         "sample_size": settings["image_size"],
         "in_channels": settings["in_channels"],
         "out_channels": settings["out_channels"],
         "block_out_channels": channels,
         "layers_per_block": settings["num_res_blocks"],
-        "down_block_types": [_block("Down", attention) for attention in attends],
-        "up_block_types": [_block("Up", attention) for attention in reversed(attends)],
-        # diffusers' name for the number of heads
-        "attention_head_dim": _heads(settings, channels),
+        "down_block_types": [f"{kind}DownBlock2D" for kind in kinds],
+        "up_block_types": [f"{kind}UpBlock2D" for kind in reversed(kinds)],
+        "attention_head_dim": heads,  # diffusers' name for the number of heads
         "cross_attention_dim": settings["context_dim"],
         "transformer_layers_per_block": settings.get("transformer_depth", 1),
         "use_linear_projection": True,
         "class_embed_type": "projection",
         "projection_class_embeddings_input_dim": CAMERA,
     }
-
-
-def _block(direction: str, attention: bool) -> str:
-    return f"{'CrossAttn' if attention else ''}{direction}Block2D"
-
-
-def _heads(settings: dict[str, Any], channels: list[int]) -> list[int]:
-    width = settings.get("num_head_channels", -1)
-    return [settings["num_heads"] if width == -1 else channel // width for channel in channels]
-
-
-def _ldm_name(name: str) -> str:
-    """Rename the camera's embedding to the class embedding, which diffusers converts."""
-    return LDM_PREFIX + name.replace("camera_embed.", "label_emb.0.")
 
 
 def attend_across_views(unet: nn.Module, views: int) -> nn.Module:
@@ -119,11 +106,15 @@ def views_attended_together(unet: nn.Module, views: int) -> Iterator[None]:
 
 
 def _join_attention(unet: nn.Module, views: int) -> list[RemovableHandle]:
+    """Register hooks that join the tokens (R, L, F) of each ``views`` consecutive rows to
+    (R / views, views L, F) before a self-attention, and part them after it.
+    """
+
     def join(module: nn.Module, args: tuple[Any, ...]) -> tuple[Any, ...]:
-        return joined(args[0], views), *args[1:]
+        return args[0].unflatten(0, (-1, views)).flatten(1, 2), *args[1:]
 
     def part(module: nn.Module, args: tuple[Any, ...], output: Tensor) -> Tensor:
-        return parted(output, views)
+        return output.unflatten(1, (views, -1)).flatten(0, 1)
 
     return [
         hook
@@ -131,13 +122,3 @@ def _join_attention(unet: nn.Module, views: int) -> list[RemovableHandle]:
         if name.endswith(".attn1")
         for hook in (module.register_forward_pre_hook(join), module.register_forward_hook(part))
     ]
-
-
-def joined(tokens: Float[Tensor, "R L F"], views: int) -> Float[Tensor, "G vL F"]:
-    """Join the tokens of each ``views`` consecutive rows."""
-    return tokens.unflatten(0, (-1, views)).flatten(1, 2)
-
-
-def parted(tokens: Float[Tensor, "G vL F"], views: int) -> Float[Tensor, "R L F"]:
-    """Part the tokens into rows of one view each, the inverse of :func:`joined`."""
-    return tokens.unflatten(1, (views, -1)).flatten(0, 1)

@@ -1,16 +1,24 @@
-"""Encode texts with a model's text encoder: CLIP for Stable Diffusion, T5 for DeepFloyd IF. The
-encoder is loaded for one call and freed; CLIP's, which is small, is kept where ``loaded.py`` keeps
-networks.
+"""Encode texts with a model's text encoders: CLIP for Stable Diffusion, T5 for DeepFloyd IF, two or
+three encoders for Stable Diffusion XL and 3. An encoder is loaded for one call and freed; CLIP's,
+which are small, are kept where ``loaded.py`` keeps networks.
 
 As in diffusers' pipelines, texts are padded to the model's length, and longer ones truncated with a
-warning. The result is float32, without gradients."""
+warning; CLIP's tokens for Stable Diffusion XL and 3 are the states before its last layer. The
+result is float32 on the CPU, without gradients.
 
+Stable Diffusion XL and 3 are conditioned on tokens and on one vector for the whole text, the pooled
+embedding. Both are kept in one tensor, the vector as a last token that is padded with zeros
+(:func:`pack`), so that caching, view-dependent prompts and Perp-Neg treat them alike."""
+
+import json
 import textwrap
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
@@ -23,12 +31,13 @@ LENGTH = 77
 """Number of tokens that CLIP, and DeepFloyd IF with T5, were trained with."""
 SHOWN = 300
 """Characters of a prompt in a warning."""
+T5_LENGTH = 256
+"""Number of tokens that Stable Diffusion 3's pipeline takes from T5."""
+T5_WIDTH = 4096
 
 
 def encode_clip(folder: Path, texts: list[str]) -> list[Float[Tensor, "N F"]]:
-    """Return the last hidden states of Stable Diffusion's text encoder, one (N, F) per text,
-    float32 on the CPU.
-    """
+    """Return the last hidden states of Stable Diffusion's text encoder, one (N, F) per text."""
     from transformers import CLIPTextModel
 
     tokens = clip_tokens(folder, texts)
@@ -43,11 +52,82 @@ def encode_clip(folder: Path, texts: list[str]) -> list[Float[Tensor, "N F"]]:
 
 
 def encode_t5(folder: Path, texts: list[str]) -> list[Float[Tensor, "N F"]]:
-    """Return the last hidden states of DeepFloyd IF's T5 encoder, one (77, F) per text, float32 on
-    the CPU.
-    """
+    """Return the last hidden states of DeepFloyd IF's T5 encoder, one (77, F) per text."""
     # as in diffusers' IFPipeline without caption cleaning
     return list(t5_states(folder, [text.lower().strip() for text in texts], length=LENGTH))
+
+
+def pack(tokens: Float[Tensor, "*B N F"], vector: Float[Tensor, "*B P"]) -> Float[Tensor, "*B M F"]:
+    """Append a vector of P <= F numbers to the tokens: M = N + 1."""
+    padded = F.pad(vector, (0, tokens.shape[-1] - vector.shape[-1]))
+    return torch.cat([tokens, padded[..., None, :].to(tokens)], dim=-2)
+
+
+def unpack(
+    packed: Float[Tensor, "*B M F"], width: int
+) -> tuple[Float[Tensor, "*B N F"], Float[Tensor, "*B P"]]:
+    """Return the tokens and the vector of ``width`` numbers that :func:`pack` appended."""
+    return packed[..., :-1, :], packed[..., -1, :width]
+
+
+def encode_sdxl(folder: Path, texts: list[str]) -> list[Float[Tensor, "N F"]]:
+    """Return the embeddings of Stable Diffusion XL, one (78, 2048) per text: the tokens of both
+    encoders side by side, and the pooled embedding of the second.
+    """
+    from transformers import CLIPTextModel, CLIPTextModelWithProjection
+
+    first, _ = _clip(folder, "", texts, CLIPTextModel)
+    second, pooled = _clip(folder, "_2", texts, CLIPTextModelWithProjection)
+    return list(pack(torch.cat([first, second], dim=-1), pooled))
+
+
+def encode_sd3(folder: Path, texts: list[str]) -> list[Float[Tensor, "N F"]]:
+    """Return the embeddings of Stable Diffusion 3, one (334, 4096) per text: the tokens of both
+    CLIP encoders side by side, padded to T5's width, then T5's; and their pooled embeddings.
+    """
+    states = t5_states(folder, texts, suffix="_3", length=T5_LENGTH, uses_mask=False)
+    return _sd3_embeddings(folder, texts, states)
+
+
+def encode_sd3_without_t5(folder: Path, texts: list[str]) -> list[Float[Tensor, "N F"]]:
+    """Return the embeddings of Stable Diffusion 3 with zeros in place of T5's tokens, as diffusers'
+    pipeline does without its third encoder.
+    """
+    settings, width = folder / "transformer" / "config.json", T5_WIDTH
+    if settings.is_file():
+        width = json.loads(settings.read_text(encoding="utf-8"))["joint_attention_dim"]
+    return _sd3_embeddings(folder, texts, torch.zeros(len(texts), T5_LENGTH, width))
+
+
+def _sd3_embeddings(
+    folder: Path, texts: list[str], states: Float[Tensor, "T L F"]
+) -> list[Float[Tensor, "N F"]]:
+    from transformers import CLIPTextModelWithProjection
+
+    parts = [_clip(folder, suffix, texts, CLIPTextModelWithProjection) for suffix in ("", "_2")]
+    tokens = torch.cat([tokens for tokens, _ in parts], dim=-1)
+    tokens = F.pad(tokens, (0, states.shape[-1] - tokens.shape[-1]))
+    pooled = torch.cat([vector for _, vector in parts], dim=-1)
+    return list(pack(torch.cat([tokens, states], dim=1), pooled))
+
+
+def _clip(
+    folder: Path, suffix: str, texts: list[str], encoder_class: Any
+) -> tuple[Float[Tensor, "T N F"], Float[Tensor, "T P"]]:
+    """Return tokens and pooled embeddings of one CLIP encoder, one text at a time, so that the
+    result doesn't depend on the other texts.
+    """
+    ids = clip_tokens(folder, texts, suffix).input_ids
+
+    def run(encoder: Any) -> tuple[Tensor, Tensor]:
+        found = [encoder(row.to(encoder.device), output_hidden_states=True) for row in ids.split(1)]
+        tokens = torch.cat([states.hidden_states[-2] for states in found])
+        # of an encoder without projection, whose pooled embedding isn't used, the first output is
+        # the last layer
+        pooled = torch.cat([states[0].flatten(1) for states in found])
+        return tokens.float().cpu(), pooled.float().cpu()
+
+    return with_encoder(encoder_class, folder, f"text_encoder{suffix}", run)
 
 
 def clip_tokens(folder: Path, texts: list[str], suffix: str = "") -> Any:
@@ -63,11 +143,8 @@ def with_encoder(
     """Load a CLIP text encoder in float32, call ``run`` with it, and free it."""
 
     def on_device(device: torch.device) -> Any:
-        def load() -> Any:
-            network = load_network(encoder_class, folder, component, dtype=torch.float32)
-            return network.to(device)
-
-        return run(loaded((component, str(folder), device), load))
+        load = partial(load_network, encoder_class, folder, component, dtype=torch.float32)
+        return run(loaded((component, str(folder), device), lambda: load().to(device)))
 
     return _freed(on_device)
 
@@ -76,7 +153,7 @@ def t5_states(
     folder: Path, texts: list[str], *, suffix: str = "", length: int, uses_mask: bool = True
 ) -> Float[Tensor, "T N F"]:
     """Return the last hidden states of the T5 encoder that is the component "text_encoder" and
-    ``suffix``, float32 on the CPU.
+    ``suffix``.
 
     On a GPU the encoder runs in half precision and takes about 11 GB; float32 takes 19 GB.
 
@@ -84,20 +161,17 @@ def t5_states(
         length: number of tokens.
         uses_mask: hide the padding, as the model was trained.
     """
-    require_extra(
-        "diffusion", "sentencepiece", "google.protobuf"
-    )  # without these modules transformers chooses another tokenizer class
+    # without these modules transformers chooses another tokenizer class
+    require_extra("diffusion", "sentencepiece", "google.protobuf")
     from transformers import T5EncoderModel
 
     tokens = _tokenize(_tokenizer(folder, f"tokenizer{suffix}"), texts, length)
 
     def run(device: torch.device) -> Tensor:
         half = device.type == "cuda"
-        dtype = torch.float16 if half else torch.float32
-        encoder = load_network(
-            T5EncoderModel, folder, f"text_encoder{suffix}", half=half, dtype=dtype
-        ).to(device)
-        return _one_by_one(encoder, tokens, uses_mask=uses_mask)
+        options = {"half": half, "dtype": torch.float16 if half else torch.float32}
+        encoder = load_network(T5EncoderModel, folder, f"text_encoder{suffix}", **options)
+        return _one_by_one(encoder.to(device), tokens, uses_mask=uses_mask)
 
     return _freed(run)
 
@@ -128,9 +202,8 @@ def _tokenize(tokenizer: Any, texts: list[str], length: int) -> Any:
                 f"the prompt has {count} tokens, the text encoder takes {length}: what comes "
                 f"last has no effect: {textwrap.shorten(text, SHOWN)!r}"
             )
-    return tokenizer(
-        texts, padding="max_length", max_length=length, truncation=True, return_tensors="pt"
-    )
+    padded = {"padding": "max_length", "max_length": length, "truncation": True}
+    return tokenizer(texts, **padded, return_tensors="pt")
 
 
 @torch.no_grad()

@@ -63,14 +63,11 @@ SHARE = in_range(0, 1)
 
 def named_share(names: dict[str, float]) -> Rule:
     """Return the rule for one of ``names`` or a number from 0 to 1."""
-    return satisfies(
-        f"{', '.join(map(repr, names))} or a number from 0 to 1",
-        lambda value: value in names if isinstance(value, str) else _is_share(value),
-    )
 
+    def is_share(value: Any) -> bool:
+        return value in names if isinstance(value, str) else is_number(value) and 0 <= value <= 1
 
-def _is_share(value: Any) -> bool:
-    return is_number(value) and 0 <= value <= 1
+    return satisfies(f"{', '.join(map(repr, names))} or a number from 0 to 1", is_share)
 
 
 def check_pose(path: str, pose: str) -> None:
@@ -113,41 +110,29 @@ class AnnyPrior(Prior):
     cfg: Config
 
     def preflight(self) -> None:
-        """Check within seconds that the body's data and the user's files are there.
-
-        Raises:
-            UserError: the package isn't installed, or a file is missing or invalid.
-        """
         data_folder()
         if self.cfg.texture:
             existing_file(self.cfg.texture, "texture")
             if self.cfg.color is not None:
-                raise UserError(
-                    f"texture: it isn't shown with color={self.cfg.color}: set color=null"
-                )
+                shown = f"color={self.cfg.color}"
+                raise UserError(f"texture: it isn't shown with {shown}: set color=null")
         if self.cfg.pose not in POSES:
             self._pose(load_body(self._person()))
 
     def generate(self, prompt: str, generator: np.random.Generator) -> PointCloud:
         cfg, body = self.cfg, load_body(self._person())
-        found = posed(body, self._pose(body))
-        mesh = Mesh(found.vertices, body.faces)
+        body = posed(body, self._pose(body))
+        mesh = Mesh(body.vertices, body.faces)
         if cfg.texture and cfg.color is None:
             mesh = textured(mesh, body, cfg.texture)
-        mesh = world_mesh(mesh, found.joints, scale=cfg.scale, face_front=cfg.face_front)
+        mesh = world_mesh(mesh, body.joints, scale=cfg.scale, face_front=cfg.face_front)
         cloud = colored_cloud(mesh, cfg, generator)
         return cloud._replace(points=cloud.points - cloud.points.mean(axis=0))
 
     def _person(self) -> Person:
         cfg = self.cfg
-        return Person(
-            GENDERS.get(cfg.gender, cfg.gender),
-            AGES.get(cfg.age, cfg.age),
-            cfg.muscle,
-            cfg.weight,
-            cfg.height,
-            cfg.proportions,
-        )
+        gender, age = GENDERS.get(cfg.gender, cfg.gender), AGES.get(cfg.age, cfg.age)
+        return Person(gender, age, cfg.muscle, cfg.weight, cfg.height, cfg.proportions)
 
     def _pose(self, body: Body) -> np.ndarray:
         if self.cfg.pose in POSES:
@@ -164,10 +149,6 @@ def textured(mesh: Mesh, body: Body, path: str) -> Mesh:
     file = existing_file(path, "texture")
     texture = decode_texture(file.read_bytes(), repr(path), Budget(file))
     corners = np.stack([body.faces, body.face_uv], axis=-1).reshape(-1, 2)
-    (pairs, faces) = np.unique(corners, axis=0, return_inverse=True)
-    return mesh._replace(
-        vertices=mesh.vertices[pairs[:, 0]],
-        faces=faces.reshape(-1, 3),
-        uv=body.uv[pairs[:, 1]],
-        texture=texture,
-    )
+    pairs, faces = np.unique(corners, axis=0, return_inverse=True)
+    vertices, uv = mesh.vertices[pairs[:, 0]], body.uv[pairs[:, 1]]
+    return mesh._replace(vertices=vertices, faces=faces.reshape(-1, 3), uv=uv, texture=texture)

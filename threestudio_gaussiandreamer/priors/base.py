@@ -20,6 +20,7 @@ from dataclasses import dataclass, field
 from typing import Any, Optional
 
 import numpy as np
+import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
@@ -39,9 +40,10 @@ from ..core.options import (
 )
 from ..core.streams import numpy_generator
 from ..formats.producers import PRODUCERS, producer_axes
+from ..gaussians.grow import longest_side
 from ..gaussians.point_cloud import PointCloud
 from ..host import BaseObject, run_seed
-from ..meshes.load import pose_rotation
+from ..meshes.load import AXES, pose_rotation
 from ..meshes.mesh import GREY, MAX_NON_FINITE
 
 logger = logging.getLogger(__name__)
@@ -63,22 +65,16 @@ def points(low: int) -> Rule:
 
 
 COLOR = satisfies("null, 'grey', 'random' or [red, green, blue] in [0, 1]", is_color)
-HEIGHT = satisfies(
-    "'auto' or a number in world units", lambda value: value == "auto" or is_number(value)
-)
+HEIGHT = satisfies("'auto' or a number in world units", lambda x: x == "auto" or is_number(x))
 SCALE = positive("world units", most=1e6)
 PATH = required("this prior reads a file; set path to it")
-
-
 PRODUCER = one_of(PRODUCERS)
+FRONT = one_of(("+x", "-x", "+y", "-y"))
 
 
 def require_axes(cfg: Any, kind: str) -> None:
     """Raise UserError unless the options ``up`` and ``front`` name two axes that aren't parallel,
-    and aren't given beside a producer.
-
-    Args:
-        kind: extension of the file ("glb"), which determines the default axes.
+    and aren't given beside a producer. The file's extension, ``kind``, has the default axes.
     """
     pose_rotation(kind, cfg.up, cfg.front)
     require_no_axes_beside_producer(cfg, cfg.up, cfg.front)
@@ -91,13 +87,8 @@ def require_no_axes_beside_producer(cfg: Any, up: str, front: Optional[str] = No
 
 
 def file_axes(cfg: Any, kind: str) -> tuple[str, Optional[str]]:
-    """Return the axes of the file that are up and the front: the producer's, or the options.
-
-    Args:
-        kind: ``GAUSSIANS`` or ``MESH`` of ``formats/producers.py``.
-
-    Raises:
-        UserError: the producer doesn't write such files.
+    """Return the axes of the file that are up and the front: the producer's, which must write files
+    of this ``kind`` (``GAUSSIANS`` or ``MESH`` of ``formats/producers.py``), or the options.
     """
     return producer_axes(cfg.producer, kind) if cfg.producer else (cfg.up, cfg.front)
 
@@ -165,9 +156,8 @@ class Prior(BaseObject):
             UserError: the source is missing, unreadable or empty, or more than 5 % of its points
                 aren't finite.
         """
-        cloud = validated(
-            self.generate(prompt, numpy_generator(run_seed(), "prior")), type(self).__name__
-        )
+        cloud = self.generate(prompt, numpy_generator(run_seed(), "prior"))
+        cloud = validated(cloud, type(self).__name__)
         if not self.cfg.ground:
             return cloud
         ground = ground_layer(cloud, self.cfg, numpy_generator(run_seed(), "ground"))
@@ -184,10 +174,6 @@ class Prior(BaseObject):
         Args:
             generator: the only source of randomness.
         """
-
-
-# --------------------------------------------------------------------------------------------------
-# points and colours
 
 
 def chosen_colors(
@@ -218,13 +204,16 @@ def validated(cloud: PointCloud, name: str) -> PointCloud:
     """
     if not isinstance(cloud, PointCloud):
         raise UserError(f"{name} returned {type(cloud).__name__}; expected a PointCloud")
-    points, colors = _as_array(cloud.points, name), _as_array(cloud.colors, name)
-    if points.ndim != 2 or points.shape[1:] != (3,) or colors.shape != points.shape:
+    try:
+        points, colors = _as_array(cloud.points), _as_array(cloud.colors)
+        normals = None if cloud.normals is None else _as_array(cloud.normals)
+    except (TypeError, ValueError, RuntimeError) as error:
         raise UserError(
-            f"{name} gave points {points.shape} and colours {colors.shape}; expected "
-            "(P, 3) for both"
-        )
-    normals = None if cloud.normals is None else _as_array(cloud.normals, name)
+            f"{name} gave something else than arrays of points, colours and normals: {error}"
+        ) from error
+    if points.ndim != 2 or points.shape[1:] != (3,) or colors.shape != points.shape:
+        shapes = f"points {points.shape} and colours {colors.shape}"
+        raise UserError(f"{name} gave {shapes}; expected (P, 3) for both")
     if normals is not None and normals.shape != points.shape:
         raise UserError(
             f"{name} gave normals {normals.shape}; expected {points.shape}, as the points"
@@ -236,54 +225,35 @@ def validated(cloud: PointCloud, name: str) -> PointCloud:
     finite = np.isfinite(points).all(axis=1) & np.isfinite(colors).all(axis=1)
     if bad := int((~finite).sum()):
         report_non_finite(bad, len(points), name)
-    require_unit_range(colors[finite], name)
-    if normals is not None:
-        normals = np.nan_to_num(normals)
+    outside = (colors[finite] < -0.25) | (colors[finite] > 2)  # a model's may be slightly outside
+    if outside.any(axis=1).mean() > 0.5:
+        low, high = colors[finite].min(), colors[finite].max()
+        raise UserError(f"{name} gave colours from {low:g} to {high:g}; expected [0, 1]")
+    normals = None if normals is None else np.nan_to_num(normals)
     cloud = cloud._replace(points=points, colors=colors.clip(0.0, 1.0), normals=normals)
     return without_rows(cloud, finite)
 
 
-def _as_array(values: Any, name: str) -> Float[np.ndarray, "..."]:
-    try:
-        if isinstance(values, Tensor):
-            values = values.detach().float().cpu()
-        return np.asarray(values, np.float32)
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise UserError(
-            f"{name} gave something else than arrays of points, colours and normals: {error}"
-        ) from error
+def _as_array(values: Any) -> Float[np.ndarray, "..."]:
+    if isinstance(values, Tensor):
+        values = values.detach().float().cpu()
+    return np.asarray(values, np.float32)
 
 
 def _valid_faces(faces: Any, count: int, name: str) -> Int[np.ndarray, "F 3"]:
-    """Return faces as an array of rows of points.
-
-    Raises:
-        UserError: they aren't, or name points that there aren't.
-    """
+    """Return faces as an array of rows of points; raise UserError if they aren't such."""
     try:
         found = np.asarray(faces.detach().cpu() if isinstance(faces, Tensor) else faces)
     except ValueError as error:  # rows of different lengths
         raise UserError(f"{name} gave faces that are no array of integers: {error}") from error
-    if not found.size:
-        found = np.zeros((0, 3), np.int64)
+    found = found if found.size else np.zeros((0, 3), np.int64)
     if found.ndim != 2 or found.shape[1] != 3 or found.dtype.kind not in "iu":
-        raise UserError(
-            f"{name} gave faces {found.shape} of type {found.dtype}; expected integers (F, 3)"
-        )
-    if len(found) and not 0 <= found.min() <= found.max() < count:
-        raise UserError(
-            f"{name} gave faces of the points {found.min()} to {found.max()}; it has {count}"
-        )
-    return found
-
-
-def require_unit_range(colors: Float[np.ndarray, "P 3"], name: str) -> None:
-    """Raise UserError if most colours are far outside [0, 1]; a model's may be slightly outside."""
-    outside = (colors < -0.25) | (colors > 2)
-    if outside.any(axis=1).mean() > 0.5:
-        raise UserError(
-            f"{name} gave colours from {colors.min():g} to {colors.max():g}; expected [0, 1]"
-        )
+        what = f"{found.shape} of type {found.dtype}; expected integers (F, 3)"
+    elif len(found) and not 0 <= found.min() <= found.max() < count:
+        what = f"of the points {found.min()} to {found.max()}; it has {count}"
+    else:
+        return found
+    raise UserError(f"{name} gave faces {what}")
 
 
 def report_non_finite(bad: int, count: int, name: str) -> None:
@@ -304,9 +274,7 @@ def without_rows(cloud: PointCloud, keep: Bool[np.ndarray, " P"]) -> PointCloud:
     if faces is not None:
         faces = (np.cumsum(keep) - 1)[faces[keep[faces].all(axis=1)]]
     normals = None if cloud.normals is None else cloud.normals[keep]
-    return PointCloud(
-        points=cloud.points[keep], colors=cloud.colors[keep], normals=normals, faces=faces
-    )
+    return PointCloud(cloud.points[keep], cloud.colors[keep], normals=normals, faces=faces)
 
 
 def ground_layer(cloud: PointCloud, cfg: Any, generator: np.random.Generator) -> PointCloud:
@@ -315,11 +283,50 @@ def ground_layer(cloud: PointCloud, cfg: Any, generator: np.random.Generator) ->
     """
     low, high = cloud.points.min(axis=0), cloud.points.max(axis=0)
     side = cfg.ground_size * ((high - low).max() or 1.0)
-    points = (low + high) / 2 + generator.uniform(-0.5, 0.5, (cfg.ground_points, 3)) * [
-        side,
-        side,
-        0.0,
-    ]
+    places = generator.uniform(-0.5, 0.5, (cfg.ground_points, 3)) * [side, side, 0.0]
+    points = (low + high) / 2 + places
     points[:, 2] = low[2] if cfg.ground_height == "auto" else cfg.ground_height
     colors = chosen_colors("random", len(points), generator)
     return PointCloud(points, colors, normals=np.tile(np.float32([0, 0, 1]), (len(points), 1)))
+
+
+# For priors with a network: their points in the world, the device, and random numbers
+
+
+def placed(cloud: PointCloud, *, front: str, scale: float, normalize: bool) -> PointCloud:
+    """Return ``cloud``, which has z up, rotated so that ``front`` becomes +x, and scaled.
+
+    Args:
+        scale: world units per unit of the cloud; with ``normalize``, half the longest side of the
+            bounding box in world units.
+        normalize: centre the bounding box at the origin, and scale it to ``scale``.
+    """
+    turn = np.stack([AXES[front], np.cross(AXES["+z"], AXES[front]), AXES["+z"]])
+    points = np.asarray(cloud.points, np.float64) @ turn.T
+    if normalize:
+        centre = (points.min(axis=0) + points.max(axis=0)) / 2
+        points = (points - centre) / (longest_side(points) / 2 or 1.0)
+    return cloud._replace(points=(scale * points).astype(np.float32))
+
+
+def chosen_device(name: str, default: torch.device) -> torch.device:
+    """Return the device called ``name``, or the run's for "auto".
+
+    Raises:
+        UserError: there is no such device.
+    """
+    if name == "auto":
+        return torch.device(default)
+    try:
+        torch.empty(0, device=name)
+        return torch.device(name)
+    except (RuntimeError, AssertionError) as error:  # a CPU build of PyTorch asserts
+        raise UserError(
+            f"device: {name!r} can't be used here ({str(error).splitlines()[0]}): give 'auto', "
+            "'cpu' or 'cuda'"
+        ) from error
+
+
+def torch_generator(generator: np.random.Generator) -> torch.Generator:
+    """Return a CPU generator of torch whose seed is drawn from ``generator``."""
+    return torch.Generator().manual_seed(int(generator.integers(2**62)))

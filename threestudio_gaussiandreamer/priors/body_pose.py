@@ -4,8 +4,6 @@ those of given joint positions.
 A pose is the rotation of every joint's part of the body from the rest pose, (22, 3, 3), in the
 body's axes. Skinning is linear (linear blend skinning)."""
 
-from typing import NamedTuple
-
 import numpy as np
 from jaxtyping import Float
 
@@ -13,76 +11,44 @@ from ..core.errors import UserError
 from .makehuman import Body
 from .skeleton import BODY_JOINTS, JOINTS, PARENTS
 
-ARMS = {
-    f"{side} {joint}": (f"{side} {end}", sign)
-    for side, sign in (("left", 1.0), ("right", -1.0))
-    for joint, end in (("shoulder", "elbow"), ("elbow", "wrist"))
-}
-"""Joints whose bones point sideways in a T-pose: the end of the bone, and the sign of its x."""
+SIDES = ("left", "right")
 INDEX = {name: number for number, name in enumerate(JOINTS[:BODY_JOINTS])}
-LIMBS = {
-    "neck": "head",
-    **{
-        f"{side} {joint}": f"{side} {end}"
-        for side in ("left", "right")
-        for joint, end in (
-            ("hip", "knee"),
-            ("knee", "ankle"),
-            ("ankle", "foot"),
-            ("shoulder", "elbow"),
-            ("elbow", "wrist"),
-        )
-    },
+CHAINS = ("hip", "knee", "ankle", "foot"), ("shoulder", "elbow", "wrist")
+LIMBS = {"neck": "head"} | {
+    f"{side} {joint}": f"{side} {end}"
+    for side in SIDES
+    for chain in CHAINS
+    for joint, end in zip(chain, chain[1:], strict=False)
 }
 """The end of the bone that begins at a joint, for bones that positions give a direction."""
 SPINE = {"lower spine": 1 / 3, "middle spine": 2 / 3, "upper spine": 1.0}
 """How far each joint of the spine turns from the pelvis' orientation to the chest's."""
-NEEDED = [
-    f"{side} {joint}"
-    for side in ("left", "right")
-    for joint in ("hip", "knee", "shoulder", "elbow")
-]
+NEEDED = [f"{side} {joint}" for side in SIDES for joint in ("hip", "knee", "shoulder", "elbow")]
 """Joints without whose positions there is no pose."""
 LEAST_EXTENT = 1e-6
 """Smallest width and height of hips and chest, relative to their sum."""
 Degrees = tuple[float, float, float]
 
-WALKING: dict[str, Degrees] = {
-    "left hip": (-28, 0, 0),
-    "left knee": (6, 0, 0),
-    "right hip": (16, 0, 0),
-    "right knee": (28, 0, 0),
-    "right ankle": (18, 0, 0),
-    "left shoulder": (24, 0, -72),
-    "right shoulder": (-24, 0, 72),
-    "left elbow": (0, -18, 0),
-    "right elbow": (0, 24, 0),
-}
-SITTING: dict[str, Degrees] = {
-    **{f"{side} hip": (-88, 0, 0) for side in ("left", "right")},
-    **{f"{side} knee": (86, 0, 0) for side in ("left", "right")},
-    "left shoulder": (-24, 0, -70),
-    "right shoulder": (-24, 0, 70),
-    "left elbow": (0, -40, 0),
-    "right elbow": (0, 40, 0),
-}
 POSES: dict[str, dict[str, Degrees]] = {
     "A": {"left shoulder": (0, 0, -45), "right shoulder": (0, 0, 45)},
     "T": {},
-    "walking": WALKING,
-    "sitting": SITTING,
-}
+    "walking": {
+        "left hip": (-28, 0, 0), "left knee": (6, 0, 0),
+        "right hip": (16, 0, 0), "right knee": (28, 0, 0), "right ankle": (18, 0, 0),
+        "left shoulder": (24, 0, -72), "left elbow": (0, -18, 0),
+        "right shoulder": (-24, 0, 72), "right elbow": (0, 24, 0),
+    },
+    "sitting": {
+        "left hip": (-88, 0, 0), "left knee": (86, 0, 0),
+        "right hip": (-88, 0, 0), "right knee": (86, 0, 0),
+        "left shoulder": (-24, 0, -70), "left elbow": (0, -40, 0),
+        "right shoulder": (-24, 0, 70), "right elbow": (0, 40, 0),
+    },
+}  # fmt: skip
 """Rotations of joints from a T-pose, degrees: about z first, then y, then x, the parent's axes."""
 
 
-class Posed(NamedTuple):
-    """A body in a pose; the axes and the unit are those of the body at rest."""
-
-    vertices: Float[np.ndarray, "V 3"]
-    joints: Float[np.ndarray, "22 3"]
-
-
-def posed(body: Body, pose: Float[np.ndarray, "22 3 3"]) -> Posed:
+def posed(body: Body, pose: Float[np.ndarray, "22 3 3"]) -> Body:
     """Return the body in a pose, with its pelvis where it is at rest."""
     joints = body.joints.copy()
     for joint, parent in enumerate(PARENTS):
@@ -91,7 +57,7 @@ def posed(body: Body, pose: Float[np.ndarray, "22 3 3"]) -> Posed:
             joints[joint] = joints[parent] + pose[parent] @ offset
     moved = np.einsum("vj,jab,vb->va", body.weights, pose, body.vertices, optimize=True)
     shifts = joints - np.einsum("jab,jb->ja", pose, body.joints)
-    return Posed(moved + body.weights @ shifts, joints)
+    return body._replace(vertices=moved + body.weights @ shifts, joints=joints)
 
 
 def named_pose(body: Body, name: str) -> Float[np.ndarray, "22 3 3"]:
@@ -113,22 +79,19 @@ def pose_of_rotations(
         local: rotation of each joint relative to its parent, from a T-pose; the first one that of
             the whole body.
     """
-    turned, to_t_pose = local.copy(), _to_t_pose(body)
+    turned = local.copy()
     for joint, parent in enumerate(PARENTS):
         if parent >= 0:
             turned[joint] = turned[parent] @ local[joint]
+    # in a T-pose the arms point sideways, and hands move with the lower arms
+    to_t_pose = np.tile(np.eye(3), (BODY_JOINTS, 1, 1))
+    for side, sign in zip(SIDES, (1.0, -1.0), strict=True):
+        shoulder, elbow, wrist = (INDEX[f"{side} {joint}"] for joint in CHAINS[1])
+        for joint, end in ((shoulder, elbow), (elbow, wrist)):
+            bone = body.joints[end] - body.joints[joint]
+            to_t_pose[joint] = swing(bone, np.array([sign, 0.0, 0.0]))
+        to_t_pose[wrist] = to_t_pose[elbow]
     return turned @ to_t_pose
-
-
-def _to_t_pose(body: Body) -> Float[np.ndarray, "22 3 3"]:
-    """Return the pose in which the arms point sideways; hands move with the lower arms."""
-    pose = np.tile(np.eye(3), (BODY_JOINTS, 1, 1))
-    for joint, (end, sign) in ARMS.items():
-        bone = body.joints[INDEX[end]] - body.joints[INDEX[joint]]
-        pose[INDEX[joint]] = swing(bone, np.array([sign, 0.0, 0.0]))
-    for side in ("left", "right"):
-        pose[INDEX[f"{side} wrist"]] = pose[INDEX[f"{side} elbow"]]
-    return pose
 
 
 def pose_of_positions(
@@ -143,10 +106,9 @@ def pose_of_positions(
     from scipy.spatial.transform import Rotation, Slerp
 
     rest = {name: body.joints[number] for name, number in INDEX.items()}
+    known = {name: rest[name] for name in rest if name in positions}
     pelvis, chest = (
-        part_frame(positions, part)
-        @ part_frame({k: rest[k] for k in rest if k in positions}, part).T
-        for part in ("hip", "shoulder")
+        part_frame(positions, part) @ part_frame(known, part).T for part in ("hip", "shoulder")
     )
     between = Slerp([0, 1], Rotation.from_matrix(np.stack([pelvis, chest])))
     pose = np.tile(pelvis, (BODY_JOINTS, 1, 1))
@@ -168,11 +130,10 @@ def part_frame(positions: dict[str, Float[np.ndarray, "3"]], part: str) -> Float
         UserError: the joints are on one line, so that they have no orientation.
     """
     left, right = positions[f"left {part}"], positions[f"right {part}"]
-    middles = {
-        name: (positions[f"left {name}"] + positions[f"right {name}"]) / 2
-        for name in ("hip", "shoulder")
-    }
-    low, high = middles["hip"], positions.get("neck", middles["shoulder"])
+    low, chest = (
+        (positions[f"left {name}"] + positions[f"right {name}"]) / 2 for name in ("hip", "shoulder")
+    )
+    high = positions.get("neck", chest)
     if part == "hip":
         high = positions.get("lower spine", high)
     across = _unit(left - right)

@@ -44,13 +44,10 @@ def cached_cloud(prior: Any, prompt: str, save_dir: Optional[str]) -> PointCloud
     consulted.clear()
     cloud = points_of(prior, prompt)
     path.parent.mkdir(parents=True, exist_ok=True)
+    content = {name: value for name, value in cloud._asdict().items() if value is not None}
+    beside = np.array(json.dumps(list(consulted.items())))
     with atomic_file(path) as file:
-        np.savez_compressed(
-            file,
-            key=np.array(key),
-            beside=np.array(json.dumps(list(consulted.items()))),
-            **{name: value for name, value in cloud._asdict().items() if value is not None},
-        )
+        np.savez_compressed(file, key=np.array(key), beside=beside, **content)
     write_points(path.with_suffix(".ply"), cloud)
     try:
         save_turntable(cloud, path.with_name("turntable.gif"))
@@ -63,9 +60,8 @@ def cache_key(prior: Any, prompt: str) -> str:
     """Return a digest of what the prior's output depends on: also of the files that its options
     name and of the code of its class, which may have changed between two runs.
     """
-    options = (
-        OmegaConf.to_container(prior.cfg) if OmegaConf.is_config(prior.cfg) else vars(prior.cfg)
-    )
+    cfg = prior.cfg
+    options = OmegaConf.to_container(cfg) if OmegaConf.is_config(cfg) else vars(cfg)
     content = [type(prior).__module__, type(prior).__qualname__, options, prompt, run_seed()]
     content += [__version__, *_files(options), *_code(type(prior))]
     return hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()

@@ -76,11 +76,6 @@ class GaussiansPrior(Prior):
     cfg: Config
 
     def preflight(self) -> None:
-        """Check that the file exists and that its format is one that is read.
-
-        Raises:
-            UserError: it doesn't, or it isn't.
-        """
         gaussian_file(self.cfg.path)
 
     def preflight_attributes(self) -> None:
@@ -145,11 +140,10 @@ def gaussian_file(path: str) -> Path:
         if not is_gaussian_ply(file) and not is_compressed_ply(file):
             read_stored(file)  # raises the error that says what else it is
     elif suffix_of(file.name) not in READ and not is_gaussian_ply(file):
-        advice = (
-            "; it is a checkpoint: export it first, with --export and resume=" + repr(str(file))
-            if file.suffix.lower() == ".ckpt"
-            else conversion(file.name)
-        )
+        advice = conversion(file.name)
+        if file.suffix.lower() == ".ckpt":
+            how = f"export it first, with --export and resume={str(file)!r}"
+            advice = f"; it is a checkpoint: {how}"
         raise UserError(
             f"file of Gaussians {str(file)!r}: {file.suffix or 'a name without extension'} isn't "
             f"one of the formats that are read: {', '.join(READ)}{advice}"

@@ -53,10 +53,8 @@ def timestep_of(sigma: float, alphas_cumprod: Float[np.ndarray, "T"]) -> int:
     The fractional timestep is interpolated linearly in abar and truncated.
     """
     level = 1 / (sigma**2 + 1)
-    index = np.interp(
-        -level, -alphas_cumprod, np.arange(len(alphas_cumprod))
-    )  # np.interp requires increasing values
-    return int(index)
+    # np.interp requires increasing values
+    return int(np.interp(-level, -alphas_cumprod, np.arange(len(alphas_cumprod))))
 
 
 def guided_denoiser(
@@ -124,14 +122,10 @@ def sample_heun(
         if gamma > 0:
             fresh = torch.randn(x.shape, generator=generator).to(x)
             x = x + fresh * math.sqrt(sigma_hat**2 - sigma**2)
-        x = _heun_step(denoise, x, sigma_hat, sigma_next)
+        slope = (x - denoise(x, sigma_hat)) / sigma_hat
+        euler = x + (sigma_next - sigma_hat) * slope
+        if sigma_next == 0:
+            return euler
+        slope_there = (euler - denoise(euler, sigma_next)) / sigma_next
+        x = x + (sigma_next - sigma_hat) * (slope + slope_there) / 2
     return x
-
-
-def _heun_step(denoise: Denoiser, x: Tensor, sigma: float, sigma_next: float) -> Tensor:
-    slope = (x - denoise(x, sigma)) / sigma
-    euler = x + (sigma_next - sigma) * slope
-    if sigma_next == 0:
-        return euler
-    slope_there = (euler - denoise(euler, sigma_next)) / sigma_next
-    return x + (sigma_next - sigma) * (slope + slope_there) / 2

@@ -28,27 +28,19 @@ RACES = {"african": 1 / 3, "asian": 1 / 3, "caucasian": 1 / 3}
 GROUPS = ("body", "helper-l-eye", "helper-r-eye")
 """Groups of faces in the base mesh that are used; the others are helpers for clothes and joints."""
 SIDES = {"left": "L", "right": "R"}
-BONES = {
-    "pelvis": ["root"],
-    "lower spine": ["spine04"],
-    "middle spine": ["spine03"],
-    "upper spine": ["spine02"],
-    "neck": ["neck01"],
-    "head": ["head"],
-    **{
-        f"{side} {joint}": [f"{bone}.{letter}" for bone in bones.split()]
-        for side, letter in SIDES.items()
-        for joint, bones in {
-            "hip": "upperleg01",
-            "knee": "lowerleg01",
-            "ankle": "foot",
-            "foot": "toe1-1 toe2-1 toe3-1 toe4-1 toe5-1",
-            "collar": "clavicle",
-            "shoulder": "upperarm01",
-            "elbow": "lowerarm01",
-            "wrist": "wrist",
-        }.items()
-    },
+CENTRAL = {
+    "pelvis": "root", "lower spine": "spine04", "middle spine": "spine03",
+    "upper spine": "spine02", "neck": "neck01", "head": "head",
+}  # fmt: skip
+PAIRED = {
+    "hip": "upperleg01", "knee": "lowerleg01", "ankle": "foot",
+    "foot": "toe1-1 toe2-1 toe3-1 toe4-1 toe5-1", "collar": "clavicle",
+    "shoulder": "upperarm01", "elbow": "lowerarm01", "wrist": "wrist",
+}  # fmt: skip
+BONES = {joint: [bone] for joint, bone in CENTRAL.items()} | {
+    f"{side} {joint}": [f"{bone}.{letter}" for bone in bones.split()]
+    for side, letter in SIDES.items()
+    for joint, bones in PAIRED.items()
 }
 """The bones of the rig that begin at each joint of SMPL; later bones move with them."""
 
@@ -143,29 +135,27 @@ def _read_body(folder: Path, person: Person) -> Body:
     )
 
 
-# ---- shape ---------------------------------------------------------------------------------------
-
-
 def target_weights(person: Person) -> Shares:
     """Return the weights of all targets that a person needs, by file name without extension."""
     gender = shares(person.gender, "male", "female")
     age = shares(person.age, "baby", "child", "young", "old")
     build = [
-        shares(getattr(person, name), *(f"{low}{name}" for low in ("min", "average", "max")))
+        shares(getattr(person, name), f"min{name}", f"average{name}", f"max{name}")
         for name in ("muscle", "weight")
     ]
     height = shares(person.height, "minheight", "maxheight")
     proportions = shares(person.proportions, "idealproportions", "uncommonproportions")
     grown = {name: share for name, share in age.items() if name != "baby"}  # babies have none
+    factors = {
+        "universal-": (gender, age, *build),
+        "": (RACES, gender, age),
+        "height/": (gender, age, *build, height),
+        "proportions/": (gender, grown, *build, proportions),
+    }
     return {
         f"macrodetails/{prefix}{name}": weight
-        for prefix, factors in (
-            ("universal-", (gender, age, *build)),
-            ("", (RACES, gender, age)),
-            ("height/", (gender, age, *build, height)),
-            ("proportions/", (gender, grown, *build, proportions)),
-        )
-        for name, weight in combined(*factors)
+        for prefix, shares_of in factors.items()
+        for name, weight in combined(*shares_of)
     }
 
 
@@ -210,17 +200,13 @@ def read_base_mesh(path: Path) -> BaseMesh:
     )
 
 
-# ---- rig -----------------------------------------------------------------------------------------
-
-
 def joint_positions(
     bones: dict, groups: dict[str, np.ndarray], vertices: Float[np.ndarray, "V 3"]
 ) -> Float[np.ndarray, "22 3"]:
     """Return the mean position of the heads of the bones that begin at each joint."""
     heads = {name: _head(bone["head"], groups, vertices) for name, bone in bones.items()}
-    return np.stack(
-        [np.mean([heads[bone] for bone in BONES[joint]], axis=0) for joint in JOINTS[:BODY_JOINTS]]
-    )
+    found = ([heads[bone] for bone in BONES[joint]] for joint in JOINTS[:BODY_JOINTS])
+    return np.stack([np.mean(of_joint, axis=0) for of_joint in found])
 
 
 def _head(head: dict, groups: dict[str, np.ndarray], vertices: np.ndarray) -> np.ndarray:

@@ -33,7 +33,7 @@ from typing import Any, Optional
 import numpy as np
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from ..core.options import at_least, in_range
 from ..formats.producers import MESH
@@ -82,11 +82,6 @@ class MeshFilePrior(Prior):
     cfg: Config
 
     def preflight(self) -> None:
-        """Check that the mesh exists and that its format is one that is read.
-
-        Raises:
-            UserError: it doesn't, or it isn't.
-        """
         mesh_file(self.cfg.path)
 
     def load(self) -> Mesh:
@@ -113,10 +108,8 @@ class MeshPrior(MeshFilePrior):
         cloud = colored_cloud(mesh, cfg, generator)
         if cfg.color_smoothing > 1:
             cloud = cloud._replace(colors=smoothed_colors(cloud, cfg.color_smoothing))
-        return cloud._replace(
-            points=cloud.points
-            + generator.normal(scale=cfg.jitter * cfg.scale, size=cloud.points.shape)
-        )
+        noise = generator.normal(scale=cfg.jitter * cfg.scale, size=cloud.points.shape)
+        return cloud._replace(points=cloud.points + noise)
 
 
 def colored_cloud(mesh: Mesh, cfg: Any, generator: np.random.Generator) -> PointCloud:
@@ -130,15 +123,10 @@ def colored_cloud(mesh: Mesh, cfg: Any, generator: np.random.Generator) -> Point
 def mesh_cloud(mesh: Mesh, num_points: int, generator: np.random.Generator) -> PointCloud:
     """Return the vertices of ``mesh`` with its faces, or ``num_points`` points on its surface."""
     if num_points == 0:
-        return vertex_cloud(mesh)
+        return PointCloud(mesh.vertices, vertex_surface_colors(mesh), faces=mesh.faces)
     points, face_index, barycentric = sample_surface(mesh, num_points, generator)
     colors = surface_colors(mesh, face_index, barycentric)
     return PointCloud(points=points, colors=colors, normals=face_normals(mesh)[face_index])
-
-
-def vertex_cloud(mesh: Mesh) -> PointCloud:
-    """Return the vertices of ``mesh`` with their colours and faces."""
-    return PointCloud(points=mesh.vertices, colors=vertex_surface_colors(mesh), faces=mesh.faces)
 
 
 def face_normals(mesh: Mesh) -> Float[np.ndarray, "F 3"]:
@@ -161,9 +149,7 @@ def smoothed_colors(cloud: PointCloud, neighbours: int) -> Float[np.ndarray, "P 
 
     def average(points: Float[np.ndarray, "Q 3"]) -> Float[np.ndarray, "Q 3"]:
         # a range, since the result for k=1 would lack the second dimension
-        nearest: Int[np.ndarray, "Q K"] = tree.query(
-            points, k=range(1, neighbours + 1), workers=-1
-        )[1]
+        _, nearest = tree.query(points, k=range(1, neighbours + 1), workers=-1)
         return F.embedding_bag(torch.from_numpy(nearest), colors, mode="mean").numpy()
 
     rows = min(SMOOTHING_ROWS, max(1, SMOOTHING_ENTRIES // neighbours))

@@ -5,7 +5,7 @@ points on its surface.
 option             meaning
 =================  =================================================================================
 motion             joint positions as MDM gives them, its results.npy or another NPY or NPZ: see
-                   ``motion_files.py``
+                   below
 body_model         the user's NPZ or PKL of SMPL, SMPL-H or SMPL-X (neutral), with the user's
                    licence
 sample             which of the file's motions; null: any
@@ -30,6 +30,11 @@ device             ``auto``: the run's GPU, or the CPU; for CLIP, the fit takes 
 ground, ...        see ``priors/base.py``
 =================  =================================================================================
 
+Files of motions are MDM's ``results.npy``, a pickled dict, of which no code is run, or an NPZ, with
+``motion`` (S, J, 3, F), and optionally ``text`` (S,) strings and ``lengths`` (S,) frames; or an NPY
+with (S, J, 3, F), or one motion as (J, 3, F) or (F, J, 3). J is 22 (HumanML3D) or 24 joints in
+SMPL's order; metres, y up, as HumanML3D has them.
+
 The motion itself comes from MDM, outside this package: for "Iron man kicks with his left leg" ask
 it for "Someone kicks with the left leg". ``python -m threestudio_gaussiandreamer.priors.motion_text
 "<prompt>"`` prints that sentence."""
@@ -47,6 +52,7 @@ from ..core.errors import UserError
 from ..core.extras import require_extra
 from ..core.files import existing_file
 from ..core.options import at_least, in_range, is_whole, positive, satisfies
+from ..formats.array_files import read_arrays
 from ..gaussians.point_cloud import PointCloud
 from ..host import info, register, warn
 from ..meshes.load import load_mesh
@@ -54,11 +60,10 @@ from ..meshes.mesh import Mesh
 from ..meshes.raycast import MeshCaster, over_background
 from ..models.clip import clip_source, picture_similarities
 from ..models.hub import Source, locate
-from .base import COLOR, SCALE, Prior, points
+from .base import COLOR, SCALE, Prior, chosen_device, points
 from .mesh import colored_cloud, face_normals
-from .motion_files import Motions, read_motions
 from .motion_text import reduced_prompt
-from .placing import chosen_device
+from .pose_files import require_frame
 from .skeleton import JOINTS, world_mesh
 from .smpl_fit import BodyFit, BodyModel, fit_bodies, load_body_model, posed_vertices
 
@@ -80,6 +85,75 @@ class Choice(NamedTuple):
 
     sample: int
     frame: int
+
+
+JOINT_COUNTS = (22, 24)
+EXPECTED = "arrays (samples, 22 or 24 joints, 3, frames) were expected"
+
+
+class Motions(NamedTuple):
+    """Sequences of joint positions."""
+
+    positions: Float[np.ndarray, "S F J 3"]
+    """Metres, y up."""
+    texts: Optional[list[str]]
+    lengths: list[int]
+    """Number of valid frames of each sample; later frames are padding."""
+
+
+def read_motions(path: str) -> Motions:
+    """Return the motions of an NPZ or NPY file.
+
+    Raises:
+        UserError: missing, pickled, of another layout, without frames, or not finite; the message
+            says what to do.
+    """
+    file = existing_file(path, "motion file")
+    arrays = read_arrays(file, "motion file", ["motion"], ["text", "lengths"])
+    positions = _sample_frame_joint(arrays["motion"], path)
+    lengths = _lengths(arrays.get("lengths"), positions, path)
+    texts = None if "text" not in arrays else [str(text) for text in np.atleast_1d(arrays["text"])]
+    for sample, length in zip(positions, lengths, strict=True):
+        if not np.isfinite(sample[:length]).all():
+            raise UserError(
+                f"motion file {path!r} has positions that are NaN or infinite: make it again"
+            )
+    return Motions(positions, texts, lengths)
+
+
+def _sample_frame_joint(motion: np.ndarray, path: str) -> Float[np.ndarray, "S F J 3"]:
+    """Convert any of the layouts to (samples, frames, joints, 3)."""
+    shape = motion.shape
+    if motion.dtype.kind not in "fiu":
+        raise UserError(f"motion file {path!r} holds {motion.dtype}, not numbers: {EXPECTED}")
+    if len(shape) == 4 and shape[1] in JOINT_COUNTS and shape[2] == 3:
+        ordered = motion.transpose(0, 3, 1, 2)
+    elif len(shape) == 3 and shape[0] in JOINT_COUNTS and shape[1] == 3:
+        ordered = motion.transpose(2, 0, 1)[None]
+    elif len(shape) == 3 and shape[1] in JOINT_COUNTS and shape[2] == 3:
+        ordered = motion[None]
+    else:
+        hint = " (6 numbers for a joint are rotations: MDM's HumanML3D models give positions)"
+        hint = hint if 6 in shape else ""
+        raise UserError(f"motion file {path!r} holds an array {shape}: {EXPECTED}{hint}")
+    if not ordered.size:
+        raise UserError(f"motion file {path!r} holds an array {shape}, without a frame")
+    return np.ascontiguousarray(ordered, np.float64)
+
+
+def _lengths(
+    lengths: Optional[np.ndarray], positions: Float[np.ndarray, "S F J 3"], path: str
+) -> list[int]:
+    samples, frames = positions.shape[:2]
+    if lengths is None:
+        return [frames] * samples
+    whole = lengths.shape == (samples,) and lengths.dtype.kind in "iu"
+    if not whole or not ((lengths >= 1) & (lengths <= frames)).all():
+        raise UserError(
+            f"motion file {path!r}: lengths must be {samples} whole numbers from 1 to "
+            f"{frames}, got {lengths.tolist()}"
+        )
+    return [int(length) for length in lengths]
 
 
 @register("motion-prior")
@@ -114,11 +188,6 @@ class MotionPrior(Prior):
     cfg: Config
 
     def preflight(self) -> None:
-        """Check within seconds that all files exist or can be downloaded, and can be read.
-
-        Raises:
-            UserError: a file is missing or invalid; the message says what to do.
-        """
         if self.cfg.candidates:
             for path in self.cfg.candidates:
                 existing_file(path, "body mesh")
@@ -133,9 +202,8 @@ class MotionPrior(Prior):
 
     def generate(self, prompt: str, generator: np.random.Generator) -> PointCloud:
         self.preflight()
-        mesh = (
-            self._chosen_candidate(prompt) if self.cfg.candidates else self._body_of_motion(prompt)
-        )
+        of = self._chosen_candidate if self.cfg.candidates else self._body_of_motion
+        mesh = of(prompt)
         cloud = colored_cloud(mesh, self.cfg, generator)
         return cloud._replace(points=cloud.points - cloud.points.mean(axis=0))
 
@@ -146,16 +214,12 @@ class MotionPrior(Prior):
         return clip_source(self.cfg.clip)
 
     def _chosen_candidate(self, prompt: str) -> Mesh:
-        meshes = [
-            load_mesh(path, scale=self.cfg.scale, up=self.cfg.up, front=self.cfg.front)
-            for path in self.cfg.candidates
-        ]
-        best = (
-            self._best(meshes, self.cfg.clip_text or prompt, self.cfg.candidates)
-            if len(meshes) > 1
-            else 0
-        )
-        info(f"body: {self.cfg.candidates[best]}")
+        cfg, best = self.cfg, 0
+        axes = {"scale": cfg.scale, "up": cfg.up, "front": cfg.front}
+        meshes = [load_mesh(path, **axes) for path in cfg.candidates]
+        if len(meshes) > 1:
+            best = self._best(meshes, cfg.clip_text or prompt, cfg.candidates)
+        info(f"body: {cfg.candidates[best]}")
         return meshes[best]
 
     def _body_of_motion(self, prompt: str) -> Mesh:
@@ -168,24 +232,21 @@ class MotionPrior(Prior):
         names = [f"motion {choice.sample}, frame {choice.frame}" for choice in choices]
         best = 0
         if len(choices) > 1:
-            best = self._best(
-                self._fitted(model, targets, ROUGH)[1],
-                self.cfg.clip_text or self._motion_text(prompt),
-                names,
-            )
-        fit, meshes = self._fitted(
-            model, targets[[best]], FINE
-        )  # fitted separately, so that the result doesn't depend on the other choices
+            _, rough = self._fitted(model, targets, ROUGH)
+            best = self._best(rough, self.cfg.clip_text or self._motion_text(prompt), names)
+        # fitted separately, so that the result doesn't depend on the other choices
+        fit, meshes = self._fitted(model, targets[[best]], FINE)
         report_residuals(fit.residuals[0], names[best], self.cfg.max_residual_mm)
         return meshes[0]
 
     def _fitted(
         self, model: BodyModel, targets: Float[np.ndarray, "F K 3"], iterations: int
     ) -> tuple[BodyFit, list[Mesh]]:
+        """Return bodies fitted to joints, also as meshes with z up, centred and scaled."""
         fit = fit_bodies(model, targets, fit_shape=self.cfg.fit_shape, iterations=iterations)
-        return fit, world_meshes(
-            model, fit, targets, scale=self.cfg.scale, face_front=self.cfg.face_front
-        )
+        options = {"scale": self.cfg.scale, "face_front": self.cfg.face_front}
+        pairs = zip(posed_vertices(model, fit), targets, strict=True)
+        return fit, [world_mesh(Mesh(found, model.faces), at, **options) for found, at in pairs]
 
     def _motion_text(self, prompt: str) -> str:
         text = self.cfg.motion_text or reduced_prompt(prompt)
@@ -200,15 +261,10 @@ class MotionPrior(Prior):
         """Return the index of the mesh whose pictures fit ``text`` best, by CLIP."""
         device = chosen_device(self.cfg.device, self.device)
         pictures = np.concatenate([body_pictures(mesh) for mesh in meshes])
-        scores = (
-            picture_similarities(self._clip(), pictures, text, device=device)
-            .reshape(len(meshes), -1)
-            .mean(axis=1)
-        )
-        info(
-            f"CLIP for {text!r}: "
-            + ", ".join(f"{name} {score:.4f}" for name, score in zip(names, scores, strict=True))
-        )
+        scores = picture_similarities(self._clip(), pictures, text, device=device)
+        scores = scores.reshape(len(meshes), -1).mean(axis=1)
+        found = (f"{name} {score:.4f}" for name, score in zip(names, scores, strict=True))
+        info(f"CLIP for {text!r}: {', '.join(found)}")
         return int(scores.argmax())
 
 
@@ -231,12 +287,7 @@ def offered_frames(
             f"sample: the file has {count} motions, numbered from 0; there is no {sample}"
         )
     if frame != "clip":
-        length = motions.lengths[sample or 0]
-        if frame >= length:
-            raise UserError(
-                f"frame: motion {sample or 0} has {length} frames, numbered from 0; there is "
-                f"no {frame}"
-            )
+        require_frame(frame, motions.lengths[sample or 0], f"motion {sample or 0}")
         return [Choice(sample or 0, frame)]
     samples = range(count) if sample is None else [sample]
     return [
@@ -263,35 +314,13 @@ def report_residuals(residuals: Float[np.ndarray, "K"], name: str, limit: float)
     info(f"SMPL fitted to {name}: {found}")
 
 
-def world_meshes(
-    model: BodyModel,
-    fit: BodyFit,
-    targets: Float[np.ndarray, "F K 3"],
-    *,
-    scale: float,
-    face_front: bool,
-) -> list[Mesh]:
-    """Return the fitted bodies with z up, centred, and with ``scale`` as half the longest side.
-
-    Args:
-        face_front: rotate each body about the z axis, so that it faces +x.
-    """
-    return [
-        world_mesh(Mesh(vertices, model.faces), joints, scale=scale, face_front=face_front)
-        for vertices, joints in zip(posed_vertices(model, fit), targets, strict=True)
-    ]
-
-
 def body_pictures(mesh: Mesh) -> Float[np.ndarray, "V H W 3"]:
     """Render the body in shaded grey on white, from the front and from both sides of the front."""
     vertices = mesh.vertices / np.abs(mesh.vertices).max()
     caster = MeshCaster(shaded(Mesh(vertices, mesh.faces)))
-    azimuths = torch.tensor(VIEW_AZIMUTHS)
-    views = orbit_c2w(
-        torch.full_like(azimuths, VIEW_ELEVATION),
-        azimuths,
-        torch.full_like(azimuths, VIEW_DISTANCE),
-    ).numpy()
+    ones = torch.ones(len(VIEW_AZIMUTHS))
+    azimuths, at = torch.tensor(VIEW_AZIMUTHS), (VIEW_ELEVATION * ones, VIEW_DISTANCE * ones)
+    views = orbit_c2w(at[0], azimuths, at[1]).numpy()
     pictures = caster.render_views([(c2w, VIEW_FOVY) for c2w in views], PICTURE_SIZE, PICTURE_SIZE)
     return over_background(pictures, np.ones(3, np.float32))
 
@@ -310,8 +339,7 @@ def _check_source(cfg: Any) -> None:
     if bool(cfg.motion) == bool(cfg.candidates):
         raise UserError(
             "motion: set it to a file of joint positions (with body_model), or set candidates "
-            "to mesh files of posed bodies, not"
-            f" {'both' if cfg.motion else 'neither'}"
+            f"to mesh files of posed bodies, not {'both' if cfg.motion else 'neither'}"
         )
     if cfg.motion and not cfg.body_model:
         raise UserError(

@@ -26,15 +26,9 @@ VERBS = (
     "wait walk wave wield work yawn yell"
 ).split()
 DOUBLED = set(
-    (
-        "clap dance flip hug hit hop jab jog limp nod pat row run sit skip slap spin squat step "
-        "stop strum swim tap trot"
-    ).split()
-) - {
-    "dance",
-    "limp",
-    "row",
-}
+    "clap flip hug hit hop jab jog nod pat run sit skip slap spin squat step stop strum swim tap "
+    "trot".split()
+)
 """Verbs whose last letter is written twice before "-ing"."""
 POSSESSIVES = re.compile(r"\b(?:his|her|its|their|my|your|our)\b", re.IGNORECASE)
 
@@ -68,22 +62,12 @@ def reduced_prompt(prompt: str) -> Optional[str]:
     which becomes "kicks"."""
     for forms in (FORMS, PROGRESSIVES, {verb: verb for verb in VERBS}):
         for match in re.finditer(r"[A-Za-z]+", prompt):
-            if match.start() and match.group().lower() in forms:
-                return _sentence(_verb(match.group().lower(), forms), prompt[match.end() :])
+            word = match.group().lower()
+            if match.start() and word in forms:
+                verb = f"is {word}" if forms is PROGRESSIVES else third_person(forms[word])
+                clause = re.split(r"[,.;:!?]", prompt[match.end() :], maxsplit=1)[0]
+                return " ".join(f"{SUBJECT} {verb} {POSSESSIVES.sub('the', clause)}".split())
     return None
-
-
-def _verb(word: str, forms: dict[str, str]) -> str:
-    """Return the verb as it follows the subject."""
-    if forms is PROGRESSIVES:
-        return f"is {word}"
-    return third_person(forms[word])
-
-
-def _sentence(verb: str, rest: str) -> str:
-    clause = re.split(r"[,.;:!?]", rest, maxsplit=1)[0]
-    words = f"{SUBJECT} {verb} {POSSESSIVES.sub('the', clause)}"
-    return re.sub(r"\s+", " ", words).strip()
 
 
 def main() -> None:

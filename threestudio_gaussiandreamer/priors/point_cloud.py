@@ -21,6 +21,7 @@ Colours are integers up to 255, whole numbers above 255 up to 65535 (16 bits, as
 numbers up to 1; without any, the points are grey. Limits: the prompt is not read."""
 
 import logging
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -77,11 +78,6 @@ class PointCloudPrior(Prior):
     cfg: Config
 
     def preflight(self) -> None:
-        """Check that the file exists and that its format is one that is read.
-
-        Raises:
-            UserError: it doesn't, or it isn't.
-        """
         point_file(self.cfg.path)
 
     def generate(self, prompt: str, generator: np.random.Generator) -> PointCloud:
@@ -157,10 +153,6 @@ def normalized(cloud: PointCloud, scale: float) -> PointCloud:
     return cloud._replace(points=(points - centre) * (scale / (longest_side(finite) / 2 or 1.0)))
 
 
-# --------------------------------------------------------------------------------------------------
-# formats
-
-
 def read_ply(path: Path) -> PointCloud:
     return read_points(path, allow_non_finite=True)
 
@@ -179,22 +171,14 @@ def read_text(path: Path) -> PointCloud:
     """Read numbers separated by blanks, commas or semicolons; a first line that isn't numbers,
     and lines with #, are skipped.
     """
-    lines = (
-        path.read_text(encoding="utf-8", errors="replace")
-        .replace(",", " ")
-        .replace(";", " ")
-        .splitlines()
-    )
-    if lines and not _is_row(lines[0]):
-        lines = lines[1:]  # a count, or the names of the columns
-    return _from_columns(path, np.loadtxt(lines, ndmin=2))
-
-
-def _is_row(line: str) -> bool:
+    text = path.read_text(encoding="utf-8", errors="replace")
+    lines = re.sub("[,;]", " ", text).splitlines()
     try:
-        return len([float(word) for word in line.split("#")[0].split()]) > 1
+        first = [float(word) for word in lines[0].split("#")[0].split()] if lines else [0.0, 0.0]
     except ValueError:
-        return False
+        first = []
+    # the first line may be a count, or the names of the columns
+    return _from_columns(path, np.loadtxt(lines[len(first) < 2 :], ndmin=2))
 
 
 def read_mesh_points(path: Path) -> PointCloud:
@@ -218,19 +202,13 @@ def require_mesh_format(path: Path) -> None:
 def _from_columns(path: Path, rows: np.ndarray) -> PointCloud:
     """Interpret columns as x y z, x y z r g b, or x y z intensity r g b (PTS)."""
     if rows.ndim != 2 or rows.shape[1] not in (3, 6, 7):
-        raise UserError(
-            f"point cloud {str(path)!r} has shape {rows.shape}: rows of x y z or x y z r g b "
-            "were expected"
-        )
+        expected = "rows of x y z or x y z r g b were expected"
+        raise UserError(f"point cloud {str(path)!r} has shape {rows.shape}: {expected}")
     return _cloud(path, rows[:, :3], rows[:, -3:] if rows.shape[1] > 3 else None)
 
 
-def _cloud(
-    path: Path,
-    points: np.ndarray,
-    colors: Optional[np.ndarray],
-    normals: Optional[np.ndarray] = None,
-) -> PointCloud:
+def _cloud(path: Path, points: np.ndarray, colors=None, normals=None) -> PointCloud:
+    """Check the shapes of arrays; without colours the points are grey."""
     if colors is None:
         logger.warning("%s has no colours: grey is used", path)
         colors = np.full(np.shape(points), GREY, np.float32)
@@ -242,9 +220,8 @@ def _cloud(
                 f"({len(points)}, 3) was expected"
             )
     return PointCloud(
-        points=np.asarray(
-            points, np.float64
-        ),  # not float32, which would round points far from the origin before they are centred
+        # not float32, which would round points far from the origin before they are centred
+        points=np.asarray(points, np.float64),
         colors=unit_colors(colors.astype(np.float32), colors.dtype, path),
         normals=None if normals is None else np.asarray(normals, np.float32),
     )

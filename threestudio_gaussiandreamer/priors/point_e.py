@@ -52,7 +52,7 @@ from ..models.clip import clip_source, load_text_encoder, load_tokenizer, text_c
 from ..models.hub import Source, locate
 from ..models.loaded import loaded
 from ..models.model_files import free_memory
-from .base import SCALE, Prior, points
+from .base import FRONT, SCALE, Prior, chosen_device, placed, points, torch_generator
 from .karras import (
     Network,
     cosine_alphas_cumprod,
@@ -61,7 +61,6 @@ from .karras import (
     linear_alphas_cumprod,
     sample_heun,
 )
-from .placing import FRONT, chosen_device, placed, torch_generator
 from .point_e_model import CHANNELS, HEAD_CHANNELS, BaseModel, Upsampler, sizes_of
 from .weights import load_exactly, read_state_dict
 
@@ -88,8 +87,6 @@ BASE = Kind(BaseModel, "Point-E base checkpoint", "base_40m_textvec.pt", "clip_e
 UPSAMPLER = Kind(
     Upsampler, "Point-E upsampler checkpoint", "upsample_40m.pt", "clip_embed.1.weight"
 )
-
-
 CHECKPOINT = required(
     "Point-E's weights are a file that you download; set checkpoint to base_40m_textvec.pt"
 )
@@ -132,11 +129,6 @@ class PointEPrior(Prior):
     cfg: Config
 
     def preflight(self) -> None:
-        """Check within seconds that all files exist or can be downloaded.
-
-        Raises:
-            UserError: a file is missing; the message says what to do.
-        """
         existing_file(self._checkpoint(), BASE.title, (BUNDLED,))
         if self.cfg.upsampler:
             existing_file(self.cfg.upsampler, UPSAMPLER.title)
@@ -153,12 +145,9 @@ class PointEPrior(Prior):
             points = torch.cat([points, self._upsampled_points(points, rng)], dim=-1)
         free_memory()
         rows = points[0].T.cpu().numpy()
-        cloud = PointCloud(
-            points=rows[:, :3], colors=rows[:, 3:].clip(0, 255).round() / np.float32(255)
-        )
-        return placed(
-            cloud, front=self.cfg.front, scale=self.cfg.scale, normalize=self.cfg.normalize
-        )
+        colors = rows[:, 3:].clip(0, 255).round() / np.float32(255)
+        cfg, cloud = self.cfg, PointCloud(points=rows[:, :3], colors=colors)
+        return placed(cloud, front=cfg.front, scale=cfg.scale, normalize=cfg.normalize)
 
     def _checkpoint(self) -> str:
         return model_part(self.cfg.checkpoint, POINTS)
@@ -168,10 +157,8 @@ class PointEPrior(Prior):
 
     def _condition(self, prompt: str, device: torch.device) -> Float[Tensor, "1 D"]:
         folder = locate(self._clip())
-        encoder = loaded(
-            ("Point-E text_encoder", str(folder), device),
-            lambda: load_text_encoder(folder).to(device),
-        )
+        key = ("Point-E text_encoder", str(folder), device)
+        encoder = loaded(key, lambda: load_text_encoder(folder).to(device))
         tokenizer = loaded(("Point-E tokenizer", str(folder)), lambda: load_tokenizer(folder))
         return text_condition(tokenizer, encoder, prompt)
 
@@ -180,23 +167,19 @@ class PointEPrior(Prior):
     ) -> Float[Tensor, "1 6 N"]:
         model = kept_network(BASE, self._checkpoint(), condition.device)
         require_features(model, condition, self.cfg.clip)
-        scale = self.cfg.guidance_scale
+        scale, none = self.cfg.guidance_scale, torch.zeros_like(condition)
         # with guidance a second row, the unconditional one
-        conditions = (
-            condition if scale == 1 else torch.cat([condition, torch.zeros_like(condition)])
-        )
-        denoise = guided_denoiser(
-            mean_of(lambda z, t: model(z, t, conditions)), cosine_alphas_cumprod(), scale=scale
-        )
+        conditions = condition if scale == 1 else torch.cat([condition, none])
+        network = mean_of(lambda z, t: model(z, t, conditions))
+        denoise = guided_denoiser(network, cosine_alphas_cumprod(), scale=scale)
         return self._sampled(denoise, self.cfg.num_points, 0, rng, condition.device)
 
     def _upsampled_points(
         self, coarse: Float[Tensor, "1 6 M"], rng: torch.Generator
     ) -> Float[Tensor, "1 6 N"]:
         model = kept_network(UPSAMPLER, self.cfg.upsampler, coarse.device)
-        denoise = guided_denoiser(
-            mean_of(lambda z, t: model(z, t, coarse)), linear_alphas_cumprod()
-        )
+        network = mean_of(lambda z, t: model(z, t, coarse))
+        denoise = guided_denoiser(network, linear_alphas_cumprod())
         return self._sampled(denoise, self.cfg.num_upsampled, 1, rng, coarse.device)
 
     def _sampled(
@@ -207,14 +190,10 @@ class PointEPrior(Prior):
         Args:
             stage: 0 for the base model, 1 for the upsampler.
         """
-        noise = torch.randn(1, CHANNELS, count, generator=rng).to(device)
-        sigmas = karras_sigmas(
-            self.cfg.num_steps, self.cfg.sigma_min, float(self.cfg.sigma_max[stage])
-        )
-        name = ("Point-E", "Point-E upsampler")[stage]
-        sample = sample_heun(
-            denoise, noise, sigmas, churn=float(self.cfg.churn[stage]), generator=rng, progress=name
-        )
+        cfg, noise = self.cfg, torch.randn(1, CHANNELS, count, generator=rng).to(device)
+        sigmas = karras_sigmas(cfg.num_steps, cfg.sigma_min, float(cfg.sigma_max[stage]))
+        title, churn = ("Point-E", "Point-E upsampler")[stage], float(cfg.churn[stage])
+        sample = sample_heun(denoise, noise, sigmas, churn=churn, generator=rng, progress=title)
         return (sample - BIASES.to(device)) / SCALES.to(device)
 
 
@@ -240,12 +219,8 @@ def load_network(kind: Kind, path: str) -> Any:
     """
     state = read_state_dict(path, kind.title)
     sizes, projection = sizes_of(state), state.get(kind.projection)
-    if (
-        projection is None
-        or not sizes["layers"]
-        or not sizes["width"]
-        or sizes["width"] % HEAD_CHANNELS
-    ):
+    fits = sizes["layers"] and sizes["width"] and sizes["width"] % HEAD_CHANNELS == 0
+    if projection is None or not fits:
         raise UserError(
             f"{kind.title} {path!r} holds another model: give {kind.file} or a finetuned one "
             "of its format"

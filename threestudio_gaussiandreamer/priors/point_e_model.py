@@ -110,14 +110,10 @@ class BaseModel(PointTransformer):
         self.clip_embed = nn.Linear(features, width)
 
     def forward(
-        self,
-        points: Float[Tensor, "B 6 N"],
-        timesteps: Real[Tensor, " B"],
-        condition: Float[Tensor, "B D"],
+        self, points: Float[Tensor, "B 6 N"], timesteps: Tensor, condition: Float[Tensor, "B D"]
     ) -> Float[Tensor, "B 12 N"]:
-        return self.transform(
-            points, [self.clip_embed(condition)[:, None], self.time_token(timesteps)]
-        )
+        tokens = [self.clip_embed(condition)[:, None], self.time_token(timesteps)]
+        return self.transform(points, tokens)
 
 
 class Upsampler(PointTransformer):
@@ -133,15 +129,11 @@ class Upsampler(PointTransformer):
         self.register_buffer("channel_biases", torch.tensor([0.0] * 3 + [-1.0] * 3))
 
     def forward(
-        self,
-        points: Float[Tensor, "B 6 N"],
-        timesteps: Real[Tensor, " B"],
-        coarse: Float[Tensor, "B 6 M"],
+        self, points: Float[Tensor, "B 6 N"], timesteps: Tensor, coarse: Float[Tensor, "B 6 M"]
     ) -> Float[Tensor, "B 12 N"]:
-        """Return ``coarse`` in the points' own units: positions, and colours up to 255."""
-        no_image = self.clip_embed(
-            points.new_zeros(len(points), 1, self.clip_embed[0].normalized_shape[0])
-        )
+        """Take ``coarse`` in the points' own units: positions, and colours up to 255."""
+        features = self.clip_embed[0].normalized_shape[0]
+        no_image = self.clip_embed(points.new_zeros(len(points), 1, features))
         scaled = coarse * self.channel_scales[:, None] + self.channel_biases[:, None]
         tokens = [
             self.time_token(timesteps),
@@ -155,9 +147,8 @@ def timestep_embedding(timesteps: Real[Tensor, " B"], width: int) -> Float[Tenso
     """Return cosines, then sines, of frequencies that fall from 1 to 1/10000 (Vaswani et
     al. 2017).
     """
-    frequencies = torch.exp(
-        -math.log(10000) * torch.arange(width // 2, device=timesteps.device) / (width // 2)
-    )
+    steps = torch.arange(width // 2, device=timesteps.device)
+    frequencies = torch.exp(-math.log(10000) * steps / (width // 2))
     angles = timesteps.float()[:, None] * frequencies
     return torch.cat([angles.cos(), angles.sin()], dim=-1)
 

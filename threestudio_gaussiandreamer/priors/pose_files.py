@@ -3,13 +3,21 @@
 * NPZ with ``poses`` (F, 3 J), as AMASS has them, or with ``global_orient`` (F, 3) and ``body_pose``
   (F, 63 or 69), as smplx's arguments; the frames' dimension may be missing;
 * NPY with (3 J,), (F, 3 J), (J, 3) or (F, J, 3);
-* BVH, see ``bvh.py``.
+* BVH, whose joints are found by their names.
 
 J is 22, 24, 52 or 55 joints in the order of SMPL, SMPL-H or SMPL-X, of which the first 22 are used.
-y is up, but in files with AMASS's frame rate, where z is."""
+y is up, but in files with AMASS's frame rate, where z is.
+
+Programs name joints in a BVH differently ("LeftUpLeg", "lThigh", "mixamorig:LeftUpLeg", "thigh.L",
+"L_Hip"). The names are split into a side and a part; the tables list the parts of each joint. Any
+further joints, as fingers, are ignored, and neither the file's unit nor its rest pose matter, since
+the body takes only directions from the positions."""
 
 import math
+import re
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Optional
 
 import numpy as np
 from jaxtyping import Float
@@ -17,8 +25,7 @@ from jaxtyping import Float
 from ..core.errors import UserError, unknown
 from ..core.files import existing_file
 from ..formats.array_files import read_arrays
-from .body_pose import pose_of_positions, pose_of_rotations
-from .bvh import read_bvh
+from .body_pose import NEEDED, SIDES, pose_of_positions, pose_of_rotations
 from .makehuman import Body
 from .skeleton import BODY_JOINTS
 
@@ -38,6 +45,29 @@ EXPECTED = (
     "axis-angle rotations were expected: (frames, 3 x joints) or (frames, joints, 3) of "
     f"{', '.join(map(str, JOINT_COUNTS[:-1]))} or {JOINT_COUNTS[-1]} joints"
 )
+CHANNELS = ("Xposition", "Yposition", "Zposition", "Xrotation", "Yrotation", "Zrotation")
+SIDE_WORDS = {"left": "left", "l": "left", "right": "right", "r": "right"}
+PREFIX = re.compile(r"^.*:|^mixamorig\d*_?|^bip\d*[ _]", re.IGNORECASE)
+WORDS = re.compile(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])|\d+")
+CENTRAL = {
+    "pelvis": ("hips", "hip", "pelvis", "root"),
+    "lower spine": ("spine", "lowerback", "spine1", "abdomen", "torso"),
+    "neck": ("neck", "neck1"),
+    "head": ("head",),
+}
+PAIRED = {
+    "hip": ("upleg", "upperleg", "thigh", "hip", "upperleg1"),
+    "knee": ("leg", "lowerleg", "lowleg", "shin", "calf", "knee", "lowerleg1"),
+    "ankle": ("ankle", "foot"),
+    "foot": ("toebase", "toe", "toes", "ball", "toe0", "foot"),
+    "shoulder": ("arm", "upperarm", "uparm", "shldr", "shoulder", "upperarm1"),
+    "elbow": ("forearm", "lowerarm", "lowarm", "elbow", "lowerarm1"),
+    "wrist": ("wrist", "hand"),
+}
+"""Parts of the names of each joint, the most specific one first: "foot" is the ankle in files
+without an "ankle", and "shoulder" the upper arm in those without an "arm"."""
+LARGEST = 1e9
+"""Largest number that is plausible, in any unit; squares of larger ones could overflow."""
 
 
 def read_pose(
@@ -74,11 +104,7 @@ def read_axis_angles(path: Path, frame: int) -> tuple[Float[np.ndarray, "22 3 3"
     names = ("poses", "global_orient", "body_pose", *FRAME_RATES)
     arrays = read_arrays(path, "pose file", required, names)
     angles = _frames(_rotations(arrays, path), path)
-    if frame >= len(angles):
-        raise UserError(
-            f"frame: pose file {str(path)!r} has {len(angles)} frames, numbered from 0; there is "
-            f"no {frame}"
-        )
+    require_frame(frame, len(angles), f"pose file {str(path)!r}")
     chosen = np.asarray(angles[frame, :BODY_JOINTS], np.float64)
     if not np.isfinite(chosen).all():
         raise UserError(
@@ -86,6 +112,12 @@ def read_axis_angles(path: Path, frame: int) -> tuple[Float[np.ndarray, "22 3 3"
         )
     up = AMASS_UP if any(name in arrays for name in FRAME_RATES) else BODY_UP
     return Rotation.from_rotvec(chosen).as_matrix(), up
+
+
+def require_frame(frame: int, count: int, name: str) -> None:
+    """Raise UserError unless a file or motion has this frame."""
+    if frame >= count:
+        raise UserError(f"frame: {name} has {count} frames, numbered from 0; there is no {frame}")
 
 
 def _rotations(arrays: dict[str, np.ndarray], path: Path) -> np.ndarray:
@@ -128,3 +160,145 @@ def _frames(values: np.ndarray, path: Path) -> Float[np.ndarray, "F J 3"]:
     raise UserError(
         f"pose file {str(path)!r} holds an array {values.shape} of {values.dtype}: {EXPECTED}{hint}"
     )
+
+
+# BVH -----------------------------------------------------------------------------------------
+
+
+@dataclass
+class Joint:
+    """A joint of the hierarchy."""
+
+    name: str
+    parent: Optional[int]
+    offset: Float[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
+    channels: list[str] = field(default_factory=list)
+
+
+def read_bvh(path: Path, frame: int) -> dict[str, Float[np.ndarray, "3"]]:
+    """Return the positions of the known joints in one frame of a BVH, in the file's unit and axes.
+
+    Raises:
+        UserError: the file is damaged, has no such frame, numbers that aren't finite, or lacks
+            joints that a pose needs.
+    """
+    hierarchy, _, motion = path.read_text(encoding="utf-8", errors="replace").partition("MOTION")
+    joints = _hierarchy(hierarchy, path)
+    names = joint_names([joint.name for joint in joints], path)
+    values = _frame_values(motion, sum(len(joint.channels) for joint in joints), frame, path)
+    positions = _positions(joints, values)
+    return {name: positions[number] for name, number in names.items()}
+
+
+def joint_names(names: list[str], path: Path) -> dict[str, int]:
+    """Return the index of the file's joint for each joint of ``skeleton.py`` that it has.
+
+    Raises:
+        UserError: a joint of ``NEEDED`` is missing.
+    """
+    known = {}
+    for number, name in enumerate(names):
+        known.setdefault(split_name(name), number)
+    found: dict[str, int] = {}
+    wanted = [(name, "", parts) for name, parts in CENTRAL.items()]
+    wanted += [(f"{s} {name}", s, parts) for s in SIDES for name, parts in PAIRED.items()]
+    for name, side, parts in wanted:
+        number = next((known[side, part] for part in parts if (side, part) in known), None)
+        if number is not None and number not in found.values():
+            found[name] = number
+    if missing := [name for name in NEEDED if name not in found]:
+        raise UserError(
+            f"BVH file {str(path)!r} has no joint that is known as the {', the '.join(missing)}: "
+            f"its joints are {', '.join(filter(None, names[:40]))}. Rename them, for example to "
+            "LeftUpLeg, LeftLeg, LeftArm, LeftForeArm"
+        )
+    return found
+
+
+def split_name(name: str) -> tuple[str, str]:
+    """Split a joint's name into its side ("left", "right" or "") and its part in lower case.
+
+    >>> split_name("mixamorig:LeftUpLeg"), split_name("thigh.L"), split_name("lShldr")
+    (('left', 'upleg'), ('left', 'thigh'), ('left', 'shldr'))
+    """
+    words = [str(word).lower() for word in WORDS.findall(PREFIX.sub("", name))]
+    side = next((SIDE_WORDS[word] for word in words if word in SIDE_WORDS), "")
+    if side:
+        words.remove(next(word for word in words if word in SIDE_WORDS))
+    elif words and (glued := re.match(r"(left|right)(.+)", words[0])):
+        side, words[0] = glued.groups()
+    return side, re.sub(r"(?<=[a-z])0+(?=\d)", "", "".join(words))
+
+
+def _hierarchy(text: str, path: Path) -> list[Joint]:
+    """Return the joints in the order of their channels; parents come first."""
+    joints: list[Joint] = []
+    above: list[Optional[int]] = []
+    current: Optional[int] = None
+    for line in text.splitlines():
+        kind, *words = line.split() or [""]
+        if kind in ("ROOT", "JOINT", "End"):
+            ends = kind == "End"  # an end site has no channels and no name of its own
+            joints.append(Joint("" if ends else " ".join(words), current))
+        elif kind == "{":
+            above.append(current)
+            current = len(joints) - 1 if joints else None
+        elif kind == "}" and above:
+            current = above.pop()
+        elif kind == "OFFSET" and joints:
+            joints[-1].offset = _numbers(words, 3, path)
+        elif kind == "CHANNELS" and joints:
+            for word in words[1:]:
+                if word not in CHANNELS:
+                    raise unknown(f"channel in the BVH file {str(path)!r}", word, CHANNELS)
+            joints[-1].channels = words[1:]
+            if len(set(words[1:])) < len(words[1:]):
+                raise UserError(f"BVH file {str(path)!r} is damaged: a joint has a channel twice")
+    if not joints or above:
+        what = "is cut off" if joints else "has no joints"
+        raise UserError(f"BVH file {str(path)!r} is damaged: its hierarchy {what}")
+    return joints
+
+
+def _frame_values(text: str, count: int, frame: int, path: Path) -> Float[np.ndarray, " C"]:
+    """Return the values of all channels in one frame."""
+    lines = [line for line in text.splitlines() if line.strip()]
+    rows = [line for line in lines if not line.lstrip().startswith("Frame")]
+    require_frame(frame, len(rows), f"BVH file {str(path)!r}")
+    return _numbers(rows[frame].split(), count, path)
+
+
+def _numbers(words: list[str], count: int, path: Path) -> Float[np.ndarray, " N"]:
+    try:
+        values = np.array(words, np.float64)
+    except ValueError:
+        values = np.array([np.nan])
+    if len(values) != count or not (np.abs(values) < LARGEST).all():
+        raise UserError(
+            f"BVH file {str(path)!r} is damaged: {count} finite numbers were expected in the line "
+            f"{' '.join(words)[:80]!r}"
+        )
+    return values
+
+
+def _positions(joints: list[Joint], values: Float[np.ndarray, " C"]) -> Float[np.ndarray, "J 3"]:
+    """Return the positions of all joints; a joint's position channels replace its offset."""
+    from scipy.spatial.transform import Rotation
+
+    positions, turns, used = np.zeros((len(joints), 3)), [], 0
+    for number, joint in enumerate(joints):
+        channels = dict(zip(joint.channels, values[used:], strict=False))
+        used += len(joint.channels)
+        offset = [channels.get(name, o) for name, o in zip(CHANNELS[:3], joint.offset, strict=True)]
+        rotations = [name for name in joint.channels if name.endswith("rotation")]
+        turn = Rotation.identity()
+        if rotations:
+            axes = "".join(name[0] for name in rotations)
+            turn = Rotation.from_euler(axes, [channels[name] for name in rotations], degrees=True)
+        if joint.parent is not None:
+            above = turns[joint.parent]
+            offset = positions[joint.parent] + above.apply(offset)
+            turn = above * turn
+        positions[number] = offset
+        turns.append(turn)
+    return positions

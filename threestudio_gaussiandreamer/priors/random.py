@@ -26,9 +26,7 @@ from .base import SCALE, Prior, chosen_colors, is_color, points
 
 
 def in_sphere(count: int, generator: np.random.Generator) -> Float[np.ndarray, "P 3"]:
-    """Return points uniform in the unit ball: a uniform direction, and a radius whose cube is
-    uniform.
-    """
+    """Return points uniform in the unit ball: a uniform direction, a radius of uniform cube."""
     directions = generator.normal(size=(count, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     return directions * np.cbrt(generator.random((count, 1)))
@@ -62,6 +60,4 @@ class RandomPrior(Prior):
 
     def generate(self, prompt: str, generator: np.random.Generator) -> PointCloud:
         points = self.cfg.size * SHAPES[self.cfg.shape](self.cfg.num_points, generator)
-        return PointCloud(
-            points=points, colors=chosen_colors(self.cfg.color, len(points), generator)
-        )
+        return PointCloud(points, chosen_colors(self.cfg.color, len(points), generator))

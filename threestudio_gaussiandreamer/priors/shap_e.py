@@ -62,9 +62,8 @@ from ..models.clip import load_text_encoder, load_tokenizer, text_condition
 from ..models.hub import Source, locate
 from ..models.loaded import loaded
 from ..models.model_files import free_memory, load_network, load_settings, needed_files
-from .base import SCALE, Prior
+from .base import FRONT, SCALE, Prior, chosen_device, placed, torch_generator
 from .karras import Network, guided_denoiser, karras_sigmas, sample_heun
-from .placing import FRONT, chosen_device, placed, torch_generator
 from .shap_e_checkpoint import load_original_prior
 
 COMPONENTS = ("tokenizer", "text_encoder", "prior", "scheduler", "shap_e_renderer")
@@ -109,11 +108,6 @@ class ShapEPrior(Prior):
     cfg: Config
 
     def preflight(self) -> None:
-        """Check within seconds that all files are available, before any long work.
-
-        Raises:
-            UserError: what is missing, and what to do.
-        """
         require_extra("diffusion", "diffusers", "transformers")
         chosen_device(self.cfg.device, self.device)
         locate(self._source(), download=False)
@@ -125,28 +119,23 @@ class ShapEPrior(Prior):
         folder = locate(self._source())
         device = chosen_device(self.cfg.device, self.device)
         info(f"Shap-E: {self.cfg.prompt or prompt!r} on {device}")
-        latents = self._sample(
-            folder, self.cfg.prompt or prompt, device, torch_generator(generator)
-        )
-        cloud = self._decode(folder, latents, device)
+        cfg, rng = self.cfg, torch_generator(generator)
+        latents = self._sample(folder, cfg.prompt or prompt, device, rng)
+        renderer = self._part(folder, "shap_e_renderer", device)
+        options = {"grid_size": cfg.grid_size, "query_batch_size": cfg.query_batch_size}
+        cloud = decoded(renderer, latents, colors=cfg.colors, **options)
         free_memory()
         info(f"Shap-E: a mesh of {len(cloud.points)} vertices and {len(cloud.faces)} faces")
-        return placed(
-            cloud, front=self.cfg.front, scale=self.cfg.scale, normalize=self.cfg.normalize
-        )
+        return placed(cloud, front=cfg.front, scale=cfg.scale, normalize=cfg.normalize)
 
     def _source(self) -> Source:
         def picks(names: Collection[str]) -> list[str]:
             return needed_files(names, COMPONENTS, allow_bin=self.cfg.allow_bin)
 
         # the folder renderer is that of another pipeline
-        return Source(
-            self.cfg.model,
-            picks,
-            "system.geometry.prior.model",
-            self.cfg.revision,
-            "--include '*/*' --exclude 'renderer/*'",
-        )
+        download = "--include '*/*' --exclude 'renderer/*'"
+        option = "system.geometry.prior.model"
+        return Source(self.cfg.model, picks, option, self.cfg.revision, download)
 
     def _sample(
         self, folder: Path, prompt: str, device: torch.device, rng: torch.Generator
@@ -154,22 +143,15 @@ class ShapEPrior(Prior):
         """Return latents of the shape, from text features through the text-to-latent network; both
         are dropped on return.
         """
-        condition = self._condition(folder, prompt, device)
+        cfg, condition = self.cfg, self._condition(folder, prompt, device)
         prior = self._part(folder, "prior", device)
         alphas_cumprod, prediction = read_schedule(folder)
-        noise = torch.randn(
-            1, prior.config.num_embeddings, prior.config.embedding_dim, generator=rng
-        ).to(device)
-        network = prior_network(
-            prior,
-            condition,
-            self.cfg.guidance_scale,
-            half=self.cfg.half_precision and device.type == "cuda",
-        )
-        denoise = guided_denoiser(
-            network, alphas_cumprod, scale=self.cfg.guidance_scale, prediction=prediction
-        )
-        sigmas = karras_sigmas(self.cfg.num_inference_steps, self.cfg.sigma_min, self.cfg.sigma_max)
+        shape = (1, prior.config.num_embeddings, prior.config.embedding_dim)
+        noise, scale = torch.randn(shape, generator=rng).to(device), cfg.guidance_scale
+        half = cfg.half_precision and device.type == "cuda"
+        network = prior_network(prior, condition, scale, half=half)
+        denoise = guided_denoiser(network, alphas_cumprod, scale=scale, prediction=prediction)
+        sigmas = karras_sigmas(cfg.num_inference_steps, cfg.sigma_min, cfg.sigma_max)
         return sample_heun(denoise, noise, sigmas, generator=rng, progress="Shap-E")
 
     def _condition(self, folder: Path, prompt: str, device: torch.device) -> Float[Tensor, "1 D"]:
@@ -178,23 +160,9 @@ class ShapEPrior(Prior):
             return network.to(device)
 
         encoder = loaded(("Shap-E text_encoder", str(folder), device, self.cfg.allow_bin), load)
-        tokenizer = loaded(
-            ("Shap-E tokenizer", str(folder)), lambda: load_tokenizer(folder, "tokenizer")
-        )
+        key = ("Shap-E tokenizer", str(folder))
+        tokenizer = loaded(key, lambda: load_tokenizer(folder, "tokenizer"))
         return text_condition(tokenizer, encoder, prompt)
-
-    def _decode(
-        self, folder: Path, latents: Float[Tensor, "1 N D"], device: torch.device
-    ) -> PointCloud:
-        """Return the surface where the signed distance is 0, in Shap-E's own space."""
-        renderer = self._part(folder, "shap_e_renderer", device)
-        return decoded(
-            renderer,
-            latents,
-            grid_size=self.cfg.grid_size,
-            query_batch_size=self.cfg.query_batch_size,
-            colors=self.cfg.colors,
-        )
 
     def _part(self, folder: Path, part: str, device: torch.device) -> Any:
         """Return one network, always in float32: in half precision the renderer's encoding of
@@ -243,21 +211,14 @@ def prior_network(
     def predict(z: Tensor, timesteps: Tensor) -> Tensor:
         with torch.autocast(z.device.type, torch.float16, enabled=half):
             output = prior(z, timesteps, conditions).predicted_image_embedding
-        return output[
-            ..., : z.shape[-1]
-        ]  # the rest is the variance, which this sampler doesn't use
+        return output[..., : z.shape[-1]]  # the rest is the variance, which isn't used
 
     return predict
 
 
 @torch.no_grad()
 def decoded(
-    renderer: Any,
-    latents: Float[Tensor, "1 N D"],
-    *,
-    grid_size: int,
-    query_batch_size: int,
-    colors: str,
+    renderer: Any, latents: Float[Tensor, "1 N D"], *, colors: str, grid_size: int, **options: int
 ) -> PointCloud:
     """Return the mesh of ``latents`` by marching cubes, with the texture field's colours at its
     vertices.
@@ -271,9 +232,7 @@ def decoded(
         )
     hook = renderer.mesh_decoder.register_forward_hook(_refuse_empty)
     try:
-        mesh = renderer.decode_to_mesh(
-            latents, latents.device, grid_size=grid_size, query_batch_size=query_batch_size
-        )
+        mesh = renderer.decode_to_mesh(latents, latents.device, grid_size=grid_size, **options)
     except torch.OutOfMemoryError as error:
         raise UserError(
             f"Shap-E's grid of {grid_size}^3 does not fit the memory: set grid_size or "
@@ -281,9 +240,8 @@ def decoded(
         ) from error
     finally:
         hook.remove()  # the renderer may be kept for the next prompt
-    linear = (
-        torch.stack([mesh.vertex_channels[name] for name in "RGB"], dim=-1).float().cpu().numpy()
-    )
+    channels = torch.stack([mesh.vertex_channels[name] for name in "RGB"], dim=-1)
+    linear = channels.float().cpu().numpy()
     return PointCloud(
         points=mesh.verts.float().cpu().numpy(),
         colors=linear if colors == "linear" else linear_to_srgb(linear),

@@ -43,9 +43,8 @@ def load_original_prior(prior: nn.Module, path: str) -> None:
     Raises:
         UserError: the file can't be read, or its names or shapes are not those of this model.
     """
-    state = to_diffusers(
-        read_state_dict(path, "Shap-E checkpoint"), prior.config.num_attention_heads
-    )
+    state = read_state_dict(path, "Shap-E checkpoint")
+    state = to_diffusers(state, prior.config.num_attention_heads)
     own = prior.state_dict()
     state.update({name: own[name] for name in UNUSED_BY_SHAP_E if name in own})
     load_exactly(prior, state, f"Shap-E checkpoint {path!r}")
@@ -60,17 +59,14 @@ def to_diffusers(state: dict[str, Tensor], heads: int) -> dict[str, Tensor]:
     converted: dict[str, Tensor] = {}
     unknown = []
     for name, value in state.items():
-        parts = (
-            _converted(name.removeprefix(PREFIX), value, heads) if name.startswith(PREFIX) else {}
-        )
+        known = name.startswith(PREFIX)
+        parts = _converted(name.removeprefix(PREFIX), value, heads) if known else {}
         converted.update(parts)
-        if not parts:
-            unknown.append(name)
+        unknown += [] if parts else [name]
     if unknown:
         raise UserError(
             f"the checkpoint has {len(unknown)} names that are none of Shap-E's text model "
-            f"({named(unknown)}):"
-            f" names like {PREFIX}backbone.resblocks.0.ln_1.weight were expected"
+            f"({named(unknown)}): names like {PREFIX}backbone.resblocks.0.ln_1.weight were expected"
         )
     return converted
 
@@ -81,11 +77,9 @@ def _converted(name: str, value: Tensor, heads: int) -> dict[str, Tensor]:
         return {"positional_embedding": value[None]}
     if packed := PACKED.fullmatch(name):
         block, kind = packed.groups()
+        start = f"transformer_blocks.{block}.attn1"
         parts = zip(("to_q", "to_k", "to_v"), unpacked(value, heads), strict=True)
-        return {
-            f"transformer_blocks.{block}.attn1.{part}.{kind}": part_value
-            for part, part_value in parts
-        }
+        return {f"{start}.{part}.{kind}": rows for part, rows in parts}
     for pattern, replacement in RENAMED:
         renamed, count = re.subn("^" + pattern + r"(?=(weight|bias)$)", replacement, name)
         if count:

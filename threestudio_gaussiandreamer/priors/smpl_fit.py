@@ -16,7 +16,7 @@ final one."""
 
 import math
 from collections.abc import Callable
-from pathlib import Path
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -43,17 +43,14 @@ LIMITS_WEIGHT = 1000.0
 STAGES = ((1.0, 0.2), (0.02, 1.0))
 """Weight of the pose prior, and the share of the iterations, of each stage."""
 DEGREES = math.pi / 180
+KNEE = {0: (0, 150), 1: (-15, 15), 2: (-15, 15)}
+ANKLE = {0: (-60, 60), 1: (-45, 45), 2: (-45, 45)}
 LIMITS = {
     # joint: axis: (low, high) in degrees. Knees bend about x, the elbows about y, the left one's
     # negative side.
-    4: {0: (0, 150), 1: (-15, 15), 2: (-15, 15)},
-    5: {0: (0, 150), 1: (-15, 15), 2: (-15, 15)},
-    18: {1: (-150, 5)},
-    19: {1: (-5, 150)},
-    **{
-        joint: {0: (-60, 60), 1: (-60, 60), 2: (-60, 60)} for joint in (3, 6, 9, 12, 15)
-    },  # spine, neck, head
-    **{joint: {0: (-60, 60), 1: (-45, 45), 2: (-45, 45)} for joint in (7, 8)},  # ankles
+    **{4: KNEE, 5: KNEE, 18: {1: (-150, 5)}, 19: {1: (-5, 150)}},
+    **{joint: dict.fromkeys(range(3), (-60, 60)) for joint in (3, 6, 9, 12, 15)},  # spine, head
+    **{7: ANKLE, 8: ANKLE},
 }
 
 
@@ -90,18 +87,21 @@ def load_body_model(path: str, *, num_shape: int = 10) -> BodyModel:
     Raises:
         UserError: missing, or not a body model; the message says what to do.
     """
-    arrays = _arrays(existing_file(path, "body model"))
+    try:
+        arrays = read_arrays(existing_file(path, "body model"), "body model", FIELDS)
+    except UserError as error:
+        expected = "the NPZ or PKL of SMPL, SMPL-H or SMPL-X was expected"
+        raise UserError(f"{error}: {expected}") from error
     _check_shapes(arrays, path)
     _check_values(arrays, path)
     vertices, joints = len(arrays["v_template"]), len(arrays["J_regressor"])
     parents = torch.from_numpy(arrays["kintree_table"][0].astype(np.int64))
     parents[0] = -1
+    directions = _tensor(arrays["posedirs"]).reshape(vertices * 3, 9 * (joints - 1))
     return BodyModel(
         template=_tensor(arrays["v_template"]),
         shape_directions=_tensor(arrays["shapedirs"][:, :, :num_shape]),
-        pose_directions=_tensor(arrays["posedirs"])
-        .reshape(vertices * 3, 9 * (joints - 1))
-        .T.contiguous(),
+        pose_directions=directions.T.contiguous(),
         joint_regressor=_tensor(arrays["J_regressor"]),
         parents=parents,
         weights=_tensor(arrays["weights"]),
@@ -125,21 +125,17 @@ def fit_bodies(
         iterations: the most of the last stage.
     """
     require_extra("smpl", "smplx")
-    wanted = _tensor(targets)[
-        :, : SMPL_JOINTS if len(model.parents) == SMPL_JOINTS else BODY_JOINTS
-    ]
-    frames, joints = len(wanted), len(model.parents)
+    joints = len(model.parents)
+    wanted = _tensor(targets)[:, : SMPL_JOINTS if joints == SMPL_JOINTS else BODY_JOINTS]
+    frames = len(wanted)
     pose = torch.zeros(frames, joints, 3, dtype=torch.float64)
     pose[:, 0], translation = _placed(model, wanted)
     shape = torch.zeros(frames, model.shape_directions.shape[-1], dtype=torch.float64)
     moved = [pose, translation, *([shape] if fit_shape else [])]
     with torch_threads(1):
         for weight, share in STAGES:
-            _minimise(
-                moved,
-                lambda weight=weight: energy(model, pose, shape, translation, wanted, weight),
-                int(share * iterations),
-            )
+            loss = partial(energy, model, pose, shape, translation, wanted, weight)
+            _minimise(moved, loss, int(share * iterations))
     found = posed_joints(model, pose, shape, translation)[:, : wanted.shape[1]]
     residuals = 1000 * (found - wanted).norm(dim=-1)
     return BodyFit(pose.detach(), shape.detach(), translation.detach(), residuals.detach().numpy())
@@ -150,18 +146,14 @@ def energy(
     pose: Tensor,
     shape: Tensor,
     translation: Tensor,
-    wanted: Float[Tensor, "F K 3"],
-    pose_weight: float,
+    wanted: Tensor,
+    weight: float,
 ) -> Tensor:
     """Compute the objective of the fit, summed over the frames; see the module's docstring."""
     found = posed_joints(model, pose, shape, translation)[:, : wanted.shape[1]]
     data = ((found - wanted) / SCALE).square().sum()
-    return (
-        data
-        + pose_weight * pose[:, 1:].square().sum()
-        + SHAPE_WEIGHT * shape.square().sum()
-        + LIMITS_WEIGHT * beyond_limits(pose)
-    )
+    priors = weight * pose[:, 1:].square().sum() + SHAPE_WEIGHT * shape.square().sum()
+    return data + priors + LIMITS_WEIGHT * beyond_limits(pose)
 
 
 def beyond_limits(pose: Float[Tensor, "F J 3"]) -> Tensor:
@@ -189,14 +181,11 @@ def posed_joints(
     from smplx.lbs import batch_rigid_transform, batch_rodrigues
 
     frames, joints = pose.shape[:2]
-    rest = model.joint_regressor @ model.template + torch.einsum(
-        "fb,jcb->fjc", shape, _joint_directions(model)
-    )
+    directions = torch.einsum("jv,vcb->jcb", model.joint_regressor, model.shape_directions)
+    rest = model.joint_regressor @ model.template + torch.einsum("fb,jcb->fjc", shape, directions)
     rotations = batch_rodrigues(pose.reshape(-1, 3)).reshape(frames, joints, 3, 3)
-    return (
-        batch_rigid_transform(rotations, rest, model.parents, dtype=pose.dtype)[0]
-        + translation[:, None]
-    )
+    found, _ = batch_rigid_transform(rotations, rest, model.parents, dtype=pose.dtype)
+    return found + translation[:, None]
 
 
 @torch.no_grad()
@@ -204,21 +193,8 @@ def posed_vertices(model: BodyModel, fit: BodyFit) -> Float[np.ndarray, "F V 3"]
     """Return the surfaces of the fitted bodies: metres, y up."""
     from smplx.lbs import lbs
 
-    vertices, _ = lbs(
-        fit.shape,
-        fit.pose.flatten(1),
-        model.template,
-        model.shape_directions,
-        model.pose_directions,
-        model.joint_regressor,
-        model.parents,
-        model.weights,
-    )
+    vertices, _ = lbs(fit.shape, fit.pose.flatten(1), *model[:-1])  # in the order of lbs
     return (vertices + fit.translation[:, None]).numpy()
-
-
-def _joint_directions(model: BodyModel) -> Float[Tensor, "J 3 B"]:
-    return torch.einsum("jv,vcb->jcb", model.joint_regressor, model.shape_directions)
 
 
 def _placed(
@@ -231,9 +207,8 @@ def _placed(
 
     rest = (model.joint_regressor @ model.template)[list(TRUNK)]
     there = wanted[:, list(TRUNK)]
-    covariance = torch.einsum(
-        "fkc,kd->fcd", there - there.mean(1, keepdim=True), rest - rest.mean(0)
-    )
+    moved = there - there.mean(1, keepdim=True)
+    covariance = torch.einsum("fkc,kd->fcd", moved, rest - rest.mean(0))
     u, _, vt = torch.linalg.svd(covariance)
     signs = torch.ones(len(wanted), 3, dtype=wanted.dtype)
     signs[:, 2] = torch.linalg.det(u @ vt).sign()
@@ -247,13 +222,8 @@ def _minimise(moved: list[Tensor], loss: Callable[[], Tensor], iterations: int) 
     """Minimise ``loss`` over the tensors ``moved`` with L-BFGS, in place."""
     for tensor in moved:
         tensor.requires_grad_(True)
-    optimiser = torch.optim.LBFGS(
-        moved,
-        max_iter=iterations,
-        history_size=20,
-        line_search_fn="strong_wolfe",
-        tolerance_change=1e-5,
-    )
+    options = {"history_size": 20, "line_search_fn": "strong_wolfe", "tolerance_change": 1e-5}
+    optimiser = torch.optim.LBFGS(moved, max_iter=iterations, **options)
 
     def closure() -> Tensor:
         optimiser.zero_grad()
@@ -264,14 +234,6 @@ def _minimise(moved: list[Tensor], loss: Callable[[], Tensor], iterations: int) 
     optimiser.step(closure)
     for tensor in moved:
         tensor.requires_grad_(False)
-
-
-def _arrays(file: Path) -> dict[str, np.ndarray]:
-    try:
-        return read_arrays(file, "body model", FIELDS)
-    except UserError as error:
-        expected = "the NPZ or PKL of SMPL, SMPL-H or SMPL-X was expected"
-        raise UserError(f"{error}: {expected}") from error
 
 
 def _check_shapes(arrays: dict[str, np.ndarray], path: str) -> None:

@@ -22,9 +22,7 @@ MILLISECONDS = 80
 """Duration of each frame, milliseconds."""
 
 
-def save_turntable(
-    cloud: PointCloud, path: str | os.PathLike, *, views: int = 24, size: int = 256
-) -> None:
+def save_turntable(cloud: PointCloud, path: str | os.PathLike, *, views=24, size=256) -> None:
     """Write an animated GIF of ``cloud`` that begins at its front (azimuth 0) and never stops."""
     from PIL import Image
 
@@ -34,20 +32,12 @@ def save_turntable(
         for picture in turntable(cloud, views=views, size=size)
     ]
     with atomic_file(path) as file:
-        pictures[0].save(
-            file,
-            format="GIF",
-            save_all=True,
-            append_images=pictures[1:],
-            duration=MILLISECONDS,
-            loop=0,
-        )
+        options = {"append_images": pictures[1:], "duration": MILLISECONDS, "loop": 0}
+        pictures[0].save(file, format="GIF", save_all=True, **options)
 
 
 @torch.no_grad()
-def turntable(
-    cloud: PointCloud, *, views: int = 24, size: int = 256
-) -> UInt8[np.ndarray, "V S S 3"]:
+def turntable(cloud: PointCloud, *, views=24, size=256) -> UInt8[np.ndarray, "V S S 3"]:
     """Return pictures of ``cloud`` on white from ``views`` azimuths, the first from the front; all
     of it is in each.
     """
@@ -55,28 +45,15 @@ def turntable(
     centre = (points.min(axis=0) + points.max(axis=0)) / 2
     radius = float(np.linalg.norm(points - centre, axis=1).max()) or 1.0
     means = torch.from_numpy((points - centre) / radius)
-    scales = torch.from_numpy(np.float32(SIZE / radius) * nearest_distance_scales(points, "rms3"))[
-        :, None
-    ].expand(-1, 3)
+    scales = np.float32(SIZE / radius) * nearest_distance_scales(points, "rms3")
+    scales = torch.from_numpy(scales)[:, None].expand(-1, 3)
     quats = torch.tensor([1.0, 0.0, 0.0, 0.0]).expand(len(means), 4)
     azimuths = torch.arange(views) * (360.0 / views)
-    c2w = orbit_c2w(
-        torch.full_like(azimuths, ELEVATION),
-        azimuths,
-        torch.full_like(azimuths, MARGIN / math.sin(FOVY / 2)),
-    )
+    distance = torch.full_like(azimuths, MARGIN / math.sin(FOVY / 2))
+    c2w = orbit_c2w(torch.full_like(azimuths, ELEVATION), azimuths, distance)
     viewmats, Ks = to_opencv(c2w, torch.full_like(azimuths, FOVY), size, size)
-    inputs = (
-        means,
-        quats,
-        scales,
-        torch.full((len(means),), 0.95),
-        torch.from_numpy(np.asarray(cloud.colors, np.float32)),
-    )
-    pictures = [
-        rasterize(
-            *inputs, viewmats[i : i + 1], Ks[i : i + 1], size, size, background=torch.ones(3)
-        ).image
-        for i in range(views)
-    ]
+    colors = torch.from_numpy(np.asarray(cloud.colors, np.float32))
+    inputs = (means, quats, scales, torch.full((len(means),), 0.95), colors)
+    white, cameras = torch.ones(3), zip(viewmats.split(1), Ks.split(1), strict=True)
+    pictures = [rasterize(*inputs, *cam, size, size, background=white).image for cam in cameras]
     return (255 * torch.cat(pictures).clamp(0, 1)).round().to(torch.uint8).numpy()

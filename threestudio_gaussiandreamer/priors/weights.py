@@ -39,8 +39,7 @@ def read_state_dict(path: str, kind: str) -> dict[str, Tensor]:
     except pickle.UnpicklingError as error:
         raise UserError(
             f"{kind} {path!r} holds more than tensors, or is no file of PyTorch, and is not "
-            "unpickled, since that could run code:"
-            f" {str(error).strip().splitlines()[0][:200]}"
+            f"unpickled, since that could run code: {str(error).strip().splitlines()[0][:200]}"
         ) from error
     except Exception as error:  # torch raises various exceptions for damaged pickles
         raise UserError(
@@ -72,21 +71,15 @@ def load_exactly(module: nn.Module, state: Mapping[str, Tensor], what: str) -> N
         UserError: names are missing or unknown, or shapes differ; the message lists some of them.
     """
     own = module.state_dict()
-    missing, unknown = own.keys() - state.keys(), state.keys() - own.keys()
-    differing = [
-        f"{name} {tuple(state[name].shape)} for {tuple(own[name].shape)}"
-        for name in own.keys() & state.keys()
-        if state[name].shape != own[name].shape
-    ]
-    problems = [
-        f"{len(names)} {word} ({named(names)})"
-        for word, names in (
-            ("missing", missing),
-            ("unknown", unknown),
-            ("of another shape", differing),
-        )
-        if names
-    ]
+    shapes = {name: (state[name].shape, own[name].shape) for name in own.keys() & state.keys()}
+    found = {
+        "missing": own.keys() - state.keys(),
+        "unknown": state.keys() - own.keys(),
+        "of another shape": [
+            f"{name} {tuple(a)} for {tuple(b)}" for name, (a, b) in shapes.items() if a != b
+        ],
+    }
+    problems = [f"{len(names)} {word} ({named(names)})" for word, names in found.items() if names]
     if problems:
         raise UserError(f"{what} does not fit the model: names {', '.join(problems)}")
     module.load_state_dict(state)
@@ -95,6 +88,5 @@ def load_exactly(module: nn.Module, state: Mapping[str, Tensor], what: str) -> N
 def named(names: Iterable[str]) -> str:
     """Return the first few of ``names``, sorted."""
     names = sorted(names)
-    return ", ".join(names[:NAMED]) + (
-        f", and {len(names) - NAMED} more" if len(names) > NAMED else ""
-    )
+    more = f", and {len(names) - NAMED} more" if len(names) > NAMED else ""
+    return ", ".join(names[:NAMED]) + more

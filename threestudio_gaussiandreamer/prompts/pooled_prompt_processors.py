@@ -24,7 +24,7 @@ from ..host import register
 from ..models.families import STABLE_DIFFUSION_3 as SD3_FAMILY
 from ..models.families import STABLE_DIFFUSION_XL as SDXL_FAMILY
 from ..models.model_files import pipeline_settings
-from ..models.pooled_embeddings import encode_sd3, encode_sd3_without_t5, encode_sdxl
+from ..models.text_encoders import encode_sd3, encode_sd3_without_t5, encode_sdxl
 from .prompt_processors import TextEncoderPromptProcessor
 
 STABLE_DIFFUSION_XL = "stabilityai/stable-diffusion-xl-base-1.0"

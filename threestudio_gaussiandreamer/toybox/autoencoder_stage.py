@@ -17,12 +17,9 @@ from torch import Tensor, nn
 from ..cameras import Orbit
 from ..core.streams import numpy_generator
 from . import models
-from .batches import StepData, normal
-from .checkpoints import is_trained
-from .loop import Stage
-from .sheet import contact_sheet
+from .loop import Stage, StepData, is_trained, normal
 from .splat_shards import render_gaussians
-from .views import DISTANCE, FOVY_DEG, Shard, held_out_shard, with_backgrounds
+from .views import DISTANCE, FOVY_DEG, Shard, with_backgrounds
 
 RANDOM_BACKGROUNDS = 0.15
 SPLAT_SHARE = 0.2
@@ -48,20 +45,15 @@ class AutoencoderData(StepData):
     def make(self, index: int, rows: np.ndarray, rng: np.random.Generator) -> AutoencoderBatch:
         full = rng.random() < 1 / FULL_EVERY
         rows = rows[: max(1, len(rows) // 4)] if full else rows
-        images = self._images(self.shards.get(index), rows, rng)
-        images = images if full else F.avg_pool2d(images, 2)
-        side = images.shape[-1] // 8
-        return AutoencoderBatch(
-            images, normal(rng, (len(rows), models.LATENT_CHANNELS, side, side))
-        )
-
-    def _images(
-        self, shard: Shard, rows: np.ndarray, rng: np.random.Generator
-    ) -> Float[Tensor, "B 3 s s"]:
+        shard = self.shards.get(index)
         rgba = shard.rgba[rows]
         for place in np.flatnonzero(rng.uniform(size=len(rows)) < SPLAT_SHARE):
             rgba[place] = rough_render(shard, int(rows[place]), rng)
-        return with_backgrounds(rgba, rng, random_share=RANDOM_BACKGROUNDS)
+        images = with_backgrounds(rgba, rng, random_share=RANDOM_BACKGROUNDS)
+        images = images if full else F.avg_pool2d(images, 2)
+        side = images.shape[-1] // 8
+        noise = normal(rng, (len(rows), models.LATENT_CHANNELS, side, side))
+        return AutoencoderBatch(images, noise)
 
 
 class AutoencoderStage(Stage):
@@ -73,12 +65,11 @@ class AutoencoderStage(Stage):
     images = 200_000
 
     def build(self) -> nn.Module:
-        self.shards = self.options.shards()
         return models.autoencoder()
 
     def frozen(self) -> tuple[str, ...]:
         """Freeze the encoder once the U-Net is trained on its latents; the decoder may improve."""
-        trained = is_trained(self.options.folder, "unet-small", "unet")
+        trained = is_trained(self.options.folder, "unet")
         return ("encoder.", "quant_conv.") if trained else ()
 
     def data(self) -> AutoencoderData:
@@ -89,7 +80,8 @@ class AutoencoderStage(Stage):
         posterior = model.encode(images).latent_dist
         decoded = model.decode(posterior.mean + posterior.std * batch.noise).sample
         error = decoded - images
-        pixels, edges = error.abs().mean(), edge_error(decoded, images)
+        # errors of pixels, and of differences between neighbouring ones
+        pixels, edges = error.abs().mean(), sum(error.diff(dim=d).abs().mean() for d in (-1, -2))
         kl = posterior.kl().mean() / posterior.mean[0].numel()
         metrics = {"l1": pixels, "edges": edges, "kl": kl}
         loss = pixels + SQUARE_WEIGHT * error.square().mean() + EDGE_WEIGHT * edges
@@ -98,35 +90,19 @@ class AutoencoderStage(Stage):
     @functools.cached_property
     def held_out(self) -> Tensor:
         """Return pictures of withheld objects, and the first eight also as rough Gaussians."""
-        shard = held_out_shard(self.options.shards_folder(), self.options.seed)
+        shard = self.shards.held_out_shard()
         rng = numpy_generator(self.options.seed, "autoencoder-held-out")
-        rgba = np.concatenate(
-            [shard.rgba[:64], np.stack([rough_render(shard, row, rng) for row in range(8)])]
-        )
+        rough = np.stack([rough_render(shard, row, rng) for row in range(8)])
+        rgba = np.concatenate([shard.rgba[:64], rough])
         return with_backgrounds(rgba, rng, random_share=0).to(self.device)
 
     def evaluate(self, model: nn.Module) -> dict[str, float]:
-        errors = [
-            (reconstructed(model, part) - part).square().mean() for part in self.held_out.split(8)
-        ]
+        errors = []
+        for part in self.held_out.split(8):
+            mean = model.encode(part * 2 - 1).latent_dist.mean
+            decoded = (model.decode(mean).sample / 2 + 0.5).clamp(0, 1)
+            errors.append((decoded - part).square().mean())
         return {"psnr": float(-10 * torch.stack(errors).mean().log10())}
-
-    def sheet(self, model: nn.Module) -> np.ndarray:
-        shown = torch.cat([self.held_out[:60:6], self.held_out[-4:]])
-        return contact_sheet(torch.cat([shown, reconstructed(model, shown)]), columns=len(shown))
-
-
-def reconstructed(model: nn.Module, images: Float[Tensor, "B 3 s s"]) -> Float[Tensor, "B 3 s s"]:
-    """Encode and decode pictures in [0, 1], using the posterior's mean."""
-    return (model.decode(model.encode(images * 2 - 1).latent_dist.mean).sample / 2 + 0.5).clamp(
-        0, 1
-    )
-
-
-def edge_error(decoded: Float[Tensor, "B 3 s s"], images: Float[Tensor, "B 3 s s"]) -> Tensor:
-    """Return the mean absolute error of differences between neighbouring pixels."""
-    error = decoded - images
-    return error.diff(dim=-1).abs().mean() + error.diff(dim=-2).abs().mean()
 
 
 def rough_render(shard: Shard, row: int, rng: np.random.Generator) -> UInt8[np.ndarray, "s s 4"]:
@@ -143,7 +119,9 @@ def rough_render(shard: Shard, row: int, rng: np.random.Generator) -> UInt8[np.n
     return (rgba * 255).round().astype(np.uint8)
 
 
-def rough_gaussians(points: Float[np.ndarray, "P 6"], rng: np.random.Generator) -> list[Tensor]:
+def rough_gaussians(
+    points: Float[np.ndarray, "P 6"], rng: np.random.Generator
+) -> tuple[np.ndarray, ...]:
     """Make Gaussians of a random number, size, opacity and error of place and colour.
 
     Args:
@@ -160,5 +138,4 @@ def rough_gaussians(points: Float[np.ndarray, "P 6"], rng: np.random.Generator) 
     means = points[:, :3] + rng.normal(0, rng.uniform(0, 0.08), (count, 3))
     scales = rng.uniform(0.01, 0.06) * rng.uniform(0.6, 1.6, (count, 3))
     opacities = rng.uniform(0.1, 0.9) * rng.uniform(0.6, 1, count)
-    values = (means, rng.normal(size=(count, 4)), scales, opacities, colors)
-    return [torch.from_numpy(np.float32(value)) for value in values]
+    return means, rng.normal(size=(count, 4)), scales, opacities, colors

@@ -1,7 +1,16 @@
-"""Train CLIP's image encoder on the features of the trained text encoder, which stay fixed."""
+"""Train CLIP: first the text encoder, to recognise an object's attributes in its prompt, then the
+image encoder, on the features of the trained text encoder, which stay fixed ("locked" text, after
+Zhai et al. 2022).
+
+The U-Net and the points model are trained on the text encoder too. Prompts cost nothing to make and
+little to encode, so it sees far more of them than there are pictures, and small encoders learn to
+associate colours with parts from classifiers much earlier than from the contrastive loss.
+"""
 
 import functools
+import re
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -9,19 +18,119 @@ import torch
 import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor, nn
+from torch.utils.data import Dataset
 
 from ..core.checkpoint_file import entries_below
 from ..core.streams import numpy_generator
 from ..models.clip import MEAN, STD
-from . import models
-from .batches import StepData, moved
-from .checkpoints import averaged_weights
-from .classifiers import accuracies, classified
-from .loop import Stage
-from .module_digest import digest
-from .text_batches import label_tensor, open_tokenizer, token_ids, training_prompts, view_prompts
-from .text_stage import TEXT_PARTS, text_features, with_trained_text
-from .views import VIEWS, held_out_shard, with_backgrounds
+from . import models, words
+from .loop import Stage, StepData, averaged_weights, is_trained, moved
+from .models import IGNORED, accuracies, classified
+from .tokens import open_tokenizer, token_ids, training_prompts, view_prompts
+from .views import LABELS, VIEWS, label_row, random_angles, with_backgrounds
+from .world import draw_attributes
+
+HELD_OUT = 512
+NAMED_QUADRANT = re.compile("(front|back|backside|left side|right side) view")
+
+
+class TextBatch(NamedTuple):
+    ids: Int[Tensor, "B 32"]
+    labels: Int[Tensor, "B L"]
+    """IGNORED where the prompt doesn't tell the class."""
+
+
+@dataclass(frozen=True)
+class TextData(Dataset):
+    """Prompts of random objects, each from a random view; a batch is a function of (seed, step)."""
+
+    seed: int
+    batch: int
+    tokenizer: Any
+    held_out: bool = False
+    """Whether the objects are those withheld from training."""
+
+    def __getitem__(self, step: int) -> TextBatch:
+        start, texts, labels = step * self.batch, [], []
+        rng = numpy_generator(self.seed, "text-batch", start, int(self.held_out))
+        for index in range(start, start + self.batch):
+            attributes = draw_attributes(self.seed, index, held_out=self.held_out)
+            elevation, azimuth = random_angles(rng)
+            text = words.prompt_of(attributes, elevation, azimuth, rng)
+            texts.append(text or words.describe(attributes, rng))
+            labels.append(label_row(attributes, azimuth))
+            if not NAMED_QUADRANT.search(texts[-1]):
+                labels[-1][list(LABELS).index("quadrant")] = IGNORED
+        return TextBatch(token_ids(self.tokenizer, texts), torch.from_numpy(np.stack(labels)))
+
+
+class TextStage(Stage):
+    """Minimise the cross entropy of linear classifiers on CLIP's text features.
+
+    The classifiers are dropped afterwards.
+    """
+
+    name = "text"
+    batch_size = 128
+    learning_rate = 1e-3
+    images = 200_000
+
+    def build(self) -> nn.Module:
+        self.tokenizer = open_tokenizer(self.options.folder)
+        clip = models.clip_model(len(self.tokenizer))
+        parts = {name: getattr(clip, name) for name in TEXT_PARTS}
+        return nn.ModuleDict({**parts, "heads": models.AttributeHeads(models.FEATURES)})
+
+    def frozen(self) -> tuple[str, ...]:
+        """Freeze the encoder once other networks are trained on it."""
+        trained = is_trained(self.options.folder, "clip", "unet", "points")
+        return TEXT_PARTS if trained else ()
+
+    def data(self) -> TextData:
+        return TextData(self.options.seed, self.batch, self.tokenizer)
+
+    def loss(self, model: nn.Module, batch: TextBatch) -> tuple[Tensor, dict[str, Tensor]]:
+        loss, right = classified(self._logits(model, batch.ids), batch.labels)
+        return loss, {"right": right}
+
+    def _logits(self, model: nn.Module, ids: Tensor) -> dict[str, Tensor]:
+        features = text_features(model["text_model"], model["text_projection"], ids)
+        return model["heads"](features * features.shape[-1] ** 0.5)
+
+    @functools.cached_property
+    def held_out(self) -> TextBatch:
+        """Return prompts of withheld combinations, which no training saw."""
+        data = TextData(self.options.seed, HELD_OUT, self.tokenizer, held_out=True)
+        return moved(data[0], self.device)
+
+    def evaluate(self, model: nn.Module) -> dict[str, float]:
+        return accuracies(self._logits(model, self.held_out.ids), self.held_out.labels)
+
+
+TEXT_PARTS = ("text_model", "text_projection")
+
+
+def text_features(
+    text_model: nn.Module, projection: nn.Module, ids: Int[Tensor, "B 32"]
+) -> Float[Tensor, "B D"]:
+    """Return the unit features of texts."""
+    return F.normalize(projection(text_model(input_ids=ids).pooler_output).float(), dim=-1)
+
+
+def trained_clip(folder: Path, vocabulary_size: int, stage: str) -> Any:
+    """Return a CLIPModel with a stage's averaged weights, without gradients; after "text" its image
+    encoder is random.
+
+    Raises:
+        UserError: the stage isn't trained.
+    """
+    clip, weights = models.clip_model(vocabulary_size), averaged_weights(folder, stage)
+    whole = stage == ClipStage.name
+    clip.load_state_dict(entries_below(weights, "clip.") if whole else weights, strict=whole)
+    return clip.eval().requires_grad_(False)
+
+
+# Pictures -------------------------------------------------------------------------------------
 
 RANDOM_BACKGROUNDS = 0.3
 LARGEST_SCALE = 100.0
@@ -48,7 +157,7 @@ class ClipData(StepData):
         return ClipBatch(
             clip_pixels(images),
             token_ids(self.tokenizer, texts),
-            label_tensor(shard, rows),
+            torch.from_numpy(shard.labels[rows]),
             torch.tensor([bool(text) for text in texts]),
         )
 
@@ -66,26 +175,23 @@ class ClipStage(Stage):
 
     def build(self) -> nn.Module:
         self.tokenizer = open_tokenizer(self.options.folder)
-        self.shards = self.options.shards()
-        clip = with_trained_text(models.clip_model(len(self.tokenizer)), self.options.folder)
-        self.text_digest = digest(clip.text_model)
+        clip = trained_clip(self.options.folder, len(self.tokenizer), "text")
         heads = models.AttributeHeads(models.FEATURES)
-        return nn.ModuleDict({"clip": clip, "image_heads": heads})
+        return nn.ModuleDict({"clip": clip, "image_heads": heads}).train().requires_grad_(True)
 
     def frozen(self) -> tuple[str, ...]:
         return tuple(f"clip.{name}" for name in TEXT_PARTS)
-
-    def depends(self) -> dict[str, str]:
-        return {"text": self.text_digest}
 
     def data(self) -> ClipData:
         return ClipData(self.shards, self.batch, self.options.pool, self.tokenizer)
 
     def loss(self, model: nn.Module, batch: ClipBatch) -> tuple[Tensor, dict[str, Tensor]]:
         text, image = clip_features(model["clip"], batch.ids, batch.pixels)
-        contrast = contrastive(
-            text[batch.has_text], image[batch.has_text], model["clip"].logit_scale
-        )
+        told = batch.has_text
+        scale = model["clip"].logit_scale.exp().clamp(max=LARGEST_SCALE)
+        matches = scale * text[told] @ image[told].T
+        target = torch.arange(len(matches), device=text.device)
+        contrast = (F.cross_entropy(matches, target) + F.cross_entropy(matches.T, target)) / 2
         logits = model["image_heads"](image * text.shape[-1] ** 0.5)
         loss, right = classified(logits, batch.labels)
         return contrast + loss, {"contrast": contrast, "right": right}
@@ -93,13 +199,13 @@ class ClipStage(Stage):
     @functools.cached_property
     def held_out(self) -> ClipBatch:
         """Return withheld objects with prompts that name the direction."""
-        shard = held_out_shard(self.options.shards_folder(), self.options.seed)
+        shard = self.shards.held_out_shard()
         rows = np.arange(len(shard.rgba))
         rng = numpy_generator(self.options.seed, "clip-held-out")
         ids = token_ids(self.tokenizer, view_prompts(shard, rows, rng))
         pixels = clip_pixels(with_backgrounds(shard.rgba, rng, random_share=0))
-        has_text = torch.ones(len(rows), dtype=torch.bool)
-        return moved(ClipBatch(pixels, ids, label_tensor(shard, rows), has_text), self.device)
+        labels, has_text = torch.from_numpy(shard.labels), torch.ones(len(rows), dtype=torch.bool)
+        return moved(ClipBatch(pixels, ids, labels, has_text), self.device)
 
     def evaluate(self, model: nn.Module) -> dict[str, float]:
         batch = self.held_out
@@ -122,23 +228,3 @@ def clip_features(
     image = clip.visual_projection(clip.vision_model(pixel_values=pixels).pooler_output)
     text = text_features(clip.text_model, clip.text_projection, ids)
     return text, F.normalize(image.float(), dim=-1)
-
-
-def contrastive(
-    text: Float[Tensor, "B D"], image: Float[Tensor, "B D"], log_scale: Tensor
-) -> Tensor:
-    """Return the mean cross entropy of matching texts and pictures within the batch."""
-    logits = log_scale.exp().clamp(max=LARGEST_SCALE) * text @ image.T
-    target = torch.arange(len(text), device=text.device)
-    return (F.cross_entropy(logits, target) + F.cross_entropy(logits.T, target)) / 2
-
-
-def trained_clip(folder: Any, vocabulary_size: int) -> Any:
-    """Load the trained CLIP's averaged weights, without gradients.
-
-    Raises:
-        UserError: it isn't trained.
-    """
-    clip = models.clip_model(vocabulary_size)
-    clip.load_state_dict(entries_below(averaged_weights(folder, "clip"), "clip."))
-    return clip.eval().requires_grad_(False)

@@ -6,7 +6,6 @@ recognises into a new folder of ``outputs/demo``. After Ctrl-C the same command 
 """
 
 import argparse
-import contextlib
 import functools
 import math
 import re
@@ -14,30 +13,33 @@ import subprocess
 import sys
 import textwrap
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from datetime import datetime
 from pathlib import Path
-from typing import Any, NamedTuple, Optional
+from typing import Any, Optional
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from .. import register_parts
+from ..cameras import Orbit
 from ..core import images
 from ..core.command import run_command
 from ..core.errors import Terminated, UserError
 from ..core.files import atomic_file, json_text, output_folder
 from ..core.signals import interrupt, raised_signals
+from ..core.streams import generator
+from ..diffusion import sds
 from ..evaluation.asset_metrics import Asset, rendered
 from ..evaluation.text_to_3d import ATTRIBUTES, Scores, prior_of, result_of
+from ..host import find
 from ..launch.folder_lock import RunFolder, claim, claim_new
 from ..models.bundled import NAME, is_export
 from ..view.run_files import read_json
 from . import recognition
-from .samples import samples
-from .sheet import contact_sheet
 from .views import BACKGROUND, SIZE
+from .world_sheet import contact_sheet
 
 PROMPTS = (
     "a red fox with a green scarf",
@@ -47,21 +49,16 @@ PROMPTS = (
 """The last is of a combination that the models were not trained on."""
 SHOWN = [1, 3, 5]
 """Which of the judge's views the sheet has: from the front, the left and the back."""
-GUIDANCE = 3.0
-"""Guidance scale of the 2D model's own pictures."""
-RECORD, SECONDS, SHEET, TABLE = "demo.json", "seconds.json", "sheet.png", "table.md"
+GUIDANCE, SAMPLE_STEPS = 3.0, 25
+"""Guidance scale and steps of the 2D model's own pictures."""
+RECORD, SHEET, TABLE = "demo.json", "sheet.png", "table.md"
 STAGES = ("prior", "result", "2D model")
-NAME_LENGTH = 40
-"""Of a prompt in the name of its folder, characters."""
-TABLE_LENGTH = 60
-"""Of a prompt in the table, characters."""
+NAME_LENGTH, TABLE_LENGTH = 40, 60
+"""Of a prompt in the name of its folder and in the table, characters."""
 
 
-class Stages(NamedTuple):
-    """Pictures and scores of one prompt, by stage."""
-
-    pictures: dict[str, Float[Tensor, "V 3 s s"]]
-    scores: dict[str, dict[str, float]]
+Stages = dict[str, tuple[Float[Tensor, "V 3 s s"], dict[str, float]]]
+"""Pictures and scores of one prompt, by stage."""
 
 
 def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
@@ -94,7 +91,10 @@ def run(args: argparse.Namespace) -> None:
         SystemExit: the launcher has failed, and said why.
     """
     for prompt in args.prompts:
-        require_text(prompt)
+        if not prompt.strip():
+            raise UserError(f'a prompt is empty: give one such as "{PROMPTS[0]}"')
+        if prompt.encode(errors="replace").decode() != prompt:
+            raise UserError(f"the prompt {prompt!r} isn't valid UTF-8")
     if args.models != NAME and not is_export(Path(args.models).expanduser()):
         raise UserError(f"--models {args.models}: expected {NAME}, or a folder of toybox.export")
     root = output_folder(args.output, "--output")
@@ -106,16 +106,6 @@ def run(args: argparse.Namespace) -> None:
         write_results(claimed.path, args, runs)
     finally:
         claimed.release()
-
-
-def require_text(prompt: str) -> None:
-    """Raise UserError for a prompt that is empty or can't be encoded."""
-    if not prompt.strip():
-        raise UserError(f'a prompt is empty: give one such as "{PROMPTS[0]}"')
-    try:
-        prompt.encode()
-    except UnicodeEncodeError as error:
-        raise UserError(f"the prompt {prompt!r} isn't valid UTF-8") from error
 
 
 def open_folder(root: Path, record: dict[str, Any]) -> RunFolder:
@@ -140,14 +130,17 @@ def open_folder(root: Path, record: dict[str, Any]) -> RunFolder:
 def train(folder: Path, index: int, args: argparse.Namespace) -> Path:
     """Train one prompt unless that is done; return the folder of its run."""
     prompt, text = args.prompts[index], folder / f"prompt{index + 1}.txt"
-    place = folder / "runs" / name_of(index, prompt)
-    if (place / SECONDS).is_file():
+    words = re.sub(r"[^a-z0-9]+", "_", prompt.lower())[:NAME_LENGTH]
+    place = folder / "runs" / f"prompt{index + 1}_{words}"
+    record = read_json(place.with_suffix(".json"), dict)
+    if record.get("finished"):
         return place
     with atomic_file(text, durable=False) as file:
         file.write(prompt.encode())
     print(f"\n{index + 1}/{len(args.prompts)}: {prompt}", flush=True)
-    spent = text.with_suffix(".json")
-    with timed(spent):
+    place.parent.mkdir(exist_ok=True)
+    start, finished = time.monotonic(), False
+    try:
         launch([
             f"exp_root_dir={folder}",
             "name=runs",
@@ -158,26 +151,12 @@ def train(folder: Path, index: int, args: argparse.Namespace) -> Path:
             f"system.guidance.pretrained_model_name_or_path={args.models}",
             *args.options,
         ])  # fmt: skip
-    with atomic_file(place / SECONDS) as file:
-        file.write(spent.read_bytes())
-    return place
-
-
-@contextlib.contextmanager
-def timed(path: Path) -> Iterator[None]:
-    """Add the seconds of this block to those that are in a file."""
-    start, earlier = time.monotonic(), read_json(path, dict).get("seconds", 0.0)
-    try:
-        yield
+        finished = True
     finally:
-        with atomic_file(path, durable=False) as file:
-            seconds = round(earlier + time.monotonic() - start, 1)
-            file.write(json_text({"seconds": seconds}).encode())
-
-
-def name_of(index: int, prompt: str) -> str:
-    """Return the name of a prompt's folder: its number and its first words."""
-    return f"prompt{index + 1}_" + re.sub(r"[^a-z0-9]+", "_", prompt.lower())[:NAME_LENGTH]
+        seconds = round(record.get("seconds", 0.0) + time.monotonic() - start, 1)
+        with atomic_file(place.with_suffix(".json")) as file:
+            file.write(json_text({"seconds": seconds, "finished": finished}).encode())
+    return place
 
 
 def launch(options: list[str]) -> None:
@@ -210,11 +189,8 @@ def launch(options: list[str]) -> None:
 
 def write_results(folder: Path, args: argparse.Namespace, runs: list[Path]) -> None:
     """Write the table and the contact sheet, and print where everything is."""
-    scores = Scores(args.models)
-    stages = [
-        stages_of(prompt, place, args.models, scores)
-        for prompt, place in zip(args.prompts, runs, strict=True)
-    ]
+    scores, pairs = Scores(args.models), zip(args.prompts, runs, strict=True)
+    stages = [stages_of(prompt, place, args.models, scores) for prompt, place in pairs]
     text = table(args.prompts, runs, stages)
     with atomic_file(folder / TABLE) as file:
         file.write(f"{text}\n".encode())
@@ -228,12 +204,9 @@ def stages_of(prompt: str, place: Path, models: str, scores: Scores) -> Stages:
     """Draw and score the prior, the result and the 2D model's own samples."""
     result = result_of(place, prompt)
     assets = {"prior": prior_of(place, result), "result": result}
-    pictures = {name: shown(asset) for name, asset in assets.items()}
-    found = {name: scores.of_asset(asset) for name, asset in assets.items()}
+    found = {name: (shown(asset), scores.of_asset(asset)) for name, asset in assets.items()}
     own = samples(models, prompt, recognition.views(), guidance_scale=GUIDANCE)
-    found["2D model"] = scores.of_pictures(own, prompt)
-    pictures["2D model"] = own[SHOWN]
-    return Stages(pictures, found)
+    return found | {"2D model": (own[SHOWN], scores.of_pictures(own, prompt))}
 
 
 def shown(asset: Asset) -> Float[Tensor, "V 3 s s"]:
@@ -242,16 +215,47 @@ def shown(asset: Asset) -> Float[Tensor, "V 3 s s"]:
     return torch.from_numpy(pictures).movedim(-1, 1)
 
 
+@torch.no_grad()
+def samples(
+    model: str, prompt: str, orbit: Orbit, *, guidance_scale: float, seed: int = 0
+) -> Float[Tensor, "V 3 s s"]:
+    """Draw a picture in [0, 1] with the 2D model itself for the direction of each view, by DDIM;
+    prompts name left and right. So is what the score distillation is guided towards, without a
+    contrast of views.
+
+    Args:
+        model: ``toybox``, a folder or a hub id.
+        guidance_scale: of classifier-free guidance; 1 is none.
+        seed: of the noise.
+    """
+    named = {"pretrained_model_name_or_path": model}
+    texts = {"prompt": prompt, "negative_prompt": "", "view_dependent_left_and_right": True}
+    processor = find("gaussiandreamer-stable-diffusion-prompt-processor")
+    prompts = processor({**named, **texts, "use_cache": False})
+    guidance = find("gaussiandreamer-stable-diffusion-guidance")(
+        {**named, "guidance_scale": guidance_scale}
+    )
+    condition = guidance.condition(
+        prompts(), elevation=orbit.elevation, azimuth=orbit.azimuth, camera_distances=orbit.distance
+    )
+    side = guidance.image_size // 2 ** (len(guidance.vae.config.block_out_channels) - 1)
+    shape = (len(orbit.azimuth), guidance.vae.config.latent_channels, side, side)
+    noise = torch.randn(shape, generator=generator(seed, "toybox-samples")).to(guidance.device)
+    abar = guidance.alphas_cumprod.to(guidance.device)
+    t = torch.full((len(noise),), len(abar) - 1, device=guidance.device)
+    latents = sds.ddim_sample(
+        lambda z, t: guidance.predict_noise(z, t, condition), noise, t, abar, steps=SAMPLE_STEPS
+    )
+    return guidance.decode(latents).cpu()
+
+
 def sheet(prompts: Sequence[str], stages: Sequence[Stages]) -> Any:
     """Arrange a row of pictures for each prompt: three of each stage."""
-    pictures = [each.pictures[name] for each in stages for name in STAGES]
-    texts = [
-        f"{name}: {prompt}" if view == 0 else ""
-        for prompt in prompts
-        for name in STAGES
-        for view in range(len(SHOWN))
-    ]
-    return contact_sheet(torch.cat(pictures), texts, columns=len(STAGES) * len(SHOWN))
+    pictures = [each[name][0] for each in stages for name in STAGES]
+    count = len(SHOWN)
+    named = [[f"{name}: {prompt}", *[""] * (count - 1)] for prompt in prompts for name in STAGES]
+    texts = [text for three in named for text in three]
+    return contact_sheet(torch.cat(pictures), texts, columns=len(STAGES) * count)
 
 
 def table(prompts: Sequence[str], runs: Sequence[Path], stages: Sequence[Stages]) -> str:
@@ -259,19 +263,16 @@ def table(prompts: Sequence[str], runs: Sequence[Path], stages: Sequence[Stages]
     head = ("prompt", "", *ATTRIBUTES, "multi-face", "seconds")
     lines = [head, ("---",) * len(head)]
     for prompt, place, each in zip(prompts, runs, stages, strict=True):
-        seconds = read_json(place / SECONDS, dict).get("seconds", math.nan)
+        seconds = read_json(place.with_suffix(".json"), dict).get("seconds", math.nan)
         for name in STAGES:
-            cells = [answer(each.scores[name].get(key, math.nan)) for key in ATTRIBUTES]
-            rate = each.scores[name].get("multi_face", math.nan)
+            scores = each[name][1]
+            found = [scores.get(key, math.nan) for key in ATTRIBUTES]
+            cells = ["" if math.isnan(value) else "yes" if value else "no" for value in found]
+            rate = scores.get("multi_face", math.nan)
             took = f"{seconds:.0f}" if name == "result" else ""
             text = textwrap.shorten(prompt, TABLE_LENGTH, placeholder=" ...").replace("|", "\\|")
             lines.append((text, name, *cells, "" if math.isnan(rate) else f"{rate:.0%}", took))
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
-
-
-def answer(value: float) -> str:
-    """Return yes or no; empty for an attribute that isn't defined for the prompt."""
-    return "" if math.isnan(value) else "yes" if value else "no"
 
 
 main = functools.partial(run_command, parse, run)

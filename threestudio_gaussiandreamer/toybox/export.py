@@ -28,13 +28,11 @@ from ..core.errors import UserError
 from ..core.files import atomic_file, output_folder
 from ..models.bundled import write_digests
 from . import models
-from .checkpoints import averaged_weights, checkpoint_path, is_trained
 from .clip_stage import trained_clip
-from .text_batches import open_tokenizer
-from .tokenizer import copy_tokenizer
+from .loop import averaged_weights, checkpoint_path, is_trained
+from .tokens import copy_tokenizer, open_tokenizer
+from .train import STAGES
 from .unet_stage import LATENT_SCALE, frozen_autoencoder
-
-STAGES = ("text", "clip", "autoencoder", "unet", "points", "judge")
 
 
 def export(training: Path, target: Path) -> dict[str, Any]:
@@ -49,13 +47,13 @@ def export(training: Path, target: Path) -> dict[str, Any]:
         UserError: a stage isn't trained yet, or the disk is full.
     """
     tokenizer = open_tokenizer(training)
-    clip = trained_clip(training, len(tokenizer))
-    write_clip(target / "clip", clip, training / "tokenizer")
+    clip = trained_clip(training, len(tokenizer), "clip")
     write_stable_diffusion(target / "stable-diffusion", training, clip)
-    if is_trained(training, "points"):
-        write_weights(target / "points.safetensors", averaged_weights(training, "points"))
-    if is_trained(training, "judge"):
-        write_weights(target / "judge.safetensors", averaged_weights(training, "judge"))
+    _save(clip, target / "clip")
+    copy_tokenizer(training / "tokenizer", target / "clip")
+    for name in ("points", "judge"):
+        if is_trained(training, name):
+            write_weights(target / f"{name}.safetensors", averaged_weights(training, name))
     record = training_record(training)
     with atomic_file(target / "training.json") as file:
         file.write(json.dumps(record, indent=2).encode())
@@ -63,18 +61,13 @@ def export(training: Path, target: Path) -> dict[str, Any]:
     return record
 
 
-def write_clip(folder: Path, clip: Any, tokenizer: Path) -> None:
-    """Write a whole CLIP with its tokenizer."""
-    _save(clip, folder)
-    copy_tokenizer(tokenizer, folder)
-
-
 def write_stable_diffusion(folder: Path, training: Path, clip: Any) -> None:
     """Write a Stable Diffusion pipeline's folder."""
     from transformers import CLIPTextModel
 
     text_encoder = CLIPTextModel(clip.config.text_config)
-    text_encoder.load_state_dict(_for(text_encoder, clip.text_model.state_dict()))
+    # whose names have a prefix or none, by the version of transformers
+    getattr(text_encoder, "text_model", text_encoder).load_state_dict(clip.text_model.state_dict())
     vae, unet = frozen_autoencoder(training), models.unet()
     content = load_file(checkpoint_path(training, "unet"))
     unet.load_state_dict(averaged_weights(training, "unet"))
@@ -114,40 +107,20 @@ def training_record(training: Path) -> dict[str, Any]:
     for name in STAGES:
         if is_trained(training, name):
             content = load_file(checkpoint_path(training, name))
+            hours = round(content["seconds"] / 3600, 3)
+            own = [{"device": content["device"], "hours": hours}] if hours else []
             record[name] = {
                 "images": content["images"],
                 "steps": content["step"],
-                "trainings": trainings(content),
+                "trainings": content["earlier"] + own,
                 "last": content["history"][-1] if content["history"] else {},
                 "withheld": content["measured"],
             }
     return record
 
 
-def trainings(content: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return device and hours of a checkpoint's training, after those that it started from."""
-    hours = round(content["seconds"] / 3600, 3)
-    own = [{"device": content.get("device", "cpu"), "hours": hours}] if hours else []
-    return content.get("earlier", []) + own
-
-
 def _save(network: Any, folder: Path) -> None:
-    from safetensors import SafetensorError
-
-    try:
-        network.half().save_pretrained(str(folder), safe_serialization=True)
-    except (OSError, SafetensorError) as error:  # the latter if the disk is full
-        reason = getattr(error, "strerror", None) or error
-        raise UserError(f"cannot write {str(folder)!r}: {reason}") from error
-    finally:
-        network.float()
-
-
-def _for(network: Any, weights: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Rename weights of a text tower for a model with or without its prefix."""
-    prefix = "text_model."
-    prefixed = any(name.startswith(prefix) for name in network.state_dict())
-    return {(prefix if prefixed else "") + name: value for name, value in weights.items()}
+    network.half().save_pretrained(str(folder), safe_serialization=True)
 
 
 def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
@@ -162,11 +135,14 @@ def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
 
 def run(args: argparse.Namespace) -> None:
     """Write the models, and print their size."""
+    from safetensors import SafetensorError
+
     target = output_folder(args.target, "TARGET")
     try:
         record = export(args.training, target)
-    except OSError as error:
-        raise UserError(f"cannot write {str(target)!r}: {error.strerror or error}") from error
+    except (OSError, SafetensorError) as error:  # the latter if the disk is full
+        reason = getattr(error, "strerror", None) or error
+        raise UserError(f"cannot write {str(target)!r}: {reason}") from error
     size = sum(path.stat().st_size for path in target.rglob("*") if path.is_file())
     print(f"{target}: {', '.join(record)}, {size / 1e6:.1f} MB")
 

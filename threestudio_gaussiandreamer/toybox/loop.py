@@ -1,17 +1,17 @@
 """The training loop of all networks of the toybox.
 
 It saves checkpoints from which it can be resumed, keeps an exponential moving average of the
-weights, and writes loss curves and contact sheets of samples.
+weights, and writes loss curves.
 
 All random draws are functions of (seed, stage, step), so a resumed training gives the same result
 as an uninterrupted one.
 """
 
-import logging
+import itertools
 import math
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Optional
@@ -20,16 +20,14 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel
-from torch.utils.data import Dataset
+from torch.utils.data import DataLoader, Dataset
 
-from ..core.checkpoint_file import save_file
+from ..core.checkpoint_file import entries_below, load_file, save_file
 from ..core.errors import UserError
-from ..core.images import write as write_picture
+from ..core.files import atomic_file
 from ..core.signals import restore_handlers, set_handlers
-from .batches import batches
-from .checkpoints import checkpoint_path, read_checkpoint
-from .curves import write_curves
-from .views import Shards
+from ..core.streams import numpy_generator
+from .views import Shards, row_batch
 
 EMA_DECAY = 0.999
 WARMUP, DECAY_SHARE = 200, 0.3
@@ -37,7 +35,101 @@ WARMUP, DECAY_SHARE = 200, 0.3
 it decreases linearly to zero.
 """
 CLIP_GRADIENT = 1.0
-log = logging.getLogger(__name__)
+LOG_EVERY, SAVE_SECONDS = 50, 300.0
+
+
+# Batches --------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class StepData(Dataset, ABC):
+    """The batches of one stage, indexed by step.
+
+    Objects are sent to worker processes, so they hold no networks.
+    """
+
+    shards: Shards
+    batch: int
+    pool: int
+    """Number of shards that are visited cyclically."""
+    stream: ClassVar[str]
+    """Name of the streams of random numbers."""
+    per_object: ClassVar[bool] = False
+    """Whether rows are objects instead of pictures."""
+
+    def __getitem__(self, step: int) -> Any:
+        """Return the batch of ``step``: a tensor, or a named tuple of tensors and numbers, on the
+        CPU.
+        """
+        stream, per_object = f"{self.stream}-rows", self.per_object
+        place = row_batch(self.shards, stream, self.batch, self.pool, step, per_object=per_object)
+        return self.make(*place, numpy_generator(self.shards.seed, f"{self.stream}-batch", step))
+
+    @abstractmethod
+    def make(self, index: int, rows: np.ndarray, rng: np.random.Generator) -> Any:
+        """Make the batch of these rows of shard ``index``."""
+
+
+@dataclass(frozen=True)
+class MixedData(Dataset):
+    """One batch in ``every`` of ``first``, the others of ``second``; each gives its batches in its
+    own order, without gaps.
+    """
+
+    first: StepData
+    second: StepData
+    every: int
+
+    def __getitem__(self, step: int) -> Any:
+        cycle, place = divmod(step, self.every)
+        return self.second[cycle * (self.every - 1) + place - 1] if place else self.first[cycle]
+
+
+def moved(batch: Any, device: torch.device) -> Any:
+    """Return a tensor, or a named tuple of tensors and numbers, on ``device``."""
+    if isinstance(batch, torch.Tensor):
+        return batch.to(device, non_blocking=True)
+    if isinstance(batch, tuple):
+        return type(batch)(*(moved(value, device) for value in batch))
+    return batch
+
+
+def torch_generator(rng: np.random.Generator) -> torch.Generator:
+    """Return a torch generator that is seeded by the next number of ``rng``."""
+    return torch.Generator().manual_seed(int(rng.integers(2**63)))
+
+
+def normal(rng: np.random.Generator, shape: Sequence[int]) -> torch.Tensor:
+    """Draw standard normal numbers, float32."""
+    return torch.from_numpy(rng.standard_normal(tuple(shape), dtype=np.float32))
+
+
+# Checkpoints ----------------------------------------------------------------------------------
+
+
+def checkpoint_path(folder: Path, name: str) -> Path:
+    """Return the path of a stage's checkpoint."""
+    return Path(folder) / f"{name}.pt"
+
+
+def is_trained(folder: Path, *names: str) -> bool:
+    """Return whether there is a checkpoint of any of these stages."""
+    return any(checkpoint_path(folder, name).exists() for name in names)
+
+
+def averaged_weights(folder: Path, name: str) -> dict[str, Tensor]:
+    """Read the averaged weights of a stage's checkpoint.
+
+    Raises:
+        UserError: the stage isn't trained yet, or its file is damaged.
+    """
+    path = checkpoint_path(folder, name)
+    if not path.exists():
+        raise UserError(f"{path} is missing: train the stage {name!r} first")
+    return entries_below(load_file(path)["ema"], "module.")
+
+
+# Training -------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -45,7 +137,7 @@ class Options:
     """The options of a training."""
 
     folder: Path
-    """The folder for shards, checkpoints, curves and sheets."""
+    """The folder for shards, checkpoints and curves."""
     seed: int = 0
     device: str = "cpu"
     pool: int = 40
@@ -53,8 +145,6 @@ class Options:
     shard_objects: int = 256
     precision: str = "float32"
     """Either "float32", or "bfloat16" for autocast on GPUs and on CPUs that multiply it."""
-    save_seconds: float = 300.0
-    sheet_seconds: float = 1200.0
     only: str = ""
     """Substring of the names of the parameters to train; the others stay fixed."""
     rate: Optional[float] = None
@@ -64,13 +154,10 @@ class Options:
     workers: int = 0
     """Number of processes that make batches in advance."""
 
-    def shards_folder(self) -> Path:
-        return self.folder / "shards"
-
-    def shards(self, seed: Optional[int] = None) -> Shards:
-        """Return the shards of a seed; None for that of the training."""
-        seed = self.seed if seed is None else seed
-        return Shards(self.shards_folder(), seed, objects=self.shard_objects)
+    @property
+    def shards(self) -> Shards:
+        """The shards of the training."""
+        return Shards(self.folder / "shards", self.seed, objects=self.shard_objects)
 
 
 class Stage(ABC):
@@ -89,6 +176,7 @@ class Stage(ABC):
         self.rate = options.rate or self.learning_rate
         self.constants: dict[str, float] = {}
         """Constants that are needed to use the trained network; stored in the checkpoint."""
+        self.shards = options.shards
         torch.manual_seed(options.seed)
         self.model = self.build().to(self.device)
 
@@ -102,7 +190,17 @@ class Stage(ABC):
 
     def batches(self, step: int) -> Iterator[Any]:
         """Yield the batches from ``step`` on, on the stage's device."""
-        return batches(self.data(), step, self.device, self.options.workers)
+        workers = self.options.workers
+        loader = DataLoader(
+            self.data(),
+            batch_size=None,
+            sampler=itertools.count(step),  # type: ignore[arg-type]
+            num_workers=workers,
+            prefetch_factor=4 if workers else None,
+            pin_memory=self.device.type == "cuda",
+            multiprocessing_context="spawn" if workers else None,
+        )
+        return (moved(batch, self.device) for batch in loader)
 
     @abstractmethod
     def loss(self, model: nn.Module, batch: Any) -> tuple[Tensor, dict[str, Tensor]]:
@@ -118,14 +216,6 @@ class Stage(ABC):
         """Measure the model on objects that are withheld from training."""
         return {}
 
-    def sheet(self, model: nn.Module) -> Optional[np.ndarray]:
-        """Return a picture of the model's outputs, uint8 (H, W, 3); None if there is none."""
-        return None
-
-    def depends(self) -> dict[str, str]:
-        """Return fingerprints of the frozen networks that this one is trained with."""
-        return {}
-
 
 @dataclass
 class Progress:
@@ -138,17 +228,12 @@ class Progress:
     """One entry for each :data:`LOG_EVERY` steps: the means of the metrics."""
 
 
-LOG_EVERY = 50
-SAVED = "model", "ema", "optimizer", "depends", "constants", "measured"
-"""Entries of a checkpoint beside those of Progress that a resumed training needs."""
-
-
 class Training:
     """Train one stage up to a number of images, resuming from its checkpoint if there is one."""
 
     def __init__(self, stage: Stage) -> None:
-        self.stage = stage
-        self.model = stage.model
+        self.stage, self.model = stage, stage.model
+        self.path = checkpoint_path(stage.options.folder, stage.name)
         self.ema = AveragedModel(self.model, multi_avg_fn=_average, use_buffers=False)
         self.optimizer = torch.optim.AdamW(
             self.model.parameters(), lr=stage.rate, betas=(0.9, 0.99), weight_decay=0.01
@@ -161,18 +246,12 @@ class Training:
         self.signum = 0
         if self.path.exists():
             self._resume()
-        self.logged = self.progress.images, self.progress.seconds
-        """Images and seconds at the last log."""
         self._freeze()
 
     @property
     def done(self) -> float:
         """Fraction of the training that is done, by images or by seconds."""
         return max(self.progress.images / self.target, self.progress.seconds / self.limit)
-
-    @property
-    def path(self) -> Path:
-        return checkpoint_path(self.stage.options.folder, self.stage.name)
 
     def run(self, images: Optional[int] = None, seconds: float = math.inf) -> Progress:
         """Train until ``images`` (default: the stage's number) have been seen or ``seconds`` of
@@ -181,34 +260,28 @@ class Training:
         """
         self.target, self.limit = images or self.stage.images, seconds
         earlier = set_handlers(self._on_signal)
+        saved = logged = started = time.monotonic()
+        progress, metrics = self.progress, []
         try:
-            self._loop()
+            for batch in self.stage.batches(progress.step):
+                if self.done >= 1 or self.signum:
+                    break
+                metrics.append(self.train_step(batch))
+                now = time.monotonic()
+                progress.seconds += now - started
+                started = now
+                if len(metrics) == LOG_EVERY:
+                    self._log(metrics, now - logged)
+                    logged, metrics = now, []
+                if now - saved > SAVE_SECONDS:
+                    saved = now
+                    self.save()
+            self.save()  # before the measurement, which takes memory of its own
+            self._measure()
+            self.save()
         finally:
             restore_handlers(earlier)
-        return self.progress
-
-    def _loop(self) -> None:
-        progress, sums = self.progress, _Sums()
-        batches = self.stage.batches(progress.step)
-        saved = shown = started = time.monotonic()
-        for batch in batches:
-            if self.done >= 1 or self.signum:
-                break
-            metrics = self.train_step(batch)
-            now = time.monotonic()
-            progress.seconds += now - started
-            started = now
-            if sums.add(metrics) == LOG_EVERY:
-                self._log(sums.mean())
-            if now - shown > self.stage.options.sheet_seconds:
-                shown = now
-                self._show()
-            if now - saved > self.stage.options.save_seconds:
-                saved = now
-                self.save()
-        self.save()  # before the sheet, which may fail
-        self._show()
-        self.save()
+        return progress
 
     def train_step(self, batch: Any) -> dict[str, Tensor]:
         """Update the weights and their average once.
@@ -243,46 +316,36 @@ class Training:
         Raises:
             UserError: the disk is full or the folder can't be written; an existing file is kept.
         """
+        cuda = self.stage.device.type == "cuda"
         content = {
             "model": self.model.state_dict(),
             "ema": self.ema.state_dict(),
             "optimizer": self.optimizer.state_dict(),
-            "depends": self.stage.depends(),
             "constants": self.stage.constants,
             "measured": self.measured,
             "earlier": self.earlier,
-            "device": _device_name(self.stage.device),
-            "torch": str(torch.__version__),
+            "device": torch.cuda.get_device_name(self.stage.device) if cuda else "cpu",
             **vars(self.progress),
         }
         save_file(self.path, content)
-        write_curves(self.path.with_suffix(".csv"), self.progress.history)
+        history = self.progress.history
+        columns = list(history[-1]) if history else []
+        rows = [columns, *([row.get(name, "") for name in columns] for row in history)]
+        with atomic_file(self.path.with_suffix(".csv"), durable=False) as file:
+            file.write("".join(",".join(map(str, row)) + "\n" for row in rows).encode())
 
     def _resume(self) -> None:
-        content = read_checkpoint(self.path, {*SAVED, *vars(Progress())})
-        if content["depends"] != self.stage.depends():
-            changed = [
-                name
-                for name, digest in self.stage.depends().items()
-                if content["depends"].get(name) != digest
-            ]
-            raise UserError(
-                f"{self.path} was trained with another {' and '.join(changed)}:"
-                " put that checkpoint back, or delete this one"
-            )
-        self.model.load_state_dict(content["model"])
-        self.ema.load_state_dict(content["ema"])
-        self.optimizer.load_state_dict(content["optimizer"])
-        self.progress = Progress(**{name: content[name] for name in vars(Progress())})
-        self.stage.constants.update(content["constants"])
-        self.measured = content["measured"]
-        self.earlier = content.get("earlier", [])
-        log.info("%s: resumed after %d images", self.stage.name, self.progress.images)
-        if (version := content.get("torch", torch.__version__)) != torch.__version__:
-            log.warning(
-                "%s: begun with torch %s, continued with %s: the result differs in rounding from "
-                "that of an uninterrupted training", self.stage.name, version, torch.__version__
-            )  # fmt: skip
+        content = load_file(self.path)
+        try:
+            self.model.load_state_dict(content["model"])
+            self.ema.load_state_dict(content["ema"])
+            self.optimizer.load_state_dict(content["optimizer"])
+            self.progress = Progress(**{name: content[name] for name in vars(Progress())})
+            self.stage.constants.update(content["constants"])
+            self.measured, self.earlier = content["measured"], content.get("earlier", [])
+        except (KeyError, TypeError, RuntimeError) as error:
+            raise UserError(f"{self.path} isn't a checkpoint of this stage: {error}") from error
+        print(f"{self.stage.name}: resumed after {self.progress.images} images", flush=True)
 
     @torch.no_grad()
     def _freeze(self) -> None:
@@ -305,61 +368,29 @@ class Training:
                 f"of the network are {', '.join(groups)}"
             )
 
-    def _log(self, means: dict[str, float]) -> None:
-        progress = self.progress
-        images, seconds = self.logged
-        rate = (progress.images - images) / max(progress.seconds - seconds, 1e-9)
-        self.logged = progress.images, progress.seconds
-        progress.history.append(
-            {"images": progress.images, "seconds": round(progress.seconds, 1), **means}
-        )
-        numbers = "  ".join(f"{name} {value:.4g}" for name, value in means.items())
-        print(
-            f"{self.stage.name}  {progress.images}/{self.target}  {rate:.1f}/s  {numbers}",
-            flush=True,
-        )
+    def _log(self, metrics: list[dict[str, Tensor]], seconds: float) -> None:
+        """Print and keep the means of these steps' metrics."""
+        progress, count = self.progress, len(metrics)
+        rate = count * self.stage.batch / max(seconds, 1e-9)
+        means = {name: float(sum(row[name] for row in metrics)) / count for name in metrics[0]}
+        seen = {"images": progress.images, "seconds": round(progress.seconds, 1)}
+        progress.history.append({**seen, **means})
+        place = f"{self.stage.name}  {progress.images}/{self.target}  {rate:.1f}/s"
+        print(place, _text(means), sep="  ", flush=True)
 
     @torch.no_grad()
-    def _show(self) -> None:
-        """Evaluate the averaged model on withheld objects and write its sheet."""
-        model = self.ema.module.eval()
-        self.measured = self.stage.evaluate(model)
-        if self.measured:
-            text = "  ".join(f"{name} {value:.4g}" for name, value in self.measured.items())
-            print(
-                f"{self.stage.name}  {self.progress.images}  withheld objects: {text}", flush=True
-            )
-        image = self.stage.sheet(model)
-        if image is not None:
-            folder = self.stage.options.folder / "sheets"
-            folder.mkdir(parents=True, exist_ok=True)
-            write_picture(folder / f"{self.stage.name}-{self.progress.images:08d}.png", image)
+    def _measure(self) -> None:
+        """Evaluate the averaged model on withheld objects."""
+        self.measured = self.stage.evaluate(self.ema.module.eval())
+        place = f"{self.stage.name}  {self.progress.images}  withheld objects:"
+        print(place, _text(self.measured), flush=True)
 
     def _on_signal(self, number: int, frame: Any) -> None:
         self.signum = number
 
 
-class _Sums:
-    """Sums of metrics since the last log."""
-
-    def __init__(self) -> None:
-        self.count, self.values = 0, {}
-
-    def add(self, metrics: dict[str, Tensor]) -> int:
-        self.count += 1
-        for name, value in metrics.items():
-            self.values[name] = self.values.get(name, 0) + value.detach()
-        return self.count
-
-    def mean(self) -> dict[str, float]:
-        """Return the means since the last call."""
-        means = {name: float(value) / self.count for name, value in self.values.items()}
-        self.count, self.values = 0, {}
-        return means
-
-
-def _device_name(device: torch.device) -> str:
-    return torch.cuda.get_device_name(device) if device.type == "cuda" else device.type
+def _text(numbers: dict[str, float]) -> str:
+    return "  ".join(f"{name} {value:.4g}" for name, value in numbers.items())
 
 
 def _average(averages: list[Tensor], current: list[Tensor], count: Any) -> None:

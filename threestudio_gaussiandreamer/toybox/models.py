@@ -3,11 +3,11 @@
 from typing import Any
 
 import torch
-from jaxtyping import Float
+import torch.nn.functional as F
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from ..priors.point_e_model import BaseModel
-from .tokenizer import LENGTH
+from .tokens import LENGTH
 from .views import LABELS, SIZE
 
 TEXT_WIDTH, TEXT_LAYERS, HEADS = 128, 2, 4
@@ -33,15 +33,13 @@ def clip_model(vocabulary_size: int) -> Any:
     from transformers import CLIPConfig, CLIPModel
 
     start, end = vocabulary_size - 2, vocabulary_size - 1
+    both = {"num_attention_heads": HEADS, "hidden_act": "gelu", "projection_dim": FEATURES}
     text = dict(
         vocab_size=vocabulary_size,
         hidden_size=TEXT_WIDTH,
         intermediate_size=4 * TEXT_WIDTH,
         num_hidden_layers=TEXT_LAYERS,
-        num_attention_heads=HEADS,
         max_position_embeddings=LENGTH,
-        hidden_act="gelu",
-        projection_dim=FEATURES,
         bos_token_id=start,
         eos_token_id=end,
         pad_token_id=end,
@@ -50,13 +48,11 @@ def clip_model(vocabulary_size: int) -> Any:
         hidden_size=VISION_WIDTH,
         intermediate_size=4 * VISION_WIDTH,
         num_hidden_layers=VISION_LAYERS,
-        num_attention_heads=HEADS,
         image_size=SIZE,
         patch_size=PATCH,
-        hidden_act="gelu",
-        projection_dim=FEATURES,
     )
-    return CLIPModel(CLIPConfig(text_config=text, vision_config=vision, projection_dim=FEATURES))
+    towers = {"text_config": text | both, "vision_config": vision | both}
+    return CLIPModel(CLIPConfig(**towers, projection_dim=FEATURES))
 
 
 def autoencoder() -> Any:
@@ -149,11 +145,6 @@ def scheduler() -> Any:
     return DDPMScheduler(**SCHEDULE, prediction_type="v_prediction", clip_sample=False)
 
 
-def points_model() -> BaseModel:
-    """Make a small model with the architecture of Point-E's base model."""
-    return BaseModel(width=POINTS_WIDTH, layers=POINTS_LAYERS, features=FEATURES)
-
-
 class AttributeHeads(nn.Module):
     """One linear classifier for each of LABELS."""
 
@@ -179,16 +170,10 @@ class Judge(nn.Module):
         super().__init__()
         layers, previous = [], 3
         for channels in self.CHANNELS:
-            layers += [
-                nn.Conv2d(previous, channels, 4, stride=2, padding=1),
-                nn.GroupNorm(8, channels),
-                nn.SiLU(),
-            ]
-            layers += [
-                nn.Conv2d(channels, channels, 3, padding=1, groups=8),
-                nn.GroupNorm(8, channels),
-                nn.SiLU(),
-            ]
+            shrink = nn.Conv2d(previous, channels, 4, stride=2, padding=1)
+            grouped = nn.Conv2d(channels, channels, 3, padding=1, groups=8)
+            for convolution in (shrink, grouped):
+                layers += [convolution, nn.GroupNorm(8, channels), nn.SiLU()]
             previous = channels
         self.body = nn.Sequential(*layers)
         self.mix = nn.Sequential(nn.Linear(2 * previous, 256), nn.SiLU())
@@ -197,3 +182,27 @@ class Judge(nn.Module):
     def forward(self, images: Float[Tensor, "B 3 s s"]) -> dict[str, Tensor]:
         x = self.body(images * 2 - 1).flatten(2)
         return self.heads(self.mix(torch.cat([x.mean(-1), x.amax(-1)], dim=1)))
+
+
+IGNORED = -100
+"""The label of classes that losses ignore."""
+
+
+def classified(logits: dict[str, Tensor], labels: Int[Tensor, "B L"]) -> tuple[Tensor, Tensor]:
+    """Return the mean cross entropy over the attributes, and the share recognised."""
+    pairs = list(zip(logits.values(), labels.unbind(1), strict=True))
+    summed = {"ignore_index": IGNORED, "reduction": "sum"}
+    sums = [F.cross_entropy(value.float(), label, **summed) for value, label in pairs]
+    known = (labels != IGNORED).sum(dim=0).clamp(min=1)  # a batch may have no label of a column
+    loss = (torch.stack(sums) / known).mean()
+    right = torch.stack([(value.argmax(-1) == label).sum() for value, label in pairs]).sum()
+    return loss, right / known.sum()
+
+
+def accuracies(logits: dict[str, Tensor], labels: Int[Tensor, "B L"]) -> dict[str, float]:
+    """Return the share recognised of each attribute."""
+    out = {}
+    for (name, value), label in zip(logits.items(), labels.unbind(1), strict=True):
+        known = label != IGNORED
+        out[name] = float((value.argmax(-1)[known] == label[known]).float().mean())
+    return out

@@ -1,6 +1,5 @@
 """Training the text-to-points model in Point-E's format, on CLIP's text features."""
 
-import math
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -9,20 +8,14 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from ..cameras import Orbit, to_opencv
-from ..core.streams import generator, numpy_generator
 from ..diffusion import sds
-from ..priors.karras import cosine_alphas_cumprod, guided_denoiser, karras_sigmas, sample_heun
+from ..priors.karras import cosine_alphas_cumprod
 from ..priors.point_e import BIASES, SCALES, mean_of
-from ..splatting import rasterize
+from ..priors.point_e_model import BaseModel
 from . import models
-from .batches import StepData, normal, torch_generator
-from .loop import Stage
-from .module_digest import digest
-from .sheet import contact_sheet
-from .text_batches import object_prompts, open_tokenizer, token_ids
-from .text_stage import frozen_text, text_features
-from .views import BACKGROUND, FOVY_DEG, VIEWS, held_out_shard
+from .clip_stage import text_features, trained_clip
+from .loop import Stage, StepData, normal, torch_generator
+from .tokens import object_prompts, open_tokenizer, token_ids
 from .world import RADIUS
 
 POINTS = 256
@@ -30,7 +23,6 @@ POINTS = 256
 TIMESTEPS = 1024
 """Of Point-E's diffusion."""
 EMPTY_SHARE = 0.1
-SAMPLES, SAMPLE_POINTS, SAMPLE_STEPS, SAMPLE_GUIDANCE = 16, 512, 24, 3.0
 
 
 class PointsBatch(NamedTuple):
@@ -74,13 +66,10 @@ class PointsStage(Stage):
 
     def build(self) -> nn.Module:
         self.tokenizer = open_tokenizer(self.options.folder)
-        self.clip = frozen_text(self.options.folder, len(self.tokenizer)).to(self.device)
-        self.shards = self.options.shards()
+        self.clip = trained_clip(self.options.folder, len(self.tokenizer), "text").to(self.device)
         self.alphas_cumprod = torch.from_numpy(cosine_alphas_cumprod()).to(self.device)
-        return models.points_model()
-
-    def depends(self) -> dict[str, str]:
-        return {"text": digest(self.clip.text_model)}
+        width, layers = models.POINTS_WIDTH, models.POINTS_LAYERS
+        return BaseModel(width=width, layers=layers, features=models.FEATURES)
 
     def data(self) -> PointsData:
         return PointsData(self.shards, self.batch, self.options.pool, self.tokenizer)
@@ -90,32 +79,14 @@ class PointsStage(Stage):
         z = sds.add_noise(batch.points, batch.noise, self.alphas_cumprod[batch.t])
         predicted = mean_of(lambda z, t: model(z, t, condition))(z, batch.t).float()
         errors = (predicted - batch.noise).square()
-        return errors.mean(), {
-            "mse_points": errors[:, :3].mean(),
-            "mse_colors": errors[:, 3:].mean(),
-        }
+        parts = {"mse_points": errors[:, :3].mean(), "mse_colors": errors[:, 3:].mean()}
+        return errors.mean(), parts
 
     @torch.no_grad()
     def condition(self, ids: Int[Tensor, "B 32"]) -> Float[Tensor, "B D"]:
         """Return CLIP's text features with unit variance, as the Point-E prior gives them."""
         features = text_features(self.clip.text_model, self.clip.text_projection, ids)
         return features * features.shape[-1] ** 0.5
-
-    @torch.no_grad()
-    def sheet(self, model: nn.Module) -> np.ndarray:
-        shard = held_out_shard(self.options.shards_folder(), self.options.seed)
-        texts = object_prompts(
-            shard.labels[::VIEWS][:SAMPLES], numpy_generator(self.options.seed, "points-sheet")
-        )
-        condition = self.condition(token_ids(self.tokenizer, texts).to(self.device))
-        conditions = torch.cat([condition, torch.zeros_like(condition)])
-        network = mean_of(lambda z, t: model(z, t, conditions))
-        denoise = guided_denoiser(network, cosine_alphas_cumprod(), scale=SAMPLE_GUIDANCE)
-        rng = generator(self.options.seed, "points-sheet")
-        noise = torch.randn(len(texts), 6, SAMPLE_POINTS, generator=rng).to(self.device)
-        sigmas = karras_sigmas(SAMPLE_STEPS, 1e-3, 120.0)
-        sample = sample_heun(denoise, noise, sigmas, churn=3.0, generator=rng).cpu()
-        return contact_sheet(torch.stack([drawn(points) for points in sample]), texts, columns=8)
 
 
 def network_units(points: Float[Tensor, "B N 6"]) -> Float[Tensor, "B 6 N"]:
@@ -126,36 +97,3 @@ def network_units(points: Float[Tensor, "B N 6"]) -> Float[Tensor, "B 6 N"]:
     x, y, z = (points[..., i] / (2 * RADIUS) for i in range(3))
     turned = torch.stack([y, -x, z, *(255 * points[..., i] for i in (3, 4, 5))], dim=1)
     return turned * SCALES + BIASES
-
-
-def world_units(sample: Float[Tensor, "6 N"]) -> Float[Tensor, "N 6"]:
-    """Invert :func:`network_units` for one sample."""
-    x, y, z, *colors = (sample - BIASES[:, 0][:, None]) / SCALES[:, 0][:, None]
-    return torch.stack(
-        [-y * 2 * RADIUS, x * 2 * RADIUS, z * 2 * RADIUS, *(color / 255 for color in colors)], dim=1
-    )
-
-
-def drawn(sample: Float[Tensor, "6 N"], size: int = 128) -> Float[Tensor, "3 s s"]:
-    """Draw a sample's points as small Gaussians, seen from the front and the left."""
-    points = world_units(sample)
-    angles = (15.0, 40.0, 2.25, math.radians(FOVY_DEG))
-    orbit = Orbit(*(torch.tensor([float(value)]) for value in angles))
-    viewmats, Ks = to_opencv(orbit.c2w, orbit.fovy, size, size)
-    count = len(points)
-    quats, scales = torch.tensor([1.0, 0, 0, 0]).repeat(count, 1), torch.full((count, 3), 0.02)
-    colors = points[:, 3:].clamp(0, 1).contiguous()
-    background = torch.tensor(BACKGROUND)
-    image = rasterize(
-        points[:, :3].contiguous(),
-        quats,
-        scales,
-        torch.full((count,), 0.9),
-        colors,
-        viewmats,
-        Ks,
-        size,
-        size,
-        background=background,
-    ).image[0]
-    return image.movedim(-1, 0)

@@ -22,6 +22,7 @@ from torch import Tensor
 from ..cameras import Orbit
 from ..core.errors import UserError
 from ..models.bundled import JUDGE, NAME, model_part
+from .kinds import ALIKE_FROM_ALL_SIDES
 from .models import Judge
 from .views import DISTANCE, FOVY_DEG, LABELS
 from .world import Attributes
@@ -35,7 +36,6 @@ OFFSETS_DEG = (-22.5, 22.5)
 """Azimuths of a quadrant's two views, relative to its middle. They keep away from its borders, at
 +-45 degrees, where the right answer is ambiguous.
 """
-ALIKE_FROM_ALL_SIDES = ("mug", "mushroom")
 EXCHANGEABLE = ("striped", "checkered")
 """Patterns that look alike with their two colours exchanged."""
 
@@ -91,10 +91,10 @@ def recognized(found: dict[str, Tensor], wanted: Attributes) -> dict[str, bool]:
     For an attribute that the prompt doesn't name, the judge's most probable class must be "none".
     Colours and pattern are those of :func:`most_probable_pattern`.
     """
-    right = {
-        name: most_probable(found, name) == (getattr(wanted, name) or "none")
-        for name in ("kind", "part", "accessory", "accessory_color")
-    }
+    right = {}
+    for name in ("kind", "part", "accessory", "accessory_color"):
+        most_probable = LABELS[name][int(found[name].mean(dim=0).argmax())]
+        right[name] = most_probable == (getattr(wanted, name) or "none")
     pattern, *colors = most_probable_pattern(found)
     asked = [wanted.color, wanted.second or "none"]
     exchanged = wanted.pattern in EXCHANGEABLE and colors == asked[::-1]
@@ -104,11 +104,6 @@ def recognized(found: dict[str, Tensor], wanted: Attributes) -> dict[str, bool]:
         "pattern": pattern == wanted.pattern,
         "accessory": right["part"] and right["accessory"] and right["accessory_color"],
     }
-
-
-def most_probable(found: dict[str, Tensor], name: str) -> str:
-    """Return the class with the highest probability, averaged over the views."""
-    return LABELS[name][int(found[name].mean(dim=0).argmax())]
 
 
 def most_probable_pattern(found: dict[str, Tensor]) -> tuple[str, str, str]:

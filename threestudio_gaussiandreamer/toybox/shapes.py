@@ -31,23 +31,19 @@ def lathe(role: str, profile, center=(0, 0, 0), axis=(0, 0, 1), segments: int = 
 
     Each piece of the polyline gets its own vertices and normal, so that its corners are sharp.
     """
-    return _revolve(role, np.asarray(profile, float), None, center, axis, segments)
+    return _revolve(role, *_sharp(np.asarray(profile, float)), center, axis, segments)
 
 
 def ellipsoid(role: str, center, radii, axis=(0, 0, 1), rings: int = 10) -> Shape:
     """Make an ellipsoid with half axes ``radii`` (x, y, z) before ``axis`` turns its z."""
     theta = np.linspace(0, np.pi, rings + 1)
-    unit = _revolve(
-        role, np.stack([np.sin(theta), -np.cos(theta)], 1), "sphere", (0, 0, 0), (0, 0, 1), SEGMENTS
-    )
+    circle = np.stack([np.sin(theta), -np.cos(theta)], 1)
+    unit = _revolve(role, circle, circle)
     radii = np.asarray(radii, float)
-    turn = frame(axis)
     normals = unit.normals / radii
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     uv = unit.uv * [radii[:2].mean(), radii[2]]
-    return Shape(
-        unit.vertices * radii @ turn + np.asarray(center), unit.faces, normals @ turn, uv, role
-    )
+    return _placed(unit.vertices * radii, unit.faces, normals, uv, center, axis, role)
 
 
 def limb(role: str, start, end, start_radius: float, end_radius: float | None = None) -> Shape:
@@ -75,17 +71,11 @@ def box(role: str, center, half, taper=(1.0, 1.0), axis=(0, 0, 1)) -> Shape:
     )
     vertices = corners[quads].reshape(-1, 3)
     normals = np.repeat(_quad_normals(corners[quads]), 4, axis=0)
-    along = np.abs(normals[:, 2]) > 0.9
-    across = np.where(
-        np.abs(normals[:, :1]) > np.abs(normals[:, 1:2]), vertices[:, 1:2], vertices[:, :1]
-    )[:, 0]
-    uv = np.stack(
-        [np.where(along, vertices[:, 0], across), np.where(along, vertices[:, 1], vertices[:, 2])],
-        1,
-    )
+    (x, y, z), (nx, ny, nz) = vertices.T, np.abs(normals.T)
+    flat = nz > 0.9
+    uv = np.stack([np.where(~flat & (nx > ny), y, x), np.where(flat, y, z)], 1)
     faces = (4 * np.arange(6)[:, None, None] + np.array([[0, 1, 2], [0, 2, 3]])).reshape(-1, 3)
-    turn = frame(axis)
-    return Shape(vertices @ turn + np.asarray(center), faces, normals @ turn, uv, role)
+    return _placed(vertices, faces, normals, uv, center, axis, role)
 
 
 def ring(
@@ -99,14 +89,10 @@ def ring(
     around = np.stack([np.cos(a), np.sin(a)], -1)
     flat = around * (np.asarray(radii, float) + thickness * np.cos(b)[..., None])
     vertices = np.concatenate([flat, height * np.sin(b)[..., None]], -1).reshape(-1, 3)
-    normals = np.concatenate([around * np.cos(b)[..., None], np.sin(b)[..., None]], -1).reshape(
-        -1, 3
-    )
+    normals = np.concatenate([around * np.cos(b)[..., None], np.sin(b)[..., None]], -1)
     uv = np.stack([a * np.mean(radii), b * thickness], -1).reshape(-1, 2)
-    turn = frame(axis)
-    return Shape(
-        vertices @ turn + np.asarray(center), _grid_faces(*a.shape), normals @ turn, uv, role
-    )
+    faces = _grid_faces(*a.shape)
+    return _placed(vertices, faces, normals.reshape(-1, 3), uv, center, axis, role)
 
 
 def frame(axis) -> Float[np.ndarray, "3 3"]:
@@ -121,48 +107,35 @@ def frame(axis) -> Float[np.ndarray, "3 3"]:
 def joined(shapes: list[Shape]) -> tuple[Shape, list[str]]:
     """Join all shapes into one, and return the role of each vertex beside it."""
     starts = np.cumsum([0, *(len(shape.vertices) for shape in shapes)])
-    fields = {
-        name: np.concatenate([getattr(s, name) for s in shapes])
-        for name in ("vertices", "normals", "uv")
-    }
-    faces = np.concatenate(
-        [shape.faces + start for shape, start in zip(shapes, starts[:-1], strict=True)]
-    )
+    fields = list(zip(*shapes, strict=True))
+    vertices, _, normals, uv = (np.concatenate(column) for column in fields[:4])
+    faces = np.concatenate([s.faces + start for s, start in zip(shapes, starts, strict=False)])
     roles = [shape.role for shape in shapes for _ in shape.vertices]
-    return Shape(faces=faces, role="", **fields), roles
+    return Shape(vertices, faces, normals, uv, ""), roles
 
 
-def _revolve(role: str, profile: np.ndarray, kind, center, axis, segments: int) -> Shape:
-    """Revolve a profile; with ``kind`` "sphere" its points are their own normals."""
-    rows, slopes = (profile, profile) if kind == "sphere" else _sharp(profile)
+def _revolve(role: str, rows, slopes, center=(0, 0, 0), axis=(0, 0, 1), segments=SEGMENTS) -> Shape:
+    """Revolve pairs (radius, height), an array, with their normals ``slopes``."""
     angle = np.linspace(-np.pi, np.pi, segments + 1)  # a pattern's seam is at the back
     around = np.stack([np.cos(angle), np.sin(angle)], 1)
-    vertices = np.concatenate(
-        [
-            rows[:, None, :1] * around,
-            np.broadcast_to(rows[:, None, 1:], (len(rows), len(angle), 1)),
-        ],
-        -1,
-    )
-    normals = np.concatenate(
-        [
-            slopes[:, None, :1] * around,
-            np.broadcast_to(slopes[:, None, 1:], (len(rows), len(angle), 1)),
-        ],
-        -1,
-    )
+    vertices, normals = (_revolved(pairs, around).reshape(-1, 3) for pairs in (rows, slopes))
     along = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(rows, axis=0), axis=1))])
     widest = rows[:, 0].max()
     uv = np.stack(np.broadcast_arrays(angle[None] * widest, along[:, None]), -1)
     faces = _grid_faces(len(rows), len(angle))[:, ::-1]
+    return _placed(vertices, faces, normals, uv.reshape(-1, 2), center, axis, role)
+
+
+def _revolved(pairs: np.ndarray, around: np.ndarray) -> Float[np.ndarray, "R A 3"]:
+    """Turn pairs (radius, height) to each of the directions ``around``."""
+    height = np.broadcast_to(pairs[:, None, 1:], (len(pairs), len(around), 1))
+    return np.concatenate([pairs[:, None, :1] * around, height], -1)
+
+
+def _placed(vertices, faces, normals, uv, center, axis, role: str) -> Shape:
+    """Turn the z axis to ``axis``, then move the origin to ``center``."""
     turn = frame(axis)
-    return Shape(
-        vertices.reshape(-1, 3) @ turn + np.asarray(center),
-        faces,
-        normals.reshape(-1, 3) @ turn,
-        uv.reshape(-1, 2),
-        role,
-    )
+    return Shape(vertices @ turn + np.asarray(center), faces, normals @ turn, uv, role)
 
 
 def _sharp(profile: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

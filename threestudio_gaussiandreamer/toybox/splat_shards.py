@@ -12,7 +12,6 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from scipy.spatial import cKDTree
-from torch import Tensor
 
 from ..cameras import Orbit, to_opencv
 from ..meshes.mesh import Mesh, face_areas, sample_surface, surface_colors
@@ -41,15 +40,14 @@ class SplatShards(Shards):
 
     file_names = f"splats{VERSION}", f"held-out-splats{VERSION}"
 
-    def _pictures(
+    def pictures(
         self, mesh: Mesh, orbit: Orbit, rng: np.random.Generator
     ) -> Float[np.ndarray, "N s s 4"]:
-        gaussians = [torch.from_numpy(np.float32(x)) for x in imperfect_gaussians(mesh, rng)]
-        return render_gaussians(gaussians, orbit, eps2d=0.1)  # as configs/toybox.yaml
+        return render_gaussians(imperfect_gaussians(mesh, rng), orbit, eps2d=0.1)  # as toybox.yaml
 
 
 def render_gaussians(
-    gaussians: Sequence[Tensor], orbit: Orbit, *, eps2d: float
+    gaussians: Sequence[np.ndarray], orbit: Orbit, *, eps2d: float
 ) -> Float[np.ndarray, "N s s 4"]:
     """Render Gaussians from these cameras; return premultiplied RGBA in [0, 1].
 
@@ -58,6 +56,7 @@ def render_gaussians(
         eps2d: dilation, square pixels.
     """
     viewmats, Ks = to_opencv(orbit.c2w, orbit.fovy, SIZE, SIZE)
+    gaussians = [torch.from_numpy(np.float32(values)) for values in gaussians]
     drawn = rasterize(*gaussians, viewmats, Ks, SIZE, SIZE, preset="fast", eps2d=eps2d)
     alpha = drawn.alpha.reshape(*drawn.image.shape[:-1], 1)
     return torch.cat([drawn.image, alpha], dim=-1).clamp(0, 1).numpy()

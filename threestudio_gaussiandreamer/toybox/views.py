@@ -6,10 +6,10 @@ shards can be used with different backgrounds.
 """
 
 import math
-import zipfile
-from functools import lru_cache, partial
+from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 import torch
@@ -53,7 +53,9 @@ LABELS: dict[str, tuple[str, ...]] = {
     "accessory_color": (*COLORS, "none"),
     "quadrant": ("front", "left", "back", "right"),
 }
-"""The attributes of a picture that classifiers recognise, and their classes."""
+"""The attributes of a picture that classifiers recognise, and their classes: those of
+:class:`Attributes`, and the side that the picture shows.
+"""
 
 
 class Shard(NamedTuple):
@@ -71,37 +73,21 @@ class Shard(NamedTuple):
     """
 
 
+@dataclass(frozen=True)
 class Shards:
-    """The shards of one seed, rendered on first use.
+    """The shards of one seed, rendered on first use."""
 
-    Args:
-        folder: contains the files, 70 MB each.
-        held_out: whether the objects are those withheld from training.
-        objects: number of objects per shard.
-        views: number of views per object.
-    """
-
-    file_names = "train", "held-out"
+    folder: Path
+    """Contains the files, 70 MB each."""
+    seed: int
+    held_out: bool = False
+    """Whether the objects are those withheld from training."""
+    objects: int = OBJECTS
+    """Of a shard."""
+    views: int = VIEWS
+    """Of an object."""
+    file_names: ClassVar[tuple[str, str]] = "train", "held-out"
     """How the names of the files begin, of objects for training and of withheld ones."""
-
-    def __init__(
-        self,
-        folder: Path,
-        seed: int,
-        *,
-        held_out: bool = False,
-        objects: int = OBJECTS,
-        views: int = VIEWS,
-    ) -> None:
-        self.folder, self.seed, self.held_out = Path(folder), seed, held_out
-        self.objects, self.views = objects, views
-        self.get = lru_cache(maxsize=2)(self._get)
-        self.get_light = lru_cache(maxsize=LIGHT_SHARDS)(self._get_light)
-
-    def __reduce__(self) -> tuple:
-        """Send to other processes without what is cached."""
-        known = {"held_out": self.held_out, "objects": self.objects, "views": self.views}
-        return partial(type(self), self.folder, self.seed, **known), ()
 
     def path(self, index: int) -> Path:
         """Return the file of shard ``index``."""
@@ -110,79 +96,64 @@ class Shards:
         return self.folder / name
 
     def ensure(self, index: int) -> None:
-        """Render shard ``index`` into its file, unless that exists and is complete."""
+        """Render shard ``index`` into its file, unless that exists."""
         path = self.path(index)
-        if is_whole(path):
-            return
-        self.folder.mkdir(parents=True, exist_ok=True)
-        remove_abandoned(path)
-        shard = self.make(index)
-        with atomic_file(path, durable=False) as file:
-            np.savez(file, **shard._asdict())
+        if not path.is_file():
+            self.folder.mkdir(parents=True, exist_ok=True)
+            remove_abandoned(path)
+            shard = self.make(index)
+            with atomic_file(path) as file:
+                np.savez(file, **shard._asdict())
 
-    def _get(self, index: int) -> Shard:
+    @lru_cache(maxsize=4)  # noqa: B019
+    def get(self, index: int) -> Shard:
+        """Return shard ``index``."""
+        return self._read(index)
+
+    @lru_cache(maxsize=LIGHT_SHARDS)  # noqa: B019
+    def get_light(self, index: int) -> Shard:
+        """Return shard ``index`` without its pictures, which take nearly all of its size."""
+        return self._read(index, pictures=False)
+
+    def _read(self, index: int, *, pictures: bool = True) -> Shard:
         self.ensure(index)
         with np.load(self.path(index), allow_pickle=False) as file:
-            return Shard(**{name: file[name] for name in Shard._fields})
+            rgba = file["rgba"] if pictures else np.zeros((0, SIZE, SIZE, 4), np.uint8)
+            return Shard(rgba, *(file[name] for name in Shard._fields[1:]))
 
-    def _get_light(self, index: int) -> Shard:
-        """Read a shard without its pictures, which take nearly all of its size."""
-        self.ensure(index)
-        with np.load(self.path(index), allow_pickle=False) as file:
-            values = {name: file[name] for name in Shard._fields if name != "rgba"}
-        return Shard(rgba=np.zeros((0, SIZE, SIZE, 4), np.uint8), **values)
+    def held_out_shard(self) -> Shard:
+        """Return the shard of withheld objects for evaluation."""
+        return replace(self, held_out=True, objects=HELD_OUT_OBJECTS).get(0)
 
     def make(self, index: int) -> Shard:
         """Render shard ``index``."""
-        rows = [self._object(index * self.objects + i) for i in range(self.objects)]
-        names = ("rgba", "labels", "elevation", "azimuth", "points")
-        columns = dict(zip(names, zip(*rows, strict=True), strict=True))
-        points = np.stack(columns.pop("points"))
-        return Shard(
-            points=points, **{name: np.concatenate(values) for name, values in columns.items()}
-        )
+        rows = (self._object(index * self.objects + i) for i in range(self.objects))
+        return Shard(*map(np.concatenate, zip(*rows, strict=True)))
 
-    def _object(self, index: int) -> tuple:
+    def _object(self, index: int) -> Shard:
         attributes = draw_attributes(self.seed, index, held_out=self.held_out)
         rng = numpy_generator(self.seed, "toybox-object", int(self.held_out), index)
         mesh = object_mesh(attributes, rng)
         orbit = draw_orbit(self.views, rng)
-        images = self._pictures(mesh, orbit, rng)
+        rgba = (self.pictures(mesh, orbit, rng) * 255).round().astype(np.uint8)
         labels = np.stack([label_row(attributes, float(a)) for a in orbit.azimuth])
-        rgba = (images * 255).round().astype(np.uint8)
-        return (
-            rgba,
-            labels,
-            orbit.elevation.numpy(),
-            orbit.azimuth.numpy(),
-            surface_points(mesh, rng),
-        )
+        points = surface_points(mesh, rng)[None]
+        return Shard(rgba, labels, orbit.elevation.numpy(), orbit.azimuth.numpy(), points)
 
-    def _pictures(
+    def pictures(
         self, mesh: Mesh, orbit: Orbit, rng: np.random.Generator
     ) -> Float[np.ndarray, "N s s 4"]:
+        """Draw these views of an object; return premultiplied RGBA in [0, 1]."""
         return render(mesh, orbit)
-
-
-def is_whole(path: Path) -> bool:
-    """Return whether a file is a complete zip archive; a truncated one lacks the end record."""
-    return path.is_file() and zipfile.is_zipfile(path)
-
-
-def held_out_shard(folder: Path, seed: int, sort: type[Shards] = Shards) -> Shard:
-    """Return the shard of withheld objects for evaluation."""
-    return sort(folder, seed, held_out=True, objects=HELD_OUT_OBJECTS).get(0)
 
 
 def draw_orbit(count: int, rng: np.random.Generator) -> Orbit:
     """Draw ``count`` views, one in each of as many azimuth sectors, with a random first sector."""
-    azimuth = (
-        rng.uniform(0, 360) + 360 / count * (np.arange(count) + rng.uniform(0, 1, count))
-    ) % 360 - 180
+    start = rng.uniform(0, 360)
+    azimuth = start + 360 / count * (np.arange(count) + rng.uniform(0, 1, count))
     overhead = rng.uniform(size=count) < OVERHEAD_SHARE
-    elevation = np.where(
-        overhead, rng.uniform(*OVERHEAD_ELEVATION, count), rng.uniform(*ELEVATION, count)
-    )
+    above, others = (rng.uniform(*bounds, count) for bounds in (OVERHEAD_ELEVATION, ELEVATION))
+    elevation, azimuth = np.where(overhead, above, others), azimuth % 360 - 180
     fovy = np.full(count, math.radians(FOVY_DEG))
     values = (elevation, azimuth, rng.uniform(*DISTANCE, count), fovy)
     return Orbit(*(torch.from_numpy(np.float32(value)) for value in values))
@@ -204,26 +175,21 @@ def render(mesh: Mesh, orbit: Orbit, size: int = SIZE) -> Float[np.ndarray, "N s
 def surface_points(mesh: Mesh, rng: np.random.Generator) -> Float[np.ndarray, "P 6"]:
     """Sample POINTS points with colours uniformly on the surface, float16."""
     places, faces, barycentric = sample_surface(mesh, POINTS, rng)
-    return np.concatenate([places, surface_colors(mesh, faces, barycentric)], axis=1).astype(
-        np.float16
-    )
+    colors = surface_colors(mesh, faces, barycentric)
+    return np.concatenate([places, colors], axis=1).astype(np.float16)
 
 
 def label_row(attributes: Attributes, azimuth: float) -> Int[np.ndarray, " L"]:
     """Return the classes of an object seen from an azimuth in degrees, in the order of LABELS."""
     quadrant = LABELS["quadrant"][int(((azimuth + 45) % 360) // 90)]
-    values = {name: value or "none" for name, value in attributes._asdict().items()} | {
-        "quadrant": quadrant
-    }
-    return np.array([classes.index(values[name]) for name, classes in LABELS.items()])
+    values = attributes._asdict() | {"quadrant": quadrant}
+    return np.array([classes.index(values[name] or "none") for name, classes in LABELS.items()])
 
 
 def attributes_of(row: Int[np.ndarray, " L"]) -> Attributes:
     """Invert :func:`label_row`."""
-    values = {name: classes[int(i)] for (name, classes), i in zip(LABELS.items(), row, strict=True)}
-    return Attributes(
-        **{name: None if values[name] == "none" else values[name] for name in Attributes._fields}
-    )
+    values = [classes[int(i)] for classes, i in zip(LABELS.values(), row, strict=True)]
+    return Attributes(*(None if value == "none" else value for value in values[:-1]))
 
 
 def with_backgrounds(

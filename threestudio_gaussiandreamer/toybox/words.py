@@ -1,9 +1,10 @@
 """Prompts for the toybox's objects: synonyms, templates, and view directions in the form of the
-prompt processors.
+prompt processors; and the inverse, the attributes that a prompt asks for.
 """
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Mapping
+from typing import Optional
 
 import numpy as np
 
@@ -64,16 +65,7 @@ ACCESSORY_WORDS: dict[str, tuple[str, ...]] = {
     "flag": ("flag", "banner"),
     "balloon": ("balloon",),
 }
-OPENINGS = (
-    "a {}",
-    "a {}",
-    "a {}",
-    "a toy {}",
-    "a small {}",
-    "a photo of a {}",
-    "a 3d model of a {}",
-    "{}",
-)
+OPENINGS = *["a {}"] * 3, "a toy {}", "a small {}", "a photo of a {}", "a 3d model of a {}", "{}"
 """Templates for the object's description; "a {}" is drawn most often."""
 OPPOSITE = {
     "front": "back",
@@ -115,11 +107,18 @@ def describe(attributes: Attributes, rng: np.random.Generator) -> str:
     """Write a prompt for the object, without a direction."""
     noun = _pick(NOUNS[attributes.kind], rng)
     color = _color(attributes.color, rng)
-    text = _pick(OPENINGS, rng).format(_patterned(attributes, noun, color, rng))
+    opening = _pick(OPENINGS, rng)
+    if attributes.second:
+        second = _color(attributes.second, rng)
+        phrase = _pick(PATTERN_PHRASES[attributes.pattern], rng)
+        text = opening.format(phrase.format(c=color, s=second, n=noun))
+    else:
+        text = opening.format(f"{color} {noun}")
     if attributes.part:
         name = PARTS[attributes.kind]
         article = "" if name.startswith(PLURALS) else "a "
-        text = f"{text}{_joint(text)}{article}{_color(attributes.part, rng)} {name}"
+        joint = "and" if " with " in text else "with"
+        text = f"{text} {joint} {article}{_color(attributes.part, rng)} {name}"
     if attributes.accessory:
         name = _pick(ACCESSORY_WORDS[attributes.accessory], rng)
         verb = "wearing" if name in ("hat", "cap", "scarf") and rng.random() < 0.25 else "with"
@@ -150,34 +149,17 @@ def prompt_of(
 
 def vocabulary() -> list[str]:
     """Return all words that occur in prompts, sorted."""
-    return sorted(set(re.findall(r"[a-z]+|\d|,", " ".join(_phrases()))))
-
-
-def _phrases() -> Iterator[str]:
-    yield from COLORS
-    yield from (
-        word
-        for words in (*NOUNS.values(), *COLOR_WORDS.values(), *ACCESSORY_WORDS.values())
-        for word in words
-    )
-    yield from (*PARTS.values(), *OPENINGS, *OPPOSITE, "backside view of , an with and wearing")
-    yield "striped stripes dotted dots spots polka spotted checkered checks"
-    yield "two tone half below above bottom top"
-
-
-def _patterned(attributes: Attributes, noun: str, color: str, rng: np.random.Generator) -> str:
-    if attributes.pattern == "plain":
-        return f"{color} {noun}"
-    second = _color(attributes.second, rng)
-    return _pick(PATTERN_PHRASES[attributes.pattern], rng).format(c=color, s=second, n=noun)
+    named = [*NOUNS.values(), *COLOR_WORDS.values(), *ACCESSORY_WORDS.values()]
+    phrases = [*COLORS, *PARTS.values(), *OPENINGS, *OPPOSITE, *(word for n in named for word in n)]
+    phrases += ["backside view of , an with and wearing half below above bottom top two tone"]
+    phrases += ["striped stripes dotted dots spots polka spotted checkered checks"]
+    return sorted(set(re.findall(r"[a-z]+|\d|,", " ".join(phrases))))
 
 
 PATTERN_PHRASES: dict[str, tuple[str, ...]] = {
     "striped": ("{c} {n} with {s} stripes", "{c} and {s} striped {n}", "striped {c} and {s} {n}"),
     "dotted": (
-        "{c} {n} with {s} dots",
-        "{c} {n} with {s} spots",
-        "{c} {n} with {s} polka dots",
+        *(f"{{c}} {{n}} with {{s}} {dots}" for dots in ("dots", "spots", "polka dots")),
         "{c} {n} dotted with {s}",
     ),
     "checkered": (
@@ -189,13 +171,87 @@ PATTERN_PHRASES: dict[str, tuple[str, ...]] = {
 }
 
 
-def _joint(text: str) -> str:
-    return " and " if " with " in text else " with "
-
-
 def _color(color: str, rng: np.random.Generator) -> str:
     return _pick(COLOR_WORDS.get(color, (color,)), rng) if rng.random() < 0.4 else color
 
 
 def _pick(choices: tuple[str, ...], rng: np.random.Generator) -> str:
     return choices[int(rng.integers(len(choices)))]
+
+
+# Reading prompts
+
+PATTERN_WORDS: dict[str, tuple[str, ...]] = {
+    "striped": ("striped", "stripes"),
+    "dotted": ("dotted", "dots", "spotted", "spots"),
+    "checkered": ("checkered", "checks"),
+    "two-tone": ("two tone", "top", "above"),
+}
+
+
+Word = tuple[str, str]
+"""The role (kind, color, pattern, part or accessory) and the meaning of a word, or of a phrase such
+as "light green".
+"""
+
+
+def attributes_in(prompt: str) -> Optional[Attributes]:
+    """Return the attributes that a prompt names; None if it names no kind of object or no colour.
+
+    The colour directly in front of a part or an accessory belongs to that. Of the other colours the
+    first is the body's and the second the pattern's. A pattern without a second colour is ignored,
+    as are unknown words.
+    """
+    words = _meanings(prompt)
+    kind = next((meaning for role, meaning in words if role == "kind"), None)
+    part = _colored(words, "part", PARTS.get(kind, ""))
+    accessory = _colored(words, "accessory")
+    rest = [word for i, word in enumerate(words) if i not in (part[0], accessory[0])]
+    colors, patterns = ([m for role, m in rest if role == of] for of in ("color", "pattern"))
+    if kind is None or not colors:
+        return None
+    plain = not patterns or len(colors) < 2
+    pattern, second = ("plain", None) if plain else (patterns[0], colors[1])
+    return Attributes(kind, colors[0], pattern, second, part[2], *accessory[1:])
+
+
+def _meanings(prompt: str) -> list[Word]:
+    """Return the known words in order; of those that begin at one place, the longest."""
+    text, found = " ".join(re.findall(r"[^\W_]+", prompt.lower())) + " ", []
+    while text:
+        phrase = next((p for p in PHRASES if text.startswith(f"{p} ")), "")
+        if phrase:
+            found.append(MEANINGS[phrase])
+        text = text[len(phrase) :].lstrip() if phrase else text.partition(" ")[2]
+    return found
+
+
+def _colored(
+    words: list[Word], role: str, meaning: str = ""
+) -> tuple[Optional[int], Optional[str], Optional[str]]:
+    """Find the first word of a role, and of this meaning if one is given, with a colour before it.
+
+    Returns:
+        the colour's index in ``words``, the word's meaning and its colour; three None if none is
+        found.
+    """
+    pairs = enumerate(zip(words, words[1:], strict=False))
+    for place, ((before, color), (word, found)) in pairs:
+        if word == role and before == "color" and meaning in ("", found):
+            return place, found, color
+    return None, None, None
+
+
+def _synonyms(role: str, words: Mapping[str, Iterable[str]]) -> dict[str, Word]:
+    return {word: (role, meaning) for meaning, same in words.items() for word in same}
+
+
+MEANINGS: dict[str, Word] = (
+    {color: ("color", color) for color in COLORS}
+    | _synonyms("color", COLOR_WORDS)
+    | _synonyms("kind", NOUNS)
+    | _synonyms("accessory", ACCESSORY_WORDS)
+    | _synonyms("pattern", PATTERN_WORDS)
+    | {part: ("part", part) for part in PARTS.values()}
+)
+PHRASES = sorted(MEANINGS, key=len, reverse=True)

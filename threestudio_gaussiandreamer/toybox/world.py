@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float
 
 from ..core.streams import numpy_generator
 from ..meshes.mesh import Mesh
-from .kinds import ACCESSORIES, KINDS, Proportions, accessory
+from .kinds import ACCESSORIES, KINDS, Proportions
 from .shapes import Shape, joined
 
 VERSION = 2
@@ -114,39 +114,20 @@ def withheld(attributes: Attributes) -> bool:
     return int.from_bytes(digest, "little") < WITHHELD_SHARE * 2**64
 
 
-def withheld_combinations() -> list[str]:
-    """List all withheld combinations as "kind/colour/pattern/extra", sorted."""
-    extras = [
-        {},
-        {"part": "red"},
-        *({"accessory": name, "accessory_color": "red"} for name in ACCESSORIES),
-    ]
-    found = []
-    for kind in KINDS:
-        for color in COLORS:
-            for pattern in PATTERNS:
-                for extra in extras:
-                    if withheld(Attributes(kind, color, pattern, **extra)):
-                        name = extra.get("accessory") or next(iter(extra), "none")
-                        found.append(f"{kind}/{color}/{pattern}/{name}")
-    return sorted(found)
-
-
 def object_mesh(attributes: Attributes, rng: np.random.Generator) -> Mesh:
     """Make an object's mesh with random proportions, a texture and baked light."""
     proportions = Proportions(rng)
-    model = KINDS[attributes.kind](proportions)
-    shapes = list(model.shapes)
+    shapes, anchors = KINDS[attributes.kind](proportions)
     if attributes.accessory:
-        shapes += accessory(attributes.accessory, model.anchors, proportions)
+        shapes += ACCESSORIES[attributes.accessory](anchors, proportions)
     shape, names = joined(shapes)
     roles = np.array(names)
     like_body = (roles == "part") & (not attributes.part)
-    vertices = _centred(shape.vertices)
+    stretch = rng.uniform(0.85, 1.15)
     return Mesh(
-        vertices=vertices,
+        vertices=_centred(shape.vertices),
         faces=shape.faces,
-        uv=_texture_coordinates(attributes.pattern, shape, roles, like_body, rng),
+        uv=_texture_coordinates(attributes.pattern, shape, roles, like_body, stretch),
         texture=texture(attributes),
         vertex_colors=_shading(shape.normals, like_body),
     )
@@ -161,31 +142,29 @@ def _centred(vertices: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, "V 3"]:
 def _shading(
     normals: Float[np.ndarray, "V 3"], like_body: Bool[np.ndarray, " V"]
 ) -> Float[np.ndarray, "V 3"]:
-    """Return the light, darker on parts that have the body's colours."""
-    light = np.where(like_body, PART_SHADE, 1.0) * _light(normals)
+    """Return half-Lambert light from above, never below AMBIENT, and darker on parts that have the
+    body's colours.
+    """
+    light = AMBIENT + (1 - AMBIENT) * (0.5 + 0.5 * normals @ LIGHT)
+    light = np.where(like_body, PART_SHADE, 1.0) * light
     return np.repeat(light[:, None], 3, axis=1).astype(np.float32)
-
-
-def _light(normals: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, " V"]:
-    """Return half-Lambert light from above, never below AMBIENT."""
-    return AMBIENT + (1 - AMBIENT) * (0.5 + 0.5 * normals @ LIGHT)
 
 
 # Texture: the pattern's PERIODS^2 periods, and to the right of them a column of cells, each plain
 
-PLAIN_ROLES = ("part", "accessory", *DETAILS)
 SIZE = CELL * PERIODS
 
 
 def texture(attributes: Attributes) -> Float[np.ndarray, "H W 3"]:
     """Draw the object's colours: float32 (256, 272, 3), row 0 on top."""
-    first = np.float32(COLORS[attributes.color])
-    second = np.float32(COLORS[attributes.second]) if attributes.second else first
+    color, named = (
+        attributes.color,
+        (attributes.second, attributes.part, attributes.accessory_color),
+    )
+    second, *others = (np.float32(COLORS[name or color]) for name in named)
     mask = _pattern_mask(attributes.pattern)
-    pattern = np.where(mask[..., None], second, first)
-    part = np.float32(COLORS[attributes.part]) if attributes.part else first
-    extra = np.float32(COLORS[attributes.accessory_color]) if attributes.accessory_color else first
-    plain = np.stack([part, extra, *(np.float32(DETAILS[name]) for name in DETAILS)])
+    pattern = np.where(mask[..., None], second, np.float32(COLORS[color]))
+    plain = np.stack([*others, *map(np.float32, DETAILS.values())])
     column = np.zeros((SIZE, CELL, 3), np.float32)
     column[: CELL * len(plain)] = np.repeat(plain, CELL, axis=0)[:, None]
     return np.concatenate([pattern, column], axis=1)
@@ -206,28 +185,21 @@ def _pattern_mask(pattern: str) -> np.ndarray:
 
 
 def _texture_coordinates(
-    pattern: str,
-    shape: Shape,
-    roles: np.ndarray,
-    like_body: Bool[np.ndarray, " V"],
-    rng: np.random.Generator,
+    pattern: str, shape: Shape, roles: np.ndarray, like_body: np.ndarray, stretch: float
 ) -> Float[np.ndarray, "V 2"]:
     """Return uv of each vertex: in the pattern for the body, and for parts ``like_body``; in their
     colour's cell for others.
     """
-    period = PERIOD.get(pattern, 1.0) * rng.uniform(0.85, 1.15)
+    period = PERIOD.get(pattern, 1.0) * stretch
     body = roles == "body"
     height = shape.vertices[:, 2] - shape.vertices[body, 2].min()
-    along = {
-        "two-tone": (height / height[body].max()).clip(0, 1) * PERIODS,
-        "striped": height / period,
-    }
-    v = along.get(pattern, shape.uv[:, 1] / period)
-    u = shape.uv[:, 0] / period
+    whole = (height / height[body].max()).clip(0, 1) * PERIODS
+    u, v = shape.uv.T / period
+    v = {"two-tone": whole, "striped": height / period}.get(pattern, v)
     uv = np.stack([_inside(u), _inside(v)], 1) * [SIZE / (SIZE + CELL), 1.0]
-    for row, role in enumerate(PLAIN_ROLES):
-        cell = [(SIZE + CELL / 2) / (SIZE + CELL), 1 - (row + 0.5) * CELL / SIZE]
-        uv[(roles == role) & ~like_body] = cell
+    middle = (SIZE + CELL / 2) / (SIZE + CELL)  # of the column of cells
+    for row, role in enumerate(("part", "accessory", *DETAILS)):
+        uv[(roles == role) & ~like_body] = [middle, 1 - (row + 0.5) * CELL / SIZE]
     return uv
 
 
