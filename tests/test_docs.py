@@ -9,7 +9,6 @@ import yaml
 
 from benchmarks import tables
 from threestudio_gaussiandreamer import register_parts
-from threestudio_gaussiandreamer.launch import experiment
 from threestudio_gaussiandreamer.launch.config import load_config
 from threestudio_gaussiandreamer.launch.config_check import check_config
 from threestudio_gaussiandreamer.launch.options import find_config, parse_arguments
@@ -20,12 +19,11 @@ ROOT = Path(__file__).parent.parent
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 TEXTS = {str(path.relative_to(ROOT)): path.read_text() for path in DOCUMENTS}
 LINKED = [*DOCUMENTS, *sorted((ROOT / "reports").glob("*.md"))]
-TINY = [
-    "data.width=16", "data.height=16", "data.eval_width=16", "data.eval_height=16",
-    "data.n_test_views=2", "data.train_views=4", "system.geometry.grow.num_candidates=200",
-    "system.evaluation.size=16", "system.evaluation.views=2", "trainer.max_steps=2",
-    "trainer.enable_progress_bar=false", "use_timestamp=false", "tag=t",
-]  # fmt: skip
+EXTENSIONS = re.compile(
+    "spiral-prior|one-color|front-first|variant.behind|smooth_depth|needles|relocate|density.every"
+    "|,extent|sky-background|background.lr"
+)
+"""Options of the examples of docs/extending.md, which tests/promises/test_extending.py trains."""
 
 
 def blocks(text: str, language: str) -> list[str]:
@@ -43,7 +41,7 @@ def launches() -> list[list[str]]:
                     r"(?:^|python )(?:launch\.py|gaussiandreamer) (.*--config.*)", line
                 )
                 found += [shlex.split(command[1], comments=True)] if command else []
-    return found
+    return [list(words) for words in dict.fromkeys(map(tuple, found))]
 
 
 def anchors(text: str) -> set[str]:
@@ -92,74 +90,9 @@ def test_a_launch_that_is_shown_is_accepted(arguments, tmp_path, monkeypatch):
     """Configuration, options and names; "..." stands for the user's own arguments."""
     args = parse_arguments([word for word in arguments if word != "..."])
     paths = [find_config(name).resolve() for name in args.config]
-    overrides = [
-        override
-        for override in args.overrides
-        if not any(override in options for options in PARTS.values())
-        and not re.search("spiral-prior|density.every", override)
-    ]  # extensions, tried below
+    overrides = [text for text in args.overrides if not EXTENSIONS.search(text)]
     monkeypatch.chdir(tmp_path)
     check_config(load_config(*paths, cli_args=overrides))
-
-
-def python_blocks() -> list[tuple[str, str]]:
-    """Return (file name in the first line, source) of the extensions in docs/."""
-    found = [
-        (re.match(r"# (custom/\S+\.py)\n", block), block)
-        for text in TEXTS.values()
-        for block in blocks(text, "python")
-    ]
-    return [(match[1], block) for match, block in found if match]
-
-
-# what the demo has to be told for each of them
-PARTS = {
-    "custom/spiral.py": ["system.geometry.prior_type=spiral-prior"],
-    "custom/one_color.py": [
-        "system.guidance_type=one-color-guidance",
-        "system.geometry.prior.path=toy.glb",
-    ],
-    "custom/front_first.py": [
-        "system.guidance.variant_type=front-first-variant",
-        "system.guidance.variant.behind=0.2",
-    ],
-    "custom/smooth.py": ["system.loss.lambda_smooth_depth=1000", "system.loss.lambda_needles=10"],
-    "custom/relocate.py": [
-        "system.geometry.density_type=relocate-density",
-        "system.geometry.density.every=1",
-        "system.geometry.density.min_opacity=0.1",
-        "system.geometry.budget=none",
-    ],
-    "custom/extent.py": ["system.exporter.formats=[ply,extent]"],
-    "custom/sky.py": [
-        "system.background_type=sky-background",
-        "system.optimizer.params.background.lr=0.01",
-    ],
-}
-
-
-def test_every_extension_that_is_shown_is_tried():
-    assert {name for name, _ in python_blocks()} == set(PARTS)
-
-
-@pytest.mark.parametrize(("name", "source"), python_blocks())
-def test_an_extension_that_is_shown_trains(name, source, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    Path("custom").mkdir()
-    Path(name).write_text(source)
-    code = experiment.main(
-        ["--config", "demo.yaml", "--train", "--gpu", "cpu", *TINY, *PARTS[name]]
-    )
-    assert code == 0 and Path("outputs/demo/t/save/it2-export/gaussians.ply").is_file()
-
-
-def test_the_documented_imports_exist():
-    (block,) = (
-        block
-        for block in blocks(TEXTS["docs/extending.md"], "python")
-        if block.startswith("from threestudio_gaussiandreamer import")
-    )
-    exec(block, {})
 
 
 def test_the_command_of_the_example_for_ci_is_accepted(tmp_path, monkeypatch):
