@@ -1,14 +1,6 @@
-"""The launcher from arguments to results, with a system of a few parameters: stages, mistakes,
-extensions.
-"""
+"""The launcher from arguments to results, with a system of a few parameters: stages, mistakes."""
 
 import os
-import re
-import shlex
-import signal
-import subprocess
-import sys
-import time
 from pathlib import Path
 
 import imageio.v3 as iio
@@ -19,9 +11,6 @@ from tests.helpers import tiny_parts
 from tests.helpers.tiny_runs import files, only_run
 from threestudio_gaussiandreamer.core.checkpoint_file import load_file, save_file
 from threestudio_gaussiandreamer.launch.config import load_config
-from threestudio_gaussiandreamer.launch.experiment import main
-
-REPOSITORY = Path(__file__).resolve().parents[2]
 
 # -- the stages ------------------------------------------------------------------------------------
 
@@ -123,15 +112,6 @@ def test_parts_are_told_every_step(launch, monkeypatch):
     assert systems[0].geometry.updates == [0, 1, 2, 3, 4, 5, 6, 6]
 
 
-def test_the_seed_decides(launch):
-    results = []
-    for seed in (3, 3, 4):
-        assert launch("--train", f"seed={seed}", f"name=seed{len(results)}")[0] == 0
-        (checkpoint,) = Path(f"outputs/seed{len(results)}").glob("*/ckpts/last.ckpt")
-        results.append(load_file(checkpoint)["state_dict"]["geometry.means"])
-    assert torch.equal(results[0], results[1]) and not torch.equal(results[0], results[2])
-
-
 # -- mistakes --------------------------------------------------------------------------------------
 
 
@@ -202,116 +182,3 @@ def test_an_internal_error_keeps_its_traceback(launch, monkeypatch):
     monkeypatch.setattr(tiny_parts.TinySystem, "configure", lambda self: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         launch("--train")
-
-
-# -- as a command ----------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-def test_launch_py_with_parts_in_custom(tmp_path):
-    """In a real process: parts come from one file in custom/, the process gets a real Ctrl-C, and
-    the printed command resumes it.
-    """
-    (tmp_path / "custom").mkdir()
-    (tmp_path / "custom" / "tiny_parts.py").write_text(Path(tiny_parts.__file__).read_text())
-    (tmp_path / "tiny.yaml").write_text(
-        tiny_parts.CONFIG.replace("max_steps: 6", "max_steps: 100000000")
-    )
-    environment = {**os.environ, "PYTHONPATH": "", "CUDA_VISIBLE_DEVICES": ""}
-    arguments = ["--config", "tiny.yaml", "--train", "trainer.limit_val_batches=0"]
-    there = {"cwd": tmp_path, "env": environment, "text": True}
-    process = subprocess.Popen(
-        [sys.executable, str(REPOSITORY / "launch.py"), *arguments],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        **there,
-    )
-    deadline = time.monotonic() + 120
-    # the TensorBoard file appears when training begins
-    while not list(tmp_path.glob("outputs/tiny/*/csv_logs/version_0/metrics.csv")):
-        assert process.poll() is None and time.monotonic() < deadline, process.communicate()
-        time.sleep(0.05)
-    process.send_signal(signal.SIGINT)
-    out, err = process.communicate(timeout=60)
-    assert process.returncode == 130 and "Traceback" not in err
-    resume = shlex.split(re.search("to resume: (.*)", out)[1])
-    step = int(re.search(r"stopped at step (\d+)", out)[1])
-    resumed = subprocess.run(
-        [sys.executable, *resume[1:], f"trainer.max_steps={step + 3}"],
-        capture_output=True,
-        timeout=120,
-        **there,
-    )
-    assert resumed.returncode == 0, resumed.stderr
-    (last,) = tmp_path.glob("outputs/tiny/*/ckpts/last.ckpt")
-    assert load_file(last)["global_step"] == step + 3
-
-
-PRIOR_FILE = """
-from dataclasses import dataclass
-from threestudio_gaussiandreamer.host import register
-from threestudio_gaussiandreamer.gaussians.point_cloud import PointCloud
-from threestudio_gaussiandreamer.priors.base import Prior
-
-@register("ring-prior")
-class RingPrior(Prior):
-    @dataclass
-    class Config(Prior.Config):
-        count: int = 64
-
-    def generate(self, prompt, generator):
-        points = generator.normal(size=(self.cfg.count, 3))
-        colors = generator.random((self.cfg.count, 3)).astype("float32")
-        return PointCloud((0.5 * points).astype("float32"), colors)
-"""
-GUIDANCE_FILE = '''
-from dataclasses import dataclass
-from threestudio_gaussiandreamer.host import BaseObject, register
-
-@register("red-guidance")
-class RedGuidance(BaseObject):
-    @dataclass
-    class Config(BaseObject.Config):
-        strength: float = 1.0
-
-    def __call__(self, rgb, prompt_utils, **batch):
-        """Pulls every pixel towards red: the smallest guidance there is."""
-        red = rgb.new_tensor([1.0, 0.0, 0.0])
-        return {"loss_sds": self.cfg.strength * (rgb - red).square().mean()}
-'''
-OWN_CONFIG = """
-name: own
-tag: run
-data_type: gaussiandreamer-datamodule
-data: {width: 16, height: 16, batch_size: 2, eval_width: 16, eval_height: 16, n_test_views: 2}
-system_type: gaussiandreamer-system
-system:
-  geometry_type: gaussiandreamer-cloud
-  geometry: {prior_type: ring-prior, prior: {count: 32}}
-  background_type: gaussiandreamer-background
-  renderer_type: gaussiandreamer-splatting
-  prompt_processor_type: plain-prompt-processor
-  prompt_processor: {prompt: a red ring}
-  guidance_type: red-guidance
-  loss: {lambda_sds: 100.0}
-trainer: {max_steps: 3, num_sanity_val_steps: 0, limit_val_batches: 0, enable_progress_bar: false}
-"""
-
-
-def test_a_prior_and_a_guidance_of_one_file_each_dropped_into_custom(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
-    for name, source in (("ring_prior.py", PRIOR_FILE), ("red_guidance.py", GUIDANCE_FILE)):
-        (tmp_path / "custom").mkdir(exist_ok=True)
-        (tmp_path / "custom" / name).write_text(source)
-    (tmp_path / "own.yaml").write_text(OWN_CONFIG)
-    assert main(["--config", "own.yaml", "--train"]) == 0, capsys.readouterr().err
-    (run,) = Path("outputs/own").iterdir()
-    assert {
-        "code/custom/ring_prior.py",
-        "code/custom/red_guidance.py",
-        "save/it3-test.mp4",
-    } <= files(run)
-    # misspelt keys of parts that come from custom/ are found too
-    assert main(["--config", "own.yaml", "--train", "system.guidance.strenght=2"]) == 2
-    assert "did you mean 'system.guidance.strength'" in capsys.readouterr().err

@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 
 from threestudio_gaussiandreamer import host, register_parts
-from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.launch.config import load_config
 from threestudio_gaussiandreamer.launch.config_check import check_config
 from threestudio_gaussiandreamer.priors.base import Prior
@@ -69,15 +68,6 @@ def test_the_prior_of_a_shipped_configuration_can_be_built(name, tmp_path):
     """Built, not run: its options are accepted, and it looks for its files only on preflight."""
     geometry = loaded(name, tmp_path).system.geometry
     assert isinstance(host.find(geometry.prior_type)(geometry.prior), Prior)
-
-
-@pytest.mark.parametrize("name", MANDATORY)
-def test_a_missing_value_is_requested(name, tmp_path):
-    paths = [ROOT / "configs" / part for part in (OVERLAYS[name], name)]
-    keys = [override.partition("=")[0] for override in MANDATORY[name]]
-    with pytest.raises(UserError) as caught:
-        load_config(*paths, cli_args=["system.prompt_processor.prompt=a fox"])
-    assert all(key in str(caught.value) for key in keys)
 
 
 def test_a_body_may_be_chosen_among_meshes_instead(tmp_path):

@@ -125,6 +125,7 @@ def test_prune_keeps_a_count(trained):
     result = command("prune", source, "small.ply", "--count", "90", "--size", "32", "--steps", "2")
     assert result.code == 0, result.err
     assert len(read_cloud("small.ply").gaussians.means) == 90
+    assert Path("small.ply.png").stat().st_size > 0
     with open("small.ply.json", encoding="utf-8") as report:
         assert json.load(report)["after"]["gaussians"] == 90
 

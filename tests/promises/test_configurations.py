@@ -14,10 +14,11 @@ import yaml
 from threestudio_gaussiandreamer import register_parts
 from threestudio_gaussiandreamer.host import find
 
-from .commands import DATA, SMOKE, accepted, check_only, launch, refused
+from .commands import DATA, ROOT, SMOKE, accepted, check_only, launch, refused
 
 register_parts()
 CONFIGS = sorted(path.name for path in (DATA / "parsed").iterdir())
+SHIPPED = sorted({*CONFIGS, *(path.name for path in (ROOT / "configs").glob("*.yaml"))})
 OPTIONS = json.loads((DATA / "options.json").read_text())
 PROMPT = "system.prompt_processor.prompt=a red fox"
 FILES = {
@@ -77,7 +78,7 @@ def stack(name: str) -> list[str]:
     return [word for config in names for word in ("--config", config)]
 
 
-@pytest.mark.parametrize("name", CONFIGS)
+@pytest.mark.parametrize("name", SHIPPED)
 def test_a_shipped_configuration_is_accepted(name):
     options = [*stack(name), "--train", PROMPT, *FILES.get(name, []), *check_only()]
     result = launch(*options)
@@ -130,7 +131,7 @@ def overlay(part: str, options: dict[str, Any]) -> dict[str, Any]:
     model = part.removesuffix("guidance")
     processor = PROCESSORS.get(model, model) + "prompt-processor"
     if model != part and processor in OPTIONS:
-        found["data"] = {"n_view": options.get("n_view", 1)}
+        found["data"] = {"n_view": options.get("n_view", 1), "train_views": 0}
         inner["prompt_processor_type"] = processor
         inner["prompt_processor"] = {"pretrained_model_name_or_path": "a model"}
     return found

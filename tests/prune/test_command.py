@@ -19,13 +19,6 @@ from threestudio_gaussiandreamer.prune import command as prune
 from threestudio_gaussiandreamer.prune.pipeline import views_of
 
 
-def test_a_count_is_met_exactly(source, tmp_path):
-    report = run(source, tmp_path / "out.ply", "--count", "250")
-    assert report["after"]["gaussians"] == 250 == len(read_gaussians(tmp_path / "out.ply").means)
-    assert json.loads((tmp_path / "out.ply.json").read_text())["after"]["gaussians"] == 250
-    assert (tmp_path / "out.ply.png").stat().st_size > 0
-
-
 def test_a_cloud_trained_antialiased_is_measured_and_written_so(source, tmp_path):
     stored = read_cloud(str(source))._replace(antialiased=True)
     write_cloud(str(tmp_path / "mip.ply"), stored)

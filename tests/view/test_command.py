@@ -4,8 +4,6 @@ errors give one message.
 
 import json
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -30,16 +28,6 @@ def source(tmp_path) -> Path:
 
 def meta(path: Path) -> dict:
     return json.loads(re.search(r'id="meta">(.*?)</script>', path.read_text())[1])
-
-
-@pytest.mark.slow
-def test_the_command_writes_a_page(source):
-    command = [sys.executable, "-m", "threestudio_gaussiandreamer.view", str(source), "--html"]
-    done = subprocess.run(command, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    assert "box.html: 30 Gaussians" in done.stdout
-    found = meta(source.with_suffix(".html"))
-    assert found["title"] == "box.ply" and found["clouds"][0]["count"] == 30
 
 
 def test_options_say_how_a_cloud_is_drawn(source, tmp_path):
