@@ -21,11 +21,10 @@ from tests.helpers.tiny_guidance import (
     renders,
 )
 from threestudio_gaussiandreamer.core import streams
-from threestudio_gaussiandreamer.guidance import half_precision, text_to_image
+from threestudio_gaussiandreamer.guidance import base, half_precision, text_to_image
 from threestudio_gaussiandreamer.guidance.base import NonFiniteScore
 from threestudio_gaussiandreamer.guidance.half_precision import (
     PerItemLossScale,
-    channels_last,
     weights_type,
 )
 from threestudio_gaussiandreamer.guidance.stable_diffusion import StableDiffusionGuidance
@@ -260,12 +259,10 @@ def half(monkeypatch):
 def test_half_precision_on_a_cpu_is_bfloat16_where_it_is_native(monkeypatch, native):
     monkeypatch.setattr(half_precision, "cpu_multiplies_bfloat16", lambda: native)
     cpu, gpu = torch.device("cpu"), torch.device("cuda")
-    cfg = StableDiffusionGuidance.Config(enable_channels_last_format=True)
+    cfg = StableDiffusionGuidance.Config()
     assert (weights_type(cfg, gpu), weights_type(cfg, cpu)) == (torch.float16, torch.float32)
     cfg.half_precision_on_cpu = True
     assert weights_type(cfg, cpu) == (torch.bfloat16 if native else torch.float32)
-    assert channels_last(cfg, weights_type(cfg, cpu), cpu) is not native
-    assert channels_last(cfg, torch.bfloat16, gpu)
     cfg.half_precision_weights = False
     assert weights_type(cfg, gpu) == weights_type(cfg, cpu) == torch.float32
 
@@ -335,8 +332,11 @@ def test_the_loss_scale_of_each_item_is_undone():
     assert [result.tolist() for result in results] == [[False] * 3]
 
 
-def test_a_gradient_that_overflows_in_the_encoder_is_left_out_and_counted(models, prompts, half):
-    guide, rgb = guidance(models, max_bad_steps=3), renders()
+def test_a_gradient_that_overflows_in_the_encoder_is_left_out_and_counted(
+    models, prompts, half, monkeypatch
+):
+    monkeypatch.setattr(base, "MAX_BAD_STEPS", 3)
+    guide, rgb = guidance(models), renders()
     clean, _ = gradient(guide, prompts[False], rgb)
     encode = guide.vae.encode
 

@@ -90,7 +90,7 @@ def test_the_error_is_the_guided_noise_minus_that_of_the_merged_lora(models, pro
 
     cond, uncond = condition.embeddings.chunk(2)
     with torch.no_grad():
-        error, _ = guide.variant.error(guide, latents, condition, views)
+        error, _ = guide.variant.residual(guide, latents, condition, views)
         own = noise(unet, cond, class_labels=torch.zeros(4))
         plain, negative = noise(guide.unet, cond), noise(guide.unet, uncond)
     expected = negative + 7.5 * (plain - negative) - own

@@ -102,24 +102,11 @@ def test_the_gradient_towards_known_views_is_the_closed_form(model, prompts, sha
     assert relative(mine, expected[[2, 0, 3, 1]]) > 0.1, "views could be exchanged"
 
 
-def test_views_that_are_no_group_are_refused(model, prompts):
+def test_views_that_are_no_group_and_partial_pictures_are_refused(model, prompts):
     guide = tiny.guidance(KIND, model)
-    said = "set data.n_view=4 and data.batch_size to a multiple of it"
-    with pytest.raises(UserError, match=f"sees 4 views .*together, and a batch has 3.*{said}"):
+    said = "sees 4 views .*together, and a batch has 3: set data.n_view=4"
+    with pytest.raises(UserError, match=said):
         guide(renders(3), prompts, **first(ring(), 3))
-    for change in (
-        {"elevation": torch.tensor([15.0, 15.0, 20.0, 15.0])},
-        {"azimuth": torch.tensor([0.0, 90.0, 270.0, 180.0])},
-    ):
-        with pytest.raises(UserError, match=f"azimuths 90 degrees apart.*{said}"):
-            guide(renders(), prompts, **ring(**change))
-    gradient(guide, prompts, renders(), **ring(azimuth=torch.tensor([100.0, -170.0, -80.0, 370.0])))
-
-
-def test_perp_neg_and_partial_pictures_are_refused(model):
-    with pytest.raises(UserError, match="use_perp_neg=false"):
-        prompt_utils = tiny.prompts("stable-diffusion", model, use_perp_neg=True)
-        gradient(tiny.guidance(KIND, model, view_dependent_prompting=True), prompt_utils, renders())
     with pytest.raises(UserError, match="max_items_eval: expected a multiple of n_view=4, or 0"):
         tiny.guidance(KIND, model, max_items_eval=3)
 
@@ -140,8 +127,6 @@ def test_a_single_view_is_evaluated_alone(model, prompts):
     ]
     assert pictures[0].shape == (1, 64, 64, 3)
     torch.testing.assert_close(*pictures, rtol=1e-3, atol=1e-3)
-    with pytest.raises(UserError, match="a batch has 1: set data.n_view=4"):
-        tiny.guidance(KIND, model)(renders(1), prompts, **first(ring(), 1))
 
 
 def in_double(guide):

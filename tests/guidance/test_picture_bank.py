@@ -23,7 +23,7 @@ def bank(request):
     if request.param == "pixel":
         return Bank.of(rgba, pixels, exact_score.LinearLatent())
     pooled = torch.nn.functional.avg_pool2d(pixels, 2)
-    latent = exact_score.LinearLatent(2, exact_score.color_matrix(4))
+    latent = exact_score.LinearLatent(2, exact_score.COLOR_MATRIX)
     return Bank.of(rgba, pooled, latent.normalised(pooled[:, :3]))
 
 

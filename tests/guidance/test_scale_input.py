@@ -2,13 +2,18 @@
 and all that needs the unconditional prediction.
 """
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 
 from tests.helpers import tiny_guidance as tiny
 from tests.helpers import tiny_large_models, tiny_models
-from threestudio_gaussiandreamer.guidance import stable_diffusion_xl  # noqa: F401
-from threestudio_gaussiandreamer.guidance.scale_input import scale_input
+from threestudio_gaussiandreamer.guidance import (
+    stable_diffusion_xl,  # noqa: F401
+    text_to_image,
+)
+from threestudio_gaussiandreamer.guidance.text_to_image import TextToImageDistillation
 from threestudio_gaussiandreamer.host import find
 from threestudio_gaussiandreamer.prompts import pooled_prompt_processors  # noqa: F401
 
@@ -25,6 +30,11 @@ def models(tmp_path_factory):
     trained = {"beta_start": 0.00085, "beta_end": 0.012, "beta_schedule": "scaled_linear"}
     diffusers.LCMScheduler(**trained).save_pretrained(folder / "scheduler")
     return {"epsilon": folder}
+
+
+def scale_input(scale, width, count):
+    part = SimpleNamespace(scale_width=width, device=torch.device("cpu"), dtype=torch.float32)
+    return TextToImageDistillation.scale_input(part, scale, count)
 
 
 @pytest.fixture(scope="module")
@@ -104,15 +114,16 @@ def test_a_negative_scale_is_extrapolated_and_not_an_input(models, prompts):
 
 def test_a_scale_that_no_model_knows_is_warned_of(models, caplog):
     tiny.guidance(models, guidance_scale=101.0)
-    assert "guidance_scale=101" in caplog.text and "3 to 15" in caplog.text
+    assert "guidance_scale=101" in caplog.text and "expected 1 to 20" in caplog.text
     caplog.clear()
     tiny.guidance(models, guidance_scale=8.5)
     assert "guidance_scale" not in caplog.text
 
 
-def test_view_contrast_is_that_of_predictions_with_guidance(models):
+def test_view_contrast_is_that_of_predictions_with_guidance(models, monkeypatch):
     """Continuous at 0, and two evaluations per view in place of three."""
-    options = {"guidance_scale": 4.0, "view_contrast_from": 0.0}
+    options = {"guidance_scale": 4.0}
+    monkeypatch.setattr(text_to_image, "CONTRAST_FROM", 0.0)
     prompt_utils = tiny.left_and_right(models)
     z = torch.randn(4, 4, 8, 8, generator=torch.Generator().manual_seed(0))
 

@@ -13,7 +13,7 @@ from tests.helpers import tiny_models
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.diffusion.noise_prediction import perp_neg, rescaled
 from threestudio_gaussiandreamer.guidance.base import NonFiniteScore
-from threestudio_gaussiandreamer.guidance.text_condition import view_of_row
+from threestudio_gaussiandreamer.guidance.types import view_of_row
 from threestudio_gaussiandreamer.prompts.prompts import PlainPrompt
 
 pytest.importorskip("diffusers")

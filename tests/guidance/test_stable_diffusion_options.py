@@ -102,7 +102,6 @@ def test_an_unusual_guidance_scale_is_told(models, caplog, scale, warned):
     [
         ("recon_std_rescale", 1.5),
         ("image_size", 0),
-        ("max_bad_steps", 0),
         ("weighting_strategy", "sdss"),
     ],
 )

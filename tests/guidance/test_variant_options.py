@@ -26,7 +26,7 @@ def test_an_inversion_takes_at_most_its_share_of_the_steps(steps, stride, monkey
     monkeypatch.setattr(MixtureGuidance, "guided_noise", guided_noise)
     own = {"inversion_steps": steps, "eta": 0.0}
     guide, x = mixture_guidance("sdi-variant", variant=own, **NOISIEST), latents(1)
-    guide.variant.error(guide, x, None, {})
+    guide.variant.residual(guide, x, None, {})
     *inversion, last = seen
     assert last == [980] and inversion == [[t] for t in range(0, 980, stride)]
     assert len(inversion) <= math.ceil(0.98 * steps)
@@ -96,14 +96,6 @@ def test_a_lora_has_no_momentum(models):
     with pytest.raises(UserError, match="variant.momentum has no effect with StableDiffusionGuid"):
         StableDiffusionGuidance.preflight(options | {"variant": {"momentum": 0.5}})
     StableDiffusionGuidance.preflight(options | {"variant": {"rank": 8, "momentum": 0.95}})
-
-
-def test_the_timesteps_of_a_view_contrast_need_one(models):
-    pytest.importorskip("diffusers")
-    options = diffusion(models, view_contrast_from=0.55)
-    with pytest.raises(UserError, match="view_contrast_from has no effect with view_contrast=0: "):
-        StableDiffusionGuidance.preflight(options)
-    StableDiffusionGuidance.preflight(options | {"view_contrast": 1.5})
 
 
 def test_an_interval_without_guidance_limits_a_view_contrast(models):

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import pytest
 import torch
+from omegaconf import OmegaConf
 
 from tests.guidance.exact_score_cases import batch, guidance, step, uniform
 from tests.helpers import tiny_guidance as tiny
@@ -14,7 +15,6 @@ from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.core.options import positive
 from threestudio_gaussiandreamer.guidance.exact_score import ExactScoreGuidance
 from threestudio_gaussiandreamer.guidance.variants import Variant
-from threestudio_gaussiandreamer.guidance.variants.base import checked_error
 from threestudio_gaussiandreamer.host import find, names, register
 from threestudio_gaussiandreamer.launch.config_check import check_part
 
@@ -71,12 +71,12 @@ def test_a_variant_of_a_user_is_one_file():
         class Config(Variant.Config):
             share: float = field(default=0.5, metadata=positive())
 
-        def error(self, guidance, latents, condition, batch):
+        def residual(self, guidance, latents, condition, batch):
             noised = guidance.add_noise(latents)
             return self.cfg.share * latents, noised.abar
 
     guide = mixture_guidance("test-half-variant", variant={"share": 0.25})
-    error, _ = guide.variant.error(guide, latents(), None, {})
+    error, _ = guide.variant.residual(guide, latents(), None, {})
     assert torch.equal(error, 0.25 * latents())
     with pytest.raises(UserError, match="system.guidance.variant.share: expected a number above 0"):
         mixture_guidance("test-half-variant", variant={"share": 0.0})
@@ -100,9 +100,6 @@ def test_a_variant_of_a_user_is_one_file():
             {"variant_type": "vsd-variant", "variant": {"rank": 0}},
             "guidance.variant.rank: expected a number from 1",
         ),
-        ({"timestep_schedule": "dreamtim", "timestep_steps": 9}, "did you mean 'dreamtime'"),
-        ({"timestep_steps": 9}, "timestep_steps: timestep_schedule=uniform doesn't use it"),
-        ({"timestep_schedule": "sqrt"}, "timestep_steps: .*sqrt needs the number of steps"),
         ({"guidance_interval": [0.6, 0.4]}, "guidance_interval: expected"),
         ({"recon_std_rescale": 1.5}, "recon_std_rescale: expected a number from 0 to 1"),
     ],
@@ -133,7 +130,7 @@ def test_options_without_effect_are_refused(mesh_path, variant, option):
 def test_surface_noise_without_a_surface_is_an_error():
     guide = mixture_guidance("cfd-variant")
     with pytest.raises(UserError, match="give the guidance the renderer's depth and opacity"):
-        guide.variant.error(guide, latents(), None, {})
+        guide.variant.residual(guide, latents(), None, {})
 
 
 def test_a_checkpoint_of_another_variant_is_refused():
@@ -258,19 +255,6 @@ def test_the_contrast_is_rescaled_for_every_guidance():
     torch.testing.assert_close(rescaled, cond)
 
 
-@pytest.mark.parametrize("schedule", ["linear", "sqrt", "dreamtime"])
-def test_timesteps_fall_from_the_largest_to_the_smallest(schedule):
-    guide = mixture_guidance(timestep_schedule=schedule, timestep_steps=50)
-    seen = []
-    for at in range(60):
-        guide.update_step(0, at)
-        t, abar = guide.draw_timesteps(latents())
-        assert (t == t[0]).all() and torch.equal(abar, guide.alphas_cumprod[t])
-        seen.append(int(t[0]))
-    assert seen == sorted(seen, reverse=True)
-    assert seen[0] >= 960 and seen[49] == 20 and seen[-1] == 20
-
-
 @pytest.mark.parametrize(
     "returned",
     [
@@ -286,9 +270,9 @@ def test_what_a_variant_returns_has_the_latents_shape(returned):
     latents = torch.zeros(2, 3, 4, 5)
     right = (torch.zeros_like(latents), torch.ones(2))
     variant = find("sds-variant")({})
-    assert checked_error(variant, right, latents) is right
-    with pytest.raises(UserError, match=r"SDS.error returned \(.*; expected the error and abar"):
-        checked_error(variant, returned, latents)
+    assert variant.checked(right, latents) is right
+    with pytest.raises(UserError, match=r"SDS.residual returned \(.*; expected the residual and"):
+        variant.checked(returned, latents)
 
 
 @register("test-errorless-variant")
@@ -298,29 +282,54 @@ class Errorless(Variant):
 
 @register("test-other-error-variant")
 class OtherError(Variant):
-    def error(self, guidance, latents):
+    def residual(self, guidance, latents):
         return latents
 
 
 @pytest.mark.parametrize(
     ("name", "said"),
-    [("errorless", "Errorless has no error"), ("other-error", "OtherError has error.*called as")],
+    [
+        ("errorless", "Errorless has no residual"),
+        ("other-error", "OtherError has residual.*called as"),
+    ],
 )
-def test_a_variant_without_the_method_error_is_refused_before_the_run(mesh_path, name, said):
+def test_a_variant_without_the_method_residual_is_refused_before_the_run(mesh_path, name, said):
     with pytest.raises(UserError, match=rf"{said}.*\(guidance, latents, condition, batch\)"):
         guidance(mesh_path, variant_type=f"test-{name}-variant")
 
 
-def test_a_variant_that_is_not_finite_is_named_and_not_the_score_model(caplog):
-    @register("test-nan-variant")
-    class WithNan(Variant):
+def test_a_variant_with_the_old_name_of_the_method_is_told_and_works(caplog):
+    class Named(Variant):
         def error(self, guidance, latents, condition, batch):
-            noised = guidance.add_noise(latents)
-            error = guidance.predict_noise(noised.z, noised.t, condition) - noised.noise
-            return error * torch.nan, noised.abar
+            return 0.25 * latents, torch.ones(len(latents))
 
-    guide = mixture_guidance(variant_type="test-nan-variant", max_bad_steps=2)
-    guide(latents(), rgb_as_latents=True)
-    assert "step 3: WithNan.error of" in caplog.text
-    with pytest.raises(UserError, match="WithNan.error returned NaN or infinity in 2 steps"):
-        guide(latents(), rgb_as_latents=True)
+    assert "Named.error is called residual now" in caplog.text
+    residual, _ = Named({}).residual(None, latents(), None, {})
+    assert torch.equal(residual, 0.25 * latents())
+
+
+def test_timesteps_fall_with_the_same_schedule_for_the_smallest_and_the_largest():
+    falling = [0, 0.98, 0.02, 50]
+    guide, seen = mixture_guidance(min_step_percent=falling, max_step_percent=falling), []
+    for at in range(60):
+        guide.update_step(0, at)
+        t, abar = guide.draw_timesteps(latents())
+        assert (t == t[0]).all() and torch.equal(abar, guide.alphas_cumprod[t])
+        seen.append(int(t[0]))
+    assert seen == sorted(seen, reverse=True) and (seen[0], seen[-1]) == (980, 20)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"reuse_steps": 1, "timestep_schedule": "uniform", "timestep_steps": 0}, ""),
+        ({"reuse_steps": 4}, "reuse_steps is no option any more: each step evaluates"),
+        ({"timestep_schedule": "linear", "timestep_steps": 9}, "give both the same schedule"),
+    ],
+)
+def test_options_of_earlier_versions_are_left_out_with_a_line(mesh_path, caplog, options, said):
+    values = OmegaConf.create({"mesh": mesh_path, **options})
+    check_part("system.guidance", "exact-score-guidance", values)
+    assert values == {"mesh": mesh_path}
+    assert caplog.text.count("no option any more") == bool(said) and said in caplog.text
+    ExactScoreGuidance.preflight({"mesh": mesh_path, **options})

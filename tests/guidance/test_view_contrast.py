@@ -6,13 +6,13 @@ import torch
 from tests.helpers import tiny_guidance as tiny
 from tests.helpers import tiny_large_models
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.guidance import mvdream  # noqa: F401
+from threestudio_gaussiandreamer.guidance import mvdream, text_to_image  # noqa: F401
 from threestudio_gaussiandreamer.host import find
 
 pytest.importorskip("diffusers")
 
 CONTRAST = 0.75
-ALL = {"view_contrast": CONTRAST, "view_contrast_from": 0.0}
+ALL = {"view_contrast": CONTRAST}
 BATCH = tiny.BATCH | {"elevation": torch.tensor([0.0, 10.0, 20.0, -5.0])}
 """Front, left, back and right."""
 TURNED = BATCH | {"azimuth": BATCH["azimuth"] + 180}
@@ -28,6 +28,12 @@ def z():
     return torch.randn(4, 4, 8, 8, generator=torch.Generator().manual_seed(0))
 
 
+@pytest.fixture
+def everywhere(monkeypatch):
+    """Apply view contrast at all timesteps."""
+    monkeypatch.setattr(text_to_image, "CONTRAST_FROM", 0.0)
+
+
 def predictions(models, prompt_utils, z, batch=BATCH, **options):
     """Return the conditional and the unconditional prediction of four views."""
     guide = tiny.guidance(models, guidance_scale=4.0, **options)
@@ -35,6 +41,7 @@ def predictions(models, prompt_utils, z, batch=BATCH, **options):
     return guide, *guide.predict(z, tiny.TIMESTEPS, guide.condition(prompt_utils, **batch))
 
 
+@pytest.mark.usefixtures("everywhere")
 def test_the_conditional_prediction_moves_away_from_the_opposite_views(models, views, z):
     _, plain, uncond = predictions(models, views, z)
     _, other, _ = predictions(models, views, z, TURNED)
@@ -45,16 +52,19 @@ def test_the_conditional_prediction_moves_away_from_the_opposite_views(models, v
     assert all(tiny.relative(*pair) > 1e-3 for pair in zip(cond, plain, strict=True))
 
 
-def test_only_at_large_timesteps(models, views, z):
+def test_only_at_large_timesteps(models, views, z, monkeypatch):
     """TIMESTEPS are 40, 400, 700 and 950 of 1000."""
     _, plain, _ = predictions(models, views, z)
-    _, everywhere, _ = predictions(models, views, z, **ALL)
+    with monkeypatch.context() as change:
+        change.setattr(text_to_image, "CONTRAST_FROM", 0.0)
+        _, everywhere, _ = predictions(models, views, z, **ALL)
     guide, cond, _ = predictions(models, views, z, view_contrast=CONTRAST)
     assert guide.evaluations == 8 + 3
     torch.testing.assert_close(cond[0], plain[0])
     torch.testing.assert_close(cond[1:], everywhere[1:])
 
 
+@pytest.mark.usefixtures("everywhere")
 def test_guidance_is_added_to_it(models, views, z):
     guide, cond, uncond = predictions(models, views, z, **ALL)
     condition = guide.condition(views, **BATCH)
@@ -62,6 +72,7 @@ def test_guidance_is_added_to_it(models, views, z):
     torch.testing.assert_close(guided, uncond + 4.0 * (cond - uncond))
 
 
+@pytest.mark.usefixtures("everywhere")
 def test_each_view_keeps_its_opposite_in_a_guidance_interval(models, views, z):
     """Views inside of the interval are those above timestep 500."""
     guide, _, _ = predictions(models, views, z, **ALL, guidance_interval=(0.5, 1.0))
@@ -85,12 +96,6 @@ def test_every_variant_follows_it(models, views, variant):
         return float(guide(tiny.renders(), views, **BATCH | surface | cameras)["grad_norm"])
 
     assert abs(norm(1.0) / norm(0.0) - 1) > 1e-3
-
-
-def test_perp_neg_is_refused(models, prompts):
-    guide = tiny.guidance(models, view_contrast=1.0)
-    with pytest.raises(UserError, match="use_perp_neg=false"):
-        guide.condition(prompts[True], **tiny.BATCH)
 
 
 def test_mvdream_refuses_it(tmp_path):

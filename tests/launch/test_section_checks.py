@@ -13,7 +13,6 @@ from threestudio_gaussiandreamer.launch.section_checks import check_shared_views
 CONFIGS = Path(__file__).parents[2] / "configs"
 PERP_NEG = "system.prompt_processor.use_perp_neg=true"
 LATENT = "system.guidance.space=latent"
-HELD = ("system.guidance.reuse_steps=4", "data.hold_steps=4")
 
 
 def check(names, *overrides):
@@ -38,14 +37,6 @@ WRONG = [
         ["system.prompt_processor_type=plain-prompt-processor", "system.prompt_processor={}"],
         "needs a prompt processor that encodes text",
     ),
-    (("toybox",), HELD[:1], "set data.hold_steps=4"),
-    (("toybox",), (HELD[0], "data.hold_steps=3"), "set data.hold_steps=4"),
-    (("toybox",), (HELD[0], "data.hold_steps=6"), "set data.hold_steps=4, or to a multiple of it"),
-    (("demo",), (HELD[0], "data.train_views=200"), "set data.hold_steps=4"),
-    (("demo",), (HELD[0], "data.train_views=4", "data.batch_uniform_azimuth=false"), "hold_steps"),
-    (("demo",), (*HELD, "system.background.hold_steps=3"), "set system.background.hold_steps=4"),
-    (("demo",), HELD, "set system.background.hold_steps=4"),
-    (("demo",), (*HELD, "system.background.mode=learned"), "a learned one changes in each step"),
     (("demo",), (LATENT, "data.height=250"), "pictures of 250x256 can't be pooled"),
     (("demo",), (LATENT, "data.width=[256,250]", "data.resolution_milestones=[9]"), "256x250"),
     (("demo",), (LATENT, "system.renderer.downsample=2", "data.height=280"), "of 140x128"),
@@ -64,10 +55,6 @@ def test_contradictions_are_named(names, overrides, message):
     ("names", "overrides"),
     [
         (("toybox",), [PERP_NEG, "system.guidance.view_contrast=0"]),
-        (("toybox",), HELD),  # with a fixed background
-        (("demo",), [*HELD, "system.background.hold_steps=4"]),
-        (("demo",), [HELD[0], "data.train_views=4", "system.background.hold_steps=8"]),
-        (("demo",), [HELD[0], "data.train_views=1", "system.background.hold_steps=4"]),
         (("demo",), [LATENT, "data.height=512", "system.renderer.downsample=2"]),
         (("demo",), ["data.height=250"]),
         (MVDREAM, []),

@@ -25,7 +25,7 @@ OVERLAYS = (
         )
     }
     | {"polish.yaml": "gaussiandreamer.yaml"}
-    | {f"toybox-{name}.yaml": "toybox.yaml" for name in ("draft", "paper", "image-targets")}
+    | {f"toybox-{name}.yaml": "toybox.yaml" for name in ("draft", "paper")}
 )
 """What each is laid over."""
 MANDATORY = {

@@ -40,7 +40,7 @@ def test_a_few_steps_with_them(tmp_path):
 
 @pytest.mark.slow
 def test_a_whole_run_is_recognised_by_the_judge(tmp_path):
-    """With the draft's options, which take fewer evaluations for the same steps."""
+    """With the draft's options, which take fewer views for the same steps."""
     pytest.importorskip("diffusers")
     cfg = yaml.safe_load((CONFIGS / "toybox.yaml").read_text())
     prior = cfg["system"]["geometry"]["prior"]

@@ -26,15 +26,6 @@ def test_random_depends_on_the_step_alone_and_rests_in_evaluation():
     assert torch.equal(background.eval().color(4), torch.ones(4, 3))
 
 
-def test_random_colours_are_held_for_so_many_steps():
-    background, colors = FlatBackground({"mode": "random", "hold_steps": 3}), []
-    for step in range(6):
-        background.update_step(0, step)
-        colors.append(background.color(2))
-    assert all(torch.equal(colors[i], colors[i - i % 3]) for i in range(6))
-    assert not torch.equal(colors[0], colors[3])
-
-
 def test_the_hosts_random_colour_depends_on_the_step_alone():
     background = SolidColorBackground({"random_aug": True, "random_aug_prob": 0.5})
     dirs, colors = torch.zeros(2, 1, 1, 3), []
@@ -69,18 +60,6 @@ def test_learned_starts_at_the_colour_stays_in_range_and_learns():
 def test_wrong_options_are_named(wrong, named):
     with pytest.raises(UserError, match=named):
         FlatBackground(wrong)
-
-
-def test_a_held_colour_is_the_same_in_all_processes_until_the_next_step(monkeypatch):
-    background, colors = FlatBackground({"mode": "random"}), []
-    for first in (0, 4):
-        monkeypatch.setattr(f"{FlatBackground.__module__}.first_item", lambda count, at=first: at)
-        background.update_step(0, 9)
-        background.hold(3)
-        colors.append(background.color(4))
-        background.update_step(0, 10)
-        colors.append(background.color(4))
-    assert torch.equal(colors[0], colors[2]) and not torch.equal(colors[1], colors[3])
 
 
 def test_a_derived_background_with_colours_of_pixels_is_drawn():

@@ -115,15 +115,6 @@ def test_a_stream_that_starts_at_step_3_continues_the_one_that_never_stopped():
         assert torch.equal(a["c2w"], b["c2w"]) and torch.equal(a["fovy"], b["fovy"])
 
 
-@pytest.mark.parametrize("options", [{}, {"train_views": 50}, {"progressive_until": 9}])
-def test_cameras_are_held_for_so_many_steps(options):
-    held = batches(module(hold_steps=2, **options), 4)
-    plain = batches(module(**options), 4)
-    for step in range(4):
-        assert torch.equal(held[step]["c2w"], plain[step - step % 2]["c2w"])
-    assert not torch.equal(held[0]["c2w"], held[2]["c2w"])
-
-
 def test_no_batch_is_degenerate():
     for batch in batches(module(), 6):
         assert batch["elevation"].unique().numel() == 4 and batch["azimuth"].unique().numel() == 4

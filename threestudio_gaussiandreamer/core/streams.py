@@ -26,11 +26,6 @@ def generator(seed: int, stream: str, step: int = 0, item: int = 0) -> torch.Gen
     return torch.Generator().manual_seed(derive_seed(seed, stream, step, item))
 
 
-def held(step: int, steps: int) -> int:
-    """Return the step whose draws ``step`` has, if draws are held for so many steps."""
-    return step - step % steps
-
-
 def numpy_generator(seed: int, stream: str, step: int = 0, item: int = 0) -> np.random.Generator:
     """Return a new NumPy generator, seeded by :func:`derive_seed`."""
     return np.random.default_rng(derive_seed(seed, stream, step, item))

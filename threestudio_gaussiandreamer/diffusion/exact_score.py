@@ -121,16 +121,14 @@ def responsibilities(
     variance: Float[Tensor, " B"],
     *,
     log_prior: Optional[Float[Tensor, "*prior K"]] = None,
-    temperature: float = 1.0,
 ) -> Float[Tensor, "B K"]:
-    """Compute gamma = softmax((log pi - distances / 2v) / temperature) in float64.
+    """Compute gamma = softmax(log pi - distances / 2v) in float64.
 
-    ``log_prior`` need not be normalised; -inf excludes an image. A temperature above 1 smooths the
-    responsibilities, which then are no longer exact."""
+    ``log_prior`` need not be normalised; -inf excludes an image."""
     logits = -distances / (2 * variance.to(distances)[:, None])
     if log_prior is not None:
         logits = logits + log_prior.to(logits)
-    return torch.softmax(logits / temperature, dim=1)
+    return torch.softmax(logits, dim=1)
 
 
 def denoise(
@@ -140,7 +138,6 @@ def denoise(
     *,
     std: float = 0.0,
     log_prior: Optional[Float[Tensor, "*prior K"]] = None,
-    temperature: float = 1.0,
     distances: Optional[Float[Tensor, "B K"]] = None,
 ) -> Denoised:
     """Compute the exact score at z, in the form of the optimal noise prediction.
@@ -150,7 +147,6 @@ def denoise(
         bank: the images x_k, shared (K, d) or per item (B, K, d), or what takes their place.
         std: s, the standard deviation of each mode, >= 0.
         log_prior: log pi_k, not necessarily normalised; by default uniform.
-        temperature: 1 is exact; see :func:`responsibilities`.
         distances: the squared distances to the images if they are already known, for instance for
             two mixtures of one bank.
     """
@@ -158,7 +154,7 @@ def denoise(
     variance = mode_variance(abar, std)
     if distances is None:
         distances = images.squared_distances(z, abar)
-    gamma = responsibilities(distances, variance, log_prior=log_prior, temperature=temperature)
+    gamma = responsibilities(distances, variance, log_prior=log_prior)
     mean = images.weighted_sum(gamma.to(z))
     residual = z - sds.per_item(abar.double().sqrt(), z) * mean
     eps = sds.per_item((1 - abar.double()).sqrt() / variance, z) * residual
@@ -204,6 +200,12 @@ def mode_variance(abar: Float[Tensor, " B"], std: float) -> Float[Tensor, " B"]:
 
 # The linear latent
 # --------------------------------------------------------------------------------------------------
+
+
+COLOR_MATRIX = torch.tensor([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / 2
+"""Orthonormal columns from RGB to four channels; its rows are the corners of a tetrahedron: the
+first channel is a luminance, the others are opponent colours.
+"""
 
 
 class LinearLatent(NamedTuple):
@@ -257,24 +259,3 @@ def _recolored(
     images: Float[Tensor, "B i h w"], matrix: Optional[Float[Tensor, "o i"]]
 ) -> Float[Tensor, "B o h w"]:
     return images if matrix is None else F.conv2d(images, matrix.to(images)[:, :, None, None])
-
-
-def color_matrix(channels: int) -> Optional[Float[Tensor, "c 3"]]:
-    """Return a matrix with orthonormal columns from RGB to ``channels`` channels.
-
-    For 3 channels it is None, the identity. For 4 its rows are the corners of a tetrahedron: the
-    first channel is a luminance, the others are opponent colours. For more it is random with a
-    fixed seed.
-
-    Raises:
-        UserError: fewer than 3 channels.
-    """
-    if channels < 3:
-        raise UserError(f"a latent of colours needs at least 3 channels, not {channels}")
-    if channels == 3:
-        return None
-    if channels == 4:
-        return torch.tensor([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / 2
-    return torch.linalg.qr(
-        torch.randn(channels, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    )[0].float()

@@ -4,11 +4,12 @@ its latent.
     x = encode(render),  z = sqrt(abar) x + sqrt(1 - abar) eps,  grad = w(t) (eps_hat(z, t) - eps),
                          dloss/dx = grad / B
 
-A variant (``variants/``) replaces eps_hat - eps by another error, for every guidance alike. A
+A variant (``variants/``) replaces eps_hat - eps by another residual, for every guidance alike. A
 guidance is a subclass that says how to ``encode`` and ``decode``, what to ``condition`` on, and
-how to ``predict`` the noise. Its networks may run in half precision; this module computes in
-float32. Timesteps and noise are functions of (seed, step, item), so a resumed run draws the same
-values as an uninterrupted one.
+how to ``predict`` the noise, with and without its condition; classifier-free guidance, its interval
+and rescaling are computed from that pair here. Networks may run in half precision; this module
+computes in float32. Timesteps and noise are functions of (seed, step, item), so a resumed run draws
+the same values as an uninterrupted one.
 
 ==================  ================================================================================
 option              meaning
@@ -23,91 +24,158 @@ variant_type        how the score becomes a gradient, and the options of it: sds
 variant             csd-variant, ...; see docs/distillation.md
 min_step_percent    smallest timestep as a share of all, a number or a schedule; timesteps are
                     clamped to [1, T - 1]
-max_step_percent    largest timestep, likewise (the paper: [500, 0.98, 0.55, 501])
-timestep_schedule   uniform: random between the two; linear, sqrt, dreamtime: from the largest to
-                    the smallest within ``timestep_steps`` steps, the same for all items. One fixed
-                    timestep: the same share as the smallest and as the largest
+max_step_percent    largest timestep, likewise (the paper: [500, 0.98, 0.55, 501]). With the same
+                    number for both all timesteps are that one; with the same schedule,
+                    [0, 0.98, 0.02, <steps>], they fall in the course of a run
 grad_clip           clamp each element of the latent's gradient to +- this; none, a number or a
                     schedule
 weighting_strategy  w(t): sds (1 - abar), uniform (1), fantasia3d (sqrt(abar) (1 - abar)),
                     x0 (sqrt((1 - abar) / abar): the gradient is x minus the denoised x),
                     rectified_flow (1 + sqrt((1 - abar) / abar): the error of a flow's velocity)
-reuse_steps         steps of the same views that one prediction serves, see ``reuse.py``
-max_bad_steps       stop after this many steps in a row in which the score of some item was NaN or
-                    infinite
 max_items_eval      how many items ``guidance_eval`` shows; 0 or less = all, as in threestudio
 eval_steps          DDIM steps from the noise to ``imgs_final``
 ==================  ================================================================================
 """
 
 import functools
-from abc import abstractmethod
+from abc import ABC, abstractmethod
+from collections import Counter
 from dataclasses import dataclass, field
-from typing import Any, Optional
+from typing import Any, ClassVar, Optional, Tuple
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from ..core import streams
 from ..core.devices import without_autocast
+from ..core.distributed import first_item
 from ..core.errors import UserError, unknown
-from ..core.host_copies import DelayedReads
+from ..core.host_copies import DelayedReads, to_device
 from ..core.methods import require_method
-from ..core.options import at_least, checked_options, in_range, one_of, schedule
+from ..core.options import checked_options, in_range, interval, one_of, schedule
 from ..diffusion import sds
-from ..host import C, find, names, parse_structured, warn
-from .non_finite import find_bad_items, masked_loss, may_have_any, without_bad_items
-from .particles import GaussianParticles, ParticleModel
-from .reuse import Error, KeptPrediction
-from .score_model import GUIDANCE_SCALE, ScoreModel
+from ..diffusion.noise_prediction import rescaled
+from ..host import BaseObject, C, find, names, parse_structured, run_seed, warn
 from .score_pictures import score_pictures
+from .types import Latents, Noised, Residual, State, Timesteps
 from .variants import Variant
-from .variants.base import checked_error, require_unset
+from .variants.base import GUIDANCE_SCALE, require_unset
+from .variants.vsd import GaussianParticles
 
 __all__ = ["GUIDANCE_SCALE", "NonFiniteScore", "ScoreDistillation"]
 
+MAX_BAD_STEPS = 10
+"""A run ends after so many steps in a row in which the score of some item was NaN or infinite."""
+
 
 class NonFiniteScore(UserError):
-    """The score model returned NaN or infinity in ``max_bad_steps`` consecutive steps."""
+    """The score model returned NaN or infinity in ``MAX_BAD_STEPS`` consecutive steps."""
 
 
-class ScoreDistillation(ScoreModel):
+class ScoreDistillation(BaseObject, ABC):
     """Base class of all guidances; see the module's docstring."""
 
     @dataclass
-    class Config(ScoreModel.Config):
+    class Config(BaseObject.Config):
+        guidance_scale: float = field(default=100.0, metadata=GUIDANCE_SCALE)
+        min_step_percent: Any = field(default=0.02, metadata=schedule(min=0, max=1))
+        max_step_percent: Any = field(default=0.98, metadata=schedule(min=0, max=1))
+        guidance_interval: Tuple[float, float] = field(
+            default=(0.0, 1.0), metadata=interval(0, 1, "shares of all timesteps")
+        )
+        recon_std_rescale: float = field(default=0.0, metadata=in_range(0, 1))
         variant_type: str = "sds-variant"
         variant: dict = field(default_factory=dict)
         grad_clip: Any = field(default=None, metadata=schedule(min=0))
         weighting_strategy: str = field(default="sds", metadata=one_of(sds.WEIGHTS))
-        reuse_steps: int = field(default=1, metadata=in_range(1, 1000, "steps"))
-        max_bad_steps: int = field(default=10, metadata=at_least(1))
         max_items_eval: int = 4
         eval_steps: int = field(default=20, metadata=in_range(1, 1000))
 
+        REMOVED: ClassVar[dict[str, Any]] = {
+            "reuse_steps": (1, "each step evaluates the score model"),
+            "timestep_schedule": (
+                "uniform",
+                "timesteps are random between min_step_percent and max_step_percent; for falling "
+                "ones give both the same schedule, such as [0, 0.98, 0.02, <steps>]",
+            ),
+            "timestep_steps": (lambda steps: True, ""),
+            "max_bad_steps": (MAX_BAD_STEPS, f"a run ends after {MAX_BAD_STEPS} of them"),
+        }
+
         @staticmethod
         def check(cfg: Any) -> None:
-            ScoreModel.Config.check(cfg)
+            for step in _knots(cfg.min_step_percent, cfg.max_step_percent):
+                sds.step_range(
+                    C(cfg.min_step_percent, step, step), C(cfg.max_step_percent, step, step)
+                )
             variant_class(cfg)
 
     cfg: Config
+    options: Any
+    """Of ``cfg``, as plain attributes."""
+    alphas_cumprod: Float[Tensor, " T"]
+    """The noise schedule, float64; a subclass may set another in ``configure``."""
+    evaluations: int
+    """Of the score model, one per item and prompt, since a step began; ``predict`` counts them."""
+
+    REPORTS: tuple[str, ...] = ()
+    """The keys of :meth:`report`, which ``checkpoint.monitor`` may name."""
+
+    UNGUIDED_IGNORES: tuple[str, ...] = ("guidance_interval", "recon_std_rescale")
+    """Options that have no effect if ``guidance_scale`` is 1."""
+
+    PARTICLES_IGNORE: tuple[str, ...] = ("rank", "lr", "samples", "camera_dropout")
+    """Options of ``vsd-variant`` that :meth:`particle_model` doesn't read."""
+
+    LOSSES: tuple[str, ...] = ("sds",)
+    """Names of the losses that a step returns, without the prefix ``loss_``."""
+
+    KNOWS_TRUTH = False
+    """Whether instances have an attribute ``truth``, see :mod:`.known_truth`."""
 
     # Defined by subclasses
     # ----------------------------------------------------------------------------------------------
 
     @abstractmethod
-    def encode(self, rgb: Float[Tensor, "B 3 H W"], **batch: Any) -> Float[Tensor, "B c h w"]:
+    def encode(self, rgb: Float[Tensor, "B 3 H W"], **batch: Any) -> Latents:
         """Encode images in [0, 1], differentiably."""
 
     @abstractmethod
-    def decode(self, latents: Float[Tensor, "B c h w"]) -> Float[Tensor, "B 3 H W"]:
+    def decode(self, latents: Latents) -> Float[Tensor, "B 3 H W"]:
         """Decode latents to images in [0, 1], for display."""
 
     @abstractmethod
     def condition(self, prompt_utils: Any, **batch: Any) -> Any:
         """Return the conditions on prompt and views for ``predict``; called without gradients."""
 
-    def particle_model(self, options: Any) -> ParticleModel:
+    @abstractmethod
+    def predict(
+        self, z: Latents, t: Timesteps, condition: Any
+    ) -> tuple[Latents, Optional[Latents]]:
+        """Predict the noise in z, conditional and unconditional (None if it isn't ``guided``);
+        called without gradients.
+        """
+
+    def select(self, condition: Any, rows: Int[Tensor, " R"]) -> Any:
+        """Return the conditions of some items. Conditions that are None, a tensor or a list with
+        one entry per item are known; subclasses with others override this.
+
+        Raises:
+            UserError: the conditions are of another type.
+        """
+        if condition is None:
+            return None
+        if isinstance(condition, Tensor):
+            return condition[rows]
+        if isinstance(condition, list):
+            return [condition[row] for row in rows.tolist()]
+        raise UserError(
+            f"{type(self).__name__} has conditions of type {type(condition).__name__}: define its "
+            f"method select, which guidance_interval and {self.cfg.variant_type} need"
+        )
+
+    def particle_model(self, options: Any) -> Any:
         """Return the model of the renders' own distribution that ``vsd-variant`` trains.
 
         Args:
@@ -138,34 +206,25 @@ class ScoreDistillation(ScoreModel):
         """Return whether the conditional score differs from the unconditional one."""
         return True
 
-    REPORTS: tuple[str, ...] = ()
-    """The keys of :meth:`report`, which ``checkpoint.monitor`` may name."""
-
-    UNGUIDED_IGNORES: tuple[str, ...] = ("guidance_interval", "recon_std_rescale")
-    """Options that have no effect if ``guidance_scale`` is 1."""
-
-    PARTICLES_IGNORE: tuple[str, ...] = ("rank", "lr", "samples", "camera_dropout")
-    """Options of ``vsd-variant`` that :meth:`particle_model` doesn't read."""
-
-    LOSSES: tuple[str, ...] = ("sds",)
-    """Names of the losses that a step returns, without the prefix ``loss_``."""
-
-    KNOWS_TRUTH = False
-    """Whether instances have an attribute ``truth``, see :mod:`.known_truth`."""
+    def known_residual(self, latents: Latents, condition: Any) -> Optional[Residual]:
+        """Return eps_hat - eps and abar if they don't depend on the noise, which isn't drawn then;
+        None if they do.
+        """
+        return None
 
     def report(self) -> dict[str, float]:
         """Return further numbers about the last step, to be logged."""
         return {}
 
-    # The shared computation
+    # A step
     # ----------------------------------------------------------------------------------------------
 
     def configure(self) -> None:
         self.options = checked_options(self.Config, self.cfg, "system.guidance.")
-        super().configure()
+        self.alphas_cumprod = sds.sd_alphas_cumprod()
+        self.evaluations, self._has_warned = 0, False
         self.variant = variant_class(self.cfg)(self.cfg.variant)
-        self._kept = KeptPrediction(self.options.reuse_steps)
-        self.bad_items = self.bad_steps = 0
+        self.bad_items, self.bad_steps = 0, Counter[str]()
         self.reads = DelayedReads()
         self.update_step(0, 0)
 
@@ -183,9 +242,11 @@ class ScoreDistillation(ScoreModel):
 
     def update_step(self, epoch: int, global_step: int, on_load_weights: bool = False) -> None:
         """Evaluate the schedules at this step."""
-        super().update_step(epoch, global_step)
-        clip = self.options.grad_clip
-        self.grad_clip = None if clip is None else C(clip, epoch, global_step)
+        self.step, options = global_step, self.options
+        now = (epoch, global_step)
+        percents = (C(p, *now) for p in (options.min_step_percent, options.max_step_percent))
+        self.min_step, self.max_step = sds.step_range(*percents, len(self.alphas_cumprod))
+        self.grad_clip = None if options.grad_clip is None else C(options.grad_clip, *now)
 
     def __call__(
         self,
@@ -210,25 +271,31 @@ class ScoreDistillation(ScoreModel):
             entries of :meth:`report`; and ``eval``, if requested.
 
         Raises:
-            NonFiniteScore: in each of the last ``max_bad_steps`` steps the score of at least one
+            NonFiniteScore: in each of the last ``MAX_BAD_STEPS`` steps the score of at least one
                 item wasn't finite. On a GPU it is raised when that is known, which may be in a
                 later step, also in its backward pass.
         """
-        self.evaluations, self.prediction_sum = 0, None
+        self.evaluations = 0
         with without_autocast(rgb.device.type):
             images = rgb.float().movedim(-1, 1).contiguous()
             latents = (images if rgb_as_latents else self.encode(images, **batch)).float()
             with torch.no_grad():
                 condition = self.condition(prompt_utils, **batch)
-                error, fresh = self._error(latents, condition, batch, guidance_eval)
-                grad, bad = self._gradient(*error)
+                found = self.variant.residual(self, latents, condition, batch)
+                residual, abar = self.variant.checked(found, latents)
+                grad, bad = self._gradient(residual, abar)
             if not guidance_eval:  # an evaluation isn't a training step
-                self._count_bad(bad)
-                if fresh:
-                    self.variant.learn(self, latents.detach(), condition, batch, ~bad)
-            loss = masked_loss(images, latents, grad, bad)
+                advice = (
+                    "use full precision (half_precision_weights=false), and check the model, the "
+                    "variant and the prior"
+                )
+                self.count_bad(bad, "the score", advice)
+                self.variant.learn(self, latents.detach(), condition, batch, ~bad)
+            if images.requires_grad and may_have_any(bad):
+                # if the encoder's derivative is infinite, its product with a zero gradient is NaN
+                images.register_hook(lambda gradient: without_bad_items(gradient, bad))
             norms = torch.linalg.vector_norm(grad.flatten(1), dim=1)
-            out = self._result(loss, norms, bad.sum().float())
+            out = self._result(sds.sds_loss(latents, grad), norms, bad.sum().float())
             if guidance_eval:
                 out["eval"] = score_pictures(self, self.add_noise(latents), prompt_utils, batch)
         return out
@@ -238,121 +305,218 @@ class ScoreDistillation(ScoreModel):
     ) -> dict[str, Any]:
         """Return the loss and what is logged, from the norm of the gradient of each item and the
         number of bad items.
+
+        Raises:
+            UserError: a part's ``report`` returned no dictionary.
         """
         out = {
             "loss_sds": loss,
             "grad_norm": torch.linalg.vector_norm(norms),
             "min_step": self.min_step,
             "max_step": self.max_step,
+            **{f"grad_norm_{i}": norm for i, norm in enumerate(norms.unbind(0))},
+            "bad_items": bad_items,
+            "evaluations": float(self.evaluations),
         }
-        out |= {f"grad_norm_{i}": norm for i, norm in enumerate(norms.unbind(0))}
-        out |= {"bad_items": bad_items, "evaluations": float(self.evaluations)}
-        return out | _reported(self) | _reported(self.variant)
-
-    def _error(
-        self,
-        latents: Float[Tensor, "B c h w"],
-        condition: Any,
-        batch: dict[str, Any],
-        guidance_eval: bool,
-    ) -> tuple[Error, bool]:
-        """Compute the variant's error; also return whether it is that of a new prediction."""
-
-        def predict() -> Error:
-            found = self.variant.error(self, latents, condition, batch)
-            return checked_error(self.variant, found, latents)
-
-        if guidance_eval:
-            return predict(), True
-        return self._kept.error(self.step, latents, batch, predict)
-
-    def state(self) -> dict[str, Tensor]:
-        """Return the tensors that a checkpoint needs to resume; empty for most configurations."""
-        return self.variant.state() | self._kept.state()
-
-    def restore(self, state: dict[str, Tensor]) -> None:
-        """Restore what :meth:`state` returned.
-
-        Raises:
-            UserError: the tensors aren't those of this configuration.
-        """
-        self.variant.restore(self, self._kept.restore(state, self.device))
-
-    def known_error(
-        self, latents: Float[Tensor, "B c h w"], condition: Any
-    ) -> Optional[tuple[Float[Tensor, "B c h w"], Float[Tensor, " B"]]]:
-        """Return eps_hat - eps and abar if they don't depend on the noise, which isn't drawn then;
-        None if they do.
-        """
-        return None
+        for part in (self, self.variant):
+            found = part.report()
+            if not isinstance(found, dict):
+                raise UserError(
+                    f"{type(part).__name__}.report returned {type(found).__name__}; expected a "
+                    "dictionary of names and numbers, {} if there is none"
+                )
+            out |= found
+        return out
 
     def _gradient(
-        self, error: Float[Tensor, "B c h w"], abar: Float[Tensor, " B"]
-    ) -> tuple[Tensor, Tensor]:
-        """Compute w(t) (eps_hat - eps), clipped to ``grad_clip``.
+        self, residual: Latents, abar: Float[Tensor, " B"]
+    ) -> tuple[Latents, Bool[Tensor, " B"]]:
+        """Weight and clip the residual.
 
         Returns:
-            the gradient, zero for items in which it isn't finite, and a mask of those, (B,) bool.
+            the gradient, zero for items in which it isn't finite, and a mask of those.
         """
-        grad = sds.per_item(sds.weight(self.options.weighting_strategy, abar), error) * error
+        weight = sds.weight(self.options.weighting_strategy, abar)
+        grad = sds.per_item(weight, residual) * residual
         bad = find_bad_items(grad)
         if may_have_any(bad):
             grad = without_bad_items(grad, bad)
         return grad if self.grad_clip is None else grad.clamp(-self.grad_clip, self.grad_clip), bad
 
-    def _count_bad(self, bad: Bool[Tensor, " B"]) -> None:
-        total = self.prediction_sum
-        good_scores = torch.zeros_like(bad[:1]) if total is None else total.isfinite().to(bad)[None]
-        self.reads.submit(
-            torch.cat([bad, good_scores]), functools.partial(self._note_bad, self.step)
-        )
-
-    def _note_bad(self, step: int, found: Bool[Tensor, " B1"]) -> None:
-        """Count the bad items of a step; warn of them, or raise NonFiniteScore.
-
-        Args:
-            found: the bad items, and whether all predictions of the score model were finite.
+    def count_bad(self, bad: Bool[Tensor, " B"], what: str, advice: str) -> None:
+        """Count items that aren't finite, when their number is known; warn of them, or raise
+        NonFiniteScore with the advice if there were some in ``MAX_BAD_STEPS`` steps in a row.
         """
-        bad, good_scores = found[:-1], bool(found[-1])
+        self.reads.submit(bad, functools.partial(self._note_bad, self.step, what, advice))
+
+    def _note_bad(self, step: int, what: str, advice: str, bad: Bool[Tensor, " B"]) -> None:
         count = int(bad.sum())
         self.bad_items += count
-        self.bad_steps = self.bad_steps + 1 if count else 0
-        if self.bad_steps >= self.options.max_bad_steps:
-            culprit, advice = (
-                "the score model",
-                (
-                    "use full precision (half_precision_weights=false), and check the model and "
-                    "the prior"
-                ),
-            )
-            if good_scores:
-                culprit = f"{type(self.variant).__name__}.error"
-                advice = "the predictions of the score model that it was given are finite"
+        self.bad_steps[what] = self.bad_steps[what] + 1 if count else 0
+        if self.bad_steps[what] >= MAX_BAD_STEPS:
             raise NonFiniteScore(
-                f"{culprit} returned NaN or infinity in {self.bad_steps} steps in a row"
-                f" (step {step}, {self.bad_items} items so far): {advice}"
+                f"{what} had NaN or infinity in {self.bad_steps[what]} steps in a row (step "
+                f"{step}, {self.bad_items} items so far): {advice}"
             )
         if count:
-            what = f"{type(self.variant).__name__}.error" if good_scores else "the score"
             warn(
                 f"step {step}: {what} of {count} of {len(bad)} items isn't finite; "
                 "they are left out"
             )
 
+    def state(self) -> State:
+        """Return the tensors that a checkpoint needs to resume; empty for most configurations."""
+        return self.variant.state()
 
-def _reported(part: ScoreModel | Variant) -> dict[str, float]:
-    """Return what a guidance or a variant reports.
+    def restore(self, state: State) -> None:
+        """Restore what :meth:`state` returned.
 
-    Raises:
-        UserError: it isn't a dictionary.
-    """
-    found = part.report()
-    if not isinstance(found, dict):
-        raise UserError(
-            f"{type(part).__name__}.report returned {type(found).__name__}; expected a dictionary "
-            "of names and numbers, {} if there is none"
+        Raises:
+            UserError: the tensors aren't those of this configuration.
+        """
+        # earlier versions kept predictions for several steps
+        kept = {name: value for name, value in state.items() if not name.startswith("kept.")}
+        self.variant.restore(self, kept)
+
+    # Predictions
+    # ----------------------------------------------------------------------------------------------
+
+    def predict_noise(self, z: Latents, t: Timesteps, condition: Any) -> Latents:
+        """Predict the noise with guidance: that of ``guidance_scale`` for items inside of
+        ``guidance_interval``, none for others.
+        """
+        options, count = self.options, len(self.alphas_cumprod)
+        low, high = (share * count for share in options.guidance_interval)
+        scale, rescale = options.guidance_scale, options.recon_std_rescale
+        inside = None if (low, high) == (0, count) else (t >= low) & (t <= high)
+        if inside is None or inside.all():
+            return self.guided_noise(z, t, condition, scale, rescale=rescale)
+        eps = torch.empty_like(z)
+        for is_inside in (True, False):
+            rows = (inside == is_inside).nonzero()[:, 0]
+            if not len(rows):
+                continue
+            some = (z[rows], t[rows], self.select(condition, rows))
+            if is_inside:
+                eps[rows] = self.guided_noise(*some, scale, rescale=rescale)
+            else:
+                eps[rows] = self.conditional(*some)
+        return eps
+
+    def guided_noise(
+        self,
+        z: Latents,
+        t: Timesteps,
+        condition: Any,
+        scale: float,
+        *,
+        rescale: float = 0.0,
+    ) -> Latents:
+        """Predict the noise with classifier-free guidance.
+
+        Args:
+            scale: 1 for no guidance.
+            rescale: see ``recon_std_rescale``.
+        """
+        if scale == 1 or not rescale:
+            eps = self.at_scale(z, t, condition, scale)
+            if eps is not None:
+                return eps.to(z)
+        cond, uncond = self._pair(self.predict(z, t, condition), z)
+        if uncond is None:
+            uncond = cond
+            if not self._has_warned:
+                self._has_warned = True
+                warn(
+                    f"guidance_scale={scale:g} has no effect: {type(self).__name__}.predict "
+                    "returns no unconditional prediction"
+                )
+        guided = sds.classifier_free(cond, uncond, scale)
+        return rescaled(guided, cond, z, self.abar_of(t), rescale) if rescale else guided
+
+    def at_scale(self, z: Latents, t: Timesteps, condition: Any, scale: float) -> Optional[Latents]:
+        """Predict the noise with guidance of this scale in one evaluation; None where the model
+        needs the unconditional prediction for it.
+        """
+        return self._pair(self.predict(z, t, condition), z)[0] if scale == 1 else None
+
+    def both(self, z: Latents, t: Timesteps, condition: Any) -> tuple[Latents, Latents]:
+        """Predict the noise, conditional and unconditional; the same if the score model has only
+        one.
+        """
+        cond, uncond = self._pair(self.predict(z, t, condition), z)
+        return cond, cond if uncond is None else uncond
+
+    def conditional(self, z: Latents, t: Timesteps, condition: Any) -> Latents:
+        """Predict the conditional noise alone; subclasses that can save time here override it."""
+        return self.both(z, t, condition)[0]
+
+    def unconditional(self, z: Latents, t: Timesteps, condition: Any) -> Latents:
+        """Predict the unconditional noise alone; subclasses that can save time here override it."""
+        return self.both(z, t, condition)[1]
+
+    def empty_prompt(self, z: Latents, t: Timesteps, condition: Any) -> Optional[Latents]:
+        """Predict the noise for an empty prompt, where the unconditional score is that of a
+        negative prompt; None where the unconditional score is all there is.
+        """
+        return None
+
+    def _pair(self, found: Any, z: Latents) -> tuple[Latents, Optional[Latents]]:
+        """Return what ``predict`` returned, in the type of z.
+
+        Raises:
+            UserError: it isn't a pair of predictions in the shape of z; a smaller tensor would be
+                broadcast.
+        """
+        entries = found if isinstance(found, (tuple, list)) else [found]
+        shapes = [entry.shape if isinstance(entry, Tensor) else type(entry) for entry in entries]
+        if entries is not found or shapes not in ([z.shape, z.shape], [z.shape, type(None)]):
+            what = " and ".join(
+                shape.__name__ if isinstance(shape, type) else str(tuple(shape)) for shape in shapes
+            )
+            raise UserError(
+                f"{type(self).__name__}.predict returned {'' if entries is found else 'only '}"
+                f"{what}; expected a pair, the conditional and the unconditional prediction (or "
+                f"None), of the shape {tuple(z.shape)} of the noisy latents"
+            )
+        cond, uncond = found
+        return cond.to(z), None if uncond is None else uncond.to(z)
+
+    # The noise of a step
+    # ----------------------------------------------------------------------------------------------
+
+    def abar_of(self, t: Int[Tensor, "*b"]) -> Float[Tensor, "*b"]:
+        """Return abar of timesteps, on their device."""
+        return self.alphas_cumprod.to(t.device)[t]
+
+    def draw_timesteps(self, latents: Latents) -> tuple[Timesteps, Float[Tensor, " B"]]:
+        """Draw this step's timesteps t; also return their abar, float64."""
+        t = sds.timesteps(
+            len(latents),
+            self.min_step,
+            self.max_step,
+            seed=run_seed(),
+            step=self.step,
+            num_train=len(self.alphas_cumprod),
+            first=first_item(len(latents)),
         )
-    return found
+        abar = self.alphas_cumprod.double().cpu()[t]
+        return to_device(t, latents.device), to_device(abar, latents.device)
+
+    @torch.no_grad()
+    def add_noise(self, latents: Latents) -> Noised:
+        """Draw this step's timesteps and noise, and add the noise to ``latents``."""
+        return self.noised(latents, self.normal(latents, "noise"))
+
+    def noised(self, latents: Latents, noise: Latents) -> Noised:
+        """Add a given noise to ``latents`` at this step's timesteps."""
+        t, abar = self.draw_timesteps(latents)
+        return Noised(t, abar, noise, sds.add_noise(latents, noise, abar))
+
+    def normal(self, like: Float[Tensor, "B *d"], stream: str) -> Float[Tensor, "B *d"]:
+        """Draw this step's standard normal numbers, of the shape and on the device of ``like``."""
+        place = run_seed(), stream, self.step, like.device, first_item(len(like))
+        return streams.normal_per_item(tuple(like.shape), *place)
 
 
 def is_guided(cfg: Any, variant: Variant | type[Variant]) -> bool:
@@ -366,16 +530,44 @@ def variant_class(cfg: Any) -> type[Variant]:
     Raises:
         UserError: it is unknown, or another kind of part.
     """
-    try:
-        found = find(cfg.variant_type)
-    except UserError:
-        found = None
+    found = find(cfg.variant_type) if cfg.variant_type in names() else None
     if not _is_variant(found):
         known = [name for name in names() if _is_variant(find(name))]
         raise UserError(f"variant_type: {unknown('variant', cfg.variant_type, known)}")
-    require_method(found, "error", "guidance", "latents", "condition", "batch")
+    require_method(found, "residual", "guidance", "latents", "condition", "batch")
     return found
 
 
 def _is_variant(part: Any) -> bool:
     return isinstance(part, type) and issubclass(part, Variant)
+
+
+def _knots(*schedules: Any) -> set[int]:
+    """Return a set that contains all steps at which the slope of a schedule changes. It also has
+    the values of the schedules, which does no harm.
+    """
+    lists = [entries for entries in schedules if not isinstance(entries, (int, float))]
+    return {0, *(int(entry) for entries in lists for entry in entries)}
+
+
+# Items that aren't finite
+# --------------------------------------------------------------------------------------------------
+
+
+def find_bad_items(grad: Float[Tensor, "B *d"]) -> Bool[Tensor, " B"]:
+    """Return which items contain NaN or infinity. If the sum over all elements is finite then so
+    are the elements, so on a CPU the usual case needs a single reduction.
+    """
+    if not grad.is_cuda and grad.sum().isfinite():
+        return torch.zeros(len(grad), dtype=torch.bool, device=grad.device)
+    return ~torch.isfinite(grad).flatten(1).all(dim=1)
+
+
+def may_have_any(bad: Bool[Tensor, " B"]) -> bool:
+    """Return whether any item is bad; true on a GPU, where looking would wait for the score."""
+    return bad.is_cuda or bool(bad.any())
+
+
+def without_bad_items(values: Float[Tensor, "B *d"], bad: Bool[Tensor, " B"]) -> Tensor:
+    """Return the values with those of bad items set to zero."""
+    return values.masked_fill(bad.reshape(-1, *[1] * (values.dim() - 1)), 0.0)

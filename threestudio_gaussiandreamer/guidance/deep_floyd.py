@@ -17,8 +17,7 @@ from ..host import register, register_builtin
 from ..models.families import DEEP_FLOYD as FAMILY
 from ..prompts.prompt_processors import DEEP_FLOYD
 from .base import GUIDANCE_SCALE
-from .model_images import resized
-from .text_to_image import TextToImageDistillation
+from .text_to_image import TextToImageDistillation, resized
 
 
 @register_builtin("deep-floyd-guidance")

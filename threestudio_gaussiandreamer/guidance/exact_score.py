@@ -20,10 +20,8 @@ space               ``pixel``: sharp, posteriors of one picture; ``latent``: poo
                     compete
 image_size          height of the pictures that are compared, pixels; 0 = as rendered; the render is
                     resized to it
-latent_size         height of the latent in pixels (image_size is a multiple); latent_channels;
-                    color_matrix: false keeps the three colours
+latent_size         height of the latent in pixels (image_size is a multiple)
 std                 width s of each mode, in the units of the space (pixels in [-1, 1])
-temperature         of the responsibilities; 1 = exact, larger = smoother
 bank_*              number of views, their ranges (degrees, world units) and their seed
 bank_includes_view  the bank stands for all views, so the camera's own is one of them, with the
                     weight of any other; without it the error can't fall below that of the
@@ -41,11 +39,11 @@ angle of view."""
 import itertools
 import math
 from dataclasses import dataclass, field
-from typing import Any, Optional, Tuple
+from typing import Any, ClassVar, Optional, Tuple
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..cameras import OrbitRanges, camera_pool
@@ -54,21 +52,27 @@ from ..core.given_gradient import given_gradient
 from ..core.memory import count_of, require_memory
 from ..core.options import at_least, in_range, interval, one_of, positive, required
 from ..diffusion import sds
-from ..diffusion.exact_score import Denoised, LinearLatent, color_matrix, denoise
+from ..diffusion.exact_score import COLOR_MATRIX, Denoised, LinearLatent, denoise
 from ..host import parse_structured, register, warn
 from ..meshes.load import AXES, load_mesh, mesh_file
 from ..meshes.raycast import MeshCaster
 from ..splatting.cpu import known_picture
-from .base import GUIDANCE_SCALE, ScoreDistillation
-from .exact_score_checks import check_render_size, picture_size, pooling_factor, require_used
+from .base import GUIDANCE_SCALE, ScoreDistillation, is_guided, variant_class
 from .known_truth import MeshTruth, background_of, composite, resized
 from .picture_bank import Bank, Mixture, direction_indices, mixture_of, modes_of
+from .types import Latents, Residual, Timesteps
+from .variants.base import require_unset
 from .variants.sds import SDS
 
 MODES = ("view-exact", "direction-bins", "view-agnostic")
 SPACES = ("pixel", "latent")
 BANK_BYTES = 16
 """Memory per pixel of the bank while it is cast, bytes."""
+MAX_MODE_BYTES = 2**31
+"""Largest memory of a bank in the space of pixels; over backgrounds of pixels, of each item's."""
+OF_BANK = ("bank_views", "bank_includes_view", "bank_elevation_range", "bank_distance_range")
+OF_BANK += ("bank_fovy_range",)
+"""Without its seed, which series of runs set for all of them."""
 
 
 @register("exact-score-guidance")
@@ -84,10 +88,7 @@ class ExactScoreGuidance(ScoreDistillation):
         space: str = field(default="pixel", metadata=one_of(SPACES))
         image_size: int = field(default=0, metadata=in_range(0, 16_384, "pixels"))
         latent_size: int = field(default=32, metadata=in_range(1, 4096, "pixels"))
-        latent_channels: int = field(default=4, metadata=in_range(3, 64))
-        color_matrix: bool = True
         std: float = field(default=0.0, metadata=at_least(0))
-        temperature: float = field(default=1.0, metadata=positive())
         bank_views: int = field(default=200, metadata=count_of("views", 1, 4096))
         bank_includes_view: bool = True
         bank_seed: int = 0
@@ -103,6 +104,13 @@ class ExactScoreGuidance(ScoreDistillation):
         supersample: int = field(default=2, metadata=in_range(1, 64, "rays a pixel each way"))
         max_cached_targets: int = field(default=512, metadata=at_least(1))
 
+        REMOVED: ClassVar[dict[str, Any]] = {
+            **ScoreDistillation.Config.REMOVED,
+            "latent_channels": (4, "a latent has 4"),
+            "color_matrix": (True, "a latent has 4 mixed channels"),
+            "temperature": (1.0, "the responsibilities are exact"),
+        }
+
         @staticmethod
         def check(cfg: Any) -> None:
             ScoreDistillation.Config.check(cfg)
@@ -112,7 +120,10 @@ class ExactScoreGuidance(ScoreDistillation):
             if cfg.space == "latent" and size:
                 pooling_factor(size, size, cfg.latent_size)
 
-        check_render_size = staticmethod(check_render_size)
+        @staticmethod
+        def check_render_size(cfg: Any, height: int, width: int) -> None:
+            """Check that renders of this size can be compared, see :func:`picture_size`."""
+            picture_size(cfg, is_guided(cfg, variant_class(cfg)), height, width)
 
     cfg: Config
     REPORTS = ("perplexity",)
@@ -141,7 +152,11 @@ class ExactScoreGuidance(ScoreDistillation):
         super().preflight(cfg)
         cfg = parse_structured(cls.Config, cfg)
         mesh_file(cfg.mesh)
-        require_used(cls, cfg)
+        if cfg.space == "pixel":  # the variance of a latent is that of the bank
+            require_unset(cls, cfg, ("latent_size",), "with space=pixel")
+            if cfg.mode == "view-exact" and cfg.guidance_scale == 1:
+                reason = "with space=pixel, mode=view-exact and guidance_scale=1: without a bank"
+                require_unset(cls, cfg, OF_BANK, reason)
         if cfg.guidance_scale != 1 and not cls.is_text_guided(cfg):
             warn(
                 "system.guidance.guidance_scale has no effect with mode=view-agnostic, whose "
@@ -163,7 +178,8 @@ class ExactScoreGuidance(ScoreDistillation):
         if found is None:
             return super().__call__(rgb, prompt_utils, **options)
         gradient, squares, error = found
-        self.evaluations, self._perplexity, self.bad_steps = 0, 1.0, 0
+        self.evaluations, self._perplexity = 0, 1.0
+        self.bad_steps.clear()
         loss = given_gradient(rgb, gradient, 0.5 * squares.sum().float() / max(len(rgb), 1))
         result = self._result(loss, squares.sqrt().float(), torch.zeros(()))
         return result | {"error_to_truth": error}
@@ -184,13 +200,9 @@ class ExactScoreGuidance(ScoreDistillation):
         the mean squared error of the renders; None if other options, or values that aren't finite,
         need the general path.
         """
-        size = rgb.shape[1:3]
-        if rgb_as_latents or guidance_eval or not known_picture.is_available(rgb.device):
-            return None
-        if not self._compares_pixels(size):
-            return None
-        background = background_of(comp_rgb_bg, len(rgb), rgb.device)
-        if background.shape[1:3] != (1, 1):
+        size, background = rgb.shape[1:3], background_of(comp_rgb_bg, len(rgb), rgb.device)
+        general = rgb_as_latents or guidance_eval or background.shape[1:3] != (1, 1)
+        if general or not known_picture.is_available(rgb.device) or not self._is_one_picture(size):
             return None
         self._size = tuple(size)
         pictures = self.truth.pictures.planes(c2w, fovy, *size)
@@ -205,7 +217,7 @@ class ExactScoreGuidance(ScoreDistillation):
         factors = zip(squares, weight.tolist(), scale.tolist(), strict=True)
         return *found, sum(square / (2 * w * s) ** 2 for square, w, s in factors) / rgb.numel()
 
-    def _compares_pixels(self, size: tuple[int, int]) -> bool:
+    def _is_one_picture(self, size: tuple[int, int]) -> bool:
         """Return whether the score is that of one picture per item without width, of the pixels of
         renders of this size, and nothing but its weight is applied to it.
         """
@@ -216,14 +228,13 @@ class ExactScoreGuidance(ScoreDistillation):
             and not self.guided
             and self.grad_clip is None
             and type(self.variant) is SDS
-            and options.reuse_steps == 1
         )
 
-    def encode(self, rgb: Float[Tensor, "B 3 H W"], **batch: Any) -> Float[Tensor, "B c h w"]:
+    def encode(self, rgb: Float[Tensor, "B 3 H W"], **batch: Any) -> Latents:
         self._size = self._picture_size(*rgb.shape[-2:])
         return self._latent().encode(resized(rgb, self._size))
 
-    def decode(self, latents: Float[Tensor, "B c h w"]) -> Float[Tensor, "B 3 H W"]:
+    def decode(self, latents: Latents) -> Float[Tensor, "B 3 H W"]:
         return self._latent().decode(latents)
 
     def condition(
@@ -244,7 +255,10 @@ class ExactScoreGuidance(ScoreDistillation):
                 "(rgb_as_latents)"
             )
         background = background_of(comp_rgb_bg, len(c2w), c2w.device)
-        own = self._own_views(c2w, fovy, background) if self._needs_own_view else [None] * len(c2w)
+        own: Any = [None] * len(c2w)
+        if self._needs_own_view:
+            rgba = self.truth.pictures(c2w, fovy, *self._size)
+            own = self._latent().encode(composite(rgba, background))
         members = self._members(batch, len(c2w))
         if not self.guided and not members.any():
             return [Mixture(view) for view in own]
@@ -253,8 +267,8 @@ class ExactScoreGuidance(ScoreDistillation):
         return [mixture_of(*item, bank, self.guided) for item in items]
 
     def predict(
-        self, z: Float[Tensor, "B c h w"], t: Int[Tensor, " B"], condition: list[Mixture]
-    ) -> tuple[Tensor, Optional[Tensor]]:
+        self, z: Latents, t: Timesteps, condition: list[Mixture]
+    ) -> tuple[Latents, Optional[Latents]]:
         abar = self.alphas_cumprod.to(t.device)[t]
         by_pictures = itertools.groupby(condition, lambda mixture: id(mixture.pictures))
         groups = [list(group) for _, group in by_pictures]
@@ -268,14 +282,10 @@ class ExactScoreGuidance(ScoreDistillation):
             return eps, None
         return eps, torch.cat([uncond.eps for _, uncond in predictions]).view_as(z)
 
-    def conditional(
-        self, z: Float[Tensor, "B c h w"], t: Int[Tensor, " B"], condition: list[Mixture]
-    ) -> Float[Tensor, "B c h w"]:
+    def conditional(self, z: Latents, t: Timesteps, condition: list[Mixture]) -> Latents:
         return self._one_of_both(0, z, t, condition)
 
-    def unconditional(
-        self, z: Float[Tensor, "B c h w"], t: Int[Tensor, " B"], condition: list[Mixture]
-    ) -> Float[Tensor, "B c h w"]:
+    def unconditional(self, z: Latents, t: Timesteps, condition: list[Mixture]) -> Latents:
         return self._one_of_both(1, z, t, condition)
 
     def _one_of_both(self, index: int, z: Tensor, t: Tensor, condition: list[Mixture]) -> Tensor:
@@ -287,9 +297,7 @@ class ExactScoreGuidance(ScoreDistillation):
         self.evaluations = before + len(z)
         return eps
 
-    def known_error(
-        self, latents: Float[Tensor, "B c h w"], condition: list[Mixture]
-    ) -> Optional[tuple[Float[Tensor, "B c h w"], Float[Tensor, " B"]]]:
+    def known_residual(self, latents: Latents, condition: list[Mixture]) -> Optional[Residual]:
         """Return sqrt(abar / (1 - abar)) (x - x_1) for mixtures of one picture without width, in
         whose score the noise cancels.
         """
@@ -313,8 +321,7 @@ class ExactScoreGuidance(ScoreDistillation):
         items with the same pictures.
         """
         modes, log_prior = modes_of(mixtures)
-        options = {"std": self.options.std, "temperature": self.options.temperature}
-        options["distances"] = modes.squared_distances(z, abar)
+        options = {"std": self.options.std, "distances": modes.squared_distances(z, abar)}
         cond = denoise(z, abar, modes, log_prior=log_prior, **options)
         return cond, denoise(z, abar, modes, **options) if self.guided else None
 
@@ -327,21 +334,13 @@ class ExactScoreGuidance(ScoreDistillation):
 
     def _members(self, batch: dict[str, Any], count: int) -> Bool[Tensor, "B K"]:
         """Return a mask of the bank's views in the conditional mixture of each item."""
-        options = self.options
-        if options.mode == "view-exact":
-            return torch.zeros(count, options.bank_views, dtype=torch.bool)
-        if options.mode == "view-agnostic":
-            return torch.ones(count, options.bank_views, dtype=torch.bool)
+        mode, views = self.options.mode, self.options.bank_views
+        if mode != "direction-bins":
+            return torch.full((count, views), mode == "view-agnostic")
         bank = direction_indices(self.bank_orbit.elevation, self.bank_orbit.azimuth)
         members = bank == direction_indices(batch["elevation"], batch["azimuth"]).cpu()[:, None]
         # if no view of the bank has this direction, as overhead below 60 degrees, take all
         return torch.where(members.any(dim=1, keepdim=True), members, torch.ones_like(members))
-
-    def _own_views(
-        self, c2w: Tensor, fovy: Tensor, background: Float[Tensor, "B bh bw 3"]
-    ) -> Float[Tensor, "B c h w"]:
-        rgba = self.truth.pictures(c2w, fovy, *self._size)
-        return self._latent().encode(composite(rgba, background))
 
     def bank(self, height: int, width: int) -> Bank:
         """Return the bank at a picture size, in pixels; the bank of the last size is cached."""
@@ -355,13 +354,11 @@ class ExactScoreGuidance(ScoreDistillation):
             cameras, height, width, supersample=self.cfg.supersample, progress="bank of views"
         )
         images = torch.from_numpy(images).to(self.device)
-        in_pixels = self.cfg.space == "pixel"
-        factor = 1 if in_pixels else pooling_factor(height, width, self.cfg.latent_size)
-        pooled = F.avg_pool2d(images.movedim(-1, 1), factor)
-        latent = LinearLatent(factor)
+        pooled, latent = images.movedim(-1, 1), LinearLatent()
         if self.cfg.space == "latent":
-            matrix = color_matrix(self.cfg.latent_channels if self.cfg.color_matrix else 3)
-            latent = latent._replace(matrix=matrix).normalised(pooled[:, :3])
+            factor = pooling_factor(height, width, self.cfg.latent_size)
+            pooled = F.avg_pool2d(pooled, factor)
+            latent = LinearLatent(factor, COLOR_MATRIX).normalised(pooled[:, :3])
         return Bank.of((images * 255).round().byte(), pooled, latent)
 
     def _latent(self) -> LinearLatent:
@@ -370,3 +367,40 @@ class ExactScoreGuidance(ScoreDistillation):
     def _picture_size(self, height: int, width: int) -> tuple[int, int]:
         """Return the size of the compared pictures for a render of this size."""
         return picture_size(self.options, self.guided, height, width)
+
+
+def picture_size(cfg: Any, guided: bool, height: int, width: int) -> tuple[int, int]:
+    """Return the size of the compared pictures for a render of this size: ``image_size`` high, with
+    the render's aspect.
+
+    Raises:
+        UserError: pictures of that size need too much memory, or can't be pooled to the latent.
+    """
+    size = cfg.image_size
+    height, width = (size, max(1, round(width * size / height))) if size else (height, width)
+    if cfg.space == "latent":
+        pooling_factor(height, width, cfg.latent_size)
+        return height, width
+    needed = 12 * cfg.bank_views * height * width
+    if (cfg.mode != "view-exact" or guided) and needed > MAX_MODE_BYTES:
+        raise UserError(
+            f"a bank of {cfg.bank_views} views of {height}x{width} pixels needs "
+            f"up to {needed / 2**30:.1f} GiB for each item:"
+            " use system.guidance.space=latent, or a smaller system.guidance.image_size"
+        )
+    return height, width
+
+
+def pooling_factor(height: int, width: int, latent_size: int) -> int:
+    """Return how many pixels each way a latent of this height has.
+
+    Raises:
+        UserError: pictures of this size can't be pooled to it.
+    """
+    factor = height // latent_size
+    if factor * latent_size != height or width % max(factor, 1):
+        raise UserError(
+            f"pictures of {height}x{width} can't be pooled to a latent {latent_size} high: give a "
+            "system.guidance.image_size that is a multiple of system.guidance.latent_size"
+        )
+    return factor

@@ -1,5 +1,5 @@
-"""Half-precision networks with float32 inputs and outputs: their dtype and memory layout, and a
-scaling of gradients that prevents overflow and underflow in the backward pass.
+"""Half-precision networks with float32 inputs and outputs: their number type, and a scaling of
+gradients that prevents overflow and underflow in the backward pass.
 """
 
 from collections.abc import Callable
@@ -8,9 +8,8 @@ from typing import Any
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.autograd.function import FunctionCtx
 
-from .non_finite import find_bad_items, without_bad_items
+from .base import find_bad_items, without_bad_items
 
 PEAK = 64.0
 """Gradients are scaled so that their largest element is in [PEAK, 2 PEAK) when they enter the
@@ -48,21 +47,13 @@ def cpu_multiplies_bfloat16() -> bool:
     return any(has.get(name, False) for name in ("avx512_bf16", "amx_bf16"))
 
 
-def channels_last(cfg: Any, dtype: torch.dtype, device: torch.device) -> bool:
-    """Return whether to lay weights out channels last: if ``enable_channels_last_format`` is set,
-    but not in bfloat16 on a CPU, where the other layout is faster.
-    """
-    return cfg.enable_channels_last_format and (device.type, dtype) != ("cpu", torch.bfloat16)
-
-
 class PerItemLossScale:
     """A separate loss scale for each item, for one forward and backward pass of a half-precision
-    network.
+    network, whose input is passed to ``enter`` and its output to ``leave``.
 
-    ``enter`` is applied to the input of the network and ``leave`` to its output; both are the
-    identity in the forward pass. In the backward pass ``leave`` multiplies the gradient of each
-    item by a power of two, and ``enter`` divides by it in float32. The loss may thus have any
-    scale, also a gradient scaler's 65536.
+    In the backward pass the gradient of each item is multiplied by a power of two where it enters
+    the network, and divided by it in float32 where it leaves. The loss may thus have any scale,
+    also a gradient scaler's 65536.
 
     Args:
         on_result: called in the backward pass with a mask, (B,) bool, of items whose gradient isn't
@@ -74,34 +65,22 @@ class PerItemLossScale:
         self.scale: Tensor = torch.ones(())
 
     def enter(self, x: Float[Tensor, "B *d"]) -> Float[Tensor, "B *d"]:
-        return _Enter.apply(x, self)
+        if x.requires_grad:
+            x.register_hook(self._unscaled)
+        return x
 
     def leave(self, y: Float[Tensor, "B *e"]) -> Float[Tensor, "B *e"]:
-        return _Leave.apply(y, self)
+        if y.requires_grad:
+            y.register_hook(self._scaled)
+        return y
 
-
-class _Leave(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: FunctionCtx, y: Tensor, loss_scale: PerItemLossScale) -> Tensor:
-        ctx.loss_scale = loss_scale
-        return y.view_as(y)
-
-    @staticmethod
-    def backward(ctx: FunctionCtx, grad: Tensor) -> tuple[Tensor, None]:
+    def _scaled(self, grad: Float[Tensor, "B *e"]) -> Float[Tensor, "B *e"]:
         peak = grad.abs().amax(dim=tuple(range(1, grad.dim())), keepdim=True)
-        ctx.loss_scale.scale = torch.where(peak > 0, PEAK / torch.exp2(peak.log2().floor()), 1.0)
-        return grad * ctx.loss_scale.scale, None
+        self.scale = torch.where(peak > 0, PEAK / torch.exp2(peak.log2().floor()), 1.0)
+        return grad * self.scale
 
-
-class _Enter(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: FunctionCtx, x: Tensor, loss_scale: PerItemLossScale) -> Tensor:
-        ctx.loss_scale = loss_scale
-        return x.view_as(x)
-
-    @staticmethod
-    def backward(ctx: FunctionCtx, grad: Tensor) -> tuple[Tensor, None]:
+    def _unscaled(self, grad: Float[Tensor, "B *d"]) -> Float[Tensor, "B *d"]:
         bad = find_bad_items(grad)
-        ctx.loss_scale.on_result(bad)
-        scale = ctx.loss_scale.scale.reshape(-1, *[1] * (grad.dim() - 1))
-        return without_bad_items(grad, bad) / scale, None
+        self.on_result(bad)
+        scale = self.scale.reshape(-1, *[1] * (grad.dim() - 1))
+        return without_bad_items(grad, bad) / scale

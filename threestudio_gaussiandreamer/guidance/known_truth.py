@@ -1,14 +1,15 @@
 """The ground truth of guidances that have one, such as a mesh.
 
-If a guidance has an attribute ``truth`` (a :class:`KnownTruth`), renders of the run are compared
-with that ground truth: the progress bar shows the PSNR, validation pictures include the ground
-truth, ``budget: auto`` measures the loss of PSNR, and, if it is a mesh, held-out views are scored.
-A guidance that has computed the mean squared error of a step's renders to the ground truth returns
-it as ``error_to_truth``; where it doesn't, steps that are logged render the ground truth.
+If a guidance has an attribute ``truth`` with the methods of :class:`MeshTruth` (whose ``mesh`` may
+be None), renders of the run are compared with it: the progress bar shows the PSNR, validation
+pictures include the ground truth, ``budget: auto`` measures the loss of PSNR, and, if it is a mesh,
+held-out views are scored. A guidance that has computed the mean squared error of a step's renders
+to the ground truth returns it as ``error_to_truth``; where it doesn't, steps that are logged render
+the ground truth.
 """
 
 from collections.abc import Callable
-from typing import Any, Optional, Protocol
+from typing import Any, Optional
 
 import torch
 import torch.nn.functional as F
@@ -21,42 +22,14 @@ Batch = dict[str, Any]
 Size = tuple[int, int]
 """Height and width, pixels."""
 
-PictureSize = Callable[[int, int], Size]
-"""Maps (height, width) of a render to the size of a picture."""
 
-
-class KnownTruth(Protocol):
-    """Renders the ground truth from any camera."""
-
-    mesh: Optional[MeshCaster]
-    """Ray casts the mesh from held-out cameras; None if the ground truth isn't a mesh."""
-
-    def render(
-        self, batch: Batch, background: Optional[Tensor] = None, *, size: Optional[Size] = None
-    ) -> Float[Tensor, "B H W 3"]:
-        """Render the ground truth from the views of a batch.
-
-        Args:
-            batch: has ``c2w``, ``fovy``, ``height`` and ``width``.
-            background: (B, 1, 1, 3) or (B, H, W, 3); None for black.
-            size: (height, width) of the pictures, pixels; None for the batch's size.
-        """
-
-    def prefetch(
-        self, c2w: Float[Tensor, "V 4 4"], fovy: Float[Tensor, " V"], height: int, width: int
-    ) -> None:
-        """Prepare to render these views, for instance many at once. Called if training will need
-        most of them at this size.
-        """
-
-
-def truth_of(guidance: Any) -> Optional[KnownTruth]:
+def truth_of(guidance: Any) -> Any:
     """Return the ground truth of a guidance of this or another package; None if it has none."""
     return getattr(guidance, "truth", None)
 
 
 class MeshTruth:
-    """A :class:`KnownTruth` that ray casts a mesh and caches the pictures of recent cameras.
+    """Ray casts a mesh, and caches the pictures of recent cameras.
 
     Args:
         mesh: casts rays at the mesh.
@@ -71,7 +44,7 @@ class MeshTruth:
         mesh: MeshCaster,
         supersample: int,
         max_cached: int,
-        prefetch_size: Optional[PictureSize] = None,
+        prefetch_size: Optional[Callable[[int, int], Size]] = None,
     ) -> None:
         self.mesh, self._prefetch_size = mesh, prefetch_size
         self.pictures = TargetCache(mesh, supersample, max_cached)
@@ -80,7 +53,13 @@ class MeshTruth:
     def render(
         self, batch: Batch, background: Optional[Tensor] = None, *, size: Optional[Size] = None
     ) -> Float[Tensor, "B H W 3"]:
-        """See :meth:`KnownTruth.render`."""
+        """Render the ground truth from the views of a batch.
+
+        Args:
+            batch: has ``c2w``, ``fovy``, ``height`` and ``width``.
+            background: (B, 1, 1, 3) or (B, H, W, 3); None for black.
+            size: (height, width) of the pictures, pixels; None for the batch's size.
+        """
         height, width = size or (batch["height"], batch["width"])
         rgba = self.pictures(batch["c2w"], batch["fovy"], height, width)
         background = background_of(background, len(rgba), rgba.device)
@@ -90,7 +69,9 @@ class MeshTruth:
     def prefetch(
         self, c2w: Float[Tensor, "V 4 4"], fovy: Float[Tensor, " V"], height: int, width: int
     ) -> None:
-        """Plan to cast these views in large batches, if all fit into the cache."""
+        """Plan to cast these views in large batches, if all fit into the cache. Called if training
+        will need most of them at this size.
+        """
         if self._prefetch_size is None or len(c2w) > self.pictures.capacity:
             return
         self.pictures.plan(c2w, fovy, *self._prefetch_size(height, width))

@@ -8,7 +8,7 @@ precision stays as it is."""
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -20,30 +20,15 @@ from ..core.host_copies import to_device
 from ..core.streams import generator
 from ..diffusion import sds
 from ..host import run_seed
-from .particles import ParticleModel, Renders, State
-from .score_pictures import Noised
-
-if TYPE_CHECKING:
-    from .text_condition import Condition
-    from .text_to_image import TextToImageDistillation
+from .types import Batch, Condition, Latents, Noised, State
+from .variants.vsd import Renders
 
 ADAPTED = re.compile(r"\.(to_q|to_k|to_v|to_out\.0)$")
 """Layers of an attention block that get a low-rank addition."""
 CAMERA = 16
 """Numbers in a camera-to-world matrix."""
 BETAS = (0.9, 0.99)
-NOT_ADAPTABLE = ("enable_torch_compile", "enable_sequential_cpu_offload")
 MOMENTS = ("exp_avg", "exp_avg_sq", "step")
-
-
-def check_adaptable(cfg: Any) -> None:
-    """Raise UserError for options of a guidance that replace its UNet's forward pass."""
-    for name in NOT_ADAPTABLE:
-        if cfg[name]:
-            raise UserError(
-                f"system.guidance.{name}: vsd-variant trains a LoRA in the UNet, which needs the "
-                f"plain UNet: set {name}=false"
-            )
 
 
 class LoRA(nn.Module):
@@ -110,7 +95,7 @@ def adapted_layers(network: nn.Module) -> Iterator[tuple[str, nn.Linear]]:
             yield name, layer
 
 
-class LoRAParticles(ParticleModel):
+class LoRAParticles:
     """The renders' denoiser as a UNet with a :class:`LoRA`, trained by Adam.
 
     The prompts are those of the views, as for the pre-trained score.
@@ -120,26 +105,20 @@ class LoRAParticles(ParticleModel):
         options: ``rank``, ``lr``, ``samples``, ``camera_dropout``; see ``variants/vsd.py``.
     """
 
-    def __init__(self, guidance: "TextToImageDistillation", options: Any) -> None:
-        check_adaptable(guidance.cfg)
+    def __init__(self, guidance: Any, options: Any) -> None:
         self.options = options
         self.lora = LoRA(guidance.unet, options.rank, run_seed())
         self.optimizer = torch.optim.Adam(self.lora.parameters(), lr=options.lr, betas=BETAS)
 
     @torch.no_grad()
-    def predict(
-        self,
-        score: "TextToImageDistillation",
-        noised: Noised,
-        condition: "Condition",
-        batch: dict[str, Any],
-    ) -> Float[Tensor, "B c h w"]:
+    def predict(self, score: Any, noised: Noised, condition: Condition, batch: Batch) -> Latents:
+        """Predict the noise; ``score`` is the guidance."""
         camera = batch["c2w"].to(noised.z.device).flatten(1)
         with self.lora.applied(score.unet, camera):
             return score.conditional(noised.z, noised.t, condition)
 
     @torch.enable_grad()
-    def learn(self, score: "TextToImageDistillation", renders: Renders) -> dict[str, float]:
+    def learn(self, score: Any, renders: Renders) -> dict[str, float]:
         """Take ``samples`` noisy copies of each render, and one step of Adam on the mean squared
         error of their predicted noise (ProlificDreamer, eq. 8).
         """
@@ -151,7 +130,7 @@ class LoRAParticles(ParticleModel):
             self.optimizer.step()
         return {"lora_error": sum(losses) / len(losses)} if losses else {}
 
-    def _backward(self, score: "TextToImageDistillation", renders: Renders, sample: int) -> float:
+    def _backward(self, score: Any, renders: Renders, sample: int) -> float:
         """Add the gradient of one noisy copy of each render; return its mean squared error."""
         noised = particle_noise(score, renders.latents, sample)
         camera = renders.batch["c2w"].to(noised.z.device).flatten(1)
@@ -190,10 +169,13 @@ class LoRAParticles(ParticleModel):
             return
         own = dict(self.lora.named_parameters())
         shapes = {name: value.shape for name, value in own.items()}
-        for key in MOMENTS:
-            kept = {f"{key}.{name}": value.shape for name, value in own.items()}
-            if state.keys() & kept.keys():
-                shapes |= kept if key != "step" else dict.fromkeys(kept, torch.Size([]))
+        if len(state) > len(shapes):  # after the first step of Adam
+            sizes = {"step": torch.Size([])}
+            shapes |= {
+                f"{key}.{name}": sizes.get(key, value.shape)
+                for key in MOMENTS
+                for name, value in own.items()
+            }
         if {name: value.shape for name, value in state.items()} != shapes:
             raise UserError(
                 f"the checkpoint's guidance had learnt {len(state)} tensors, not the LoRA of rank "
@@ -203,19 +185,15 @@ class LoRAParticles(ParticleModel):
         for name, parameter in own.items():
             parameter.copy_(state[name])
             if f"step.{name}" in state:
+                moments = {key: state[f"{key}.{name}"].clone() for key in MOMENTS}
+                # Adam expects its step count on the CPU
                 self.optimizer.state[parameter] = {
-                    key: self._placed(key, state[f"{key}.{name}"], parameter) for key in MOMENTS
+                    key: value.cpu() if key == "step" else value.to(parameter)
+                    for key, value in moments.items()
                 }
 
-    @staticmethod
-    def _placed(key: str, value: Tensor, parameter: nn.Parameter) -> Tensor:
-        """Return a copy of a moment where Adam expects it: its step count on the CPU."""
-        return value.clone().cpu() if key == "step" else value.clone().to(parameter)
 
-
-def particle_noise(
-    score: "TextToImageDistillation", latents: Float[Tensor, "B c h w"], sample: int
-) -> Noised:
+def particle_noise(score: Any, latents: Latents, sample: int) -> Noised:
     """Add noise at timesteps from 1 to the last, uniform, drawn independently of those
     of the error.
     """

@@ -29,7 +29,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from ..core.errors import UserError
@@ -41,10 +41,7 @@ from ..models.multiview_unet import CAMERA, attend_across_views, load_multiview_
 from ..models.text_encoders import pack, unpack
 from .base import GUIDANCE_SCALE
 from .stable_diffusion import StableDiffusionGuidance
-from .text_condition import Condition, Embeddings, Latents, Timesteps, view_of_row
-
-SAME = 1e-2
-"""Largest difference of angles that count as equal, degrees."""
+from .types import Condition, Embeddings, Latents, Timesteps, view_of_row
 
 
 @register("gaussiandreamer-mvdream-guidance")
@@ -102,29 +99,17 @@ class MVDreamGuidance(StableDiffusionGuidance):
             "another system.guidance.variant_type"
         )
 
-    def __call__(
-        self,
-        rgb: Float[Tensor, "B H W c"],
-        prompt_utils: Any = None,
-        *,
-        guidance_eval: bool = False,
-        **batch: Any,
-    ) -> dict[str, Any]:
-        """See :class:`.base.ScoreDistillation`.
+    def condition(self, prompt_utils: Any, **batch: Any) -> Condition:
+        """See :meth:`.ScoreDistillation.condition`.
 
         Raises:
             UserError: the batch isn't groups of views, nor a single view to evaluate.
         """
-        if not (guidance_eval and len(rgb) == 1):
-            require_groups(batch["elevation"], batch["azimuth"], self.cfg.n_view)
-        return super().__call__(rgb, prompt_utils, guidance_eval=guidance_eval, **batch)
-
-    def condition(self, prompt_utils: Any, **batch: Any) -> Condition:
-        condition = super().condition(prompt_utils, **batch)
-        if condition.negative_weights is not None:
+        condition, views = super().condition(prompt_utils, **batch), len(batch["c2w"])
+        if views != 1 and views % self.cfg.n_view:
             raise UserError(
-                "Perp-Neg interpolates between the prompts of directions, and this model has one "
-                "prompt for all: set system.prompt_processor.use_perp_neg=false"
+                f"this model sees {self.cfg.n_view} views of an object together, and a batch has "
+                f"{views}: set data.n_view={self.cfg.n_view} and data.batch_size to a multiple"
             )
         embeddings = condition.embeddings
         cameras = camera_matrices(batch["c2w"].to(embeddings))
@@ -134,9 +119,7 @@ class MVDreamGuidance(StableDiffusionGuidance):
             empty = pack(empty.expand(len(cameras), -1, -1), cameras)
         return Condition(pack(embeddings, cameras[rows]), None, empty)
 
-    def draw_timesteps(
-        self, latents: Float[Tensor, "B c h w"]
-    ) -> tuple[Int[Tensor, " B"], Float[Tensor, " B"]]:
+    def draw_timesteps(self, latents: Latents) -> tuple[Timesteps, Float[Tensor, " B"]]:
         """Draw one timestep for each object, and repeat it for its views."""
         t, abar = super().draw_timesteps(latents[:: self.cfg.n_view])
         return tuple(
@@ -158,24 +141,3 @@ def camera_matrices(c2w: Float[Tensor, "B 4 4"]) -> Float[Tensor, "B 16"]:
     position = torch.nn.functional.normalize(c2w[:, :3, 3:], dim=1)
     upper = torch.cat([c2w[:, :3, :3], position], dim=2)
     return torch.cat([upper, c2w[:, 3:]], dim=1).flatten(1)
-
-
-def require_groups(
-    elevation: Float[Tensor, " B"], azimuth: Float[Tensor, " B"], n_view: int
-) -> None:
-    """Raise UserError unless the views are groups of ``n_view`` at one elevation and at azimuths
-    360 / ``n_view`` degrees apart.
-    """
-    wanted = f"set data.n_view={n_view} and data.batch_size to a multiple of it"
-    if len(azimuth) % n_view:
-        raise UserError(
-            f"this model sees {n_view} views of an object together, and a batch has "
-            f"{len(azimuth)}: {wanted}"
-        )
-    tilt, turn = (angle.reshape(-1, n_view) for angle in (elevation, azimuth))
-    steps = (turn - turn[:, :1] - 360 / n_view * torch.arange(n_view).to(turn) + 180) % 360 - 180
-    if max((tilt - tilt[:, :1]).abs().max(), steps.abs().max()) > SAME:
-        raise UserError(
-            f"this model sees {n_view} views of an object together, at one elevation and at "
-            f"azimuths {360 / n_view:g} degrees apart, and this batch's aren't: {wanted}"
-        )

@@ -16,7 +16,7 @@ from ..diffusion.exact_score import (
     weighted_sum,
 )
 from ..prompts.view_prompts import view_directions
-from .known_truth import composite, resized
+from .known_truth import composite
 
 
 class Pictures(NamedTuple):
@@ -69,12 +69,8 @@ class Bank(NamedTuple):
         rgba: UInt8[Tensor, "K H W 4"], pooled: Float[Tensor, "K 4 h w"], latent: LinearLatent
     ) -> "Bank":
         """Encode pictures, which ``pooled`` has as averages over the latent's pixels, in [0, 1]."""
-        channels = 3 if latent.matrix is None else len(latent.matrix)
-        layers = pooled.new_empty(len(pooled), channels + 1, *pooled.shape[2:])
-        chunk = images_per_chunk(layers[0].numel(), layers.device)
-        for part, place in zip(pooled.split(chunk), layers.split(chunk), strict=True):
-            # pooling and compositing commute
-            place[:, :-1], place[:, -1] = latent.encode_pooled(part[:, :3]), 1 - part[:, 3]
+        # pooling and compositing commute
+        layers = torch.cat([latent.encode_pooled(pooled[:, :3]), 1 - pooled[:, 3:]], dim=1)
         return Bank(rgba, Pictures.of(layers), latent)
 
 
@@ -146,7 +142,8 @@ def mixture_of(
     else:
         rows = torch.arange(len(members)) if guided else members.nonzero().flatten()
         members = members[rows]
-        pictures = Pictures.of(_composited(bank, rows.to(bank.rgba.device), background))
+        rgba = bank.rgba.index_select(0, rows.to(bank.rgba.device))
+        pictures = Pictures.of(bank.latent.encode(composite(rgba, background[None])))
         mixing = torch.eye(pictures.layers.shape[1], device=background.device)
     conditional = torch.cat([torch.ones(int(own is not None), dtype=torch.bool), members])
     log_prior = torch.where(conditional, 0.0, -torch.inf).to(background.device)
@@ -170,20 +167,6 @@ def _mixing_of_color(latent: LinearLatent, color: Float[Tensor, "1 1 3"]) -> Flo
     color = color.reshape(1, 3, 1, 1)
     tint = (latent.encode_pooled(color) - latent.encode_pooled(torch.zeros_like(color)))[0, :, :, 0]
     return torch.cat([torch.eye(len(tint), device=tint.device), tint], dim=1)
-
-
-def _composited(
-    bank: Bank, rows: Int[Tensor, " k"], background: Float[Tensor, "bh bw 3"]
-) -> Float[Tensor, "k c h w"]:
-    """Encode pictures on a background of pixels."""
-    latents = bank.pictures.layers.new_empty(len(rows), *bank.pictures.layers[0, :-1].shape)
-    chunk = images_per_chunk(bank.rgba[0].numel(), bank.rgba.device)
-    size = tuple(bank.rgba.shape[1:3])
-    background = resized(background.movedim(-1, 0)[None], size).movedim(1, -1)
-    for some, place in zip(rows.split(chunk), latents.split(chunk), strict=True):
-        rgb = composite(bank.rgba.index_select(0, some), background)
-        place.copy_(bank.latent.encode(rgb))
-    return latents
 
 
 def _chunks(layers: Float[Tensor, "K l h w"]) -> tuple[Float[Tensor, "k l p"], ...]:

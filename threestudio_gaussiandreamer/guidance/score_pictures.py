@@ -2,33 +2,19 @@
 ``guidance_evaluation_save`` and for validation.
 """
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any
 
 import torch
-from jaxtyping import Float, Int
-from torch import Tensor
 
 from ..diffusion import sds
-
-if TYPE_CHECKING:
-    from .base import ScoreDistillation
-
-
-class Noised(NamedTuple):
-    """A batch of noisy latents, the input of the score model."""
-
-    t: Int[Tensor, " B"]
-    abar: Float[Tensor, " B"]
-    """float64."""
-    noise: Float[Tensor, "B c h w"]
-    z: Float[Tensor, "B c h w"]
+from .types import Batch, Noised, items_of
 
 
 @torch.no_grad()
 def score_pictures(
-    guidance: "ScoreDistillation", noised: Noised, prompt_utils: Any, batch: dict[str, Any]
+    guidance: Any, noised: Noised, prompt_utils: Any, batch: Batch
 ) -> dict[str, Any]:
-    """Decode the noisy latents and the predictions of the score model.
+    """Decode the noisy latents and the predictions of a guidance's score model.
 
     Returns:
         pictures (B, H, W, 3) in [0, 1]: ``imgs_noisy``, the noisy latents; ``imgs_1step``,
@@ -52,34 +38,19 @@ def score_pictures(
             steps=guidance.cfg.eval_steps,
         ),
     }
-    levels = (t / len(guidance.alphas_cumprod)).tolist()
     images = {
         name: guidance.decode(value).float().movedim(1, -1) for name, value in latents.items()
     }
+    levels = (t / len(guidance.alphas_cumprod)).tolist()
     return {"bs": count, "noise_levels": levels, "texts": _captions(levels, batch), **images}
 
 
-def items_of(batch: dict[str, Any], size: int, index: Any) -> dict[str, Any]:
-    """Select items of a batch of ``size`` items; ``index`` is anything that indexes a tensor's
-    first dimension.
-    """
-    return {
-        k: v[index] if isinstance(v, Tensor) and v.dim() and len(v) == size else v
-        for k, v in batch.items()
-    }
-
-
-def _captions(levels: list[float], batch: dict[str, Any]) -> list[str]:
+def _captions(levels: list[float], batch: Batch) -> list[str]:
     """Write threestudio's captions: noise level, elevation, azimuth and distance of each item."""
-    captions = [f"n{level:.02f}" for level in levels]
-    for letter, name, digits in (
-        ("e", "elevation", 1),
-        ("a", "azimuth", 1),
-        ("c", "camera_distances", 2),
-    ):
-        if name in batch:
-            captions = [
-                f"{caption}\n{letter}{float(value):.0{digits}f}"
-                for caption, value in zip(captions, batch[name], strict=True)
-            ]
-    return captions
+    shown = (("e", "elevation", 1), ("a", "azimuth", 1), ("c", "camera_distances", 2))
+    columns = [[f"n{level:.02f}" for level in levels]] + [
+        [f"{letter}{float(value):.0{digits}f}" for value in batch[name]]
+        for letter, name, digits in shown
+        if name in batch
+    ]
+    return ["\n".join(lines) for lines in zip(*columns, strict=True)]

@@ -13,7 +13,6 @@ enable_vae_tiling    encode and decode in overlapping tiles: for images much lar
 ===================  ===============================================================================
 """
 
-import functools
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,12 +23,11 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
 from ..core.errors import UserError
-from ..host import register, register_builtin, warn
+from ..host import register, register_builtin
 from ..prompts.prompt_processors import STABLE_DIFFUSION
-from .base import NonFiniteScore
 from .half_precision import PerItemLossScale
-from .model_images import resized
-from .text_to_image import TextToImageDistillation
+from .text_to_image import TextToImageDistillation, resized
+from .types import Latents
 
 
 @register_builtin("stable-diffusion-guidance")
@@ -63,7 +61,6 @@ class StableDiffusionGuidance(TextToImageDistillation):
                 f"system.guidance.image_size: expected a multiple of {factor}, got "
                 f"{self.image_size}"
             )
-        self._bad_backwards = 0
 
     def vae_type(self, folder: Path) -> torch.dtype:
         """Return the number type of the VAE."""
@@ -83,17 +80,17 @@ class StableDiffusionGuidance(TextToImageDistillation):
             vae.enable_tiling()
         return vae.to(self.device)
 
-    def encode(self, rgb: Float[Tensor, "B 3 H W"], **batch: Any) -> Float[Tensor, "B 4 h w"]:
+    def encode(self, rgb: Float[Tensor, "B 3 H W"], **batch: Any) -> Latents:
         """Draw latents from the VAE's posterior, scaled to unit variance, float32. The draw is a
         function of (seed, step, item).
         """
         images = resized(rgb, self.image_size) * 2 - 1
         if self.vae_dtype == torch.float32:
             return self._encode(images)
-        loss_scale = PerItemLossScale(self._count_bad_backwards)
+        loss_scale = PerItemLossScale(self._count_bad_backward)
         return loss_scale.leave(self._encode(loss_scale.enter(images)))
 
-    def _encode(self, images: Float[Tensor, "B 3 s s"]) -> Float[Tensor, "B 4 h w"]:
+    def _encode(self, images: Float[Tensor, "B 3 s s"]) -> Latents:
         images = images.to(self.vae_dtype)
         if self.cfg.enable_vae_slicing and torch.is_grad_enabled():
             parts = [
@@ -115,30 +112,13 @@ class StableDiffusionGuidance(TextToImageDistillation):
         posterior = self.vae.encode(images).latent_dist
         return posterior.mean, posterior.std
 
-    def decode(self, latents: Float[Tensor, "B 4 h w"]) -> Float[Tensor, "B 3 s s"]:
+    def decode(self, latents: Latents) -> Float[Tensor, "B 3 s s"]:
         latents = (latents / self.vae.config.scaling_factor + self._shift).to(self.vae_dtype)
         # one at a time, since memory matters more than the speed of pictures for display
         images = torch.cat([self.vae.decode(latent).sample for latent in latents.split(1)]).float()
         return (images / 2 + 0.5).clamp(0, 1)
 
-    def _count_bad_backwards(self, bad: Bool[Tensor, " B"]) -> None:
-        self.reads.submit(bad, functools.partial(self._note_bad_backward, self.step))
-
-    def _note_bad_backward(self, step: int, bad: Bool[Tensor, " B"]) -> None:
-        """Count consecutive backward passes in which the encoder's gradient of some items wasn't
-        finite and was set to zero; raise NonFiniteScore after ``max_bad_steps``.
-        """
-        count = int(bad.sum())
-        self._bad_backwards = self._bad_backwards + 1 if count else 0
-        self.bad_items += count
-        if self._bad_backwards >= self.cfg.max_bad_steps:
-            raise NonFiniteScore(
-                f"the gradient of the VAE was NaN or infinite in {self._bad_backwards} steps "
-                f"in a row (step {step}): "
-                "set system.guidance.half_precision_weights=false"
-            )
-        if count:
-            warn(
-                f"step {step}: the VAE's gradient of {count} of {len(bad)} items isn't "
-                "finite; they are left out"
-            )
+    def _count_bad_backward(self, bad: Bool[Tensor, " B"]) -> None:
+        self.count_bad(
+            bad, "the VAE's gradient", "set system.guidance.half_precision_weights=false"
+        )

@@ -36,7 +36,7 @@ from ..models.text_encoders import unpack
 from ..prompts.pooled_prompt_processors import STABLE_DIFFUSION_3
 from .base import GUIDANCE_SCALE
 from .stable_diffusion import StableDiffusionGuidance
-from .text_condition import Embeddings, Latents, Timesteps
+from .types import Embeddings, Latents, Timesteps
 
 
 @register("gaussiandreamer-stable-diffusion-3-guidance")

@@ -22,7 +22,7 @@ from ..models.model_files import pipeline_settings
 from ..models.text_encoders import unpack
 from ..prompts.pooled_prompt_processors import STABLE_DIFFUSION_XL
 from .stable_diffusion import StableDiffusionGuidance
-from .text_condition import Embeddings, Latents, Timesteps
+from .types import Embeddings, Latents, Timesteps
 
 SIZES = 6
 """How many numbers describe original size, cropped corner and size of a picture."""

@@ -11,7 +11,8 @@ guidance_scale                      of classifier-free guidance; 1 is none (thre
 ..._step_percent, grad_clip,        see ``guidance/base.py``
 weighting_strategy, ...
 view_dependent_prompting            use the prompt of each view's direction
-view_contrast, view_contrast_from   see ``guidance/view_contrast.py``
+view_contrast                       move the conditional prediction away from that for the opposite
+                                    view's prompt, by this factor of their difference; 0: none
 image_size                          height and width that the model sees, pixels; none = what it was
                                     trained with
 half_precision_weights              half precision on a GPU; images, latents, gradients and
@@ -27,14 +28,30 @@ enable_sequential_cpu_offload       keep the network's weights in the CPU's memo
 enable_memory_efficient_attention   torch's own attention is so already; accepted for threestudio's
                                     configurations
 ==================================  ================================================================
+
+View contrast is eps_c' = eps_c + view_contrast (eps_c - eps_o), where o is the prompt of the view
+from the other side of the object: "front view" for "back view", and "left side view" for "right
+side view" where the prompts tell these apart. It is the negation of a concept as in composable
+diffusion (Liu et al. 2022, arXiv:2206.01714), for models whose views of a prompt are alike; what it
+brings is measured in docs/toybox.md. Perp-Neg (Armandpour et al. 2023) takes away only what is
+perpendicular to eps_c - eps_u. Each view at or above the share ``CONTRAST_FROM`` of the timesteps,
+which decide the view, costs one more evaluation. It is part of guidance, so outside of
+``guidance_interval`` there is none.
+
+A UNet with ``time_cond_proj_dim`` takes the guidance scale as an input (Meng et al. 2023, "On
+Distillation of Guided Diffusion Models", arXiv:2210.03142), such as that of a latent consistency
+model (Luo et al. 2023, arXiv:2310.04378), and predicts the noise with guidance in one evaluation.
+Other models predict the mean of all pictures that fit z; a consistency model predicts one of them.
 """
 
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, ClassVar, Optional
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
@@ -42,27 +59,34 @@ from ..core.errors import UserError, unknown
 from ..core.extras import require_extra
 from ..core.options import in_range, one_of
 from ..diffusion.noise_prediction import PREDICTIONS, perp_neg
-from ..host import debug, info, parse_structured, warn
+from ..host import info, parse_structured, warn
 from ..models.families import STABLE_DIFFUSION, Family
 from ..models.hub import find_model
 from ..models.loaded import keep_on_cpu, loaded
 from ..models.model_files import load_network, load_settings
 from .base import ScoreDistillation
-from .half_precision import HALF_TYPES, channels_last, weights_type
-from .lora import LoRAParticles, check_adaptable
-from .model_images import size_of_images
-from .particles import ParticleModel
-from .scale_input import scale_input, scale_width
-from .text_condition import Condition, Embeddings, Latents, Timesteps, view_of_row
-from .variants.base import require_unset
-from .view_contrast import check_view_contrast, contrasted, opposite
+from .half_precision import HALF_TYPES, weights_type
+from .lora import LoRAParticles
+from .types import Condition, Embeddings, Latents, Timesteps, view_of_row
 
-USUAL_SCALES = 200
-"""Guidance scales above this, twice the paper's, are worth a warning."""
+USUAL_SCALES = (0, 200)
+"""Guidance scales beyond these are worth a warning: above twice the paper's results saturate, and
+those below 0 lead away from the prompt.
+"""
 TERMINAL_ABAR = 2.0**-24
 """Replaces an ``abar`` of exactly 0, which schedules with zero terminal SNR have at the last step,
 since ``predict_x0`` divides by its square root.
 """
+CONTRAST_FROM = 0.4
+"""Smallest timestep, as a share of all, at which view contrast is applied."""
+TAKEN_SCALES = (1, 20)
+"""Those that a network which takes the scale may know; latent consistency models' are 3 to 15."""
+SCALE_UNIT = 1000.0
+"""Factor of the scale in its embedding."""
+ENLARGED = 4
+"""Renders that are enlarged by a larger factor are worth a warning."""
+NOT_ADAPTABLE = ("enable_torch_compile", "enable_sequential_cpu_offload")
+"""Options that replace the UNet's forward pass, where ``vsd-variant`` trains a LoRA."""
 
 
 class TextToImageDistillation(ScoreDistillation):
@@ -76,7 +100,6 @@ class TextToImageDistillation(ScoreDistillation):
         revision: Optional[str] = None
         view_dependent_prompting: bool = True
         view_contrast: float = field(default=0.0, metadata=in_range(0, 100))
-        view_contrast_from: float = field(default=0.4, metadata=in_range(0, 1))
         image_size: Optional[int] = field(default=None, metadata=in_range(1, 4096, "pixels"))
         half_precision_weights: bool = True
         half_precision_type: str = field(default="float16", metadata=one_of(HALF_TYPES))
@@ -87,10 +110,19 @@ class TextToImageDistillation(ScoreDistillation):
         enable_sequential_cpu_offload: bool = False
         enable_memory_efficient_attention: bool = False
 
+        REMOVED: ClassVar[dict[str, Any]] = {
+            **ScoreDistillation.Config.REMOVED,
+            "view_contrast_from": (CONTRAST_FROM, f"it is {CONTRAST_FROM}"),
+        }
+
         @staticmethod
         def check(cfg: Any) -> None:
             ScoreDistillation.Config.check(cfg)
-            check_view_contrast(cfg)
+            if cfg.view_contrast and not cfg.view_dependent_prompting:
+                raise UserError(
+                    "view_contrast compares the prompts of opposite views: set "
+                    "view_dependent_prompting=true, or view_contrast=0"
+                )
 
     cfg: Config
     components: ClassVar[tuple[str, ...]] = ("unet", "scheduler")
@@ -109,8 +141,6 @@ class TextToImageDistillation(ScoreDistillation):
     def preflight(cls, cfg: Any) -> None:
         cfg = parse_structured(cls.Config, cfg)
         super().preflight(cfg)
-        if not cfg.view_contrast:
-            require_unset(cls, cfg, ("view_contrast_from",), "with view_contrast=0")
         cls._find(cfg, download=False)
 
     @classmethod
@@ -129,11 +159,12 @@ class TextToImageDistillation(ScoreDistillation):
         )
         self.set_schedule(folder)
         self.load(folder)
-        scale = self.cfg.guidance_scale
-        if self.scale_width is None and not 0 <= scale <= USUAL_SCALES:
+        low, high = USUAL_SCALES if self.scale_width is None else TAKEN_SCALES
+        if not low <= self.cfg.guidance_scale <= high:
             warn(
-                f"system.guidance.guidance_scale={scale:g}: expected 1 (none) to {USUAL_SCALES}; "
-                "larger scales saturate results, and those below 0 lead away from the prompt"
+                f"system.guidance.guidance_scale={self.cfg.guidance_scale:g}: expected {low} to "
+                f"{high} (1: none) for {self.cfg.pretrained_model_name_or_path}"
+                + ("" if self.scale_width is None else ", which takes the scale as an input")
             )
 
     @property
@@ -148,10 +179,8 @@ class TextToImageDistillation(ScoreDistillation):
         from diffusers import DDPMScheduler
 
         scheduler = load_settings(DDPMScheduler, folder, "scheduler")
-        if (
-            not {"beta_schedule", "trained_betas"}
-            & DDPMScheduler.load_config(folder, subfolder="scheduler").keys()
-        ):
+        settings = DDPMScheduler.load_config(folder, subfolder="scheduler")
+        if not settings.keys() & {"beta_schedule", "trained_betas"}:
             raise UserError(
                 f"{self.cfg.pretrained_model_name_or_path} has no known noise schedule: "
                 "its scheduler has no beta_schedule"
@@ -177,20 +206,35 @@ class TextToImageDistillation(ScoreDistillation):
     def load(self, folder: Path) -> None:
         """Load the networks; subclasses extend this with their own."""
         self.load_denoiser(folder)
-        if self.cfg.enable_memory_efficient_attention:
-            debug("enable_memory_efficient_attention: torch's attention needs little memory")
 
     def load_denoiser(self, folder: Path) -> None:
         """Load the network that predicts the noise, and set ``text_width`` and ``scale_width``."""
         from diffusers import UNet2DConditionModel
 
         self.unet = self.network(UNet2DConditionModel, folder, "unet", self.prepare_denoiser)
-        self.scale_width = scale_width(self.unet, self.cfg)
+        self.scale_width = self.unet.config.time_cond_proj_dim
         self.text_width = self.unet.config.encoder_hid_dim or self.unet.config.cross_attention_dim
 
     def size_of_images(self, factor: int = 1) -> int:
-        """Return height and width of the images for the model; see ``guidance/model_images.py``."""
-        return size_of_images(self.cfg, self.denoiser.config.sample_size, factor)
+        """Return height and width of the images for the model, pixels: ``image_size``, or
+        ``factor`` times the latent size that the model was trained with. Warn if they differ.
+
+        Raises:
+            UserError: neither is known.
+        """
+        cfg, trained = self.cfg, self.denoiser.config.sample_size
+        size = trained * factor if isinstance(trained, int) else None
+        if size is None and cfg.image_size is None:
+            raise UserError(
+                f"{cfg.pretrained_model_name_or_path} has sample_size {trained}: set "
+                "system.guidance.image_size, pixels"
+            )
+        if None not in (size, cfg.image_size) and cfg.image_size != size:
+            warn(
+                f"system.guidance.image_size={cfg.image_size}: {cfg.pretrained_model_name_or_path} "
+                f"was trained on images of {size} x {size} and may draw poor ones of another size"
+            )
+        return cfg.image_size or size
 
     def require_text_to_image(
         self, channels: int, embedding_types: tuple[Optional[str], ...] = (None, "text")
@@ -198,17 +242,10 @@ class TextToImageDistillation(ScoreDistillation):
         """Raise UserError unless the inputs of the UNet are an image of ``channels`` channels and
         embeddings of these types only.
         """
-        config = self.unet.config
-        wanted = {
-            "in_channels": (channels,),
-            "class_embed_type": (None,),
-            "addition_embed_type": embedding_types,
-        }
-        if other := [
-            f"{name} {config[name]}"
-            for name, values in wanted.items()
-            if config[name] not in values
-        ]:
+        wanted = {"in_channels": (channels,), "class_embed_type": (None,)}
+        wanted["addition_embed_type"] = embedding_types
+        given = {name: self.unet.config[name] for name in wanted}
+        if other := [f"{name} {given[name]}" for name in wanted if given[name] not in wanted[name]]:
             raise UserError(
                 f"{self.cfg.pretrained_model_name_or_path} needs other inputs than text "
                 f"({', '.join(other)}), like models for inpainting, depth or upscaling: use a "
@@ -239,7 +276,8 @@ class TextToImageDistillation(ScoreDistillation):
         def load() -> nn.Module:
             network = read(network_class, folder, component, half=self.half, torch_dtype=dtype)
             network.requires_grad_(False)
-            if channels_last(self.cfg, dtype, self.device):
+            is_cpu_half = (self.device.type, dtype) == ("cpu", torch.bfloat16)
+            if self.cfg.enable_channels_last_format and not is_cpu_half:  # slower there
                 network.to(memory_format=torch.channels_last)
             return prepare(network)
 
@@ -273,15 +311,12 @@ class TextToImageDistillation(ScoreDistillation):
                 "this guidance needs text embeddings: set system.prompt_processor_type to the "
                 "processor of its model"
             )
-        views = (
-            batch["elevation"],
-            batch["azimuth"],
-            batch["camera_distances"],
-            self.cfg.view_dependent_prompting,
-        )
-        other = None
+        elevation, azimuth = batch["elevation"], batch["azimuth"]
+        more = (batch["camera_distances"], self.cfg.view_dependent_prompting)
+        views, other = (elevation, azimuth, *more), None
         if self.cfg.view_contrast:
-            other = opposite(prompt_utils, *views).to(self.device)
+            opposite = prompt_utils.get_text_embeddings(elevation, azimuth + 180, *more)
+            other = opposite[: len(azimuth)].to(self.device)
         if getattr(prompt_utils, "use_perp_neg", False):
             embeddings, weights = prompt_utils.get_text_embeddings_perp_neg(*views)
             weights = weights.to(self.device)
@@ -294,78 +329,85 @@ class TextToImageDistillation(ScoreDistillation):
                 "give system.prompt_processor and system.guidance the same "
                 "pretrained_model_name_or_path"
             )
-        empty = self._empty_embedding(prompt_utils)
+        # threestudio's prompts can't make an empty one
+        make = getattr(prompt_utils, "empty", None) if self.variant.NEEDS_EMPTY_PROMPT else None
+        empty = make().to(self.device) if make else None
         return Condition(embeddings.to(self.device), weights, empty, other)
-
-    def _empty_embedding(self, prompt_utils: Any) -> Optional[Float[Tensor, "1 N F"]]:
-        """Return the embedding of an empty prompt if the variant needs one and ``prompt_utils`` can
-        make it, as this package's can.
-        """
-        make = getattr(prompt_utils, "empty", None)
-        return make().to(self.device) if self.variant.NEEDS_EMPTY_PROMPT and make else None
 
     def select(self, condition: Condition, rows: Int[Tensor, " R"]) -> Condition:
         return condition.select(rows)
 
-    def conditional(
-        self, z: Float[Tensor, "B c h w"], t: Int[Tensor, " B"], condition: Condition
-    ) -> Float[Tensor, "B c h w"]:
+    def conditional(self, z: Latents, t: Timesteps, condition: Condition) -> Latents:
         return self.noise(z, t, condition.embeddings[: len(z)])
 
-    def unconditional(
-        self, z: Float[Tensor, "B c h w"], t: Int[Tensor, " B"], condition: Condition
-    ) -> Float[Tensor, "B c h w"]:
+    def unconditional(self, z: Latents, t: Timesteps, condition: Condition) -> Latents:
         return self.noise(z, t, condition.embeddings[len(z) : 2 * len(z)])
 
-    def empty_prompt(
-        self, z: Float[Tensor, "B c h w"], t: Int[Tensor, " B"], condition: Condition
-    ) -> Optional[Float[Tensor, "B c h w"]]:
+    def empty_prompt(self, z: Latents, t: Timesteps, condition: Condition) -> Optional[Latents]:
         if condition.empty is None:
             return None
         return self.noise(z, t, condition.empty.expand(len(z), -1, -1))
 
-    def particle_model(self, options: Any) -> ParticleModel:
+    def particle_model(self, options: Any) -> LoRAParticles:
         return LoRAParticles(self, options)
 
     @classmethod
     def check_particle_model(cls, cfg: Any) -> None:
-        check_adaptable(cfg)
+        if found := [name for name in NOT_ADAPTABLE if cfg[name]]:
+            raise UserError(
+                f"system.guidance.{found[0]}: vsd-variant trains a LoRA in the UNet, which needs "
+                f"the plain UNet: set {found[0]}=false"
+            )
 
-    def guided_noise(
-        self,
-        z: Float[Tensor, "B c h w"],
-        t: Int[Tensor, " B"],
-        condition: Condition,
-        scale: float,
-        *,
-        rescale: float = 0.0,
-    ) -> Float[Tensor, "B c h w"]:
-        """Predict the noise with guidance, in one evaluation per view if the network takes the
-        scale; Perp-Neg, ``rescale`` and scales below 1 need the unconditional prediction.
+    def at_scale(
+        self, z: Latents, t: Timesteps, condition: Condition, scale: float
+    ) -> Optional[Latents]:
+        """Predict the noise with guidance in one evaluation per view, if the network takes the
+        scale; Perp-Neg and scales below 1 need the unconditional prediction.
         """
-        perp = condition.negative_weights is not None
-        if scale == 1 and not perp:
-            return contrasted(self, self.conditional(z, t, condition), z, t, condition).to(z)
-        if self.scale_width is None or rescale or perp or scale < 1:
-            return super().guided_noise(z, t, condition, scale, rescale=rescale)
+        if condition.negative_weights is not None:
+            return super().at_scale(z, t, condition, scale)
+        if scale != 1 and (self.scale_width is None or scale < 1):
+            return None
         eps = self.noise(z, t, condition.embeddings[: len(z)], scale)
-        return contrasted(self, eps, z, t, condition, scale).to(z)
+        return self._contrasted(eps, z, t, condition, scale)
 
     def predict(
-        self, z: Float[Tensor, "B c h w"], t: Int[Tensor, " B"], condition: Condition
-    ) -> tuple[Tensor, Optional[Tensor]]:
+        self, z: Latents, t: Timesteps, condition: Condition
+    ) -> tuple[Latents, Optional[Latents]]:
         batch, perp = len(z), condition.negative_weights
         rows = len(condition.embeddings) if self.guided or perp is not None else batch
         eps = self.noise(z, t, condition.embeddings[:rows])
         cond, uncond = eps[:batch], eps[batch : 2 * batch] if rows > batch else None
         if perp is None:
-            return contrasted(self, cond, z, t, condition), uncond
+            return self._contrasted(cond, z, t, condition), uncond
         return perp_neg(cond, uncond, eps[2 * batch :].unflatten(0, (batch, 2)), perp), uncond
+
+    def _contrasted(
+        self,
+        eps: Latents,
+        z: Latents,
+        t: Timesteps,
+        condition: Condition,
+        scale: float = 1.0,
+    ) -> Latents:
+        """Return the conditional predictions ``eps`` with view contrast, if the condition has it.
+
+        Args:
+            scale: of guidance in ``eps``, if the network takes it as an input.
+        """
+        if condition.opposite is None:
+            return eps
+        rows = (t >= CONTRAST_FROM * len(self.alphas_cumprod)).nonzero()[:, 0]
+        if not len(rows):
+            return eps
+        other = self.noise(z[rows], t[rows], condition.opposite[rows], scale)
+        return eps.index_add(0, rows, eps[rows] - other, alpha=self.cfg.view_contrast)
 
     def noise(
         self,
-        z: Float[Tensor, "B c h w"],
-        t: Int[Tensor, " B"],
+        z: Latents,
+        t: Timesteps,
         embeddings: Float[Tensor, "kB N F"],
         scale: float = 1.0,
     ) -> Float[Tensor, "kB c h w"]:
@@ -378,8 +420,7 @@ class TextToImageDistillation(ScoreDistillation):
         self.evaluations += len(embeddings)
         rows = view_of_row(len(z), len(embeddings), z.device)
         z, t = z[rows], t[rows]
-        inputs = scale_input(scale, self.scale_width, len(z), device=z.device, dtype=self.dtype)
-        output = self.run_network(z, t, embeddings, **inputs).float()
+        output = self.run_network(z, t, embeddings, **self.scale_input(scale, len(z))).float()
         # models may also predict the variance of the reverse step, in further channels
         return PREDICTIONS[self.prediction_type](output[:, : z.shape[1]], z, self._abar[t])
 
@@ -391,3 +432,37 @@ class TextToImageDistillation(ScoreDistillation):
         """
         tokens = embeddings.to(self.dtype)
         return self.unet(z.to(self.dtype), t, encoder_hidden_states=tokens, **inputs).sample
+
+    def scale_input(self, scale: float, count: int) -> dict[str, Float[Tensor, "B width"]]:
+        """Return the input of a UNet that takes the scale, for so many latents; none for others."""
+        if self.scale_width is None:
+            return {}
+        from diffusers.models.embeddings import get_timestep_embedding
+
+        w = SCALE_UNIT * torch.full((count,), scale - 1.0)
+        embedding = get_timestep_embedding(w, self.scale_width, downscale_freq_shift=1)
+        return {"timestep_cond": embedding.to(self.device, self.dtype)}
+
+
+def resized(images: Float[Tensor, "B 3 H W"], size: int) -> Float[Tensor, "B 3 s s"]:
+    """Resize images to the model's size, with antialiasing if they shrink by more than a factor of
+    2, since bilinear sampling would skip pixels.
+    """
+    height, width = images.shape[-2:]
+    if (height, width) == (size, size):
+        return images
+    _warn_of_small_renders(height, width, size)
+    antialias = max(height, width) > 2 * size
+    return F.interpolate(
+        images, (size, size), mode="bilinear", align_corners=False, antialias=antialias
+    )
+
+
+@lru_cache
+def _warn_of_small_renders(height: int, width: int, size: int) -> None:
+    """Warn, once per process, of renders that the model gets blurred."""
+    if min(height, width) * ENLARGED < size:
+        warn(
+            f"renders of {width} x {height} are enlarged to the {size} x {size} of the model, "
+            "which sees them blurred: give a larger data.width and data.height"
+        )

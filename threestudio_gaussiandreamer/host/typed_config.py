@@ -12,6 +12,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from ..core.errors import UserError, unknown
 from ..core.interpolation import escape
+from ..core.logs import warn
 from ..core.option_types import check_types
 
 MOST_KEPT = 256
@@ -49,19 +50,38 @@ def _parse(config_class: Any, values: Any) -> DictConfig:
     """
     if values is not None and not isinstance(values, Mapping):
         raise UserError(f"expected keys and values, got {values!r}")
+    values = without_removed(config_class, values or {})
     known = [field.name for field in fields(config_class)]
-    for key in values or {}:
+    for key in values:
         if key not in known:
             raise unknown("key", key, known)
     try:
-        check_types(config_class, values or {})
+        check_types(config_class, values)
         return OmegaConf.structured(
-            config_class(**{key: escape(value) for key, value in (values or {}).items()})
+            config_class(**{key: escape(value) for key, value in values.items()})
         )
     except OmegaConfBaseException as error:
         raise UserError(f"{error.full_key or error.key}: {_problem(error)}") from error
     except TypeError as error:
         raise UserError(f"{config_class.__qualname__}: {error}") from error
+
+
+def without_removed(config_class: Any, values: Any, path: str = "") -> Any:
+    """Return a section without the options that its part had in earlier versions.
+
+    ``Config.REMOVED`` has their names, each with the value that did nothing, or a function that
+    says whether a value did, and with what is the case now; other values are warned of.
+
+    Args:
+        path: of the section, for messages, such as "system.guidance.".
+    """
+    removed = getattr(config_class, "REMOVED", {})
+    found = [key for key in values if key in removed]
+    for key in found:
+        neutral, now = removed[key]
+        if not (neutral(values[key]) if callable(neutral) else values[key] == neutral):
+            warn(f"{path}{key} is no option any more: {now}")
+    return {key: values[key] for key in values if key not in found} if found else values
 
 
 def _problem(error: OmegaConfBaseException) -> str:

@@ -20,7 +20,7 @@ from ..core.errors import UserError, unknown
 from ..core.methods import require_dataclass
 from ..core.options import check_options, require_representable, shown
 from ..host import find, pl, validate_schedule
-from ..host.typed_config import parse_structured
+from ..host.typed_config import parse_structured, without_removed
 from .live_viewer import ViewerConfig
 from .part_kinds import check_kind, find_part
 from .section_checks import check_sections
@@ -109,6 +109,9 @@ def check_part(path: str, type_name: Any, values: Any) -> None:
         require_dataclass(part)
     except UserError as error:
         raise UserError(f"{path}_type: {error}") from error
+    kept = without_removed(config_class, _mapping(path, values), f"{path}.")
+    for key in [key for key in values if key not in kept]:
+        values.pop(key)
     _check_keys(path, values, config_class)
     for key in values:  # before the part's own checks, whose messages don't name the key
         if key.endswith("_type") and key.removesuffix("_type") in values and values.get(key):

@@ -6,12 +6,11 @@ from typing import Any
 
 from ..core.distributed import require_shareable
 from ..core.errors import UserError
-from ..guidance.view_contrast import NOT_WITH_PERP_NEG
 from ..host import find, parse_structured
 from ..training.camera_options import sizes_of_stages
 
 DATA = ("gaussiandreamer-datamodule", "random-camera-datamodule")
-"""Data modules that draw new views in each step, unless ``hold_steps`` is more than 1."""
+"""Data modules that draw new views in each step."""
 
 
 def check_sections(cfg: Any) -> None:
@@ -29,7 +28,6 @@ def check_sections(cfg: Any) -> None:
         return
     guidance = parse_structured(options, cfg.system.get("guidance"))
     _check_view_groups(guidance, cfg.data)
-    _check_reuse(guidance, cfg)
     if hasattr(options, "check_render_size") and cfg.data_type in DATA:
         _check_render_sizes(options, guidance, cfg)
     if "view_dependent_prompting" in guidance:
@@ -57,32 +55,6 @@ def _check_view_groups(guidance: Any, data: Any) -> None:
         )
 
 
-def _check_reuse(guidance: Any, cfg: Any) -> None:
-    """Raise UserError where a prediction couldn't serve as many steps as ``reuse_steps`` says."""
-    steps = guidance.get("reuse_steps", 1)
-    if steps == 1:
-        return
-    wanted = f"system.guidance.reuse_steps={steps} needs steps of the same"
-    if cfg.data_type in DATA:
-        data = parse_structured(find(cfg.data_type).Config, cfg.data)
-        if data.get("hold_steps", 1) % steps and not _has_one_batch(data):
-            raise UserError(f"{wanted} views: set data.hold_steps={steps}, or to a multiple of it")
-    background = cfg.system.get("background") or {}
-    if background.get("mode") == "learned":
-        raise UserError(f"{wanted} background, and a learned one changes in each step")
-    if background.get("mode") == "random" and background.get("hold_steps", 1) % steps:
-        raise UserError(
-            f"{wanted} background: set system.background.hold_steps={steps}, or to a multiple of it"
-        )
-
-
-def _has_one_batch(data: Any) -> bool:
-    """Return whether all steps draw the same views of a pool: one, or one of each sector."""
-    pool = data.get("train_views", 0)
-    batches = [views for *_, views in sizes_of_stages(data)]
-    return pool == 1 or data.batch_uniform_azimuth and all(views == pool for views in batches)
-
-
 def _check_render_sizes(options: type, guidance: Any, cfg: Any) -> None:
     """Raise UserError where the guidance can't compare the renders of a training stage."""
     data = parse_structured(find(cfg.data_type).Config, cfg.data)
@@ -106,4 +78,7 @@ def _check_prompts(guidance: Any, system: Any) -> None:
     if not guidance.view_dependent_prompting:
         raise UserError(f"{refused}: set system.guidance.view_dependent_prompting=true")
     if guidance.get("view_contrast"):
-        raise UserError(NOT_WITH_PERP_NEG)
+        raise UserError(
+            "view_contrast and Perp-Neg both compare the prompts of views: set "
+            "system.prompt_processor.use_perp_neg=false, or system.guidance.view_contrast=0"
+        )

@@ -7,12 +7,11 @@ mode        ``fixed``: always ``color``; ``random``: in training a random colour
             ``color``; ``learned``
 color       RGB in [0, 1]
 lr          learning rate of the learned colour: a number or a schedule
-hold_steps  consecutive steps with the same random colours
 ==========  ========================================================================================
 """
 
 from dataclasses import dataclass, field
-from typing import Any, Tuple
+from typing import Any, ClassVar, Tuple
 
 import torch
 from jaxtyping import Float
@@ -20,8 +19,8 @@ from torch import Tensor, nn
 
 from ..core.distributed import first_item
 from ..core.host_copies import to_device
-from ..core.options import at_least, checked_options, each, in_range, one_of, schedule
-from ..core.streams import generator, held
+from ..core.options import checked_options, each, in_range, one_of, schedule
+from ..core.streams import generator
 from ..host import BaseBackground, C, register, run_seed
 
 MODES = ("fixed", "random", "learned")
@@ -36,7 +35,8 @@ class FlatBackground(BaseBackground):
             default=(0.0, 0.0, 0.0), metadata=each(in_range(0, 1))
         )
         lr: Any = field(default=1e-2, metadata=schedule(min=0))
-        hold_steps: int = field(default=1, metadata=at_least(1))
+
+        REMOVED: ClassVar[dict[str, Any]] = {"hold_steps": (1, "each step has its own colours")}
 
     cfg: Config
 
@@ -47,14 +47,10 @@ class FlatBackground(BaseBackground):
             self.logit = nn.Parameter(torch.logit(color.clamp(1e-3, 1 - 1e-3)))
         else:
             self.register_buffer("fixed", color, persistent=False)
-        self.step, self.is_shared = 0, False
+        self.step = 0
 
     def update_step(self, epoch: int, global_step: int, on_load_weights: bool = False) -> None:
-        self.step, self.is_shared = global_step, False
-
-    def hold(self, step: int) -> None:
-        """Return the random colours of ``step``, the same in all processes, until the next step."""
-        self.step, self.is_shared = step, True
+        self.step = global_step
 
     def parameter_groups(self) -> list[dict[str, Any]]:
         """Return the optimiser's group of the learned colour; none for the other modes."""
@@ -74,10 +70,9 @@ class FlatBackground(BaseBackground):
         if self.options.mode == "learned":
             return torch.sigmoid(self.logit).expand(batch_size, 3)
         if self.options.mode == "random" and self.training:
-            first = 0 if self.is_shared else first_item(batch_size)
-            step = held(self.step, self.options.hold_steps)
+            first = first_item(batch_size)
             colors = [
-                torch.rand(3, generator=generator(run_seed(), "background", step, item))
+                torch.rand(3, generator=generator(run_seed(), "background", self.step, item))
                 for item in range(first, first + batch_size)
             ]
             return to_device(torch.stack(colors), self.fixed.device).to(self.fixed)

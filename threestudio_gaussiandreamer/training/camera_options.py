@@ -1,7 +1,7 @@
 """The options of the data module; ``data.py`` describes them."""
 
 from dataclasses import dataclass, field
-from typing import Any, List, Tuple
+from typing import Any, ClassVar, List, Tuple
 
 from ..core.errors import UserError
 from ..core.memory import count_of, require_memory
@@ -63,9 +63,10 @@ class CameraConfig:
     progressive_until: int = field(default=0, metadata=at_least(0, "steps"))
     rays_d_normalize: bool = True
     train_views: int = field(default=0, metadata=count_of("views", 0, CAMERA_BYTES))
-    hold_steps: int = field(default=1, metadata=at_least(1, "steps"))
     rays: bool = False
     n_view: int = field(default=1, metadata=in_range(1, 64, "views"))
+
+    REMOVED: ClassVar[dict[str, Any]] = {"hold_steps": (1, "each step has its own cameras")}
 
     @staticmethod
     def check(cfg: Any) -> None:

@@ -26,7 +26,6 @@ n_view                    how many views of an object a multi-view model sees to
                           evenly spaced azimuths; ``batch_size`` is a multiple
 train_views               0: continuous cameras; n: draw from a fixed pool of n views (so that
                           targets can be reused)
-hold_steps                consecutive steps with the same cameras
 rays                      add rays_o and rays_d (B, H, W, 3) to every batch
 ========================  ==========================================================================
 """
@@ -46,7 +45,7 @@ from .. import cameras
 from ..cameras import Orbit, OrbitRanges
 from ..core.distributed import own_rows, require_shareable
 from ..core.options import checked_options
-from ..core.streams import generator, held
+from ..core.streams import generator
 from ..host import Updateable, parse_structured, pl, register, register_builtin, run_seed
 from .camera_options import CameraConfig, plain
 
@@ -128,7 +127,6 @@ class TrainCameras(IterableDataset, Updateable):
 
     def collate(self, step: int) -> dict[str, Any]:
         """Return this process's views of the batch for ``step``, a function of (seed, step)."""
-        step = held(step, self.cfg.hold_steps)
         height, width, batch_size = self.sizes[
             bisect.bisect_right(self.cfg.resolution_milestones, step)
         ]

@@ -22,7 +22,6 @@ prune          options of a second, pruned export. Its budget is one of count; b
                (dB that may be lost against the ground truth); auto (dB: twice as many would gain
                less). quality, size and steps are as in
                the prune command; eps2d and antialias by default the renderer's
-image_targets  a stage of training towards a few pictures of the 2D model: see ``image_targets.py``
 pages          write a page that shows the cloud in a browser, and more: see ``pages.py``
 =============  =====================================================================================
 """
@@ -32,7 +31,7 @@ from collections import ChainMap
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Optional
+from typing import Any, ClassVar, Optional
 
 import torch
 from torch import Tensor
@@ -43,7 +42,7 @@ from ..core.host_copies import flush_reads
 from ..core.nested import adopt_nested
 from ..core.options import checked_options
 from ..gaussians.stored_state import SHAPES, require_cloud
-from ..guidance.foreign import (
+from ..guidance.external import (
     call_guidance,
     learnt_weights,
     own_randomness,
@@ -68,7 +67,6 @@ from .finite import (
     warn_if_invisible,
 )
 from .held_out import EvaluationConfig, HeldOut, Measurements
-from .image_targets import ImageTargets, ImageTargetsConfig, check_image_targets
 from .loss_scale import LossScale
 from .losses import (
     check_losses,
@@ -97,8 +95,14 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         exporter_type: str = "gaussiandreamer-exporter"
         evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
         prune: PruneOptions = field(default_factory=PruneOptions)
-        image_targets: ImageTargetsConfig = field(default_factory=ImageTargetsConfig)
         pages: bool = True
+
+        REMOVED: ClassVar[dict[str, Any]] = {
+            "image_targets": (
+                lambda stage: not (stage or {}).get("stop"),
+                "pictures of the 2D model as targets brought nothing (docs/toybox.md)",
+            )
+        }
 
         def __post_init__(self) -> None:
             adopt_nested(self)
@@ -109,7 +113,6 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
             for name, weight in cfg.loss.items():
                 validate_schedule(weight, f"loss.{name}")
             check_losses(find(cfg.guidance_type), cfg.loss)
-            check_image_targets(cfg)
             check_optimizer(cfg.optimizer, cfg.scheduler)
 
     cfg: Config
@@ -144,7 +147,6 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         self.part_rates = PartRates(self.cfg.optimizer)
         super().configure()
         self.density = density_rule(self.geometry)
-        self.image_targets = ImageTargets(self.options.image_targets)
         self.automatic_optimization = False
         self.__dict__["guidance"] = self.measurements = self.prompt_utils = None
         self.loss_scale = LossScale()
@@ -188,6 +190,7 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         super().on_load_checkpoint(checkpoint)
         self._learnt = checkpoint.get("guidance")
+        checkpoint["state_dict"].pop("image_targets.pictures", None)  # of earlier versions
 
     def require_finite(self) -> None:
         """Check parameters and optimiser state; see :mod:`.finite`."""
@@ -232,9 +235,8 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
     def on_train_start(self) -> None:
         restore_arguments(self.optimizers().optimizer)
         self.require_finite()
-        for part in (self.density, self.image_targets):
-            if problem := part.schedule_problem(self.global_step, self.trainer.max_steps):
-                warn(problem)
+        if problem := self.density.schedule_problem(self.global_step, self.trainer.max_steps):
+            warn(problem)
         if self.global_step == 0:
             save_first_cloud(self)
         if self.measurements:
@@ -251,17 +253,15 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
     def training_step(self, batch: dict[str, Any], batch_idx: int) -> None:
         optimizer, step = self.optimizers(), self.global_step
         self.set_learning_rates(optimizer)
-        batch = self.image_targets.batch(batch, step, self.background)
         out = self(batch)
         warn_if_invisible(out["opacity"], step)
-        guided = self.supervise(out, batch)
+        guided = self.guide(out, batch)
         self.density.before_backward(out, step, self.error_of(out, batch, guided))
         losses = self.losses(guided, out)
         self.recent_losses.add(step, losses)
         self.manual_backward(total(losses, self.options.guidance_type))
         require_gradients(self.geometry, losses)
         average_gradients(p for group in optimizer.param_groups for p in group["params"])
-        self.image_targets.hold_shapes(optimizer, step)
         loss_scale = self.loss_scale.value(self.trainer)
         self.density.after_backward(out["rasterized"], batch["width"], batch["height"], loss_scale)
         optimizer.step()
@@ -312,14 +312,7 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         """
         now = self.true_current_epoch, self.true_global_step
         weights = {name: C(weight, *now) for name, weight in self.loss_weights.items()}
-        weights = self.image_targets.loss_weights(weights, now[1])
         return weighted_losses(guided, ChainMap(out, self.geometry.drawn()), weights)
-
-    def supervise(self, out: Mapping[str, Any], batch: dict[str, Any]) -> dict[str, Any]:
-        """Return the losses of this step's renders, and what is logged with them."""
-        if not self.image_targets.is_active(self.global_step):
-            return self.guide(out, batch)
-        return self.image_targets.guide(self.guidance, out, self.prompt_utils, batch)
 
     def guide(
         self, out: Mapping[str, Any], batch: dict[str, Any], **options: Any

@@ -8,12 +8,10 @@ what SDS at the same scale adds to eps_u - eps. There are no options."""
 
 from typing import Any
 
-from jaxtyping import Float
-from torch import Tensor
-
 from ...core.errors import UserError
 from ...host import register
-from .base import Batch, Error, Variant
+from ..types import Batch, Latents, Residual
+from .base import Variant
 
 
 @register("csd-variant")
@@ -26,13 +24,11 @@ class CSD(Variant):
         super().preflight(guidance, cfg)
         if cfg.guidance_scale == 0:
             raise UserError(
-                f"system.guidance.guidance_scale: it is the factor of {cfg.variant_type}'s error, "
-                "which is zero with 0: set it to another number"
+                f"system.guidance.guidance_scale: {cfg.variant_type} is multiplied by it, so its "
+                "gradient is zero with 0: set it to another number"
             )
 
-    def error(
-        self, guidance: Any, latents: Float[Tensor, "B c h w"], condition: Any, batch: Batch
-    ) -> Error:
+    def residual(self, guidance: Any, latents: Latents, condition: Any, batch: Batch) -> Residual:
         noised = guidance.add_noise(latents)
         cond, uncond = guidance.both(noised.z, noised.t, condition)
         return guidance.cfg.guidance_scale * (cond - uncond), noised.abar

@@ -22,14 +22,14 @@ The paper's ``guidance_scale`` is 7.5."""
 from dataclasses import dataclass, field
 from typing import Any
 
-from jaxtyping import Float
 from torch import Tensor
 
 from ...core.options import in_range
 from ...diffusion import sds
 from ...diffusion.inversion import Step, invert
 from ...host import register
-from .base import Batch, Error, Variant
+from ..types import Batch, Latents, Residual
+from .base import Variant
 
 
 @register("ism-variant")
@@ -43,9 +43,7 @@ class ISM(Variant):
 
     cfg: Config
 
-    def error(
-        self, guidance: Any, latents: Float[Tensor, "B c h w"], condition: Any, batch: Batch
-    ) -> Error:
+    def residual(self, guidance: Any, latents: Latents, condition: Any, batch: Batch) -> Residual:
         t, abar = guidance.draw_timesteps(latents)
         interval = self._timesteps(guidance, self.options.interval)
         stride = self._timesteps(guidance, self.options.stride)

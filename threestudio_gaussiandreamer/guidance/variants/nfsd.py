@@ -20,13 +20,12 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from ...core.options import in_range
 from ...diffusion.sds import per_item
 from ...host import register
-from .base import Batch, Error, Variant
+from ..types import Batch, Latents, Residual
+from .base import Variant
 
 
 @register("nfsd-variant")
@@ -40,9 +39,7 @@ class NFSD(Variant):
 
     cfg: Config
 
-    def error(
-        self, guidance: Any, latents: Float[Tensor, "B c h w"], condition: Any, batch: Batch
-    ) -> Error:
+    def residual(self, guidance: Any, latents: Latents, condition: Any, batch: Batch) -> Residual:
         noised = guidance.add_noise(latents)
         cond, negative = guidance.both(noised.z, noised.t, condition)
         empty = guidance.empty_prompt(noised.z, noised.t, condition)

@@ -17,7 +17,7 @@ inversion_steps  DDIM steps from no noise to all, at most: each is a whole numbe
 eta              0 to 1: share of fresh noise in each step of the inversion; threestudio: 0.3
 ===============  ===================================================================================
 
-The paper also anneals t linearly (``timestep_schedule: linear``), with a ``guidance_scale`` of 7.5,
+The paper also anneals t linearly (see ``min_step_percent``), with a ``guidance_scale`` of 7.5,
 which is 8.5 here."""
 
 from dataclasses import dataclass, field
@@ -33,8 +33,8 @@ from ...core.options import in_range
 from ...diffusion.inversion import Step, invert
 from ...diffusion.noise_table import NoiseTable
 from ...host import register, run_seed
-from ..score_model import GUIDANCE_SCALE
-from .base import Batch, Error, Variant
+from ..types import Batch, Latents, Residual
+from .base import GUIDANCE_SCALE, Variant
 
 
 @register("sdi-variant")
@@ -53,9 +53,7 @@ class SDI(Variant):
         super().configure()
         self._table: Optional[NoiseTable] = None
 
-    def error(
-        self, guidance: Any, latents: Float[Tensor, "B c h w"], condition: Any, batch: Batch
-    ) -> Error:
+    def residual(self, guidance: Any, latents: Latents, condition: Any, batch: Batch) -> Residual:
         t, abar = guidance.draw_timesteps(latents)
         # rounded up, since each step costs predictions and the option limits their number
         stride = -(-len(guidance.alphas_cumprod) // self.options.inversion_steps)
@@ -77,7 +75,7 @@ class SDI(Variant):
         noise = z.addcmul(shift, latents).mul_(per_sigma)
         return guidance.predict_noise(z, t, condition) - noise, abar
 
-    def _table_for(self, latents: Float[Tensor, "B c h w"]) -> NoiseTable:
+    def _table_for(self, latents: Latents) -> NoiseTable:
         """Return the table of the noise that the inversion adds to items of this shape."""
         if self._table is None or self._table.shape != latents.shape[1:]:
             self._table = NoiseTable(run_seed(), latents.shape[1:], latents.device)

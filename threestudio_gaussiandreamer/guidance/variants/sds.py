@@ -8,19 +8,15 @@ variants."""
 
 from typing import Any
 
-from jaxtyping import Float
-from torch import Tensor
-
 from ...host import register
-from .base import Batch, Error, Variant
+from ..types import Batch, Latents, Residual
+from .base import Variant
 
 
 @register("sds-variant")
 class SDS(Variant):
-    def error(
-        self, guidance: Any, latents: Float[Tensor, "B c h w"], condition: Any, batch: Batch
-    ) -> Error:
-        known = guidance.known_error(latents, condition)
+    def residual(self, guidance: Any, latents: Latents, condition: Any, batch: Batch) -> Residual:
+        known = guidance.known_residual(latents, condition)
         if known is not None:
             return known
         noised = guidance.add_noise(latents)

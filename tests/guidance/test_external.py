@@ -5,7 +5,7 @@ import torch
 from torch import nn
 
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.guidance.foreign import (
+from threestudio_gaussiandreamer.guidance.external import (
     call_guidance,
     learnt_weights,
     own_randomness,

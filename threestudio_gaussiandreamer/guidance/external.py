@@ -1,12 +1,9 @@
-"""Call guidances of other packages as threestudio's systems do, with any of the signatures that its
-guidances have.
+"""Guidances of this and other packages as threestudio's systems use them: calls with any of the
+signatures that its guidances have, and what they train themselves.
 """
 
-import functools
 import inspect
-import itertools
-import types
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
@@ -37,66 +34,41 @@ def call_guidance(
         UserError: the guidance returns no dict, or a ``loss_*`` that isn't a single finite number.
     """
     call = guidance.forward if isinstance(guidance, nn.Module) else guidance.__call__
-    arguments = _parameters(call)
+    arguments = inspect.signature(call).parameters
     given = {"prompt_utils": prompt_utils, **batch, **options}
-    second = next(itertools.islice(arguments.values(), 1, None), None)
-    if (
-        second is not None
-        and second.kind is second.POSITIONAL_OR_KEYWORD
-        and second.default is second.empty
-        and second.name not in given
-    ):
-        given[second.name] = given.pop("prompt_utils")
+    for second in list(arguments.values())[1:2]:
+        is_positional = second.kind is second.POSITIONAL_OR_KEYWORD
+        if is_positional and second.default is second.empty and second.name not in given:
+            given[second.name] = given.pop("prompt_utils")
     if not any(argument.kind is argument.VAR_KEYWORD for argument in arguments.values()):
         given = {name: value for name, value in given.items() if name in arguments}
-    out = _checked(guidance(rgb, **given), type(guidance).__name__, rgb.device)
-    if not isinstance(guidance, ScoreDistillation):
-        _require_finite(out, type(guidance).__name__)
-    return out
-
-
-def _parameters(call: Callable[..., Any]) -> Mapping[str, inspect.Parameter]:
-    """Return the parameters of a function or bound method."""
-    function = getattr(call, "__func__", None)
-    return inspect.signature(call).parameters if function is None else _of_method(function)
-
-
-@functools.lru_cache(maxsize=16)
-def _of_method(function: Callable[..., Any]) -> Mapping[str, inspect.Parameter]:
-    """Return the parameters of a function as a method of any object, which isn't kept."""
-    return inspect.signature(types.MethodType(function, object())).parameters
-
-
-def _checked(out: Any, name: str, device: torch.device) -> dict[str, Any]:
-    """Check the output of a guidance, and convert every ``loss_*`` to a scalar tensor, since some
-    guidances return plain numbers for disabled losses.
-    """
+    out, name = guidance(rgb, **given), type(guidance).__name__
+    if isinstance(guidance, ScoreDistillation):
+        return out
     if not isinstance(out, dict):
         raise UserError(
             f"{name} returned {type(out).__name__}: a guidance returns a dict with its losses "
             "as loss_*"
         )
     losses = {key: value for key, value in out.items() if key.startswith("loss_")}
-    for key, value in losses.items():
-        try:
-            losses[key] = loss = torch.as_tensor(value, device=device)
-        except (TypeError, ValueError, RuntimeError) as error:
-            raise UserError(
-                f"{name} returned {key} of type {type(value).__name__}: one number was expected"
-            ) from error
-        if loss.numel() != 1:
-            raise UserError(
-                f"{name} returned {key} of shape {tuple(loss.shape)}: one number was expected, "
-                "as from .mean()"
-            )
-    return out | {key: loss.reshape(()) for key, loss in losses.items()}
+    return out | {key: _loss(value, f"{name} returned {key}", rgb) for key, value in losses.items()}
 
 
-def _require_finite(out: Mapping[str, Any], name: str) -> None:
-    """Raise UserError for a loss that isn't finite; on a GPU, looking would wait for it."""
-    for key, loss in out.items():
-        if key.startswith("loss_") and loss.device.type == "cpu" and not loss.isfinite():
-            raise UserError(f"{name} returned {key} = {loss.item()}: expected a finite number")
+def _loss(value: Any, what: str, rgb: Tensor) -> Float[Tensor, ""]:
+    """Return a loss as a tensor, since some guidances return plain numbers for disabled ones."""
+    try:
+        loss = torch.as_tensor(value, device=rgb.device)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise UserError(
+            f"{what} of type {type(value).__name__}: one number was expected"
+        ) from error
+    if loss.numel() != 1:
+        raise UserError(
+            f"{what} of shape {tuple(loss.shape)}: one number was expected, as from .mean()"
+        )
+    if loss.device.type == "cpu" and not loss.isfinite():  # on a GPU, looking would wait for it
+        raise UserError(f"{what} = {loss.item()}: expected a finite number")
+    return loss.reshape(())
 
 
 @contextmanager
@@ -123,10 +95,6 @@ def own_randomness(step: int) -> Iterator[None]:
     finally:
         for generator, state in zip(generators, states, strict=True):
             generator.set_state(state)
-
-
-# Parameters that a guidance trains itself, such as the LoRA of VSD
-# ---------------------------------------------------------------------------------
 
 
 def trainable_parameters(guidance: Any) -> dict[str, nn.Parameter]:
