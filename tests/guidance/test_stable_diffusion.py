@@ -130,10 +130,9 @@ def test_rescaling_restores_the_contrast_of_the_conditional_picture():
 
 def test_prompts_that_do_not_fit_are_reported(models, prompts):
     guide = tiny.guidance(models)
-    with pytest.raises(UserError, match="stable-diffusion-prompt-processor"):
-        guide(tiny.renders(), PlainPrompt("a fox"), **tiny.BATCH)
-    with pytest.raises(UserError, match="needs text embeddings"):
-        guide(tiny.renders(), None, **tiny.BATCH)
+    for without in (PlainPrompt("a fox"), None):
+        with pytest.raises(UserError, match="needs text embeddings"):
+            guide(tiny.renders(), without, **tiny.BATCH)
     guide.text_width = 1024
     with pytest.raises(
         UserError, match="32 channels, .* takes 1024: .*the same pretrained_model_name_or_path"

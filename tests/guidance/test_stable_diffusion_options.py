@@ -22,7 +22,6 @@ pytest.importorskip("diffusers")
     "options",
     [
         {"enable_vae_slicing": True},
-        {"enable_vae_tiling": True},
         {"enable_channels_last_format": True},
         {"enable_attention_slicing": True},
         {"enable_sequential_cpu_offload": True},

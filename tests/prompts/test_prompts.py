@@ -54,11 +54,6 @@ def test_view_dependent_prompts_are_in_the_order_of_the_host():
     assert processed(prompt="a fox").prompts_vd == expected
 
 
-def test_there_are_no_embeddings():
-    with pytest.raises(UserError, match="no text encoder.*stable-diffusion-prompt-processor"):
-        processed(prompt="a fox").get_text_embeddings(None, None, None, True)
-
-
 def test_of_a_huge_prompt_file_only_the_beginning_is_read(tmp_path):
     with open(tmp_path / "prompt.txt", "wb") as file:
         file.truncate(1 << 30)  # sparse

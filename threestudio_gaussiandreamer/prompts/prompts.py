@@ -11,7 +11,7 @@ negative_prompt  passed on to the guidance as text; this package's guidances don
 """
 
 from dataclasses import dataclass
-from typing import List, NoReturn, Optional
+from typing import Any, List, Optional
 
 from ..core.errors import UserError
 from ..core.files import existing_file
@@ -34,15 +34,6 @@ class PlainPrompt:
         """Prompts with each of ``DIRECTIONS``: "a fox, side view", ..."""
         return [f"{self.prompt}, {direction} view" for direction in DIRECTIONS]
 
-    def get_text_embeddings(self, *args: object, **kwargs: object) -> NoReturn:
-        """Raise UserError: a guidance that needs embeddings needs another prompt processor."""
-        raise UserError(
-            "plain-prompt-processor has no text encoder, but the guidance asks for text "
-            "embeddings: "
-            "set system.prompt_processor_type to the processor of that guidance, for instance "
-            "stable-diffusion-prompt-processor."
-        )
-
 
 @register("plain-prompt-processor")
 class PlainPromptProcessor(BaseObject):
@@ -59,13 +50,15 @@ class PlainPromptProcessor(BaseObject):
     def configure(self) -> None:
         if self.cfg.prompt and self.cfg.prompt_file is not None:
             raise UserError("both prompt and prompt_file are set: give one of them")
-        prompt = (
-            self.cfg.prompt if self.cfg.prompt_file is None else read_prompt(self.cfg.prompt_file)
-        )
-        self._prompt = PlainPrompt(prompt=prompt, negative_prompt=self.cfg.negative_prompt)
+        self._prompt = PlainPrompt(given_prompt(self.cfg), self.cfg.negative_prompt)
 
     def __call__(self) -> PlainPrompt:
         return self._prompt
+
+
+def given_prompt(cfg: Any) -> str:
+    """Return the prompt that the options of a processor give as text or as a file."""
+    return cfg.prompt if cfg.prompt_file is None else read_prompt(cfg.prompt_file)
 
 
 def read_prompt(path: str) -> str:
@@ -75,21 +68,15 @@ def read_prompt(path: str) -> str:
         UserError: the file is missing, isn't UTF-8, or is larger than ``MAX_PROMPT_BYTES``.
     """
     file = existing_file(path, "prompt file (system.prompt_processor.prompt_file)")
+    what = f"the prompt file {str(file)!r}"
     try:
         with open(file, "rb") as opened:
             content = opened.read(MAX_PROMPT_BYTES + 1)
         text = content.decode("utf-8-sig")
     except OSError as error:
-        raise UserError(
-            f"cannot read the prompt file {str(file)!r}: {error.strerror or error}."
-        ) from error
+        raise UserError(f"cannot read {what}: {error.strerror or error}.") from error
     except UnicodeDecodeError as error:
-        raise UserError(
-            f"the prompt file {str(file)!r} is not UTF-8 text (byte {error.start})."
-        ) from error
+        raise UserError(f"{what} is not UTF-8 text (byte {error.start}).") from error
     if len(content) > MAX_PROMPT_BYTES:
-        raise UserError(
-            f"the prompt file {str(file)!r} has more than {MAX_PROMPT_BYTES} bytes: is it the "
-            "right file?"
-        )
+        raise UserError(f"{what} has more than {MAX_PROMPT_BYTES} bytes: is it the right file?")
     return text.removesuffix("\n").removesuffix("\r")

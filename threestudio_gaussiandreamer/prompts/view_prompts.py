@@ -14,8 +14,6 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from ..core.errors import UserError
-
 Condition = Callable[[Tensor, Tensor, Tensor], Tensor]
 Coefficients = Tuple[float, float, float]
 
@@ -27,7 +25,6 @@ class Direction(NamedTuple):
 
     name: str
     prompt: Callable[[str], str]
-    negative_prompt: Callable[[str], str]
     condition: Condition
     """Maps (elevation, azimuth, camera_distances), each (B,), to bool (B,): which views have this
     direction.
@@ -59,7 +56,7 @@ def view_directions(
         "overhead": lambda elevation, azimuth, distance: elevation > overhead_threshold,
     }
     return [
-        Direction(name, _prompt_maker(name, prefix), str, condition)
+        Direction(name, _prompt_maker(name, prefix), condition)
         for name, condition in conditions.items()
     ]
 
@@ -126,10 +123,8 @@ class PromptEmbeddings:
     ) -> Int[Tensor, " B"]:
         """Return the index of each view's direction, which is its row of ``*_vd``."""
         indices = torch.zeros_like(elevation, dtype=torch.long)
-        for direction in self.directions:
-            indices[direction.condition(elevation, azimuth, camera_distances)] = self.direction2idx[
-                direction.name
-            ]
+        for name, _, condition in self.directions:
+            indices[condition(elevation, azimuth, camera_distances)] = self.direction2idx[name]
         return indices
 
     def get_text_embeddings(
@@ -169,21 +164,16 @@ class PromptEmbeddings:
         The two Perp-Neg rows of a view are adjacent (view 0 first, view 0 second, view 1 first,
         ...), as in threestudio. With more than one view threestudio's guidances combine them with
         the latents of other views; this package's guidances pair them by view.
-
-        Raises:
-            UserError: ``view_dependent_prompting`` is off, which leaves no directions to
-                distinguish.
         """
-        if not view_dependent_prompting:
-            raise UserError(
-                "use_perp_neg needs view-dependent prompts: set "
-                "system.guidance.view_dependent_prompting=true"
-            )
         device = self.text_embeddings_vd.device
         rows = self.direction_indices(elevation, azimuth, camera_distances).to(device)
         overhead = rows == self.direction2idx["overhead"]
         angle, side = shifted(azimuth).abs().to(device), self._side_rows(azimuth).to(device)
-        pair, share = self._interpolation(angle, side)
+        front, back = (torch.full_like(side, self.direction2idx[k]) for k in ("front", "back"))
+        in_front, pair_in_front = (angle < 90)[:, None], torch.stack([front, side], 1)
+        # the two directions that a view lies between, and the share of the first one in its prompt
+        pair = torch.where(in_front, pair_in_front, torch.stack([side, back], 1))
+        share = torch.where(angle < 90, 1 - angle / 90, 2 - angle / 90)
         embeddings, uncond = self.text_embeddings_vd, self.uncond_text_embeddings_vd[rows]
         first = share.to(embeddings)[:, None, None]
         positive = first * embeddings[pair[:, 0]] + (1 - first) * embeddings[pair[:, 1]]
@@ -192,7 +182,7 @@ class PromptEmbeddings:
         negative = torch.where(
             overhead[:, None, None, None],
             uncond[:, None],
-            embeddings[self._negative_rows(angle, side)],
+            embeddings[torch.where(in_front, pair_in_front, pair_in_front.flip(1))],
         )
         weights = torch.where(overhead[:, None], 0.0, self._negative_weights(angle, share))
         return torch.cat([positive, uncond, negative.flatten(0, 1)]), weights.to(elevation.device)
@@ -202,27 +192,6 @@ class PromptEmbeddings:
         names = ("left side", "right side") if "left side" in self.direction2idx else ("side",) * 2
         left, right = (self.direction2idx[name] for name in names)
         return torch.where(shifted(azimuth) >= 0, left, right)
-
-    def _interpolation(
-        self, angle: Float[Tensor, " B"], side: Int[Tensor, " B"]
-    ) -> Tuple[Int[Tensor, "B 2"], Float[Tensor, " B"]]:
-        """Return the two directions that each view lies between, and the share of the first one in
-        the interpolated prompt, in [0, 1].
-        """
-        front, back = (torch.full_like(side, self.direction2idx[k]) for k in ("front", "back"))
-        in_front = angle < 90
-        pair = torch.where(
-            in_front[:, None], torch.stack([front, side], 1), torch.stack([side, back], 1)
-        )
-        return pair, torch.where(in_front, 1 - angle / 90, 2 - angle / 90)
-
-    def _negative_rows(
-        self, angle: Float[Tensor, " B"], side: Int[Tensor, " B"]
-    ) -> Int[Tensor, "B 2"]:
-        front = torch.full_like(side, self.direction2idx["front"])
-        return torch.where(
-            (angle < 90)[:, None], torch.stack([front, side], 1), torch.stack([side, front], 1)
-        )
 
     def _negative_weights(
         self, angle: Float[Tensor, " B"], share: Float[Tensor, " B"]
