@@ -15,7 +15,11 @@ from tests.helpers.mixture_guidance import (
     noise_of,
 )
 from threestudio_gaussiandreamer.core import streams
-from threestudio_gaussiandreamer.diffusion.consistent_noise import TABLE, attached_noise
+from threestudio_gaussiandreamer.diffusion.consistent_noise import (
+    TABLE,
+    attached_noise,
+    cell_values,
+)
 from threestudio_gaussiandreamer.diffusion.noise_table import NoiseTable
 
 EXACT = 1e-10
@@ -287,7 +291,7 @@ def test_cfd_uses_the_surfaces_noise():
     }
     noise = attached_noise(
         x.shape[-2:],
-        guidance.variant.table(guidance.step + 1, x),  # the same in another step
+        cell_values(3, streams.generator(0, "surface noise")),  # the same in each step
         streams.derive_seed(0, "background cells", guidance.step) % TABLE,
         0,
         *(batch[name] for name in ("depth", "opacity", "c2w", "fovy")),
