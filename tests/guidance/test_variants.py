@@ -291,7 +291,7 @@ def test_cfd_uses_the_surfaces_noise():
     }
     noise = attached_noise(
         x.shape[-2:],
-        cell_values(3, streams.generator(0, "surface noise")),  # the same in each step
+        cell_values(x.shape[1], streams.generator(0, "surface noise")),  # the same in each step
         streams.derive_seed(0, "background cells", guidance.step) % TABLE,
         0,
         *(batch[name] for name in ("depth", "opacity", "c2w", "fovy")),
