@@ -9,7 +9,6 @@ PACKAGE, PAGE = ROOT / "threestudio_gaussiandreamer", ROOT / "docs/options.md"
 PLACES = {
     "data": ["training/data.py"],
     "system": ["training/system.py"],
-    "system.image_targets": ["training/image_targets.py"],
     "system.geometry": ["training/geometry.py"],
     "system.geometry.prior": ["priors/base.py", "priors/*.py"],
     "system.renderer": ["training/renderer.py"],
