@@ -99,7 +99,7 @@ class ScoreDistillation(BaseObject, ABC):
                 "timesteps are random between min_step_percent and max_step_percent; for falling "
                 "ones give both the same schedule, such as [0, 0.98, 0.02, <steps>]",
             ),
-            "timestep_steps": (lambda steps: True, ""),
+            "timestep_steps": (lambda steps: True, "it belonged to timestep_schedule"),
             "max_bad_steps": (MAX_BAD_STEPS, f"a run ends after {MAX_BAD_STEPS} of them"),
         }
 

@@ -12,7 +12,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from ..core.errors import UserError, unknown
 from ..core.interpolation import escape
-from ..core.logs import warn
+from ..core.logs import info, warn
 from ..core.option_types import check_types
 
 MOST_KEPT = 256
@@ -70,7 +70,8 @@ def without_removed(config_class: Any, values: Any, path: str = "") -> Any:
     """Return a section without the options that its part had in earlier versions.
 
     ``Config.REMOVED`` has their names, each with the value that did nothing, or a function that
-    says whether a value did, and with what is the case now; other values are warned of.
+    says whether a value did, and with what is the case now. Each that is given is named in a line,
+    a warning if it did something.
 
     Args:
         path: of the section, for messages, such as "system.guidance.".
@@ -79,8 +80,9 @@ def without_removed(config_class: Any, values: Any, path: str = "") -> Any:
     found = [key for key in values if key in removed]
     for key in found:
         neutral, now = removed[key]
-        if not (neutral(values[key]) if callable(neutral) else values[key] == neutral):
-            warn(f"{path}{key} is no option any more: {now}")
+        did_nothing = neutral(values[key]) if callable(neutral) else values[key] == neutral
+        tell = info if did_nothing else warn
+        tell(f"{path}{key} is no option any more: {now}")
     return {key: values[key] for key in values if key not in found} if found else values
 
 

@@ -127,7 +127,8 @@ def check_part(path: str, type_name: Any, values: Any) -> None:
                 f"{_default(config_class, key)!r}"
             )
         if typed[key]:
-            check_part(f"{path}.{section}", typed[key], typed[section])
+            given = values.get(section)
+            check_part(f"{path}.{section}", typed[key], typed[section] if given is None else given)
 
 
 def _default(config_class: type, key: str) -> Any:

@@ -100,7 +100,7 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         REMOVED: ClassVar[dict[str, Any]] = {
             "image_targets": (
                 lambda stage: not (stage or {}).get("stop"),
-                "pictures of the 2D model as targets brought nothing (docs/toybox.md)",
+                "pictures of the 2D model as targets brought nothing (reports/tried.md)",
             )
         }
 
