@@ -325,7 +325,7 @@ def test_the_loss_scale_of_each_item_is_undone():
     inner = loss_scale.enter(x) * 1.0
     inner.register_hook(seen.append)
     weights = torch.tensor([[1e-12], [0.0], [3e12]])
-    (loss_scale.leave(inner) * weights).sum().backward()
+    (loss_scale.leave(inner * 1.0) * weights).sum().backward()
     torch.testing.assert_close(x.grad, weights.expand(3, 5), rtol=0, atol=0)
     peaks = seen[0].abs().amax(1)
     assert (peaks[[0, 2]] >= 64).all() and (peaks[[0, 2]] < 128).all() and peaks[1] == 0

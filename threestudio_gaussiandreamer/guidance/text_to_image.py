@@ -59,7 +59,7 @@ from ..core.errors import UserError, unknown
 from ..core.extras import require_extra
 from ..core.options import in_range, one_of
 from ..diffusion.noise_prediction import PREDICTIONS, perp_neg
-from ..host import info, parse_structured, warn
+from ..host import debug, info, parse_structured, warn
 from ..models.families import STABLE_DIFFUSION, Family
 from ..models.hub import find_model
 from ..models.loaded import keep_on_cpu, loaded
@@ -206,6 +206,8 @@ class TextToImageDistillation(ScoreDistillation):
     def load(self, folder: Path) -> None:
         """Load the networks; subclasses extend this with their own."""
         self.load_denoiser(folder)
+        if self.cfg.enable_memory_efficient_attention:
+            debug("enable_memory_efficient_attention: torch's attention needs little memory")
 
     def load_denoiser(self, folder: Path) -> None:
         """Load the network that predicts the noise, and set ``text_width`` and ``scale_width``."""
