@@ -350,8 +350,7 @@ class ScoreDistillation(BaseObject, ABC):
         self.reads.submit(bad, functools.partial(self._note_bad, self.step, what, advice))
 
     def _note_bad(self, step: int, what: str, advice: str, bad: Bool[Tensor, " B"]) -> None:
-        count = int(bad.sum())
-        self.bad_items += count
+        self.bad_items += (count := int(bad.sum()))
         self.bad_steps[what] = self.bad_steps[what] + 1 if count else 0
         if self.bad_steps[what] >= MAX_BAD_STEPS:
             raise NonFiniteScore(
@@ -359,10 +358,7 @@ class ScoreDistillation(BaseObject, ABC):
                 f"{step}, {self.bad_items} items so far): {advice}"
             )
         if count:
-            warn(
-                f"step {step}: {what} of {count} of {len(bad)} items isn't finite; "
-                "they are left out"
-            )
+            warn(f"step {step}: {what} of {count} of {len(bad)} items isn't finite: left out")
 
     def state(self) -> State:
         """Return the tensors that a checkpoint needs to resume; empty for most configurations."""

@@ -34,7 +34,6 @@ from ..models.families import STABLE_DIFFUSION_3 as FAMILY
 from ..models.model_files import load_settings
 from ..models.text_encoders import unpack
 from ..prompts.pooled_prompt_processors import STABLE_DIFFUSION_3
-from .base import GUIDANCE_SCALE
 from .stable_diffusion import StableDiffusionGuidance
 from .types import Embeddings, Latents, Timesteps
 
@@ -44,7 +43,6 @@ class StableDiffusion3Guidance(StableDiffusionGuidance):
     @dataclass
     class Config(StableDiffusionGuidance.Config):
         pretrained_model_name_or_path: str = STABLE_DIFFUSION_3
-        guidance_scale: float = field(default=100.0, metadata=GUIDANCE_SCALE)
         weighting_strategy: str = field(default="rectified_flow", metadata=one_of(sds.WEIGHTS))
         flow_shift: Optional[float] = field(default=None, metadata=in_range(0.01, 100))
 
@@ -101,11 +99,11 @@ class StableDiffusion3Guidance(StableDiffusionGuidance):
         return size
 
     def require_inputs(self) -> None:
-        config, name = self.transformer.config, self.cfg.pretrained_model_name_or_path
-        if config.in_channels != self.vae.config.latent_channels:
+        channels = self.transformer.config.in_channels
+        if channels != self.vae.config.latent_channels:
             raise UserError(
-                f"{name} needs other inputs than text (in_channels {config.in_channels}): use a "
-                "model that makes images from text alone"
+                f"{self.cfg.pretrained_model_name_or_path} needs other inputs than text "
+                f"(in_channels {channels}): use a model that makes images from text alone"
             )
 
     def run_network(self, z: Latents, t: Timesteps, embeddings: Embeddings) -> Latents:
