@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from threestudio_gaussiandreamer.formats.codebook import scalar_codebook, vector_codebook
+from threestudio_gaussiandreamer.formats.sog import scalar_codebook, vector_codebook
 
 
 def test_few_values_are_kept_exactly():

@@ -6,7 +6,7 @@ import pytest
 from tests.helpers.object_clouds import assert_close, ball
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.formats.gaussian_files import read_cloud
-from threestudio_gaussiandreamer.formats.ksplat import read_ksplat
+from threestudio_gaussiandreamer.formats.splat import read_ksplat
 
 COUNT, FULL, BUCKET, BLOCK = 50, 2, 16, 4.0
 PARTLY = (10, 8)

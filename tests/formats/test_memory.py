@@ -5,14 +5,14 @@ import tracemalloc
 import pytest
 
 from tests.helpers.object_clouds import ball
-from threestudio_gaussiandreamer.formats import glb, sog_archive
+from threestudio_gaussiandreamer.formats import glb, sog
 from threestudio_gaussiandreamer.formats.gaussian_files import FORMATS, StoredCloud, write_cloud
 
 COUNT = 6000
 
 
 @pytest.mark.parametrize("degree", [0, 3])
-@pytest.mark.parametrize(("suffix", "module"), [(".sog", sog_archive), (".glb", glb)])
+@pytest.mark.parametrize(("suffix", "module"), [(".sog", sog), (".glb", glb)])
 def test_reading_takes_no_more_than_what_is_budgeted(tmp_path, suffix, module, degree):
     path = tmp_path / f"a{suffix}"
     write_cloud(str(path), StoredCloud(ball(COUNT, degree)))

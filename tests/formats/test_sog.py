@@ -13,7 +13,11 @@ from PIL import Image
 from tests.helpers.object_clouds import assert_close, ball, in_order_of
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.formats.gaussian_files import read_cloud
-from threestudio_gaussiandreamer.formats.sog import load_sog, read_sog, write_sog
+from threestudio_gaussiandreamer.formats.sog import load_sog, write_sog
+
+
+def read_sog(path):
+    return load_sog(path)[0]
 
 
 def members(path):

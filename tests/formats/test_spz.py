@@ -12,15 +12,13 @@ import torch
 from tests.helpers.ply_files import gaussians
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.formats.spz import (
+    DECODED_BYTES,
+    DECODED_BYTES_PER_HARMONIC,
     read_spz,
     read_spz_comment,
     spz_arrays,
     spz_bytes,
     write_spz,
-)
-from threestudio_gaussiandreamer.formats.spz_container import (
-    DECODED_BYTES,
-    DECODED_BYTES_PER_HARMONIC,
 )
 from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
 from threestudio_gaussiandreamer.gaussians.sh import sh_to_colors

@@ -19,7 +19,7 @@ from tests.formats.test_spz import (
     stored,
 )
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.formats import spz_container
+from threestudio_gaussiandreamer.formats import spz as spz_container
 from threestudio_gaussiandreamer.formats.gaussian_files import StoredCloud, write_cloud
 from threestudio_gaussiandreamer.formats.spz import load_spz, read_spz, spz_bytes, write_spz
 

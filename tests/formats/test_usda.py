@@ -14,8 +14,13 @@ from tests.helpers.object_clouds import assert_close, ball
 from tests.helpers.usd_reader import read_with_pxr
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.formats.gaussian_files import StoredCloud, read_cloud, write_cloud
-from threestudio_gaussiandreamer.formats.usda import HARMONICS, write_usda, write_usdz
-from threestudio_gaussiandreamer.formats.usda_reader import read_usd, read_usda
+from threestudio_gaussiandreamer.formats.usda import (
+    HARMONICS,
+    read_usd,
+    read_usda,
+    write_usda,
+    write_usdz,
+)
 from threestudio_gaussiandreamer.gaussians.axes import rotate
 from threestudio_gaussiandreamer.gaussians.sh import rgb_to_sh0, sh0_colors
 from threestudio_gaussiandreamer.meshes.mesh import srgb_to_linear

@@ -59,9 +59,9 @@ from tests.fuzz.run_targets import (
 )
 from tests.fuzz.target import Target, require_picture
 from threestudio_gaussiandreamer.formats.compressed_ply import read_compressed_ply
-from threestudio_gaussiandreamer.formats.ksplat import read_ksplat
-from threestudio_gaussiandreamer.formats.sog import read_sog
-from threestudio_gaussiandreamer.formats.usda_reader import read_usda
+from threestudio_gaussiandreamer.formats.sog import load_sog
+from threestudio_gaussiandreamer.formats.splat import read_ksplat
+from threestudio_gaussiandreamer.formats.usda import read_usda
 
 
 def mutant(name: str, seed: int, index: int) -> bytes:
@@ -130,13 +130,13 @@ TARGETS: dict[str, Target] = {
     "sog": Target(
         ".sog",
         lambda: files(".sog", [(12, 0), (9, 1)]),
-        exercise_means(read_sog, sog_means),
+        exercise_means(lambda path: load_sog(path)[0], sog_means),
         packing=SOG,
     ),
     "sog-folder": Target(
         ".sog",
         lambda: files(".sog", [(12, 0), (9, 1)]),
-        exercise_means(lambda path: read_sog(unpacked(path)), sog_means),
+        exercise_means(lambda path: load_sog(unpacked(path))[0], sog_means),
         packing=SOG,
     ),
     "ksplat": Target(".ksplat", ksplats, exercise_means(read_ksplat, ksplat_means)),

@@ -5,10 +5,10 @@ import pytest
 import torch
 
 from threestudio_gaussiandreamer import cameras
-from threestudio_gaussiandreamer.meshes import raycast, zbuffer
+from threestudio_gaussiandreamer.meshes import raycast
 from threestudio_gaussiandreamer.meshes.load import load_mesh
 from threestudio_gaussiandreamer.meshes.mesh import Mesh
-from threestudio_gaussiandreamer.meshes.zbuffer import ZBuffer
+from threestudio_gaussiandreamer.meshes.raycast import ZBuffer
 
 FOCAL = 20.0
 PLACES = np.arange(-16, 16) + 0.5
@@ -80,7 +80,7 @@ def test_triangles_through_the_camera_plane_are_what_single_rays_see(seed):
 def test_working_in_small_steps_changes_nothing(monkeypatch):
     vertices, faces = soup(7)
     whole = draw(vertices, faces)
-    monkeypatch.setattr(zbuffer, "PAIRS_PER_STEP", 37)
+    monkeypatch.setattr(raycast, "PAIRS_PER_STEP", 37)
     assert_same(draw(vertices, faces), whole)
     assert_same(draw(vertices, np.concatenate([faces, faces])), whole)  # of equals the first stays
 
@@ -113,10 +113,10 @@ def test_what_is_nearer_than_the_near_plane_is_not_seen():
     vertices = (
         np.array([[-1.0, -1, -1], [1, -1, -1], [0, 1, -1]])
         * np.array([[0.5], [2], [2]])
-        * zbuffer.NEAR
+        * raycast.NEAR
     )
     nearest, weights = cast(vertices, [[0, 1, 2]])
-    seen = (nearest >= 0) & (-(weights @ vertices)[..., 2] > zbuffer.NEAR)
+    seen = (nearest >= 0) & (-(weights @ vertices)[..., 2] > raycast.NEAR)
     assert 0 < seen.sum() < (nearest >= 0).sum()
     np.testing.assert_array_equal(draw(vertices, [[0, 1, 2]])[0], np.where(seen, 0, -1))
 

@@ -107,6 +107,23 @@ def test_a_cloud_without_visible_gaussians_is_refused_before_rendering(gaussians
         mesh_from_gaussians(gaussians, SMALL)
 
 
+def test_a_part_as_thin_as_a_cell_stays(caplog):
+    """A plate on a rod, as a mirror of a truck."""
+    rng, cell = np.random.default_rng(0), 1.8 / 48
+    ball, height = 0.5 * sphere_points(1500), np.arange(0.45, 1.1, cell / 4)
+    rod = np.stack([0 * height, 0 * height, height], axis=1)
+    plate = (rng.random((800, 3)) - 0.5) * [0.3, 0.3, 2 * cell] + [0, 0, 1.15]
+    means = np.concatenate([ball, rod, plate]).astype(np.float32)
+    sizes = np.repeat([0.03, cell / 3, cell / 2], [len(ball), len(rod), len(plate)])
+    cloud = painted_ball(len(means), opacity=0.99)._replace(
+        means=means, log_scales=np.log(np.repeat(sizes[:, None], 3, 1)).astype(np.float32)
+    )
+    options = dataclasses.replace(SMALL, faces=2000, resolution=48, view_size=192)
+    mesh = mesh_from_gaussians(cloud, options)
+    assert mesh.vertices[:, 2].max() > 1.1 and len(parts(mesh)) == 1
+    assert "loose parts" not in caplog.text
+
+
 def test_a_cloud_of_fog_is_refused():
     with pytest.raises(UserError, match="no view is covered to more than half"):
         mesh_from_gaussians(painted_ball(30, opacity=0.05), SMALL)

@@ -30,8 +30,7 @@ from ..formats.gaussian_files import (
     write_cloud,
 )
 from ..formats.producers import GAUSSIANS, from_producer, producers_of
-from ..formats.spz import SPZ_UP, SYSTEM_OF, VERSION
-from ..formats.spz_container import VERSIONS, ZSTD_VERSION, require_version
+from ..formats.spz import SPZ_UP, SYSTEM_OF, VERSION, VERSIONS, ZSTD_VERSION, require_version
 from ..gaussians.axes import AXES, VIEWER_UP
 from ..gaussians.gaussians import finite
 from ..gaussians.sh import COEFFICIENTS, MAX_DEGREE

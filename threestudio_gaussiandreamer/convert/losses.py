@@ -12,10 +12,10 @@ from ..formats.spz import (
     MIN_LOG_SCALE,
     SPZ_UP,
     STEPS_PER_SIZE,
+    ZSTD_VERSION,
     out_of_range,
     position_step,
 )
-from ..formats.spz_container import ZSTD_VERSION
 from ..gaussians.gaussians import Gaussians
 
 ROUNDING = {

@@ -63,8 +63,7 @@ from ..core.options import Rule, check_options, each, in_range, one_of, rule
 from ..formats.gaussian_files import FORMATS, StoredCloud, suffix_of
 from ..formats.glb import GLB_UP
 from ..formats.ply import padded_sh
-from ..formats.spz import VERSION
-from ..formats.spz_container import VERSIONS, require_version
+from ..formats.spz import VERSION, VERSIONS, require_version
 from ..gaussians.axes import AXES, VIEWER_UP, WORLD_UP, rotation_between
 from ..gaussians.densify import LOG_SCALE_RANGE
 from ..gaussians.gaussians import Gaussians, finite, opaque

@@ -18,7 +18,6 @@ from ..gaussians.gaussians import Gaussians, drawable
 from . import spz
 from .compressed_ply import is_compressed_ply, read_compressed_ply, write_compressed_ply
 from .glb import GLB_UP, load_glb, write_glb, write_spz_glb
-from .ksplat import read_ksplat
 from .ply import (
     gaussians_size,
     is_gaussian_ply,
@@ -27,10 +26,9 @@ from .ply import (
     write_gaussians,
 )
 from .sog import SOG_UP, load_sog, write_sog
-from .splat import read_splat
+from .splat import read_ksplat, read_splat
 from .spz import SPZ_UP, load_spz, read_spz_comment, spz_arrays, spz_bytes, write_spz
-from .usda import USDA_UP, write_usda, write_usdz
-from .usda_reader import read_usd
+from .usda import USDA_UP, read_usd, write_usda, write_usdz
 
 logger = logging.getLogger(__name__)
 

@@ -27,8 +27,7 @@ from ..core.files import existing_file
 from ..gaussians.axes import placed, rotate
 from ..gaussians.gaussians import Gaussians, finite, joined
 from ..gaussians.sh import COEFFICIENTS, sh0_colors
-from ..meshes.gltf import parse_errors, world_matrices
-from ..meshes.gltf_document import Document
+from ..meshes.gltf import Document, parse_errors, world_matrices
 from ..meshes.mesh import srgb_to_linear
 from ..meshes.write import write_glb_file
 from .packing import (

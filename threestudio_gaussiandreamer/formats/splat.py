@@ -1,20 +1,53 @@
-"""``.splat``, antimatter15's headerless records of 32 bytes: read only, since it has no harmonics
-and less precision than any format that is written here.
+"""``.splat`` and ``.ksplat``: read only, since they have less precision than what is written here.
 
-A record is position and scale (3 float32 each, the scale linear), colour and opacity (4 bytes) and
-the quaternion wxyz (4 bytes, 128 + 128 q). Axes are those of 3D Gaussian splatting's PLY, -y up."""
+``.splat``, antimatter15's format, is headerless records of 32 bytes without harmonics: position and
+scale (3 float32 each, the scale linear), colour and opacity (4 bytes) and the quaternion wxyz (4
+bytes, 128 + 128 q). Axes of both are those of 3D Gaussian splatting's PLY, -y up.
+
+``.ksplat``, of mkkellogg's GaussianSplats3D, levels 0 to 2: a header of 4096 bytes, a header of
+1024 bytes for each section, then the sections: the counts of their partly filled buckets, the
+centres of all buckets, and a record for each Gaussian: position, scale (linear), quaternion wxyz,
+colour and opacity (a byte each) and the harmonics above the constant one, band by band, and in a
+band channel by channel. Numbers are float32 at level 0. At levels 1 and 2 they are float16,
+positions are steps from the centre of the Gaussian's bucket, and at level 2 harmonics are bytes."""
 
 import os
+from typing import NoReturn
 
 import numpy as np
+from jaxtyping import Float
 
 from ..core.errors import UserError
 from ..core.files import existing_file
 from ..gaussians.gaussians import Gaussians
-from ..gaussians.sh import C0
+from ..gaussians.sh import C0, COEFFICIENTS, rgb_to_sh0
 from .packing import logits_of_bytes
 
 RECORD = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
+HEADER = np.dtype(
+    {
+        "names": ["major", "minor", "sections", "level", "range"],
+        "formats": ["u1", "u1", "<u4", "<u2", ("<f4", 2)],
+        "offsets": [0, 1, 4, 20, 36],
+        "itemsize": 4096,
+    }
+)
+SECTION = np.dtype(
+    {
+        "names": "count room bucket buckets block stride steps full partial degree".split(),
+        "formats": ["<u4", "<u4", "<u4", "<u4", "<f4", "<u2", "<u4", "<u4", "<u4", "<u2"],
+        "offsets": [0, 4, 8, 12, 16, 20, 24, 32, 36, 40],
+        "itemsize": 1024,
+    }
+)
+NUMBERS = (("<f4", "<f4", "<f4"), ("<u2", "<f2", "<f2"), ("<u2", "<f2", "u1"))
+"""Types of positions, of scales and quaternions, and of harmonics, by level."""
+STEPS = 32767
+"""Steps from a bucket's centre to its side, where the section doesn't say."""
+HARMONICS_RANGE = (-1.5, 1.5)
+MAX_DEGREE = 2
+ROUNDED_TO_0 = 2.0**-25
+"""The largest scale that is 0 as float16."""
 
 
 def read_splat(path: str | os.PathLike) -> Gaussians:
@@ -41,3 +74,107 @@ def read_splat(path: str | os.PathLike) -> Gaussians:
         logit_opacities=logits_of_bytes(rows["rgba"][:, 3]),
         sh=colors[:, None],
     )
+
+
+def read_ksplat(path: str | os.PathLike) -> Gaussians:
+    """Read a ``.ksplat`` file; rows with values that aren't finite are kept.
+
+    Raises:
+        UserError: there is no such file, or it is damaged or of another version.
+    """
+    return _File(path).gaussians()
+
+
+class _File:
+    """The bytes of a file, which are read at places that are checked."""
+
+    def __init__(self, path: str | os.PathLike) -> None:
+        self.path = existing_file(path, ".ksplat file")
+        self.data = np.fromfile(self.path, np.uint8)
+        self.header = self.rows(HEADER, 0, 1)[0]
+        version, self.level = (self.header["major"], self.header["minor"]), self.header["level"]
+        if version[0] != 0 or version[1] < 1 or self.level not in range(len(NUMBERS)):
+            self.fail(
+                "version 0.1 and level 0, 1 or 2 were expected, not version "
+                f"{version[0]}.{version[1]} and level {self.level}"
+            )
+
+    def fail(self, problem: str) -> NoReturn:
+        raise UserError(f".ksplat file {str(self.path)!r}: {problem}")
+
+    def rows(self, kind: np.dtype, at: int, count: int) -> np.ndarray:
+        """Return ``count`` values of a type from the byte ``at`` on."""
+        if (end := at + count * kind.itemsize) > len(self.data):
+            self.fail(f"it ends after {len(self.data)} bytes instead of {end}: it is damaged")
+        return self.data[at:end].view(kind)
+
+    def gaussians(self) -> Gaussians:
+        """Return the Gaussians of all sections."""
+        sections = self.rows(SECTION, HEADER.itemsize, int(self.header["sections"]))
+        if len(sections) and sections["degree"].max() > MAX_DEGREE:
+            self.fail(f"harmonics of degree {sections['degree'].max()}; expected 0 to {MAX_DEGREE}")
+        coefficients = COEFFICIENTS[sections["degree"].max(initial=0)]
+        at, found = HEADER.itemsize + sections.nbytes, []
+        for section in sections:
+            values = {name: section[name].item() for name in SECTION.names}
+            position, number, harmonic = NUMBERS[self.level]
+            record = np.dtype(
+                [
+                    ("mean", position, 3),
+                    ("scale", number, 3),
+                    ("quat", number, 4),
+                    ("rgba", "u1", 4),
+                    ("sh", harmonic, 3 * (COEFFICIENTS[values["degree"]] - 1)),
+                ]
+            )
+            buckets = 4 * values["partial"] + values["stride"] * values["buckets"]
+            rows = self.rows(record, at + buckets, values["count"])
+            means = rows["mean"] if self.level == 0 else self.positions(rows["mean"], values, at)
+            found.append(self.cloud(rows, means, coefficients))
+            at += buckets + values["room"] * record.itemsize
+        if not found:
+            self.fail("it has no Gaussians")
+        return Gaussians(*(np.concatenate(values) for values in zip(*found, strict=True)))
+
+    def positions(
+        self, steps: np.ndarray, section: dict[str, float], at: int
+    ) -> Float[np.ndarray, "N 3"]:
+        """Return positions from steps around the centres of buckets."""
+        partly = self.rows(np.dtype("<u4"), at, section["partial"])
+        centers = self.rows(np.dtype("<f4"), at + partly.nbytes, 3 * section["buckets"])
+        held = section["full"] * section["bucket"] + int(partly.sum(dtype=np.int64))
+        usual = section["full"] + section["partial"] == section["buckets"]
+        if section["stride"] != 3 * centers.itemsize or not usual or held != len(steps):
+            self.fail(f"its buckets hold {held} of the {len(steps)} Gaussians: it is damaged")
+        sizes = np.concatenate([np.full(section["full"], section["bucket"], np.int64), partly])
+        far = section["steps"] or STEPS
+        offsets = (steps.astype(np.float64) - far) * (section["block"] / 2 / far)
+        return offsets + np.repeat(centers.reshape(-1, 3), sizes, axis=0)
+
+    def cloud(
+        self, rows: np.ndarray, means: Float[np.ndarray, "N 3"], coefficients: int
+    ) -> Gaussians:
+        """Return the Gaussians of a section's records, with harmonics up to ``coefficients``."""
+        sh = np.zeros((len(rows), coefficients, 3), np.float32)
+        sh[:, 0] = rgb_to_sh0(rows["rgba"][:, :3] / np.float32(255))
+        values = rows["sh"].astype(np.float32)
+        if self.level == 2:
+            low, high = (
+                said or usual
+                for said, usual in zip(self.header["range"], HARMONICS_RANGE, strict=True)
+            )
+            values = low + (high - low) * (values / 255)
+        for start, end in ((1, 4), (4, 9)):
+            if values.shape[1] >= 3 * (end - 1):
+                band = values[:, 3 * (start - 1) : 3 * (end - 1)].reshape(len(rows), 3, -1)
+                sh[:, start:end] = band.swapaxes(1, 2)
+        scales = rows["scale"].astype(np.float32)
+        with np.errstate(divide="ignore", invalid="ignore"):  # of scales that are negative
+            log_scales = np.log(np.where(scales == 0, np.float32(ROUNDED_TO_0), scales))
+        return Gaussians(
+            means=means.astype(np.float32),
+            quats=rows["quat"].astype(np.float32),
+            log_scales=log_scales,
+            logit_opacities=logits_of_bytes(rows["rgba"][:, 3]),
+            sh=sh,
+        )
