@@ -2,6 +2,7 @@
 registered from ``custom/`` and train.
 """
 
+import ast
 import json
 import re
 from pathlib import Path
@@ -48,7 +49,7 @@ FROZEN = blocks(DATA / "extending.txt")
 SHOWN = [block for page in sorted((ROOT / "docs").glob("*.md")) for block in blocks(page)]
 EXAMPLES = {
     f"{Path(match[1]).stem}-{number}": block
-    for number, block in enumerate(dict.fromkeys(FROZEN + SHOWN))
+    for number, block in enumerate({ast.dump(ast.parse(b)): b for b in SHOWN + FROZEN}.values())
     if (match := re.match(r"# (custom/\S+\.py)\n", block))
 }
 

@@ -10,7 +10,7 @@ import torch
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.splatting import rasterize
 
-WIDTH, HEIGHT = 33, 18
+WIDTH, HEIGHT = 34, 18
 NAMES = ("means", "quats", "scales", "opacities", "colors", "background")
 
 
@@ -47,16 +47,23 @@ def drawn(backend: str, dtype: torch.dtype, cloud: dict, **options) -> dict[str,
     leaves = {name: value.to(dtype).requires_grad_() for name, value in cloud.items()}
     views = {name: value.to(dtype) for name, value in cameras(2).items()}
     size = {"width": WIDTH, "height": HEIGHT}
-    try:
-        out = rasterize(**leaves, **views, **size, backend=backend, **options)
-    except UserError as error:
-        pytest.skip(str(error))
+    out = rasterize(**leaves, **views, **size, backend=backend, **options)
     pictures = {"image": out.image, "alpha": out.alpha, "depth": out.depth}
     rng = torch.Generator().manual_seed(1)
     weights = [torch.rand(p.shape, generator=rng, dtype=torch.float64) for p in pictures.values()]
     total = sum((p * w).sum() for p, w in zip(pictures.values(), weights, strict=True))
     grads = torch.autograd.grad(total, list(leaves.values()))
     return pictures | dict(zip(NAMES, grads, strict=True))
+
+
+@pytest.fixture(params=["cpu", "torch"])
+def backend(request) -> str:
+    """Return a backend; skip it where this machine can't run it."""
+    try:
+        drawn(request.param, torch.float32, scene(1, 0.1, seed=0))
+    except UserError as error:
+        pytest.skip(str(error))
+    return request.param
 
 
 OPTIONS = [
@@ -68,7 +75,6 @@ OPTIONS = [
 ]
 
 
-@pytest.mark.parametrize("backend", ["cpu", "torch"])
 @pytest.mark.parametrize("options", OPTIONS, ids=str)
 def test_a_backend_is_the_specification(backend, options):
     cloud = scene(120, 0.15, seed=0)
@@ -83,33 +89,26 @@ def test_the_specification_is_front_to_back_compositing():
     """Two Gaussians on the axis of a camera, by the formula."""
     cloud = scene(2, 0.1, seed=0)
     cloud["means"] = torch.tensor([[0, 0, 0], [0, 0, 1]], dtype=torch.float64)
-    cloud["scales"] = torch.full((2, 3), 0.2, dtype=torch.float64)
+    cloud["scales"] = torch.ones((2, 3), dtype=torch.float64)
     cloud["opacities"] = torch.tensor([0.5, 0.8], dtype=torch.float64)
     view = {name: value[:1] for name, value in cameras(1).items()}
     image = rasterize(**cloud, **view, width=WIDTH, height=HEIGHT, backend="reference").image
     near, far = cloud["colors"]
     middle = image[0, HEIGHT // 2, WIDTH // 2]
-    depth_of_two = 0.5 * near + 0.5 * (0.8 * far + 0.2 * cloud["background"])
-    assert (middle - depth_of_two).abs().max() < 0.05
+    expected = 0.5 * near + 0.5 * (0.8 * far + 0.2 * cloud["background"])
+    assert (middle - expected).abs().max() < 0.02
 
 
-@pytest.mark.parametrize("backend", ["cpu", "torch", "reference"])
 def test_nothing_and_nonsense(backend):
     cloud = scene(40, 0.15, seed=2)
     cloud["means"][3, 0] = math.nan
     found = drawn(backend, torch.float32, cloud)
-    assert all(value.isfinite().all() for name, value in found.items() if name in ("image",))
-    with pytest.raises(UserError):
-        drawn_strictly(backend, cloud)
+    assert found["image"].isfinite().all()
+    with pytest.raises(UserError, match="means"):
+        drawn(backend, torch.float32, cloud, non_finite="error")
     empty = {name: value[:0] if name != "background" else value for name, value in cloud.items()}
     image = drawn(backend, torch.float32, empty)["image"]
     assert (image == empty["background"].float()).all()
-
-
-def drawn_strictly(backend: str, cloud: dict) -> None:
-    views = {name: value.float() for name, value in cameras(2).items()}
-    cloud = {name: value.float() for name, value in cloud.items()}
-    rasterize(**cloud, **views, width=WIDTH, height=HEIGHT, backend=backend, non_finite="error")
 
 
 @pytest.mark.parametrize(

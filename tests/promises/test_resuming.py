@@ -97,6 +97,7 @@ def test_a_file_of_the_first_layout_is_pruned(name):
     assert b"element vertex 65\n" in Path("out.ply").read_bytes()
 
 
+@pytest.mark.slow
 def test_a_folder_in_use_ctrl_c_and_the_command_that_resumes(tmp_path):
     """In a process of its own, which trains until it is stopped."""
     where = ["use_timestamp=false", "tag=t", "trainer.max_steps=1000000", "pages=false"]

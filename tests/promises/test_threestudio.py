@@ -11,16 +11,10 @@ from tests.helpers.real_host import HARNESS, NEEDED, REPOSITORY, SHARED
 pytestmark = NEEDED
 
 SMALL = [
-    f"system.guidance.mesh={SHARED / 'assets' / 'spot.glb'}",
-    "trainer.max_steps=3",
-    "data.width=32",
-    "data.height=32",
-    "data.eval_width=32",
-    "data.eval_height=32",
-    "data.n_test_views=2",
-    "system.geometry.prior.num_points=300",
-    "system.geometry.grow.max_points=100",
-    "system.evaluation.size=32",
+    *(f"system.guidance.mesh={SHARED / 'assets' / 'spot.glb'}", "trainer.max_steps=3"),
+    *("data.width=32", "data.height=32", "data.eval_width=32", "data.eval_height=32"),
+    *("data.n_test_views=2", "system.geometry.prior.num_points=300"),
+    *("system.geometry.grow.max_points=100", "system.evaluation.size=32"),
     "system.evaluation.views=2",
 ]
 
@@ -35,14 +29,8 @@ def try_extension(tmp_path: Path, config: Path, *overrides: str) -> set[str]:
             filter(None, [str(REPOSITORY), os.environ.get("EXTRA_PYTHONPATH")])
         ),
     }
-    command = [
-        "bash",
-        str(HARNESS),
-        str(REPOSITORY / "custom" / "threestudio-gaussiandreamer"),
-        str(config),
-        *SMALL,
-        *overrides,
-    ]
+    drop_in = REPOSITORY / "custom" / "threestudio-gaussiandreamer"
+    command = ["bash", str(HARNESS), str(drop_in), str(config), *SMALL, *overrides]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stdout + done.stderr
     (run,) = (tmp_path / "scratch" / "outputs" / "demo").iterdir()
