@@ -85,8 +85,8 @@ def test_smoke_yaml_runs_every_stage_on_any_prompt(prompt, tmp_path, monkeypatch
     assert written >= {
         "ckpts/last.ckpt",
         "save/prior/points.npz",
-        "save/it4-0.png",
-        "save/it8-test/3.png",
+        "save/it8-0.png",
+        "save/it8-test/1.png",
         "save/it8-export/gaussians.ply",
         "save/it8-export/gaussians.spz",
         "index.html",

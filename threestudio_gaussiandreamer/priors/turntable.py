@@ -18,11 +18,11 @@ MARGIN = 1.3
 """Camera distance, relative to that at which the points exactly fill the picture."""
 SIZE = 0.8
 """Size of a point relative to the distance to its neighbours: the smallest without visible gaps."""
-MILLISECONDS = 80
+MILLISECONDS = 160
 """Duration of each frame, milliseconds."""
 
 
-def save_turntable(cloud: PointCloud, path: str | os.PathLike, *, views=24, size=256) -> None:
+def save_turntable(cloud: PointCloud, path: str | os.PathLike, *, views=12, size=256) -> None:
     """Write an animated GIF of ``cloud`` that begins at its front (azimuth 0) and never stops."""
     from PIL import Image
 
@@ -37,7 +37,7 @@ def save_turntable(cloud: PointCloud, path: str | os.PathLike, *, views=24, size
 
 
 @torch.no_grad()
-def turntable(cloud: PointCloud, *, views=24, size=256) -> UInt8[np.ndarray, "V S S 3"]:
+def turntable(cloud: PointCloud, *, views: int, size: int) -> UInt8[np.ndarray, "V S S 3"]:
     """Return pictures of ``cloud`` on white from ``views`` azimuths, the first from the front; all
     of it is in each.
     """
