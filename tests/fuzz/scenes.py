@@ -7,9 +7,9 @@ from typing import Any, NamedTuple, Optional
 import torch
 from torch import Tensor
 
-from tests.helpers.splatting_scenes import NAMES, Cloud, cotangents
+from tests.helpers.splatting_scenes import NAMES, Cloud, cotangents, rasterize
 from threestudio_gaussiandreamer.gaussians.sh import sh_to_colors
-from threestudio_gaussiandreamer.splatting import Rasterized, rasterize
+from threestudio_gaussiandreamer.splatting import Rasterized
 
 MAX = 3.4028235e38
 DENORMAL = 1e-42

@@ -22,11 +22,11 @@ from tests.helpers.splatting_scenes import (
     front_camera,
     one_gaussian,
     random_cloud,
+    rasterize,
     run,
     stacks_on_one_pixel,
     trimmed_error,
 )
-from threestudio_gaussiandreamer.splatting import rasterize
 
 
 class KernelContract(LimitsContract):

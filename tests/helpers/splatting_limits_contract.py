@@ -15,9 +15,9 @@ from tests.helpers.splatting_scenes import (
     equal,
     error,
     random_cloud,
+    rasterize,
     require_backward_twice_adds_up,
 )
-from threestudio_gaussiandreamer.splatting import rasterize
 
 
 class LimitsContract:

@@ -24,11 +24,11 @@ from tests.helpers.splatting_scenes import (
     front_camera,
     one_gaussian,
     random_cloud,
+    rasterize,
 )
 from threestudio_gaussiandreamer.core import memory
 from threestudio_gaussiandreamer.core.devices import torch_threads
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.splatting import rasterize
 from threestudio_gaussiandreamer.splatting.cpu import backend as cpu
 from threestudio_gaussiandreamer.splatting.validation import LARGEST_SIDE
 

@@ -11,9 +11,17 @@ import torch
 from tests.helpers.cuda_shim.device import ORDERS, HostDevice, unavailable
 from tests.helpers.splatting_contract import KernelContract
 from tests.helpers.splatting_draws import BACKGROUND, draw
-from tests.helpers.splatting_scenes import NAMES, Cloud, cameras, cotangents, equal, random_cloud
+from tests.helpers.splatting_scenes import (
+    NAMES,
+    Cloud,
+    cameras,
+    cotangents,
+    equal,
+    random_cloud,
+    rasterize,
+)
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.splatting import backends, rasterize
+from threestudio_gaussiandreamer.splatting import backends
 from threestudio_gaussiandreamer.splatting.cuda import backend as cuda
 from threestudio_gaussiandreamer.splatting.cuda import driver as cuda_driver
 from threestudio_gaussiandreamer.splatting.cuda import memory as cuda_memory

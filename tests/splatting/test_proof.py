@@ -10,9 +10,9 @@ import torch
 
 from tests.helpers.broken_kernels import DEFAULT, FAULTS, BrokenDevice, Fault, other_constants
 from tests.helpers.cuda_shim.device import HostDevice, library, unavailable
-from tests.helpers.splatting_scenes import cameras, random_cloud
+from tests.helpers.splatting_scenes import cameras, random_cloud, rasterize
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.splatting import backends, rasterize
+from threestudio_gaussiandreamer.splatting import backends
 from threestudio_gaussiandreamer.splatting.cuda import driver, nvrtc, proof
 from threestudio_gaussiandreamer.training.renderer import check_backend
 

@@ -19,11 +19,12 @@ from tests.helpers.splatting_scenes import (
     one_gaussian,
     psnr,
     random_cloud,
+    rasterize,
     run,
     scene_of,
 )
 from tests.splatting.reference_cases import ROUNDING, SPECIFICATION
-from threestudio_gaussiandreamer.splatting import rasterize, reference
+from threestudio_gaussiandreamer.splatting import reference
 from threestudio_gaussiandreamer.splatting.options import RasterizeOptions
 from threestudio_gaussiandreamer.splatting.projection import project
 

@@ -10,8 +10,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from tests.helpers import splatting_scenes as scenes
+from tests.helpers.splatting_scenes import rasterize
 from tests.splatting.torch_backend_cases import ROUNDING, compare
-from threestudio_gaussiandreamer.splatting import rasterize
 
 # float32 against float64 with the worst 0.5 % of the rows left out: issue and stability.md ask for
 # 2e-5.

@@ -9,13 +9,14 @@ from tests.helpers.splatting_scenes import (
     front_camera,
     one_gaussian,
     random_cloud,
+    rasterize,
     require_backward_twice_adds_up,
     run,
     scene_of,
 )
 from tests.splatting.torch_backend_cases import compare
 from threestudio_gaussiandreamer.core.devices import torch_threads
-from threestudio_gaussiandreamer.splatting import rasterize, tiles, torch_backend
+from threestudio_gaussiandreamer.splatting import tiles, torch_backend
 from threestudio_gaussiandreamer.splatting.options import RasterizeOptions
 from threestudio_gaussiandreamer.splatting.projection import project
 

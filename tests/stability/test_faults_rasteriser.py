@@ -16,13 +16,14 @@ from tests.helpers.splatting_scenes import (
     one_gaussian,
     psnr,
     random_cloud,
+    rasterize,
 )
 from tests.stability.backends import each_backend
 from tests.stability.faults_rasteriser_cases import central_difference, single, slope_error
 from tests.stability.rows import row
 from tests.stability.scenes import clamped_alpha, clamped_slope, plain_image, stack
 from threestudio_gaussiandreamer.gaussians.grow import nearest_distance_scales
-from threestudio_gaussiandreamer.splatting import rasterize, tiles
+from threestudio_gaussiandreamer.splatting import tiles
 from threestudio_gaussiandreamer.splatting.projection import quats_to_rotations
 
 

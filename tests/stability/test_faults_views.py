@@ -8,13 +8,13 @@ from tests.helpers.splatting_scenes import (
     NO_CUTOFFS,
     front_camera,
     one_gaussian,
+    rasterize,
 )
 from tests.stability.backends import each_backend
 from tests.stability.faults_rasteriser_cases import single, slope_error
 from tests.stability.rows import row
 from tests.stability.scenes import joined, plain_image
 from threestudio_gaussiandreamer import cameras as host_cameras
-from threestudio_gaussiandreamer.splatting import rasterize
 
 
 @row("A0", "F10")

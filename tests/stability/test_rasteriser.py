@@ -11,11 +11,12 @@ import torch
 
 from tests.helpers import splatting_scenes as scenes
 from tests.helpers.splatting_draws import draw
+from tests.helpers.splatting_scenes import rasterize
 from tests.stability.backends import each_backend
 from tests.stability.rasteriser_cases import BACKGROUND
 from tests.stability.rows import row
 from tests.stability.scenes import finite, joined, pixels, stack
-from threestudio_gaussiandreamer.splatting import PRESETS, rasterize
+from threestudio_gaussiandreamer.splatting import PRESETS
 from threestudio_gaussiandreamer.training.geometry import GaussianCloud
 
 # ---- what is culled ------------------------------------------------------------------------------

@@ -20,12 +20,13 @@ from tests.helpers.splatting_scenes import (
     front_camera,
     one_gaussian,
     random_cloud,
+    rasterize,
     run,
 )
 from tests.stability.backends import BACKENDS, each_backend
 from tests.stability.rows import row
 from tests.stability.scenes import clamped_alpha, finite
-from threestudio_gaussiandreamer.splatting import rasterize, tiles
+from threestudio_gaussiandreamer.splatting import tiles
 
 EXACT = ["torch", "reference"]  # those that support float64
 

@@ -11,10 +11,10 @@ from tests.helpers.splatting_scenes import (
     one_gaussian,
     psnr,
     random_cloud,
+    rasterize,
 )
 from tests.stability.backends import each_backend
 from tests.stability.rows import row
-from threestudio_gaussiandreamer.splatting import rasterize
 
 TILTED = torch.tensor([[0.9, 0.2, 0.1, 0.4]], dtype=torch.float64)
 

@@ -17,13 +17,13 @@ from tests.helpers.splatting_scenes import (
     front_camera,
     one_gaussian,
     random_cloud,
+    rasterize,
 )
 from tests.stability.backends import BACKENDS, each_backend
 from tests.stability.rasteriser_cases import BACKGROUND
 from tests.stability.rows import row
 from tests.stability.scenes import finite
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.splatting import rasterize
 from threestudio_gaussiandreamer.splatting.cpu import backend as cpu
 from threestudio_gaussiandreamer.training.finite import require_finite
 from threestudio_gaussiandreamer.training.geometry import GaussianCloud

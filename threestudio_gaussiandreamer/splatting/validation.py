@@ -1,6 +1,6 @@
 """Check the arguments of `rasterize`, and convert them to a `Scene`."""
 
-import logging
+import math
 from numbers import Integral, Real
 from typing import Optional
 
@@ -11,9 +11,9 @@ from ..core.errors import UserError, unknown
 from .options import RasterizeOptions
 from .scene import Scene
 
-logger = logging.getLogger(__name__)
 PRESETS = {"fast": 1 / 255, "balanced": 1 / 1024, "accurate": 1 / 65536}
 LARGEST_SIDE = 16 * (2**16 - 1)  # pixels; kernels number tiles and their ends with 16 bits
+ROUNDING = 1e-4  # how far scales and opacities may lie outside their ranges
 GAUSSIANS = ("means", "quats", "scales", "opacities", "colors")
 
 
@@ -48,7 +48,7 @@ def check(
     check_shapes(tensors)
     check_numbers(width, height, options)
     check_finite(policy, tensors)
-    report_raw(tensors)
+    check_ranges(tensors)
 
 
 def as_scene(tensors: dict[str, Tensor], width: int, height: int) -> Scene:
@@ -175,26 +175,30 @@ def check_numbers(width: int, height: int, options: RasterizeOptions) -> None:
             raise UserError(f"{name} must be {wanted}; got {got}.")
 
 
-_looked_at: set[torch.device] = set()
+def check_ranges(tensors: dict[str, Tensor]) -> None:
+    """Check that scales and opacities aren't their logarithms and logits: on a CPU in every call,
+    elsewhere in the first one on each device, since looking waits for it.
 
-
-def report_raw(tensors: dict[str, Tensor]) -> None:
-    """Warn of logarithms in place of scales and logits in place of opacities, in the first call on
-    each device, since looking waits for it. They are drawn as the specification says.
+    Raises:
+        UserError: a scale is below 0, or an opacity outside [0, 1]. Values that aren't finite are
+            left to the policy.
     """
     device = tensors["means"].device
-    if device in _looked_at:
+    if device in _looked_at or not len(tensors["means"]):
         return
-    _looked_at.add(device)
-    scales, opacities = tensors["scales"].detach(), tensors["opacities"].detach()
-    outside = (opacities - 0.5).abs() > 0.5001
-    for name, values, raw, wanted, hint in (
-        ("scales", scales, scales < 0, "0 or more", "exp() of logarithms"),
-        ("opacities", opacities, outside, "in [0, 1]", "sigmoid() of logits"),
+    if device.type != "cpu":
+        _looked_at.add(device)
+    for name, most, wanted, hint in (
+        ("scales", math.inf, "0 or more", "exp() of logarithms"),
+        ("opacities", 1 + ROUNDING, "in [0, 1]", "sigmoid() of logits"),
     ):
-        if raw.any():
-            found = values[raw][0].item()
-            logger.warning("%s should be %s, but one is %g: pass %s", name, wanted, found, hint)
+        low, high = (value.item() for value in tensors[name].detach().aminmax())
+        for found in (low, high):
+            if math.isfinite(found) and not -ROUNDING <= found <= most:
+                raise UserError(f"{name} must be {wanted}, but one is {found:g}: pass {hint}.")
+
+
+_looked_at: set[torch.device] = set()
 
 
 def _is_whole(number) -> bool:
