@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-import tests.guidance.test_foreign  # noqa: F401  registers test-learning-guidance
+import tests.guidance.test_external  # noqa: F401  registers test-learning-guidance
 from tests.helpers import tiny_models
 from tests.helpers.guidance_runs import assert_resumes, checkpoint, config, diffusion, run
 from threestudio_gaussiandreamer.host import BaseObject, register
