@@ -6,7 +6,7 @@ from PIL import Image
 
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.gaussians.point_cloud import PointCloud
-from threestudio_gaussiandreamer.priors.turntable import save_turntable, turntable
+from threestudio_gaussiandreamer.priors.cache import save_turntable, turntable
 
 
 @pytest.fixture

@@ -73,11 +73,7 @@ class EmbeddingCache:
             return None
 
     def write(self, text: str, embedding: Float[Tensor, "N F"]) -> None:
-        """Store one embedding atomically: a crash leaves the earlier file, or none.
-
-        Raises:
-            UserError: the folder can't be created or written.
-        """
+        """Store one embedding atomically; raise UserError if the folder can't be written."""
         from safetensors.torch import save
 
         output_folder(self.folder, "system.prompt_processor.cache_dir")

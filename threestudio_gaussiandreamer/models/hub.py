@@ -120,7 +120,21 @@ def locate(source: Source, *, download: bool = True) -> Optional[Path]:
             source.picks(files_below(cached))
             return cached
     sizes = _files_on_hub(source)
-    return _downloaded(source, sizes) if download else None
+    if not download:
+        return None
+    info(f"downloading {source.name}: up to {sum(sizes.values()) / 1e9:.1f} GB, once")
+    try:  # exactly these files, except those that the cache already has
+        found = _snapshot(source, list(sizes), endpoint=os.environ.get("HF_ENDPOINT") or None)
+    except Exception as error:  # from huggingface_hub, its HTTP library, sockets or the file system
+        raise UserError(explain(source, error)) from error
+    return _checked(found, source)
+
+
+def _snapshot(source: Source, patterns: list[str], **options: Any) -> Path:
+    from huggingface_hub import snapshot_download
+
+    options |= {"revision": source.revision, "allow_patterns": patterns}
+    return Path(snapshot_download(source.name, **options))
 
 
 def _checked(folder: Path, source: Source) -> Path:
@@ -150,14 +164,12 @@ def cached_snapshot(source: Source) -> Optional[Path]:
     """Return the cache folder of a model's newest downloaded version, complete or not; None if
     there is none. Makes no network request.
     """
-    from huggingface_hub import snapshot_download
     from huggingface_hub.errors import HFValidationError
 
     # The pattern matches no file, so that snapshot_download doesn't check for completeness;
     # ``locate`` does, for the needed files only.
-    options = {"revision": source.revision, "local_files_only": True, "allow_patterns": ["-"]}
     try:
-        return Path(snapshot_download(source.name, **options))
+        return _snapshot(source, ["-"], local_files_only=True)
     except HFValidationError as error:
         message = f"{source}: there is no such folder, and it is no hub id: {error}"
         raise UserError(message) from error
@@ -208,19 +220,6 @@ def _with_timeout(ask: Callable[[], Any]) -> Any:
     if not wait([answers], TIMEOUT).done:
         raise TimeoutError(f"no answer within {TIMEOUT:g} seconds")
     return answers.result()
-
-
-def _downloaded(source: Source, sizes: dict[str, int]) -> Path:
-    """Download exactly these files into the hub's cache, except those that it already has."""
-    from huggingface_hub import snapshot_download
-
-    info(f"downloading {source.name}: up to {sum(sizes.values()) / 1e9:.1f} GB, once")
-    options = {"revision": source.revision, "endpoint": os.environ.get("HF_ENDPOINT") or None}
-    try:
-        folder = snapshot_download(source.name, allow_patterns=list(sizes), **options)
-    except Exception as error:  # as above, or from the file system
-        raise UserError(explain(source, error)) from error
-    return _checked(Path(folder), source)
 
 
 def explain(source: Source, error: Exception) -> str:

@@ -76,12 +76,8 @@ class Body(NamedTuple):
     """By how much each vertex moves with each joint; rows sum to 1."""
 
 
-class BaseMesh(NamedTuple):
-    """The contents of ``base.obj``, in its unit; corners of a face are (vertex, uv) pairs."""
-
-    vertices: Float[np.ndarray, "V 3"]
-    uv: Float[np.ndarray, "T 2"]
-    groups: dict[str, Int[np.ndarray, "F 4 2"]]
+Groups = dict[str, Int[np.ndarray, "F 4 2"]]
+"""Faces by group; the corners of a face are (vertex, uv) pairs."""
 
 
 def data_folder() -> Path:
@@ -114,23 +110,22 @@ def load_body(person: Person) -> Body:
 
 
 def _read_body(folder: Path, person: Person) -> Body:
-    base = read_base_mesh(folder / "3dobjs" / "base.obj")
-    shape = base.vertices.copy()
+    shape, uv, groups = read_base_mesh(folder / "3dobjs" / "base.obj")
     for name, weight in target_weights(person).items():
         rows, offsets = read_target(folder / "targets" / f"{name}.target.gz")
         shape[rows] += weight * offsets
     rig = json.loads((folder / "rigs" / "standard" / "rig.default.json").read_bytes())
     skin = json.loads((folder / "rigs" / "standard" / "weights.default.json").read_bytes())
     bones = rig.get("bones", rig)
-    quads = np.concatenate([base.groups[group] for group in GROUPS])
+    quads = np.concatenate([groups[group] for group in GROUPS])
     corners = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
     used, faces = np.unique(corners[:, :, 0], return_inverse=True)
     return Body(
         vertices=METRES * shape[used],
         faces=faces.reshape(-1, 3),
-        uv=base.uv,
+        uv=uv,
         face_uv=corners[:, :, 1],
-        joints=METRES * joint_positions(bones, base.groups, shape),
+        joints=METRES * joint_positions(bones, groups, shape),
         weights=joint_weights(bones, skin["weights"], len(shape))[used],
     )
 
@@ -180,8 +175,10 @@ def read_target(path: Path) -> tuple[Int[np.ndarray, " N"], Float[np.ndarray, "N
     return values[:, 0].astype(np.int64), values[:, 1:]
 
 
-def read_base_mesh(path: Path) -> BaseMesh:
-    """Read an OBJ of quads with texture coordinates, and its groups of faces."""
+def read_base_mesh(
+    path: Path,
+) -> tuple[Float[np.ndarray, "V 3"], Float[np.ndarray, "T 2"], Groups]:
+    """Read an OBJ of quads, in its unit: vertices, texture coordinates, and groups of faces."""
     vertices, uv, groups, group = [], [], {}, ""
     for line in path.read_text("utf-8").splitlines():
         kind, *words = line.split() or [""]
@@ -193,11 +190,8 @@ def read_base_mesh(path: Path) -> BaseMesh:
             group = words[0]
         elif kind == "f":
             groups.setdefault(group, []).append([word.split("/")[:2] for word in words])
-    return BaseMesh(
-        np.array(vertices, np.float64),
-        np.array(uv, np.float64),
-        {name: np.array(faces, np.int64) - 1 for name, faces in groups.items()},
-    )
+    quads = {name: np.array(faces, np.int64) - 1 for name, faces in groups.items()}
+    return np.array(vertices, np.float64), np.array(uv, np.float64), quads
 
 
 def joint_positions(

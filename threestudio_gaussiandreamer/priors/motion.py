@@ -80,11 +80,8 @@ FRAME = satisfies(
 )
 
 
-class Choice(NamedTuple):
-    """One frame of one motion."""
-
-    sample: int
-    frame: int
+Choice = tuple[int, int]
+"""A motion and one of its frames."""
 
 
 JOINT_COUNTS = (22, 24)
@@ -229,7 +226,7 @@ class MotionPrior(Prior):
             info(f"{self.cfg.motion}: {', '.join(sorted(set(motions.texts)))}")
         choices = offered_frames(motions, self.cfg.sample, self.cfg.frame, self.cfg.num_frames)
         targets = np.stack([motions.positions[choice] for choice in choices])
-        names = [f"motion {choice.sample}, frame {choice.frame}" for choice in choices]
+        names = [f"motion {sample}, frame {frame}" for sample, frame in choices]
         best = 0
         if len(choices) > 1:
             _, rough = self._fitted(model, targets, ROUGH)
@@ -288,10 +285,10 @@ def offered_frames(
         )
     if frame != "clip":
         require_frame(frame, motions.lengths[sample or 0], f"motion {sample or 0}")
-        return [Choice(sample or 0, frame)]
+        return [(sample or 0, frame)]
     samples = range(count) if sample is None else [sample]
     return [
-        Choice(s, int(f))
+        (s, int(f))
         for s in samples
         for f in np.unique(np.linspace(0, motions.lengths[s] - 1, num_frames).round())
     ]

@@ -153,18 +153,10 @@ def normalized(cloud: PointCloud, scale: float) -> PointCloud:
     return cloud._replace(points=(points - centre) * (scale / (longest_side(finite) / 2 or 1.0)))
 
 
-def read_ply(path: Path) -> PointCloud:
-    return read_points(path, allow_non_finite=True)
-
-
 def read_npz(path: Path) -> PointCloud:
     """Read the arrays ``points`` (P, 3) and optionally ``colors`` (P, 3) and ``normals`` (P, 3)."""
     arrays = read_arrays(path, "point cloud", ["points"], ["colors", "normals"])
     return _cloud(path, arrays["points"], arrays.get("colors"), arrays.get("normals"))
-
-
-def read_npy(path: Path) -> PointCloud:
-    return _from_columns(path, read_arrays(path, "point cloud", ["rows"])["rows"])
 
 
 def read_text(path: Path) -> PointCloud:
@@ -228,8 +220,8 @@ def _cloud(path: Path, points: np.ndarray, colors=None, normals=None) -> PointCl
 
 
 READERS: dict[str, Callable[[Path], PointCloud]] = {
-    ".ply": read_ply,
+    ".ply": lambda path: read_points(path, allow_non_finite=True),
     ".npz": read_npz,
-    ".npy": read_npy,
+    ".npy": lambda path: _from_columns(path, read_arrays(path, "point cloud", ["rows"])["rows"]),
     **dict.fromkeys([".xyz", ".txt", ".pts", ".csv"], read_text),
 }

@@ -166,7 +166,12 @@ class PointEPrior(Prior):
         self, condition: Float[Tensor, "1 D"], rng: torch.Generator
     ) -> Float[Tensor, "1 6 N"]:
         model = kept_network(BASE, self._checkpoint(), condition.device)
-        require_features(model, condition, self.cfg.clip)
+        given, expected = condition.shape[-1], model.clip_embed.in_features
+        if given != expected:
+            raise UserError(
+                f"clip: {self.cfg.clip!r} has {given} features, but the checkpoint was trained "
+                f"with {expected}: use ViT-L/14"
+            )
         scale, none = self.cfg.guidance_scale, torch.zeros_like(condition)
         # with guidance a second row, the unconditional one
         conditions = condition if scale == 1 else torch.cat([condition, none])
@@ -205,9 +210,7 @@ def mean_of(network: Network) -> Network:
 
 
 def kept_network(kind: Kind, path: str, device: torch.device) -> Any:
-    """Return the network of :func:`load_network` on ``device``, loaded once if the process keeps
-    its networks (``models/loaded.py``).
-    """
+    """Return the network of :func:`load_network` on ``device``, see ``models/loaded.py``."""
     return loaded((kind.title, path, device), lambda: load_network(kind, path).to(device))
 
 
@@ -228,13 +231,3 @@ def load_network(kind: Kind, path: str) -> Any:
     network = kind.network(**sizes, features=projection.shape[1])
     load_exactly(network, state, f"{kind.title} {path!r}")
     return network.eval().requires_grad_(False)
-
-
-def require_features(model: BaseModel, condition: Float[Tensor, "1 D"], clip: str) -> None:
-    """Raise UserError unless CLIP's features have the size that the model was trained with."""
-    expected = model.clip_embed.in_features
-    if condition.shape[-1] != expected:
-        raise UserError(
-            f"clip: {clip!r} has {condition.shape[-1]} features, but the checkpoint was "
-            f"trained with {expected}: use ViT-L/14"
-        )

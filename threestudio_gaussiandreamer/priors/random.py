@@ -32,12 +32,7 @@ def in_sphere(count: int, generator: np.random.Generator) -> Float[np.ndarray, "
     return directions * np.cbrt(generator.random((count, 1)))
 
 
-def in_box(count: int, generator: np.random.Generator) -> Float[np.ndarray, "P 3"]:
-    """Return points uniform in the cube [-1, 1]³."""
-    return generator.uniform(-1.0, 1.0, (count, 3))
-
-
-SHAPES = {"sphere": in_sphere, "box": in_box}
+SHAPES = {"sphere": in_sphere, "box": lambda count, rng: rng.uniform(-1.0, 1.0, (count, 3))}
 OWN_COLOR = satisfies(
     "'random', 'grey' or [red, green, blue] in [0, 1], since random points have no colours of "
     "their own",

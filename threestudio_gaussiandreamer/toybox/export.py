@@ -48,9 +48,9 @@ def export(training: Path, target: Path) -> dict[str, Any]:
     """
     tokenizer = open_tokenizer(training)
     clip = trained_clip(training, len(tokenizer), "clip")
-    write_stable_diffusion(target / "stable-diffusion", training, clip)
     _save(clip, target / "clip")
     copy_tokenizer(training / "tokenizer", target / "clip")
+    write_stable_diffusion(target / "stable-diffusion", training, clip)
     for name in ("points", "judge"):
         if is_trained(training, name):
             write_weights(target / f"{name}.safetensors", averaged_weights(training, name))
