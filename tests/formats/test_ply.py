@@ -8,7 +8,7 @@ import pytest
 from tests.helpers.ply_files import cloud, gaussians, header, rng, saved, write_raw_gaussians
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.formats import ply
-from threestudio_gaussiandreamer.formats.ply_table import write_table
+from threestudio_gaussiandreamer.formats.ply import write_table
 from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians, usable
 
 

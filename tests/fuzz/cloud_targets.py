@@ -14,7 +14,7 @@ from tests.fuzz.target import (
     same,
     strictly,
 )
-from threestudio_gaussiandreamer.formats import ply, ply_table
+from threestudio_gaussiandreamer.formats import ply
 from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
 from threestudio_gaussiandreamer.priors.gaussians import GaussiansPrior
 from threestudio_gaussiandreamer.priors.point_cloud import PointCloudPrior
@@ -31,7 +31,7 @@ def ply_bytes(
     columns: dict[str, tuple[str, np.ndarray]], encoding: str, faces: bool = False
 ) -> bytes:
     """A PLY of any encoding, with an element of lists before the vertices if asked for."""
-    order = ply_table.BYTE_ORDERS[encoding]
+    order = ply.BYTE_ORDERS[encoding]
     count = len(next(iter(columns.values()))[1])
     lines = ["ply", f"format {encoding} 1.0", "comment made for fuzzing"]
     lines += (
@@ -46,10 +46,7 @@ def ply_bytes(
     ]
     rows = np.empty(
         count,
-        [
-            (name, (order or "<") + ply_table.NUMBER_TYPES[kind])
-            for name, (kind, _) in columns.items()
-        ],
+        [(name, (order or "<") + ply.NUMBER_TYPES[kind]) for name, (kind, _) in columns.items()],
     )
     for name, (_, values) in columns.items():
         rows[name] = values

@@ -4,8 +4,11 @@ from pathlib import Path
 
 import numpy as np
 
-from threestudio_gaussiandreamer.formats.ply import gaussian_columns, gaussian_properties
-from threestudio_gaussiandreamer.formats.ply_table import write_table
+from threestudio_gaussiandreamer.formats.ply import (
+    gaussian_columns,
+    gaussian_properties,
+    write_table,
+)
 from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
 from threestudio_gaussiandreamer.gaussians.point_cloud import PointCloud
 

@@ -12,7 +12,7 @@ from tests.helpers.ply_files import write_raw_gaussians
 from tests.priors.priors_cases import build, rng
 from threestudio_gaussiandreamer import priors
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.formats import ply, ply_table
+from threestudio_gaussiandreamer.formats import ply
 from threestudio_gaussiandreamer.host import find
 from threestudio_gaussiandreamer.priors.base import preflight_prior
 
@@ -160,7 +160,7 @@ class TestPointCloud:
             np.savetxt(path, rows)
         else:
             properties = [(name, "float") for name in (*ply.MEANS, *ply.COLORS)]
-            ply_table.write_table(path, properties, rows.astype(np.float32))
+            ply.write_table(path, properties, rows.astype(np.float32))
         return path
 
     def test_normalize(self, tmp_path):

@@ -27,7 +27,7 @@ from ..core.files import atomic_file, existing_file
 from ..gaussians.gaussians import Gaussians, finite
 from ..gaussians.sh import COEFFICIENTS, rgb_to_sh0, sh0_to_rgb
 from . import packing
-from .ply_table import BYTE_ORDERS, Element, read_header
+from .ply import BYTE_ORDERS, Element, read_header
 
 logger = logging.getLogger(__name__)
 CHUNK = 256

@@ -8,20 +8,30 @@ vertex colour, else vertex, face or material colour, else grey 0.5. All values a
 
 ``up="auto"`` is +y for glTF, OBJ and other modelling formats and +z for PLY, STL and OFF. The front
 is the axis after the up axis (x -> y -> z -> x), which is +z for y-up files, as glTF says, and +x
-for z-up ones."""
+for z-up ones.
 
+glTF is read by ``gltf.py``, PLY here, and other formats (OBJ, STL, OFF, ...) by trimesh, after a
+check of what it would ignore silently or read wrongly. A PLY has polygons of any and of mixed
+numbers of corners, colours of vertices or faces, and texture coordinates of vertices (Blender) or
+of the corners of faces (MeshLab). There is no standard for its textures: their names are in
+comments ``TextureFile``, which Blender doesn't write."""
+
+import functools
+import io
 import logging
+import re
 from pathlib import Path
-from typing import Optional
+from typing import Any, Optional
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from ..core.errors import UserError, unknown
 from ..core.files import existing_file
-from .gltf import read_gltf
-from .mesh import MAX_NON_FINITE, Mesh, face_areas, merged
-from .ply_mesh import read_ply_mesh
-from .trimesh_reader import read_with_trimesh
+from ..formats.ply import COLORS, MEANS, Lists, PlyTable, read_comments, read_faces, unit_colors
+from .gltf import LARGEST_UV, read_gltf
+from .mesh import GREY, MAX_NON_FINITE, Mesh, face_areas, linear_to_srgb, merged, unit_rgb
+from .side_files import Budget, SideFiles, decode_image, decode_texture, fail, open_texture, utf8
 
 GLTF_FORMATS = ("glb", "gltf")
 Z_UP_FORMATS = ("ply", "stl", "off", "xyz")
@@ -34,6 +44,30 @@ AXES = {
 ASSETS = Path(__file__).parents[1] / "assets"
 
 log = logging.getLogger(__name__)
+INDICES = ("vertex_indices", "vertex_index")
+COORDINATES = (("s", "t"), ("u", "v"), ("texture_u", "texture_v"))
+"""Of vertices, by the names that programs give them."""
+OF_CORNERS, TEXTURE_NUMBER, TEXTURE_FILE = "texcoord", "texnumber", "TextureFile "
+MATERIALS = "materials"
+"""The name by which trimesh asks for the joined material libraries of an OBJ; all other files that
+it asks for are textures.
+"""
+UNSET_COLOR = (102, 102, 102)
+"""trimesh's default for materials without a colour; ignored, since it would darken the texture."""
+
+LIBRARIES = re.compile(rb"^[ \t]*mtllib[ \t]+(.*)$", re.MULTILINE)
+END_OF_NAME = re.compile(r"(?<=\.mtl)[\"']?\s+", re.IGNORECASE)
+"""Between the names of libraries on one line; names may have spaces."""
+MATERIAL = re.compile(rb"^[ \t]*newmtl[ \t]+(.*?)\s*$", re.MULTILINE)
+MATERIAL_USED = re.compile(rb"^[ \t]*usemtl\b", re.MULTILINE)
+# No text matches one of these patterns in two ways: backtracking on a long line would take
+# quadratic time.
+NUMBER = rb"[-+]?(?:\d+(?:\.\d*)?(?:[eE][-+]?\d+)?|\.\d+(?:[eE][-+]?\d+)?|nan|inf)"
+CORNER = rb"-?[1-9]\d*(?:/(?:-?[1-9]\d*)?){0,2}"
+ENTRY = rb"(?:[ \t]+%b)" % NUMBER
+FIRST_VERTEX = re.compile(rb"^v (.*)$", re.MULTILINE)
+ROWS_AND_FACES = re.compile(rb"^(v|vt|vn|f) (.*)$", re.MULTILINE)
+RELATIVE_FACE = re.compile(rb"^f .*-", re.MULTILINE)
 
 
 def load_mesh(
@@ -185,3 +219,411 @@ def pose_rotation(extension: str, up: str, front: Optional[str]) -> np.ndarray:
             f"the front of a mesh can't lie along its up axis: up is {up}, front is {front}"
         )
     return np.stack([AXES[front], np.cross(AXES[up], AXES[front]), AXES[up]])
+
+
+# PLY
+# --------------------------------------------------------------------------------------------------
+
+
+def read_ply_mesh(path: Path) -> list[Mesh]:
+    """Read the parts of a PLY, one for each texture; points have no faces.
+
+    Raises:
+        UserError: the file is damaged or exceeds its budget.
+    """
+    budget, table, faces = Budget(path), PlyTable.read(path), read_faces(path)
+    if missing := [name for name in MEANS if name not in table]:
+        fail(path, f"its vertices have no {', '.join(missing)}")
+    vertices = table.doubles(MEANS)
+    corners = next((faces[name] for name in INDICES if name in faces), Lists(*np.zeros((2, 0))))
+    triangles, polygons = _triangles(corners)
+    budget.spend_geometry(len(vertices), len(triangles))
+    known = (corners.values >= 0) & (corners.values < len(vertices)) & (corners.values % 1 == 0)
+    if not known.all():
+        wrong = corners.values[~known][0]
+        fail(path, f"it is damaged: a face names vertex {wrong:g} of {len(vertices)}")
+    indices = corners.values.astype(np.int64)
+    mesh = Mesh(vertices, indices[triangles])
+    if all(name in table for name in COLORS):
+        colors = unit_colors(table[COLORS], table.stored_type(COLORS[0]), path)
+        mesh = mesh._replace(vertex_colors=_finite(colors, path))
+    elif all(name in faces for name in COLORS):
+        colors = np.stack([faces[name].values for name in COLORS], axis=1)
+        full = 255 if colors.max(initial=0) > 1 else 1
+        mesh = mesh._replace(face_colors=unit_rgb(colors[polygons] / full))
+    uv = _corner_coordinates(table, faces, corners, indices)
+    if uv is None or not len(triangles):
+        return [mesh]
+    numbers = faces[TEXTURE_NUMBER].values if TEXTURE_NUMBER in faces else np.zeros(len(polygons))
+    return _textured(mesh, triangles, indices, uv, numbers[polygons], budget)
+
+
+def _triangles(
+    corners: Lists,
+) -> tuple[Int[np.ndarray, "T 3"], Int[np.ndarray, " T"]]:
+    """Divide polygons into fans; return the positions of the triangles' corners among all corners,
+    and the polygon of each triangle.
+    """
+    lengths = corners.lengths.astype(np.int64)
+    counts = np.maximum(lengths - 2, 0)
+    polygons = np.repeat(np.arange(len(lengths)), counts)
+    first = np.repeat(np.cumsum(lengths) - lengths, counts)
+    second = first + 1 + np.arange(len(polygons)) - np.repeat(np.cumsum(counts) - counts, counts)
+    return np.stack([first, second, second + 1], axis=1), polygons
+
+
+def _finite(colors: Float[np.ndarray, "V 3"], path: Path) -> Float[np.ndarray, "V 3"]:
+    """Return the colours with grey for those that aren't finite, if they are few."""
+    finite = np.isfinite(colors).all(axis=1)
+    if (bad := int((~finite).sum())) > MAX_NON_FINITE * len(finite):
+        raise UserError(
+            f"{bad} of {len(finite)} colours of {str(path)!r} aren't finite (at most 5 % may "
+            "be): export the mesh again"
+        )
+    if bad:
+        log.warning(
+            "%d of %d colours of %s aren't finite: they become grey", bad, len(finite), path
+        )
+    return np.where(finite[:, None], colors, np.float32(GREY))
+
+
+def _corner_coordinates(
+    table: PlyTable, faces: dict[str, Lists], corners: Lists, indices: Int[np.ndarray, " C"]
+) -> Optional[Float[np.ndarray, "C 2"]]:
+    """Return the texture coordinates of all corners, or None."""
+    of_corners = faces.get(OF_CORNERS)
+    if of_corners is not None and (of_corners.lengths == 2 * corners.lengths).all():
+        uv = of_corners.values.reshape(-1, 2)
+    else:
+        named = [names for names in COORDINATES if all(name in table for name in names)]
+        if not named:
+            return None
+        uv = table.doubles(named[0])[indices]
+    return np.nan_to_num(uv).clip(-LARGEST_UV, LARGEST_UV).astype(np.float32)
+
+
+def _textured(
+    mesh: Mesh,
+    triangles: Int[np.ndarray, "T 3"],
+    indices: Int[np.ndarray, " C"],
+    uv: Float[np.ndarray, "C 2"],
+    numbers: Float[np.ndarray, " T"],
+    budget: Budget,
+) -> list[Mesh]:
+    """Return a part for each texture: the triangles with its number, with vertices divided where
+    their coordinates differ. Triangles without a texture keep their colours.
+    """
+    path, files = budget.path, SideFiles(budget.path, budget)
+    names = [
+        comment[len(TEXTURE_FILE) :].strip()
+        for comment in read_comments(path)
+        if comment.lower().startswith(TEXTURE_FILE.lower())
+    ]
+    if not names:
+        log.warning(
+            "%s has texture coordinates but names no texture, which isn't shown: add the line "
+            "'comment %sNAME.png' to its header, or save the mesh as GLB",
+            path,
+            TEXTURE_FILE,
+        )
+    parts = []
+    for number in np.unique(numbers):
+        rows = numbers == number
+        name = names[int(number)] if 0 <= number < len(names) else None
+        content = None if name is None else files.read(name)
+        if content is None:
+            colors = None if mesh.face_colors is None else mesh.face_colors[rows]
+            parts.append(mesh._replace(faces=mesh.faces[rows], face_colors=colors))
+            continue
+        corners = triangles[rows].ravel()
+        keys = np.column_stack([indices[corners], uv[corners]])
+        _, kept, places = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+        used = corners[kept]
+        parts.append(
+            Mesh(
+                mesh.vertices[indices[used]],
+                places.reshape(-1, 3),
+                uv=uv[used],
+                texture=decode_texture(content, repr(name[:80]), budget),
+            )
+        )
+    return parts
+
+
+# Other formats, by trimesh
+# --------------------------------------------------------------------------------------------------
+
+
+def read_with_trimesh(path: Path) -> list[Mesh]:
+    """Read the parts of a file, transformed by its scene graph; parts that consist of points have
+    no faces.
+
+    Raises:
+        UserError: the file is damaged, exceeds its budget, or references something that isn't a
+            regular file.
+    """
+    try:
+        return [_require_fitting(part, path) for part in _parts(path, Budget(path))]
+    except UserError:
+        raise
+    except Exception as error:  # trimesh's readers raise exceptions of many types
+        fail(path, f"{type(error).__name__}: {error}")
+
+
+def _parts(path: Path, budget: Budget) -> list[Mesh]:
+    import trimesh
+
+    files, content = _Resolver(path, budget), path.read_bytes()
+    if path.suffix.lower() == ".obj":
+        content = files.with_libraries(_checked_obj(utf8(content), path))
+    elif path.suffix.lower() == ".stl":
+        content = _exact_stl(content, path)
+    scene = trimesh.load_scene(
+        io.BytesIO(content),
+        file_type=path.suffix.lower().lstrip("."),
+        resolver=files,
+        process=False,
+    )
+    if files.refused:
+        raise files.refused
+    if path.suffix.lower() == ".off":
+        _add_off_colors(scene, content.decode("utf-8-sig", errors="replace"), path)
+    parts = []
+    for node in scene.graph.nodes_geometry:
+        world, name = scene.graph[node]
+        geometry = scene.geometry[name]
+        if len(getattr(geometry, "vertices", ())):
+            part = _colored(_surface(geometry, path, budget), geometry, files)
+            parts.append(part._replace(vertices=_placed(part.vertices, world)))
+    return parts
+
+
+def _checked_obj(data: bytes, path: Path) -> bytes:
+    """Return an OBJ whose lines of vertices and faces are valid, since trimesh stops reading at the
+    first text that isn't a number, and whose faces count from the first vertex.
+    """
+    text = data.replace(b"\\\r\n", b"").replace(b"\\\n", b"")
+    first = FIRST_VERTEX.search(text)
+    if wrong := _wrong_obj_line(len(first[1].split()) if first else 3).search(text):
+        number = text.count(b"\n", 0, wrong.start()) + 1
+        fail(
+            path, f"line {number} is no vertex or face: {wrong[0][:80].decode(errors='replace')!r}"
+        )
+    if not RELATIVE_FACE.search(text):
+        return text
+    counts = {b"v": 0, b"vt": 0, b"vn": 0}
+
+    def absolute(number: bytes, count: int) -> bytes:
+        if not number.startswith(b"-"):
+            return number
+        if int(number) < -count:
+            fail(path, f"a face names number {int(number)} of {count} vertices")
+        return b"%d" % (count + 1 + int(number))
+
+    def line(found: re.Match[bytes]) -> bytes:
+        if found[1] in counts:
+            counts[found[1]] += 1
+            return found[0]
+        corners = (zip(x.split(b"/"), counts.values(), strict=False) for x in found[2].split())
+        return b"f " + b" ".join(b"/".join(absolute(*x) for x in corner) for corner in corners)
+
+    return ROWS_AND_FACES.sub(line, text)
+
+
+@functools.cache
+def _wrong_obj_line(width: int) -> re.Pattern[bytes]:
+    """Return a pattern of lines that begin like a vertex or face but are not valid.
+
+    A vertex has 3 numbers, or 6 with its colour. If the first vertex has 4 (with a weight) or 7
+    (with alpha), all must have as many: trimesh splits the numbers of all vertices into rows of the
+    first one's width without checking each line."""
+    vertex = b"%b{%d}" % (ENTRY, width) if width in (4, 7) else b"%b{3}(?:%b{3})?" % (ENTRY, ENTRY)
+    right = rb"v(?= )%b|vt(?= )%b{2,3}|vn(?= )%b{3}|vp .*|f(?= )(?:[ \t]+%b){3,}" % (
+        vertex,
+        ENTRY,
+        ENTRY,
+        CORNER,
+    )
+    return re.compile(
+        rb"^(?=[ \t]*[vf])(?!(?:%b)[ \t]*\r?$).*$" % right, re.MULTILINE | re.IGNORECASE
+    )
+
+
+def _exact_stl(data: bytes, path: Path) -> bytes:
+    """Return a binary STL without what follows its last triangle, and an STL of text as it is."""
+    if b"facet" in data[:1024] or b"endsolid" in data[:1024]:
+        return data
+    size = 84 + 50 * int.from_bytes(data[80:84], "little")
+    if len(data) < size:
+        fail(path, f"it is truncated or damaged: {size} bytes were expected, not {len(data)}")
+    return data[:size]
+
+
+def _add_off_colors(scene: Any, text: str, path: Path) -> None:
+    """Set the colours of an OFF file's vertices, which trimesh doesn't read; log a warning for
+    others, such as those of faces.
+    """
+    (kind, *counts), *lines = filter(
+        None, (line.partition("#")[0].split() for line in text.splitlines())
+    )
+    (vertices, faces, *_), *lines = [counts, *lines] if counts else lines
+    rows, polygons = lines[: int(vertices)], lines[int(vertices) :][: int(faces)]
+    colors = _rgb_of([row[3:] for row in rows]) if kind.upper() in ("OFF", "COFF") else None
+    has_more = "C" in kind.upper() or kind.upper() == "OFF" and any(len(row) > 3 for row in rows)
+    of_faces = any(len(polygon) > int(polygon[0]) + 1 for polygon in polygons)
+    if of_faces or has_more and colors is None:
+        what = "faces" if of_faces else "vertices"
+        log.warning(
+            "%s: the colours of its %s aren't read; convert it to PLY to keep them", path, what
+        )
+    if colors is not None:
+        (geometry,) = scene.geometry.values()
+        geometry.visual.vertex_colors = colors
+
+
+def _rgb_of(rows: list[list[str]]) -> Optional[np.ndarray]:
+    """Return colours, written from 0 to 1 or to 255, as bytes; None if not every row has one."""
+    try:
+        colors = np.array([row[:3] for row in rows], float).reshape(-1, 3)
+    except ValueError:  # of other lengths, or no numbers
+        return None
+    if len(colors) < len(rows) or not np.isfinite(colors).all():
+        return None
+    return (colors * (255 if colors.max() <= 1 else 1)).round().clip(0, 255).astype(np.uint8)
+
+
+class _Resolver:
+    """Resolver through which trimesh reads the files that a mesh references.
+
+    trimesh catches the exceptions raised here, so the first UserError is kept in ``refused``.
+    """
+
+    def __init__(self, path: Path, budget: Budget) -> None:
+        self.budget, self.file_name = budget, path.name
+        self.refused: Optional[UserError] = None
+        self._files = SideFiles(path, budget)
+        self._pictures: dict[int, tuple[Any, np.ndarray]] = {}
+        self._materials = b""
+
+    def with_libraries(self, content: bytes) -> bytes:
+        """Read all material libraries of an OBJ, of which trimesh reads one; return the OBJ with
+        the joined one. A single material that no line uses is that of all faces.
+        """
+        lines = [utf8(line).decode() for line in LIBRARIES.findall(content)]
+        names = [name for line in lines for name in END_OF_NAME.split(line.strip())]
+        found = [self._files.read(name) for name in names]
+        self._materials = b"\n".join(utf8(text) for text in found if text is not None)
+        head, known = f"mtllib {MATERIALS}\n".encode(), MATERIAL.findall(self._materials)
+        if len(known) == 1 and not MATERIAL_USED.search(content):
+            head += b"usemtl " + known[0] + b"\n"
+        return head + LIBRARIES.sub(b"", content)
+
+    def get(self, name: str) -> bytes:
+        if name == MATERIALS:
+            return self._materials
+        # options stand before the name of a texture, which may have spaces: -clamp on a 1.png
+        ends = [word.end() for word in re.finditer(r"\s+", name) if name.startswith("-")]
+        try:
+            content = self._files.read(name, *(name[end:] for end in ends))
+            if content is not None:
+                # trimesh would read the part without a texture that can't be opened
+                open_texture(content, repr(name[:80]), self.budget)
+        except UserError as error:
+            self.refused = self.refused or error
+            raise
+        if content is None:
+            raise FileNotFoundError(name)
+        return content
+
+    __getitem__ = get
+
+    def picture(self, image: Any) -> np.ndarray:
+        """Decode an image that trimesh has opened; each image is decoded once."""
+        if id(image) not in self._pictures:  # the image is kept, so that its id isn't reused
+            name = str(image.info.get("file_path", ""))[:80]
+            self._pictures[id(image)] = image, decode_image(image, repr(name), self.budget)
+        return self._pictures[id(image)][1]
+
+
+def _placed(vertices: np.ndarray, world: np.ndarray) -> np.ndarray:
+    if np.array_equal(world, np.eye(4)):
+        return vertices
+    return vertices @ world[:3, :3].T + world[:3, 3]
+
+
+def _surface(geometry: Any, path: Path, budget: Budget) -> Mesh:
+    """Return vertices and faces of a geometry of trimesh."""
+    vertices = np.array(geometry.vertices, dtype=np.float64)
+    faces = np.asarray(getattr(geometry, "faces", np.zeros((0, 3))), dtype=np.int64)
+    budget.spend_geometry(len(vertices), len(faces))
+    if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.shape[1:] != (3,):
+        fail(
+            path,
+            f"it is damaged: vertices {vertices.shape} and faces {faces.shape} aren't of three "
+            "numbers",
+        )
+    if len(faces) and (faces.min() < 0 or faces.max() >= len(vertices)):
+        fail(path, f"it is damaged: a face names vertex {faces.max()} of {len(vertices)}")
+    return Mesh(vertices=vertices, faces=faces)
+
+
+def _colored(part: Mesh, geometry: Any, files: _Resolver) -> Mesh:
+    """Return the part with the texture, vertex colours or face colours of trimesh's geometry."""
+    visual = geometry.visual
+    if not len(part.faces):
+        colors = getattr(geometry, "colors", None)
+        usual = colors is not None and len(colors) == len(part.vertices)
+        return part._replace(vertex_colors=unit_rgb(colors)) if usual else part
+    if visual.kind == "texture":
+        return _with_material(part, visual, files)
+    if visual.kind == "vertex":
+        return part._replace(vertex_colors=unit_rgb(visual.vertex_colors))
+    if visual.kind == "face":
+        return part._replace(face_colors=unit_rgb(visual.face_colors))
+    return part
+
+
+def _with_material(part: Mesh, visual: Any, files: _Resolver) -> Mesh:
+    """Return the part with its texture multiplied by the material's colour, or with that colour
+    alone. Black with a texture is ignored, as programs write it that don't multiply.
+    """
+    texture, tint = _texture(visual.material, files), _tint(visual.material)
+    if tint is not None and (texture is None or tint.any()):
+        part = part._replace(vertex_colors=np.broadcast_to(tint, part.vertices.shape))
+    if texture is None or visual.uv is None:
+        return part
+    uv = np.nan_to_num(np.asarray(visual.uv, dtype=np.float32)[:, :2])
+    return part._replace(uv=uv.clip(-LARGEST_UV, LARGEST_UV), texture=texture)
+
+
+def _texture(material: Any, files: _Resolver) -> Optional[np.ndarray]:
+    """Return the colour texture of a material, or None if it has none.
+
+    For an OBJ with coordinates but without a material trimesh creates a grey image, which is
+    recognised by its missing file format and ignored.
+    """
+    image = getattr(material, "image", getattr(material, "baseColorTexture", None))
+    return None if getattr(image, "format", None) is None else files.picture(image)
+
+
+def _tint(material: Any) -> Optional[np.ndarray]:
+    """Return the material's colour (3,) as sRGB values in [0, 1], or None if it has none."""
+    linear = hasattr(material, "baseColorFactor")
+    tint = getattr(material, "baseColorFactor" if linear else "diffuse", None)
+    if tint is None or tuple(np.asarray(tint)[:3]) == UNSET_COLOR:
+        return None
+    tint = unit_rgb(np.asarray(tint)[None])[0]
+    return linear_to_srgb(tint) if linear else tint
+
+
+def _require_fitting(part: Mesh, path: Path) -> Mesh:
+    """Return the part after checking that its colours have one row per vertex or face."""
+    count = {
+        "uv": (len(part.vertices), 2),
+        "vertex_colors": (len(part.vertices), 3),
+        "face_colors": (len(part.faces), 3),
+    }
+    for name, shape in count.items():
+        if (values := getattr(part, name)) is not None and values.shape != shape:
+            fail(path, f"it is damaged: its {name} are {values.shape}, {shape} was expected")
+    return part

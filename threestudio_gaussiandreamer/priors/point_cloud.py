@@ -34,8 +34,7 @@ from ..core.errors import UserError, unknown
 from ..core.files import existing_file
 from ..formats.array_files import read_arrays
 from ..formats.gaussian_files import ply_up
-from ..formats.ply import is_gaussian_ply, read_points, unit_colors
-from ..formats.ply_table import read_header
+from ..formats.ply import is_gaussian_ply, read_header, read_points, unit_colors
 from ..formats.producers import GAUSSIANS, MESH
 from ..gaussians.axes import FRONTS
 from ..gaussians.grow import longest_side

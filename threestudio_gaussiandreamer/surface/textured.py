@@ -24,7 +24,7 @@ from ..core.errors import UserError
 from ..core.extras import require_extra
 from ..core.logs import warn
 from ..core.memory import require_memory
-from ..core.options import Rule, at_least, check_options, in_range, one_of, satisfies
+from ..core.options import Rule, at_least, check_options, in_range, is_whole, one_of, satisfies
 from ..gaussians.gaussians import Gaussians, finite, opaque
 from ..gaussians.surface import MIN_OPACITY, gaussian_surface
 from ..gaussians.views import EPS2D, views_around
@@ -46,11 +46,8 @@ DISTANCE = 1.2
 
 
 def whole(low: int, high: int, unit: str) -> Rule:
-    """Accept whole numbers from ``low`` to ``high``."""
-    return satisfies(
-        f"a whole number from {low} to {high} ({unit})",
-        lambda v: isinstance(v, int) and not isinstance(v, bool) and low <= v <= high,
-    )
+    expected = f"a whole number from {low} to {high} ({unit})"
+    return satisfies(expected, lambda v: is_whole(v) and low <= v <= high)
 
 
 @dataclass

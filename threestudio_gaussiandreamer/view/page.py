@@ -22,8 +22,7 @@ import numpy as np
 from ..core.errors import UserError
 from ..core.files import atomic_file
 from ..formats.gaussian_files import StoredCloud, ply_notes, spz_note
-from ..formats.ply import gaussian_properties
-from ..formats.ply_table import header_bytes
+from ..formats.ply import gaussian_properties, header_bytes
 from ..formats.spz import SPZ_UP, spz_bytes
 from ..gaussians.axes import WORLD_UP, rotation_between
 from ..gaussians.gaussians import finite
