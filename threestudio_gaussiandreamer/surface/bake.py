@@ -23,7 +23,7 @@ from tqdm import tqdm
 from ..formats.packing import morton_order
 from ..meshes.mesh import Mesh
 from ..meshes.raycast import MeshCaster
-from .closed import unit
+from .closed import Faces, Vertices, unit
 from .fusion import Renders
 
 XATLAS_FACES = 5000
@@ -63,18 +63,14 @@ def faces_that_fit(size: int) -> int:
     return max(XATLAS_FACES, 2 * (size // SMALLEST_CELL) ** 2)
 
 
-def unwrap(
-    vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"], size: int
-) -> Unwrapped:
+def unwrap(vertices: Vertices, faces: Faces, size: int) -> Unwrapped:
     """Unwrap a mesh to a texture of size x size texels."""
     if len(faces) <= XATLAS_FACES:
         return in_charts(vertices, faces, size)
     return in_grid(vertices, faces, size)
 
 
-def in_charts(
-    vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"], size: int
-) -> Unwrapped:
+def in_charts(vertices: Vertices, faces: Faces, size: int) -> Unwrapped:
     """Unwrap a mesh to charts of few seams."""
     import xatlas
 
@@ -90,9 +86,7 @@ def in_charts(
     return Unwrapped(rows.astype(np.int64), index.astype(np.int64), uv.astype(np.float64))
 
 
-def in_grid(
-    vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"], size: int
-) -> Unwrapped:
+def in_grid(vertices: Vertices, faces: Faces, size: int) -> Unwrapped:
     """Unwrap a mesh to two triangles per cell of a grid; the longest edge is the hypotenuse."""
     across = math.ceil(math.sqrt(math.ceil(len(faces) / 2)))
     cell = size // across
