@@ -32,11 +32,10 @@ enable_memory_efficient_attention   torch's own attention is so already; accepte
 View contrast is eps_c' = eps_c + view_contrast (eps_c - eps_o), where o is the prompt of the view
 from the other side of the object: "front view" for "back view", and "left side view" for "right
 side view" where the prompts tell these apart. It is the negation of a concept as in composable
-diffusion (Liu et al. 2022, arXiv:2206.01714), for models whose views of a prompt are alike; what it
-brings is measured in docs/toybox.md. Perp-Neg (Armandpour et al. 2023) takes away only what is
-perpendicular to eps_c - eps_u. Each view at or above the share ``CONTRAST_FROM`` of the timesteps,
-which decide the view, costs one more evaluation. It is part of guidance, so outside of
-``guidance_interval`` there is none.
+diffusion (Liu et al. 2022, arXiv:2206.01714), for models whose views of a prompt are alike;
+Perp-Neg (Armandpour et al. 2023) takes away only what is perpendicular to eps_c - eps_u. Each view
+at or above the share ``CONTRAST_FROM`` of the timesteps, which decide the view, costs one more
+evaluation. It is part of guidance, so outside of ``guidance_interval`` there is none.
 
 A UNet with ``time_cond_proj_dim`` takes the guidance scale as an input (Meng et al. 2023, "On
 Distillation of Guided Diffusion Models", arXiv:2210.03142), such as that of a latent consistency
