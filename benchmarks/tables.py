@@ -42,7 +42,7 @@ def readme_table() -> str:
     """Return the table of README.md: dB, differences and seconds for toy / spot / duck."""
     few = "1,500 Gaussians − all 10,000 of the paper's recipe"
     rows = (
-        ("the demo, held-out dB (5,000 Gaussians)", median_of("quality", "default")),
+        ("the demo, held-out dB", median_of("quality", "default")),
         ("the demo, CPU seconds of one thread",
          median_of("quality", "default", "cpu_seconds", digits=0)),
         ("`demo-draft.yaml` / `demo-best.yaml`, dB",

@@ -80,7 +80,6 @@ DIFFERENCES = (
                "by removal error 2500", "no pruning"),
     Difference("1,500, pruned in the loop − no pruning", "count",
                "by removal error 1500", "no pruning"),
-    Difference("`budget: auto` − no pruning", "count", "by removal error, auto", "no pruning"),
     Difference("1,500, pruned in the loop − 1,500 from scratch", "count",
                "by removal error 1500", "from scratch 1500"),
     Difference("1,500, by removal error − by opacity", "count",
