@@ -258,3 +258,13 @@ def test_the_prompt_of_an_own_object_is_its_files_name(overlay, overrides, promp
     cfg = load_config(*paths, cli_args=overrides)
     assert cfg.system.prompt_processor.prompt == prompt
     assert cfg.tag == prompt.replace(" ", "_")
+
+
+def test_a_removed_option_of_a_section_within_is_named_and_dropped(capsys):
+    cfg = load_config(
+        ROOT / "configs" / "demo.yaml", cli_args=["system.geometry.prune.quality=0.3"]
+    )
+    check_config(cfg)
+    said = "".join(capsys.readouterr())
+    assert "system.geometry.prune.quality is no option any more: budget=auto goes by" in said
+    assert "quality" not in cfg.system.geometry.prune

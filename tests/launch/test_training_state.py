@@ -47,7 +47,8 @@ def without(*keys: Any) -> Callable[[dict], None]:
 
 def empty_cloud(content: dict) -> None:
     state = content["state_dict"]
-    state |= {key: value[:0] for key, value in state.items() if key.startswith("geometry.")}
+    cloud = {key: value for key, value in state.items() if key.startswith("geometry.")}
+    state |= {key: value[:0] for key, value in cloud.items() if value.dim()}
 
 
 MEANS, ADAM = ("state_dict", "geometry.means"), ("optimizer_states", 0)

@@ -129,7 +129,7 @@ def require_learnt(weights: Any, what: str) -> None:
         UserError: it isn't a mapping of tensors.
     """
     weights = {} if weights is None else weights
-    values = weights.values() if isinstance(weights, Mapping) else [weights]
+    values = weights.values() if isinstance(weights, Mapping) else [None]
     if not all(isinstance(value, Tensor) for value in values):
         raise UserError(f"{what}: its guidance isn't a mapping of tensors")
 

@@ -4,7 +4,7 @@ and the built-in one), and the built-in host passes them to the classes."""
 import copy
 import re
 from collections.abc import Mapping
-from dataclasses import fields
+from dataclasses import fields, is_dataclass
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
@@ -83,7 +83,12 @@ def without_removed(config_class: Any, values: Any, path: str = "") -> Any:
         did_nothing = neutral(values[key]) if callable(neutral) else values[key] == neutral
         tell = info if did_nothing else warn
         tell(f"{path}{key} is no option any more: {now}")
-    return {key: values[key] for key in values if key not in found} if found else values
+    kept = {key: values[key] for key in values if key not in found}
+    for section in fields(config_class):
+        if is_dataclass(section.type) and isinstance(kept.get(section.name), Mapping):
+            nested = f"{path}{section.name}."
+            kept[section.name] = without_removed(section.type, kept[section.name], nested)
+    return kept
 
 
 def _problem(error: OmegaConfBaseException) -> str:

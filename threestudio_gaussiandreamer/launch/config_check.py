@@ -109,9 +109,7 @@ def check_part(path: str, type_name: Any, values: Any) -> None:
         require_dataclass(part)
     except UserError as error:
         raise UserError(f"{path}_type: {error}") from error
-    kept = without_removed(config_class, _mapping(path, values), f"{path}.")
-    for key in [key for key in values if key not in kept]:
-        values.pop(key)
+    _keep_only(without_removed(config_class, _mapping(path, values), f"{path}."), values)
     _check_keys(path, values, config_class)
     for key in values:  # before the part's own checks, whose messages don't name the key
         if key.endswith("_type") and key.removesuffix("_type") in values and values.get(key):
@@ -129,6 +127,15 @@ def check_part(path: str, type_name: Any, values: Any) -> None:
         if typed[key]:
             given = values.get(section)
             check_part(f"{path}.{section}", typed[key], typed[section] if given is None else given)
+
+
+def _keep_only(kept: Any, values: Any) -> None:
+    """Drop the keys that ``kept`` lacks, also from sections within."""
+    for key in list(values):
+        if key not in kept:
+            values.pop(key)
+        elif isinstance(kept[key], Mapping):
+            _keep_only(kept[key], values[key])
 
 
 def _default(config_class: type, key: str) -> Any:

@@ -3,17 +3,15 @@ describes them.
 """
 
 import contextlib
-import logging
 import math
 from dataclasses import dataclass, field
-from typing import Any, Optional
+from typing import Any, ClassVar
 
 from ..core.errors import UserError
 from ..core.options import at_least, between, in_range, is_whole, one_of, positive, shown
 from ..gaussians import importance
 
 AUTO = "auto"
-logger = logging.getLogger(__name__)
 
 
 @dataclass
@@ -43,13 +41,11 @@ class PruneConfig:
     score: str = field(default="removal", metadata=one_of(importance.SCORES))
     gain: float = field(default=0.5, metadata=between(0, 6, "dB"))
     likeness: float = field(default=40.0, metadata=at_least(0, "dB"))
-    quality: Optional[float] = None
+    REMOVED: ClassVar[dict[str, Any]] = {"quality": (0.1, "budget=auto goes by prune.gain")}
 
     @staticmethod
     def check(cfg: Any) -> None:
         require_order(cfg)
-        if cfg.quality is not None:
-            logger.warning("prune.quality is no longer used: budget=auto goes by prune.gain")
 
 
 def require_order(cfg: Any) -> None:
