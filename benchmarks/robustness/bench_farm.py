@@ -1,6 +1,6 @@
 """What a farm costs beside its assets: ``python -m benchmarks.robustness.bench_farm``.
 
-``ledger``: seconds and memory to start, resume and report with a ledger of many rows. ``speed``:
+``records``: seconds and memory to start, resume and report with many rows. ``speed``:
 farms of tiny guided assets with one and two workers: speed-up, seconds per asset that aren't the
 asset's, and how often a worker loads each network. Results: benchmarks/results/farm.csv.
 """
@@ -16,54 +16,47 @@ import tempfile
 import time
 from collections import defaultdict
 from collections.abc import Iterator
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, Optional
 
 from benchmarks.quality.runs import commit, machine
-from threestudio_gaussiandreamer.farm.ledger import FINISHED, RUNNING, Ledger
+from threestudio_gaussiandreamer.farm.place import FINISHED, Place
 from threestudio_gaussiandreamer.farm.report import write_report
 from threestudio_gaussiandreamer.farm.rows import check_rows, read_rows
-from threestudio_gaussiandreamer.farm.storage import Place
 
 ROOT = Path(__file__).resolve().parents[2]
 RESULTS = ROOT / "benchmarks/results/farm.csv"
 COLUMNS = ("measured", "rows", "workers", "value", "unit", "machine", "commit")
 
 
-# -- the ledger ------------------------------------------------------------------------------------
+# -- records ---------------------------------------------------------------------------------------
 
 
 def write_rows(folder: Path, count: int) -> None:
-    """Write a prompt list, and a ledger in which every second asset is finished."""
+    """Write a prompt list, and the results of every second asset."""
     with open(folder / "prompts.txt", "w") as file:
         file.writelines(f"a toy number {i} of a long list\n" for i in range(count))
     done = {"seconds": 600.0, "steps": 1200, "gaussians": 80_000, "megabytes": 9000.0}
     done |= {"hash": "0" * 64, "scores": {"psnr": 30.0}, "picture": "save/it1200-test/0.png"}
     done |= {"files": ["save/it1200-export/gaussians.ply", "save/it1200-export/gaussians.spz"]}
-    ledger = Ledger(folder / "ledger.jsonl")
-    for state, more in ((RUNNING, {}), (FINISHED, done)):
-        ledger.append(
-            {"name": row.name, "key": row.key, "state": state, **more}
-            for row in read_rows(folder / "prompts.txt")
-            if state == RUNNING or row.line % 2
-        )
-    ledger.close()
+    for row in read_rows(folder / "prompts.txt"):
+        asset = folder / "assets" / row.name
+        asset.mkdir(parents=True)
+        if row.line % 2:
+            (asset / "result.json").write_text(json.dumps({"key": row.key, **done}))
 
 
-def measure_ledger(stage: str, folder: Path) -> dict[str, float]:
+def measure_records(stage: str, folder: Path) -> dict[str, float]:
     """Do one thing that the command does, in this process; return seconds and memory."""
-    prompts, path = folder / "prompts.txt", folder / "ledger.jsonl"
+    prompts = folder / "prompts.txt"
     before, began = peak_megabytes(), time.monotonic()
-    if stage == "start":
-        check_rows(prompts)
-        new = Ledger(folder / "none.jsonl")
-        sum(new.state(row) == FINISHED for row in read_rows(prompts))
-    elif stage == "resume":
-        check_rows(prompts)
-        ledger = Ledger(path)
-        sum(ledger.state(row) == FINISHED for row in read_rows(prompts))
+    count = check_rows(prompts)
+    place = Place(folder / "none" if stage == "start" else folder)
+    if stage == "report":
+        write_report(place, read_rows(prompts), count, price=1.0)
     else:
-        write_report(Place(folder), read_rows(prompts), Ledger(path), price=1.0)
+        sum(record["state"] == FINISHED for _, record in place.records(read_rows(prompts)))
     return {"s": time.monotonic() - began, "MB": peak_megabytes() - before}
 
 
@@ -71,7 +64,7 @@ def peak_megabytes() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
-def bench_ledger(counts: list[int]) -> Iterator[dict[str, Any]]:
+def bench_records(counts: list[int]) -> Iterator[dict[str, Any]]:
     """Each stage in a process of its own, so that its memory is its own."""
     for count in counts:
         with tempfile.TemporaryDirectory() as folder:
@@ -104,7 +97,7 @@ def bench_speed(count: int, steps: int) -> Iterator[dict[str, Any]]:
             command = [sys.executable, "-m", "threestudio_gaussiandreamer.farm", *arguments]
             command += ["--out", str(out), "--workers", str(workers)]
             subprocess.run(command, check=True, cwd=ROOT, capture_output=True)
-            lines = [json.loads(line) for line in open(out / "ledger.jsonl")]
+            lines = sorted(map(timed, out.glob("assets/*/result.json")), key=itemgetter("time"))
             shutil.rmtree(out)
             seconds[workers] = duration(lines)
             rows = [
@@ -122,18 +115,18 @@ def bench_speed(count: int, steps: int) -> Iterator[dict[str, Any]]:
     yield {"measured": "share of the ideal speed-up", "rows": count, "workers": 2, "value": ideal}
 
 
+def timed(path: Path) -> dict[str, Any]:
+    """Return a result with the time when it was written."""
+    return {**json.loads(path.read_text()), "time": path.stat().st_mtime}
+
+
 def duration(lines: list[dict[str, Any]]) -> float:
     """Seconds from the first asset's start to the last one's end."""
-    times = [line["time"] for line in lines]
-    return max(times) - min(times)
-
-
-def finished(lines: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    return [line for line in lines if line["state"] == FINISHED]
+    return lines[-1]["time"] - min(line["time"] - line["seconds"] for line in lines)
 
 
 def median_seconds(lines: list[dict[str, Any]]) -> float:
-    ordered = sorted(line["seconds"] for line in finished(lines))
+    ordered = sorted(line["seconds"] for line in lines)
     return ordered[len(ordered) // 2]
 
 
@@ -142,7 +135,7 @@ def overhead(lines: list[dict[str, Any]]) -> float:
     the latter's own seconds don't account for.
     """
     ends: dict[int, list[tuple[float, float]]] = defaultdict(list)
-    for line in finished(lines):
+    for line in lines:
         ends[line["process"]].append((line["time"], line["seconds"]))
     gaps = [
         later[0] - earlier[0] - later[1]
@@ -153,7 +146,7 @@ def overhead(lines: list[dict[str, Any]]) -> float:
 
 
 def most_loads(lines: list[dict[str, Any]]) -> int:
-    return max(count for line in finished(lines) for count in line["loads"].values())
+    return max(count for line in lines for count in line["loads"].values())
 
 
 # -- the command -----------------------------------------------------------------------------------
@@ -176,11 +169,11 @@ def write(rows: list[dict[str, Any]]) -> None:
 def main(arguments: Optional[list[str]] = None) -> int:
     options = parse_arguments(arguments)
     if options.stage:
-        print(json.dumps(measure_ledger(options.stage[0], Path(options.stage[1]))))
+        print(json.dumps(measure_records(options.stage[0], Path(options.stage[1]))))
         return 0
     rows = []
-    if "ledger" in options.what:
-        rows += bench_ledger(options.rows)
+    if "records" in options.what:
+        rows += bench_records(options.rows)
     if "speed" in options.what:
         rows += bench_speed(options.assets, options.steps)
     about = {"machine": machine(), "commit": commit()}
@@ -195,7 +188,7 @@ def parse_arguments(arguments: Optional[list[str]]) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("what", nargs="*", default=["ledger", "speed"], help="ledger, speed")
+    parser.add_argument("what", nargs="*", default=["records", "speed"], help="records, speed")
     parser.add_argument("--rows", type=int, nargs="+", default=[10_000, 100_000])
     parser.add_argument("--assets", type=int, default=60)
     parser.add_argument("--steps", type=int, default=60)

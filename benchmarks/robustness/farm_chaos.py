@@ -9,7 +9,6 @@ Result: benchmarks/results/farm_chaos.csv.
 
 import argparse
 import csv
-import json
 import os
 import random
 import re
@@ -24,11 +23,13 @@ from pathlib import Path
 from typing import Any, Optional
 
 from benchmarks.quality.runs import commit, machine
-from threestudio_gaussiandreamer.farm import assets
+from threestudio_gaussiandreamer.farm.results import digest
 
 ROOT = Path(__file__).resolve().parents[2]
 RETRIES = 50
 WORKER, DRIVER, NODE = "worker", "driver", "node"
+ENDED = "the run at a glance"
+"""What a run says at its end."""
 
 
 class Cluster:
@@ -89,7 +90,7 @@ def busy_workers() -> list[int]:
 def training_workers(out: Path) -> list[int]:
     """Processes of the workers whose asset has a checkpoint and isn't finished."""
     folders = {path.parents[1] for path in out.glob("assets/*/ckpts/*.ckpt")}
-    left = [folder for folder in folders if not (folder / assets.RESULT).exists()]
+    left = [folder for folder in folders if not (folder / "result.json").exists()]
     last = {int((folder / "attempts.txt").read_text().split()[-1]) for folder in left}
     return sorted(last & set(busy_workers()))
 
@@ -160,16 +161,10 @@ class Chaos:
 # -- what is left ----------------------------------------------------------------------------------
 
 
-def finished_lines(out: Path) -> Counter:
-    """How often the ledger says of each asset that it was finished."""
-    found: Counter = Counter()
-    for content in (out / "ledger.jsonl").read_bytes().splitlines():
-        try:
-            line = json.loads(content)
-        except ValueError:  # half a line of a killed driver
-            continue
-        found[line["name"]] += line["state"] == "finished"
-    return found
+def trained_to_the_end(out: Path) -> list[int]:
+    """How often each finished asset's run was trained to its end, by its log."""
+    logs = [path.parent / "log.txt" for path in out.glob("assets/*/result.json")]
+    return [path.read_text(errors="replace").count(ENDED) for path in logs]
 
 
 def resumed(out: Path) -> int:
@@ -184,8 +179,8 @@ def equal_to_single_runs(folder: Path, out: Path, count: int, steps: int) -> int
 
     same = 0
     for number in range(count):
-        alone = assets.digest(make_alone(folder, number, steps))
-        same += alone == assets.digest(out / "assets" / f"toy{number}")
+        alone = digest(make_alone(folder, number, steps))
+        same += alone == digest(out / "assets" / f"toy{number}")
         print(f"\rsingle run {number + 1} of {count}, {same} equal ", end="", file=sys.stderr)
     print(file=sys.stderr)
     return same
@@ -194,7 +189,7 @@ def equal_to_single_runs(folder: Path, out: Path, count: int, steps: int) -> int
 def report(
     options: argparse.Namespace, chaos: Chaos, folder: Path, out: Path, seconds: float
 ) -> dict[str, Any]:
-    lines = finished_lines(out)
+    ends = trained_to_the_end(out)
     attempts = [len(path.read_text().splitlines()) for path in out.glob("assets/*/attempts.txt")]
     return {
         "assets": options.assets,
@@ -202,8 +197,8 @@ def report(
         "worker_kills": chaos.done[WORKER],
         "driver_kills": chaos.done[DRIVER],
         "node_kills": chaos.done[NODE],
-        "finished": sum(count > 0 for count in lines.values()),
-        "finished_twice": sum(count > 1 for count in lines.values()),
+        "finished": len(ends),
+        "finished_twice": sum(count > 1 for count in ends),
         "equal_to_single_runs": equal_to_single_runs(folder, out, options.assets, options.steps),
         "attempts": sum(attempts),
         "resumed_from_checkpoint": resumed(out),

@@ -52,7 +52,7 @@ def farm() -> str:
     """Return the costs of a farm beside its assets, and what a farm with killed processes made."""
     measured: dict[str, list[str]] = {}
     for row in read(RESULTS / "farm.csv"):
-        where = f"{int(row['rows']):,} {'assets' if row['workers'] else 'rows of the ledger'}"
+        where = f"{int(row['rows']):,} {'assets' if row['workers'] else 'rows'}"
         where += f", {row['workers']} workers" if row["workers"] else ""
         value = f"{float(row['value']):.3g} {row['unit']}".strip()
         measured.setdefault(f"{row['measured']}, {where}", []).append(value)

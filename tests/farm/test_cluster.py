@@ -2,13 +2,7 @@
 
 import pytest
 
-from threestudio_gaussiandreamer import __version__
-from threestudio_gaussiandreamer.farm.cluster import (
-    Device,
-    check_versions,
-    choose_device,
-    count_workers,
-)
+from threestudio_gaussiandreamer.farm.cluster import Device, choose_device, count_workers
 
 CPU, GPUS = {"CPU": 8.0}, {"CPU": 8.0, "GPU": 2.0}
 
@@ -38,11 +32,3 @@ def test_as_many_workers_as_fit():
 def test_more_than_there_is_is_refused(act, message):
     with pytest.raises(ValueError, match=message):
         act()
-
-
-def test_a_machine_with_another_version_is_named():
-    check_versions([("one", __version__), ("two", __version__)])
-    with pytest.raises(ValueError, match=f"worker two has .* 9.9; this is {__version__}"):
-        check_versions([("one", __version__), ("two", "9.9")])
-    with pytest.raises(ValueError, match="worker two doesn't have it"):
-        check_versions([("two", None)])

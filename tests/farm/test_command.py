@@ -1,6 +1,5 @@
 """The command: what is refused before any work, and the lock of the farm's folder."""
 
-import contextlib
 import fcntl
 import os
 import sys
@@ -9,14 +8,16 @@ import pytest
 
 from tests.launch.bad_input_cases import DEMO
 from threestudio_gaussiandreamer.farm import command
-from threestudio_gaussiandreamer.farm.assets import Recipe, Source
 from threestudio_gaussiandreamer.farm.command import main
-from threestudio_gaussiandreamer.farm.identity import require_same_farm
-from threestudio_gaussiandreamer.farm.ledger import FINISHED
-from threestudio_gaussiandreamer.farm.recipe import check_recipe, make_recipe
-from threestudio_gaussiandreamer.farm.remote_ledger import open_ledger
+from threestudio_gaussiandreamer.farm.place import Place
+from threestudio_gaussiandreamer.farm.recipe import (
+    Recipe,
+    Source,
+    check_recipe,
+    make_recipe,
+    require_same_farm,
+)
 from threestudio_gaussiandreamer.farm.rows import Row, read_rows
-from threestudio_gaussiandreamer.farm.storage import Place
 
 RECIPE = Recipe((Source("a.yaml", b"x: 1"),), ("y=2",), cpu=True, cores=1)
 
@@ -142,14 +143,15 @@ def test_a_finished_farm_needs_no_ray(farm, monkeypatch, tmp_path):
     require_same_farm(place, recipe)
     (tmp_path / "prompts.txt").write_text("a fox")
     (row,) = read_rows(tmp_path / "prompts.txt")
-    with contextlib.closing(open_ledger(place)) as ledger:
-        ledger.append([{"name": row.name, "key": row.key, "state": FINISHED}])
+    place.publish(row, {"key": row.key})
     assert farm("a fox", *arguments) == (0, "")
     assert (tmp_path / "out/report/table.csv").is_file()
     code, err = farm("a fox", *arguments[:2], "trainer.max_steps=4")
     assert code == 2 and "belongs to another farm: its overrides is" in err
     with pytest.raises(AssertionError, match="Ray was started"):
         farm("a fox\na cat", *arguments)
+    code, err = farm('{"prompt": "a cat", "name": "a_fox"}', *arguments, name="prompts.jsonl")
+    assert code == 2 and "line 1 of the prompt list: 'a_fox' was begun in this farm with" in err
 
 
 # -- configurations --------------------------------------------------------------------------------
@@ -208,5 +210,5 @@ def test_a_folder_of_another_farm_is_refused(tmp_path, other, message):
 
 def test_a_damaged_farm_file_is_named(tmp_path):
     (tmp_path / "farm.json").write_text("{")
-    with pytest.raises(ValueError, match="farm.json is damaged"):
+    with pytest.raises(ValueError, match="farm.json is damaged .*: delete it, or"):
         require_same_farm(Place(tmp_path), RECIPE)

@@ -1,20 +1,16 @@
 """The driver's decisions, with workers that return at once and a stand-in for Ray."""
 
-import io
-import json
 from types import SimpleNamespace
 
 import pytest
 
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.farm import driver
-from threestudio_gaussiandreamer.farm.assets import Job, Recipe, Source
 from threestudio_gaussiandreamer.farm.board import Beat
-from threestudio_gaussiandreamer.farm.display import Display
 from threestudio_gaussiandreamer.farm.driver import Driver
-from threestudio_gaussiandreamer.farm.ledger import FAILED, FINISHED, RUNNING, Ledger
+from threestudio_gaussiandreamer.farm.place import FAILED, FINISHED, STOPPED, WAITING, Place
+from threestudio_gaussiandreamer.farm.recipe import Job, Recipe, Source
 from threestudio_gaussiandreamer.farm.rows import Row
-from threestudio_gaussiandreamer.farm.worker import BLOCKED, NO_MEMORY, STOPPED, Setting
+from threestudio_gaussiandreamer.farm.worker import BLOCKED, NO_MEMORY, Setting
 
 ROWS = [Row(f"toy{i}", f"toy {i}", i) for i in range(6)]
 LOW = Source("low.yaml", b"")
@@ -54,14 +50,17 @@ class Handle:
 
 
 class FakeWorker:
-    def __init__(self, answers):
-        self.made = []
+    def __init__(self, place, answers):
+        self.place, self.made = place, []
         self.make = SimpleNamespace(remote=self._make)
         self.answers = answers
 
     def _make(self, job, setting):
         self.made.append(job)
-        return Handle(self.answers(job))
+        outcome = self.answers(job)
+        if not isinstance(outcome, Exception) and outcome["state"] == FINISHED:
+            self.place.publish(job.row, outcome)
+        return Handle(outcome)
 
 
 def finished(job):
@@ -73,21 +72,21 @@ class Bench:
 
     def __init__(self, path, answers, rows=ROWS, low_memory=LOW, workers=1):
         recipe = Recipe((Source("a.yaml", b""),), (), True, 1, low_memory)
-        self.ray, self.worker = FakeRay(), FakeWorker(answers)
+        self.place = Place(path)
+        self.ray, self.worker = FakeRay(), FakeWorker(self.place, answers)
         self.beats, self.stops, self.reads = {}, 0, 0
         board = SimpleNamespace(
             read=SimpleNamespace(remote=self._read),
             stop=SimpleNamespace(remote=self._stop),
         )
-        self.ledger, self.stream = Ledger(path), io.StringIO()
         self.driver = Driver(
             self.ray,
             [self.worker] * workers,
-            [Setting(number, recipe, None, board, "", "now", 3) for number in range(workers)],
-            iter([Job(row) for row in rows]),
-            self.ledger,
+            [Setting(i, recipe, self.place, board, "", "now", 3) for i in range(workers)],
+            iter([Job(row, spent=100.0) for row in rows]),
             10.0,
-            Display(len(rows), 0, self.stream),
+            len(rows),
+            0,
         )
 
     def _read(self):
@@ -98,20 +97,23 @@ class Bench:
         self.stops += 1
         return Handle(None)
 
+    def records(self):
+        return [record for _, record in self.place.records(ROWS)]
+
     def states(self):
-        return [self.ledger.state(row) for row in ROWS]
+        return [record["state"] for record in self.records()]
 
 
 @pytest.fixture
 def path(tmp_path):
-    return tmp_path / "ledger.jsonl"
+    return tmp_path
 
 
 def test_a_step_collects_all_outcomes_and_looks_after_workers_now_and_then(path):
     bench = Bench(path, finished, workers=3)
     bench.driver.fill()
     bench.driver.step()
-    assert bench.states() == [FINISHED] * 3 + [RUNNING] * 3
+    assert bench.states() == [FINISHED] * 3 + [WAITING] * 3
     bench.driver.step()
     assert bench.states() == [FINISHED] * 6 and bench.reads == 1
     bench.driver.look_due = 0.0
@@ -119,31 +121,26 @@ def test_a_step_collects_all_outcomes_and_looks_after_workers_now_and_then(path)
     assert bench.reads == 2
 
 
-def test_the_ledger_has_the_seconds_of_every_attempt(path, monkeypatch):
-    clock = iter(range(1000))
-    monkeypatch.setattr(driver.time, "monotonic", lambda: float(next(clock)))
-
+def test_the_seconds_of_every_attempt_are_kept(path):
     def answers(job):
         if job.saves_memory:
-            return finished(job)
+            return finished(job) | {"worker_seconds": job.worker_seconds(job.handed_out + 5)}
         return {"state": NO_MEMORY if job.row == ROWS[0] else FAILED, "error": job.row.name}
 
     bench = Bench(path, answers)
     bench.driver.run()
-    bench.ledger.close()
-    lines = [json.loads(text) for text in path.read_text().splitlines()]
-    spent = [line.get("worker_seconds") for line in lines if line["name"] == ROWS[0].name]
-    assert spent[0] is None and spent[1] > 0 and spent[2] is None and spent[3] > 0
-    assert Ledger(path).worker_seconds(ROWS[0]) == spent[1] + spent[3]
-    assert Ledger(path).worker_seconds(ROWS[1]) > 0
+    found = [record["worker_seconds"] for record in bench.records()]
+    assert found[0] >= 105 and all(100 <= seconds < 105 for seconds in found[1:])
+    assert not (path / "assets/toy0/failed.json").exists()
 
 
-def test_every_asset_is_made_once(path):
+def test_every_asset_is_made_once(path, capsys):
     bench = Bench(path, finished)
     bench.driver.run()
     assert [job.row for job in bench.worker.made] == ROWS
     assert bench.states() == [FINISHED] * 6
-    assert "6 of 6 finished" in bench.stream.getvalue()
+    said = capsys.readouterr().err
+    assert "toy0: finished: 1.0 s (1 of 6, 00:00 left)" in said and "toy5: finished: 1.0 s" in said
 
 
 def test_a_failed_asset_stops_no_other_and_is_reported_with_its_command(path):
@@ -154,7 +151,7 @@ def test_a_failed_asset_stops_no_other_and_is_reported_with_its_command(path):
     bench = Bench(path, answers)
     bench.driver.run()
     assert bench.states() == [FINISHED, FAILED, *[FINISHED] * 4]
-    line = bench.ledger.last(ROWS[1])
+    line = bench.records()[1]
     assert line["error"] == "no surface" and "prompt=toy 1" in line["command"]
 
 
@@ -166,7 +163,7 @@ def test_an_asset_whose_worker_can_not_be_restarted_is_given_up(path):
     bench = Bench(path, answers)
     bench.driver.run()
     assert bench.states() == [FAILED, *[FINISHED] * 5]
-    assert bench.ledger.last(ROWS[0])["error"] == "its worker can't be restarted: killed"
+    assert bench.records()[0]["error"] == "its worker can't be restarted: killed"
 
 
 def test_an_asset_without_memory_is_tried_with_less(path):
@@ -190,7 +187,7 @@ def test_an_asset_without_memory_is_reported_at_last(path, low_memory):
     bench = Bench(path, answers, low_memory=low_memory)
     bench.driver.run()
     assert bench.states() == [FAILED, *[FINISHED] * 5]
-    assert ("low.yaml" in bench.ledger.last(ROWS[0])["command"]) == bool(low_memory)
+    assert ("low.yaml" in bench.records()[0]["command"]) == bool(low_memory)
 
 
 def test_a_full_disk_ends_the_farm_and_leaves_the_assets_to_the_next(path):
@@ -201,7 +198,7 @@ def test_a_full_disk_ends_the_farm_and_leaves_the_assets_to_the_next(path):
     bench = Bench(path, answers)
     with pytest.raises(UserError, match="No space left"):
         bench.driver.run()
-    assert bench.states() == [FINISHED, FINISHED, RUNNING, None, None, None] and bench.stops
+    assert bench.states() == [FINISHED, FINISHED, STOPPED, *[WAITING] * 3] and bench.stops
 
 
 def test_assets_that_all_fail_alike_end_the_farm(path):
@@ -244,22 +241,16 @@ def test_ctrl_c_lets_the_workers_write_checkpoints(path):
     bench = Bench(path, answers)
     with pytest.raises(KeyboardInterrupt):
         bench.driver.run()
-    assert bench.stops == 1 and bench.states() == [FINISHED, RUNNING, None, None, None, None]
+    assert bench.stops == 1 and bench.states() == [FINISHED, STOPPED, *[WAITING] * 4]
 
 
-def test_a_full_disk_does_not_take_the_place_of_ctrl_c(path, capsys):
-    bench = Bench(path, finished)
-    wait = bench.ray.wait
+def test_a_record_that_can_not_be_written_ends_the_farm_and_not_ctrl_c(path, monkeypatch):
+    bench = Bench(path, lambda job: {"state": FAILED, "error": "x"})
 
-    def full(lines):
-        raise UserError("the ledger can't be written")
+    def full(files):
+        raise UserError("no space left")
 
-    def interrupted(*args, **options):
-        bench.ray.wait, bench.ledger.append = wait, full
-        raise KeyboardInterrupt
-
-    bench.ray.wait = interrupted
-    with pytest.raises(KeyboardInterrupt):
+    monkeypatch.setattr(bench.place, "write", full)
+    with pytest.raises(UserError, match="no space left"):
         bench.driver.run()
-    assert not bench.driver.running and bench.states()[0] == RUNNING
-    assert "error: the ledger can't be written" in capsys.readouterr().out
+    assert len(bench.worker.made) == 1 and bench.stops

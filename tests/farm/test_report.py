@@ -1,30 +1,36 @@
 """The report: tables, gallery and failures, for any number of assets."""
 
 import csv
+import json
 
 import pytest
 
 from threestudio_gaussiandreamer.farm import report
-from threestudio_gaussiandreamer.farm.ledger import FAILED, FINISHED, RUNNING, Ledger
+from threestudio_gaussiandreamer.farm.place import FAILED, FINISHED, RUNNING, WAITING, Place
 from threestudio_gaussiandreamer.farm.rows import Row
-from threestudio_gaussiandreamer.farm.storage import Place
 
 ROWS = [Row(f"toy{i}", f"a <b>toy</b> {i}", i) for i in range(5)]
 
 
-def line(row, state, **more):
-    return {"name": row.name, "key": row.key, "state": state, **more}
+def note(place, row, file, **record):
+    place.write({f"assets/{row.name}/{file}": json.dumps({"key": row.key, **record}).encode()})
 
 
 @pytest.fixture
-def ledger(tmp_path):
-    ledger = Ledger(tmp_path / "ledger.jsonl")
+def place(tmp_path):
+    place = Place(tmp_path)
     done = {"seconds": 36.0, "steps": 5, "gaussians": 10, "attempts": 2, "saves_memory": False}
     scores = {"scores": {"psnr": 30.0}, "picture": "save/it5-test/0.png", "page": "a.html"}
-    ledger.append([line(ROWS[0], FINISHED, **done, **scores), line(ROWS[1], RUNNING)])
-    ledger.append([line(ROWS[2], FAILED, error="no <space>", command="launch 'a b'")])
-    ledger.append([line(ROWS[3], FINISHED, **done)])
-    return ledger
+    note(place, ROWS[0], "result.json", **done, **scores)
+    place.work_folder(ROWS[1]).mkdir()
+    note(place, ROWS[2], "failed.json", error="no <space>", command="launch 'a b'")
+    note(place, ROWS[3], "result.json", **done)
+    return place
+
+
+def write(place, **options):
+    path, states = report.write_report(place, ROWS, len(ROWS), **options)
+    return path.read_text()
 
 
 def read(path):
@@ -32,41 +38,38 @@ def read(path):
         return list(csv.DictReader(file))
 
 
-def test_the_table_has_a_row_per_asset_and_its_cost(tmp_path, ledger):
-    report.write_report(Place(tmp_path), ROWS, ledger, price=2.0)
+def test_the_table_has_a_row_per_asset_and_its_cost(tmp_path, place):
+    write(place, price=2.0)
     rows = read(tmp_path / "report/table.csv")
     states = [row["state"] for row in rows]
-    assert states == [FINISHED, RUNNING, FAILED, FINISHED, report.WAITING]
+    assert states == [FINISHED, RUNNING, FAILED, FINISHED, WAITING]
     assert (rows[0]["cost"], rows[0]["psnr"], rows[0]["seed"]) == ("0.02", "30.0", "0")
     assert rows[1]["cost"] == "" and rows[2]["command"] == "launch 'a b'"
 
 
-def test_the_cost_has_all_attempts_and_the_failures(tmp_path, ledger):
-    ledger.append([line(ROWS[1], RUNNING, worker_seconds=18.0)])
-    ledger.append([line(ROWS[1], FINISHED, seconds=36.0, worker_seconds=54.0)])
-    ledger.append([line(ROWS[2], FAILED, error="none", worker_seconds=108.0)])
-    ledger.close()
-    again = Ledger(ledger.path)  # as read from the disk
-    first = report.write_report(Place(tmp_path), ROWS, again, price=100.0).read_text()
+def test_the_cost_has_all_attempts_and_the_failures(tmp_path, place):
+    note(place, ROWS[1], "result.json", seconds=36.0, worker_seconds=72.0)
+    note(place, ROWS[2], "failed.json", error="none", worker_seconds=108.0)
+    first = write(place, price=100.0)
     rows = read(tmp_path / "report/table.csv")
     assert [row["worker_seconds"] for row in rows] == ["36.0", "72.0", "108.0", "36.0", ""]
     assert [row["cost"] for row in rows] == ["1.0", "2.0", "3.0", "1.0", ""]
     assert "<td>4 min 12 s</td>" in first and "7, 2.333 per finished asset" in first
 
 
-def test_parquet_has_the_same_rows(tmp_path, ledger, monkeypatch):
+def test_parquet_has_the_same_rows(tmp_path, place, monkeypatch):
     parquet = pytest.importorskip("pyarrow.parquet")
     monkeypatch.setattr(report, "BATCH", 2)
-    report.write_report(Place(tmp_path), ROWS, ledger)
+    write(place)
     rows = parquet.read_table(tmp_path / "report/table.parquet").to_pylist()
     assert [row["name"] for row in rows] == [row.name for row in ROWS]
     assert rows[0]["seconds"] == 36.0 and rows[4]["seconds"] is None
     assert list(rows[0]) == list(report.COLUMNS)
 
 
-def test_the_pages_show_pictures_and_failures_escaped(tmp_path, ledger, monkeypatch):
+def test_the_pages_show_pictures_and_failures_escaped(tmp_path, place, monkeypatch):
     monkeypatch.setattr(report, "PER_PAGE", 1)
-    first = report.write_report(Place(tmp_path), ROWS, ledger, price=2.0).read_text()
+    first = write(place, price=2.0)
     assert "no &lt;space&gt;" in first and "launch &#x27;a b&#x27;" in first
     assert "page-2.html" in first and "page-3.html" not in first
     assert "0.04, 0.02 per finished asset" in first
@@ -76,7 +79,11 @@ def test_the_pages_show_pictures_and_failures_escaped(tmp_path, ledger, monkeypa
     assert (tmp_path / "report/page-2.html").exists()
 
 
+def test_durations_are_short():
+    texts = [report.duration(seconds) for seconds in (5, 65, 3720)]
+    assert texts == ["5 s", "1 min 05 s", "1 h 02 min"]
+
+
 def test_an_empty_farm_has_a_report(tmp_path):
-    ledger = Ledger(tmp_path / "ledger.jsonl")
-    report.write_report(Place(tmp_path), ROWS, ledger)
-    assert {row["state"] for row in read(tmp_path / "report/table.csv")} == {report.WAITING}
+    write(Place(tmp_path))
+    assert {row["state"] for row in read(tmp_path / "report/table.csv")} == {WAITING}

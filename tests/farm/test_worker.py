@@ -8,10 +8,9 @@ import torch
 
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.farm import worker
-from threestudio_gaussiandreamer.farm.assets import Job, Recipe, Source
-from threestudio_gaussiandreamer.farm.ledger import FAILED
+from threestudio_gaussiandreamer.farm.place import FAILED, Place, Unreachable
+from threestudio_gaussiandreamer.farm.recipe import Job, Recipe, Source
 from threestudio_gaussiandreamer.farm.rows import Row
-from threestudio_gaussiandreamer.farm.storage import Place, Unreachable
 from threestudio_gaussiandreamer.farm.worker import (
     BLOCKED,
     NO_MEMORY,
@@ -51,8 +50,15 @@ def test_errors_have_states(error, state):
 
 
 def test_attempts_are_counted_in_the_session_and_in_all(tmp_path):
-    assert [count_attempts(tmp_path, "one") for _ in range(2)] == [(1, 1), (2, 2)]
-    assert count_attempts(tmp_path, "two") == (3, 1)
+    (tmp_path / "attempts.txt").write_text("zero host 7\n")  # of an earlier version
+    assert [count_attempts(tmp_path, "one", JOB) for _ in range(2)] == [(2, 1), (3, 2)]
+    assert count_attempts(tmp_path, "two", JOB) == (4, 1)
+
+
+def test_a_row_that_has_changed_does_not_go_on_with_the_checkpoints_of_the_other(tmp_path):
+    count_attempts(tmp_path, "one", JOB)
+    with pytest.raises(UserError, match="line 7 .*'fox' was begun in this farm with another"):
+        count_attempts(tmp_path, "two", JOB._replace(row=JOB.row._replace(prompt="b", line=7)))
 
 
 def setting(place, **options):

@@ -1,1 +1,1 @@
-"""Prompt lists to assets: a Ray worker per GPU, a ledger, a report."""
+"""Prompt lists to assets: a Ray worker per GPU, a record per asset, a report."""

@@ -5,7 +5,9 @@ machine."""
 
 import time
 from collections.abc import Callable
-from typing import Any, NamedTuple, Optional
+from typing import Any, NamedTuple
+
+from ..host import pl
 
 SECONDS_BETWEEN = 1.0
 """Shortest time between two reports of a worker."""
@@ -19,7 +21,7 @@ class Beat(NamedTuple):
     attempt: int
     stage: str
     step: int
-    steps: int
+    steps: int = 0
     """Number of steps of the stage; 0 if unknown."""
 
 
@@ -45,32 +47,48 @@ class Board:
         self.stopping = True
 
 
-class Reporter:
-    """Sends a worker's reports without waiting for the answers.
+class Heartbeat(pl.Callback):
+    """Report the steps of a run, at most one a second, and stop it when the farm is stopping.
 
     Args:
-        send: sends a :class:`Beat` and returns a handle of the answer.
-        answer: returns the answer of a handle if it has come, else None.
+        report: sends a :class:`Beat`; returns whether the farm is stopping.
+        stop: ends the run as SIGTERM does, with a checkpoint.
+        on_step: called after each training step, such as to upload a new checkpoint.
     """
 
     def __init__(
-        self, send: Callable[[Beat], Any], answer: Callable[[Any], Optional[bool]]
+        self,
+        name: str,
+        attempt: int,
+        report: Callable[[Beat], bool],
+        stop: Callable[[], None],
+        on_step: Callable[[], None],
     ) -> None:
-        self.send, self.answer = send, answer
-        self.sent: Any = None
-        self.due = 0.0
-        self.stopping = False
+        self.name, self.attempt = name, attempt
+        self.report, self.stop, self.on_step = report, stop, on_step
+        self.due, self.asked = 0.0, False
+        self.beat("starting", 0)
 
-    def __call__(self, beat: Beat, now: bool = False) -> bool:
-        """Report; return whether the last answer was to stop.
+    def on_train_batch_end(self, trainer: Any, *args: Any) -> None:
+        self.on_step()
+        stopping = self.beat("training", trainer.global_step, max(trainer.max_steps, 0))
+        if stopping and not self.asked:
+            self.asked = True
+            self.stop()
 
-        Args:
-            now: also if the last report was less than :data:`SECONDS_BETWEEN` ago.
-        """
-        if not now and time.monotonic() < self.due:
-            return self.stopping
-        if self.sent is not None:
-            self.stopping = bool(self.answer(self.sent)) or self.stopping
-        self.sent = self.send(beat)
+    def on_validation_batch_end(
+        self, trainer: Any, module: Any, outputs: Any, batch: Any, batch_idx: int, *args: Any
+    ) -> None:
+        self.beat("validating", batch_idx + 1)
+
+    def on_test_batch_end(
+        self, trainer: Any, module: Any, outputs: Any, batch: Any, batch_idx: int, *args: Any
+    ) -> None:
+        self.beat("rendering", batch_idx + 1)
+
+    def beat(self, stage: str, step: int, steps: int = 0) -> bool:
+        if time.monotonic() < self.due:
+            return False
+        stopping = self.report(Beat(self.name, self.attempt, stage, step, steps))
         self.due = time.monotonic() + SECONDS_BETWEEN
-        return self.stopping
+        return stopping

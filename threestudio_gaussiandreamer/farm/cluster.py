@@ -11,7 +11,6 @@ from typing import Any, NamedTuple, Optional
 from .. import __version__
 from ..core.errors import UserError
 from ..core.extras import require_extra
-from .board import Board
 from .worker import Setting, Worker
 
 OBJECT_STORE_BYTES = 100 << 20
@@ -89,20 +88,25 @@ def require_same_version(ray: Any) -> None:
     Raises:
         UserError: a machine has none or another version, or doesn't answer.
     """
-    probes = [
-        ray.remote(num_cpus=0, max_retries=0)(installed_version).options(
-            scheduling_strategy=ray.util.scheduling_strategies.NodeAffinitySchedulingStrategy(
-                node["NodeID"], soft=False
-            )
-        )
+    at = ray.util.scheduling_strategies.NodeAffinitySchedulingStrategy
+    probe = ray.remote(num_cpus=0, max_retries=0)(installed_version)
+    asked = [
+        probe.options(scheduling_strategy=at(node["NodeID"], soft=False)).remote()
         for node in ray.nodes()
         if node["Alive"]
     ]
     try:
-        found = ray.get([probe.remote() for probe in probes], timeout=SECONDS_TO_ANSWER)
+        found = ray.get(asked, timeout=SECONDS_TO_ANSWER)
     except ray.exceptions.RayError as error:
         raise UserError(f"a machine of the cluster doesn't answer: {error}") from error
-    check_versions(found)
+    for host, version in found:
+        if version != __version__:
+            has = f"has threestudio-gaussiandreamer {version}" if version else "doesn't have it"
+            raise UserError(
+                f"the worker {host} {has}; this is {__version__}, and all assets of a farm are "
+                f"made with one version: pip install threestudio-gaussiandreamer=={__version__} "
+                "there"
+            )
 
 
 def installed_version() -> tuple[str, Optional[str]]:
@@ -120,22 +124,6 @@ def installed_version() -> tuple[str, Optional[str]]:
 installed_version.__module__ = "__main__"
 
 
-def check_versions(found: list[tuple[str, Optional[str]]]) -> None:
-    """Raise UserError unless every machine has this version of the package.
-
-    Args:
-        found: names of machines and versions; None for a machine without the package.
-    """
-    for host, version in found:
-        if version != __version__:
-            has = f"has threestudio-gaussiandreamer {version}" if version else "doesn't have it"
-            raise UserError(
-                f"the worker {host} {has}; this is {__version__}, and all assets of a farm are "
-                f"made with one version: pip install threestudio-gaussiandreamer=={__version__} "
-                "there"
-            )
-
-
 def choose_device(resources: dict[str, float], gpus: Optional[int], cores: int) -> Device:
     """Return what one worker gets: a GPU where the cluster has some, else ``cores``.
 
@@ -147,9 +135,7 @@ def choose_device(resources: dict[str, float], gpus: Optional[int], cores: int) 
     """
     there, cpus = int(resources.get("GPU", 0)), int(resources.get("CPU", 0))
     if gpus is not None and gpus > there:
-        most = (
-            f"has {there} GPUs; give --gpus {there} or less" if there else "has no GPU; give none"
-        )
+        most = f"has {there} GPUs; give at most that" if there else "has no GPU; give none"
         raise UserError(f"--gpus {gpus}: the cluster {most}")
     if cores > cpus:
         raise UserError(f"--cores {cores}: the cluster has {cpus} cores; give fewer")
@@ -177,15 +163,11 @@ def count_workers(
 # --------------------------------------------------------------------------------------------------
 
 
-def start_board(ray: Any) -> Any:
-    return ray.remote(num_cpus=0, max_restarts=-1)(Board).remote()
-
-
 def start_workers(ray: Any, settings: list[Setting], device: Device) -> list[Any]:
     """Start a worker per setting and wait until all are ready.
 
     Raises:
-        UserError: a worker can't start, or has another version of the package.
+        UserError: a worker can't start.
     """
     environment = {"OMP_NUM_THREADS": str(device.cores), "OMP_WAIT_POLICY": "passive"}
     if not device.gpus:
@@ -200,10 +182,7 @@ def start_workers(ray: Any, settings: list[Setting], device: Device) -> list[Any
     workers = [actor.remote() for _ in settings]
     greetings = [w.hello.remote(setting) for w, setting in zip(workers, settings, strict=True)]
     try:
-        versions = ray.get(greetings, timeout=SECONDS_TO_ANSWER)
-    except ray.exceptions.RayTaskError as error:
-        raise UserError(f"a worker can't start: {error.cause}") from error
+        ray.get(greetings, timeout=SECONDS_TO_ANSWER)
     except ray.exceptions.RayError as error:
-        raise UserError(f"a worker can't start: {error}") from error
-    check_versions([(f"number {i}", version) for i, version in enumerate(versions)])
+        raise UserError(f"a worker can't start: {getattr(error, 'cause', error)}") from error
     return workers

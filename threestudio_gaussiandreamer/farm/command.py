@@ -7,28 +7,26 @@ The same command goes on where it was after any kind of stop, and tries failed a
 import argparse
 import os
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
 from typing import Any, Optional
 
+from tqdm import tqdm
+
 from ..core.command import run_command
+from ..core.errors import UserError
 from ..core.launcher import train_alone
 from ..core.signals import raised_signals
 from ..launch.experiment import configure_logging
-from ..launch.folder_lock import claim, require_writable
+from ..launch.folder_lock import require_writable
 from ..launch.options import add_config, parse_with_overrides
 from . import cluster
-from .assets import Recipe
-from .display import Display
+from .board import Board
 from .driver import Driver
-from .identity import require_farm, require_same_farm, require_same_recipe
-from .ledger import FAILED, FINISHED, Ledger
-from .recipe import check_recipe, jobs_left, make_recipe, root_of
-from .remote_ledger import open_ledger
+from .place import FAILED, FINISHED, Place, adopt_ledger, claimed, is_url
+from .recipe import FARM, Job, Recipe, check_recipe, job_of, make_recipe, require_same_farm, root_of
 from .report import write_report
 from .rows import check_rows, read_rows
-from .storage import Place, is_url, place_of
 from .worker import Setting
 
 PROGRAM = "python -m threestudio_gaussiandreamer.farm"
@@ -73,35 +71,22 @@ def parse_arguments(argv: Optional[Sequence[str]] = None) -> argparse.Namespace:
 
 
 def _add_cluster_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--address",
-        help="address of a Ray cluster, host:port or auto (default: start Ray on this machine)",
-    )
-    parser.add_argument(
-        "--workers",
-        type=whole(1),
-        help="number of workers (default: as many as fit into the cluster)",
-    )
-    parser.add_argument(
-        "--gpus",
-        type=whole(0),
-        help="number of GPUs, one per worker (default: all; 0: the CPU)",
-    )
-    parser.add_argument(
-        "--cores", type=whole(1), default=1, help="CPU cores per worker (default: %(default)s)"
-    )
-    parser.add_argument(
+    add = parser.add_argument
+    add("--address", help="of a Ray cluster, host:port or auto (default: start Ray here)")
+    add("--workers", type=whole(1), help="number of workers (default: as many as fit)")
+    add("--gpus", type=whole(0), help="number of GPUs, one per worker (default: all; 0: the CPU)")
+    add("--cores", type=whole(1), default=1, help="CPU cores per worker (default: %(default)s)")
+    add(
         "--retries",
         type=whole(0),
         default=3,
         help="how often an asset is tried again after its worker has died (default: %(default)s)",
     )
-    parser.add_argument(
+    add(
         "--time-limit",
         type=positive,
         default=1800.0,
-        help="seconds without a finished step after which an asset counts as hung (default: "
-        "%(default)g)",
+        help="seconds without a step after which an asset counts as hung (default: %(default)g)",
     )
 
 
@@ -135,26 +120,40 @@ def run_farm(args: argparse.Namespace) -> int:
     configure_logging(verbose=False)
     total = check_rows(args.prompts)
     root, overrides = split_root(args.overrides)
-    place = place_of(args.out or f"{root or root_of(args.config)}/farm-{args.prompts.stem}")
+    place = Place(args.out or f"{root or root_of(args.config)}/farm-{args.prompts.stem}")
     if args.report:
-        require_farm(place)
-        return report(args, place, open_ledger(place, only_read=True))
+        if place.json(FARM) is None:
+            raise UserError(f"there is no farm in {place}: it has no {FARM}; check --out")
+        adopt_ledger(place)
+        return report(args, place, total)
     if not is_url(str(place)):
         require_writable(place.folder, "--out" if args.out else "exp_root_dir")
     # before Ray starts: this takes a second
     recipe = make_recipe(args.config, overrides, cpu=True, cores=args.cores)
     recipe = check_recipe(recipe, read_rows(args.prompts))
+    require_same_farm(place, recipe, before_ray=True)
+    adopt_ledger(place)
     with claimed(place):
-        require_same_recipe(place, recipe)
-        ledger = open_ledger(place)
-        done = sum(ledger.state(row) == FINISHED for row in read_rows(args.prompts))
-        try:
-            if done < total:
-                with connected(args) as ray:
-                    make_assets(args, ray, place, recipe, ledger, Display(total, done))
-        finally:
-            ledger.close()
-    return report(args, place, ledger)
+        finished: set[int] = set()
+        spent: dict[int, float] = {}
+        rows = place.records(read_rows(args.prompts))
+        for row, record in tqdm(rows, "records", total, unit="asset", disable=None, delay=1):
+            if record["state"] == FINISHED:
+                finished.add(row.line)
+            elif "worker_seconds" in record:
+                spent[row.line] = record["worker_seconds"]
+        jobs = (
+            job_of(row, spent.get(row.line, 0.0))
+            for row in read_rows(args.prompts)
+            if row.line not in finished
+        )
+        if len(finished) < total:
+            ray = cluster.connect(args.address)
+            try:
+                make_assets(args, ray, place, recipe, jobs, total, len(finished))
+            finally:
+                ray.shutdown()  # which ends the workers
+    return report(args, place, total)
 
 
 def split_root(overrides: Sequence[str]) -> tuple[Optional[str], list[str]]:
@@ -169,58 +168,35 @@ def make_assets(
     ray: Any,
     place: Place,
     recipe: Recipe,
-    ledger: Ledger,
-    display: Display,
+    jobs: Iterator[Job],
+    total: int,
+    done: int,
 ) -> None:
     """Start the workers and make all assets that are left."""
     resources = ray.cluster_resources()
     device = cluster.choose_device(resources, args.gpus, args.cores)
     count = cluster.count_workers(resources, device, args.gpus, args.workers)
-    count = min(count, display.total - display.done)
+    count = min(count, total - done)
     recipe = recipe._replace(cpu=not device.gpus)
     require_same_farm(place, recipe)
     cluster.require_same_version(ray)
     print(
-        f"{display.total} assets, {display.done} finished; {count} workers with "
+        f"{total} assets, {done} finished; {count} workers with "
         f"{'1 GPU' if device.gpus else f'{device.cores} cores'} each; results in {place}",
         flush=True,
     )
-    board = cluster.start_board(ray)
+    board = ray.remote(num_cpus=0, max_restarts=-1)(Board).remote()
     session = datetime.now().isoformat()
     settings = [
         Setting(i, recipe, place, board, os.getcwd(), session, args.retries) for i in range(count)
     ]
     workers = cluster.start_workers(ray, settings, device)
-    jobs = jobs_left(read_rows(args.prompts), ledger)
-    Driver(ray, workers, settings, jobs, ledger, args.time_limit, display).run()
+    Driver(ray, workers, settings, jobs, args.time_limit, total, done).run()
 
 
-def report(args: argparse.Namespace, place: Place, ledger: Ledger) -> int:
+def report(args: argparse.Namespace, place: Place, total: int) -> int:
     """Write the report; return 1 if assets have failed."""
-    path = write_report(place, read_rows(args.prompts), ledger, args.price)
-    states = [entry.state for entry in ledger.index.values()]
-    counts = {state: states.count(i) for i, state in enumerate(("running", FINISHED, FAILED))}
-    ledger.close()
-    place_name = place if is_url(str(place)) else path
-    print(f"{counts[FINISHED]} finished, {counts[FAILED]} failed; report: {place_name}")
-    return 1 if counts[FAILED] else 0
-
-
-@contextmanager
-def claimed(place: Place) -> Iterator[None]:
-    """Lock the farm's folder, or its scratch folder on this machine, against other commands."""
-    folder = claim(place.folder, "another farm command is at work", ", or choose another --out")
-    try:
-        yield
-    finally:
-        folder.release()
-
-
-@contextmanager
-def connected(args: argparse.Namespace) -> Iterator[Any]:
-    """Connect to Ray, and disconnect at the end, which ends the workers."""
-    ray = cluster.connect(args.address)
-    try:
-        yield ray
-    finally:
-        ray.shutdown()
+    path, states = write_report(place, read_rows(args.prompts), total, args.price)
+    where = place if is_url(str(place)) else path
+    print(f"{states[FINISHED]} finished, {states[FAILED]} failed; report: {where}")
+    return 1 if states[FAILED] else 0

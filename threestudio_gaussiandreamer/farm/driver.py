@@ -1,16 +1,19 @@
-"""The driver hands assets to the workers, notes their outcomes in the ledger, and watches for
-workers that hang."""
+"""The driver hands assets to the workers, notes what became of them, and watches for workers that
+hang."""
 
+import sys
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Iterator
 from typing import Any, NamedTuple, Optional
 
+from tqdm import tqdm
+
 from ..core.errors import UserError
-from .assets import Job, repeat_command
+from ..core.files import json_text
 from .board import Beat
-from .display import Display
-from .ledger import FAILED, FINISHED, RUNNING, Ledger
+from .place import ASSETS, FAILED, FAILURE, FINISHED, STOPPED
+from .recipe import Job, repeat_command
 from .worker import BLOCKED, NO_MEMORY, Setting
 
 POLL = 0.5
@@ -26,8 +29,6 @@ class Running(NamedTuple):
 
     worker: int
     job: Job
-    began: float
-    """When the worker got it, seconds of the monotonic clock."""
 
 
 class Driver:
@@ -38,8 +39,9 @@ class Driver:
         workers: handles of :class:`.worker.Worker`.
         settings: of the workers, in the same order.
         jobs: the assets that aren't finished; the iterator is advanced when a worker is idle.
-        ledger: the farm's ledger.
         hang: seconds without a finished step after which a worker is restarted.
+        total: number of assets of the farm.
+        done: how many were finished before.
     """
 
     def __init__(
@@ -48,21 +50,23 @@ class Driver:
         workers: list[Any],
         settings: list[Setting],
         jobs: Iterator[Job],
-        ledger: Ledger,
         hang: float,
-        display: Display,
+        total: int,
+        done: int,
     ) -> None:
         self.ray, self.workers, self.settings = ray, workers, settings
-        self.board, self.recipe = settings[0].board, settings[0].recipe
-        self.jobs, self.ledger = jobs, ledger
-        self.hang, self.display = hang, display
+        _, self.recipe, self.place, self.board, *_ = settings[0]
+        self.jobs, self.hang, self.total, self.done = jobs, hang, total, done
         self.idle = deque(range(len(workers)))
         self.running: dict[Any, Running] = {}
         self.again: deque[Job] = deque()
         self.killed: dict[int, Beat] = {}
+        self.counts: Counter = Counter()
         self.errors: list[str] = []
         self.obstacle: Optional[str] = None
-        self.look_due = 0.0
+        self.began, self.look_due = time.monotonic(), 0.0
+        # only on terminals; elsewhere a line per asset
+        self.bar = tqdm(total=total, initial=done, unit="asset", disable=None, dynamic_ncols=True)
 
     def run(self) -> None:
         """Make the assets.
@@ -72,7 +76,6 @@ class Driver:
             KeyboardInterrupt: Ctrl-C; the workers have written checkpoints.
         """
         try:
-            self.display.start_clock()
             self.fill()
             while self.running:
                 self.step()
@@ -80,12 +83,14 @@ class Driver:
             print("\nstopping: the workers write checkpoints; once more to stop at once")
             self.stop()
             raise
+        finally:
+            self.bar.close()
         if self.obstacle:
             raise UserError(self.obstacle)
 
     def step(self) -> None:
         """Wait up to :data:`POLL` seconds for outcomes and hand out new assets; each :data:`POLL`
-        seconds restart hung workers and draw the display.
+        seconds restart hung workers and show what the workers do.
         """
         ready, _ = self.ray.wait(list(self.running), timeout=POLL)
         if ready:  # all that are there: each wait takes longer the more workers there are
@@ -99,23 +104,16 @@ class Driver:
             self.look_after_workers()
             self.look_due = time.monotonic() + POLL
 
-    def look_after_workers(self) -> None:
-        """Restart hung workers, and draw the display."""
-        beats = self.read_board()
-        self.restart_hung(beats)
-        names = {worker: job.row.name for worker, job, _ in self.running.values()}
-        self.display.draw(beats, names)
-
     def fill(self) -> None:
         """Give an asset to each worker that has none."""
         while self.idle:
             job = self.again.popleft() if self.again else next(self.jobs, None)
             if job is None:
                 return
-            self.ledger.append([self.line(job, RUNNING)])
+            job = job._replace(handed_out=time.time())
             number = self.idle.popleft()
             handle = self.workers[number].make.remote(job, self.settings[number])
-            self.running[handle] = Running(number, job, time.monotonic())
+            self.running[handle] = Running(number, job)
 
     def stop(self) -> None:
         """Let all workers write a checkpoint and end."""
@@ -124,71 +122,62 @@ class Driver:
         while self.running and time.monotonic() < deadline:
             ready, _ = self.ray.wait(list(self.running), timeout=POLL)
             for handle in ready:
-                self._collect_last(handle)
-
-    def _collect_last(self, handle: Any) -> None:
-        """Note the outcome of an asset while the farm is stopped; an error of the ledger, such as a
-        full disk, is printed, so that it doesn't take the place of Ctrl-C.
-        """
-        try:
-            self.collect(handle)
-        except UserError as error:
-            print(f"error: {error}")
+                self.collect(handle)
 
     # Outcomes
     # ----------------------------------------------------------------------------------------------
 
     def collect(self, handle: Any) -> None:
         """Note the outcome of an asset."""
-        number, job, began = self.running.pop(handle)
+        number, job = self.running.pop(handle)
         self.idle.append(number)
         outcome = self.outcome(handle)
-        state, spent = outcome["state"], round(time.monotonic() - began, 3)
+        state = outcome["state"]
         if state == FINISHED:
-            self.finish(job, outcome, spent)
+            self.note(job, FINISHED, f"{outcome.get('seconds', 0):.1f} s")
             return
-        if state == FAILED or state == NO_MEMORY and not self.can_save_memory(job):
-            self.fail(job, outcome["error"], spent)
-            return
-        self.ledger.append([self.line(job, RUNNING, worker_seconds=spent)])
-        if state == NO_MEMORY:
-            self.display.note(job.row.name, "again with less memory", outcome["error"])
+        job, error = job._replace(spent=job.worker_seconds(time.time())), outcome["error"]
+        if state == NO_MEMORY and self.recipe.low_memory and not job.saves_memory:
+            self.record(job, STOPPED, error)
+            self.note(job, "again with less memory", error)
             self.again.append(job._replace(saves_memory=True))
             self.restart(number)
-        elif state == BLOCKED:
-            self.block(outcome["error"])
-
-    def can_save_memory(self, job: Job) -> bool:
-        """Return whether an asset can be made again in less memory."""
-        return bool(self.recipe.low_memory) and not job.saves_memory
+        elif state in (FAILED, NO_MEMORY):
+            self.fail(job, error)
+        else:
+            self.record(job, STOPPED, error)
+            if state == BLOCKED:
+                self.block(error)
 
     def outcome(self, handle: Any) -> dict[str, Any]:
         """Return what the worker returned, or what Ray says about its death."""
-        errors = self.ray.exceptions
         try:
             return self.ray.get(handle)
-        except errors.RayActorError as error:
-            return {"state": FAILED, "error": f"its worker can't be restarted: {error}"}
-        except errors.RayError as error:
-            return {"state": FAILED, "error": first_line(error)}
+        except self.ray.exceptions.RayError as error:
+            said = (str(error).strip().splitlines() or [type(error).__name__])[0][:500]
+            if isinstance(error, self.ray.exceptions.RayActorError):
+                said = f"its worker can't be restarted: {said}"
+            return {"state": FAILED, "error": said}
 
-    def finish(self, job: Job, outcome: dict[str, Any], spent: float) -> None:
-        outcome.pop("key")
-        self.ledger.append([self.line(job, **outcome, worker_seconds=spent)])
-        self.display.note(job.row.name, FINISHED, f"{outcome.get('seconds', 0):.1f} s")
-
-    def fail(self, job: Job, error: str, spent: float) -> None:
+    def fail(self, job: Job, error: str) -> None:
         """Note a failed asset; end the farm if the first assets all failed with one message."""
-        command = repeat_command(self.recipe, job)
-        more = {"error": error, "command": command, "worker_seconds": spent}
-        self.ledger.append([self.line(job, FAILED, **more)])
-        self.display.note(job.row.name, FAILED, error)
+        self.record(job, FAILED, error)
+        self.note(job, FAILED, error)
         self.errors.append(error)
-        finished = self.display.done + self.display.counts[FINISHED]
-        if not finished and self.errors == [error] * SAME_ERRORS:
+        if not self.done + self.counts[FINISHED] and self.errors == [error] * SAME_ERRORS:
             self.block(
                 f"the first {SAME_ERRORS} assets have failed alike, so the farm ends: {error}"
             )
+
+    def record(self, job: Job, state: str, error: str) -> None:
+        """Write the record of an attempt that ended without a result."""
+        record = {"state": state, "key": job.row.key, "error": error}
+        record |= {"command": repeat_command(self.recipe, job), "worker_seconds": job.spent}
+        content = json_text(record, indent=1).encode()
+        try:
+            self.place.write({f"{ASSETS}/{job.row.name}/{FAILURE}": content})
+        except UserError as problem:  # such as a full disk
+            self.block(str(problem))
 
     def block(self, error: str) -> None:
         """Hand out no more assets, and let the workers write checkpoints; :meth:`run` then raises
@@ -197,43 +186,49 @@ class Driver:
         self.obstacle = self.obstacle or error
         self.tell_board_to_stop()
 
-    def line(self, job: Job, state: str, **more: Any) -> dict[str, Any]:
-        row = job.row
-        return {"name": row.name, "key": row.key, "state": state, **more}
+    def note(self, job: Job, state: str, text: str) -> None:
+        """Count and print the outcome of an asset, and off terminals how much is left."""
+        self.counts[state] += 1
+        made = self.counts[FINISHED] + self.counts[FAILED]
+        self.bar.update(self.done + made - self.bar.n)
+        left = self.total - self.done - made
+        if self.bar.disable and made and left:
+            seconds = (time.monotonic() - self.began) / made * left
+            text += f" ({self.done + made} of {self.total}, {tqdm.format_interval(seconds)} left)"
+        self.bar.write(f"{job.row.name}: {state}: {text}", file=sys.stderr)
 
     # Workers
     # ----------------------------------------------------------------------------------------------
 
-    def read_board(self) -> dict[int, tuple[Beat, float]]:
-        """Return the board's content; nothing while its process is restarted."""
+    def look_after_workers(self) -> None:
+        """Restart hung workers, and show what the workers do."""
         try:
-            return self.ray.get(self.board.read.remote(), timeout=2)
+            beats = self.ray.get(self.board.read.remote(), timeout=2)
         except self.ray.exceptions.RayError:
-            return {}
+            return  # the board's process is being restarted
+        self.restart_hung(beats)
+        shown = [f"{beat.name} {beat.stage} {beat.step}/{beat.steps}" for beat, _ in beats.values()]
+        failed = f"{self.counts[FAILED]} failed, " if self.counts[FAILED] else ""
+        self.bar.set_postfix_str(failed + ", ".join(shown))
+
+    def restart_hung(self, beats: dict[int, tuple[Beat, float]]) -> None:
+        """Restart workers that have finished no step for ``hang`` seconds; Ray calls
+        :meth:`.worker.Worker.make` again with the same asset.
+        """
+        for number, job in self.running.values():
+            beat, seconds = beats.get(number, (None, 0.0))
+            hangs = beat is not None and beat.name == job.row.name and seconds > self.hang
+            if hangs and self.killed.get(number) != beat:
+                self.killed[number] = beat
+                reason = f"no step for {seconds:.0f} s ({beat.stage} {beat.step})"
+                self.note(job, "restarted", reason)
+                self.restart(number)
+
+    def restart(self, number: int) -> None:
+        self.ray.kill(self.workers[number], no_restart=False)
 
     def tell_board_to_stop(self) -> None:
         try:
             self.ray.get(self.board.stop.remote(), timeout=5)
         except self.ray.exceptions.RayError:
             pass  # it is being restarted; the workers are stopped without checkpoints
-
-    def restart_hung(self, beats: dict[int, tuple[Beat, float]]) -> None:
-        """Restart workers that have finished no step for ``hang`` seconds; Ray calls
-        :meth:`.worker.Worker.make` again with the same asset.
-        """
-        for number, job, _ in self.running.values():
-            beat, seconds = beats.get(number, (None, 0.0))
-            hangs = beat is not None and beat.name == job.row.name and seconds > self.hang
-            if hangs and self.killed.get(number) != beat:
-                self.killed[number] = beat
-                reason = f"no step for {seconds:.0f} s ({beat.stage} {beat.step})"
-                self.display.note(job.row.name, "restarted", reason)
-                self.restart(number)
-
-    def restart(self, number: int) -> None:
-        self.ray.kill(self.workers[number], no_restart=False)
-
-
-def first_line(error: BaseException) -> str:
-    lines = str(error).strip().splitlines() or [type(error).__name__]
-    return lines[0][:500]

@@ -1,22 +1,82 @@
-"""Read and check the configuration of a farm before any work: its own, and those of the rows."""
+"""What the assets of a farm are made with: its configuration and those of the rows, checked before
+any work, the launcher's arguments for an asset, and ``farm.json``, which tells one farm from
+another."""
 
-from collections.abc import Iterable, Iterator
+import hashlib
+import json
+import shlex
+from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
-from typing import Any, Optional
+from typing import NamedTuple, Optional
 
+from .. import __version__
 from ..core.errors import UserError
+from ..core.files import json_text
 from ..launch.config_source import read_yaml
 from ..launch.experiment import read_source
 from ..launch.options import find_config
-from .assets import MANAGED, Job, Recipe, Source, run_overrides
-from .ledger import FINISHED, Ledger
+from ..launch.run_folder import program_anywhere
+from .place import ASSETS, Place
 from .rows import Row
 
+FARM = "farm.json"
+OF_MACHINES = ("device", "cores")
+"""Entries of ``farm.json`` that are known only when Ray has told which machines there are."""
 LOW_MEMORY = "gaussiandreamer-lowmem.yaml"
 MOST_CHECKS = 500
 """Rows of one list may have different overrides; so many are checked before any work, and further
 ones when it is their turn."""
+MANAGED = {
+    "exp_root_dir": "--out",
+    "name": "--out",
+    "tag": "the column name",
+    "timestamp": "the farm",
+    "use_timestamp": "the farm",
+    "resume": "the farm, which resumes by itself",
+    "system.prompt_processor.prompt": "the prompt list",
+    "system.prompt_processor.prompt_file": "the prompt list",
+}
+"""Options that a farm sets, and what to use instead of an override."""
+
+
+class Source(NamedTuple):
+    """A YAML file as it was read when the farm was started."""
+
+    name: str
+    content: bytes
+
+
+class Recipe(NamedTuple):
+    """What all assets of a farm have in common."""
+
+    sources: tuple[Source, ...]
+    overrides: tuple[str, ...]
+    cpu: bool
+    """Whether the assets are made on the CPU."""
+    cores: int
+    """Threads of an asset. On the CPU the last bits of a result depend on it."""
+    low_memory: Optional[Source] = None
+    """Laid over the sources for an asset for which the memory didn't suffice; None: not valid
+    with them."""
+
+
+class Job(NamedTuple):
+    """One row and what is needed to make its asset."""
+
+    row: Row
+    sources: tuple[Source, ...] = ()
+    """The YAML files of the row's column ``config``."""
+    saves_memory: bool = False
+    """Whether the low-memory configuration is laid over the others."""
+    spent: float = 0.0
+    """Seconds of workers in earlier attempts."""
+    handed_out: float = 0.0
+    """When a worker got it, seconds since 1970."""
+
+    def worker_seconds(self, now: float) -> float:
+        """Return the seconds of workers in all attempts, which end ``now``."""
+        return round(self.spent + max(now - self.handed_out, 0.0), 3)
 
 
 @cache
@@ -34,10 +94,27 @@ def make_recipe(
     Raises:
         UserError: a file is missing, or an override is one that the farm sets.
     """
+    return Recipe(tuple(map(read_config, configs)), _free(overrides), cpu, cores)
+
+
+def job_of(row: Row, spent: float = 0.0) -> Job:
+    """Return the job of a row, with the YAML files of its column ``config``.
+
+    Raises:
+        UserError: a file is missing, or an override is one that the farm sets.
+    """
+    _free(row.overrides)
+    return Job(row, tuple(map(read_config, row.config)), spent=spent)
+
+
+def _free(overrides: Iterable[str]) -> tuple[str, ...]:
+    """Return the overrides; raise UserError if one is of an option that the farm sets."""
     overrides = tuple(overrides)
     for override in overrides:
-        require_free(override)
-    return Recipe(tuple(map(read_config, configs)), overrides, cpu, cores)
+        key = override.partition("=")[0]
+        if key in MANAGED:
+            raise UserError(f"{key} is set by {MANAGED[key]}: remove {override[:80]!r}")
+    return overrides
 
 
 def root_of(configs: Iterable[str]) -> str:
@@ -46,29 +123,53 @@ def root_of(configs: Iterable[str]) -> str:
     return str([root for root in ["outputs", *roots] if root][-1])
 
 
-def require_free(override: str) -> None:
-    """Raise UserError for an override of an option that the farm sets."""
-    key = override.partition("=")[0]
-    if key in MANAGED:
-        raise UserError(f"{key} is set by {MANAGED[key]}: remove {override[:80]!r}")
+# Arguments
+# --------------------------------------------------------------------------------------------------
 
 
-def job_of(row: Row) -> Job:
-    """Return the job of a row, with the YAML files of its column ``config``.
+def launch_arguments(recipe: Recipe, job: Job, configs: list[str], folder: Path) -> list[str]:
+    """Return the launcher's arguments for an asset.
 
-    Raises:
-        UserError: a file is missing, or an override is one that the farm sets.
+    Args:
+        configs: the paths of the YAML files.
+        folder: of the farm; the asset's is ``folder/assets/<name>``.
     """
-    for override in row.overrides:
-        require_free(override)
-    return Job(row, tuple(map(read_config, row.config)))
+    return [
+        *(text for path in configs for text in ("--config", path)),
+        "--train",
+        *(["--gpu", "cpu"] if recipe.cpu else []),
+        *run_overrides(recipe, job),
+        f"exp_root_dir={folder}",
+        f"name={ASSETS}",
+        f"tag={job.row.name}",
+        "use_timestamp=false",
+        "resume=auto",
+    ]
 
 
-def jobs_left(rows: Iterable[Row], ledger: Ledger) -> Iterator[Job]:
-    """Yield the jobs that aren't finished."""
-    for row in rows:
-        if ledger.state(row) != FINISHED:
-            yield job_of(row)
+def run_overrides(recipe: Recipe, job: Job) -> list[str]:
+    """Return the overrides that an asset depends on."""
+    seed = [] if job.row.seed is None else [f"seed={job.row.seed}"]
+    prompt = f"system.prompt_processor.prompt={job.row.prompt}"
+    return [*recipe.overrides, *job.row.overrides, *seed, prompt]
+
+
+def all_sources(recipe: Recipe, job: Job) -> list[Source]:
+    """Return the YAML files of an asset, later ones taking precedence."""
+    extra = [recipe.low_memory] if job.saves_memory and recipe.low_memory else []
+    return [*recipe.sources, *job.sources, *extra]
+
+
+def repeat_command(recipe: Recipe, job: Job) -> str:
+    """Return the command that makes an asset by itself, in ``outputs/``."""
+    configs = [text for source in all_sources(recipe, job) for text in ("--config", source.name)]
+    device = ["--gpu", "cpu"] if recipe.cpu else []
+    command = [*program_anywhere(), *configs, "--train", *device, *run_overrides(recipe, job)]
+    return f"OMP_NUM_THREADS={recipe.cores} {shlex.join(command)}"
+
+
+# Checks
+# --------------------------------------------------------------------------------------------------
 
 
 def check_recipe(recipe: Recipe, rows: Iterable[Row]) -> Recipe:
@@ -92,37 +193,65 @@ def check_recipe(recipe: Recipe, rows: Iterable[Row]) -> Recipe:
         kind = row.config, row.overrides
         if kind not in checked and len(checked) < MOST_CHECKS:
             checked.add(kind)
-            check_row(recipe, row)
-    return recipe if first is None else with_low_memory(recipe, first)
+            try:
+                check_job(recipe, job_of(row))
+            except UserError as error:
+                if row.config or row.overrides:
+                    raise UserError(f"line {row.line} of the prompt list: {error}") from error
+                raise
+    if first is not None:
+        try:
+            saving = recipe._replace(low_memory=read_config(LOW_MEMORY))
+            check_job(saving, job_of(first)._replace(saves_memory=True))
+            return saving
+        except UserError:
+            pass
+    return recipe
 
 
-def check_row(recipe: Recipe, row: Row) -> None:
-    try:
-        check_job(recipe, job_of(row))
-    except UserError as error:
-        if row.config or row.overrides:
-            raise UserError(f"line {row.line} of the prompt list: {error}") from error
-        raise
-
-
-def check_job(recipe: Recipe, job: Job) -> Any:
-    """Check the configuration of one asset as the launcher does, and return it."""
+def check_job(recipe: Recipe, job: Job) -> None:
+    """Check the configuration of one asset as the launcher does."""
     from ..launch.config import load_config
     from ..launch.config_check import check_config
 
-    extra = [recipe.low_memory] if job.saves_memory and recipe.low_memory else []
-    paths = [Path(source.name) for source in (*recipe.sources, *job.sources, *extra)]
+    paths = [Path(source.name) for source in all_sources(recipe, job)]
     # the farm's own exp_root_dir may be a URL, which a single run refuses
-    cfg = load_config(*paths, cli_args=[*run_overrides(recipe, job), "exp_root_dir=outputs"])
-    check_config(cfg)
-    return cfg
+    overrides = [*run_overrides(recipe, job), "exp_root_dir=outputs"]
+    check_config(load_config(*paths, cli_args=overrides))
 
 
-def with_low_memory(recipe: Recipe, row: Row) -> Recipe:
-    """Return the recipe with the low-memory configuration, if it is valid with the row's."""
-    try:
-        saving = recipe._replace(low_memory=read_config(LOW_MEMORY))
-        check_job(saving, job_of(row)._replace(saves_memory=True))
-    except UserError:
-        return recipe
-    return saving
+def require_same_farm(place: Place, recipe: Recipe, *, before_ray: bool = False) -> None:
+    """Check that a folder is new or of the same farm, and note the farm in a new one.
+
+    Args:
+        before_ray: don't compare what depends on the machines, and note nothing.
+
+    Raises:
+        UserError: the folder belongs to another farm; the message names what differs.
+    """
+    ours = {
+        "version": __version__,
+        "configurations": [
+            f"{Path(source.name).name} {hashlib.sha256(source.content).hexdigest()[:16]}"
+            for source in recipe.sources
+        ],
+        "overrides": list(recipe.overrides),
+        "device": "cpu" if recipe.cpu else "gpu",
+        "cores": recipe.cores if recipe.cpu else None,
+    }
+    theirs = place.json(FARM)
+    if theirs is None and not before_ray:
+        place.write({FARM: json_text(ours, indent=1).encode()})
+    for name, here in ours.items():
+        if theirs is None or (before_ray and name in OF_MACHINES) or theirs.get(name) == here:
+            continue
+        there, note = theirs.get(name), ""
+        if isinstance(there, list) and isinstance(here, list):
+            only = [x for x in there if x not in here], [x for x in here if x not in there]
+            # else only their order differs, or nothing is in both
+            if any(only) and only != (there, here):
+                (there, here), note = only, " (without what is in both)"
+        raise UserError(
+            f"{place} belongs to another farm: its {name} is {json.dumps(there)[:300]}, here "
+            f"{json.dumps(here)[:300]}{note}; choose another --out"
+        )

@@ -1,32 +1,32 @@
-"""The report of a farm, from the prompt list and the ledger: a gallery, and a table in CSV and
-Parquet.
+"""The report of a farm, from the prompt list and the assets' records: a gallery, and a table in CSV
+and Parquet.
 
 Everything is written as it is read, so that the memory doesn't grow with the number of assets."""
 
 import csv
 import html
-import os
+import io
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable
+from contextlib import ExitStack
+from itertools import islice
 from pathlib import Path
-from typing import Any, NamedTuple, Optional
+from typing import Any, Optional
 from urllib.parse import quote
 
-from ..core.files import atomic_file
-from .assets import ASSETS
-from .display import duration
-from .ledger import FAILED, FINISHED, Ledger
-from .rows import Row
-from .storage import Place
+from tqdm import tqdm
 
-FOLDER = "report"
+from ..core.files import atomic_file
+from .place import ASSETS, FAILED, FINISHED, Place
+from .rows import Row
+
+FOLDER, CSV, PARQUET = "report", "table.csv", "table.parquet"
 PER_PAGE = 200
 """Assets on one page of the gallery."""
 MOST_FAILURES = 1000
 """Failures that the first page lists; the table has all."""
 BATCH = 5000
 """Rows of the table that are held in memory."""
-WAITING = "waiting"
 TEXT, WHOLE, NUMBER = "text", "whole number", "number"
 COLUMNS = {
     "name": TEXT,
@@ -59,167 +59,99 @@ figcaption{overflow-wrap:anywhere}.failed{color:#b00020}code{overflow-wrap:anywh
 table{border-collapse:collapse}td,th{padding:.2rem .8rem .2rem 0;text-align:left}"""
 
 
-class Totals:
-    """Sums over the rows that pass through :meth:`counted`."""
-
-    def __init__(self) -> None:
-        self.states: Counter = Counter()
-        self.seconds = self.cost = 0.0
-        self.failures: list[dict[str, Any]] = []
-
-    def counted(self, lines: Iterable[dict[str, Any]]) -> Iterator[dict[str, Any]]:
-        for line in lines:
-            self.states[line["state"]] += 1
-            self.seconds += line["worker_seconds"] or 0.0
-            self.cost += line["cost"] or 0.0
-            if line["state"] == FAILED and len(self.failures) < MOST_FAILURES:
-                self.failures.append(line)
-            yield line
-
-
-class Table(NamedTuple):
-    """Paths of the tables that were written."""
-
-    csv: Path
-    parquet: Optional[Path]
-    """None where pyarrow isn't installed."""
-
-
 def write_report(
-    place: Place, rows: Iterable[Row], ledger: Ledger, price: Optional[float] = None
-) -> Path:
-    """Write the report of a farm and return its first page.
+    place: Place, rows: Iterable[Row], total: int, price: Optional[float] = None
+) -> tuple[Path, Counter]:
+    """Write the report of a farm; return its first page and the number of assets of each state.
 
     Args:
-        rows: the prompt list.
+        rows: the prompt list, ``total`` rows.
         price: of an hour of one worker; None: the table has no cost.
     """
     folder = place.folder / FOLDER
     folder.mkdir(parents=True, exist_ok=True)
-    totals = Totals()
-    pages = Gallery(folder)
-    lines = totals.counted(table_lines(rows, ledger, price))
-    table = write_table(folder, pages.shown(lines))
-    pages.close()
-    write_text(folder / "index.html", first_page(totals, table, pages.names, price))
+    states, seconds, failures, figures, pages = Counter(), 0.0, [], [], 0
+    with ExitStack() as stack:
+        write = tables(stack, folder)
+        bar = tqdm(place.records(rows), "report", total, unit="asset", disable=None, delay=1)
+        lines = (table_line(row, record, price) for row, record in bar)
+        batch: Optional[list] = None
+        while batch is None or batch:
+            batch = list(islice(lines, BATCH))
+            write(batch)
+            states.update(line["state"] for line in batch)
+            seconds += sum(line["worker_seconds"] or 0.0 for line in batch)
+            failures += [failure(line) for line in batch if line["state"] == FAILED]
+            del failures[MOST_FAILURES:]
+            figures += [figure(line) for line in batch if line["state"] == FINISHED]
+            while len(figures) >= PER_PAGE or figures and not batch:
+                pages += 1
+                body = f"<main>{''.join(figures[:PER_PAGE])}</main>"
+                write_page(folder / f"page-{pages}.html", f"Assets, page {pages}", body)
+                del figures[:PER_PAGE]
+    numbers = {state: f"{states[state]}" for state in sorted(states)}
+    numbers["worker time"] = duration(seconds)
+    if price is not None:
+        cost = seconds / 3600 * price
+        each = f", {cost / states[FINISHED]:.4g} per finished asset" if states[FINISHED] else ""
+        numbers["cost"] = f"{cost:.4g}{each}"
+    cells = "".join(f"<tr><th>{name}</th><td>{text}</td></tr>" for name, text in numbers.items())
+    names = [name for name in (CSV, PARQUET) if (folder / name).exists()]
+    names += [f"page-{i + 1}.html" for i in range(pages)]
+    links = " ".join(f'<a href="{name}">{name}</a>' for name in names)
+    more = states[FAILED] - len(failures)
+    left_out = f"<p>{more} more are in {CSV}.</p>" if more else ""
+    failed = f"<h2>Failures</h2>{''.join(failures)}{left_out}" if failures else ""
+    first = folder / "index.html"
+    write_page(first, "Report", f"<table>{cells}</table><p>{links}</p>{failed}")
     for path in sorted(folder.iterdir()):
         place.upload(f"{FOLDER}/{path.name}")
-    return folder / "index.html"
+    return first, states
 
 
-def table_lines(
-    rows: Iterable[Row], ledger: Ledger, price: Optional[float]
-) -> Iterator[dict[str, Any]]:
-    """Yield a line of the table, with all :data:`COLUMNS`, for each row."""
-    for row in rows:
-        last = ledger.last(row) or {}
-        known = {**last, **(last.get("scores") or {})}
-        line = {column: known.get(column) for column in COLUMNS}
-        line |= {"name": row.name, "prompt": row.prompt, "seed": row.seed}
-        line["state"] = last.get("state", WAITING)
-        if line["saves_memory"] is not None:
-            line["saves_memory"] = "yes" if line["saves_memory"] else "no"
-        # the ledger lacks the last attempt's where the driver was killed
-        spent = round(max(ledger.worker_seconds(row), line["seconds"] or 0.0), 3) or None
-        line["worker_seconds"] = spent
-        if price is not None and spent is not None:
-            line["cost"] = round(spent / 3600 * price, 6)
-        yield line
+def table_line(row: Row, record: dict[str, Any], price: Optional[float]) -> dict[str, Any]:
+    """Return a line of the table, with all :data:`COLUMNS`."""
+    known = {**record, **(record.get("scores") or {})}
+    line = {column: known.get(column) for column in COLUMNS}
+    line |= {"name": row.name, "prompt": row.prompt, "seed": row.seed}
+    if line["saves_memory"] is not None:
+        line["saves_memory"] = "yes" if line["saves_memory"] else "no"
+    # earlier versions recorded only the last attempt's where the driver was killed
+    spent = round(max(line["worker_seconds"] or 0.0, line["seconds"] or 0.0), 3) or None
+    line["worker_seconds"] = spent
+    if price is not None and spent is not None:
+        line["cost"] = round(spent / 3600 * price, 6)
+    return line
 
 
-# Tables
-# --------------------------------------------------------------------------------------------------
-
-
-def write_table(folder: Path, lines: Iterable[dict[str, Any]]) -> Table:
-    """Write ``table.csv``, and ``table.parquet`` where pyarrow is installed."""
-    table = Table(folder / "table.csv", folder / "table.parquet")
+def tables(stack: ExitStack, folder: Path) -> Callable[[list[dict[str, Any]]], None]:
+    """Begin ``table.csv``, and ``table.parquet`` where pyarrow is installed; return the function
+    that writes lines to them. They are complete when ``stack`` is closed.
+    """
+    # closed before its file would be
+    text = io.TextIOWrapper(stack.enter_context(atomic_file(folder / CSV)), "utf-8", newline="")
+    stack.callback(text.detach)
+    writer = csv.DictWriter(text, list(COLUMNS), lineterminator="\n")
+    writer.writeheader()
     try:
-        import pyarrow  # noqa: F401
+        import pyarrow as pa
+        from pyarrow.parquet import ParquetWriter
     except ImportError:
-        table = table._replace(parquet=None)
-    with atomic_file(table.csv) as file:
-        content = Utf8Lines(file)
-        writer = csv.DictWriter(content, list(COLUMNS), lineterminator="\n")
-        writer.writeheader()
-        lines = written(writer, lines)
-        if table.parquet:
-            write_parquet(table.parquet, lines)
-        else:
-            for _ in lines:
-                pass
-    return table
-
-
-class Utf8Lines:
-    """The text file that ``csv`` writes to, on a binary one."""
-
-    def __init__(self, file: Any) -> None:
-        self.file = file
-
-    def write(self, text: str) -> None:
-        self.file.write(text.encode())
-
-
-def written(writer: Any, lines: Iterable[dict[str, Any]]) -> Iterator[dict[str, Any]]:
-    """Write each line as it passes."""
-    for line in lines:
-        writer.writerow(line)
-        yield line
-
-
-def write_parquet(path: Path, lines: Iterable[dict[str, Any]]) -> None:
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
+        return writer.writerows
     kinds = {TEXT: pa.string(), WHOLE: pa.int64(), NUMBER: pa.float64()}
     schema = pa.schema([(name, kinds[kind]) for name, kind in COLUMNS.items()])
-    with atomic_file(path) as file, pq.ParquetWriter(file, schema) as writer:
-        for batch in batches(lines, BATCH):
-            writer.write_table(pa.Table.from_pylist(batch, schema))
+    file = stack.enter_context(atomic_file(folder / PARQUET))
+    parquet = stack.enter_context(ParquetWriter(file, schema))
 
+    def write(lines: list[dict[str, Any]]) -> None:
+        writer.writerows(lines)
+        parquet.write_table(pa.Table.from_pylist(lines, schema))
 
-def batches(lines: Iterable[dict[str, Any]], size: int) -> Iterator[list[dict[str, Any]]]:
-    batch = []
-    for line in lines:
-        batch.append(line)
-        if len(batch) == size:
-            yield batch
-            batch = []
-    if batch:
-        yield batch
+    return write
 
 
 # Pages
 # --------------------------------------------------------------------------------------------------
-
-
-class Gallery:
-    """The pages of finished assets, :data:`PER_PAGE` on each."""
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        self.names: list[str] = []
-        self.figures: list[str] = []
-
-    def shown(self, lines: Iterable[dict[str, Any]]) -> Iterator[dict[str, Any]]:
-        """Add each finished asset as it passes."""
-        for line in lines:
-            if line["state"] == FINISHED:
-                self.figures.append(figure(line))
-                if len(self.figures) == PER_PAGE:
-                    self.close()
-            yield line
-
-    def close(self) -> None:
-        """Write the page that isn't full."""
-        if self.figures:
-            name = f"page-{len(self.names) + 1}.html"
-            title = f"Assets, page {len(self.names) + 1}"
-            body = f"<main>{''.join(self.figures)}</main>"
-            write_text(self.folder / name, page(title, body), durable=False)
-            self.names.append(name)
-            self.figures = []
 
 
 def figure(line: dict[str, Any]) -> str:
@@ -234,25 +166,6 @@ def figure(line: dict[str, Any]) -> str:
     return f"<figure>{linked}<figcaption>{caption}</figcaption></figure>"
 
 
-def first_page(totals: Totals, table: Table, pages: list[str], price: Optional[float]) -> str:
-    """Return the page with the totals, the failures, and links to tables and gallery."""
-    numbers = {state: f"{count}" for state, count in sorted(totals.states.items())}
-    numbers["worker time"] = duration(totals.seconds)
-    if price is not None:
-        made = totals.states[FINISHED]
-        each = f", {totals.cost / made:.4g} per finished asset" if made else ""
-        numbers["cost"] = f"{totals.cost:.4g}{each}"
-    cells = "".join(f"<tr><th>{name}</th><td>{text}</td></tr>" for name, text in numbers.items())
-    files = [path.name for path in table if path is not None]
-    links = " ".join(f'<a href="{name}">{name}</a>' for name in [*files, *pages])
-    failures = "".join(failure(line) for line in totals.failures)
-    more = totals.states[FAILED] - len(totals.failures)
-    left_out = f"<p>{more} more are in {table.csv.name}.</p>" if more else ""
-    heading = "<h2>Failures</h2>" if failures else ""
-    body = f"<table>{cells}</table><p>{links}</p>{heading}{failures}{left_out}"
-    return page("Report", body)
-
-
 def failure(line: dict[str, Any]) -> str:
     """Return a failed asset, its error, and the command that repeats it."""
     error, command = html.escape(str(line["error"])), html.escape(str(line["command"]))
@@ -263,13 +176,16 @@ def failure(line: dict[str, Any]) -> str:
     )
 
 
-def page(title: str, body: str) -> str:
-    return (
-        f'<!doctype html><meta charset="utf-8"><title>{title}</title>'
-        f"<style>{STYLE}</style><h1>{title}</h1>{body}\n"
-    )
+def write_page(path: Path, title: str, body: str) -> None:
+    with atomic_file(path, durable=False) as file:
+        text = f'<!doctype html><meta charset="utf-8"><title>{title}</title><style>{STYLE}</style>'
+        file.write(f"{text}<h1>{title}</h1>{body}\n".encode())
 
 
-def write_text(path: str | os.PathLike, text: str, *, durable: bool = True) -> None:
-    with atomic_file(path, durable=durable) as file:
-        file.write(text.encode())
+def duration(seconds: float) -> str:
+    """Format a duration, such as "1 h 05 min"."""
+    if seconds < 60:
+        return f"{seconds:.0f} s"
+    if seconds < 3600:
+        return f"{seconds // 60:.0f} min {seconds % 60:02.0f} s"
+    return f"{seconds // 3600:.0f} h {seconds % 3600 // 60:02.0f} min"

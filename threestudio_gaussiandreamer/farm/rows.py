@@ -1,18 +1,5 @@
-"""Read prompt lists: one prompt per line, or CSV or JSONL with more columns per prompt.
-
-=========  =========================================================================================
-column     meaning
-=========  =========================================================================================
-prompt     the text; required
-name       the asset's folder; by default made from the prompt, and from the seed if one is given
-seed       the run's seed; by default the configuration's
-config     a YAML file, or a list of them, laid over the farm's configuration
-overrides  ``key=value`` arguments of the launcher; in CSV separated by spaces and quoted as in a
-           shell, in JSONL a list, a text or an object
-=========  =========================================================================================
-
-Empty lines and lines that begin with ``#`` are skipped. A list is read as a stream, since it may
-have a million rows."""
+"""Read prompt lists: one prompt per line, or CSV or JSONL with the columns of docs/farm.md; as a
+stream, since a list may have a million rows."""
 
 import csv
 import hashlib
@@ -20,6 +7,7 @@ import json
 import shlex
 import unicodedata
 from collections.abc import Callable, Iterator, Mapping
+from itertools import count
 from pathlib import Path
 from typing import Any, NamedTuple, Optional
 
@@ -132,10 +120,9 @@ def _seed(value: Any) -> Optional[int]:
     if value is None or value == "":
         return None
     text = str(value)
-    if isinstance(value, bool) or not text.isascii() or not text.isdigit() or len(text) > 10:
+    whole = text.isascii() and text.isdigit() and len(text) <= 10
+    if isinstance(value, bool) or not whole or int(text) > MOST_SEED:
         raise UserError(f"the seed is {value!r}; expected a whole number from 0 to {MOST_SEED}")
-    if int(text) > MOST_SEED:
-        raise UserError(f"the seed is {value}; expected at most {MOST_SEED}")
     return int(text)
 
 
@@ -160,7 +147,8 @@ def _texts(column: str, value: Any) -> list[str]:
 
 def _overrides(value: Any) -> list[str]:
     if isinstance(value, Mapping):
-        value = [f"{key}={_yaml(item)}" for key, item in value.items()]
+        # JSON is YAML, but a text stands without its quotes, as on a command line
+        value = [f"{k}={v if isinstance(v, str) else json.dumps(v)}" for k, v in value.items()]
     if isinstance(value, str):
         try:
             value = shlex.split(value)
@@ -173,11 +161,6 @@ def _overrides(value: Any) -> list[str]:
     return texts
 
 
-def _yaml(value: Any) -> str:
-    # JSON is YAML, but a text stands without its quotes, as on a command line
-    return value if isinstance(value, str) else json.dumps(value)
-
-
 # Formats
 # --------------------------------------------------------------------------------------------------
 
@@ -185,34 +168,26 @@ def _yaml(value: Any) -> str:
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
     """Yield number and text of each line that is neither empty nor a comment."""
     with open(path, "rb") as file:
-        number = 0
-        while content := file.readline(MOST_LINE_BYTES + 1):
-            number += 1
+        for number in count(1):
+            content = file.readline(MOST_LINE_BYTES + 1)
+            if not content:
+                return
             if len(content) > MOST_LINE_BYTES:
                 raise UserError(
                     f"{path}, line {number} is longer than {MOST_LINE_BYTES} bytes: is this a "
                     "list of prompts, one per line?"
                 )
-            text = _decoded(content, path, number)
+            try:
+                text = content.decode("utf-8-sig" if number == 1 else "utf-8")
+            except UnicodeDecodeError:
+                text = "\0"
+            if "\0" in text:
+                raise UserError(
+                    f"{path}, line {number} isn't UTF-8 text; expected a list of prompts (.txt, "
+                    ".csv, .jsonl), which Excel saves as CSV UTF-8"
+                )
             if text.strip() and not text.lstrip().startswith("#"):
                 yield number, text
-
-
-def _decoded(content: bytes, path: Path, number: int) -> str:
-    try:
-        text = content.decode("utf-8-sig" if number == 1 else "utf-8")
-    except UnicodeDecodeError as error:
-        raise _not_text(path, number) from error
-    if "\0" in text:
-        raise _not_text(path, number)
-    return text
-
-
-def _not_text(path: Path, number: int) -> UserError:
-    return UserError(
-        f"{path}, line {number} isn't UTF-8 text; expected a list of prompts (.txt, .csv, .jsonl), "
-        "which Excel saves as CSV UTF-8"
-    )
 
 
 def _from_text(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
@@ -221,40 +196,36 @@ def _from_text(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
 
 
 def _from_csv(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
-    numbers = [0]
-    reader = csv.reader(_noted(path, numbers), skipinitialspace=True, strict=True)
+    number = 0
+
+    def texts() -> Iterator[str]:
+        nonlocal number
+        for number, text in _lines(path):  # noqa: B007
+            yield text
+
+    reader = csv.DictReader(texts(), skipinitialspace=True, strict=True)
     try:
-        header = [column.strip() for column in next(reader, [])]
-        _check_header(path, header)
-        for cells in reader:
-            if len(cells) > len(header):
+        reader.fieldnames = header = [column.strip() for column in reader.fieldnames or []]
+        for separator, name in ((";", "semicolons"), ("\t", "tabs")):
+            if len(header) == 1 and separator in header[0]:
+                raise UserError(f"{path}: columns are separated by commas, this file has {name}")
+        for column in header:
+            if column not in COLUMNS:
+                raise UserError(f"{path}: {unknown('column', column, COLUMNS)}")
+        if header and "prompt" not in header or len(set(header)) != len(header):
+            raise UserError(
+                f"{path}: its first line must name each column once, with a column prompt; "
+                f"it is {','.join(header)!r}"
+            )
+        for values in reader:
+            if None in values:
                 raise UserError(
-                    f"{path}, line {numbers[0]}: {len(cells)} cells for {len(header)} columns; "
-                    "put a text with commas in double quotes"
+                    f"{path}, line {number}: {len(header) + len(values[None])} cells for "
+                    f"{len(header)} columns; put a text with commas in double quotes"
                 )
-            yield numbers[0], dict(zip(header, cells, strict=False))
+            yield number, values
     except csv.Error as error:
-        raise UserError(f"{path}, line {numbers[0]}: {error}") from error
-
-
-def _noted(path: Path, numbers: list[int]) -> Iterator[str]:
-    """Yield the lines, and keep the number of the last one in ``numbers``."""
-    for numbers[0], text in _lines(path):
-        yield text
-
-
-def _check_header(path: Path, header: list[str]) -> None:
-    for separator, name in ((";", "semicolons"), ("\t", "tabs")):
-        if len(header) == 1 and separator in header[0]:
-            raise UserError(f"{path}: columns are separated by commas, this file has {name}")
-    for column in header:
-        if column not in COLUMNS:
-            raise UserError(f"{path}: {unknown('column', column, COLUMNS)}")
-    if header and "prompt" not in header or len(set(header)) != len(header):
-        raise UserError(
-            f"{path}: its first line must name each column once, with a column prompt; "
-            f"it is {','.join(header)!r}"
-        )
+        raise UserError(f"{path}, line {number}: {error}") from error
 
 
 def _from_jsonl(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:

@@ -17,24 +17,22 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple, Optional
 
-from .. import __version__, register_parts
+from .. import register_parts
 from ..core.errors import UserError, raised_in
 from ..core.launcher import train_alone
-from ..models.loaded import keep_loaded, load_counts
-from . import assets
-from .assets import Job, Recipe, Source
-from .board import Beat, Reporter
-from .heartbeat import Heartbeat
-from .ledger import FAILED, FINISHED
-from .storage import Place, Unreachable
+from ..models.loaded import keep_loaded
+from .board import Beat, Heartbeat
+from .place import FAILED, FINISHED, STOPPED, Place, Unreachable, another_row, has_files
+from .recipe import Job, Recipe, Source, all_sources, launch_arguments
+from .results import reset_peak_memory, result_of
 
-STOPPED, BLOCKED, NO_MEMORY = "stopped", "blocked", "no memory"
-"""Outcomes beside ``ledger.STATES``: stopped with a checkpoint; the results can't be written; out
-of memory.
-"""
+BLOCKED, NO_MEMORY = "blocked", "no memory"
+"""Outcomes beside the states of an asset: the results can't be written; out of memory."""
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
 SECONDS_FOR_LOCK = 60
 """How long an asset's folder may still be locked by a process of an earlier, killed driver."""
+SAVES_MEMORY = "saves_memory.txt"
+"""Marks an asset's folder that is made with the low-memory configuration."""
 
 
 class Setting(NamedTuple):
@@ -62,15 +60,15 @@ class Worker:
     setting: Setting
     is_ready = False
 
-    def hello(self, setting: Setting) -> str:
-        """Prepare this process; return the version of the package in it.
+    def hello(self, setting: Setting) -> None:
+        """Prepare this process.
 
         Raises:
             UserError: the folder that the farm was started in doesn't exist on this machine.
         """
         self.setting = setting
         if self.is_ready:
-            return __version__
+            return
         if not os.path.isdir(setting.start):
             raise UserError(
                 f"{socket.gethostname()} has no folder {setting.start}: start the farm in a "
@@ -84,21 +82,17 @@ class Worker:
         keep_loaded()
         register_parts()
         self.is_ready = True
-        return __version__
 
     def make(self, job: Job, setting: Setting) -> dict[str, Any]:
         """Make an asset, or resume it from its checkpoint, and return its outcome.
 
         Returns:
-            ``state``, one of ``ledger.STATES``, :data:`STOPPED`, :data:`BLOCKED` or
-            :data:`NO_MEMORY`; ``error`` unless it is finished; and what ``result.json`` holds.
+            ``state``: FINISHED, with what ``result.json`` holds; or FAILED, STOPPED,
+            :data:`BLOCKED` or :data:`NO_MEMORY`, with ``error``.
         """
         try:
             self.hello(setting)
-            earlier = self.setting.place.finished(job.row)
-            if earlier is not None:
-                return {"state": FINISHED, **earlier}
-            return self._make(job)
+            return self.setting.place.finished(job.row) or self._make(job)
         except SystemExit as stop:
             if raised_in(stop, "ray."):  # which ends this process
                 raise
@@ -111,91 +105,66 @@ class Worker:
             gc.collect()
 
     def _make(self, job: Job) -> dict[str, Any]:
-        folder = self.setting.place.work_folder(job.row)
-        if marked(folder):  # an earlier session chose it, and this one resumes its checkpoint
+        place = self.setting.place
+        folder = place.work_folder(job.row)
+        if (folder / SAVES_MEMORY).is_file():
+            # an earlier session chose it, and this one resumes its checkpoint
             job = job._replace(saves_memory=True)
         elif job.saves_memory:
-            self.setting.place.discard(job.row)  # what was made with the other configuration
+            place.discard(job.row)  # what was made with the other configuration
         folder.mkdir(parents=True, exist_ok=True)
         if job.saves_memory:
-            mark(folder)
-        attempt, session_attempt = count_attempts(folder, self.setting.session)
+            (folder / SAVES_MEMORY).touch()
+        attempt, session_attempt = count_attempts(folder, self.setting.session, job)
         if session_attempt > self.setting.retries + 1:
             times = session_attempt - 1
             error = f"its worker died or hung {times} times, as if the memory didn't suffice"
             return {"state": NO_MEMORY, "error": error}
-        self.setting.place.fetch_checkpoint(job.row)
+        place.fetch_checkpoint(job.row)
         began = time.monotonic()
         reset_peak_memory()
         with written_log(folder / "log.txt"):
             run, code = self._run(job, folder, attempt)
         if code:
-            self.setting.place.keep_checkpoint(job.row)
+            place.keep_checkpoint(job.row)
             return {"state": STOPPED, "error": f"stopped by signal {code - 128}"}
         seconds = round(time.monotonic() - began, 3)
-        result = {**result_of(job, folder, run), "seconds": seconds, "attempts": attempt}
-        if not assets.has_files(result):
+        result = {"state": FINISHED, **result_of(job, folder, run), "seconds": seconds}
+        result |= {"attempts": attempt, "worker_seconds": job.worker_seconds(time.time())}
+        if not has_files(result):
             raise UserError(f"the run has left no files in {folder}")
-        assets.write_result(folder, result)
-        self.setting.place.publish(job.row)
-        return {"state": FINISHED, **result}
+        place.publish(job.row, result)
+        return result
 
     def _run(self, job: Job, folder: Path, attempt: int) -> tuple[Any, int]:
         """Train an asset with the launcher; return its run and exit code."""
         from ..launch.experiment import prepare
         from ..launch.options import parse_arguments
 
-        report = Reporter(self._send, answer_of)
-        report(Beat(job.row.name, attempt, "starting", 0, 0), now=True)
         heartbeat = Heartbeat(
             job.row.name,
             attempt,
-            report,
+            self._report,
             lambda: signal.raise_signal(signal.SIGTERM),
             lambda: self.setting.place.keep_checkpoint(job.row),
         )
-        with written_sources(assets.all_sources(self.setting.recipe, job)) as configs:
-            root = folder.parents[1]
-            argv = assets.launch_arguments(self.setting.recipe, job, configs, root)
+        with written_sources(all_sources(self.setting.recipe, job)) as configs:
+            argv = launch_arguments(self.setting.recipe, job, configs, folder.parents[1])
             args = parse_arguments(argv)
             return run_when_unlocked(
                 lambda: prepare(args, argv, callbacks=[heartbeat], records_code=False)
             )
 
-    def _send(self, beat: Beat) -> Any:
-        return self.setting.board.report.remote(self.setting.number, beat)
+    def _report(self, beat: Beat) -> bool:
+        """Tell the board; return whether the farm is stopping. A board that is being restarted
+        isn't waited for.
+        """
+        import ray
 
-
-def result_of(job: Job, folder: Path, run: Any) -> dict[str, Any]:
-    """Return what a finished run has made, and where."""
-    geometry = run.system.geometry
-    return {
-        "key": job.row.key,
-        "hash": assets.digest(folder),
-        "files": [path.relative_to(folder).as_posix() for path in assets.exported(folder)],
-        "picture": assets.picture(folder),
-        "page": assets.newest(folder, "it*-export/view.html"),
-        "scores": assets.scores(folder),
-        "steps": run.trainer.global_step,
-        "gaussians": len(geometry) if hasattr(geometry, "__len__") else 0,
-        "megabytes": peak_megabytes(),
-        "bytes": assets.stored_bytes(folder),
-        "saves_memory": job.saves_memory,
-        "host": socket.gethostname(),
-        "process": os.getpid(),
-        "loads": load_counts(),
-    }
-
-
-def answer_of(handle: Any) -> Optional[bool]:
-    """Return the board's answer if it has come; None also if the board is gone."""
-    import ray
-
-    try:
-        ready, _ = ray.wait([handle], timeout=0)
-        return ray.get(ready[0]) if ready else None
-    except ray.exceptions.RayError:
-        return None
+        try:
+            return ray.get(self.setting.board.report.remote(self.setting.number, beat), timeout=1)
+        except ray.exceptions.RayError:
+            return False
 
 
 def run_when_unlocked(prepared: Callable[[], Any]) -> tuple[Any, int]:
@@ -248,28 +217,25 @@ def written_log(path: Path) -> Iterator[None]:
                 raise
 
 
-def count_attempts(folder: Path, session: str) -> tuple[int, int]:
+def count_attempts(folder: Path, session: str, job: Job) -> tuple[int, int]:
     """Note one more attempt in an asset's folder; return how many there were, and how many of them
     in this session.
+
+    Raises:
+        UserError: the folder's checkpoints are of another row.
     """
     path = folder / "attempts.txt"
-    with open(path, "a", encoding="utf-8") as file:
-        file.write(f"{session} {socket.gethostname()} {os.getpid()}\n")
-    lines = path.read_text(encoding="utf-8").splitlines()
-    return len(lines), sum(line.startswith(f"{session} ") for line in lines)
+    with open(path, "a+", encoding="utf-8") as file:
+        file.seek(0)
+        earlier = [line.split() for line in file]
+        # earlier versions noted no key
+        if any(len(words) == 4 and words[1] != job.row.key for words in earlier):
+            raise another_row(job.row)
+        file.write(f"{session} {job.row.key} {socket.gethostname()} {os.getpid()}\n")
+    return len(earlier) + 1, sum(words[0] == session for words in earlier) + 1
 
 
-def mark(folder: Path) -> None:
-    """Record that an asset's folder is made with the low-memory configuration."""
-    (folder / "saves_memory.txt").touch()
-
-
-def marked(folder: Path) -> bool:
-    """Return whether :func:`mark` was called for the folder."""
-    return (folder / "saves_memory.txt").is_file()
-
-
-# Errors and memory
+# Errors
 # --------------------------------------------------------------------------------------------------
 
 
@@ -304,27 +270,3 @@ def is_blocked(error: BaseException) -> bool:
         isinstance(cause, Unreachable) or (isinstance(cause, OSError) and cause.errno in FULL)
         for cause in chain(error)
     )
-
-
-def reset_peak_memory() -> None:
-    """Begin to measure the peak of this process's memory (Linux), or of the GPU's."""
-    import torch
-
-    if torch.cuda.is_available():
-        torch.cuda.reset_peak_memory_stats()
-    with contextlib.suppress(OSError):
-        Path("/proc/self/clear_refs").write_text("5", encoding="utf-8")
-
-
-def peak_megabytes() -> float:
-    """Return the peak since :func:`reset_peak_memory`, of the GPU where there is one."""
-    import torch
-
-    if torch.cuda.is_available():
-        return round(torch.cuda.max_memory_allocated() / 2**20, 1)
-    try:
-        status = Path("/proc/self/status").read_text(encoding="utf-8")
-    except OSError:
-        return 0.0
-    peaks = [line.split()[1] for line in status.splitlines() if line.startswith("VmHWM")]
-    return round(int(peaks[0]) / 1024, 1) if peaks else 0.0

@@ -1,10 +1,11 @@
-"""What one asset is made with, and its result."""
+"""What one asset is made with, and what a run has made."""
 
 import shlex
 from pathlib import Path
 
-from threestudio_gaussiandreamer.farm import assets
-from threestudio_gaussiandreamer.farm.assets import Job, Recipe, Source
+from threestudio_gaussiandreamer.farm import recipe
+from threestudio_gaussiandreamer.farm.recipe import Job, Recipe, Source
+from threestudio_gaussiandreamer.farm.results import digest
 from threestudio_gaussiandreamer.farm.rows import Row
 from threestudio_gaussiandreamer.launch.options import parse_arguments
 
@@ -13,7 +14,7 @@ JOB = Job(Row("fox", "a fox's tail", 7, (), ("y=2",)), (Source("row.yaml", b""),
 
 
 def test_a_row_comes_after_the_farm_and_the_prompt_last():
-    args = parse_arguments(assets.launch_arguments(RECIPE, JOB, ["1.yaml"], Path("/farm")))
+    args = parse_arguments(recipe.launch_arguments(RECIPE, JOB, ["1.yaml"], Path("/farm")))
     assert args.config == ["1.yaml"] and args.stage == "train" and args.gpu == "cpu"
     chosen = ["x=1", "y=2", "seed=7", "system.prompt_processor.prompt=a fox's tail"]
     assert args.overrides[:4] == chosen
@@ -21,7 +22,7 @@ def test_a_row_comes_after_the_farm_and_the_prompt_last():
 
 
 def test_the_command_that_repeats_an_asset_has_its_prompt_and_threads():
-    words = shlex.split(assets.repeat_command(RECIPE, JOB))
+    words = shlex.split(recipe.repeat_command(RECIPE, JOB))
     assert words[0] == "OMP_NUM_THREADS=2" and "row.yaml" in words
     assert "launch.py" not in words  # this process wasn't started by it
     assert "system.prompt_processor.prompt=a fox's tail" in words
@@ -29,17 +30,9 @@ def test_the_command_that_repeats_an_asset_has_its_prompt_and_threads():
 
 def test_the_low_memory_configuration_wins():
     saving = RECIPE._replace(low_memory=Source("low.yaml", b""))
-    names = [source.name for source in assets.all_sources(saving, JOB._replace(saves_memory=True))]
+    names = [source.name for source in recipe.all_sources(saving, JOB._replace(saves_memory=True))]
     assert names == ["a.yaml", "row.yaml", "low.yaml"]
-    assert "low.yaml" not in assets.repeat_command(saving, JOB)
-
-
-def test_a_result_is_of_its_row_only(tmp_path):
-    assets.write_result(tmp_path, {"key": JOB.row.key, "hash": "ab"})
-    assert assets.read_result(tmp_path, JOB.row)["hash"] == "ab"
-    assert assets.read_result(tmp_path, JOB.row._replace(seed=8)) is None
-    (tmp_path / assets.RESULT).write_text('{"key"')
-    assert assets.read_result(tmp_path, JOB.row) is None
+    assert "low.yaml" not in recipe.repeat_command(saving, JOB)
 
 
 def test_the_digest_is_of_names_and_contents(tmp_path):
@@ -48,8 +41,7 @@ def test_the_digest_is_of_names_and_contents(tmp_path):
     digests = set()
     for name, content in (("a.ply", b"1"), ("a.ply", b"2"), ("b.spz", b"2")):
         (folder / name).write_bytes(content)
-        digests.add(assets.digest(tmp_path))
-    assert assets.stored_bytes(tmp_path) == 2
+        digests.add(digest(tmp_path))
     (folder / "report.json").write_text("seconds")
     (folder / "pruned").mkdir()
-    assert len(digests) == 3 and assets.digest(tmp_path) in digests
+    assert len(digests) == 3 and digest(tmp_path) in digests

@@ -1,0 +1,301 @@
+"""The farm's folder, also in memory and on an S3 server that runs on this machine, and the records
+of its assets.
+"""
+
+import json
+import os
+import pickle
+import signal
+import socket
+import subprocess
+import sys
+import time
+import urllib.request
+
+import pytest
+
+from threestudio_gaussiandreamer.core.checkpoint_file import newest_readable, save_file
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.farm import place as module
+from threestudio_gaussiandreamer.farm import worker
+from threestudio_gaussiandreamer.farm.place import (
+    FAILED,
+    FINISHED,
+    LAST,
+    RUNNING,
+    STOPPED,
+    WAITING,
+    Place,
+    Unreachable,
+    adopt_ledger,
+)
+from threestudio_gaussiandreamer.farm.recipe import Job, Recipe
+from threestudio_gaussiandreamer.farm.report import write_report
+from threestudio_gaussiandreamer.farm.rows import Row
+from threestudio_gaussiandreamer.farm.worker import Setting, Worker
+
+FOX, CAT, DOG = Row("fox", "a fox"), Row("cat", "a cat", line=2), Row("dog", "a dog")
+
+
+@pytest.fixture(autouse=True)
+def scratch(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+
+
+@pytest.fixture
+def memory():
+    fsspec = pytest.importorskip("fsspec")
+    fsspec.filesystem("memory").store.clear()
+    return "memory://farm"
+
+
+@pytest.fixture(scope="module")
+def s3():
+    """The URL of a bucket on a moto server."""
+    for package in ("s3fs", "moto.server"):
+        pytest.importorskip(package)
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    command = [sys.executable, "-m", "moto.server", "-p", str(port)]
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    server = subprocess.Popen(command, **quiet)
+    endpoint = f"http://127.0.0.1:{port}"
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in {
+            "AWS_ENDPOINT_URL": endpoint,
+            "AWS_ACCESS_KEY_ID": "testing",
+            "AWS_SECRET_ACCESS_KEY": "testing",
+            "AWS_DEFAULT_REGION": "us-east-1",
+        }.items():
+            patch.setenv(name, value)
+        wait_for(endpoint)
+        import s3fs
+
+        s3fs.S3FileSystem().mkdir("farms")
+        yield "s3://farms/one"
+    server.kill()
+    server.wait()
+
+
+def wait_for(endpoint):
+    for _ in range(300):
+        try:
+            return urllib.request.urlopen(endpoint, timeout=1)
+        except OSError:
+            time.sleep(0.1)
+    raise RuntimeError("the S3 server doesn't start")
+
+
+def made(place, row=FOX):
+    """Write what a run leaves in an asset's work folder."""
+    folder = place.work_folder(row)
+    for name in (
+        "save/it5-export/a.ply",
+        "ckpts/last.ckpt",
+        "ckpts/epoch=0-step=5.ckpt",
+        "cmd.txt",
+    ):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(name)
+    return folder
+
+
+RESULT = {"key": FOX.key, "hash": "ab", "files": ["save/it5-export/a.ply"]}
+
+
+def life_of_a_farm(url, elsewhere):
+    """Train, lose the machine, go on elsewhere, fail, publish, and read the records."""
+    first, second = Place(url), pickle.loads(pickle.dumps(Place(url, scratch=elsewhere)))
+    folder = made(first)
+    first.keep_checkpoint(FOX)
+    assert list(second.records([FOX, CAT])) == [
+        (FOX, {"state": RUNNING}),
+        (CAT, {"state": WAITING}),
+    ]
+    second.fetch_checkpoint(FOX)
+    assert (second.work_folder(FOX) / "ckpts/fetched.ckpt").read_text() == "ckpts/last.ckpt"
+    other = FOX._replace(prompt="another")
+    second.fetch_checkpoint(other)
+    failure = json.dumps({"key": FOX.key, "state": STOPPED, "worker_seconds": 3.0}).encode()
+    first.write({"assets/fox/failed.json": failure})
+    assert next(second.records([FOX]))[1]["state"] == STOPPED
+    first.publish(FOX, RESULT)
+    assert second.finished(FOX)["hash"] == "ab" and not folder.exists()
+    assert dict(second.records([CAT, FOX]))[FOX] == {"state": FINISHED, **RESULT}
+    files = ("save/it5-export/a.ply", "ckpts/epoch=0-step=5.ckpt", "failed.json")
+    found = first.read([f"assets/fox/{name}" for name in files])
+    assert found == [b"save/it5-export/a.ply", None, None]
+    assert first.read([module.part_of(FOX)]) == [None]
+    write_report(first, [FOX], 1)
+    assert b"fox" in first.read(["report/table.csv"])[0]
+
+
+def test_a_farm_in_memory(memory, tmp_path):
+    life_of_a_farm(memory, tmp_path / "elsewhere")
+
+
+def test_a_farm_on_s3(s3, tmp_path):
+    life_of_a_farm(s3, tmp_path / "elsewhere")
+
+
+def test_checkpoints_of_earlier_attempts_are_not_uploaded(tmp_path):
+    made = ("ckpts/last.ckpt", "ckpts/fetched.ckpt", "ckpts-2/last.ckpt", "ckpts-2/.part")
+    for name in made:
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    assert module.files_of(tmp_path) == [tmp_path / "ckpts/last.ckpt"]
+
+
+def test_the_result_is_uploaded_last_and_a_reader_sees_no_half_asset(memory, monkeypatch):
+    place, seen = Place(memory), []
+    made(place)
+    upload = place.upload
+
+    def watched(name, path):
+        seen.append(name)
+        assert Place(memory).finished(FOX) is None
+        upload(name, path)
+
+    monkeypatch.setattr(place, "upload", watched)
+    place.publish(FOX, RESULT)
+    assert len(seen) == 3 and Place(memory).finished(FOX)
+
+
+def test_a_store_that_is_gone_is_named(memory, monkeypatch):
+    place = Place(memory)
+
+    def gone(*args, **options):
+        raise ConnectionError("no route to host")
+
+    for name in ("cat_file", "pipe_file", "ls"):
+        monkeypatch.setattr(place.system, name, gone)
+    for act in (place.finished, lambda row: place.write({"a": b""}), lambda row: place.names("a")):
+        with pytest.raises(Unreachable, match="memory://farm can't be reached: .*no route to host"):
+            act(FOX)
+
+
+def checkpoint(place, step):
+    """Write the last checkpoint of an asset's run."""
+    content = {"global_step": step, "epoch": 0, "state_dict": {}}
+    save_file(place.work_folder(FOX) / LAST, content)
+
+
+def test_the_newer_checkpoint_wins_on_every_machine(memory, tmp_path):
+    first, second = (Place(memory, scratch=tmp_path / name) for name in "ab")
+    for place, step in ((first, 3), (second, 7)):
+        place.fetch_checkpoint(FOX)
+        checkpoint(place, step)
+        place.keep_checkpoint(FOX)
+    first.fetch_checkpoint(FOX)
+    assert newest_readable(first.work_folder(FOX) / "ckpts")[1] == 7
+    first.keep_checkpoint(FOX)  # its own file is older than the one that it goes on from
+    third = Place(memory, scratch=tmp_path / "c")
+    third.fetch_checkpoint(FOX)
+    assert newest_readable(third.work_folder(FOX) / "ckpts")[1] == 7
+
+
+def test_what_a_stopped_worker_has_saved_is_there_for_others(memory, tmp_path, monkeypatch):
+    def stopped(self, job, folder, attempt):
+        checkpoint(place, 4278)
+        return None, 128 + signal.SIGTERM
+
+    monkeypatch.setattr(worker.Worker, "_run", stopped)
+    monkeypatch.setattr(worker, "keep_loaded", lambda: None)
+    monkeypatch.chdir(tmp_path)
+    place = Place(memory)
+    setting = Setting(0, Recipe((), (), True, 1), place, None, ".", "now", 1)
+    assert Worker().make(Job(FOX), setting)["state"] == worker.STOPPED
+    other = Place(memory, scratch=tmp_path / "other")
+    other.fetch_checkpoint(FOX)
+    assert newest_readable(other.work_folder(FOX) / "ckpts")[1] == 4278
+
+
+# -- records ---------------------------------------------------------------------------------------
+
+
+def note(place, row, file, **record):
+    place.write({f"assets/{row.name}/{file}": json.dumps({"key": row.key, **record}).encode()})
+
+
+def test_a_finished_asset_without_files_is_made_again(tmp_path):
+    place, nothing = Place(tmp_path), {"files": [], "picture": None, "page": None}
+    note(place, FOX, "result.json", **nothing)
+    note(place, CAT, "result.json", **nothing | {"page": "a"})
+    note(place, DOG, "result.json", **nothing)
+    note(place, DOG, "failed.json", state=FAILED)
+    states = [record["state"] for _, record in place.records([FOX, CAT, DOG])]
+    assert states == [RUNNING, FINISHED, FAILED] and place.finished(FOX) is None
+
+
+@pytest.mark.parametrize("file", ["result.json", "failed.json"])
+def test_a_row_that_has_changed_is_refused_with_its_line(tmp_path, file):
+    note(Place(tmp_path), CAT, file)
+    with pytest.raises(UserError, match="line 2 .*'cat' was begun in this farm with another"):
+        list(Place(tmp_path).records([FOX, CAT._replace(seed=1)]))
+
+
+@pytest.mark.parametrize("content", ["", "{", "[]", "5", "[" * 99_999])
+def test_a_record_that_something_else_has_written_is_one_message(tmp_path, content):
+    note(Place(tmp_path), FOX, "result.json")
+    (tmp_path / "assets/fox/result.json").write_text(content)
+    with pytest.raises(UserError, match="assets/fox/result.json is damaged .*: delete it, or"):
+        list(Place(tmp_path).records([FOX]))
+
+
+def test_many_records_are_read_in_the_order_of_the_rows(tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "BATCH", 2)
+    rows, place = [Row(f"toy{i}", "a toy", i) for i in range(7)], Place(tmp_path)
+    for row in rows[::2]:
+        note(place, row, "result.json", steps=row.seed)
+    found = [(row.seed, record.get("steps")) for row, record in place.records(iter(rows))]
+    assert found == [(i, None if i % 2 else i) for i in range(7)]
+
+
+LEDGER = [
+    {"name": "fox", "key": FOX.key, "state": RUNNING},
+    {"name": "fox", "key": FOX.key, "state": RUNNING, "worker_seconds": 2.0},
+    {"name": "cat", "key": CAT.key, "state": FAILED, "error": "none", "all_worker_seconds": 9.0},
+    {"name": "fox", "key": FOX.key, "state": FINISHED, "worker_seconds": 3.0, **RESULT},
+    {"name": "dog", "key": DOG.key, "state": FINISHED, "files": []},
+    {"name": "dog", "key": DOG.key, "state": RUNNING, "worker_seconds": 1.0},
+]
+
+
+@pytest.mark.parametrize("url", [None, "memory://farm"])
+def test_a_farm_of_an_earlier_version_goes_on(tmp_path, memory, url):
+    place = Place(url or tmp_path)
+    parts = [json.dumps(line).encode() + b"\n" for line in LEDGER] + [b'{"name": "fox", "ke']
+    if url:
+        place.write({f"ledger/{i}.jsonl": part for i, part in enumerate(parts)})
+        place.write({"parts/dog/last.ckpt": b"step 5"})
+    else:
+        place.write({"ledger.jsonl": b"".join(parts)})
+    for _ in range(2):
+        adopt_ledger(place)
+        records = dict(place.records([FOX, CAT, DOG]))
+        assert [record["state"] for record in records.values()] == [FINISHED, FAILED, STOPPED]
+        assert [record["worker_seconds"] for record in records.values()] == [5.0, 9.0, 1.0]
+        assert records[FOX]["hash"] == "ab" and records[CAT]["error"] == "none"
+        assert place.read(["ledger.jsonl", "ledger/0.jsonl"]) == [None, None]
+        assert place.read(["ledger-adopted.jsonl"]) == [b"".join(parts)]
+    if url:
+        place.fetch_checkpoint(DOG)
+        assert (place.work_folder(DOG) / module.FETCHED).read_bytes() == b"step 5"
+
+
+def test_an_unknown_protocol_is_refused():
+    with pytest.raises(UserError, match="nothing://farm can't be used"):
+        Place("nothing://farm")
+
+
+def test_a_folder_is_a_place_too(tmp_path):
+    place = Place(str(tmp_path))
+    place.write({"a/b.txt": b"1"})
+    made(place)
+    assert place.read(["a/b.txt", "none"]) == [b"1", None] and str(place) == os.fspath(tmp_path)
+    place.publish(FOX, RESULT)
+    assert place.finished(FOX)["hash"] == "ab" and place.finished(FOX._replace(seed=1)) is None
+    assert (tmp_path / "assets/fox/ckpts/last.ckpt").exists()
+    place.discard(FOX)
+    assert place.finished(FOX) is None
