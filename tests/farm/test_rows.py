@@ -108,7 +108,7 @@ def test_texts_that_are_no_folders_names_are_an_asset_each(tmp_path):
         ("prompt\na fox, b", ".csv", "line 2: 2 cells for 1 columns"),
         ('prompt\n"a fox', ".csv", "line 2: unexpected end of data"),
         ("prompt,seed\na,-1", ".csv", "line 2: the seed is '-1'"),
-        ("prompt,seed\na,4294967296", ".csv", "line 2: the seed is 4294967296"),
+        ("prompt,seed\na,4294967296", ".csv", "line 2: the seed is '4294967296'"),
         ("prompt,name\na,../b", ".csv", "line 2: the name '../b' can't be a folder's"),
         ("prompt,overrides\na,max_steps", ".csv", "line 2: the override 'max_steps' isn't"),
         ('prompt,overrides\na,"x=\'1"', ".csv", "open quote"),
