@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any, Optional
 
 from benchmarks.quality.runs import commit, machine
-from threestudio_gaussiandreamer.farm.results import digest
+from threestudio_gaussiandreamer.farm.worker import digest
 
 ROOT = Path(__file__).resolve().parents[2]
 RETRIES = 50

@@ -2,15 +2,16 @@
 
 from types import SimpleNamespace
 
-from threestudio_gaussiandreamer.farm import board
-from threestudio_gaussiandreamer.farm.board import Beat, Board, Heartbeat
+from threestudio_gaussiandreamer.farm import worker
+from threestudio_gaussiandreamer.farm.rows import Row
+from threestudio_gaussiandreamer.farm.worker import Beat, Board, Heartbeat
 
 BEAT = Beat("fox", 1, "training", 3, 12)
 
 
 def test_the_board_knows_since_when_nothing_has_changed(monkeypatch):
     now = SimpleNamespace(seconds=0.0)
-    monkeypatch.setattr(board.time, "monotonic", lambda: now.seconds)
+    monkeypatch.setattr(worker.time, "monotonic", lambda: now.seconds)
     found = Board()
     assert found.report(0, BEAT) is False
     now.seconds = 5.0
@@ -24,14 +25,17 @@ def test_the_board_knows_since_when_nothing_has_changed(monkeypatch):
 
 def test_reports_are_rare_and_a_run_is_stopped_once(monkeypatch):
     now = SimpleNamespace(seconds=0.0)
-    monkeypatch.setattr(board.time, "monotonic", lambda: now.seconds)
+    monkeypatch.setattr(worker.time, "monotonic", lambda: now.seconds)
     told, stops, steps = [], [], []
-    report = lambda beat: told.append(beat) or len(told) > 2  # noqa: E731
-    beats = Heartbeat("fox", 1, report, lambda: stops.append(1), lambda: steps.append(1))
+    monkeypatch.setattr(worker.signal, "raise_signal", stops.append)
+    monkeypatch.setattr(Heartbeat, "report", lambda _, beat: told.append(beat) or len(told) > 2)
+    setting = SimpleNamespace(place=SimpleNamespace(keep_checkpoint=steps.append))
+    beats = Heartbeat(Row("fox", "a fox"), 1, 0, setting)
     for _ in range(4):
         now.seconds += 0.5
         beats.on_train_batch_end(SimpleNamespace(global_step=3, max_steps=12))
     assert [beat.stage for beat in told] == ["starting", "training", "training"]
     now.seconds = 9.0
     beats.on_train_batch_end(SimpleNamespace(global_step=4, max_steps=12))
-    assert told[-1] == BEAT._replace(step=4) and len(stops) == 1 and len(steps) == 5
+    assert told[-1] == BEAT._replace(step=4) and len(steps) == 5
+    assert stops == [worker.signal.SIGTERM]

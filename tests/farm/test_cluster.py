@@ -2,33 +2,37 @@
 
 import pytest
 
-from threestudio_gaussiandreamer.farm.cluster import Device, choose_device, count_workers
+from threestudio_gaussiandreamer.farm.driver import plan_workers
 
 CPU, GPUS = {"CPU": 8.0}, {"CPU": 8.0, "GPU": 2.0}
 
 
-def test_a_worker_gets_a_gpu_where_there_is_one():
-    assert choose_device(GPUS, None, 1) == Device(1, 1)
-    assert choose_device(GPUS, 0, 1) == choose_device(CPU, None, 1) == Device(0, 1)
-
-
-def test_as_many_workers_as_fit():
-    assert count_workers(CPU, Device(0, 3), None, None) == 2
-    assert count_workers(GPUS, Device(1, 1), None, None) == 2
-    assert count_workers(GPUS, Device(1, 1), 1, None) == 1
-    assert count_workers(GPUS, Device(1, 5), None, None) == 1
-    assert count_workers(CPU, Device(0, 1), None, 3) == 3
+@pytest.mark.parametrize(
+    ("resources", "gpus", "cores", "workers", "plan"),
+    [
+        (GPUS, None, 1, None, (2, 1)),
+        (GPUS, 1, 1, None, (1, 1)),
+        (GPUS, None, 5, None, (1, 1)),
+        (GPUS, 0, 1, None, (8, 0)),
+        (CPU, None, 3, None, (2, 0)),
+        (CPU, None, 1, 3, (3, 0)),
+    ],
+)
+def test_a_worker_gets_a_gpu_where_there_is_one_and_as_many_start_as_fit(
+    resources, gpus, cores, workers, plan
+):
+    assert plan_workers(resources, gpus, cores, workers) == plan
 
 
 @pytest.mark.parametrize(
-    ("act", "message"),
+    ("options", "message"),
     [
-        (lambda: choose_device(CPU, 1, 1), "--gpus 1: the cluster has no GPU; give none"),
-        (lambda: choose_device(CPU, None, 9), "--cores 9: the cluster has 8 cores"),
-        (lambda: count_workers(CPU, Device(0, 4), None, 3), "with 4 cores each, 2 fit"),
-        (lambda: count_workers(GPUS, Device(1, 1), None, 3), "with 1 GPU each, 2 fit"),
+        ((CPU, 1, 1, None), "--gpus 1: the cluster has no GPU; give none"),
+        ((CPU, None, 9, None), "--cores 9: the cluster has 8 cores"),
+        ((CPU, None, 4, 3), "with 4 cores each, 2 fit"),
+        ((GPUS, None, 1, 3), "with 1 GPU each, 2 fit"),
     ],
 )
-def test_more_than_there_is_is_refused(act, message):
+def test_more_than_there_is_is_refused(options, message):
     with pytest.raises(ValueError, match=message):
-        act()
+        plan_workers(*options)

@@ -14,12 +14,16 @@ from threestudio_gaussiandreamer.farm.recipe import (
     Recipe,
     Source,
     check_recipe,
-    make_recipe,
+    read_config,
     require_same_farm,
 )
 from threestudio_gaussiandreamer.farm.rows import Row, read_rows
 
 RECIPE = Recipe((Source("a.yaml", b"x: 1"),), ("y=2",), cpu=True, cores=1)
+
+
+def recipe_of(config, *overrides):
+    return Recipe((read_config(config),), overrides, cpu=True, cores=1)
 
 
 @pytest.fixture
@@ -39,7 +43,7 @@ def no_ray(monkeypatch):
     def refuse(address):
         raise AssertionError("Ray was started")
 
-    monkeypatch.setattr(command.cluster, "connect", refuse)
+    monkeypatch.setattr(command.driver, "connect", refuse)
 
 
 @pytest.mark.parametrize(
@@ -138,7 +142,7 @@ def test_a_finished_farm_needs_no_ray(farm, monkeypatch, tmp_path):
     """It writes the report; nor does a farm of another configuration start Ray to be refused."""
     no_ray(monkeypatch)
     arguments = ["--out", "out", "trainer.max_steps=3"]
-    recipe = make_recipe([str(DEMO)], arguments[2:], cpu=True, cores=1)
+    recipe = recipe_of(str(DEMO), *arguments[2:])
     place = Place(tmp_path / "out")
     require_same_farm(place, recipe)
     (tmp_path / "prompts.txt").write_text("a fox")
@@ -160,23 +164,23 @@ def test_a_finished_farm_needs_no_ray(farm, monkeypatch, tmp_path):
 def test_an_error_in_a_rows_configuration_names_its_line(tmp_path):
     path = tmp_path / "prompts.csv"
     path.write_text("prompt,overrides\na fox,\na cat,trainer.max_steps=-3\n")
-    recipe = make_recipe([str(DEMO)], [], cpu=True, cores=1)
+    recipe = recipe_of(str(DEMO))
     with pytest.raises(ValueError, match="line 3 of the prompt list: trainer.max_steps"):
         check_recipe(recipe, read_rows(path))
 
 
 def test_a_missing_configuration_of_a_row_names_its_line(tmp_path):
     row = Row("fox", "a fox", config=("nothing.yaml",), line=4)
-    recipe = make_recipe([str(DEMO)], [], cpu=True, cores=1)
+    recipe = recipe_of(str(DEMO))
     with pytest.raises(ValueError, match="line 4 .*unknown configuration 'nothing.yaml'"):
         check_recipe(recipe, [row])
 
 
 def test_the_low_memory_configuration_is_used_where_it_is_valid():
     row = [Row("fox", "a fox")]
-    demo = make_recipe([str(DEMO)], [], cpu=True, cores=1)
+    demo = recipe_of(str(DEMO))
     assert check_recipe(demo, row).low_memory is None  # its guidance has no such options
-    paper = make_recipe(["gaussiandreamer.yaml"], [], cpu=True, cores=1)
+    paper = recipe_of("gaussiandreamer.yaml")
     assert check_recipe(paper, row).low_memory.name.endswith("gaussiandreamer-lowmem.yaml")
 
 

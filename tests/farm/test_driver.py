@@ -5,12 +5,11 @@ from types import SimpleNamespace
 import pytest
 
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.farm.board import Beat
 from threestudio_gaussiandreamer.farm.driver import Driver
 from threestudio_gaussiandreamer.farm.place import FAILED, FINISHED, STOPPED, WAITING, Place
 from threestudio_gaussiandreamer.farm.recipe import Job, Recipe, Source
 from threestudio_gaussiandreamer.farm.rows import Row
-from threestudio_gaussiandreamer.farm.worker import BLOCKED, NO_MEMORY, Setting
+from threestudio_gaussiandreamer.farm.worker import BLOCKED, NO_MEMORY, Beat, Setting
 
 ROWS = [Row(f"toy{i}", f"toy {i}", i) for i in range(6)]
 LOW = Source("low.yaml", b"")
@@ -55,7 +54,7 @@ class FakeWorker:
         self.make = SimpleNamespace(remote=self._make)
         self.answers = answers
 
-    def _make(self, job, setting):
+    def _make(self, job, number, setting):
         self.made.append(job)
         outcome = self.answers(job)
         if not isinstance(outcome, Exception) and outcome["state"] == FINISHED:
@@ -82,7 +81,7 @@ class Bench:
         self.driver = Driver(
             self.ray,
             [self.worker] * workers,
-            [Setting(i, recipe, self.place, board, "", "now", 3) for i in range(workers)],
+            Setting(recipe, self.place, board, "", "now", 3),
             iter([Job(row, spent=100.0) for row in rows]),
             10.0,
             len(rows),
@@ -163,7 +162,7 @@ def test_an_asset_whose_worker_can_not_be_restarted_is_given_up(path):
     bench = Bench(path, answers)
     bench.driver.run()
     assert bench.states() == [FAILED, *[FINISHED] * 5]
-    assert bench.records()[0]["error"] == "its worker can't be restarted: killed"
+    assert bench.records()[0]["error"] == "its worker is lost: killed"
 
 
 def test_an_asset_without_memory_is_tried_with_less(path):

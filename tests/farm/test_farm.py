@@ -11,10 +11,8 @@ import time
 import pytest
 
 from tests.helpers.tiny_farm import ROOT, make_alone, write_farm
-from threestudio_gaussiandreamer import __version__
-from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.farm import cluster
-from threestudio_gaussiandreamer.farm.results import digest, exported
+from threestudio_gaussiandreamer.farm import driver
+from threestudio_gaussiandreamer.farm.worker import digest, exported
 
 pytest.importorskip("ray", reason="Ray isn't installed: pip install -e .[cluster]")
 pytestmark = pytest.mark.slow
@@ -180,19 +178,8 @@ def test_a_long_folder_for_temporary_files_and_proxies_do_not_matter(tmp_path, m
     monkeypatch.delenv("RAY_TMPDIR", raising=False)
     monkeypatch.setenv("TMPDIR", str(long))
     monkeypatch.setattr(tempfile, "tempdir", None)
-    ray = cluster.connect(None)
+    ray = driver.connect(None)
     try:
-        cluster.require_same_version(ray)
-    finally:
-        ray.shutdown()
-
-
-def test_a_machine_with_another_version_is_refused(monkeypatch):
-    ray = cluster.connect(None)
-    try:
-        cluster.require_same_version(ray)
-        monkeypatch.setattr(cluster, "__version__", "9.9")
-        with pytest.raises(UserError, match=f"has threestudio-.* {__version__}; this is 9.9"):
-            cluster.require_same_version(ray)
+        assert ray.get(ray.remote(lambda: 5).remote(), timeout=60) == 5
     finally:
         ray.shutdown()

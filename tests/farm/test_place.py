@@ -141,10 +141,10 @@ def test_a_farm_on_s3(s3, tmp_path):
 
 def test_checkpoints_of_earlier_attempts_are_not_uploaded(tmp_path):
     made = ("ckpts/last.ckpt", "ckpts/fetched.ckpt", "ckpts-2/last.ckpt", "ckpts-2/.part")
-    for name in made:
+    for name in (*made, "result.json"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).touch()
-    assert module.files_of(tmp_path) == [tmp_path / "ckpts/last.ckpt"]
+    assert list(module.uploads(tmp_path)) == [("ckpts/last.ckpt", tmp_path / "ckpts/last.ckpt")]
 
 
 def test_the_result_is_uploaded_last_and_a_reader_sees_no_half_asset(memory, monkeypatch):
@@ -204,8 +204,8 @@ def test_what_a_stopped_worker_has_saved_is_there_for_others(memory, tmp_path, m
     monkeypatch.setattr(worker, "keep_loaded", lambda: None)
     monkeypatch.chdir(tmp_path)
     place = Place(memory)
-    setting = Setting(0, Recipe((), (), True, 1), place, None, ".", "now", 1)
-    assert Worker().make(Job(FOX), setting)["state"] == worker.STOPPED
+    setting = Setting(Recipe((), (), True, 1), place, None, ".", "now", 1)
+    assert Worker().make(Job(FOX), 0, setting)["state"] == worker.STOPPED
     other = Place(memory, scratch=tmp_path / "other")
     other.fetch_checkpoint(FOX)
     assert newest_readable(other.work_folder(FOX) / "ckpts")[1] == 4278

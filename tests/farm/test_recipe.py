@@ -5,12 +5,12 @@ from pathlib import Path
 
 from threestudio_gaussiandreamer.farm import recipe
 from threestudio_gaussiandreamer.farm.recipe import Job, Recipe, Source
-from threestudio_gaussiandreamer.farm.results import digest
 from threestudio_gaussiandreamer.farm.rows import Row
+from threestudio_gaussiandreamer.farm.worker import digest
 from threestudio_gaussiandreamer.launch.options import parse_arguments
 
 RECIPE = Recipe((Source("a.yaml", b""),), ("x=1",), cpu=True, cores=2)
-JOB = Job(Row("fox", "a fox's tail", 7, (), ("y=2",)), (Source("row.yaml", b""),))
+JOB = Job(Row("fox", "a fox's tail", 7, ("demo.yaml",), ("y=2",)))
 
 
 def test_a_row_comes_after_the_farm_and_the_prompt_last():
@@ -23,15 +23,17 @@ def test_a_row_comes_after_the_farm_and_the_prompt_last():
 
 def test_the_command_that_repeats_an_asset_has_its_prompt_and_threads():
     words = shlex.split(recipe.repeat_command(RECIPE, JOB))
-    assert words[0] == "OMP_NUM_THREADS=2" and "row.yaml" in words
+    assert words[0] == "OMP_NUM_THREADS=2" and "demo.yaml" in words
     assert "launch.py" not in words  # this process wasn't started by it
     assert "system.prompt_processor.prompt=a fox's tail" in words
 
 
 def test_the_low_memory_configuration_wins():
     saving = RECIPE._replace(low_memory=Source("low.yaml", b""))
-    names = [source.name for source in recipe.all_sources(saving, JOB._replace(saves_memory=True))]
-    assert names == ["a.yaml", "row.yaml", "low.yaml"]
+    job = JOB._replace(saves_memory=True)
+    names = [Path(source.name).name for source in recipe.all_sources(saving, job)]
+    assert names == ["a.yaml", "demo.yaml", "low.yaml"]
+    assert "low.yaml" in recipe.repeat_command(saving, job)
     assert "low.yaml" not in recipe.repeat_command(saving, JOB)
 
 

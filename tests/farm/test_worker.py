@@ -6,9 +6,10 @@ from types import SimpleNamespace
 import pytest
 import torch
 
+from threestudio_gaussiandreamer import __version__
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.farm import worker
-from threestudio_gaussiandreamer.farm.place import FAILED, Place, Unreachable
+from threestudio_gaussiandreamer.farm.place import FAILED, STOPPED, Place, Unreachable
 from threestudio_gaussiandreamer.farm.recipe import Job, Recipe, Source
 from threestudio_gaussiandreamer.farm.rows import Row
 from threestudio_gaussiandreamer.farm.worker import (
@@ -19,6 +20,7 @@ from threestudio_gaussiandreamer.farm.worker import (
     count_attempts,
     outcome_of,
 )
+from threestudio_gaussiandreamer.launch import experiment
 from threestudio_gaussiandreamer.launch.folder_lock import FolderInUse
 
 JOB = Job(Row("fox", "a fox"))
@@ -63,7 +65,7 @@ def test_a_row_that_has_changed_does_not_go_on_with_the_checkpoints_of_the_other
 
 def setting(place, **options):
     recipe = Recipe((Source("a.yaml", b""),), (), True, 1, Source("low.yaml", b""))
-    return Setting(0, recipe, place, None, options.pop("start", "."), "now", retries=1)
+    return Setting(recipe, place, None, options.pop("start", "."), "now", retries=1)
 
 
 @pytest.fixture
@@ -76,10 +78,10 @@ def place(tmp_path, monkeypatch):
 def test_an_asset_is_given_up_after_its_retries(place, monkeypatch):
     monkeypatch.setattr(Worker, "_run", dies)
     with pytest.raises(KeyboardInterrupt):
-        Worker().make(JOB, setting(place))
+        Worker().make(JOB, 0, setting(place))
     with pytest.raises(KeyboardInterrupt):
-        Worker().make(JOB, setting(place))
-    outcome = Worker().make(JOB, setting(place))
+        Worker().make(JOB, 0, setting(place))
+    outcome = Worker().make(JOB, 0, setting(place))
     assert outcome["state"] == NO_MEMORY and "died or hung 2 times" in outcome["error"]
 
 
@@ -94,7 +96,7 @@ def test_what_was_made_with_much_memory_is_not_gone_on_with(place, monkeypatch):
     (folder / "ckpts").mkdir(parents=True)
     for expected in (False, True):
         with pytest.raises(KeyboardInterrupt):
-            Worker().make(saving, setting(place))
+            Worker().make(saving, 0, setting(place))
         assert (folder / "ckpts").exists() == expected
         (folder / "ckpts").mkdir(exist_ok=True)
 
@@ -107,30 +109,38 @@ def test_a_later_session_goes_on_with_the_low_memory_configuration(place, monkey
         raise ValueError("killed")
 
     monkeypatch.setattr(Worker, "_run", fails)
-    Worker().make(JOB._replace(saves_memory=True), setting(place))
-    Worker().make(JOB, setting(place))
+    Worker().make(JOB._replace(saves_memory=True), 0, setting(place))
+    Worker().make(JOB, 0, setting(place))
     assert tries == [True, True]
 
 
-def test_a_folder_that_a_dying_process_still_holds_is_waited_for(monkeypatch):
+def test_a_folder_that_a_dying_process_still_holds_is_waited_for(place, monkeypatch):
     monkeypatch.setattr(worker.time, "sleep", lambda seconds: None)
-    codes = [FolderInUse("held"), FolderInUse("held"), 0]
+    monkeypatch.setattr(worker.Heartbeat, "report", lambda self, beat: False)
+    codes = [FolderInUse("held"), FolderInUse("held"), 128 + 15]
 
     class Run:
         def run(self):
             code = codes.pop(0)
-            if code:
+            if isinstance(code, Exception):
                 raise code
             return code
 
     made = []
-    run, code = worker.run_when_unlocked(lambda: made.append(Run()) or made[-1])
-    assert code == 0 and run is made[2] and not codes
+    monkeypatch.setattr(experiment, "prepare", lambda *args, **more: made.append(1) or Run())
+    outcome = Worker().make(JOB, 0, setting(place))
+    assert outcome == {"state": STOPPED, "error": "stopped by signal 15"}
+    assert len(made) == 3 and not codes
 
 
 def test_a_machine_without_the_folder_is_named(place):
-    outcome = Worker().make(JOB, setting(place, start="/nowhere"))
+    outcome = Worker().make(JOB, 0, setting(place, start="/nowhere"))
     assert outcome["state"] == FAILED and "has no folder /nowhere" in outcome["error"]
+
+
+def test_a_machine_with_another_version_is_named(place):
+    with pytest.raises(UserError, match=f"has threestudio-.* {__version__}; the farm is of 9.9"):
+        Worker().hello("9.9", ".", 1)
 
 
 def test_an_asset_without_files_has_failed(place, monkeypatch):
@@ -139,7 +149,7 @@ def test_an_asset_without_files_has_failed(place, monkeypatch):
         system=SimpleNamespace(geometry=None), trainer=SimpleNamespace(global_step=5)
     )
     monkeypatch.setattr(Worker, "_run", lambda *args: (run, 0))
-    outcome = Worker().make(JOB, setting(place))
+    outcome = Worker().make(JOB, 0, setting(place))
     assert outcome["state"] == FAILED and "has left no files in" in outcome["error"]
     assert place.finished(JOB.row) is None
 
@@ -150,11 +160,11 @@ def test_an_exit_of_a_part_fails_its_asset_and_one_of_ray_ends_the_worker(place,
 
     monkeypatch.setattr(Worker, "_run", exits)
     module = "a_part"
-    outcome = Worker().make(JOB, setting(place))
+    outcome = Worker().make(JOB, 0, setting(place))
     assert outcome["state"] == FAILED and "ended the run with sys.exit(3)" in outcome["error"]
     module = "ray._private.worker"
     with pytest.raises(SystemExit):
-        Worker().make(JOB, setting(place))
+        Worker().make(JOB, 0, setting(place))
 
 
 def test_an_error_is_in_the_log_of_its_asset(place, monkeypatch):
@@ -162,5 +172,5 @@ def test_an_error_is_in_the_log_of_its_asset(place, monkeypatch):
         raise ValueError("no such thing")
 
     monkeypatch.setattr(Worker, "_run", fails)
-    assert Worker().make(JOB, setting(place))["error"] == "ValueError: no such thing"
+    assert Worker().make(JOB, 0, setting(place))["error"] == "ValueError: no such thing"
     assert "Traceback" in (place.work_folder(JOB.row) / "log.txt").read_text()

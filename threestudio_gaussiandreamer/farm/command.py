@@ -5,11 +5,12 @@ The same command goes on where it was after any kind of stop, and tries failed a
 ``--report`` it only writes the report of what there is."""
 
 import argparse
+import contextlib
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Sequence
 from datetime import datetime
 from pathlib import Path
-from typing import Any, Optional
+from typing import Optional
 
 from tqdm import tqdm
 
@@ -18,16 +19,14 @@ from ..core.errors import UserError
 from ..core.launcher import train_alone
 from ..core.signals import raised_signals
 from ..launch.experiment import configure_logging
-from ..launch.folder_lock import require_writable
+from ..launch.folder_lock import claim, require_writable
 from ..launch.options import add_config, parse_with_overrides
-from . import cluster
-from .board import Board
-from .driver import Driver
-from .place import FAILED, FINISHED, Place, adopt_ledger, claimed, is_url
-from .recipe import FARM, Job, Recipe, check_recipe, job_of, make_recipe, require_same_farm, root_of
+from . import driver
+from .place import FAILED, FINISHED, Place, adopt_ledger
+from .recipe import FARM, Job, Recipe, check_recipe, read_config, require_same_farm, root_of
 from .report import write_report
 from .rows import check_rows, read_rows
-from .worker import Setting
+from .worker import Board, Setting
 
 PROGRAM = "python -m threestudio_gaussiandreamer.farm"
 
@@ -45,10 +44,6 @@ def main(argv: Optional[Sequence[str]] = None) -> int:
     return run_command(parse_arguments, run, argv) or codes[0]
 
 
-# Arguments
-# --------------------------------------------------------------------------------------------------
-
-
 def parse_arguments(argv: Optional[Sequence[str]] = None) -> argparse.Namespace:
     """Parse the command line; all arguments ``key=value`` are overrides."""
     parser = argparse.ArgumentParser(
@@ -57,40 +52,24 @@ def parse_arguments(argv: Optional[Sequence[str]] = None) -> argparse.Namespace:
         epilog="Everything else is an override of the configuration: trainer.max_steps=600",
         allow_abbrev=False,
     )
-    parser.add_argument("prompts", type=Path, help="a list of prompts: .txt, .csv or .jsonl")
-    add_config(parser)
-    parser.add_argument(
-        "--out",
-        help="the farm's folder, or a URL such as s3://bucket/farm (default: "
-        "farm-<prompts> in exp_root_dir)",
-    )
-    parser.add_argument("--report", action="store_true", help="only write the report")
-    parser.add_argument("--price", type=positive, help="cost of one worker-hour, for the report")
-    _add_cluster_options(parser)
-    return parse_with_overrides(parser, argv)
-
-
-def _add_cluster_options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
+    add("prompts", type=Path, help="a list of prompts: .txt, .csv or .jsonl")
+    add_config(parser)
+    add("--out", help="folder, or URL such as s3://bucket/farm (default: in exp_root_dir)")
+    add("--report", action="store_true", help="only write the report")
+    add("--price", type=positive, help="cost of one worker-hour, for the report")
     add("--address", help="of a Ray cluster, host:port or auto (default: start Ray here)")
     add("--workers", type=whole(1), help="number of workers (default: as many as fit)")
     add("--gpus", type=whole(0), help="number of GPUs, one per worker (default: all; 0: the CPU)")
-    add("--cores", type=whole(1), default=1, help="CPU cores per worker (default: %(default)s)")
-    add(
-        "--retries",
-        type=whole(0),
-        default=3,
-        help="how often an asset is tried again after its worker has died (default: %(default)s)",
-    )
-    add(
-        "--time-limit",
-        type=positive,
-        default=1800.0,
-        help="seconds without a step after which an asset counts as hung (default: %(default)g)",
-    )
+    add("--cores", type=whole(1), default=1, help="CPU cores per worker (default: 1)")
+    retries = "how often an asset is tried again after its worker has died (default: 3)"
+    add("--retries", type=whole(0), default=3, help=retries)
+    limit = "seconds without a step after which an asset counts as hung (default: 1800)"
+    add("--time-limit", type=positive, default=1800.0, help=limit)
+    return parse_with_overrides(parser, argv)
 
 
-def whole(low: int) -> Any:
+def whole(low: int) -> Callable[[str], int]:
     def parse(text: str) -> int:
         if not text.isdigit() or int(text) < low:
             raise argparse.ArgumentTypeError(f"expected a whole number from {low}, got {text!r}")
@@ -101,17 +80,10 @@ def whole(low: int) -> Any:
 
 def positive(text: str) -> float:
     """Parse a finite number above 0."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = -1.0
-    if not 0 < value < float("inf"):
-        raise argparse.ArgumentTypeError(f"expected a number above 0, got {text!r}")
-    return value
-
-
-# The farm
-# --------------------------------------------------------------------------------------------------
+    with contextlib.suppress(ValueError):
+        if 0 < float(text) < float("inf"):
+            return float(text)
+    raise argparse.ArgumentTypeError(f"expected a number above 0, got {text!r}")
 
 
 def run_farm(args: argparse.Namespace) -> int:
@@ -119,84 +91,61 @@ def run_farm(args: argparse.Namespace) -> int:
     train_alone()  # whatever has started this process, such as a job of SLURM
     configure_logging(verbose=False)
     total = check_rows(args.prompts)
-    root, overrides = split_root(args.overrides)
-    place = Place(args.out or f"{root or root_of(args.config)}/farm-{args.prompts.stem}")
-    if args.report:
-        if place.json(FARM) is None:
-            raise UserError(f"there is no farm in {place}: it has no {FARM}; check --out")
-        adopt_ledger(place)
-        return report(args, place, total)
-    if not is_url(str(place)):
-        require_writable(place.folder, "--out" if args.out else "exp_root_dir")
-    # before Ray starts: this takes a second
-    recipe = make_recipe(args.config, overrides, cpu=True, cores=args.cores)
-    recipe = check_recipe(recipe, read_rows(args.prompts))
-    require_same_farm(place, recipe, before_ray=True)
-    adopt_ledger(place)
-    with claimed(place):
-        finished: set[int] = set()
-        spent: dict[int, float] = {}
-        rows = place.records(read_rows(args.prompts))
-        for row, record in tqdm(rows, "records", total, unit="asset", disable=None, delay=1):
-            if record["state"] == FINISHED:
-                finished.add(row.line)
-            elif "worker_seconds" in record:
-                spent[row.line] = record["worker_seconds"]
-        jobs = (
-            job_of(row, spent.get(row.line, 0.0))
-            for row in read_rows(args.prompts)
-            if row.line not in finished
-        )
-        if len(finished) < total:
-            ray = cluster.connect(args.address)
-            try:
-                make_assets(args, ray, place, recipe, jobs, total, len(finished))
-            finally:
-                ray.shutdown()  # which ends the workers
-    return report(args, place, total)
-
-
-def split_root(overrides: Sequence[str]) -> tuple[Optional[str], list[str]]:
-    """Return the value of ``exp_root_dir``, in which the farm's folder lies, and the others."""
-    roots = [text for text in overrides if text.startswith("exp_root_dir=")]
-    others = [text for text in overrides if text not in roots]
-    return roots[-1].partition("=")[2] if roots else None, others
-
-
-def make_assets(
-    args: argparse.Namespace,
-    ray: Any,
-    place: Place,
-    recipe: Recipe,
-    jobs: Iterator[Job],
-    total: int,
-    done: int,
-) -> None:
-    """Start the workers and make all assets that are left."""
-    resources = ray.cluster_resources()
-    device = cluster.choose_device(resources, args.gpus, args.cores)
-    count = cluster.count_workers(resources, device, args.gpus, args.workers)
-    count = min(count, total - done)
-    recipe = recipe._replace(cpu=not device.gpus)
-    require_same_farm(place, recipe)
-    cluster.require_same_version(ray)
-    print(
-        f"{total} assets, {done} finished; {count} workers with "
-        f"{'1 GPU' if device.gpus else f'{device.cores} cores'} each; results in {place}",
-        flush=True,
-    )
-    board = ray.remote(num_cpus=0, max_restarts=-1)(Board).remote()
-    session = datetime.now().isoformat()
-    settings = [
-        Setting(i, recipe, place, board, os.getcwd(), session, args.retries) for i in range(count)
-    ]
-    workers = cluster.start_workers(ray, settings, device)
-    Driver(ray, workers, settings, jobs, args.time_limit, total, done).run()
-
-
-def report(args: argparse.Namespace, place: Place, total: int) -> int:
-    """Write the report; return 1 if assets have failed."""
+    roots = [text for text in args.overrides if text.startswith("exp_root_dir=")]
+    root = roots[-1].partition("=")[2] if roots else root_of(args.config)
+    place = Place(args.out or f"{root}/farm-{args.prompts.stem}")
+    if not args.report:
+        if not place.remote:
+            require_writable(place.folder, "--out" if args.out else "exp_root_dir")
+        # before Ray starts: this takes a second
+        overrides = tuple(text for text in args.overrides if text not in roots)
+        recipe = Recipe(tuple(map(read_config, args.config)), overrides, True, args.cores)
+        recipe = check_recipe(recipe, read_rows(args.prompts))
+        require_same_farm(place, recipe, before_ray=True)
+        lock = claim(place.folder, "another farm command is at work", ", or choose another --out")
+        try:
+            adopt_ledger(place)
+            make_assets(args, place, recipe, total)
+        finally:
+            lock.release()
+    elif place.read_json(FARM) == [None]:
+        raise UserError(f"there is no farm in {place}: it has no {FARM}; check --out")
     path, states = write_report(place, read_rows(args.prompts), total, args.price)
-    where = place if is_url(str(place)) else path
+    where = place if place.remote else path
     print(f"{states[FINISHED]} finished, {states[FAILED]} failed; report: {where}")
     return 1 if states[FAILED] else 0
+
+
+def make_assets(args: argparse.Namespace, place: Place, recipe: Recipe, total: int) -> None:
+    """Start Ray and the workers, and make all assets that are left."""
+    finished: set[int] = set()
+    spent: dict[int, float] = {}
+    rows = place.records(read_rows(args.prompts))
+    for row, record in tqdm(rows, "records", total, unit="asset", disable=None, delay=1):
+        if record["state"] == FINISHED:
+            finished.add(row.line)
+        elif "worker_seconds" in record:
+            spent[row.line] = record["worker_seconds"]
+    left = total - len(finished)
+    if not left:
+        return
+    rows = (row for row in read_rows(args.prompts) if row.line not in finished)
+    jobs = (Job(row, spent=spent.get(row.line, 0.0)) for row in rows)
+    ray = driver.connect(args.address)
+    try:
+        there = ray.cluster_resources()
+        count, gpus = driver.plan_workers(there, args.gpus, args.cores, args.workers)
+        count, recipe = min(count, left), recipe._replace(cpu=not gpus)
+        require_same_farm(place, recipe)
+        print(
+            f"{total} assets, {len(finished)} finished; {count} workers with "
+            f"{'1 GPU' if gpus else f'{args.cores} cores'} each; results in {place}",
+            flush=True,
+        )
+        board = ray.remote(num_cpus=0, max_restarts=-1)(Board).remote()
+        session = datetime.now().isoformat()
+        setting = Setting(recipe, place, board, os.getcwd(), session, args.retries)
+        workers = driver.start_workers(ray, count, gpus, args.cores)
+        driver.Driver(ray, workers, setting, jobs, args.time_limit, total, len(finished)).run()
+    finally:
+        ray.shutdown()  # which ends the workers

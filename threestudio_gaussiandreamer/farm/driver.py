@@ -1,21 +1,35 @@
-"""The driver hands assets to the workers, notes what became of them, and watches for workers that
-hang."""
+"""Connect to Ray and start the workers; hand assets to them, note what became of these, and watch
+for workers that hang.
 
+Ray gives each worker its GPU or cores, restarts a worker that was killed or whose machine is gone,
+and hands it the asset again."""
+
+import os
+import socket
 import sys
+import tempfile
 import time
 from collections import Counter, deque
-from collections.abc import Iterator
-from typing import Any, NamedTuple, Optional
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, Optional
 
 from tqdm import tqdm
 
+from .. import __version__
 from ..core.errors import UserError
+from ..core.extras import require_extra
 from ..core.files import json_text
-from .board import Beat
 from .place import ASSETS, FAILED, FAILURE, FINISHED, STOPPED
 from .recipe import Job, repeat_command
-from .worker import BLOCKED, NO_MEMORY, Setting
+from .worker import BLOCKED, NO_MEMORY, Beat, Setting, Worker
 
+OBJECT_STORE_BYTES = 100 << 20
+"""Memory for what workers send each other: little."""
+LONGEST_FOLDER = 36
+"""Characters of a temporary folder in which the names of Ray's sockets are valid, at most 107."""
+SECONDS_TO_ANSWER = 120
+"""How long workers may take to start."""
 POLL = 0.5
 """Seconds between two reads of the board, and longest wait for an outcome."""
 SECONDS_TO_STOP = 60
@@ -24,41 +38,116 @@ SAME_ERRORS = 3
 """The farm ends if its first assets, this many, all fail with the same message."""
 
 
-class Running(NamedTuple):
-    """An asset that a worker has."""
+def connect(address: Optional[str]) -> Any:
+    """Connect to the cluster at ``address``, or start Ray on this machine; return the module.
 
-    worker: int
-    job: Job
-
-
-class Driver:
-    """Gives all remaining assets to the workers.
-
-    Args:
-        ray: the module ``ray``, connected to a cluster.
-        workers: handles of :class:`.worker.Worker`.
-        settings: of the workers, in the same order.
-        jobs: the assets that aren't finished; the iterator is advanced when a worker is idle.
-        hang: seconds without a finished step after which a worker is restarted.
-        total: number of assets of the farm.
-        done: how many were finished before.
+    Raises:
+        UserError: Ray isn't installed, or no cluster answers.
     """
+    require_extra("cluster", "ray")
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    import ray
 
-    def __init__(
-        self,
-        ray: Any,
-        workers: list[Any],
-        settings: list[Setting],
-        jobs: Iterator[Job],
-        hang: float,
-        total: int,
-        done: int,
-    ) -> None:
-        self.ray, self.workers, self.settings = ray, workers, settings
-        _, self.recipe, self.place, self.board, *_ = settings[0]
-        self.jobs, self.hang, self.total, self.done = jobs, hang, total, done
-        self.idle = deque(range(len(workers)))
-        self.running: dict[Any, Running] = {}
+    source, leave = "--address", "leave --address out"
+    if not address and "RAY_ADDRESS" in os.environ:
+        source, leave = "RAY_ADDRESS", "`unset RAY_ADDRESS`"
+    address = address or os.environ.get("RAY_ADDRESS") or "local"
+    options: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
+    if address == "local":
+        options |= {"include_dashboard": False, "object_store_memory": OBJECT_STORE_BYTES}
+        if len(tempfile.gettempdir()) > LONGEST_FOLDER and os.path.isdir("/tmp"):
+            os.environ.setdefault("RAY_TMPDIR", "/tmp")
+    try:
+        host, _, port = address.removeprefix("ray://").rpartition(":")
+        if "://" in host or host in ("http", "https"):
+            raise ValueError("expected host:port, such as that which `ray start --head` prints")
+        if host:  # else "local", or "auto", which Ray resolves by itself
+            # Ray's own attempt takes minutes
+            socket.create_connection((host.strip("[]"), int(port)), timeout=5).close()
+        ray.init(address=address, **options)
+    except (OSError, ValueError, RuntimeError, OverflowError, ray.exceptions.RayError) as error:
+        said = (str(error).strip().splitlines() or [type(error).__name__])[0][:300]
+        if address == "local":
+            raise UserError(f"Ray can't be started on this machine: {said}") from error
+        raise UserError(
+            f"{source} {address}: no Ray cluster answers there ({said}); start one with "
+            f"`ray start --head`, or {leave} to run on this machine"
+        ) from error
+    return ray
+
+
+def plan_workers(
+    resources: Mapping[str, float], gpus: Optional[int], cores: int, workers: Optional[int]
+) -> tuple[int, int]:
+    """Return how many workers of so many cores fit into the cluster, or are asked for, and the GPUs
+    of each: 1 where the cluster has some, else 0. ``gpus=None`` asks for all.
+
+    Raises:
+        UserError: the cluster has fewer.
+    """
+    there, cpus = int(resources.get("GPU", 0)), int(resources.get("CPU", 0))
+    if gpus is not None and gpus > there:
+        most = f"has {there} GPUs; give at most that" if there else "has no GPU; give none"
+        raise UserError(f"--gpus {gpus}: the cluster {most}")
+    if cores > cpus:
+        raise UserError(f"--cores {cores}: the cluster has {cpus} cores; give fewer")
+    gpus = there if gpus is None else gpus
+    fits = min(cpus // cores, gpus) if gpus else cpus // cores
+    if workers is not None and workers > fits:
+        what = "1 GPU" if gpus else f"{cores} cores"
+        raise UserError(f"--workers {workers}: with {what} each, {fits} fit into the cluster")
+    return workers or fits, int(gpus > 0)
+
+
+def start_workers(ray: Any, count: int, gpus: int, cores: int) -> list[Any]:
+    """Start workers with so many GPUs and cores each, and wait until all are ready.
+
+    Raises:
+        UserError: one can't start.
+    """
+    environment = {"OMP_NUM_THREADS": str(cores), "OMP_WAIT_POLICY": "passive"}
+    if not gpus:
+        environment["CUDA_VISIBLE_DEVICES"] = ""
+    actor = ray.remote(
+        num_cpus=cores,
+        num_gpus=gpus,
+        max_restarts=-1,
+        max_task_retries=-1,  # Ray also counts attempts to reach a process that is restarting
+        runtime_env={"env_vars": environment},
+    )(Worker)
+    workers = [actor.remote() for _ in range(count)]
+    greetings = [worker.hello.remote(__version__, os.getcwd(), cores) for worker in workers]
+    try:
+        ray.get(greetings, timeout=SECONDS_TO_ANSWER)
+    except ray.exceptions.RayError as error:
+        said = getattr(error, "cause", None) or (
+            f"each machine needs threestudio-gaussiandreamer {__version__}: {error}"
+        )
+        raise UserError(f"a worker can't start: {said}") from error
+    return workers
+
+
+@dataclass
+class Driver:
+    """Gives all remaining assets to the workers."""
+
+    ray: Any
+    """The module, connected to a cluster."""
+    workers: list[Any]
+    """Handles of :class:`.worker.Worker`."""
+    setting: Setting
+    jobs: Iterator[Job]
+    """The assets that aren't finished; it is advanced when a worker is idle."""
+    hang: float
+    """Seconds without a finished step after which a worker is restarted."""
+    total: int
+    """Number of assets of the farm."""
+    done: int
+    """How many were finished before."""
+
+    def __post_init__(self) -> None:
+        self.idle = deque(range(len(self.workers)))
+        self.running: dict[Any, tuple[int, Job]] = {}
         self.again: deque[Job] = deque()
         self.killed: dict[int, Beat] = {}
         self.counts: Counter = Counter()
@@ -66,7 +155,7 @@ class Driver:
         self.obstacle: Optional[str] = None
         self.began, self.look_due = time.monotonic(), 0.0
         # only on terminals; elsewhere a line per asset
-        self.bar = tqdm(total=total, initial=done, unit="asset", disable=None, dynamic_ncols=True)
+        self.bar = tqdm(total=self.total, initial=self.done, unit="asset", disable=None, ncols=110)
 
     def run(self) -> None:
         """Make the assets.
@@ -81,7 +170,10 @@ class Driver:
                 self.step()
         except (KeyboardInterrupt, SystemExit):
             print("\nstopping: the workers write checkpoints; once more to stop at once")
-            self.stop()
+            self.tell_board_to_stop()
+            deadline = time.monotonic() + SECONDS_TO_STOP
+            while self.running and time.monotonic() < deadline:
+                self.collect_ready()
             raise
         finally:
             self.bar.close()
@@ -89,20 +181,22 @@ class Driver:
             raise UserError(self.obstacle)
 
     def step(self) -> None:
-        """Wait up to :data:`POLL` seconds for outcomes and hand out new assets; each :data:`POLL`
-        seconds restart hung workers and show what the workers do.
-        """
-        ready, _ = self.ray.wait(list(self.running), timeout=POLL)
-        if ready:  # all that are there: each wait takes longer the more workers there are
-            handles = list(self.running)
-            ready, _ = self.ray.wait(handles, num_returns=len(handles), timeout=0)
-        for handle in ready:
-            self.collect(handle)
+        """Wait for outcomes, hand out new assets, and now and then look after the workers."""
+        self.collect_ready()
         if not self.obstacle:
             self.fill()
         if time.monotonic() >= self.look_due:
             self.look_after_workers()
             self.look_due = time.monotonic() + POLL
+
+    def collect_ready(self) -> None:
+        """Wait up to :data:`POLL` seconds for an outcome, and note all that are there."""
+        handles = list(self.running)
+        ready, _ = self.ray.wait(handles, timeout=POLL)
+        if ready:  # each wait takes longer the more workers there are
+            ready, _ = self.ray.wait(handles, num_returns=len(handles), timeout=0)
+        for handle in ready:
+            self.collect(handle)
 
     def fill(self) -> None:
         """Give an asset to each worker that has none."""
@@ -112,52 +206,34 @@ class Driver:
                 return
             job = job._replace(handed_out=time.time())
             number = self.idle.popleft()
-            handle = self.workers[number].make.remote(job, self.settings[number])
-            self.running[handle] = Running(number, job)
-
-    def stop(self) -> None:
-        """Let all workers write a checkpoint and end."""
-        self.tell_board_to_stop()
-        deadline = time.monotonic() + SECONDS_TO_STOP
-        while self.running and time.monotonic() < deadline:
-            ready, _ = self.ray.wait(list(self.running), timeout=POLL)
-            for handle in ready:
-                self.collect(handle)
-
-    # Outcomes
-    # ----------------------------------------------------------------------------------------------
+            handle = self.workers[number].make.remote(job, number, self.setting)
+            self.running[handle] = number, job
 
     def collect(self, handle: Any) -> None:
         """Note the outcome of an asset."""
         number, job = self.running.pop(handle)
         self.idle.append(number)
-        outcome = self.outcome(handle)
+        try:
+            outcome = self.ray.get(handle)
+        except self.ray.exceptions.RayError as error:  # its worker can't be restarted
+            said = (str(error).strip().splitlines() or [type(error).__name__])[0][:500]
+            outcome = {"state": FAILED, "error": f"its worker is lost: {said}"}
         state = outcome["state"]
         if state == FINISHED:
             self.note(job, FINISHED, f"{outcome.get('seconds', 0):.1f} s")
             return
         job, error = job._replace(spent=job.worker_seconds(time.time())), outcome["error"]
-        if state == NO_MEMORY and self.recipe.low_memory and not job.saves_memory:
-            self.record(job, STOPPED, error)
+        again = state == NO_MEMORY and self.setting.recipe.low_memory and not job.saves_memory
+        if state == FAILED or state == NO_MEMORY and not again:
+            self.fail(job, error)
+            return
+        self.record(job, STOPPED, error)
+        if again:
             self.note(job, "again with less memory", error)
             self.again.append(job._replace(saves_memory=True))
-            self.restart(number)
-        elif state in (FAILED, NO_MEMORY):
-            self.fail(job, error)
-        else:
-            self.record(job, STOPPED, error)
-            if state == BLOCKED:
-                self.block(error)
-
-    def outcome(self, handle: Any) -> dict[str, Any]:
-        """Return what the worker returned, or what Ray says about its death."""
-        try:
-            return self.ray.get(handle)
-        except self.ray.exceptions.RayError as error:
-            said = (str(error).strip().splitlines() or [type(error).__name__])[0][:500]
-            if isinstance(error, self.ray.exceptions.RayActorError):
-                said = f"its worker can't be restarted: {said}"
-            return {"state": FAILED, "error": said}
+            self.ray.kill(self.workers[number], no_restart=False)
+        elif state == BLOCKED:
+            self.block(error)
 
     def fail(self, job: Job, error: str) -> None:
         """Note a failed asset; end the farm if the first assets all failed with one message."""
@@ -165,24 +241,21 @@ class Driver:
         self.note(job, FAILED, error)
         self.errors.append(error)
         if not self.done + self.counts[FINISHED] and self.errors == [error] * SAME_ERRORS:
-            self.block(
-                f"the first {SAME_ERRORS} assets have failed alike, so the farm ends: {error}"
-            )
+            alike = f"the first {SAME_ERRORS} assets have failed alike, so the farm ends: {error}"
+            self.block(alike)
 
     def record(self, job: Job, state: str, error: str) -> None:
         """Write the record of an attempt that ended without a result."""
         record = {"state": state, "key": job.row.key, "error": error}
-        record |= {"command": repeat_command(self.recipe, job), "worker_seconds": job.spent}
+        record |= {"command": repeat_command(self.setting.recipe, job), "worker_seconds": job.spent}
         content = json_text(record, indent=1).encode()
         try:
-            self.place.write({f"{ASSETS}/{job.row.name}/{FAILURE}": content})
+            self.setting.place.write({f"{ASSETS}/{job.row.name}/{FAILURE}": content})
         except UserError as problem:  # such as a full disk
             self.block(str(problem))
 
     def block(self, error: str) -> None:
-        """Hand out no more assets, and let the workers write checkpoints; :meth:`run` then raises
-        the first of these errors.
-        """
+        """Hand out no more assets, and let the workers write checkpoints, and end with an error."""
         self.obstacle = self.obstacle or error
         self.tell_board_to_stop()
 
@@ -197,24 +270,18 @@ class Driver:
             text += f" ({self.done + made} of {self.total}, {tqdm.format_interval(seconds)} left)"
         self.bar.write(f"{job.row.name}: {state}: {text}", file=sys.stderr)
 
-    # Workers
-    # ----------------------------------------------------------------------------------------------
-
     def look_after_workers(self) -> None:
         """Restart hung workers, and show what the workers do."""
         try:
-            beats = self.ray.get(self.board.read.remote(), timeout=2)
+            beats = self.ray.get(self.setting.board.read.remote(), timeout=2)
         except self.ray.exceptions.RayError:
             return  # the board's process is being restarted
         self.restart_hung(beats)
         shown = [f"{beat.name} {beat.stage} {beat.step}/{beat.steps}" for beat, _ in beats.values()]
-        failed = f"{self.counts[FAILED]} failed, " if self.counts[FAILED] else ""
-        self.bar.set_postfix_str(failed + ", ".join(shown))
+        self.bar.set_postfix_str(f"{self.counts[FAILED]} failed, {', '.join(shown)}")
 
     def restart_hung(self, beats: dict[int, tuple[Beat, float]]) -> None:
-        """Restart workers that have finished no step for ``hang`` seconds; Ray calls
-        :meth:`.worker.Worker.make` again with the same asset.
-        """
+        """Restart workers that have finished no step for ``hang`` seconds, with the same asset."""
         for number, job in self.running.values():
             beat, seconds = beats.get(number, (None, 0.0))
             hangs = beat is not None and beat.name == job.row.name and seconds > self.hang
@@ -222,13 +289,10 @@ class Driver:
                 self.killed[number] = beat
                 reason = f"no step for {seconds:.0f} s ({beat.stage} {beat.step})"
                 self.note(job, "restarted", reason)
-                self.restart(number)
-
-    def restart(self, number: int) -> None:
-        self.ray.kill(self.workers[number], no_restart=False)
+                self.ray.kill(self.workers[number], no_restart=False)
 
     def tell_board_to_stop(self) -> None:
         try:
-            self.ray.get(self.board.stop.remote(), timeout=5)
+            self.ray.get(self.setting.board.stop.remote(), timeout=5)
         except self.ray.exceptions.RayError:
             pass  # it is being restarted; the workers are stopped without checkpoints

@@ -21,7 +21,6 @@ from typing import Any, Optional
 
 from ..core.errors import UserError
 from ..core.files import atomic_file, json_text
-from ..launch.folder_lock import claim
 from .rows import Row
 
 ASSETS, PARTS = "assets", "parts"
@@ -33,6 +32,7 @@ WAITING, RUNNING, STOPPED, FAILED, FINISHED = "waiting", "running", "stopped", "
 failed; complete."""
 LAST, FETCHED = "ckpts/last.ckpt", "ckpts/fetched.ckpt"
 NOT_UPLOADED = ("ckpts/epoch=*", "ckpts/*-prev.ckpt", FETCHED, "ckpts/.*", "ckpts-*/*", "tb_logs/*")
+NOT_UPLOADED += (RESULT,)  # comes last
 BATCH = 1000
 """Records that are read together."""
 
@@ -41,39 +41,26 @@ class Unreachable(UserError):
     """Raised when a URL can't be read or written: other assets would fail in the same way."""
 
 
-def is_url(text: str) -> bool:
-    return "://" in text
-
-
 class Place:
-    """A farm's folder on a disk that all its machines share, or below a URL.
-
-    Args:
-        out: the folder or URL.
-        scratch: holds the folders in which assets for a URL are made; by default the user's cache
-            folder.
+    """A farm's folder on a disk that all its machines share, or below a URL. ``scratch`` holds the
+    folders in which assets for a URL are made; by default it is the user's cache folder.
 
     Raises:
         UserError: the URL's protocol is unknown, or its package isn't installed.
     """
 
-    system: Any = None
-    """fsspec's file system of a URL."""
-
     def __init__(self, out: str | os.PathLike, scratch: Optional[Path] = None) -> None:
-        self.uploaded: dict[str, float] = {}
-        if not is_url(str(out)):
-            self.folder = Path(out).expanduser().absolute()
-            self.url = str(self.folder)
+        self.remote = "://" in str(out)
+        self.folder = Path(out).expanduser().absolute()
+        self.url = str(out).rstrip("/") if self.remote else str(self.folder)
+        if not self.remote:
             return
         import fsspec
 
-        root = scratch or Path(
-            os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache",
-            *("threestudio_gaussiandreamer", "farm"),
-        )
-        self.url = str(out).rstrip("/")
-        self.folder = root / hashlib.sha256(self.url.encode()).hexdigest()[:16]
+        cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+        scratch = scratch or Path(cache, "threestudio_gaussiandreamer", "farm")
+        self.folder = scratch / hashlib.sha256(self.url.encode()).hexdigest()[:16]
+        self.uploaded: dict[str, float] = {}
         try:
             self.system = fsspec.core.url_to_fs(self.url, use_listings_cache=False)[0]
         except (ImportError, ValueError) as error:
@@ -90,23 +77,18 @@ class Place:
         """Raise Unreachable for errors of a URL, which its file system has tried again."""
         try:
             yield
-        except FileNotFoundError:
-            raise
         except Exception as error:  # each file system of fsspec has its own
-            if self.system is None:
+            if not self.remote or isinstance(error, FileNotFoundError):
                 raise
             raise Unreachable(
                 f"{self.url} can't be reached: {type(error).__name__}: {error}; check the address "
                 "and the credentials, and give the same command again"
             ) from error
 
-    # Files
-    # ----------------------------------------------------------------------------------------------
-
     def names(self, below: str) -> set[str]:
         """List what is in a folder of the farm."""
         with contextlib.suppress(FileNotFoundError), self.reached():
-            if self.system is None:
+            if not self.remote:
                 return set(os.listdir(self.folder / below))
             found = self.system.ls(f"{self.url}/{below}", detail=False)
             return {path.rstrip("/").rpartition("/")[2] for path in found}
@@ -115,7 +97,7 @@ class Place:
     def read(self, names: Sequence[str]) -> list[Optional[bytes]]:
         """Return the contents of files of the farm; None for those that don't exist."""
         with self.reached():
-            if self.system is None:
+            if not self.remote:
                 paths = [self.folder / name for name in names]
                 return [path.read_bytes() if path.is_file() else None for path in paths]
             paths = [f"{self.url}/{name}" for name in names]
@@ -125,28 +107,25 @@ class Place:
                     raise content
             return [content if isinstance(content, bytes) else None for content in found]
 
-    def json(self, name: str) -> Optional[dict[str, Any]]:
-        """Return the content of a JSON file of the farm; None if there is none."""
-        return self.parsed(name, *self.read([name]))
-
-    def parsed(self, name: str, content: Optional[bytes]) -> Optional[dict[str, Any]]:
-        """Return a JSON file's content.
+    def read_json(self, *names: str) -> list[Optional[dict[str, Any]]]:
+        """Return the contents of JSON files of the farm; None for those that don't exist.
 
         Raises:
-            UserError: it isn't an object: the file was written by something else.
+            UserError: one isn't an object: it was written by something else.
         """
-        if content is None:
-            return None
-        try:
-            return {**json.loads(content)}
-        except (ValueError, TypeError, RecursionError) as error:
-            raise UserError(
-                f"{self}/{name} is damaged ({error}): delete it, or choose another --out"
-            ) from error
+        found = []
+        for name, content in zip(names, self.read(names), strict=True):
+            try:
+                found.append(None if content is None else {**json.loads(content)})
+            except (ValueError, TypeError, RecursionError) as error:
+                raise UserError(
+                    f"{self}/{name} is damaged ({error}): delete it, or choose another --out"
+                ) from error
+        return found
 
     def write(self, files: Mapping[str, bytes]) -> None:
         """Write files of the farm, each atomically, as object stores do by themselves."""
-        if self.system is not None:
+        if self.remote:
             with self.reached():
                 self.system.pipe({f"{self.url}/{name}": files[name] for name in files})
             return
@@ -157,20 +136,17 @@ class Place:
 
     def upload(self, name: str, path: Optional[Path] = None) -> None:
         """Make a file that was written below :attr:`folder` available to readers."""
-        if self.system is not None:
+        if self.remote:
             with self.reached():
                 self.system.put_file(str(path or self.folder / name), f"{self.url}/{name}")
 
     def remove(self, names: Iterable[str]) -> None:
         for name in names:
             with contextlib.suppress(FileNotFoundError), self.reached():
-                if self.system is None:
+                if not self.remote:
                     (self.folder / name).unlink()
                 else:
                     self.system.rm_file(f"{self.url}/{name}")
-
-    # Assets
-    # ----------------------------------------------------------------------------------------------
 
     def work_folder(self, row: Row) -> Path:
         """Return the folder in which an asset is made."""
@@ -178,34 +154,32 @@ class Place:
 
     def finished(self, row: Row) -> Optional[dict[str, Any]]:
         """Return the result of a finished asset; None if it isn't finished."""
-        record = self.json(f"{ASSETS}/{row.name}/{RESULT}")
+        (record,) = self.read_json(f"{ASSETS}/{row.name}/{RESULT}")
         ours = record and record.get("key") == row.key and has_files(record)
         return {"state": FINISHED, **record} if ours else None
 
     def discard(self, row: Row) -> None:
         """Remove an asset that isn't finished."""
         shutil.rmtree(self.work_folder(row), ignore_errors=True)
-        if self.system is not None:
+        if self.remote:
             self.remove([part_of(row)])
 
     def fetch_checkpoint(self, row: Row) -> None:
         """Bring the last checkpoint beside what this machine has of the asset, of which
         ``resume=auto`` takes the one with the highest step.
         """
-        if self.system is None:
-            return
-        folder = self.work_folder(row)
-        self.uploaded = {row.name: _written(folder / LAST)}  # which may be older than the other
-        (content,) = self.read([part_of(row)])
-        if content is not None:
-            (folder / FETCHED).parent.mkdir(parents=True, exist_ok=True)
-            with atomic_file(folder / FETCHED) as file:
-                file.write(content)
+        if self.remote:
+            folder = self.work_folder(row)
+            self.uploaded = {row.name: _written(folder / LAST)}  # may be older than the other
+            (content,) = self.read([part_of(row)])
+            if content is not None:
+                (folder / FETCHED).parent.mkdir(parents=True, exist_ok=True)
+                (folder / FETCHED).write_bytes(content)
 
     def keep_checkpoint(self, row: Row) -> None:
         """Make the work folder's last checkpoint available to other workers."""
         path = self.work_folder(row) / LAST
-        if self.system is not None and _written(path) > self.uploaded.get(row.name, 0.0):
+        if self.remote and _written(path) > self.uploaded.get(row.name, 0.0):
             written = _written(path)
             self.upload(part_of(row), path)
             self.uploaded = {row.name: written}
@@ -215,15 +189,12 @@ class Place:
         them, and remove what only unfinished ones have.
         """
         folder, name = self.work_folder(row), f"{ASSETS}/{row.name}"
-        for path in files_of(folder) if self.system is not None else ():
-            self.upload(f"{name}/{path.relative_to(folder).as_posix()}", path)
+        for file, path in uploads(folder) if self.remote else ():
+            self.upload(f"{name}/{file}", path)
         self.write({f"{name}/{RESULT}": json_text(result, indent=1).encode()})
         self.remove([f"{name}/{FAILURE}"])
-        if self.system is not None:
+        if self.remote:
             self.discard(row)
-
-    # Records
-    # ----------------------------------------------------------------------------------------------
 
     def records(self, rows: Iterable[Row]) -> Iterator[tuple[Row, dict[str, Any]]]:
         """Yield each row with the record of its asset: the content of ``result.json``, else of
@@ -232,19 +203,17 @@ class Place:
         Raises:
             UserError: an asset of this name was made from another row.
         """
-        begun = self.names(ASSETS) | (self.names(PARTS) if self.system is not None else set())
+        begun = self.names(ASSETS) | (self.names(PARTS) if self.remote else set())
         rows = iter(rows)
         while batch := list(islice(rows, BATCH)):
             found: dict[str, dict[str, Any]] = {}
-            for file in (RESULT, FAILURE):
+            for file, state in ((RESULT, FINISHED), (FAILURE, FAILED)):
                 asked = [row for row in batch if row.name in begun and row.name not in found]
                 names = [f"{ASSETS}/{row.name}/{file}" for row in asked]
-                for row, name, content in zip(asked, names, self.read(names), strict=True):
-                    record = self.parsed(name, content)
+                for row, record in zip(asked, self.read_json(*names), strict=True):
                     if record is not None and record.get("key") != row.key:
                         raise another_row(row)
                     if record is not None and (file == FAILURE or has_files(record)):
-                        state = FINISHED if file == RESULT else FAILED
                         found[row.name] = {"state": state, **record}
             for row in batch:
                 state = RUNNING if row.name in begun else WAITING
@@ -264,21 +233,16 @@ def has_files(result: Mapping[str, Any]) -> bool:
 
 
 def part_of(row: Row) -> str:
-    """Return where the last checkpoint of an unfinished asset is; those of another row under this
-    name are elsewhere.
-    """
+    """Return where the last checkpoint of an unfinished asset is; that of another row isn't."""
     return f"{PARTS}/{row.name}/{row.key}.ckpt"
 
 
-def files_of(folder: Path) -> list[Path]:
-    """List the files of a finished asset that readers get below a URL."""
-    found = sorted(path for path in folder.rglob("*") if path.is_file())
-    names = [path.relative_to(folder).as_posix() for path in found]
-    return [
-        path
-        for path, name in zip(found, names, strict=True)
-        if not any(fnmatch.fnmatch(name, pattern) for pattern in NOT_UPLOADED)
-    ]
+def uploads(folder: Path) -> Iterator[tuple[str, Path]]:
+    """Yield the files of a finished asset that readers get below a URL, and their names there."""
+    for path in sorted(path for path in folder.rglob("*") if path.is_file()):
+        name = path.relative_to(folder).as_posix()
+        if not any(fnmatch.fnmatch(name, pattern) for pattern in NOT_UPLOADED):
+            yield name, path
 
 
 def _written(path: Path) -> float:
@@ -286,29 +250,13 @@ def _written(path: Path) -> float:
     return path.stat().st_mtime if path.exists() else 0.0
 
 
-@contextlib.contextmanager
-def claimed(place: Place) -> Iterator[None]:
-    """Lock the farm's folder, or its scratch folder on this machine, against other commands."""
-    folder = claim(place.folder, "another farm command is at work", ", or choose another --out")
-    try:
-        yield
-    finally:
-        folder.release()
-
-
-# Farms of earlier versions
-# --------------------------------------------------------------------------------------------------
-
-
 def adopt_ledger(place: Place) -> None:
-    """Write the records of a farm of an earlier version, which had them in ``ledger.jsonl``: a line
-    whenever an asset started, finished or failed; below a URL in parts. The last line of an asset
-    counts, but seconds are added up. The ledger is kept under another name.
+    """Write the records of a farm of an earlier version, which had them in ``ledger.jsonl``, or in
+    parts of it. An asset had a line whenever it started, finished or failed: the last one counts,
+    but seconds are added up. The ledger is kept under another name.
     """
     names = [f"ledger/{name}" for name in sorted(place.names("ledger"))] or ["ledger.jsonl"]
     content = b"".join(filter(None, place.read(names)))
-    if not content:
-        return
     spent: Counter = Counter()
     last: dict[str, dict[str, Any]] = {}
     for text in content.splitlines():
@@ -319,17 +267,14 @@ def adopt_ledger(place: Place) -> None:
             spent[name] = more = round(more, 3)
             state = line["state"] if made or line["state"] == FAILED else STOPPED
             last[name] = {**line, "key": line["key"], "state": state, "worker_seconds": more}
-    with claimed(place):
-        lines = iter(last.items())
-        while batch := list(islice(lines, BATCH)):
-            place.write({_record(name, line): json_text(line).encode() for name, line in batch})
-        for name in place.names(PARTS) & last.keys():
-            part = f"{place}/{PARTS}/{name}"
-            with contextlib.suppress(FileNotFoundError), place.reached():
-                place.system.mv(f"{part}/last.ckpt", f"{part}/{last[name]['key']}.ckpt")
+    lines = iter(last.items())
+    while batch := list(islice(lines, BATCH)):
+        files = {n: RESULT if line["state"] == FINISHED else FAILURE for n, line in batch}
+        place.write({f"{ASSETS}/{n}/{files[n]}": json_text(line).encode() for n, line in batch})
+    for name in place.names(PARTS) & last.keys():
+        part = f"{place}/{PARTS}/{name}"
+        with contextlib.suppress(FileNotFoundError), place.reached():
+            place.system.mv(f"{part}/last.ckpt", f"{part}/{last[name]['key']}.ckpt")
+    if content:
         place.write({"ledger-adopted.jsonl": content})
         place.remove(names)
-
-
-def _record(name: str, line: Mapping[str, Any]) -> str:
-    return f"{ASSETS}/{name}/{RESULT if line['state'] == FINISHED else FAILURE}"

@@ -28,12 +28,9 @@ MOST_CHECKS = 500
 """Rows of one list may have different overrides; so many are checked before any work, and further
 ones when it is their turn."""
 MANAGED = {
-    "exp_root_dir": "--out",
-    "name": "--out",
+    **dict.fromkeys(("exp_root_dir", "name"), "--out"),
     "tag": "the column name",
-    "timestamp": "the farm",
-    "use_timestamp": "the farm",
-    "resume": "the farm, which resumes by itself",
+    **dict.fromkeys(("timestamp", "use_timestamp", "resume"), "the farm, which resumes by itself"),
     "system.prompt_processor.prompt": "the prompt list",
     "system.prompt_processor.prompt_file": "the prompt list",
 }
@@ -57,16 +54,13 @@ class Recipe(NamedTuple):
     cores: int
     """Threads of an asset. On the CPU the last bits of a result depend on it."""
     low_memory: Optional[Source] = None
-    """Laid over the sources for an asset for which the memory didn't suffice; None: not valid
-    with them."""
+    """For assets for which the memory didn't suffice; None: it isn't valid over the sources."""
 
 
 class Job(NamedTuple):
-    """One row and what is needed to make its asset."""
+    """One attempt to make the asset of a row."""
 
     row: Row
-    sources: tuple[Source, ...] = ()
-    """The YAML files of the row's column ``config``."""
     saves_memory: bool = False
     """Whether the low-memory configuration is laid over the others."""
     spent: float = 0.0
@@ -86,97 +80,59 @@ def read_config(name: str) -> Source:
     return Source(str(path), read_source(path))
 
 
-def make_recipe(
-    configs: Iterable[str], overrides: Iterable[str], *, cpu: bool, cores: int
-) -> Recipe:
-    """Return what all assets have in common.
-
-    Raises:
-        UserError: a file is missing, or an override is one that the farm sets.
-    """
-    return Recipe(tuple(map(read_config, configs)), _free(overrides), cpu, cores)
-
-
-def job_of(row: Row, spent: float = 0.0) -> Job:
-    """Return the job of a row, with the YAML files of its column ``config``.
-
-    Raises:
-        UserError: a file is missing, or an override is one that the farm sets.
-    """
-    _free(row.overrides)
-    return Job(row, tuple(map(read_config, row.config)), spent=spent)
-
-
-def _free(overrides: Iterable[str]) -> tuple[str, ...]:
-    """Return the overrides; raise UserError if one is of an option that the farm sets."""
-    overrides = tuple(overrides)
-    for override in overrides:
-        key = override.partition("=")[0]
-        if key in MANAGED:
-            raise UserError(f"{key} is set by {MANAGED[key]}: remove {override[:80]!r}")
-    return overrides
-
-
 def root_of(configs: Iterable[str]) -> str:
     """Return ``exp_root_dir`` of the configuration: the folder or URL for the farm's folder."""
     roots = [read_yaml(read_config(name).name).get("exp_root_dir") for name in configs]
     return str([root for root in ["outputs", *roots] if root][-1])
 
 
-# Arguments
-# --------------------------------------------------------------------------------------------------
-
-
 def launch_arguments(recipe: Recipe, job: Job, configs: list[str], folder: Path) -> list[str]:
-    """Return the launcher's arguments for an asset.
-
-    Args:
-        configs: the paths of the YAML files.
-        folder: of the farm; the asset's is ``folder/assets/<name>``.
+    """Return the launcher's arguments for an asset in the farm's ``folder``; ``configs`` are the
+    paths of the YAML files.
     """
-    return [
-        *(text for path in configs for text in ("--config", path)),
-        "--train",
-        *(["--gpu", "cpu"] if recipe.cpu else []),
-        *run_overrides(recipe, job),
-        f"exp_root_dir={folder}",
-        f"name={ASSETS}",
-        f"tag={job.row.name}",
-        "use_timestamp=false",
-        "resume=auto",
-    ]
+    managed = {"exp_root_dir": folder, "name": ASSETS, "tag": job.row.name}
+    managed |= {"use_timestamp": "false", "resume": "auto"}
+    return [*_arguments(recipe, job, configs), *(f"{key}={managed[key]}" for key in managed)]
+
+
+def _arguments(recipe: Recipe, job: Job, configs: Iterable[str]) -> list[str]:
+    device = ["--gpu", "cpu"] if recipe.cpu else []
+    paths = [text for path in configs for text in ("--config", path)]
+    return [*paths, "--train", *device, *run_overrides(recipe, job)]
 
 
 def run_overrides(recipe: Recipe, job: Job) -> list[str]:
-    """Return the overrides that an asset depends on."""
+    """Return the overrides that an asset depends on.
+
+    Raises:
+        UserError: one is of an option that the farm sets.
+    """
+    overrides = [*recipe.overrides, *job.row.overrides]
+    for override in overrides:
+        key = override.partition("=")[0]
+        if key in MANAGED:
+            raise UserError(f"{key} is set by {MANAGED[key]}: remove {override[:80]!r}")
     seed = [] if job.row.seed is None else [f"seed={job.row.seed}"]
-    prompt = f"system.prompt_processor.prompt={job.row.prompt}"
-    return [*recipe.overrides, *job.row.overrides, *seed, prompt]
+    return [*overrides, *seed, f"system.prompt_processor.prompt={job.row.prompt}"]
 
 
 def all_sources(recipe: Recipe, job: Job) -> list[Source]:
     """Return the YAML files of an asset, later ones taking precedence."""
     extra = [recipe.low_memory] if job.saves_memory and recipe.low_memory else []
-    return [*recipe.sources, *job.sources, *extra]
+    return [*recipe.sources, *map(read_config, job.row.config), *extra]
 
 
 def repeat_command(recipe: Recipe, job: Job) -> str:
     """Return the command that makes an asset by itself, in ``outputs/``."""
-    configs = [text for source in all_sources(recipe, job) for text in ("--config", source.name)]
-    device = ["--gpu", "cpu"] if recipe.cpu else []
-    command = [*program_anywhere(), *configs, "--train", *device, *run_overrides(recipe, job)]
-    return f"OMP_NUM_THREADS={recipe.cores} {shlex.join(command)}"
-
-
-# Checks
-# --------------------------------------------------------------------------------------------------
+    names = [*(source.name for source in recipe.sources), *job.row.config]
+    names += [recipe.low_memory.name] if job.saves_memory and recipe.low_memory else []
+    command = shlex.join([*program_anywhere(), *_arguments(recipe, job, names)])
+    return f"OMP_NUM_THREADS={recipe.cores} {command}"
 
 
 def check_recipe(recipe: Recipe, rows: Iterable[Row]) -> Recipe:
-    """Check the configuration of each different combination of rows' ``config`` and ``overrides``.
-
-    Returns:
-        the recipe with the low-memory configuration, if that is valid with the farm's.
+    """Check the configuration of each different combination of rows' ``config`` and ``overrides``;
+    return the recipe with the low-memory configuration, if that is valid with the farm's.
 
     Raises:
         UserError: the first error, with the line of the row.
@@ -186,27 +142,23 @@ def check_recipe(recipe: Recipe, rows: Iterable[Row]) -> Recipe:
 
     register_parts()
     load_extensions()
-    first: Optional[Row] = None
-    checked = set()
+    checked: dict[tuple, Row] = {}
     for row in rows:
-        first = first or row
         kind = row.config, row.overrides
         if kind not in checked and len(checked) < MOST_CHECKS:
-            checked.add(kind)
+            checked[kind] = row
             try:
-                check_job(recipe, job_of(row))
+                check_job(recipe, Job(row))
             except UserError as error:
-                if row.config or row.overrides:
+                if any(kind):
                     raise UserError(f"line {row.line} of the prompt list: {error}") from error
                 raise
-    if first is not None:
-        try:
-            saving = recipe._replace(low_memory=read_config(LOW_MEMORY))
-            check_job(saving, job_of(first)._replace(saves_memory=True))
-            return saving
-        except UserError:
-            pass
-    return recipe
+    try:
+        saving = recipe._replace(low_memory=read_config(LOW_MEMORY))
+        check_job(saving, Job(next(iter(checked.values())), saves_memory=True))
+    except UserError:
+        return recipe
+    return saving
 
 
 def check_job(recipe: Recipe, job: Job) -> None:
@@ -221,10 +173,8 @@ def check_job(recipe: Recipe, job: Job) -> None:
 
 
 def require_same_farm(place: Place, recipe: Recipe, *, before_ray: bool = False) -> None:
-    """Check that a folder is new or of the same farm, and note the farm in a new one.
-
-    Args:
-        before_ray: don't compare what depends on the machines, and note nothing.
+    """Check that a folder is new or of the same farm, and note the farm in a new one;
+    ``before_ray`` without what depends on the machines, and without a note.
 
     Raises:
         UserError: the folder belongs to another farm; the message names what differs.
@@ -239,13 +189,15 @@ def require_same_farm(place: Place, recipe: Recipe, *, before_ray: bool = False)
         "device": "cpu" if recipe.cpu else "gpu",
         "cores": recipe.cores if recipe.cpu else None,
     }
-    theirs = place.json(FARM)
-    if theirs is None and not before_ray:
-        place.write({FARM: json_text(ours, indent=1).encode()})
+    (theirs,) = place.read_json(FARM)
+    if theirs is None:
+        if not before_ray:
+            place.write({FARM: json_text(ours, indent=1).encode()})
+        return
     for name, here in ours.items():
-        if theirs is None or (before_ray and name in OF_MACHINES) or theirs.get(name) == here:
-            continue
         there, note = theirs.get(name), ""
+        if there == here or before_ray and name in OF_MACHINES:
+            continue
         if isinstance(there, list) and isinstance(here, list):
             only = [x for x in there if x not in here], [x for x in here if x not in there]
             # else only their order differs, or nothing is in both

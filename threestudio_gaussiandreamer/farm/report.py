@@ -1,7 +1,5 @@
 """The report of a farm, from the prompt list and the assets' records: a gallery, and a table in CSV
-and Parquet.
-
-Everything is written as it is read, so that the memory doesn't grow with the number of assets."""
+and Parquet. It is written as it is read: the memory doesn't grow with the number of assets."""
 
 import csv
 import html
@@ -27,31 +25,14 @@ MOST_FAILURES = 1000
 """Failures that the first page lists; the table has all."""
 BATCH = 5000
 """Rows of the table that are held in memory."""
-TEXT, WHOLE, NUMBER = "text", "whole number", "number"
-COLUMNS = {
-    "name": TEXT,
-    "prompt": TEXT,
-    "seed": WHOLE,
-    "state": TEXT,
-    "seconds": NUMBER,
-    "worker_seconds": NUMBER,
-    "steps": WHOLE,
-    "gaussians": WHOLE,
-    "megabytes": NUMBER,
-    "bytes": WHOLE,
-    "attempts": WHOLE,
-    "saves_memory": TEXT,
-    "psnr": NUMBER,
-    "ssim": NUMBER,
-    "multi_face": NUMBER,
-    "cost": NUMBER,
-    "host": TEXT,
-    "hash": TEXT,
-    "picture": TEXT,
-    "page": TEXT,
-    "error": TEXT,
-    "command": TEXT,
-}
+COLUMNS = (
+    *("name", "prompt", "seed", "state", "seconds", "worker_seconds", "steps", "gaussians"),
+    *("megabytes", "bytes", "attempts", "saves_memory", "psnr", "ssim", "multi_face", "cost"),
+    *("host", "hash", "picture", "page", "error", "command"),
+)
+WHOLE = ("seed", "steps", "gaussians", "bytes", "attempts")
+NUMBERS = ("seconds", "worker_seconds", "megabytes", "psnr", "ssim", "multi_face", "cost")
+"""Columns that are no texts."""
 STYLE = """body{font:15px/1.4 system-ui,sans-serif;margin:2rem;max-width:80rem}
 main{display:grid;grid-template-columns:repeat(auto-fill,minmax(180px,1fr));gap:1rem}
 figure{margin:0}img{width:100%;background:#eee;aspect-ratio:1;object-fit:cover}
@@ -90,7 +71,7 @@ def write_report(
                 write_page(folder / f"page-{pages}.html", f"Assets, page {pages}", body)
                 del figures[:PER_PAGE]
     numbers = {state: f"{states[state]}" for state in sorted(states)}
-    numbers["worker time"] = duration(seconds)
+    numbers["worker time"] = tqdm.format_interval(seconds)
     if price is not None:
         cost = seconds / 3600 * price
         each = f", {cost / states[FINISHED]:.4g} per finished asset" if states[FINISHED] else ""
@@ -131,15 +112,15 @@ def tables(stack: ExitStack, folder: Path) -> Callable[[list[dict[str, Any]]], N
     # closed before its file would be
     text = io.TextIOWrapper(stack.enter_context(atomic_file(folder / CSV)), "utf-8", newline="")
     stack.callback(text.detach)
-    writer = csv.DictWriter(text, list(COLUMNS), lineterminator="\n")
+    writer = csv.DictWriter(text, COLUMNS, lineterminator="\n")
     writer.writeheader()
     try:
         import pyarrow as pa
         from pyarrow.parquet import ParquetWriter
     except ImportError:
         return writer.writerows
-    kinds = {TEXT: pa.string(), WHOLE: pa.int64(), NUMBER: pa.float64()}
-    schema = pa.schema([(name, kinds[kind]) for name, kind in COLUMNS.items()])
+    kinds = dict.fromkeys(WHOLE, pa.int64()) | dict.fromkeys(NUMBERS, pa.float64())
+    schema = pa.schema([(name, kinds.get(name, pa.string())) for name in COLUMNS])
     file = stack.enter_context(atomic_file(folder / PARQUET))
     parquet = stack.enter_context(ParquetWriter(file, schema))
 
@@ -150,17 +131,15 @@ def tables(stack: ExitStack, folder: Path) -> Callable[[list[dict[str, Any]]], N
     return write
 
 
-# Pages
-# --------------------------------------------------------------------------------------------------
-
-
 def figure(line: dict[str, Any]) -> str:
     """Return the picture of an asset with its prompt and numbers."""
     folder = f"../{ASSETS}/{quote(line['name'])}"
     picture = line["picture"]
     image = f'<img loading="lazy" src="{folder}/{quote(picture)}" alt="">' if picture else ""
     score = f", {line['psnr']:.1f} dB" if line["psnr"] is not None else ""
-    numbers = f"{line['gaussians'] or 0} Gaussians, {duration(line['seconds'] or 0)}{score}"
+    numbers = (
+        f"{line['gaussians'] or 0} Gaussians, {tqdm.format_interval(line['seconds'] or 0)}{score}"
+    )
     caption = f"{html.escape(line['prompt'])}<br><small>{numbers}</small>"
     linked = f'<a href="{folder}/{quote(line["page"] or "")}">{image}</a>'
     return f"<figure>{linked}<figcaption>{caption}</figcaption></figure>"
@@ -180,12 +159,3 @@ def write_page(path: Path, title: str, body: str) -> None:
     with atomic_file(path, durable=False) as file:
         text = f'<!doctype html><meta charset="utf-8"><title>{title}</title><style>{STYLE}</style>'
         file.write(f"{text}<h1>{title}</h1>{body}\n".encode())
-
-
-def duration(seconds: float) -> str:
-    """Format a duration, such as "1 h 05 min"."""
-    if seconds < 60:
-        return f"{seconds:.0f} s"
-    if seconds < 3600:
-        return f"{seconds // 60:.0f} min {seconds % 60:02.0f} s"
-    return f"{seconds // 3600:.0f} h {seconds % 3600 // 60:02.0f} min"

@@ -7,7 +7,6 @@ import json
 import shlex
 import unicodedata
 from collections.abc import Callable, Iterator, Mapping
-from itertools import count
 from pathlib import Path
 from typing import Any, NamedTuple, Optional
 
@@ -52,11 +51,22 @@ def read_rows(path: Path) -> Iterator[Row]:
     suffix = path.suffix.lower()
     if suffix not in FORMATS:
         raise unknown(f"format of the prompt list {str(path)!r}:", suffix, filter(None, FORMATS))
-    for line, values in FORMATS[suffix](path):
-        try:
-            yield make_row(values, line)
-        except UserError as error:
-            raise UserError(f"{path}, line {line}: {error}") from error
+    number = 0
+
+    def texts() -> Iterator[str]:
+        nonlocal number
+        with open(path, "rb") as file:
+            while content := file.readline(MOST_LINE_BYTES + 1):
+                number += 1
+                text = _decoded(content, "utf-8-sig" if number == 1 else "utf-8")
+                if text.strip() and not text.lstrip().startswith("#"):
+                    yield text
+
+    try:
+        for values in FORMATS[suffix](texts()):
+            yield make_row(values, number)
+    except (UserError, csv.Error) as error:
+        raise UserError(f"{path}, line {number}: {error}") from error
 
 
 def check_rows(path: Path) -> int:
@@ -65,9 +75,11 @@ def check_rows(path: Path) -> int:
     Raises:
         UserError: as :func:`read_rows`, the list has no prompt, or two rows have the same name.
     """
-    lines: dict[int, int] = {}
+    lines: dict[bytes, int] = {}
     for row in read_rows(path):
-        earlier = lines.setdefault(name_number(row.name.casefold()), row.line)
+        # a digest, since a set of a million names takes less memory so
+        digest = hashlib.blake2b(row.name.casefold().encode(), digest_size=8).digest()
+        earlier = lines.setdefault(digest, row.line)
         if earlier != row.line:
             raise UserError(
                 f"{path}: lines {earlier} and {row.line} have the same name {row.name!r} (upper "
@@ -79,33 +91,15 @@ def check_rows(path: Path) -> int:
     return len(lines)
 
 
-def name_number(name: str) -> int:
-    """Return a 64-bit digest of a name: a set of a million names takes less memory so."""
-    return int.from_bytes(hashlib.blake2b(name.encode(), digest_size=8).digest(), "little")
-
-
-# Values
-# --------------------------------------------------------------------------------------------------
-
-
 def make_row(values: Mapping[str, Any], line: int = 0) -> Row:
-    """Check the values of one row, and fill in its name.
-
-    Raises:
-        UserError: a column is unknown, the prompt is empty, or a value is invalid.
-    """
+    """Check the values of one row, and fill in its name."""
     for column in values:
         if column not in COLUMNS:
             raise unknown("column", column, COLUMNS)
     prompt, seed = _prompt(values.get("prompt")), _seed(values.get("seed"))
-    return Row(
-        name=_name(values.get("name"), prompt, seed),
-        prompt=prompt,
-        seed=seed,
-        config=tuple(_texts("config", values.get("config"))),
-        overrides=tuple(_overrides(values.get("overrides"))),
-        line=line,
-    )
+    name = _name(values.get("name"), prompt, seed)
+    config, overrides = _texts("config", values.get("config")), _overrides(values.get("overrides"))
+    return Row(name, prompt, seed, tuple(config), tuple(overrides), line)
 
 
 def _prompt(value: Any) -> str:
@@ -161,82 +155,59 @@ def _overrides(value: Any) -> list[str]:
     return texts
 
 
-# Formats
-# --------------------------------------------------------------------------------------------------
-
-
-def _lines(path: Path) -> Iterator[tuple[int, str]]:
-    """Yield number and text of each line that is neither empty nor a comment."""
-    with open(path, "rb") as file:
-        for number in count(1):
-            content = file.readline(MOST_LINE_BYTES + 1)
-            if not content:
-                return
-            if len(content) > MOST_LINE_BYTES:
-                raise UserError(
-                    f"{path}, line {number} is longer than {MOST_LINE_BYTES} bytes: is this a "
-                    "list of prompts, one per line?"
-                )
-            try:
-                text = content.decode("utf-8-sig" if number == 1 else "utf-8")
-            except UnicodeDecodeError:
-                text = "\0"
-            if "\0" in text:
-                raise UserError(
-                    f"{path}, line {number} isn't UTF-8 text; expected a list of prompts (.txt, "
-                    ".csv, .jsonl), which Excel saves as CSV UTF-8"
-                )
-            if text.strip() and not text.lstrip().startswith("#"):
-                yield number, text
-
-
-def _from_text(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
-    for number, text in _lines(path):
-        yield number, {"prompt": text.strip()}
-
-
-def _from_csv(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
-    number = 0
-
-    def texts() -> Iterator[str]:
-        nonlocal number
-        for number, text in _lines(path):  # noqa: B007
-            yield text
-
-    reader = csv.DictReader(texts(), skipinitialspace=True, strict=True)
+def _decoded(content: bytes, encoding: str) -> str:
+    if len(content) > MOST_LINE_BYTES:
+        raise UserError(
+            f"longer than {MOST_LINE_BYTES} bytes; is this a list of prompts, one per line?"
+        )
     try:
-        reader.fieldnames = header = [column.strip() for column in reader.fieldnames or []]
-        for separator, name in ((";", "semicolons"), ("\t", "tabs")):
-            if len(header) == 1 and separator in header[0]:
-                raise UserError(f"{path}: columns are separated by commas, this file has {name}")
-        for column in header:
-            if column not in COLUMNS:
-                raise UserError(f"{path}: {unknown('column', column, COLUMNS)}")
-        if header and "prompt" not in header or len(set(header)) != len(header):
+        text = content.decode(encoding)
+    except UnicodeDecodeError:
+        text = "\0"
+    if "\0" in text:
+        raise UserError(
+            "no UTF-8 text; expected a list of prompts (.txt, .csv, .jsonl), which Excel saves as "
+            "CSV UTF-8"
+        )
+    return text
+
+
+def _from_text(texts: Iterator[str]) -> Iterator[dict[str, Any]]:
+    return ({"prompt": text.strip()} for text in texts)
+
+
+def _from_csv(texts: Iterator[str]) -> Iterator[dict[str, Any]]:
+    reader = csv.DictReader(texts, skipinitialspace=True, strict=True)
+    reader.fieldnames = header = [column.strip() for column in reader.fieldnames or []]
+    for separator, name in ((";", "semicolons"), ("\t", "tabs")):
+        if len(header) == 1 and separator in header[0]:
+            raise UserError(f"columns are separated by commas, this file has {name}")
+    for column in header:
+        if column not in COLUMNS:
+            raise unknown("column", column, COLUMNS)
+    if header and "prompt" not in header or len(set(header)) != len(header):
+        raise UserError(
+            "the first line must name each column once, with a column prompt; it is "
+            f"{','.join(header)!r}"
+        )
+    for values in reader:
+        if None in values:
             raise UserError(
-                f"{path}: its first line must name each column once, with a column prompt; "
-                f"it is {','.join(header)!r}"
+                f"{len(header) + len(values[None])} cells for {len(header)} columns; put a text "
+                "with commas in double quotes"
             )
-        for values in reader:
-            if None in values:
-                raise UserError(
-                    f"{path}, line {number}: {len(header) + len(values[None])} cells for "
-                    f"{len(header)} columns; put a text with commas in double quotes"
-                )
-            yield number, values
-    except csv.Error as error:
-        raise UserError(f"{path}, line {number}: {error}") from error
+        yield values
 
 
-def _from_jsonl(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
-    for number, text in _lines(path):
+def _from_jsonl(texts: Iterator[str]) -> Iterator[dict[str, Any]]:
+    for text in texts:
         try:
             values = json.loads(text, object_pairs_hook=_named_once)
         except (ValueError, RecursionError) as error:
-            raise UserError(f"{path}, line {number} can't be read as JSON: {error}") from error
+            raise UserError(f"can't be read as JSON: {error}") from error
         if not isinstance(values, dict):
-            raise UserError(f'{path}, line {number}: expected an object {{"prompt": "a fox"}}')
-        yield number, values
+            raise UserError('expected an object {"prompt": "a fox"}')
+        yield values
 
 
 def _named_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -248,7 +219,7 @@ def _named_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return found
 
 
-FORMATS: dict[str, Callable[[Path], Iterator[tuple[int, dict[str, Any]]]]] = {
+FORMATS: dict[str, Callable[[Iterator[str]], Iterator[dict[str, Any]]]] = {
     ".csv": _from_csv,
     ".jsonl": _from_jsonl,
     ".ndjson": _from_jsonl,

@@ -1,4 +1,5 @@
-"""The Ray actor that makes asset after asset in one process, with the launcher's own functions.
+"""The Ray actor that makes asset after asset in one process, with the launcher's own functions, and
+the board that it reports to.
 
 Networks, compiled kernels and extensions stay loaded. Nothing else passes from one asset to the
 next: every random draw is a function of the seed (``core/streams.py``)."""
@@ -6,6 +7,8 @@ next: every random draw is a function of the seed (``core/streams.py``)."""
 import contextlib
 import errno
 import gc
+import hashlib
+import json
 import os
 import signal
 import socket
@@ -13,41 +16,42 @@ import sys
 import tempfile
 import time
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple, Optional
 
-from .. import register_parts
+from .. import __version__, register_parts
 from ..core.errors import UserError, raised_in
 from ..core.launcher import train_alone
-from ..models.loaded import keep_loaded
-from .board import Beat, Heartbeat
+from ..host import pl
+from ..models.loaded import keep_loaded, load_counts
 from .place import FAILED, FINISHED, STOPPED, Place, Unreachable, another_row, has_files
-from .recipe import Job, Recipe, Source, all_sources, launch_arguments
-from .results import reset_peak_memory, result_of
+from .recipe import Job, Recipe, all_sources, launch_arguments
+from .rows import Row
 
 BLOCKED, NO_MEMORY = "blocked", "no memory"
 """Outcomes beside the states of an asset: the results can't be written; out of memory."""
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
+SECONDS_BETWEEN = 1.0
+"""Shortest time between two reports of a worker."""
 SECONDS_FOR_LOCK = 60
 """How long an asset's folder may still be locked by a process of an earlier, killed driver."""
 SAVES_MEMORY = "saves_memory.txt"
 """Marks an asset's folder that is made with the low-memory configuration."""
+NOT_EXPORTED = (".json", ".html", ".png")
+"""Reports and pages beside the exported files, which may hold times."""
+PICTURES = ("it*-export/poster.png", "it*-test/0.png", "it*.png")
 
 
 class Setting(NamedTuple):
-    """What a worker needs besides the job. It is passed with each job, since Ray restarts a killed
-    worker without calling :meth:`Worker.hello`.
-    """
+    """What the workers need besides the job."""
 
-    number: int
-    """Index of the worker, from 0."""
     recipe: Recipe
     place: Place
     board: Any
-    """The handle of a :class:`.board.Board`."""
+    """The handle of a :class:`Board`."""
     start: str
-    """The folder that the farm was started in: relative paths and ``custom/`` are found there."""
+    """Where the farm was started: relative paths and ``custom/`` are found there."""
     session: str
     """Identifier of one start of the driver."""
     retries: int
@@ -57,42 +61,47 @@ class Setting(NamedTuple):
 class Worker:
     """Makes assets."""
 
-    setting: Setting
     is_ready = False
 
-    def hello(self, setting: Setting) -> None:
+    def hello(self, version: str, start: str, cores: int) -> None:
         """Prepare this process.
 
         Raises:
-            UserError: the folder that the farm was started in doesn't exist on this machine.
+            UserError: this machine has another version of the package, or not the folder that the
+                farm was started in.
         """
-        self.setting = setting
         if self.is_ready:
             return
-        if not os.path.isdir(setting.start):
+        host = socket.gethostname()
+        if version != __version__:
             raise UserError(
-                f"{socket.gethostname()} has no folder {setting.start}: start the farm in a "
-                "folder that all machines share"
+                f"{host} has threestudio-gaussiandreamer {__version__}; the farm is of {version}, "
+                "and all its assets are made with one version: "
+                f"pip install threestudio-gaussiandreamer=={version} there"
             )
-        os.chdir(setting.start)
+        if not os.path.isdir(start):
+            raise UserError(
+                f"{host} has no folder {start}: start the farm in a folder that all machines share"
+            )
+        os.chdir(start)
         train_alone()  # before Lightning is imported, which reads the variables
         import torch
 
-        torch.set_num_threads(setting.recipe.cores)
+        torch.set_num_threads(cores)
         keep_loaded()
         register_parts()
         self.is_ready = True
 
-    def make(self, job: Job, setting: Setting) -> dict[str, Any]:
-        """Make an asset, or resume it from its checkpoint, and return its outcome.
-
-        Returns:
-            ``state``: FINISHED, with what ``result.json`` holds; or FAILED, STOPPED,
-            :data:`BLOCKED` or :data:`NO_MEMORY`, with ``error``.
+    def make(self, job: Job, number: int, setting: Setting) -> dict[str, Any]:
+        """Make an asset, or resume it from its checkpoint, with the worker of this number; return
+        ``state``, FINISHED with what ``result.json`` holds, or FAILED, STOPPED, :data:`BLOCKED` or
+        :data:`NO_MEMORY` with ``error``.
         """
+        self.number, self.setting = number, setting
         try:
-            self.hello(setting)
-            return self.setting.place.finished(job.row) or self._make(job)
+            # here too, since Ray restarts a killed worker without it
+            self.hello(__version__, setting.start, setting.recipe.cores)
+            return setting.place.finished(job.row) or self._make(job)
         except SystemExit as stop:
             if raised_in(stop, "ray."):  # which ends this process
                 raise
@@ -138,83 +147,40 @@ class Worker:
 
     def _run(self, job: Job, folder: Path, attempt: int) -> tuple[Any, int]:
         """Train an asset with the launcher; return its run and exit code."""
-        from ..launch.experiment import prepare
+        from ..launch import experiment
+        from ..launch.folder_lock import FolderInUse
         from ..launch.options import parse_arguments
 
-        heartbeat = Heartbeat(
-            job.row.name,
-            attempt,
-            self._report,
-            lambda: signal.raise_signal(signal.SIGTERM),
-            lambda: self.setting.place.keep_checkpoint(job.row),
-        )
-        with written_sources(all_sources(self.setting.recipe, job)) as configs:
-            argv = launch_arguments(self.setting.recipe, job, configs, folder.parents[1])
+        heartbeat = Heartbeat(job.row, attempt, self.number, self.setting)
+        deadline = time.monotonic() + SECONDS_FOR_LOCK
+        with tempfile.TemporaryDirectory() as temporary:
+            names = []
+            for i, source in enumerate(all_sources(self.setting.recipe, job)):
+                names.append(f"{temporary}/{i}-{Path(source.name).stem}.yaml")
+                Path(names[-1]).write_bytes(source.content)  # as the driver read it
+            argv = launch_arguments(self.setting.recipe, job, names, folder.parents[1])
             args = parse_arguments(argv)
-            return run_when_unlocked(
-                lambda: prepare(args, argv, callbacks=[heartbeat], records_code=False)
-            )
-
-    def _report(self, beat: Beat) -> bool:
-        """Tell the board; return whether the farm is stopping. A board that is being restarted
-        isn't waited for.
-        """
-        import ray
-
-        try:
-            return ray.get(self.setting.board.report.remote(self.setting.number, beat), timeout=1)
-        except ray.exceptions.RayError:
-            return False
-
-
-def run_when_unlocked(prepared: Callable[[], Any]) -> tuple[Any, int]:
-    """Run as soon as the folder's lock is free; return the run and its exit code.
-
-    A process of a killed driver may hold the lock for a while. ``prepared`` makes the run, and is
-    called again after each wait, since that process may have written newer checkpoints.
-
-    Raises:
-        FolderInUse: the folder is still locked after :data:`SECONDS_FOR_LOCK`.
-    """
-    from ..launch.folder_lock import FolderInUse
-
-    deadline = time.monotonic() + SECONDS_FOR_LOCK
-    while True:
-        run = prepared()
-        try:
-            return run, run.run()
-        except FolderInUse:
-            if time.monotonic() > deadline:
-                raise
-            time.sleep(0.5)
-
-
-# Files
-# --------------------------------------------------------------------------------------------------
-
-
-@contextlib.contextmanager
-def written_sources(sources: list[Source]) -> Iterator[list[str]]:
-    """Write the YAML files as the driver read them; yield their paths."""
-    with tempfile.TemporaryDirectory() as folder:
-        paths = []
-        for i, source in enumerate(sources):
-            path = Path(folder, f"{i}-{Path(source.name).stem}.yaml")
-            path.write_bytes(source.content)
-            paths.append(str(path))
-        yield paths
+            while True:
+                # each time, since the process that has the lock may have written checkpoints
+                run = experiment.prepare(args, argv, callbacks=[heartbeat], records_code=False)
+                try:
+                    return run, run.run()
+                except FolderInUse:
+                    if time.monotonic() > deadline:
+                        raise
+                    time.sleep(0.5)
 
 
 @contextlib.contextmanager
 def written_log(path: Path) -> Iterator[None]:
     """Append what a run prints, and the traceback of its error, to a file."""
-    with open(path, "a", buffering=1, encoding="utf-8", errors="backslashreplace") as file:
-        with contextlib.redirect_stdout(file), contextlib.redirect_stderr(file):
-            try:
-                yield
-            except Exception:
-                traceback.print_exc()
-                raise
+    file = open(path, "a", buffering=1, encoding="utf-8", errors="backslashreplace")
+    with file, contextlib.redirect_stdout(file), contextlib.redirect_stderr(file):
+        try:
+            yield
+        except Exception:
+            traceback.print_exc()
+            raise
 
 
 def count_attempts(folder: Path, session: str, job: Job) -> tuple[int, int]:
@@ -224,8 +190,7 @@ def count_attempts(folder: Path, session: str, job: Job) -> tuple[int, int]:
     Raises:
         UserError: the folder's checkpoints are of another row.
     """
-    path = folder / "attempts.txt"
-    with open(path, "a+", encoding="utf-8") as file:
+    with open(folder / "attempts.txt", "a+", encoding="utf-8") as file:
         file.seek(0)
         earlier = [line.split() for line in file]
         # earlier versions noted no key
@@ -235,38 +200,175 @@ def count_attempts(folder: Path, session: str, job: Job) -> tuple[int, int]:
     return len(earlier) + 1, sum(words[0] == session for words in earlier) + 1
 
 
-# Errors
-# --------------------------------------------------------------------------------------------------
+class Beat(NamedTuple):
+    """The last report of a worker."""
+
+    name: str
+    attempt: int
+    stage: str
+    step: int
+    steps: int = 0
+    """Number of steps of the stage; 0 if unknown."""
+
+
+class Board:
+    """A Ray actor that holds the last report of each worker. Its answers say whether the farm is
+    stopping, so that Ctrl-C reaches workers on every machine."""
+
+    def __init__(self) -> None:
+        self.beats: dict[int, tuple[Beat, float]] = {}
+        self.stopping = False
+
+    def report(self, worker: int, beat: Beat) -> bool:
+        """Note a worker's report; return whether it should stop."""
+        if worker not in self.beats or self.beats[worker][0] != beat:
+            self.beats[worker] = beat, time.monotonic()
+        return self.stopping
+
+    def read(self) -> dict[int, tuple[Beat, float]]:
+        """Return each worker's last report, and the seconds since it changed."""
+        now = time.monotonic()
+        return {worker: (beat, now - since) for worker, (beat, since) in self.beats.items()}
+
+    def stop(self) -> None:
+        self.stopping = True
+
+
+class Heartbeat(pl.Callback):
+    """Report the steps of a run, at most one a second, and stop it as SIGTERM does, with a
+    checkpoint, when the farm is stopping."""
+
+    def __init__(self, row: Row, attempt: int, number: int, setting: Setting) -> None:
+        self.row, self.attempt, self.number, self.setting = row, attempt, number, setting
+        self.due, self.asked = 0.0, False
+        self.beat("starting", 0)
+
+    def on_train_batch_end(self, trainer: Any, *args: Any) -> None:
+        self.setting.place.keep_checkpoint(self.row)
+        stopping = self.beat("training", trainer.global_step, max(trainer.max_steps, 0))
+        if stopping and not self.asked:
+            self.asked = True
+            signal.raise_signal(signal.SIGTERM)
+
+    def on_validation_batch_end(
+        self, trainer: Any, module: Any, outputs: Any, batch: Any, batch_idx: int, *args: Any
+    ) -> None:
+        self.beat("validating", batch_idx + 1)
+
+    def on_test_batch_end(
+        self, trainer: Any, module: Any, outputs: Any, batch: Any, batch_idx: int, *args: Any
+    ) -> None:
+        self.beat("rendering", batch_idx + 1)
+
+    def beat(self, stage: str, step: int, steps: int = 0) -> bool:
+        if time.monotonic() < self.due:
+            return False
+        stopping = self.report(Beat(self.row.name, self.attempt, stage, step, steps))
+        self.due = time.monotonic() + SECONDS_BETWEEN
+        return stopping
+
+    def report(self, beat: Beat) -> bool:
+        """Tell the board, unless it is being restarted; return whether the farm is stopping."""
+        import ray
+
+        try:
+            return ray.get(self.setting.board.report.remote(self.number, beat), timeout=1)
+        except ray.exceptions.RayError:
+            return False
 
 
 def outcome_of(error: Exception) -> dict[str, Any]:
     """Return the outcome of an asset that ended with an error."""
+    causes: list[BaseException] = []
+    cause: Optional[BaseException] = error
+    while cause is not None:
+        causes.append(cause)
+        cause = cause.__cause__ or cause.__context__
+    torch = sys.modules.get("torch")
+    no_memory = (MemoryError, torch.OutOfMemoryError) if torch else MemoryError
+    state = FAILED
+    if any(isinstance(c, no_memory) or "DefaultCPUAllocator: can't" in str(c) for c in causes):
+        state = NO_MEMORY
+    # other assets would fail in the same way
+    elif any(isinstance(c, Unreachable) or getattr(c, "errno", None) in FULL for c in causes):
+        state = BLOCKED
     text = f"{error}" if isinstance(error, UserError) else f"{type(error).__name__}: {error}"
-    state = NO_MEMORY if is_memory_error(error) else BLOCKED if is_blocked(error) else FAILED
     return {"state": state, "error": text[:2000] or type(error).__name__}
 
 
-def chain(error: Optional[BaseException]) -> Iterator[BaseException]:
-    """Yield an error and the errors that caused it."""
-    while error is not None:
-        yield error
-        error = error.__cause__ or error.__context__
+def result_of(job: Job, folder: Path, run: Any) -> dict[str, Any]:
+    """Return what a finished run has made, and where."""
+    geometry = run.system.geometry
+    pictures = (newest(folder, pattern) for pattern in PICTURES)
+    return {
+        "key": job.row.key,
+        "hash": digest(folder),
+        "files": [path.relative_to(folder).as_posix() for path in exported(folder)],
+        "picture": next(filter(None, pictures), None),
+        "page": newest(folder, "it*-export/view.html"),
+        "scores": scores(folder),
+        "steps": run.trainer.global_step,
+        "gaussians": len(geometry) if hasattr(geometry, "__len__") else 0,
+        "megabytes": peak_megabytes(),
+        "bytes": sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()),
+        "saves_memory": job.saves_memory,
+        "host": socket.gethostname(),
+        "process": os.getpid(),
+        "loads": load_counts(),
+    }
 
 
-def is_memory_error(error: BaseException) -> bool:
-    torch = sys.modules.get("torch")
-    kinds = (MemoryError, torch.OutOfMemoryError) if torch else (MemoryError,)
-    return any(
-        isinstance(cause, kinds) or "DefaultCPUAllocator: can't allocate" in str(cause)
-        for cause in chain(error)
-    )
+def exported(folder: Path) -> list[Path]:
+    """List the exported files of an asset, sorted."""
+    found = folder.glob("save/it*-export/**/*")
+    return sorted(p for p in found if p.is_file() and p.suffix not in NOT_EXPORTED)
 
 
-def is_blocked(error: BaseException) -> bool:
-    """Return whether other assets would fail in the same way: a full disk, or a store that can't
-    be reached.
+def digest(folder: Path) -> str:
+    """Return the digest of the names and contents of the exported files, which a single run of the
+    same arguments reproduces.
     """
-    return any(
-        isinstance(cause, Unreachable) or (isinstance(cause, OSError) and cause.errno in FULL)
-        for cause in chain(error)
-    )
+    total = hashlib.sha256()
+    for path in exported(folder):
+        content = hashlib.sha256(path.read_bytes()).hexdigest()
+        total.update(f"{path.relative_to(folder).as_posix()} {content}\n".encode())
+    return total.hexdigest()
+
+
+def newest(folder: Path, pattern: str) -> Optional[str]:
+    """Return the last of the files below ``save`` with this pattern, relative to ``folder``."""
+    found = sorted(folder.glob(f"save/{pattern}"))
+    return found[-1].relative_to(folder).as_posix() if found else None
+
+
+def scores(folder: Path) -> dict[str, float]:
+    """Return the numbers that a run has measured on its result."""
+    try:
+        measured = json.loads((folder / "save" / "metrics.json").read_bytes())["result"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return {}
+    names = ("psnr", "ssim", "multi_face")
+    return {name: measured[name] for name in names if isinstance(measured.get(name), (int, float))}
+
+
+def reset_peak_memory() -> None:
+    """Begin to measure the peak of this process's memory (Linux), or of the GPU's."""
+    import torch
+
+    if torch.cuda.is_available():
+        torch.cuda.reset_peak_memory_stats()
+    with contextlib.suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5", encoding="utf-8")
+
+
+def peak_megabytes() -> float:
+    """Return the peak since :func:`reset_peak_memory`, of the GPU where there is one."""
+    import torch
+
+    if torch.cuda.is_available():
+        return round(torch.cuda.max_memory_allocated() / 2**20, 1)
+    with contextlib.suppress(OSError):
+        for line in Path("/proc/self/status").read_text(encoding="utf-8").splitlines():
+            if line.startswith("VmHWM"):
+                return round(int(line.split()[1]) / 1024, 1)
+    return 0.0
