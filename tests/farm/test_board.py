@@ -3,8 +3,9 @@
 from types import SimpleNamespace
 
 from threestudio_gaussiandreamer.farm import worker
+from threestudio_gaussiandreamer.farm.board import Beat, Board
 from threestudio_gaussiandreamer.farm.rows import Row
-from threestudio_gaussiandreamer.farm.worker import Beat, Board, Heartbeat
+from threestudio_gaussiandreamer.farm.worker import Heartbeat
 
 BEAT = Beat("fox", 1, "training", 3, 12)
 

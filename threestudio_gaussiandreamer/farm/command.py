@@ -22,11 +22,12 @@ from ..launch.experiment import configure_logging
 from ..launch.folder_lock import claim, require_writable
 from ..launch.options import add_config, parse_with_overrides
 from . import driver
+from .board import Board
 from .place import FAILED, FINISHED, Place, adopt_ledger
 from .recipe import FARM, Job, Recipe, check_recipe, read_config, require_same_farm, root_of
 from .report import write_report
 from .rows import check_rows, read_rows
-from .worker import Board, Setting
+from .worker import Setting
 
 PROGRAM = "python -m threestudio_gaussiandreamer.farm"
 

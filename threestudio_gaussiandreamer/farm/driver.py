@@ -20,9 +20,10 @@ from .. import __version__
 from ..core.errors import UserError
 from ..core.extras import require_extra
 from ..core.files import json_text
+from .board import Beat
 from .place import ASSETS, FAILED, FAILURE, FINISHED, STOPPED
 from .recipe import Job, repeat_command
-from .worker import BLOCKED, NO_MEMORY, Beat, Setting, Worker
+from .worker import BLOCKED, NO_MEMORY, Setting, Worker
 
 OBJECT_STORE_BYTES = 100 << 20
 """Memory for what workers send each other: little."""

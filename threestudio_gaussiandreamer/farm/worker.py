@@ -1,5 +1,4 @@
-"""The Ray actor that makes asset after asset in one process, with the launcher's own functions, and
-the board that it reports to.
+"""The Ray actor that makes asset after asset in one process, with the launcher's own functions.
 
 Networks, compiled kernels and extensions stay loaded. Nothing else passes from one asset to the
 next: every random draw is a function of the seed (``core/streams.py``)."""
@@ -25,6 +24,7 @@ from ..core.errors import UserError, raised_in
 from ..core.launcher import train_alone
 from ..host import pl
 from ..models.loaded import keep_loaded, load_counts
+from .board import Beat
 from .place import FAILED, FINISHED, STOPPED, Place, Unreachable, another_row, has_files
 from .recipe import Job, Recipe, all_sources, launch_arguments
 from .rows import Row
@@ -49,7 +49,7 @@ class Setting(NamedTuple):
     recipe: Recipe
     place: Place
     board: Any
-    """The handle of a :class:`Board`."""
+    """The handle of a :class:`.board.Board`."""
     start: str
     """Where the farm was started: relative paths and ``custom/`` are found there."""
     session: str
@@ -198,40 +198,6 @@ def count_attempts(folder: Path, session: str, job: Job) -> tuple[int, int]:
             raise another_row(job.row)
         file.write(f"{session} {job.row.key} {socket.gethostname()} {os.getpid()}\n")
     return len(earlier) + 1, sum(words[0] == session for words in earlier) + 1
-
-
-class Beat(NamedTuple):
-    """The last report of a worker."""
-
-    name: str
-    attempt: int
-    stage: str
-    step: int
-    steps: int = 0
-    """Number of steps of the stage; 0 if unknown."""
-
-
-class Board:
-    """A Ray actor that holds the last report of each worker. Its answers say whether the farm is
-    stopping, so that Ctrl-C reaches workers on every machine."""
-
-    def __init__(self) -> None:
-        self.beats: dict[int, tuple[Beat, float]] = {}
-        self.stopping = False
-
-    def report(self, worker: int, beat: Beat) -> bool:
-        """Note a worker's report; return whether it should stop."""
-        if worker not in self.beats or self.beats[worker][0] != beat:
-            self.beats[worker] = beat, time.monotonic()
-        return self.stopping
-
-    def read(self) -> dict[int, tuple[Beat, float]]:
-        """Return each worker's last report, and the seconds since it changed."""
-        now = time.monotonic()
-        return {worker: (beat, now - since) for worker, (beat, since) in self.beats.items()}
-
-    def stop(self) -> None:
-        self.stopping = True
 
 
 class Heartbeat(pl.Callback):
