@@ -28,7 +28,7 @@ from .worker import BLOCKED, NO_MEMORY, Setting, Worker
 OBJECT_STORE_BYTES = 100 << 20
 """Memory for what workers send each other: little."""
 LONGEST_FOLDER = 36
-"""Characters of a temporary folder in which the names of Ray's sockets are valid, at most 107."""
+"""Characters of a temporary folder; the names of Ray's sockets then fit into the system's 107."""
 SECONDS_TO_ANSWER = 120
 """How long workers may take to start."""
 POLL = 0.5
@@ -60,7 +60,7 @@ def connect(address: Optional[str]) -> Any:
             os.environ.setdefault("RAY_TMPDIR", "/tmp")
     try:
         host, _, port = address.removeprefix("ray://").rpartition(":")
-        if "://" in host or host in ("http", "https"):
+        if "://" in address.removeprefix("ray://"):
             raise ValueError("expected host:port, such as that which `ray start --head` prints")
         if host:  # else "local", or "auto", which Ray resolves by itself
             # Ray's own attempt takes minutes
