@@ -66,7 +66,7 @@ def connect(address: Optional[str]) -> Any:
             # Ray's own attempt takes minutes
             socket.create_connection((host.strip("[]"), int(port)), timeout=5).close()
         ray.init(address=address, **options)
-    except (OSError, ValueError, RuntimeError, OverflowError, ray.exceptions.RayError) as error:
+    except Exception as error:  # Ray raises many kinds
         said = (str(error).strip().splitlines() or [type(error).__name__])[0][:300]
         if address == "local":
             raise UserError(f"Ray can't be started on this machine: {said}") from error
