@@ -16,6 +16,7 @@ from threestudio_gaussiandreamer.farm.recipe import (
     check_recipe,
     read_config,
     require_same_farm,
+    root_of,
 )
 from threestudio_gaussiandreamer.farm.rows import Row, read_rows
 
@@ -136,6 +137,13 @@ def test_the_report_needs_neither_ray_nor_a_finished_asset(farm, monkeypatch, tm
     code, _ = farm("a fox", *options)
     assert code == 0
     assert "waiting" in (tmp_path / "runs/farm-prompts/report/table.csv").read_text()
+
+
+def test_the_folder_may_be_that_of_the_environment(tmp_path, monkeypatch):
+    monkeypatch.setenv("HERE", "s3://bucket")
+    (tmp_path / "a.yaml").write_text("exp_root_dir: ${oc.env:HERE}/runs")
+    assert root_of([str(DEMO), str(tmp_path / "a.yaml")]) == "s3://bucket/runs"
+    assert root_of([str(DEMO)]) == "outputs"
 
 
 def test_a_finished_farm_needs_no_ray(farm, monkeypatch, tmp_path):

@@ -10,6 +10,8 @@ from functools import cache
 from pathlib import Path
 from typing import NamedTuple, Optional
 
+from omegaconf import OmegaConf
+
 from .. import __version__
 from ..core.errors import UserError
 from ..core.files import json_text
@@ -83,7 +85,8 @@ def read_config(name: str) -> Source:
 def root_of(configs: Iterable[str]) -> str:
     """Return ``exp_root_dir`` of the configuration: the folder or URL for the farm's folder."""
     roots = [read_yaml(read_config(name).name).get("exp_root_dir") for name in configs]
-    return str([root for root in ["outputs", *roots] if root][-1])
+    # which may be that of a variable of the environment
+    return str(OmegaConf.create([root for root in ["outputs", *roots] if root])[-1])
 
 
 def launch_arguments(recipe: Recipe, job: Job, configs: list[str], folder: Path) -> list[str]:
