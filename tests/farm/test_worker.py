@@ -141,6 +141,8 @@ def test_a_machine_without_the_folder_is_named(place):
 def test_a_machine_with_another_version_is_named(place):
     with pytest.raises(UserError, match=f"has threestudio-.* {__version__}; the farm is of 9.9"):
         Worker().hello("9.9", ".", 1)
+    outcome = Worker().make(JOB, 0, setting(place)._replace(version="9.9"))
+    assert outcome["state"] == FAILED and "the farm is of 9.9" in outcome["error"]
 
 
 def test_an_asset_without_files_has_failed(place, monkeypatch):

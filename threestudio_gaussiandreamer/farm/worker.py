@@ -56,6 +56,7 @@ class Setting(NamedTuple):
     """Identifier of one start of the driver."""
     retries: int
     """How often an asset is tried again in a session after its worker has died."""
+    version: str = __version__
 
 
 class Worker:
@@ -100,7 +101,7 @@ class Worker:
         self.number, self.setting = number, setting
         try:
             # here too, since Ray restarts a killed worker without it
-            self.hello(__version__, setting.start, setting.recipe.cores)
+            self.hello(setting.version, setting.start, setting.recipe.cores)
             return setting.place.finished(job.row) or self._make(job)
         except SystemExit as stop:
             if raised_in(stop, "ray."):  # which ends this process
