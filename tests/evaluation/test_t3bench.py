@@ -60,12 +60,13 @@ def test_the_object_is_centred_and_scaled_without_what_is_invisible():
 
 
 @pytest.mark.slow
-def test_t3benchs_scripts_find_their_pictures(plys, tmp_path):
+def test_t3benchs_scripts_find_their_pictures(plys, tmp_path, monkeypatch):
     """Makes the folders, and the two calls that T3Bench's scripts make."""
     import trimesh
 
     prompt, root = "A cat's blue hat", tmp_path / "T3Bench"
-    options = ["--t3bench-method", "dreamfusion", "--t3bench-size", "16"]
+    options = ["--t3bench-method", "dreamfusion"]
+    monkeypatch.setattr(t3bench, "SIZE", 16)
     assert main([plys[0], "--prompt", prompt, "--t3bench", str(root), *options]) == 0
     runs = root / "outputs_mesh_t3/dreamfusion_single"
     meshes = list(runs.glob(f"{prompt.replace(' ', '_')}*/save/it*-export/model.obj"))

@@ -1,28 +1,9 @@
-"""Metrics of finished assets: numbers computed from renders of a cloud and from its prompt.
-
-=============  ===============================================================  =================
-metric         columns                                                          needs
-=============  ===============================================================  =================
-clip           clip: 100 times the cosine of CLIP's features of picture and     ``--clip`` FOLDER
-               prompt, by the paper's protocol; 3 seeds of 10 of 120 views
-directions     wrong_direction: share of views from front, side and back that   ``--clip`` FOLDER
-               CLIP assigns to the prompt of another direction
-imagereward    imagereward: mean of ImageReward over ten of the paper's views   ``--imagereward``
-                                                                                FOLDER
-quality        quality: T3Bench's, from ImageReward on its 162 x 5 views of     ``--imagereward``
-               the cloud itself                                                 FOLDER
-judge          kind, colors, pattern, accessory: 1 where the toybox's judge     ``--judge`` FILE
-               recognises what the prompt names
-janus          multi_face: share of views that the judge takes for views from   ``--judge`` FILE
-               another quadrant
-=============  ===============================================================  =================
-
-A metric that isn't defined for a prompt, such as the judge's for words that the toybox doesn't
-know, is NaN.
+"""Metrics of finished assets, from renders of a cloud and from its prompt: the table of
+docs/evaluation.md. One that isn't defined for a prompt, such as the judge's for words that the
+toybox doesn't know, is NaN.
 """
 
 import math
-from abc import ABC, abstractmethod
 from argparse import Namespace
 from functools import lru_cache
 from typing import ClassVar, NamedTuple, Optional
@@ -60,26 +41,20 @@ class Asset(NamedTuple):
     """Index of the asset; it seeds the asset's random views."""
 
 
-class Metric(ABC):
-    """A metric of finished assets; constructed once, before the first render."""
+class Metric:
+    """A metric of finished assets; constructed once, before the first render, with what it needs.
+    ``score`` returns the columns of one asset.
+    """
 
     columns: ClassVar[tuple[str, ...]]
-    """Keys of the dictionary that :meth:`score` returns."""
-
     undefined: ClassVar[str] = ""
     """Why all of them are NaN for some assets."""
 
-    @abstractmethod
     def __init__(self, args: Namespace) -> None:
-        """Load what the metric needs.
+        raise NotImplementedError
 
-        Raises:
-            UserError: a file is missing; the message names it.
-        """
-
-    @abstractmethod
     def score(self, asset: Asset) -> dict[str, float]:
-        """Return the columns of one asset."""
+        raise NotImplementedError
 
 
 @lru_cache(maxsize=1)
@@ -113,14 +88,7 @@ class Directions(Metric):
 
     def score(self, asset: Asset) -> dict[str, float]:
         azimuth = torch.tensor([float(a) for group in self.AZIMUTHS.values() for a in group])
-        ones, protocol = torch.ones_like(azimuth), self.protocol
-        orbit = Orbit(
-            protocol.elevation_deg * ones,
-            azimuth,
-            protocol.radius * ones,
-            math.radians(protocol.fovy_deg) * ones,
-        )
-        pictures = rendered(asset, orbit, protocol.size)
+        pictures = rendered(asset, self.protocol.at(azimuth), self.protocol.size)
         texts = {d.name: d.prompt(asset.prompt) for d in view_directions(45, 45, 60)}
         found = np.stack(
             [self.clip.similarities(pictures, texts[name]) for name in self.AZIMUTHS], axis=1
@@ -154,7 +122,7 @@ class Quality(Metric):
 
     def score(self, asset: Asset) -> dict[str, float]:
         cloud = t3bench.normalized(asset.gaussians)
-        chunks = t3bench.quality_pictures(cloud, t3bench.SIZE, asset.result.antialiased)
+        chunks = t3bench.quality_pictures(cloud, asset.result.antialiased)
         found = [self.model.rewards(pictures, asset.prompt) for pictures in chunks]
         rewards = np.concatenate(found).reshape(-1, len(t3bench.QUALITY_FOVY))
         return {"quality": t3bench.quality(rewards)}

@@ -18,16 +18,18 @@ import functools
 import math
 import sys
 from collections.abc import Sequence
+from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple, Optional
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int
+from torch import Tensor
 
 from .. import register_parts
 from ..cameras import Orbit
-from ..core import images as files_of_pictures
+from ..core import images as picture_files
 from ..core.command import run_command
 from ..core.errors import UserError
 from ..core.files import atomic_file, existing_file, json_text, output_folder
@@ -42,15 +44,12 @@ from .results import Pictures, Result, find_result, read_result
 from .t3bench import require_folder_names, write_t3bench
 
 FILES = ("clip.json", "clip.png")
-MAX_VIEWS = 100_000
 PERCENT = 100.0
 THUMBNAIL = 160
 
 
 class Protocol(NamedTuple):
-    """The views that are compared. The defaults are the paper's, or the released code's if the
-    paper gives none.
-    """
+    """The views that are compared: the paper's; the released code's where the paper gives none."""
 
     seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
     views: int = 120
@@ -62,22 +61,18 @@ class Protocol(NamedTuple):
 
     @property
     def orbit(self) -> Orbit:
-        same = torch.ones(self.views)
-        azimuth = -180 + 360 * torch.arange(self.views) / self.views
-        return Orbit(
-            self.elevation_deg * same,
-            azimuth,
-            self.radius * same,
-            math.radians(self.fovy_deg) * same,
-        )
+        return self.at(-180 + 360 * torch.arange(self.views) / self.views)
+
+    def at(self, azimuth: Float[Tensor, " V"]) -> Orbit:
+        """Return the cameras at these azimuths, degrees."""
+        ones = torch.ones_like(azimuth)
+        fovy = math.radians(self.fovy_deg) * ones
+        return Orbit(self.elevation_deg * ones, azimuth, self.radius * ones, fovy)
 
     def draw(self, seed: int, item: int) -> Int[np.ndarray, " drawn"]:
         """Draw the indices of the views of result number ``item``, distinct and ascending."""
-        return np.sort(
-            numpy_generator(seed, "clip-views", item=item).choice(
-                self.views, self.drawn, replace=False
-            )
-        )
+        generator = numpy_generator(seed, "clip-views", item=item)
+        return np.sort(generator.choice(self.views, self.drawn, replace=False))
 
 
 def has_own_cameras(clip: Optional[str]) -> bool:
@@ -129,45 +124,14 @@ def score(result: Result, prompt: str, item: int, clip: PictureText, protocol: P
     needed = np.unique(np.concatenate(draws))
     orbit = protocol.orbit.rows(needed)
     similarity, thumbnails = np.full(protocol.views, np.nan), {}
-    start = 0
+    left = iter(needed)
     pictures = Pictures(read_result(result), result.background, result.antialiased)
     for images in pictures.render(orbit.c2w, orbit.fovy, protocol.size):
-        rows = needed[start : start + len(images)]
+        rows = list(islice(left, len(images)))
         similarity[rows] = PERCENT * clip.similarities(images, prompt)
-        thumbnails.update(
-            {
-                int(row): _thumbnail(image)
-                for row, image in zip(rows, images, strict=True)
-                if row in draws[0]
-            }
-        )
-        start += len(images)
-    return Scored(
-        np.array([similarity[draw].mean() for draw in draws]),
-        [thumbnails[int(row)] for row in draws[0]],
-    )
-
-
-def report(
-    results: Sequence[Result],
-    prompts: Sequence[str],
-    scores: Sequence[Scored],
-    clip: str,
-    protocol: Protocol,
-) -> dict[str, Any]:
-    """Return the content of ``clip.json``."""
-    seeds = np.stack([scored.per_seed for scored in scores])
-    each = [
-        {"result": str(result.file), "prompt": prompt, **_mean_and_spread(scored.per_seed)}
-        for result, prompt, scored in zip(results, prompts, scores, strict=True)
-    ]
-    return {
-        "clip": clip,
-        "unit": "100 * cosine",
-        "protocol": protocol._asdict(),
-        **_mean_and_spread(seeds.mean(axis=0)),
-        "results": each,
-    }
+        thumbnails |= {row: _thumbnail(image) for row, image in zip(rows, images, strict=True)}
+    means = np.array([similarity[draw].mean() for draw in draws])
+    return Scored(means, [thumbnails[row] for row in draws[0]])
 
 
 def _mean_and_spread(per_seed: Float[np.ndarray, " S"]) -> dict[str, Any]:
@@ -180,43 +144,39 @@ def contact_sheet(prompts: Sequence[str], scores: Sequence[Scored]) -> np.ndarra
     """Draw a row of the first seed's views for each result, and its prompt and score over them."""
     rows = []
     for prompt, scored in zip(prompts, scores, strict=True):
-        rows.append(
-            files_of_pictures.with_texts(
-                np.concatenate(scored.thumbnails, axis=1),
-                [f"{scored.per_seed.mean():.2f}  {prompt}"],
-            )
-        )
+        text = f"{scored.per_seed.mean():.2f}  {prompt}"
+        rows.append(picture_files.with_texts(np.concatenate(scored.thumbnails, axis=1), [text]))
     return np.concatenate(rows, axis=0)
 
 
 def _thumbnail(image: Float[np.ndarray, "H W 3"]) -> np.ndarray:
     from PIL import Image
 
-    return np.asarray(
-        Image.fromarray((image * 255).round().astype(np.uint8)).resize(
-            (THUMBNAIL, THUMBNAIL), Image.Resampling.LANCZOS
-        )
-    )
-
-
-# --------------------------------------------------------------------------------------------------
-# the command
+    small = Image.fromarray((image * 255).round().astype(np.uint8))
+    return np.asarray(small.resize((THUMBNAIL, THUMBNAIL), Image.Resampling.LANCZOS))
 
 
 def prompts_for(
     results: Sequence[Result], prompt: Optional[str], prompts_file: Optional[str]
 ) -> list[str]:
-    """Return the prompt of each result: ``prompt``, the file's lines in the order of the results,
-    or the prompts of their runs.
+    """Return the prompt of each result: ``prompt``, the file's non-empty lines in the order of the
+    results, such as T3Bench's ``data/prompt_single.txt``, or the prompts of their runs.
 
     Raises:
-        UserError: both are given, the prompt of a result is unknown, isn't valid Unicode, or the
-            numbers of lines and results differ.
+        UserError: both are given, the file is missing, a prompt is unknown or isn't valid Unicode,
+            or the numbers of lines and results differ.
     """
     if prompt is not None and prompts_file is not None:
         raise UserError("both --prompt and --prompts-file: give one of them")
     if prompts_file is not None:
-        lines = read_prompts(prompts_file)
+        file = existing_file(prompts_file, "list of prompts")
+        try:
+            lines = file.read_text(encoding="utf-8-sig").splitlines()
+        except (OSError, UnicodeDecodeError) as error:
+            raise UserError(
+                f"the list of prompts {prompts_file!r} can't be read as UTF-8 text: {error}"
+            ) from error
+        lines = [line.strip() for line in lines if line.strip()]
         if len(lines) != len(results):
             raise UserError(
                 f"--prompts-file {prompts_file} has {len(lines)} prompts for {len(results)} "
@@ -236,61 +196,27 @@ def prompts_for(
     return prompts
 
 
-def read_prompts(path: str) -> list[str]:
-    """Read the non-empty lines of a list of prompts, such as T3Bench's ``data/prompt_single.txt``.
-
-    Raises:
-        UserError: the file is missing or isn't UTF-8.
-    """
-    file = existing_file(path, "list of prompts")
-    try:
-        return [
-            line.strip()
-            for line in file.read_text(encoding="utf-8-sig").splitlines()
-            if line.strip()
-        ]
-    except (OSError, UnicodeDecodeError) as error:
-        raise UserError(
-            f"the list of prompts {path!r} can't be read as UTF-8 text: {error}"
-        ) from error
-
-
 def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
-    defaults = Protocol()
+    paper = Protocol()
     parser = argparse.ArgumentParser(
         prog=f"python -m {__package__}.clip_similarity",
         description="CLIP similarity, as in the paper.",
     )
     add = parser.add_argument
-    add(
-        "results", nargs="+", metavar="RUN_FOLDER|PLY", help="a run's folder, or a PLY of Gaussians"
-    )
+    what = "a run's folder, or a PLY of Gaussians"
+    add("results", nargs="+", metavar="RUN_FOLDER|PLY", help=what)
     add("--clip", help="CLIP folder in transformers' format, or toybox (bundled)")
     add("--prompt", help="the text of all results; default: what each run was asked for")
     add("--prompts-file", help="one prompt for each result, a line each")
     add("--output", default="evaluation", help="folder for clip.json and clip.png")
-    add("--seeds", type=int, nargs="+", default=list(defaults.seeds))
-    add("--views", type=int, default=defaults.views, help="number of views on the circle")
-    add("--drawn", type=int, default=defaults.drawn, help="views drawn per seed")
-    add("--size", type=int, help=f"width and height, pixels (default: {defaults.size})")
-    add(
-        "--fovy",
-        type=float,
-        help=f"vertical field of view, degrees (default: {defaults.fovy_deg:g})",
-    )
-    add(
-        "--t3bench",
-        metavar="FOLDER",
-        help="also write T3Bench's views of every result; see docs/evaluation.md",
-    )
-    add(
-        "--t3bench-group",
-        default="single",
-        choices=["single", "surr", "multi"],
-        help="the list of its prompts",
-    )
+    add("--seeds", type=int, nargs="+", default=list(paper.seeds))
+    add("--size", type=int, help=f"width and height, pixels (default: {paper.size})")
+    add("--fovy", type=float, help=f"vertical field of view, degrees (default: {paper.fovy_deg:g})")
+    views = "also write T3Bench's views of every result; see docs/evaluation.md"
+    add("--t3bench", metavar="FOLDER", help=views)
+    groups = ["single", "surr", "multi"]
+    add("--t3bench-group", default="single", choices=groups, help="the list of its prompts")
     add("--t3bench-method", default="gaussiandreamer", help="its name for what made the results")
-    add("--t3bench-size", type=int, default=512, help="size of its views, pixels")
     return parser.parse_args(argv)
 
 
@@ -303,25 +229,13 @@ def protocol_of(args: argparse.Namespace) -> Protocol:
     for option, value in (("--size", args.size), ("--fovy", args.fovy)):
         if value is not None and has_own_cameras(args.clip):
             raise UserError(f"{option} has no effect with --clip {args.clip}")
-    if not 1 <= args.drawn <= args.views:
-        raise UserError(f"--drawn {args.drawn}: expected 1 to {args.views}, the number of views")
     size = Protocol().size if args.size is None else args.size
     fovy = Protocol().fovy_deg if args.fovy is None else args.fovy
-    for option, pixels in (("--size", size), ("--t3bench-size", args.t3bench_size)):
-        if not 1 <= pixels <= MAX_SIDE:
-            raise UserError(f"{option} {shown(pixels)}: expected 1 to {MAX_SIDE} pixels")
-    if args.views > MAX_VIEWS:
-        raise UserError(f"--views {shown(args.views)}: expected at most {MAX_VIEWS}")
+    if not 1 <= size <= MAX_SIDE:
+        raise UserError(f"--size {shown(size)}: expected 1 to {MAX_SIDE} pixels")
     if not 0 < fovy < 180:
         raise UserError(f"--fovy {fovy}: expected degrees between 0 and 180")
-    return protocol_for(
-        args.clip,
-        seeds=tuple(args.seeds),
-        views=args.views,
-        drawn=args.drawn,
-        fovy_deg=fovy,
-        size=size,
-    )
+    return protocol_for(args.clip, seeds=tuple(args.seeds), fovy_deg=fovy, size=size)
 
 
 def run(args: argparse.Namespace) -> None:
@@ -339,14 +253,8 @@ def run(args: argparse.Namespace) -> None:
         output = output_folder(args.output, "--output", FILES)
         evaluate(results, prompts, args.clip, protocol, output)
     if args.t3bench:
-        write_t3bench(
-            Path(args.t3bench).expanduser(),
-            results,
-            prompts,
-            method=args.t3bench_method,
-            group=args.t3bench_group,
-            size=args.t3bench_size,
-        )
+        folder, name = Path(args.t3bench), f"{args.t3bench_method}_{args.t3bench_group}"
+        write_t3bench(folder.expanduser(), name, results, prompts)
 
 
 def evaluate(
@@ -355,28 +263,23 @@ def evaluate(
     clip_folder: str,
     protocol: Protocol,
     output: Path,
-) -> dict[str, Any]:
-    """Score all results, print the scores, and write ``clip.json`` and ``clip.png``.
-
-    Returns:
-        the content of ``clip.json``.
-    """
-    clip, scores = open_clip(clip_folder), []
+) -> None:
+    """Score all results, print the scores, and write ``clip.json`` and ``clip.png``."""
+    clip, scores, each = open_clip(clip_folder), [], []
     for item, (result, prompt) in enumerate(zip(results, prompts, strict=True)):
-        scores.append(score(result, prompt, item, clip, protocol))
-        print(f"{scores[-1].per_seed.mean():6.2f}  {prompt}  {result.file}", flush=True)
-    content = report(results, prompts, scores, clip_folder, protocol)
-    text = json_text(content, indent=2, ensure_ascii=False)
+        scored = score(result, prompt, item, clip, protocol)
+        scores.append(scored)
+        numbers = _mean_and_spread(scored.per_seed)
+        each.append({"result": str(result.file), "prompt": prompt, **numbers})
+        print(f"{numbers['mean']:6.2f}  {prompt}  {result.file}", flush=True)
+    total = _mean_and_spread(np.mean([scored.per_seed for scored in scores], axis=0))
+    about = {"clip": clip_folder, "unit": "100 * cosine", "protocol": protocol._asdict()}
+    text = json_text({**about, **total, "results": each}, indent=2, ensure_ascii=False)
     with atomic_file(output / "clip.json") as file:
         file.write(text.encode(errors="surrogateescape"))  # paths may hold invalid UTF-8
-    files_of_pictures.write(output / "clip.png", contact_sheet(prompts, scores))
-    spread = (
-        ""
-        if content["std"] is None
-        else f" +- {content['std']:.2f} over {len(protocol.seeds)} seeds"
-    )
-    print(f"{content['mean']:6.2f}{spread}: {output / 'clip.json'}, {output / 'clip.png'}")
-    return content
+    picture_files.write(output / "clip.png", contact_sheet(prompts, scores))
+    spread = total["std"] and f" +- {total['std']:.2f} over {len(protocol.seeds)} seeds"
+    print(f"{total['mean']:6.2f}{spread or ''}: {output / 'clip.json'}, {output / 'clip.png'}")
 
 
 main = functools.partial(run_command, parse, run)

@@ -98,13 +98,9 @@ def _background_of(system: Mapping[str, Any], folder: Path) -> Sequence[float]:
 
 
 def _prompt_of(processor: Mapping[str, Any]) -> Optional[str]:
+    library = processor.get("prompt_library", PROMPT_LIBRARY)
     try:
-        return (
-            resolve_prompt(
-                processor.get("prompt") or "", processor.get("prompt_library", PROMPT_LIBRARY)
-            )
-            or None
-        )
+        return resolve_prompt(processor.get("prompt") or "", library) or None
     except UserError:  # the prompt library was removed; the prompt can be given as an option
         return None
 
@@ -138,6 +134,7 @@ class Pictures:
         geometry.to(get_device())
         backdrop.to(get_device()).eval()
 
+    @torch.no_grad()
     def render(
         self, c2w: Float[Tensor, "V 4 4"], fovy: Float[Tensor, " V"], size: int, *, chunk: int = 4
     ) -> Iterator[Float[np.ndarray, "B H W 3"]]:
@@ -148,10 +145,5 @@ class Pictures:
             size: height and width of the pictures, pixels.
         """
         for views, angles in zip(c2w.split(chunk), fovy.split(chunk), strict=True):
-            yield self._render(views, angles, size)
-
-    @torch.no_grad()
-    def _render(
-        self, c2w: Float[Tensor, "B 4 4"], fovy: Float[Tensor, " B"], size: int
-    ) -> Float[np.ndarray, "B H W 3"]:
-        return self._renderer(c2w, fovy, size, size)["comp_rgb"].clamp(0, 1).cpu().numpy()
+            found = self._renderer(views, angles, size, size)["comp_rgb"]
+            yield found.clamp(0, 1).cpu().numpy()

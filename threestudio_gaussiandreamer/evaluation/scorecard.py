@@ -48,18 +48,12 @@ def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
     add("folders", nargs="+", metavar="FOLDER", help="a run's folder, or one that holds runs")
     add("--metrics", default="clip", help=f"comma-separated, of {', '.join(METRICS)}")
     add("--against", metavar="FOLDER", help="also score these runs, and print paired differences")
-    add(
-        "--clip",
-        help="folder of a CLIP in transformers' format, or toybox (bundled): clip, directions",
-    )
+    clip = "folder of a CLIP in transformers' format, or toybox (bundled): clip, directions"
+    add("--clip", help=clip)
     add("--imagereward", help="folder with ImageReward.pt and vocab.txt, for imagereward, quality")
     add("--judge", default=NAME, help="model of judge and janus: a file, or toybox (bundled)")
-    add(
-        "--size",
-        type=int,
-        help=f"width and height of the pictures for clip, directions and imagereward, pixels "
-        f"(default: {Protocol().size})",
-    )
+    size = "width and height of the pictures for clip, directions and imagereward, pixels"
+    add("--size", type=int, help=f"{size} (default: {Protocol().size})")
     add("--output", default="evaluation", help="folder for scorecard.csv and scorecard.json")
     return parser.parse_args(argv)
 
@@ -150,18 +144,14 @@ def find_results(folders: Sequence[str], failed: list[str]) -> list[Result]:
         if not runs:
             raise UserError(f"{folder!r} holds no finished run, which has a save/it*-export folder")
         for place in runs:
-            if place.resolve() not in found:
-                found[place.resolve()] = result_or_note(place, failed)
+            if place.resolve() in found:
+                continue
+            found[place.resolve()] = None
+            try:
+                found[place.resolve()] = find_result(str(place))
+            except UserError as error:
+                failed.append(str(error))
     return [result for result in found.values() if result]
-
-
-def result_or_note(place: Path, failed: list[str]) -> Optional[Result]:
-    """Return the result in a run's folder; None, and a message in ``failed``, if it has none."""
-    try:
-        return find_result(str(place))
-    except UserError as error:
-        failed.append(str(error))
-        return None
 
 
 def run_folders(folder: Path) -> Iterator[Path]:
@@ -191,7 +181,9 @@ def scored(
     for item, result in enumerate(tqdm(results, unit="asset", disable=None)):
         row: dict[str, Any] = {"asset": str(result.file.parents[2])}
         try:
-            row["prompt"] = prompt_of(result)
+            if not result.prompt:
+                raise UserError(f"{str(result.file)!r} has no prompt in configs/parsed.yaml")
+            row["prompt"] = result.prompt
             asset = Asset(result, row["prompt"], read_result(result), item)
             for metric in metrics:
                 row |= metric.score(asset)
@@ -201,19 +193,16 @@ def scored(
             yield row
 
 
-def prompt_of(result: Result) -> str:
-    """Return the prompt of a run, with which metrics compare its renders.
-
-    Raises:
-        UserError: its configuration has none.
-    """
-    if not result.prompt:
-        raise UserError(f"{str(result.file)!r} has no prompt in its run's configs/parsed.yaml")
-    return result.prompt
-
-
 def summary(metrics: Sequence[Metric], first: Rows, second: Rows) -> dict[str, Any]:
     """Return the content of ``scorecard.json``."""
+
+    def prompt_means(rows: Rows, column: str) -> dict[str, float]:
+        values = np.array([row[column] for row in rows], float)
+        return per_prompt([row["prompt"] for row in rows], values)
+
+    def estimate(means: dict[str, float]) -> Estimate:
+        return bootstrap(np.array(list(means.values()), float))
+
     content: dict[str, Any] = {}
     for column in (name for metric in metrics for name in metric.columns):
         means = [prompt_means(rows, column) for rows in (first, second)]
@@ -222,17 +211,6 @@ def summary(metrics: Sequence[Metric], first: Rows, second: Rows) -> dict[str, A
             entry |= {"against": estimate(means[1]), "difference": paired(*means)}
         content[column] = {name: value._asdict() for name, value in entry.items()}
     return content
-
-
-def prompt_means(rows: Rows, column: str) -> dict[str, float]:
-    """Return the mean of a column for each prompt."""
-    values = np.array([row[column] for row in rows], float)
-    return per_prompt([row["prompt"] for row in rows], values)
-
-
-def estimate(means: dict[str, float]) -> Estimate:
-    """Return the mean over the prompts with its bootstrap interval."""
-    return bootstrap(np.array(list(means.values()), float))
 
 
 def write(output: Path, rows: Rows, content: dict[str, Any]) -> None:

@@ -1,14 +1,11 @@
 """Write results for T3Bench's scripts: meshes, and pictures of their views, in the folders where
-the scripts look for them.
+the scripts look for them (docs/evaluation.md).
 
-Its ``run_eval_quality.py`` and ``run_caption.py`` look for a mesh of each prompt of
-``data/prompt_<group>.txt`` in ``outputs_mesh_t3/<method>_<group>/<prompt with _ for
-spaces>*/save/it*-export/model.obj``, have ``render/meshrender.py`` or ``render/meshrender_cap.py``
-render it, and score the pictures ``<vertex>_<camera>.png`` and ``<vertex>.png``. The mesh written
-here is the surface of the Gaussians (``surface.py``), which is all that the published scripts need.
-To score the Gaussians themselves, replace the two scripts in ``render`` by those written to
-``render_gaussians``: they copy pictures that this package's rasteriser has rendered with the same
-cameras.
+``run_eval_quality.py`` and ``run_caption.py`` look for ``outputs_mesh_t3/<method>_<group>/<prompt
+with _ for spaces>*/save/it*-export/model.obj``, have ``render/meshrender.py`` or
+``render/meshrender_cap.py`` render it, and score ``<vertex>_<camera>.png`` and ``<vertex>.png``.
+The mesh is the surface of the Gaussians; the scripts written to ``render_gaussians`` copy pictures
+of the Gaussians instead, rendered with the same cameras.
 
 Cameras for quality: the 162 vertices of an icosphere of radius 2.2, with five fields of view each.
 Cameras for captions: the 12 vertices of an icosahedron of radius 2.2^2 (T3Bench's script multiplies
@@ -20,7 +17,7 @@ of a mesh, or the centres of Gaussians with an opacity of at least ``MIN_OPACITY
 import math
 import os
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -28,7 +25,7 @@ import torch
 from jaxtyping import Float
 
 from ..cameras import look_at
-from ..core import images as files_of_pictures
+from ..core import images as picture_files
 from ..core.errors import UserError
 from ..core.files import atomic_file
 from ..core.options import shown
@@ -68,34 +65,25 @@ if not found:
 
 def write_t3bench(
     folder: Path,
+    name: str,
     results: Sequence[Result],
     prompts: Sequence[str],
-    *,
-    method: str,
-    group: str,
-    size: int = SIZE,
 ) -> None:
     """Write meshes, pictures and scripts into ``folder``, a checkout of T3Bench, without changing
-    its own files.
-
-    Args:
-        method, group: parts of the name of the results' folder.
-        size: height and width of the pictures, pixels.
+    its own files; the results into a folder of this ``name``.
 
     Raises:
-        UserError: a prompt can't name a folder, or a file can't be written.
+        UserError: a file can't be written.
     """
-    require_folder_names(method, prompts)
     try:
-        _write_stand_ins(folder / "render_gaussians", size)
+        _write_stand_ins(folder / "render_gaussians")
         for result, prompt in zip(results, prompts, strict=True):
-            save = folder / "outputs_mesh_t3" / f"{method}_{group}" / folder_name(prompt) / "save"
-            _write_result(save, normalized(read_result(result)), size, result.antialiased)
+            save = folder / "outputs_mesh_t3" / name / folder_name(prompt) / "save"
+            _write_result(save, normalized(read_result(result)), result.antialiased)
             print(f"T3Bench: {save}", flush=True)
     except OSError as error:
-        raise UserError(
-            f"--t3bench {folder} can't be written: {error.strerror or error}"
-        ) from error
+        why = error.strerror or error
+        raise UserError(f"--t3bench {folder} can't be written: {why}") from error
 
 
 def require_folder_names(method: str, prompts: Sequence[str]) -> None:
@@ -123,58 +111,55 @@ def folder_name(prompt: str) -> str:
     return prompt.replace(" ", "_")
 
 
-def _write_stand_ins(folder: Path, size: int) -> None:
+def _write_stand_ins(folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     for script, kind, names in (
         ("meshrender.py", "quality", quality_names()),
         ("meshrender_cap.py", "caption", caption_names()),
     ):
         with atomic_file(folder / script, durable=False) as file:
-            file.write(STAND_IN.format(kind=kind, names=names, size=size).encode())
+            file.write(STAND_IN.format(kind=kind, names=names, size=SIZE).encode())
 
 
-def _write_result(save: Path, arrays: Gaussians, size: int, antialias: bool) -> None:
-    views = (arrays, size, antialias)
-    _write_views(save / "t3bench" / "quality", quality_names(), quality_pictures(*views))
-    _write_views(save / "t3bench" / "caption", caption_names(), caption_pictures(*views))
+def _write_result(save: Path, arrays: Gaussians, antialias: bool) -> None:
+    for kind, names, pictures in (
+        ("quality", quality_names(), quality_pictures(arrays, antialias)),
+        ("caption", caption_names(), caption_pictures(arrays, antialias)),
+    ):
+        folder = save / "t3bench" / kind
+        folder.mkdir(parents=True, exist_ok=True)
+        images = (image for chunk in pictures for image in chunk)
+        for name, image in zip(names, images, strict=True):
+            picture_files.write(folder / name, (image * 255).round().astype(np.uint8))
     export = save / "it0-export"
     export.mkdir(parents=True, exist_ok=True)
     write_obj(export / "model.obj", gaussian_surface(arrays))
 
 
-def _write_views(
-    folder: Path, names: list[str], chunks: Iterable[Float[np.ndarray, "B s s 3"]]
-) -> None:
-    """Write pictures under their names."""
-    folder.mkdir(parents=True, exist_ok=True)
-    remaining = iter(names)
-    for images in chunks:
-        for image in images:
-            files_of_pictures.write(
-                folder / next(remaining), (image * 255).round().astype(np.uint8)
-            )
-
-
 def quality_pictures(
-    arrays: Gaussians, size: int = SIZE, antialias: bool = False
+    arrays: Gaussians, antialias: bool = False
 ) -> Iterator[Float[np.ndarray, "B size size 3"]]:
     """Render the 162 x 5 views for quality of a normalised cloud, in the order of
     :func:`quality_names`.
     """
     positions = np.repeat(icosphere(2, RADIUS), len(QUALITY_FOVY), 0)
     angles = torch.tensor(QUALITY_FOVY).repeat(len(positions) // len(QUALITY_FOVY))
-    pictures = Pictures(arrays, antialias=antialias)
-    return pictures.render(towards_origin(positions), angles, size, chunk=8)
+    return _pictures(arrays, positions, angles, antialias)
 
 
 def caption_pictures(
-    arrays: Gaussians, size: int = SIZE, antialias: bool = False
+    arrays: Gaussians, antialias: bool = False
 ) -> Iterator[Float[np.ndarray, "B size size 3"]]:
     """Render the 12 views for captions of a normalised cloud."""
     positions = icosphere(0, RADIUS) * RADIUS
-    angles = torch.full((len(positions),), CAPTION_FOVY)
+    return _pictures(arrays, positions, torch.full((len(positions),), CAPTION_FOVY), antialias)
+
+
+def _pictures(
+    arrays: Gaussians, positions: Float[np.ndarray, "V 3"], fovy: torch.Tensor, antialias: bool
+) -> Iterator[Float[np.ndarray, "B size size 3"]]:
     pictures = Pictures(arrays, antialias=antialias)
-    return pictures.render(towards_origin(positions), angles, size, chunk=8)
+    return pictures.render(towards_origin(positions), fovy, SIZE, chunk=8)
 
 
 def quality(rewards: Float[np.ndarray, "162 5"]) -> float:
@@ -191,9 +176,7 @@ def quality(rewards: Float[np.ndarray, "162 5"]) -> float:
 
 
 def quality_names() -> list[str]:
-    return [
-        f"{vertex:03d}_{camera}.png" for vertex in range(162) for camera in range(len(QUALITY_FOVY))
-    ]
+    return [f"{vertex:03d}_{i}.png" for vertex in range(162) for i in range(len(QUALITY_FOVY))]
 
 
 def caption_names() -> list[str]:
