@@ -5,6 +5,7 @@ A small file can expand to a large size: a PNG of one colour, a thousand nodes t
 mesh, an accessor of a billion zeros. There is one budget for a mesh file and the files that it
 references."""
 
+import codecs
 import contextlib
 import io
 import logging
@@ -103,14 +104,16 @@ def stamp(path: str | Path) -> Optional[tuple[int, int]]:
 
 
 def utf8(text: bytes) -> bytes:
-    """Return a text in UTF-8; one in another encoding becomes one character per byte, from which
-    ``SideFiles`` finds the files that it names.
+    """Return a text in UTF-8, without a byte order mark; one in an encoding without a mark becomes
+    one character per byte, from which ``SideFiles`` finds the files that it names.
     """
+    if text[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE):
+        return text.decode("utf-16", "replace").encode()
     try:
         text.decode()
     except UnicodeDecodeError:
-        return text if text[:2] in (b"\xff\xfe", b"\xfe\xff") else text.decode("latin-1").encode()
-    return text
+        return text.decode("latin-1").encode()
+    return text.removeprefix(codecs.BOM_UTF8)
 
 
 def _plain(name: str) -> str:
