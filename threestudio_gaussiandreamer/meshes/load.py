@@ -108,11 +108,8 @@ def mesh_file(path: str | Path) -> Path:
 def find_mesh(path: str | Path) -> Path:
     """Return the bundled mesh if ``path`` is its bare name and not a file itself, else ``path``."""
     bundled = ASSETS / Path(path).name
-    return (
-        bundled
-        if str(path) == bundled.name and bundled.is_file() and not Path(path).exists()
-        else Path(path)
-    )
+    is_bare = str(path) == bundled.name and not Path(path).exists()
+    return bundled if is_bare and bundled.is_file() else Path(path)
 
 
 def bundled_meshes() -> list[str]:
@@ -406,9 +403,8 @@ def _checked_obj(data: bytes, path: Path) -> bytes:
     first = FIRST_VERTEX.search(text)
     if wrong := _wrong_obj_line(len(first[1].split()) if first else 3).search(text):
         number = text.count(b"\n", 0, wrong.start()) + 1
-        fail(
-            path, f"line {number} is no vertex or face: {wrong[0][:80].decode(errors='replace')!r}"
-        )
+        shown = repr(wrong[0][:80].decode(errors="replace"))
+        fail(path, f"line {number} is no vertex or face: {shown}")
     if not RELATIVE_FACE.search(text):
         return text
     counts = {b"v": 0, b"vt": 0, b"vn": 0}
