@@ -22,16 +22,13 @@ CONFIGS = sorted(path.name for path in (DATA / "parsed").iterdir())
 SHIPPED = sorted({*CONFIGS, *(path.name for path in (ROOT / "configs").glob("*.yaml"))})
 OPTIONS = json.loads((DATA / "options.json").read_text())
 PROMPT = "system.prompt_processor.prompt=a red fox"
+PRIOR = "system.geometry.prior."
 FILES = {
-    "gaussiandreamer-pointe.yaml": [
-        "system.geometry.prior.checkpoint=base.pt",
-        "system.geometry.prior.upsampler=upsample.pt",
-    ],
+    "gaussiandreamer-pointe.yaml": [f"{PRIOR}checkpoint=base.pt", f"{PRIOR}upsampler=upsample.pt"],
     "gaussiandreamer-avatar-smpl.yaml": [
-        "system.geometry.prior.motion=results.npz",
-        "system.geometry.prior.body_model=body.npz",
+        *(f"{PRIOR}motion=results.npz", f"{PRIOR}body_model=body.npz")
     ],
-    "polish.yaml": ["system.geometry.prior.path=fox.ply"],
+    "polish.yaml": [f"{PRIOR}path=fox.ply"],
 }
 """The user's files where a configuration leaves them open."""
 MODELS = {
@@ -58,13 +55,8 @@ SECTIONS = {
 }
 """The section of a part, by the last word of its name."""
 GIVEN = {
-    "prompt": "a ball",
-    "pretrained_model_name_or_path": "a model",
-    "path": "fox.ply",
-    "mesh": "toy.glb",
-    "motion": "results.npz",
-    "body_model": "body.npz",
-    "checkpoint": "base.pt",
+    **{"prompt": "a ball", "pretrained_model_name_or_path": "a model", "checkpoint": "base.pt"},
+    **{"path": "fox.ply", "mesh": "toy.glb", "motion": "results.npz", "body_model": "body.npz"},
 }
 """Values in place of an empty default, which no run can have."""
 PROCESSORS = {"gaussiandreamer-mvdream-": "gaussiandreamer-stable-diffusion-"}

@@ -100,25 +100,19 @@ def test_a_file_of_the_first_layout_is_pruned(name):
 @pytest.mark.slow
 def test_a_folder_in_use_ctrl_c_and_the_command_that_resumes(tmp_path):
     """In a process of its own, which trains until it is stopped."""
-    where = ["use_timestamp=false", "tag=t", "trainer.max_steps=1000000", "pages=false"]
-    options = [*SMOKE, "--gpu", "cpu", *where[:-1], "trainer.val_check_interval=1000000"]
-    process = subprocess.Popen(
-        [sys.executable, str(ROOT / "launch.py"), *options],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-    )
+    where = [*SMOKE, "use_timestamp=false", "tag=t"]
+    endless = ["--gpu", "cpu", "trainer.max_steps=1000000", "trainer.val_check_interval=1000000"]
+    started = [sys.executable, str(ROOT / "launch.py"), *where, *endless]
+    streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    process = subprocess.Popen(started, env=environment, **streams)
     try:
         deadline = time.monotonic() + 300
         while not list(Path("outputs").glob("smoke/t/csv_logs/version_0/metrics.csv")):
             assert process.poll() is None and time.monotonic() < deadline, process.communicate()
             time.sleep(0.1)
-        refused(
-            launch(*SMOKE, "use_timestamp=false", "tag=t"),
-            "another run is training in outputs/smoke/t",
-            f"process {process.pid} ",
-        )
+        in_use = "another run is training in outputs/smoke/t"
+        refused(launch(*where), in_use, f"process {process.pid} ")
         process.send_signal(signal.SIGINT)
         out, err = process.communicate(timeout=300)
     finally:
