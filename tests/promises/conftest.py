@@ -26,7 +26,8 @@ def trained(tmp_path_factory) -> Path:
     """Return the folder of a finished run of ``smoke.yaml``, to be read only."""
     root = tmp_path_factory.mktemp("gallery")
     places = [f"exp_root_dir={root}", "use_timestamp=false", "tag=gallery"]
-    result = launch(*SMOKE, *places, "checkpoint.every_n_train_steps=4")
+    kept = ["checkpoint.save_top_k=-1", "checkpoint.every_n_train_steps=4"]
+    result = launch(*SMOKE, *places, *kept, "trainer.val_check_interval=4")
     assert result.code == 0, result.err
     return root / "smoke" / "gallery"
 

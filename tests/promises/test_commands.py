@@ -141,18 +141,12 @@ def test_list_parts_prints_kinds_and_parts():
     assert "prior" in lines and "  mesh-prior" in lines and "  sds-variant" in lines
 
 
-@pytest.mark.slow
-def test_farm_makes_the_assets_of_a_list_once():
-    pytest.importorskip("ray")
+def test_farm_checks_its_list_before_it_starts_a_cluster():
     Path("prompts.txt").write_text("a red ball\na blue ball\n")
-    words = ["prompts.txt", "--config", "smoke.yaml", "--out", "farm", "--gpus", "0"]
-    result = command("farm", *words, "--workers", "1", "system.pages=false")
-    assert result.code == 0, result.said
-    clouds = {path: path.stat().st_mtime for path in Path("farm").rglob("gaussians.ply")}
-    assert len(clouds) == 2
-    assert command("farm", *words, "--workers", "1", "system.pages=false").code == 0
-    assert {path: path.stat().st_mtime for path in Path("farm").rglob("gaussians.ply")} == clouds
-    assert command("farm", *words, "--report", "system.pages=false").code == 0
+    words = ["prompts.txt", "--config", "smoke.yaml", "--out", "farm"]
+    refused(command("farm", *words, "--report"), "there is no farm in", "--out")
+    refused(command("farm", *words, "trainer.max_stps=3"), "did you mean 'trainer.max_steps'")
+    assert not Path("farm").exists()
 
 
 @pytest.mark.slow
