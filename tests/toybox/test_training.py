@@ -161,11 +161,11 @@ def test_a_time_limit_ends_a_stage_and_lowers_the_rate_before(folder, tmp_path):
 
     def step(batch):
         rates.append(loop.rate_factor(loop.WARMUP, run.done))
-        run.progress.seconds += 10
+        run.progress.seconds += 1e5  # beside which those of a busy machine are few
         return {"loss": torch.zeros(())}
 
     run.train_step = step
-    run.run(seconds=100.0)
+    run.run(seconds=1e6)
     assert len(rates) == 10 and rates[0] == 1 and 0 < rates[9] < rates[8] < 1
 
 
