@@ -134,7 +134,6 @@ class Pictures:
         geometry.to(get_device())
         backdrop.to(get_device()).eval()
 
-    @torch.no_grad()
     def render(
         self, c2w: Float[Tensor, "V 4 4"], fovy: Float[Tensor, " V"], size: int, *, chunk: int = 4
     ) -> Iterator[Float[np.ndarray, "B H W 3"]]:
@@ -145,5 +144,6 @@ class Pictures:
             size: height and width of the pictures, pixels.
         """
         for views, angles in zip(c2w.split(chunk), fovy.split(chunk), strict=True):
-            found = self._renderer(views, angles, size, size)["comp_rgb"]
+            with torch.no_grad():  # no decorator, which --typecheck would hide the generator from
+                found = self._renderer(views, angles, size, size)["comp_rgb"]
             yield found.clamp(0, 1).cpu().numpy()
