@@ -141,21 +141,14 @@ def test_half_precision(model, prompts, monkeypatch, half_type):
 
 
 @pytest.mark.parametrize(
-    "options",
-    [
-        {"enable_vae_slicing": True},
-        {"enable_channels_last_format": True},
-        {"enable_attention_slicing": True},
-        {"enable_sequential_cpu_offload": True},
-    ],
-    ids=lambda options: next(iter(options)),
+    "saver", ["vae_slicing", "channels_last_format", "attention_slicing", "sequential_cpu_offload"]
 )
-def test_memory_savers_change_nothing_but_memory(model, prompts, options):
-    if "enable_sequential_cpu_offload" in options:
+def test_memory_savers_change_nothing_but_memory(model, prompts, saver):
+    if saver == "sequential_cpu_offload":
         pytest.importorskip("accelerate")
     rgb = renders()
     plain, _ = tiny.gradient(tiny.guidance(KIND, model), prompts, rgb)
-    saving, _ = tiny.gradient(tiny.guidance(KIND, model, **options), prompts, rgb)
+    saving, _ = tiny.gradient(tiny.guidance(KIND, model, **{f"enable_{saver}": True}), prompts, rgb)
     assert relative(saving, plain.double()) < 1e-5
 
 

@@ -5,7 +5,6 @@ import ctypes
 import io
 import os
 import random
-import resource
 import signal
 import struct
 import time
@@ -15,6 +14,7 @@ import numpy as np
 import pytest
 import torch
 
+from tests.promises.commands import full_disk
 from tests.stability.rows import row
 from tests.stability.run_failures_cases import EVERY_STEP, content
 from tests.stability.small_runs import Ended, launch, require_equal_ends
@@ -113,16 +113,6 @@ def test_a_file_written_in_place_is_lost_by_such_kills(tmp_path, measured):
 
 
 @contextlib.contextmanager
-def file_size_limit(limit: int):
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-
-
-@contextlib.contextmanager
 def permissions_count_for_root():
     """Make permissions effective for root by dropping two capabilities of the thread for
     a while.
@@ -169,7 +159,7 @@ def assert_stopped_cleanly(ended: Ended, message: str) -> None:
 @row("A5", "Disk full, read-only")
 def test_a_full_disk_in_the_middle_of_a_run(tmp_path, monkeypatch, measured):
     with contextlib.ExitStack() as full:
-        at_step(monkeypatch, 3, lambda _: full.enter_context(file_size_limit(2000)))
+        at_step(monkeypatch, 3, lambda _: full.enter_context(full_disk(2000)))
         ended = launch(tmp_path, *EVERY_STEP)
     assert_stopped_cleanly(ended, "File too large")
     measured("named error, exit code 2, earlier file intact, no temporary")
@@ -188,7 +178,7 @@ def test_a_disk_that_is_full_by_then(hook, tmp_path, monkeypatch, measured):
     with contextlib.ExitStack() as full:
 
         def wrapped(self, *args):
-            full.enter_context(file_size_limit(100))
+            full.enter_context(full_disk(100))
             return original(self, *args)
 
         monkeypatch.setattr(owner, hook, wrapped)
@@ -225,12 +215,12 @@ def test_a_partial_video_is_an_error(kind, limit, tmp_path, measured):
             str(path), frames, fps=5
         )
 
-    with file_size_limit(limit), pytest.raises(UserError, match=f"out.{kind}"):
+    with full_disk(limit), pytest.raises(UserError, match=f"out.{kind}"):
         write()
     assert not path.exists()
     write()
     whole = path.read_bytes()
-    with file_size_limit(limit), pytest.raises(UserError):
+    with full_disk(limit), pytest.raises(UserError):
         write()
     assert path.read_bytes() == whole and len(list(tmp_path.iterdir())) == 5
     measured("named error, earlier file intact")

@@ -3,13 +3,15 @@
 from typing import Any, NamedTuple, Optional
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 Batch = dict[str, Any]
 Latents = Float[Tensor, "B c h w"]
 """Clean or noisy ones, noise, predictions of it, or gradients."""
 Timesteps = Int[Tensor, " B"]
+Good = Bool[Tensor, " B"]
+"""Items whose residual is finite."""
 Residual = tuple[Latents, Float[Tensor, " B"]]
 """A residual e of the latents, and abar of each item, float64, of which the weight w(t) of e is a
 function.

@@ -11,13 +11,12 @@ from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from jaxtyping import Bool
 from torch import Tensor
 
 from ...core.errors import UserError
 from ...core.options import checked_options, in_range, require_defaults
 from ...host import BaseObject, warn
-from ..types import Batch, Latents, Residual, State
+from ..types import Batch, Good, Latents, Residual, State
 
 GUIDANCE_SCALE = in_range(-1e6, 1e6)
 OFF = {"recon_std_rescale": 0.0}
@@ -114,12 +113,7 @@ class Variant(BaseObject, ABC):
         return found
 
     def learn(
-        self,
-        guidance: Any,
-        latents: Latents,
-        condition: Any,
-        batch: Batch,
-        good: Bool[Tensor, " B"],
+        self, guidance: Any, latents: Latents, condition: Any, batch: Batch, good: Good
     ) -> None:
         """Train what the variant trains, after the residual of a training step has been computed.
 

@@ -25,7 +25,7 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from ...core.distributed import all_sum
@@ -33,7 +33,7 @@ from ...core.errors import UserError
 from ...core.options import in_range, positive, require_defaults
 from ...diffusion import sds
 from ...host import parse_structured, register
-from ..types import Batch, Latents, Noised, Residual, State, items_of
+from ..types import Batch, Good, Latents, Noised, Residual, State, items_of
 from .base import Variant
 
 
@@ -159,12 +159,7 @@ class VSD(Variant):
         return eps - own, noised.abar
 
     def learn(
-        self,
-        guidance: Any,
-        latents: Latents,
-        condition: Any,
-        batch: Batch,
-        good: Bool[Tensor, " B"],
+        self, guidance: Any, latents: Latents, condition: Any, batch: Batch, good: Good
     ) -> None:
         renders = Renders(latents, condition, batch)
         if not good.all():
