@@ -136,11 +136,6 @@ def test_the_demo_asks_for_its_models():
     refused(command("toybox.demo", "a red fox", "--models", "nothing"), "nothing")
 
 
-def test_list_parts_prints_kinds_and_parts():
-    lines = launch("--list-parts").out.splitlines()
-    assert "prior" in lines and "  mesh-prior" in lines and "  sds-variant" in lines
-
-
 def test_farm_checks_its_list_before_it_starts_a_cluster():
     Path("prompts.txt").write_text("a red ball\na blue ball\n")
     words = ["prompts.txt", "--config", "smoke.yaml", "--out", "farm"]

@@ -101,11 +101,9 @@ def test_exports_of_one_cloud_agree(exported):
         assert nearest.max() < 5e-3
 
 
-def test_a_cloud_written_twice_is_the_same_file(exported):
+def test_a_ply_is_converted_without_loss(exported):
     source = exported / "all/save/it8-export/gaussians.ply"
-    for name in ("a.ply", "b.ply"):
-        assert command("convert", source, name).code == 0
-    assert Path("a.ply").read_bytes() == Path("b.ply").read_bytes()
+    assert command("convert", source, "a.ply").code == 0
     before, after = (read_cloud(str(path)).gaussians for path in (source, "a.ply"))
     assert all(np.array_equal(one, other) for one, other in zip(before, after, strict=True))
 

@@ -86,7 +86,8 @@ def test_options_of_a_part_are_checked_like_ours(name):
 
 def test_parts_in_custom_are_listed_and_failures_named():
     placed(next(iter(EXAMPLES)))
-    assert "  spiral-prior" in launch("--list-parts").out
+    lines = launch("--list-parts").out.splitlines()
+    assert {"prior", "  spiral-prior", "  mesh-prior", "  sds-variant"} <= set(lines)
     Path("custom/broken.py").write_text("import nothing_of_this_name")
     refused(launch(*SMOKE), "custom/broken.py", "nothing_of_this_name")
     Path("custom/broken.py").rename("custom/broken_disabled.py")
