@@ -6,6 +6,7 @@ import time
 import pytest
 
 from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.prune.command import parse
 from threestudio_gaussiandreamer.prune.options import (
     PruneOptions,
     budget_of,
@@ -69,6 +70,18 @@ def test_a_gain_is_a_budget(given, gain, error):
     assert budget.gain == gain and budget.error == pytest.approx(error)
 
 
+@pytest.mark.parametrize(
+    ("words", "gain"),
+    [
+        ("--auto in.ply out.ply", "0.5"),
+        ("in.ply out.ply --auto", "0.5"),
+        ("in.ply --auto 1dB o", "1dB"),
+    ],
+)
+def test_auto_may_stand_anywhere(words, gain):
+    assert parse(words.split()).auto == gain
+
+
 @pytest.mark.parametrize("text", ["0", "-1", "100", "6", "nan", "much"])
 def test_a_gain_that_is_none_is_named(text):
     with pytest.raises(UserError, match="--auto: expected a"):
@@ -83,7 +96,7 @@ def test_decibels_with_and_without_their_unit(text):
 def test_numbers_are_read_in_linear_time():
     text = "4" + 100_000 * " " + "x"
     started = time.process_time()
-    for parse in (parse_bytes, lambda text, name: parse_number(text, name, "dB")):
+    for read in (parse_bytes, lambda text, name: parse_number(text, name, "dB")):
         with pytest.raises(UserError):
-            parse(text, "x")
+            read(text, "x")
     assert time.process_time() - started < 0.5

@@ -75,9 +75,11 @@ def test_a_round_of_auto_says_what_more_would_gain_and_so_does_the_end():
     cost = 10 * math.log10(1.025) / math.log2(10 / 8)
     assert outcome.needed.gain == pytest.approx(0.5 * (cost / 0.12) ** 3) and outcome.after == 10
     assert str(outcome) == "10 -> 10 Gaussians: half as many would lose 1 dB or more"
-    assert density.summary() == "10 of 10 Gaussians: twice as many would gain 1 dB or more"
+    assert density.summary() == "10 of 10 Gaussians: a round would have lost too much"
     density.cloud.gain.fill_(0.25)
     after_step(sampled(density, torch.full((10,), 0.0125), 1.0))
+    assert density.summary() == "10 of 10 Gaussians: twice as many would gain 0.2 dB"
+    after_step(sampled(density, torch.zeros(10), 0.0))  # a round without a sample
     assert density.summary() == "10 of 10 Gaussians: twice as many would gain 0.2 dB"
 
 
@@ -87,7 +89,6 @@ def test_a_run_says_how_many_it_kept_and_why():
     after_step(density)
     assert density.summary() == "8 of 1,200 Gaussians: the budget is 5"
     assert control().summary() == "10 Gaussians: no budget"  # of a checkpoint without the number
-    assert "wasn't measured" in control(budget="auto").summary()
 
 
 @pytest.mark.parametrize("error", [0.0, math.nan, math.inf])
@@ -144,6 +145,9 @@ def test_the_error_of_a_round_is_that_of_its_views_or_of_the_likeness(known):
         ({"budget": 2}, 0, 10, None),
         ({"budget": 1}, 7, 10, "2 rounds of pruning must reduce 10 Gaussians to 1"),
         ({"budget": 20}, 9, 10, None),
+        ({"budget": "auto"}, 0, 10, "too rarely in 1 steps a round"),
+        ({"budget": "auto", "prune": {"start": 1, "stop": 9, "every": 20}}, 0, 20, "no round"),
+        ({"budget": "auto", "prune": {"start": 20, "stop": 50, "every": 12}}, 0, 50, None),
         ({"densify": ROUNDS}, 0, 20, None),
         ({"densify": ROUNDS}, 10, -1, None),
         ({"densify": ROUNDS}, 0, 5, "1 of the 2 rounds of densification would come after step 5"),

@@ -2,7 +2,7 @@
 
 If a guidance has an attribute ``truth`` with the methods of :class:`MeshTruth` (whose ``mesh`` may
 be None), renders of the run are compared with it: the progress bar shows the PSNR, validation
-pictures include the ground truth, ``budget: auto`` measures the loss of PSNR, and, if it is a mesh,
+pictures include the ground truth, ``budget: auto`` goes by their error, and, if it is a mesh,
 held-out views are scored. A guidance that has computed the mean squared error of a step's renders
 to the ground truth returns it as ``error_to_truth``; where it doesn't, steps that are logged render
 the ground truth.

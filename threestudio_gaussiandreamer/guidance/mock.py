@@ -71,7 +71,7 @@ class MockGuidance(ScoreDistillation):
         self, z: Float[Tensor, "B 3 H W"], t: Tensor, condition: Float[Tensor, "B 3 H W"]
     ) -> tuple[Tensor, Tensor]:
         self.evaluations += len(z)
-        abar = sds.per_item(self.alphas_cumprod[t], z)
+        abar = sds.per_item(self.abar_of(t), z)
         guided, unguided = (
             (z - abar.sqrt() * share * condition) / (1 - abar).sqrt()
             for share in (1.0, UNCONDITIONAL)

@@ -130,8 +130,12 @@ def mixture_of(
     else:
         rows = torch.arange(len(members)) if guided else members.nonzero().flatten()
         members = members[rows]
-        rgba = bank.rgba.index_select(0, rows.to(bank.rgba.device))
-        pictures = Pictures.of(bank.latent.encode(composite(rgba, background[None])))
+        chunks = rows.to(bank.rgba.device).split(
+            images_per_chunk(bank.rgba[0].numel(), rows.device)
+        )
+        rgba = (bank.rgba.index_select(0, some) for some in chunks)
+        latents = [bank.latent.encode(composite(some, background[None])) for some in rgba]
+        pictures = Pictures.of(torch.cat(latents))
         mixing = torch.eye(pictures.layers.shape[1], device=background.device)
     conditional = torch.cat([torch.ones(int(own is not None), dtype=torch.bool), members])
     log_prior = torch.where(conditional, 0.0, -torch.inf).to(background.device)

@@ -33,7 +33,7 @@ class Noised(NamedTuple):
 
 class Condition(NamedTuple):
     """The text embeddings of B views, k rows per view. What else a model is conditioned on is in
-    further tokens of each row (``models/pooled_embeddings.py``).
+    further tokens of each row (``models/text_encoders.py``).
     """
 
     embeddings: Embeddings

@@ -77,7 +77,8 @@ def without_removed(config_class: Any, values: Any, path: str = "") -> Any:
         path: of the section, for messages, such as "system.guidance.".
     """
     removed = getattr(config_class, "REMOVED", {})
-    found = [key for key in values if key in removed]
+    known = {field.name for field in fields(config_class)}  # a derived part may have its own
+    found = [key for key in values if key in removed and key not in known]
     for key in found:
         neutral, now = removed[key]
         did_nothing = neutral(values[key]) if callable(neutral) else values[key] == neutral

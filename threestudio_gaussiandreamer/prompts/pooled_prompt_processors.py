@@ -2,7 +2,7 @@
 and ``gaussiandreamer-stable-diffusion-3-prompt-processor``.
 
 Options: those of ``prompt_processors.py``. An embedding contains the tokens of all encoders and, as
-its last token, the pooled embedding (``models/pooled_embeddings.py``). In addition:
+its last token, the pooled embedding (``models/text_encoders.py``). In addition:
 
 ===============  ===================================================================================
 option           meaning

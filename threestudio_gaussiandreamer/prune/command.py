@@ -12,6 +12,8 @@ removed."""
 
 import argparse
 import functools
+import re
+import sys
 from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
@@ -34,6 +36,7 @@ BUDGETS = {
     "--within": "what the pruned cloud may lose against the truth, such as 0.1dB: see --quality",
 }
 AUTO = "as many as are needed, so that twice as many would gain less than DB (default: 0.5)"
+GAIN = r"[-+]?[\d.]+(e[-+]?\d+)?\s*(dB)?"
 OPTIONS: dict[str, dict[str, Any]] = {
     "--quality": {
         "type": float,
@@ -83,7 +86,11 @@ def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
     budget.add_argument("--auto", metavar="DB", nargs="?", const="0.5", help=AUTO)
     for name, settings in OPTIONS.items():
         parser.add_argument(name, **settings)
-    return parser.parse_args(argv)
+    words = list(sys.argv[1:] if argv is None else argv)
+    for at, word in enumerate(words):
+        if word == "--auto" and not re.fullmatch(GAIN, "".join(words[at + 1 : at + 2])):
+            words[at] = "--auto=0.5"  # the next word isn't its value
+    return parser.parse_args(words)
 
 
 def run(args: argparse.Namespace) -> dict[str, Any]:

@@ -218,8 +218,15 @@ class DensityControl(DensityRule):
         budget, rounds, count = self.options.budget, self.prune_rounds, len(self.cloud)
         if budget is None:
             return None
+        if not rounds:
+            return f"pruning has no round: {SET_ROUNDS.format('prune')}"
         if late := late_rounds("pruning", "prune", rounds, end):
             return late
+        if budget == AUTO and rounds.step < importance.SAMPLES:
+            return (
+                f"budget=auto samples once a step, too rarely in {rounds.step} steps a round: set "
+                f"system.geometry.prune.every to {importance.SAMPLES} or more"
+            )
         if budget == AUTO or count <= budget:
             return None
         return self._shortage([round_ for round_ in rounds if step < round_ <= end])
@@ -393,13 +400,16 @@ class DensityControl(DensityRule):
             error = float(cloud.error)
             needed = importance.needed_count(scores, stats.removal, error, cfg.gain, cfg.keep)
             count = max(count, needed.count)
-            if not needed.enough or cloud.gain < 0:
+            if needed.gain >= 0 and not needed.enough:
                 cloud.gain.fill_(needed.gain)
         return importance.keep_highest(values, scores, count, first), needed
 
     def summary(self) -> str:
         budget, gain = self.options.budget, float(self.cloud.gain)
-        why = {None: "no budget", AUTO: str(Need(len(self.cloud), gain))}
+        needed = (
+            str(Need(len(self.cloud), gain)) if gain >= 0 else "a round would have lost too much"
+        )
+        why = {None: "no budget", AUTO: needed}
         return f"{super().summary()}: {why.get(budget, f'the budget is {budget}')}"
 
 

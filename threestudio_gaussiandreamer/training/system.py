@@ -99,7 +99,7 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
 
         REMOVED: ClassVar[dict[str, Any]] = {
             "image_targets": (
-                lambda stage: not (stage or {}).get("stop"),
+                lambda stage: not (isinstance(stage, Mapping) and stage.get("stop")),
                 "pictures of the 2D model as targets brought nothing (reports/tried.md)",
             )
         }
@@ -284,7 +284,7 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
                 f"{type(self.density).__name__}.after_step returned {type(outcome).__name__}; "
                 "expected None or a DensityOutcome"
             )
-        if outcome and outcome.needed:
+        if outcome and outcome.needed and outcome.needed.gain >= 0:
             self.step_log.write(self.trainer, {"prune/gain": outcome.needed.gain})
             info(f"step {self.global_step}: {outcome}")
 
