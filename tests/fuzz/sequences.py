@@ -14,7 +14,7 @@ from torch import Tensor
 from tests.fuzz.target import require_picture
 from threestudio_gaussiandreamer.gaussians.densify import Change
 from threestudio_gaussiandreamer.splatting import Rasterized
-from threestudio_gaussiandreamer.training.density import DensityControl
+from threestudio_gaussiandreamer.training.density import DECAY, DensityControl
 from threestudio_gaussiandreamer.training.geometry import STATISTICS, GaussianCloud
 
 EXTREMES = {
@@ -213,6 +213,9 @@ class CloudSequence(RuleBasedStateMachine):
         old = {
             name: value.detach().clone() for name, value in self.cloud.parameters_by_name().items()
         }
+        if budget == "auto":
+            rates = {group["name"]: group["lr"] for group in self.optimizer.param_groups}
+            old["logit_opacities"] -= DECAY * rates["logit_opacities"]
         rules.budget, rules.densify.enabled = budget, densify is not None
         for section, options in ((rules.densify, densify), (rules.prune, prune)):
             vars(section).update(options or {})

@@ -132,7 +132,7 @@ register_parts()
         ("system.optimizer.args.eps=-1", "Adam doesn't accept this: Invalid epsilon value"),
         (
             "system.optimizer.args.betas=[0.9]",
-            "system.optimizer.args.betas: Adam doesn't accept this: list index out of range",
+            "system.optimizer.args.betas: Adam doesn't accept this: tuple index out of range",
         ),
         ("system.optimizer.args={fused: true, foreach: true}", "Adam doesn't accept this: `fused`"),
         ("system.optimizer.args.capturable=true", "Adam doesn't accept this: If capturable=True"),

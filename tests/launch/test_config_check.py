@@ -253,7 +253,7 @@ def test_an_extension_with_the_name_of_a_module_is_refused(folder, name):
 
 def test_an_unknown_part_says_where_own_parts_are_looked_for(folder):
     with pytest.raises(UserError, match="the folder custom in the working folder, which has none"):
-        find_part("system.guidance_type", "own-guidance")
+        find_part("system.guidance_type", "nowhere-guidance")
 
 
 def test_another_part_forgets_the_options_that_only_the_earlier_one_has():

@@ -1,5 +1,6 @@
 """Misspelt keys are rejected with a suggestion; prompts stay text."""
 
+from dataclasses import fields
 from pathlib import Path
 
 import pytest
@@ -102,8 +103,9 @@ def test_every_option_of_every_part_misspelt_is_refused_with_the_right_one(measu
     tried, failed = 0, []
     for place, config in test_configs.config_classes().items():
         name, _, group = place.partition(".")
-        for word in config.__dataclass_fields__:
-            for wrong in set(misspelt(word)) - set(config.__dataclass_fields__):
+        words = {field.name for field in fields(config)}
+        for word in words:
+            for wrong in set(misspelt(word)) - words:
                 tried += 1
                 try:
                     check_part("part", name, {group: {wrong: 1}} if group else {wrong: 1})
@@ -123,7 +125,7 @@ def test_every_option_of_every_part_misspelt_is_refused_with_the_right_one(measu
 @row("A5", "Wrong config keys")
 def test_every_accepted_key_is_read(measured):
     read, classes = test_configs.names_that_are_read(), test_configs.config_classes()
-    keys = [(name, field) for name, cls in classes.items() for field in cls.__dataclass_fields__]
+    keys = [(name, field.name) for name, cls in classes.items() for field in fields(cls)]
     measured(
         sum(field not in read for _, field in keys),
         f"of {len(keys)} keys",

@@ -27,7 +27,7 @@ SIZES = [
     "data.n_val_views=1", "data.n_test_views=2", "system.geometry.grow.num_candidates=20000",
     "system.guidance.eval_steps=2", f"trainer.max_steps={STEPS}",
     f"trainer.val_check_interval={STEPS}", "trainer.enable_progress_bar=false", "name=run", "tag=t",
-    "use_timestamp=false",
+    "use_timestamp=false", "system.geometry.budget=null",
 ]  # fmt: skip
 
 
@@ -204,6 +204,10 @@ RUNS = {
         ["shap_e", "mvdream"],
     ),
     "lowmem": (["gaussiandreamer.yaml", "gaussiandreamer-lowmem.yaml"], ["shap_e", "epsilon"]),
+    "without pruning": (
+        ["gaussiandreamer.yaml", "gaussiandreamer-paper.yaml"],
+        ["shap_e", "epsilon"],
+    ),
 }
 
 

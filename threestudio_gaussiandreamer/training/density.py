@@ -372,12 +372,11 @@ class DensityControl(DensityRule):
 
     def _cap(self) -> int:
         """Return the largest number of Gaussians after densification: ``max_gaussians``, and with a
-        budget at most the larger of the budget and the current number (for ``auto`` the latter).
+        budget that is a number at most the larger of it and the current number.
         """
-        budget, count = self.options.budget, len(self.cloud)
-        if budget is None:
+        if self.options.budget in (None, AUTO):
             return self.options.max_gaussians
-        return min(self.options.max_gaussians, count if budget == AUTO else max(budget, count))
+        return min(self.options.max_gaussians, max(self.options.budget, len(self.cloud)))
 
     def _prune(self, step: int, first: Optional[Change]) -> tuple[Change, Optional[Need]]:
         """Prune once towards the budget.
