@@ -175,6 +175,26 @@ def test_a_store_that_is_gone_is_named(memory, monkeypatch):
             act(FOX)
 
 
+def test_a_bucket_that_does_not_exist_is_empty_and_can_not_be_written(memory, monkeypatch):
+    place = Place(memory)
+
+    def missing(*args, **options):
+        raise FileNotFoundError("The specified bucket does not exist")
+
+    for name in ("cat_file", "pipe_file", "put_file", "ls", "rm_file"):
+        monkeypatch.setattr(place.system, name, missing)
+    place.remove(["a"])
+    assert place.names("a") == set() and place.read(["a"]) == [None]
+    for act in (lambda: place.write({"a": b""}), lambda: place.upload("a")):
+        with pytest.raises(Unreachable, match="bucket does not exist"):
+            act()
+
+
+def test_a_file_may_be_removed_while_it_is_read(tmp_path, monkeypatch):
+    monkeypatch.setattr("pathlib.Path.is_file", lambda path: True)
+    assert Place(tmp_path).read(["none"]) == [None]
+
+
 def checkpoint(place, step):
     """Write the last checkpoint of an asset's run."""
     content = {"global_step": step, "epoch": 0, "state_dict": {}}

@@ -73,12 +73,14 @@ class Place:
         return self.url
 
     @contextlib.contextmanager
-    def reached(self) -> Iterator[None]:
-        """Raise Unreachable for errors of a URL, which its file system has tried again."""
+    def reached(self, may_lack: bool = False) -> Iterator[None]:
+        """Raise Unreachable for errors of a URL, which its file system has tried again; a file that
+        ``may_lack`` still raises FileNotFoundError, as a bucket that doesn't exist does.
+        """
         try:
             yield
         except Exception as error:  # each file system of fsspec has its own
-            if not self.remote or isinstance(error, FileNotFoundError):
+            if not self.remote or may_lack and isinstance(error, FileNotFoundError):
                 raise
             raise Unreachable(
                 f"{self.url} can't be reached: {type(error).__name__}: {error}; check the address "
@@ -87,7 +89,7 @@ class Place:
 
     def names(self, below: str) -> set[str]:
         """List what is in a folder of the farm."""
-        with contextlib.suppress(FileNotFoundError), self.reached():
+        with contextlib.suppress(FileNotFoundError), self.reached(may_lack=True):
             if not self.remote:
                 return set(os.listdir(self.folder / below))
             found = self.system.ls(f"{self.url}/{below}", detail=False)
@@ -96,10 +98,9 @@ class Place:
 
     def read(self, names: Sequence[str]) -> list[Optional[bytes]]:
         """Return the contents of files of the farm; None for those that don't exist."""
-        with self.reached():
+        with self.reached(may_lack=True):
             if not self.remote:
-                paths = [self.folder / name for name in names]
-                return [path.read_bytes() if path.is_file() else None for path in paths]
+                return [_content(self.folder / name) for name in names]
             paths = [f"{self.url}/{name}" for name in names]
             found = self.system.cat_ranges(paths, None, None, on_error="return")
             for content in found:
@@ -142,7 +143,7 @@ class Place:
 
     def remove(self, names: Iterable[str]) -> None:
         for name in names:
-            with contextlib.suppress(FileNotFoundError), self.reached():
+            with contextlib.suppress(FileNotFoundError), self.reached(may_lack=True):
                 if not self.remote:
                     (self.folder / name).unlink()
                 else:
@@ -245,6 +246,14 @@ def uploads(folder: Path) -> Iterator[tuple[str, Path]]:
             yield name, path
 
 
+def _content(path: Path) -> Optional[bytes]:
+    """Return the content of a file, which another process may be removing; None without one."""
+    try:
+        return path.read_bytes()
+    except (FileNotFoundError, IsADirectoryError, NotADirectoryError):
+        return None
+
+
 def _written(path: Path) -> float:
     """Return when a file was written; 0 without one."""
     return path.stat().st_mtime if path.exists() else 0.0
@@ -273,7 +282,7 @@ def adopt_ledger(place: Place) -> None:
         place.write({f"{ASSETS}/{n}/{files[n]}": json_text(line).encode() for n, line in batch})
     for name in place.names(PARTS) & last.keys():
         part = f"{place}/{PARTS}/{name}"
-        with contextlib.suppress(FileNotFoundError), place.reached():
+        with contextlib.suppress(FileNotFoundError), place.reached(may_lack=True):
             place.system.mv(f"{part}/last.ckpt", f"{part}/{last[name]['key']}.ckpt")
     if content:
         place.write({"ledger-adopted.jsonl": content})
