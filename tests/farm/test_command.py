@@ -177,6 +177,13 @@ def test_an_error_in_a_rows_configuration_names_its_line(tmp_path):
         check_recipe(recipe, read_rows(path))
 
 
+def test_an_option_of_the_farm_is_refused_in_every_row(tmp_path, monkeypatch):
+    monkeypatch.setattr("threestudio_gaussiandreamer.farm.recipe.MOST_CHECKS", 1)
+    rows = [Row("fox", "a fox"), Row("cat", "a cat", overrides=("resume=x.ckpt",), line=2)]
+    with pytest.raises(ValueError, match="line 2 of the prompt list: resume is set by the farm"):
+        check_recipe(recipe_of(str(DEMO)), rows)
+
+
 def test_a_missing_configuration_of_a_row_names_its_line(tmp_path):
     row = Row("fox", "a fox", config=("nothing.yaml",), line=4)
     recipe = recipe_of(str(DEMO))

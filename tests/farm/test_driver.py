@@ -1,5 +1,6 @@
 """The driver's decisions, with workers that return at once and a stand-in for Ray."""
 
+import errno
 from types import SimpleNamespace
 
 import pytest
@@ -9,7 +10,7 @@ from threestudio_gaussiandreamer.farm.driver import Driver
 from threestudio_gaussiandreamer.farm.place import FAILED, FINISHED, STOPPED, WAITING, Place
 from threestudio_gaussiandreamer.farm.recipe import Job, Recipe, Source
 from threestudio_gaussiandreamer.farm.rows import Row
-from threestudio_gaussiandreamer.farm.worker import BLOCKED, NO_MEMORY, Beat, Setting
+from threestudio_gaussiandreamer.farm.worker import BLOCKED, NO_MEMORY, REFUSED, Beat, Setting
 
 ROWS = [Row(f"toy{i}", f"toy {i}", i) for i in range(6)]
 LOW = Source("low.yaml", b"")
@@ -228,6 +229,41 @@ def test_a_worker_that_hangs_is_restarted_once_for_each_standstill(path):
         assert len(bench.ray.restarted) == restarts, beat
 
 
+def test_an_asset_whose_worker_was_told_to_stop_is_handed_out_again(path):
+    """As when its machine is drained."""
+
+    def answers(job):
+        if job.row == ROWS[0] and not bench.states()[0] == STOPPED:
+            return {"state": STOPPED, "error": "stopped by signal 15"}
+        return finished(job)
+
+    bench = Bench(path, answers)
+    bench.driver.run()
+    assert bench.states() == [FINISHED] * 6 and not bench.stops
+    again = [job for job in bench.worker.made if job.row == ROWS[0]]
+    assert len(again) == 2 and again[1].spent >= 100
+
+
+def test_a_row_that_was_given_an_option_of_the_farm_later_fails_alone(path):
+    def answers(job):
+        failed = {"state": FAILED, "error": "resume is set by the farm"}
+        return failed if job.row.overrides else finished(job)
+
+    bench = Bench(path, answers, rows=[ROWS[0]._replace(overrides=("resume=a",)), *ROWS[1:]])
+    bench.driver.run()
+    assert bench.driver.counts == {FAILED: 1, FINISHED: 5}
+
+
+def test_a_refused_row_leaves_no_record_beside_what_the_other_has_made(path):
+    def answers(job):
+        refused = {"state": REFUSED, "error": "was begun with another prompt"}
+        return refused if job.row == ROWS[0] else finished(job)
+
+    bench = Bench(path, answers)
+    bench.driver.run()
+    assert bench.states() == [WAITING, *[FINISHED] * 5] and bench.driver.counts[FAILED] == 1
+
+
 def test_ctrl_c_lets_the_workers_write_checkpoints(path):
     def answers(job):
         if job.row == ROWS[1]:
@@ -246,10 +282,10 @@ def test_ctrl_c_lets_the_workers_write_checkpoints(path):
 def test_a_record_that_can_not_be_written_ends_the_farm_and_not_ctrl_c(path, monkeypatch):
     bench = Bench(path, lambda job: {"state": FAILED, "error": "x"})
 
-    def full(files):
-        raise UserError("no space left")
+    def full(folder, *args, **options):
+        raise OSError(errno.ENOSPC, "no space left")
 
-    monkeypatch.setattr(bench.place, "write", full)
+    monkeypatch.setattr("pathlib.Path.mkdir", full)
     with pytest.raises(UserError, match="no space left"):
         bench.driver.run()
     assert len(bench.worker.made) == 1 and bench.stops

@@ -9,12 +9,19 @@ import torch
 from threestudio_gaussiandreamer import __version__
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.farm import worker
-from threestudio_gaussiandreamer.farm.place import FAILED, STOPPED, Place, Unreachable
+from threestudio_gaussiandreamer.farm.place import (
+    FAILED,
+    STOPPED,
+    AnotherRow,
+    Place,
+    Unreachable,
+)
 from threestudio_gaussiandreamer.farm.recipe import Job, Recipe, Source
 from threestudio_gaussiandreamer.farm.rows import Row
 from threestudio_gaussiandreamer.farm.worker import (
     BLOCKED,
     NO_MEMORY,
+    REFUSED,
     Setting,
     Worker,
     count_attempts,
@@ -43,6 +50,7 @@ def caused(error, cause):
         (OSError(errno.ENOSPC, "No space left on device"), BLOCKED),
         (caused(UserError("can't write"), OSError(errno.ENOSPC, "full")), BLOCKED),
         (Unreachable("s3://a can't be reached"), BLOCKED),
+        (AnotherRow(JOB.row), REFUSED),
         (OSError(errno.ENOENT, "no such file"), FAILED),
     ],
 )

@@ -23,7 +23,7 @@ from ..core.files import json_text
 from .board import Beat
 from .place import ASSETS, FAILED, FAILURE, FINISHED, STOPPED
 from .recipe import Job, repeat_command
-from .worker import BLOCKED, NO_MEMORY, Setting, Worker
+from .worker import BLOCKED, NO_MEMORY, REFUSED, Setting, Worker
 
 OBJECT_STORE_BYTES = 100 << 20
 """Memory for what workers send each other: little."""
@@ -154,6 +154,7 @@ class Driver:
         self.counts: Counter = Counter()
         self.errors: list[str] = []
         self.obstacle: Optional[str] = None
+        self.stopping = False
         self.began, self.look_due = time.monotonic(), 0.0
         # only on terminals; elsewhere a line per asset
         self.bar = tqdm(total=self.total, initial=self.done, unit="asset", disable=None, ncols=110)
@@ -225,7 +226,9 @@ class Driver:
             return
         job, error = job._replace(spent=job.worker_seconds(time.time())), outcome["error"]
         again = state == NO_MEMORY and self.setting.recipe.low_memory and not job.saves_memory
-        if state == FAILED or state == NO_MEMORY and not again:
+        if state in (FAILED, REFUSED) or state == NO_MEMORY and not again:
+            if state != REFUSED:  # else the record is the other row's
+                self.record(job, FAILED, error)
             self.fail(job, error)
             return
         self.record(job, STOPPED, error)
@@ -235,10 +238,12 @@ class Driver:
             self.ray.kill(self.workers[number], no_restart=False)
         elif state == BLOCKED:
             self.block(error)
+        elif not self.stopping:  # a signal that is only for its worker
+            self.note(job, "again", error)
+            self.again.append(job)
 
     def fail(self, job: Job, error: str) -> None:
         """Note a failed asset; end the farm if the first assets all failed with one message."""
-        self.record(job, FAILED, error)
         self.note(job, FAILED, error)
         self.errors.append(error)
         if not self.done + self.counts[FINISHED] and self.errors == [error] * SAME_ERRORS:
@@ -293,6 +298,7 @@ class Driver:
                 self.ray.kill(self.workers[number], no_restart=False)
 
     def tell_board_to_stop(self) -> None:
+        self.stopping = True
         try:
             self.ray.get(self.setting.board.stop.remote(), timeout=5)
         except self.ray.exceptions.RayError:

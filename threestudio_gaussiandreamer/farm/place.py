@@ -21,6 +21,7 @@ from typing import Any, Optional
 
 from ..core.errors import UserError
 from ..core.files import atomic_file, json_text
+from ..launch.folder_lock import make_folder
 from .rows import Row
 
 ASSETS, PARTS = "assets", "parts"
@@ -39,6 +40,16 @@ BATCH = 1000
 
 class Unreachable(UserError):
     """Raised when a URL can't be read or written: other assets would fail in the same way."""
+
+
+class AnotherRow(UserError):
+    """Raised for an asset that was made from another row of its name."""
+
+    def __init__(self, row: Row) -> None:
+        super().__init__(
+            f"line {row.line} of the prompt list: {row.name!r} was begun in this farm with another "
+            "prompt, seed, config or overrides; give it another name, or choose another --out"
+        )
 
 
 class Place:
@@ -125,13 +136,17 @@ class Place:
         return found
 
     def write(self, files: Mapping[str, bytes]) -> None:
-        """Write files of the farm, each atomically, as object stores do by themselves."""
+        """Write files of the farm, each atomically, as object stores do by themselves.
+
+        Raises:
+            UserError: one can't be written.
+        """
         if self.remote:
             with self.reached():
                 self.system.pipe({f"{self.url}/{name}": files[name] for name in files})
             return
         for name, content in files.items():
-            (self.folder / name).parent.mkdir(parents=True, exist_ok=True)
+            make_folder((self.folder / name).parent)
             with atomic_file(self.folder / name) as file:
                 file.write(content)
 
@@ -202,7 +217,7 @@ class Place:
         ``failed.json``, with ``state``. What hasn't been begun costs nothing but one listing.
 
         Raises:
-            UserError: an asset of this name was made from another row.
+            AnotherRow: an asset of this name was made from another row.
         """
         begun = self.names(ASSETS) | (self.names(PARTS) if self.remote else set())
         rows = iter(rows)
@@ -213,19 +228,12 @@ class Place:
                 names = [f"{ASSETS}/{row.name}/{file}" for row in asked]
                 for row, record in zip(asked, self.read_json(*names), strict=True):
                     if record is not None and record.get("key") != row.key:
-                        raise another_row(row)
+                        raise AnotherRow(row)
                     if record is not None and (file == FAILURE or has_files(record)):
                         found[row.name] = {"state": state, **record}
             for row in batch:
                 state = RUNNING if row.name in begun else WAITING
                 yield row, found.get(row.name, {"state": state})
-
-
-def another_row(row: Row) -> UserError:
-    return UserError(
-        f"line {row.line} of the prompt list: {row.name!r} was begun in this farm with another "
-        "prompt, seed, config or overrides; give it another name, or choose another --out"
-    )
 
 
 def has_files(result: Mapping[str, Any]) -> bool:

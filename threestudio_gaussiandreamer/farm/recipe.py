@@ -92,7 +92,12 @@ def root_of(configs: Iterable[str]) -> str:
 def launch_arguments(recipe: Recipe, job: Job, configs: list[str], folder: Path) -> list[str]:
     """Return the launcher's arguments for an asset in the farm's ``folder``; ``configs`` are the
     paths of the YAML files.
+
+    Raises:
+        UserError: an override is of an option that the farm sets: the list has changed since it was
+            checked.
     """
+    require_unmanaged(recipe, job.row)
     managed = {"exp_root_dir": folder, "name": ASSETS, "tag": job.row.name}
     managed |= {"use_timestamp": "false", "resume": "auto"}
     return [*_arguments(recipe, job, configs), *(f"{key}={managed[key]}" for key in managed)]
@@ -105,18 +110,22 @@ def _arguments(recipe: Recipe, job: Job, configs: Iterable[str]) -> list[str]:
 
 
 def run_overrides(recipe: Recipe, job: Job) -> list[str]:
-    """Return the overrides that an asset depends on.
+    """Return the overrides that an asset depends on."""
+    seed = [] if job.row.seed is None else [f"seed={job.row.seed}"]
+    prompt = f"system.prompt_processor.prompt={job.row.prompt}"
+    return [*recipe.overrides, *job.row.overrides, *seed, prompt]
+
+
+def require_unmanaged(recipe: Recipe, row: Row) -> None:
+    """Check that no override is of an option that the farm sets.
 
     Raises:
-        UserError: one is of an option that the farm sets.
+        UserError: one is.
     """
-    overrides = [*recipe.overrides, *job.row.overrides]
-    for override in overrides:
+    for override in (*recipe.overrides, *row.overrides):
         key = override.partition("=")[0]
         if key in MANAGED:
             raise UserError(f"{key} is set by {MANAGED[key]}: remove {override[:80]!r}")
-    seed = [] if job.row.seed is None else [f"seed={job.row.seed}"]
-    return [*overrides, *seed, f"system.prompt_processor.prompt={job.row.prompt}"]
 
 
 def all_sources(recipe: Recipe, job: Job) -> list[Source]:
@@ -134,8 +143,8 @@ def repeat_command(recipe: Recipe, job: Job) -> str:
 
 
 def check_recipe(recipe: Recipe, rows: Iterable[Row]) -> Recipe:
-    """Check the configuration of each different combination of rows' ``config`` and ``overrides``;
-    return the recipe with the low-memory configuration, if that is valid with the farm's.
+    """Check the overrides of all rows, and the configuration of each different combination of
+    ``config`` and ``overrides``, of the first :data:`MOST_CHECKS`; return the recipe with the low-memory configuration, if that is valid with the farm's.
 
     Raises:
         UserError: the first error, with the line of the row.
@@ -148,14 +157,15 @@ def check_recipe(recipe: Recipe, rows: Iterable[Row]) -> Recipe:
     checked: dict[tuple, Row] = {}
     for row in rows:
         kind = row.config, row.overrides
-        if kind not in checked and len(checked) < MOST_CHECKS:
-            checked[kind] = row
-            try:
+        try:
+            require_unmanaged(recipe, row)
+            if kind not in checked and len(checked) < MOST_CHECKS:
+                checked[kind] = row
                 check_job(recipe, Job(row))
-            except UserError as error:
-                if any(kind):
-                    raise UserError(f"line {row.line} of the prompt list: {error}") from error
-                raise
+        except UserError as error:
+            if any(kind):
+                raise UserError(f"line {row.line} of the prompt list: {error}") from error
+            raise
     try:
         saving = recipe._replace(low_memory=read_config(LOW_MEMORY))
         check_job(saving, Job(next(iter(checked.values())), saves_memory=True))

@@ -25,12 +25,13 @@ from ..core.launcher import train_alone
 from ..host import pl
 from ..models.loaded import keep_loaded, load_counts
 from .board import Beat
-from .place import FAILED, FINISHED, STOPPED, Place, Unreachable, another_row, has_files
+from .place import FAILED, FINISHED, STOPPED, AnotherRow, Place, Unreachable, has_files
 from .recipe import Job, Recipe, all_sources, launch_arguments
 from .rows import Row
 
-BLOCKED, NO_MEMORY = "blocked", "no memory"
-"""Outcomes beside the states of an asset: the results can't be written; out of memory."""
+BLOCKED, NO_MEMORY, REFUSED = "blocked", "no memory", "refused"
+"""Outcomes beside the states of an asset: the results can't be written; out of memory; what there
+is was made from another row."""
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
 SECONDS_BETWEEN = 1.0
 """Shortest time between two reports of a worker."""
@@ -95,8 +96,8 @@ class Worker:
 
     def make(self, job: Job, number: int, setting: Setting) -> dict[str, Any]:
         """Make an asset, or resume it from its checkpoint, with the worker of this number; return
-        ``state``, FINISHED with what ``result.json`` holds, or FAILED, STOPPED, :data:`BLOCKED` or
-        :data:`NO_MEMORY` with ``error``.
+        ``state``, FINISHED with what ``result.json`` holds, or FAILED, STOPPED, :data:`BLOCKED`,
+        :data:`NO_MEMORY` or :data:`REFUSED` with ``error``.
         """
         self.number, self.setting = number, setting
         try:
@@ -189,14 +190,14 @@ def count_attempts(folder: Path, session: str, job: Job) -> tuple[int, int]:
     in this session.
 
     Raises:
-        UserError: the folder's checkpoints are of another row.
+        AnotherRow: the folder's checkpoints are of another row.
     """
     with open(folder / "attempts.txt", "a+", encoding="utf-8") as file:
         file.seek(0)
         earlier = [line.split() for line in file]
         # earlier versions noted no key
         if any(len(words) == 4 and words[1] != job.row.key for words in earlier):
-            raise another_row(job.row)
+            raise AnotherRow(job.row)
         file.write(f"{session} {job.row.key} {socket.gethostname()} {os.getpid()}\n")
     return len(earlier) + 1, sum(words[0] == session for words in earlier) + 1
 
@@ -253,7 +254,7 @@ def outcome_of(error: Exception) -> dict[str, Any]:
         cause = cause.__cause__ or cause.__context__
     torch = sys.modules.get("torch")
     no_memory = (MemoryError, torch.OutOfMemoryError) if torch else MemoryError
-    state = FAILED
+    state = REFUSED if isinstance(error, AnotherRow) else FAILED
     if any(isinstance(c, no_memory) or "DefaultCPUAllocator: can't" in str(c) for c in causes):
         state = NO_MEMORY
     # other assets would fail in the same way
