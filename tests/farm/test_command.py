@@ -146,6 +146,29 @@ def test_the_folder_may_be_that_of_the_environment(tmp_path, monkeypatch):
     assert root_of([str(DEMO)]) == "outputs"
 
 
+@pytest.mark.parametrize("root", ["out/${name}", "${oc.env:NOWHERE}", "???"])
+def test_a_folder_that_is_not_known_is_asked_for(farm, monkeypatch, tmp_path, root):
+    no_ray(monkeypatch)
+    (tmp_path / "a.yaml").write_text(f"exp_root_dir: {root}")
+    code, err = farm("a fox", "--config", "a.yaml", "--report")
+    assert code == 2 and "isn't known here: give --out" in err
+    code, err = farm("a fox", "--config", "a.yaml", "--report", "--out", "out")
+    assert code == 2 and "there is no farm in" in err
+
+
+def test_the_report_of_an_earlier_farm_would_lack_its_failures(farm, monkeypatch, tmp_path):
+    no_ray(monkeypatch)
+    require_same_farm(Place(tmp_path / "out"), RECIPE)
+    (tmp_path / "out/ledger.jsonl").touch()
+    code, err = farm("a fox", "--out", "out", "--report")
+    assert code == 2 and "give the command once without --report" in err
+
+
+def test_the_code_is_that_of_a_finished_farm_only_if_all_is_finished(farm, monkeypatch):
+    monkeypatch.setattr(command, "make_assets", lambda *args: None)
+    assert farm("a fox", "--out", "out") == (1, "")
+
+
 def test_a_finished_farm_needs_no_ray(farm, monkeypatch, tmp_path):
     """It writes the report; nor does a farm of another configuration start Ray to be refused."""
     no_ray(monkeypatch)

@@ -304,6 +304,29 @@ def test_a_farm_of_an_earlier_version_goes_on(tmp_path, memory, url):
         assert (place.work_folder(DOG) / module.FETCHED).read_bytes() == b"step 5"
 
 
+def test_an_adoption_that_was_killed_while_it_removed_the_parts_is_not_repeated(memory):
+    place, lines = Place(memory), [json.dumps(line).encode() + b"\n" for line in LEDGER]
+    place.write({f"ledger/{i}.jsonl": line for i, line in enumerate(lines)})
+    adopt_ledger(place)
+    place.write({"ledger/5.jsonl": lines[5], "ledger/2.jsonl": lines[1]})
+    adopt_ledger(place)
+    records = dict(place.records([FOX, CAT, DOG]))
+    assert [record["worker_seconds"] for record in records.values()] == [5.0, 9.0, 1.0]
+    assert place.read(["ledger-adopted.jsonl"]) == [b"".join(lines)]
+    assert not module.ledgers(place)
+
+
+def test_a_server_that_refuses_the_connection_is_one_message(monkeypatch):
+    fsspec = pytest.importorskip("fsspec")
+
+    def refuses(*args, **options):
+        raise ConnectionRefusedError("Connection refused")
+
+    monkeypatch.setattr(fsspec.core, "url_to_fs", refuses)
+    with pytest.raises(UserError, match="ftp://host/farm can't be used: Connection refused"):
+        Place("ftp://host/farm")
+
+
 def test_an_unknown_protocol_is_refused():
     with pytest.raises(UserError, match="nothing://farm can't be used"):
         Place("nothing://farm")

@@ -23,7 +23,7 @@ from ..launch.folder_lock import claim, require_writable
 from ..launch.options import add_config, parse_with_overrides
 from . import driver
 from .board import Board
-from .place import FAILED, FINISHED, Place, adopt_ledger
+from .place import FAILED, FINISHED, Place, adopt_ledger, ledgers
 from .recipe import FARM, Job, Recipe, check_recipe, read_config, require_same_farm, root_of
 from .report import write_report
 from .rows import check_rows, read_rows
@@ -33,8 +33,8 @@ PROGRAM = "python -m threestudio_gaussiandreamer.farm"
 
 
 def main(argv: Optional[Sequence[str]] = None) -> int:
-    """Run one command line and return the exit code: 0 if all assets are finished, 1 if some have
-    failed, 2 for invalid input, 130 for Ctrl-C.
+    """Run one command line and return the exit code: 0 if all assets are finished, 1 if some aren't
+    (with ``--report``: have failed), 2 for invalid input, 130 for Ctrl-C.
     """
     codes = [0]
 
@@ -93,7 +93,7 @@ def run_farm(args: argparse.Namespace) -> int:
     configure_logging(verbose=False)
     total = check_rows(args.prompts)
     roots = [text for text in args.overrides if text.startswith("exp_root_dir=")]
-    root = roots[-1].partition("=")[2] if roots else root_of(args.config)
+    root = roots[-1].partition("=")[2] if roots else args.out or root_of(args.config)
     place = Place(args.out or f"{root}/farm-{args.prompts.stem}")
     if not args.report:
         if not place.remote:
@@ -111,10 +111,12 @@ def run_farm(args: argparse.Namespace) -> int:
             lock.release()
     elif place.read_json(FARM) == [None]:
         raise UserError(f"there is no farm in {place}: it has no {FARM}; check --out")
+    elif ledgers(place):
+        raise UserError(f"{place} is of an earlier version: give the command once without --report")
     path, states = write_report(place, read_rows(args.prompts), total, args.price)
     where = place if place.remote else path
     print(f"{states[FINISHED]} finished, {states[FAILED]} failed; report: {where}")
-    return 1 if states[FAILED] else 0
+    return int(states[FAILED] > 0 or not args.report and states[FINISHED] < total)
 
 
 def make_assets(args: argparse.Namespace, place: Place, recipe: Recipe, total: int) -> None:

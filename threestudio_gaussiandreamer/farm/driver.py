@@ -154,7 +154,6 @@ class Driver:
         self.counts: Counter = Counter()
         self.errors: list[str] = []
         self.obstacle: Optional[str] = None
-        self.stopping = False
         self.began, self.look_due = time.monotonic(), 0.0
         # only on terminals; elsewhere a line per asset
         self.bar = tqdm(total=self.total, initial=self.done, unit="asset", disable=None, ncols=110)
@@ -238,8 +237,7 @@ class Driver:
             self.ray.kill(self.workers[number], no_restart=False)
         elif state == BLOCKED:
             self.block(error)
-        elif not self.stopping:  # a signal that is only for its worker
-            self.note(job, "again", error)
+        elif not self.obstacle:  # a signal that was only for its worker
             self.again.append(job)
 
     def fail(self, job: Job, error: str) -> None:
@@ -298,7 +296,6 @@ class Driver:
                 self.ray.kill(self.workers[number], no_restart=False)
 
     def tell_board_to_stop(self) -> None:
-        self.stopping = True
         try:
             self.ray.get(self.setting.board.stop.remote(), timeout=5)
         except self.ray.exceptions.RayError:

@@ -34,6 +34,7 @@ failed; complete."""
 LAST, FETCHED = "ckpts/last.ckpt", "ckpts/fetched.ckpt"
 NOT_UPLOADED = ("ckpts/epoch=*", "ckpts/*-prev.ckpt", FETCHED, "ckpts/.*", "ckpts-*/*", "tb_logs/*")
 NOT_UPLOADED += (RESULT,)  # comes last
+ADOPTED = "ledger-adopted.jsonl"
 BATCH = 1000
 """Records that are read together."""
 
@@ -57,7 +58,8 @@ class Place:
     folders in which assets for a URL are made; by default it is the user's cache folder.
 
     Raises:
-        UserError: the URL's protocol is unknown, or its package isn't installed.
+        UserError: the URL's protocol is unknown, its package isn't installed, or its server, to
+            which some connect here, doesn't answer.
     """
 
     def __init__(self, out: str | os.PathLike, scratch: Optional[Path] = None) -> None:
@@ -74,7 +76,7 @@ class Place:
         self.uploaded: dict[str, float] = {}
         try:
             self.system = fsspec.core.url_to_fs(self.url, use_listings_cache=False)[0]
-        except (ImportError, ValueError) as error:
+        except Exception as error:  # each file system has its own
             raise UserError(
                 f"{self.url} can't be used: {error}; s3:// needs pip install "
                 "'threestudio-gaussiandreamer[cluster]'"
@@ -136,11 +138,7 @@ class Place:
         return found
 
     def write(self, files: Mapping[str, bytes]) -> None:
-        """Write files of the farm, each atomically, as object stores do by themselves.
-
-        Raises:
-            UserError: one can't be written.
-        """
+        """Write files of the farm, each atomically, as object stores do by themselves."""
         if self.remote:
             with self.reached():
                 self.system.pipe({f"{self.url}/{name}": files[name] for name in files})
@@ -267,12 +265,21 @@ def _written(path: Path) -> float:
     return path.stat().st_mtime if path.exists() else 0.0
 
 
+def ledgers(place: Place) -> list[str]:
+    """List the files with the records of a farm of an earlier version."""
+    found = [f"ledger/{name}" for name in sorted(place.names("ledger"))]
+    return found or sorted({"ledger.jsonl"} & place.names(""))
+
+
 def adopt_ledger(place: Place) -> None:
     """Write the records of a farm of an earlier version, which had them in ``ledger.jsonl``, or in
     parts of it. An asset had a line whenever it started, finished or failed: the last one counts,
     but seconds are added up. The ledger is kept under another name.
     """
-    names = [f"ledger/{name}" for name in sorted(place.names("ledger"))] or ["ledger.jsonl"]
+    names = ledgers(place)
+    if not names or ADOPTED in place.names(""):  # killed while it removed the parts
+        place.remove(names)
+        return
     content = b"".join(filter(None, place.read(names)))
     spent: Counter = Counter()
     last: dict[str, dict[str, Any]] = {}
@@ -292,6 +299,5 @@ def adopt_ledger(place: Place) -> None:
         part = f"{place}/{PARTS}/{name}"
         with contextlib.suppress(FileNotFoundError), place.reached(may_lack=True):
             place.system.mv(f"{part}/last.ckpt", f"{part}/{last[name]['key']}.ckpt")
-    if content:
-        place.write({"ledger-adopted.jsonl": content})
-        place.remove(names)
+    place.write({ADOPTED: content})
+    place.remove(names)

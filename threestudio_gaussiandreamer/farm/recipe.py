@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import NamedTuple, Optional
 
 from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
 from .. import __version__
 from ..core.errors import UserError
@@ -85,19 +86,17 @@ def read_config(name: str) -> Source:
 def root_of(configs: Iterable[str]) -> str:
     """Return ``exp_root_dir`` of the configuration: the folder or URL for the farm's folder."""
     roots = [read_yaml(read_config(name).name).get("exp_root_dir") for name in configs]
-    # which may be that of a variable of the environment
-    return str(OmegaConf.create([root for root in ["outputs", *roots] if root])[-1])
+    root = next(filter(None, reversed(roots)), "outputs")
+    try:  # it may be that of a variable of the environment
+        return str(OmegaConf.create([root])[0])
+    except OmegaConfBaseException as error:
+        raise UserError(f"exp_root_dir is {root!r}, which isn't known here: give --out") from error
 
 
 def launch_arguments(recipe: Recipe, job: Job, configs: list[str], folder: Path) -> list[str]:
     """Return the launcher's arguments for an asset in the farm's ``folder``; ``configs`` are the
     paths of the YAML files.
-
-    Raises:
-        UserError: an override is of an option that the farm sets: the list has changed since it was
-            checked.
     """
-    require_unmanaged(recipe, job.row)
     managed = {"exp_root_dir": folder, "name": ASSETS, "tag": job.row.name}
     managed |= {"use_timestamp": "false", "resume": "auto"}
     return [*_arguments(recipe, job, configs), *(f"{key}={managed[key]}" for key in managed)]
@@ -143,8 +142,9 @@ def repeat_command(recipe: Recipe, job: Job) -> str:
 
 
 def check_recipe(recipe: Recipe, rows: Iterable[Row]) -> Recipe:
-    """Check the overrides of all rows, and the configuration of each different combination of
-    ``config`` and ``overrides``, of the first :data:`MOST_CHECKS`; return the recipe with the low-memory configuration, if that is valid with the farm's.
+    """Check the overrides of all rows, and the configuration of the first :data:`MOST_CHECKS`
+    combinations of rows' ``config`` and ``overrides``; return the recipe with the low-memory
+    configuration, if that is valid with the farm's.
 
     Raises:
         UserError: the first error, with the line of the row.
