@@ -19,6 +19,7 @@ from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.farm import place as module
 from threestudio_gaussiandreamer.farm import worker
 from threestudio_gaussiandreamer.farm.place import (
+    CHANGED,
     FAILED,
     FINISHED,
     LAST,
@@ -249,13 +250,23 @@ def test_a_finished_asset_without_files_is_made_again(tmp_path):
 
 
 @pytest.mark.parametrize("file", ["result.json", "failed.json"])
-def test_a_row_that_has_changed_is_refused_with_its_line(tmp_path, file):
-    note(Place(tmp_path), CAT, file)
-    with pytest.raises(UserError, match="line 2 .*'cat' was begun in this farm with another"):
-        list(Place(tmp_path).records([FOX, CAT._replace(seed=1)]))
+def test_a_row_that_has_changed_has_a_state_of_its_own(tmp_path, file):
+    note(Place(tmp_path), CAT, file, seconds=5.0)
+    other = CAT._replace(seed=1)
+    assert dict(Place(tmp_path).records([FOX, other]))[other] == {"state": CHANGED}
+    _, states = write_report(Place(tmp_path), [FOX, other], 2)
+    assert states == {WAITING: 1, CHANGED: 1}
 
 
-@pytest.mark.parametrize("content", ["", "{", "[]", "5", "[" * 99_999])
+WRONG = [
+    '{"seconds": "5"}',
+    '{"worker_seconds": null}',
+    '{"scores": [1]}',
+    '{"scores": {"a": [1]}}',
+]
+
+
+@pytest.mark.parametrize("content", ["", "{", "[]", "5", "[" * 99_999, *WRONG])
 def test_a_record_that_something_else_has_written_is_one_message(tmp_path, content):
     note(Place(tmp_path), FOX, "result.json")
     (tmp_path / "assets/fox/result.json").write_text(content)

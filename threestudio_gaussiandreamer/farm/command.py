@@ -23,7 +23,7 @@ from ..launch.folder_lock import claim, require_writable
 from ..launch.options import add_config, parse_with_overrides
 from . import driver
 from .board import Board
-from .place import FAILED, FINISHED, Place, adopt_ledger, ledgers
+from .place import CHANGED, FAILED, FINISHED, AnotherRow, Place, adopt_ledger, ledgers
 from .recipe import FARM, Job, Recipe, check_recipe, read_config, require_same_farm, root_of
 from .report import write_report
 from .rows import check_rows, read_rows
@@ -127,6 +127,8 @@ def make_assets(args: argparse.Namespace, place: Place, recipe: Recipe, total: i
     for row, record in tqdm(rows, "records", total, unit="asset", disable=None, delay=1):
         if record["state"] == FINISHED:
             finished.add(row.line)
+        elif record["state"] == CHANGED:
+            raise AnotherRow(row)
         elif "worker_seconds" in record:
             spent[row.line] = record["worker_seconds"]
     left = total - len(finished)

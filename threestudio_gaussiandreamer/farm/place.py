@@ -29,12 +29,15 @@ ASSETS, PARTS = "assets", "parts"
 last checkpoint."""
 RESULT, FAILURE = "result.json", "failed.json"
 WAITING, RUNNING, STOPPED, FAILED, FINISHED = "waiting", "running", "stopped", "failed", "finished"
+CHANGED = "changed"
 """States of an asset: not begun; begun, and without a record; an attempt was stopped; an attempt
-failed; complete."""
+failed; complete; its record is of another row."""
 LAST, FETCHED = "ckpts/last.ckpt", "ckpts/fetched.ckpt"
 NOT_UPLOADED = ("ckpts/epoch=*", "ckpts/*-prev.ckpt", FETCHED, "ckpts/.*", "ckpts-*/*", "tb_logs/*")
 NOT_UPLOADED += (RESULT,)  # comes last
 ADOPTED = "ledger-adopted.jsonl"
+NUMBERS = ("seconds", "worker_seconds", "megabytes", "steps", "gaussians", "bytes", "attempts")
+"""Entries of a record that are numbers, if it has them."""
 BATCH = 1000
 """Records that are read together."""
 
@@ -125,13 +128,16 @@ class Place:
         """Return the contents of JSON files of the farm; None for those that don't exist.
 
         Raises:
-            UserError: one isn't an object: it was written by something else.
+            UserError: one isn't an object, or no record: it was written by something else.
         """
         found = []
         for name, content in zip(names, self.read(names), strict=True):
             try:
                 found.append(None if content is None else {**json.loads(content)})
-            except (ValueError, TypeError, RecursionError) as error:
+                record = found[-1] or {}
+                scores = (record.get("scores") or {}).values()
+                sum([*(record.get(key, 0) for key in NUMBERS), *filter(None, scores)])
+            except (ValueError, TypeError, AttributeError, RecursionError) as error:
                 raise UserError(
                     f"{self}/{name} is damaged ({error}): delete it, or choose another --out"
                 ) from error
@@ -213,9 +219,6 @@ class Place:
     def records(self, rows: Iterable[Row]) -> Iterator[tuple[Row, dict[str, Any]]]:
         """Yield each row with the record of its asset: the content of ``result.json``, else of
         ``failed.json``, with ``state``. What hasn't been begun costs nothing but one listing.
-
-        Raises:
-            AnotherRow: an asset of this name was made from another row.
         """
         begun = self.names(ASSETS) | (self.names(PARTS) if self.remote else set())
         rows = iter(rows)
@@ -226,7 +229,7 @@ class Place:
                 names = [f"{ASSETS}/{row.name}/{file}" for row in asked]
                 for row, record in zip(asked, self.read_json(*names), strict=True):
                     if record is not None and record.get("key") != row.key:
-                        raise AnotherRow(row)
+                        record = {"state": CHANGED}
                     if record is not None and (file == FAILURE or has_files(record)):
                         found[row.name] = {"state": state, **record}
             for row in batch:

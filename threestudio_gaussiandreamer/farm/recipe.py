@@ -116,11 +116,7 @@ def run_overrides(recipe: Recipe, job: Job) -> list[str]:
 
 
 def require_unmanaged(recipe: Recipe, row: Row) -> None:
-    """Check that no override is of an option that the farm sets.
-
-    Raises:
-        UserError: one is.
-    """
+    """Raise UserError for an override of an option that the farm sets."""
     for override in (*recipe.overrides, *row.overrides):
         key = override.partition("=")[0]
         if key in MANAGED:
