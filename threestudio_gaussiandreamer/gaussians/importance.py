@@ -141,8 +141,6 @@ class Need(NamedTuple):
     """Whether fewer would lose more than asked for, so that only idle Gaussians are dropped."""
 
     def __str__(self) -> str:
-        if self.gain < 0:
-            return "what more would gain wasn't measured"
         gain = "1 dB or more" if self.gain >= 1 else f"{self.gain:.1g} dB"
         return f"{'half as many would lose' if self.enough else 'twice as many would gain'} {gain}"
 

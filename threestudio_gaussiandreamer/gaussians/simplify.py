@@ -116,9 +116,7 @@ class _Search:
         self.rounds = 0
 
     def run(self, cloud: Gaussians) -> Gaussians:
-        # the rounding of the file isn't a cost of the first round
-        start = math.inf if self.budget.gain is None else self.recovery.quality(cloud)
-        self._take(Round(cloud, start))
+        self._take(self._unfitted(cloud))
         self._reduce(self.recovery.contribution)
         if not self.scores.any():
             raise UserError(
@@ -140,6 +138,10 @@ class _Search:
     def cloud(self) -> Gaussians:
         return self.best.cloud
 
+    def _unfitted(self, cloud: Gaussians) -> Round:
+        """Return a round without a recovery; only a gain needs its quality, as stored."""
+        return Round(cloud, math.inf if self.budget.gain is None else self.recovery.quality(cloud))
+
     def _take(self, best: Round) -> None:
         self.best = best
         self.__dict__.pop("scores", None)
@@ -159,8 +161,7 @@ class _Search:
             return self.recovery.quality(self.cloud.rows(kept.nonzero()[:, 0])) >= least
 
         count = smallest_count(scores, self.budget.count or 1, same)
-        fewer = keep_best(self.cloud, scores, count)
-        self._take(Round(fewer, self.recovery.quality(fewer)))
+        self._take(self._unfitted(keep_best(self.cloud, scores, count)))
 
     def _merge(self) -> None:
         values = self.cloud._asdict()
