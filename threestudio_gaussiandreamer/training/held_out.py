@@ -32,7 +32,7 @@ from ..meshes.mesh import SurfaceDistance
 from ..meshes.raycast import over_background
 from .camera_options import MAX_SIDE
 from .data import orbit_batch
-from .renderer import render
+from .renderer import require_outputs
 
 VIEW_BYTES = 40
 """Memory per pixel, bytes: ground truth with coverage (16), ground truth over the background (12)
@@ -109,7 +109,7 @@ class HeldOut:
         for start in range(0, self.cfg.views, chunk):
             part = self.orbit.rows(slice(start, start + chunk))
             side = self.cfg.size * renderer.cfg.downsample
-            out = render(renderer, orbit_batch(part, side, side))
+            out = require_outputs(renderer, renderer(**orbit_batch(part, side, side)))
             images.append(out["comp_rgb"].cpu())
             backgrounds.append(out["comp_rgb_bg"].cpu().mean((1, 2)))
         for module, training in modes:

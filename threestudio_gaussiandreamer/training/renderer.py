@@ -17,7 +17,7 @@ downsample  1, or 2: return the 2x2 box of the rendered size (the paper renders 
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Optional
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -58,13 +58,12 @@ OUTPUTS = ("comp_rgb", "comp_rgb_bg", "opacity", "depth", "rasterized")
 """What training reads of a renderer's outputs, whatever its options are."""
 
 
-def render(renderer: Rasterizer, batch: dict[str, Any]) -> Mapping[str, Any]:
+def require_outputs(renderer: Any, out: Any) -> Mapping[str, Any]:
     """Return the outputs of a renderer, which may be a subclass outside this package.
 
     Raises:
         UserError: some of ``OUTPUTS`` aren't among them.
     """
-    out = renderer(**batch)
     missing = [name for name in OUTPUTS if name not in out] if isinstance(out, Mapping) else OUTPUTS
     if missing:
         raise UserError(
@@ -117,22 +116,30 @@ class SplattingRenderer(Rasterizer):
             error is differentiated by. ``depth`` and ``comp_normal`` are computed when they are
             first read.
         """
-        device = self.geometry.means.device
+        options, cloud, device = self.options, self.geometry, self.geometry.means.device
+        c2w, fovy = c2w.to(device, torch.float32), fovy.to(device, torch.float32)
         with without_autocast(device.type):
-            return self._render(
-                c2w.to(device, torch.float32), fovy.to(device, torch.float32), height, width, batch
+            flat = FlatBackground.is_flat(self.background)
+            color = self.background.color(len(c2w)) if flat else None
+            opacities = cloud.opacities()
+            viewmats, Ks = cameras.to_opencv(c2w, fovy, height, width)
+            colors = cloud.colors(c2w[:, :3, 3])
+            out = rasterize(
+                *(cloud.means, cloud.quats, cloud.scales(), opacities, colors),
+                *(viewmats, Ks, width, height),
+                background=color,
+                near=options.near,
+                far=options.far,
+                eps2d=options.eps2d,
+                antialias=options.antialias,
+                preset=options.preset,
+                downsample=options.downsample,
+                backend=options.backend,
+                absgrad=self.training and getattr(cloud, "wants_absgrad", False),
             )
-
-    def _render(
-        self, c2w: Tensor, fovy: Tensor, height: int, width: int, batch: dict[str, Any]
-    ) -> LazyMapping:
-        ours = FlatBackground.is_flat(self.background)
-        flat = self.background.color(len(c2w)) if ours else None
-        opacities = self.geometry.opacities()
-        out = self._rasterize(c2w, fovy, (height, width), opacities, flat)
-        image, background = out.image, None if flat is None else flat[:, None, None]
-        if background is None:
-            image, background = self._composite(out, c2w, fovy, batch)
+            image, background = out.image, color[:, None, None] if flat else None
+            if not flat:
+                image, background = self._composite(out, c2w, fovy, batch)
 
         def depth() -> Tensor:
             return out.depth / out.alpha.clamp_min(1e-6)
@@ -148,38 +155,7 @@ class SplattingRenderer(Rasterizer):
             "gaussian_opacities": opacities,
         }
         later = {"depth": depth, "comp_normal": normals}
-        device = out.alpha.device.type
-        return LazyMapping(pictures, {k: postponed(call, device) for k, call in later.items()})
-
-    def _rasterize(
-        self,
-        c2w: Float[Tensor, "B 4 4"],
-        fovy: Float[Tensor, " B"],
-        size: tuple[int, int],
-        opacities: Float[Tensor, " N"],
-        background: Optional[Float[Tensor, "B 3"]],
-    ) -> Rasterized:
-        """Rasterize the cloud at (height, width) = ``size``, before ``downsample``."""
-        options, cloud, (height, width) = self.options, self.geometry, size
-        viewmats, Ks = cameras.to_opencv(c2w, fovy, height, width)
-        colors = cloud.colors(c2w[:, :3, 3])
-        gaussians = cloud.means, cloud.quats, cloud.scales(), opacities, colors
-        return rasterize(
-            *gaussians,
-            viewmats,
-            Ks,
-            width,
-            height,
-            background=background,
-            near=options.near,
-            far=options.far,
-            eps2d=options.eps2d,
-            antialias=options.antialias,
-            preset=options.preset,
-            downsample=options.downsample,
-            backend=options.backend,
-            absgrad=self.training and getattr(cloud, "wants_absgrad", False),
-        )
+        return LazyMapping(pictures, {k: postponed(call, device.type) for k, call in later.items()})
 
     def _composite(
         self, out: Rasterized, c2w: Tensor, fovy: Tensor, batch: dict[str, Any]

@@ -81,7 +81,7 @@ from .optimizer import PartRates, check_optimizer, drop_gradients, make_optimize
 from .pages import discard_turntable, save_first_cloud, turntable_name, write_turntable
 from .pictures import rgb_panel, save_pictures
 from .preflight import check_parts, preflight_parts
-from .renderer import render
+from .renderer import require_outputs
 from .truth import prefetch_truth, true_views
 
 GUIDANCE_LR = 1e-4
@@ -248,18 +248,30 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
     # -- one step ----------------------------------------------------------------------------------
 
     def forward(self, batch: dict[str, Any]) -> Mapping[str, Any]:
-        return render(self.renderer, batch)
+        return require_outputs(self.renderer, self.renderer(**batch))
 
     def training_step(self, batch: dict[str, Any], batch_idx: int) -> None:
-        optimizer, step = self.optimizers(), self.global_step
+        """Render, score, sum the losses, differentiate, optimise, densify and prune, log."""
+        optimizer = self.optimizers()
         self.set_learning_rates(optimizer)
         out = self(batch)
-        warn_if_invisible(out["opacity"], step)
         guided = self.guide(out, batch)
-        self.density.before_backward(out, step, self.error_of(out, batch, guided))
+        self.density.before_backward(out, self.global_step, self.error_of(out, batch, guided))
         losses = self.losses(guided, out)
-        self.recent_losses.add(step, losses)
         self.manual_backward(total(losses, self.options.guidance_type))
+        self.optimize(optimizer, out, batch, losses)
+        self.control_density(optimizer)
+        self.report(out, batch, guided, losses)
+
+    def optimize(
+        self,
+        optimizer: torch.optim.Optimizer,
+        out: Mapping[str, Any],
+        batch: dict[str, Any],
+        losses: dict[str, Tensor],
+    ) -> None:
+        """Reduce the gradients over the processes, and step the optimiser."""
+        warn_if_invisible(out["opacity"], self.global_step)
         require_gradients(self.geometry, losses)
         average_gradients(p for group in optimizer.param_groups for p in group["params"])
         loss_scale = self.loss_scale.value(self.trainer)
@@ -271,8 +283,6 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         if self.global_step % CHECK_EVERY == 0:
             self.require_finite()
         drop_gradients(optimizer)
-        self.control_density(optimizer)
-        self.report(out, batch, guided, losses)
 
     def control_density(self, optimizer: torch.optim.Optimizer) -> None:
         """Densify and prune on schedule; log what a round of ``budget: auto`` found."""
@@ -312,7 +322,9 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         """
         now = self.true_current_epoch, self.true_global_step
         weights = {name: C(weight, *now) for name, weight in self.loss_weights.items()}
-        return weighted_losses(guided, ChainMap(out, self.geometry.drawn()), weights)
+        losses = weighted_losses(guided, ChainMap(out, self.geometry.drawn()), weights)
+        self.recent_losses.add(self.global_step, losses)
+        return losses
 
     def guide(
         self, out: Mapping[str, Any], batch: dict[str, Any], **options: Any

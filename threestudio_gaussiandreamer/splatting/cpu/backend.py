@@ -52,10 +52,6 @@ class CpuKernel(NamedTuple):
 
     def forward(self, scene: Scene, means2d: Tensor) -> tuple[Drawn, tuple[Tensor, ...], None]:
         """Render; the only tensor to save is a handle of the library's state."""
-        drawn, state = self._draw(scene, means2d)
-        return drawn, (state.as_tensor(),), None
-
-    def _draw(self, scene: Scene, means2d: Tensor) -> tuple[Drawn, "_State"]:
         views, gaussians = scene.shape
         new, scale = scene.means.new_empty, self.options.downsample
         size = (views, scene.height // scale, scene.width // scale)
@@ -65,7 +61,7 @@ class CpuKernel(NamedTuple):
         keep = ctypes.byref(handle) if self.tracked else None
         out = _Pictures(*map(address, (*images, means2d, *drawn[3:])))
         _check(self.library.splat_forward(scene.struct(), self._settings(), out, keep))
-        return drawn, _State(self.library, handle)
+        return drawn, (_State(self.library, handle).as_tensor(),), None
 
     def backward(
         self,
@@ -79,7 +75,8 @@ class CpuKernel(NamedTuple):
         """Differentiate; render again if hooks on saved tensors (checkpointing, offloading) have
         replaced the tensor that owns the state.
         """
-        owner = getattr(saved[0], "owner", None) or self._draw(scene, means2d)[1]
+        saved = saved if hasattr(saved[0], "owner") else self.forward(scene, means2d)[1]
+        owner = saved[0].owner
         found = SceneGradients(*map(torch.empty_like, (*scene[:6], means2d)))
         found = found if wants_viewmats else found._replace(viewmats=None)
         absgrad = torch.empty_like(means2d) if self.options.absgrad else None
