@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 from threestudio_gaussiandreamer.farm import worker
 from threestudio_gaussiandreamer.farm.board import Beat, Board
+from threestudio_gaussiandreamer.farm.recipe import Job
 from threestudio_gaussiandreamer.farm.rows import Row
 from threestudio_gaussiandreamer.farm.worker import Heartbeat
 
@@ -30,8 +31,10 @@ def test_reports_are_rare_and_a_run_is_stopped_once(monkeypatch):
     told, stops, steps = [], [], []
     monkeypatch.setattr(worker.signal, "raise_signal", stops.append)
     monkeypatch.setattr(Heartbeat, "report", lambda _, beat: told.append(beat) or len(told) > 2)
-    setting = SimpleNamespace(place=SimpleNamespace(keep_checkpoint=steps.append))
-    beats = Heartbeat(Row("fox", "a fox"), 1, 0, setting)
+    setting = SimpleNamespace(
+        place=SimpleNamespace(keep_checkpoint=lambda *asset: steps.append(asset))
+    )
+    beats = Heartbeat(Job(Row("fox", "a fox")), 1, 0, setting)
     for _ in range(4):
         now.seconds += 0.5
         beats.on_train_batch_end(SimpleNamespace(global_step=3, max_steps=12))

@@ -156,14 +156,6 @@ def test_a_folder_that_is_not_known_is_asked_for(farm, monkeypatch, tmp_path, ro
     assert code == 2 and "there is no farm in" in err
 
 
-def test_the_report_of_an_earlier_farm_would_lack_its_failures(farm, monkeypatch, tmp_path):
-    no_ray(monkeypatch)
-    require_same_farm(Place(tmp_path / "out"), RECIPE)
-    (tmp_path / "out/ledger.jsonl").touch()
-    code, err = farm("a fox", "--out", "out", "--report")
-    assert code == 2 and "give the command once without --report" in err
-
-
 def test_the_code_is_that_of_a_finished_farm_only_if_all_is_finished(farm, monkeypatch):
     monkeypatch.setattr(command, "make_assets", lambda *args: None)
     assert farm("a fox", "--out", "out") == (1, "")

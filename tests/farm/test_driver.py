@@ -1,6 +1,7 @@
 """The driver's decisions, with workers that return at once and a stand-in for Ray."""
 
 import errno
+import json
 from types import SimpleNamespace
 
 import pytest
@@ -172,8 +173,18 @@ def test_an_asset_without_memory_is_tried_with_less(path):
         return none if job.row == ROWS[0] and not job.saves_memory else finished(job)
 
     bench = Bench(path, answers)
+    noted = []
+    write = bench.place.write
+
+    def watched(files):
+        noted.extend(json.loads(content) for content in files.values())
+        write(files)
+
+    bench.place.write = watched
     bench.driver.run()
     assert bench.states() == [FINISHED] * 6 and len(bench.ray.restarted) == 1
+    (failed,) = (record for record in noted if "error" in record)  # for a driver that is killed
+    assert failed["saves_memory"] is True and "low.yaml" in failed["command"]
     tries = [job.saves_memory for job in bench.worker.made if job.row == ROWS[0]]
     assert tries == [False, True]
 

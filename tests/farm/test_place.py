@@ -28,11 +28,10 @@ from threestudio_gaussiandreamer.farm.place import (
     WAITING,
     Place,
     Unreachable,
-    adopt_ledger,
 )
-from threestudio_gaussiandreamer.farm.recipe import Job, Recipe
+from threestudio_gaussiandreamer.farm.recipe import Job, Recipe, Source, job_of, unfinished
 from threestudio_gaussiandreamer.farm.report import write_report
-from threestudio_gaussiandreamer.farm.rows import Row
+from threestudio_gaussiandreamer.farm.rows import Row, read_rows
 from threestudio_gaussiandreamer.farm.worker import Setting, Worker
 
 FOX, CAT, DOG = Row("fox", "a fox"), Row("cat", "a cat", line=2), Row("dog", "a dog")
@@ -109,15 +108,15 @@ def life_of_a_farm(url, elsewhere):
     """Train, lose the machine, go on elsewhere, fail, publish, and read the records."""
     first, second = Place(url), pickle.loads(pickle.dumps(Place(url, scratch=elsewhere)))
     folder = made(first)
-    first.keep_checkpoint(FOX)
+    first.keep_checkpoint(FOX, False)
     assert list(second.records([FOX, CAT])) == [
         (FOX, {"state": RUNNING}),
         (CAT, {"state": WAITING}),
     ]
-    second.fetch_checkpoint(FOX)
+    second.fetch_checkpoint(FOX, False)
     assert (second.work_folder(FOX) / "ckpts/fetched.ckpt").read_text() == "ckpts/last.ckpt"
     other = FOX._replace(prompt="another")
-    second.fetch_checkpoint(other)
+    second.fetch_checkpoint(other, False)
     failure = json.dumps({"key": FOX.key, "state": STOPPED, "worker_seconds": 3.0}).encode()
     first.write({"assets/fox/failed.json": failure})
     assert next(second.records([FOX]))[1]["state"] == STOPPED
@@ -127,7 +126,7 @@ def life_of_a_farm(url, elsewhere):
     files = ("save/it5-export/a.ply", "ckpts/epoch=0-step=5.ckpt", "failed.json")
     found = first.read([f"assets/fox/{name}" for name in files])
     assert found == [b"save/it5-export/a.ply", None, None]
-    assert first.read([module.part_of(FOX)]) == [None]
+    assert first.read([module.part_of(FOX, False)]) == [None]
     write_report(first, [FOX], 1)
     assert b"fox" in first.read(["report/table.csv"])[0]
 
@@ -205,14 +204,14 @@ def checkpoint(place, step):
 def test_the_newer_checkpoint_wins_on_every_machine(memory, tmp_path):
     first, second = (Place(memory, scratch=tmp_path / name) for name in "ab")
     for place, step in ((first, 3), (second, 7)):
-        place.fetch_checkpoint(FOX)
+        place.fetch_checkpoint(FOX, False)
         checkpoint(place, step)
-        place.keep_checkpoint(FOX)
-    first.fetch_checkpoint(FOX)
+        place.keep_checkpoint(FOX, False)
+    first.fetch_checkpoint(FOX, False)
     assert newest_readable(first.work_folder(FOX) / "ckpts")[1] == 7
-    first.keep_checkpoint(FOX)  # its own file is older than the one that it goes on from
+    first.keep_checkpoint(FOX, False)  # its own file is older than the one that it goes on from
     third = Place(memory, scratch=tmp_path / "c")
-    third.fetch_checkpoint(FOX)
+    third.fetch_checkpoint(FOX, False)
     assert newest_readable(third.work_folder(FOX) / "ckpts")[1] == 7
 
 
@@ -228,7 +227,7 @@ def test_what_a_stopped_worker_has_saved_is_there_for_others(memory, tmp_path, m
     setting = Setting(Recipe((), (), True, 1), place, None, ".", "now", 1)
     assert Worker().make(Job(FOX), 0, setting)["state"] == worker.STOPPED
     other = Place(memory, scratch=tmp_path / "other")
-    other.fetch_checkpoint(FOX)
+    other.fetch_checkpoint(FOX, False)
     assert newest_readable(other.work_folder(FOX) / "ckpts")[1] == 4278
 
 
@@ -283,50 +282,6 @@ def test_many_records_are_read_in_the_order_of_the_rows(tmp_path, monkeypatch):
     assert found == [(i, None if i % 2 else i) for i in range(7)]
 
 
-LEDGER = [
-    {"name": "fox", "key": FOX.key, "state": RUNNING},
-    {"name": "fox", "key": FOX.key, "state": RUNNING, "worker_seconds": 2.0},
-    {"name": "cat", "key": CAT.key, "state": FAILED, "error": "none", "all_worker_seconds": 9.0},
-    {"name": "fox", "key": FOX.key, "state": FINISHED, "worker_seconds": 3.0, **RESULT},
-    {"name": "dog", "key": DOG.key, "state": FINISHED, "files": []},
-    {"name": "dog", "key": DOG.key, "state": RUNNING, "worker_seconds": 1.0},
-]
-
-
-@pytest.mark.parametrize("url", [None, "memory://farm"])
-def test_a_farm_of_an_earlier_version_goes_on(tmp_path, memory, url):
-    place = Place(url or tmp_path)
-    parts = [json.dumps(line).encode() + b"\n" for line in LEDGER] + [b'{"name": "fox", "ke']
-    if url:
-        place.write({f"ledger/{i}.jsonl": part for i, part in enumerate(parts)})
-        place.write({"parts/dog/last.ckpt": b"step 5"})
-    else:
-        place.write({"ledger.jsonl": b"".join(parts)})
-    for _ in range(2):
-        adopt_ledger(place)
-        records = dict(place.records([FOX, CAT, DOG]))
-        assert [record["state"] for record in records.values()] == [FINISHED, FAILED, STOPPED]
-        assert [record["worker_seconds"] for record in records.values()] == [5.0, 9.0, 1.0]
-        assert records[FOX]["hash"] == "ab" and records[CAT]["error"] == "none"
-        assert place.read(["ledger.jsonl", "ledger/0.jsonl"]) == [None, None]
-        assert place.read(["ledger-adopted.jsonl"]) == [b"".join(parts)]
-    if url:
-        place.fetch_checkpoint(DOG)
-        assert (place.work_folder(DOG) / module.FETCHED).read_bytes() == b"step 5"
-
-
-def test_an_adoption_that_was_killed_while_it_removed_the_parts_is_not_repeated(memory):
-    place, lines = Place(memory), [json.dumps(line).encode() + b"\n" for line in LEDGER]
-    place.write({f"ledger/{i}.jsonl": line for i, line in enumerate(lines)})
-    adopt_ledger(place)
-    place.write({"ledger/5.jsonl": lines[5], "ledger/2.jsonl": lines[1]})
-    adopt_ledger(place)
-    records = dict(place.records([FOX, CAT, DOG]))
-    assert [record["worker_seconds"] for record in records.values()] == [5.0, 9.0, 1.0]
-    assert place.read(["ledger-adopted.jsonl"]) == [b"".join(lines)]
-    assert not module.ledgers(place)
-
-
 def test_a_server_that_refuses_the_connection_is_one_message(monkeypatch):
     fsspec = pytest.importorskip("fsspec")
 
@@ -353,3 +308,42 @@ def test_a_folder_is_a_place_too(tmp_path):
     assert (tmp_path / "assets/fox/ckpts/last.ckpt").exists()
     place.discard(FOX)
     assert place.finished(FOX) is None
+
+
+def test_the_low_memory_configuration_goes_on_on_any_machine(memory, tmp_path, monkeypatch):
+    """Of an asset that one machine begins with it, others resume that checkpoint and no other."""
+    seen = []
+
+    def stopped(self, job, folder, attempt):
+        place = self.setting.place
+        seen.append((job.saves_memory, (newest_readable(folder / "ckpts") or [0, None])[1]))
+        checkpoint(place, 90 - 80 * job.saves_memory + len(seen))
+        return None, 128 + signal.SIGTERM
+
+    monkeypatch.setattr(worker.Worker, "_run", stopped)
+    monkeypatch.setattr(worker, "keep_loaded", lambda: None)
+    monkeypatch.chdir(tmp_path)
+    recipe = Recipe((), (), True, 1, Source("low.yaml", b""))
+    normal, low = Job(FOX), Job(FOX, saves_memory=True)
+    for machine, job in (("a", normal), ("b", low), ("a", low), ("c", low)):
+        place = Place(memory, scratch=tmp_path / machine)
+        outcome = worker.Worker().make(job, 0, Setting(recipe, place, None, ".", "now", 9))
+        assert outcome["state"] == worker.STOPPED
+    assert seen == [(False, None), (True, None), (True, 12), (True, 13)]
+
+
+def test_unfinished_assets_are_handed_out_with_what_their_records_say(tmp_path):
+    place, path = Place(tmp_path), tmp_path / "prompts.jsonl"
+    (tmp_path / "row.yaml").write_text("x: 1")
+    rows = [{"prompt": row.prompt, "name": row.name} for row in (FOX, CAT, DOG)]
+    rows[2]["config"] = str(tmp_path / "row.yaml")
+    path.write_text("\n".join(map(json.dumps, rows)))
+    note(place, FOX, "result.json")
+    note(place, CAT, "failed.json", state=STOPPED, saves_memory=True, worker_seconds=3.0)
+    list(map(job_of, read_rows(path)))  # as the check before any work does
+    (tmp_path / "row.yaml").write_text("x: 2")
+    finished, jobs = unfinished(place, path, 3)
+    assert finished == 1
+    cat, dog = jobs
+    assert (cat.row.name, cat.saves_memory, cat.spent) == ("cat", True, 3.0)
+    assert [source.content for source in dog.sources] == [b"x: 1"]

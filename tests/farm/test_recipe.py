@@ -7,10 +7,12 @@ from threestudio_gaussiandreamer.farm import recipe
 from threestudio_gaussiandreamer.farm.recipe import Job, Recipe, Source
 from threestudio_gaussiandreamer.farm.rows import Row
 from threestudio_gaussiandreamer.farm.worker import digest
-from threestudio_gaussiandreamer.launch.options import parse_arguments
+from threestudio_gaussiandreamer.launch.config import load_config
+from threestudio_gaussiandreamer.launch.config_check import check_config
+from threestudio_gaussiandreamer.launch.options import find_config, parse_arguments
 
 RECIPE = Recipe((Source("a.yaml", b""),), ("x=1",), cpu=True, cores=2)
-JOB = Job(Row("fox", "a fox's tail", 7, ("demo.yaml",), ("y=2",)))
+JOB = Job(Row("fox", "a fox's tail", 7, ("demo.yaml",), ("y=2",)), (Source("demo.yaml", b""),))
 
 
 def test_a_row_comes_after_the_farm_and_the_prompt_last():
@@ -47,3 +49,14 @@ def test_the_digest_is_of_names_and_contents(tmp_path):
     (folder / "report.json").write_text("seconds")
     (folder / "pruned").mkdir()
     assert len(digests) == 3 and digest(tmp_path) in digests
+
+
+def test_the_command_that_repeats_an_asset_of_a_farm_on_s3_can_be_run(tmp_path):
+    (tmp_path / "s3.yaml").write_text("exp_root_dir: s3://bucket/runs")
+    sources = tuple(map(recipe.read_config, ("demo.yaml", str(tmp_path / "s3.yaml"))))
+    farm = RECIPE._replace(sources=sources, overrides=())
+    words = shlex.split(recipe.repeat_command(farm, Job(Row("fox", "a fox"))))
+    args = parse_arguments(words[words.index("--config") :])
+    cfg = load_config(*map(find_config, args.config), cli_args=args.overrides)
+    check_config(cfg)
+    assert cfg.exp_root_dir == "outputs"

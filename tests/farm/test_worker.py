@@ -109,19 +109,6 @@ def test_what_was_made_with_much_memory_is_not_gone_on_with(place, monkeypatch):
         (folder / "ckpts").mkdir(exist_ok=True)
 
 
-def test_a_later_session_goes_on_with_the_low_memory_configuration(place, monkeypatch):
-    tries = []
-
-    def fails(self, job, folder, attempt):
-        tries.append(job.saves_memory)
-        raise ValueError("killed")
-
-    monkeypatch.setattr(Worker, "_run", fails)
-    Worker().make(JOB._replace(saves_memory=True), 0, setting(place))
-    Worker().make(JOB, 0, setting(place))
-    assert tries == [True, True]
-
-
 def test_a_folder_that_a_dying_process_still_holds_is_waited_for(place, monkeypatch):
     monkeypatch.setattr(worker.time, "sleep", lambda seconds: None)
     monkeypatch.setattr(worker.Heartbeat, "report", lambda self, beat: False)

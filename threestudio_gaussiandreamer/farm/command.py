@@ -12,8 +12,6 @@ from datetime import datetime
 from pathlib import Path
 from typing import Optional
 
-from tqdm import tqdm
-
 from ..core.command import run_command
 from ..core.errors import UserError
 from ..core.launcher import train_alone
@@ -23,8 +21,8 @@ from ..launch.folder_lock import claim, require_writable
 from ..launch.options import add_config, parse_with_overrides
 from . import driver
 from .board import Board
-from .place import CHANGED, FAILED, FINISHED, AnotherRow, Place, adopt_ledger, ledgers
-from .recipe import FARM, Job, Recipe, check_recipe, read_config, require_same_farm, root_of
+from .place import FAILED, FINISHED, Place
+from .recipe import FARM, Recipe, check_recipe, read_config, require_same_farm, root_of, unfinished
 from .report import write_report
 from .rows import check_rows, read_rows
 from .worker import Setting
@@ -105,14 +103,11 @@ def run_farm(args: argparse.Namespace) -> int:
         require_same_farm(place, recipe, before_ray=True)
         lock = claim(place.folder, "another farm command is at work", ", or choose another --out")
         try:
-            adopt_ledger(place)
             make_assets(args, place, recipe, total)
         finally:
             lock.release()
     elif place.read_json(FARM) == [None]:
         raise UserError(f"there is no farm in {place}: it has no {FARM}; check --out")
-    elif ledgers(place):
-        raise UserError(f"{place} is of an earlier version: give the command once without --report")
     path, states = write_report(place, read_rows(args.prompts), total, args.price)
     where = place if place.remote else path
     print(f"{states[FINISHED]} finished, {states[FAILED]} failed; report: {where}")
@@ -121,29 +116,17 @@ def run_farm(args: argparse.Namespace) -> int:
 
 def make_assets(args: argparse.Namespace, place: Place, recipe: Recipe, total: int) -> None:
     """Start Ray and the workers, and make all assets that are left."""
-    finished: set[int] = set()
-    spent: dict[int, float] = {}
-    rows = place.records(read_rows(args.prompts))
-    for row, record in tqdm(rows, "records", total, unit="asset", disable=None, delay=1):
-        if record["state"] == FINISHED:
-            finished.add(row.line)
-        elif record["state"] == CHANGED:
-            raise AnotherRow(row)
-        elif "worker_seconds" in record:
-            spent[row.line] = record["worker_seconds"]
-    left = total - len(finished)
-    if not left:
+    finished, jobs = unfinished(place, args.prompts, total)
+    if finished == total:
         return
-    rows = (row for row in read_rows(args.prompts) if row.line not in finished)
-    jobs = (Job(row, spent=spent.get(row.line, 0.0)) for row in rows)
     ray = driver.connect(args.address)
     try:
         there = ray.cluster_resources()
         count, gpus = driver.plan_workers(there, args.gpus, args.cores, args.workers)
-        count, recipe = min(count, left), recipe._replace(cpu=not gpus)
+        count, recipe = min(count, total - finished), recipe._replace(cpu=not gpus)
         require_same_farm(place, recipe)
         print(
-            f"{total} assets, {len(finished)} finished; {count} workers with "
+            f"{total} assets, {finished} finished; {count} workers with "
             f"{'1 GPU' if gpus else f'{args.cores} cores'} each; results in {place}",
             flush=True,
         )
@@ -151,6 +134,6 @@ def make_assets(args: argparse.Namespace, place: Place, recipe: Recipe, total: i
         session = datetime.now().isoformat()
         setting = Setting(recipe, place, board, os.getcwd(), session, args.retries)
         workers = driver.start_workers(ray, count, gpus, args.cores)
-        driver.Driver(ray, workers, setting, jobs, args.time_limit, total, len(finished)).run()
+        driver.Driver(ray, workers, setting, jobs, args.time_limit, total, finished).run()
     finally:
         ray.shutdown()  # which ends the workers

@@ -224,16 +224,19 @@ class Driver:
             self.note(job, FINISHED, f"{outcome.get('seconds', 0):.1f} s")
             return
         job, error = job._replace(spent=job.worker_seconds(time.time())), outcome["error"]
-        again = state == NO_MEMORY and self.setting.recipe.low_memory and not job.saves_memory
+        saving = bool(self.setting.recipe.low_memory)
+        again = state == NO_MEMORY and saving and not job.saves_memory
         if state in (FAILED, REFUSED) or state == NO_MEMORY and not again:
             if state != REFUSED:  # else the record is the other row's
                 self.record(job, FAILED, error)
             self.fail(job, error)
             return
+        # noted too, so that after any stop every machine makes it so
+        job = job._replace(saves_memory=job.saves_memory or again)
         self.record(job, STOPPED, error)
         if again:
             self.note(job, "again with less memory", error)
-            self.again.append(job._replace(saves_memory=True))
+            self.again.append(job)
             self.ray.kill(self.workers[number], no_restart=False)
         elif state == BLOCKED:
             self.block(error)
@@ -251,7 +254,8 @@ class Driver:
     def record(self, job: Job, state: str, error: str) -> None:
         """Write the record of an attempt that ended without a result."""
         record = {"state": state, "key": job.row.key, "error": error}
-        record |= {"command": repeat_command(self.setting.recipe, job), "worker_seconds": job.spent}
+        record |= {"command": repeat_command(self.setting.recipe, job)}
+        record |= {"worker_seconds": job.spent, "saves_memory": job.saves_memory}
         content = json_text(record, indent=1).encode()
         try:
             self.setting.place.write({f"{ASSETS}/{job.row.name}/{FAILURE}": content})

@@ -13,7 +13,6 @@ import hashlib
 import json
 import os
 import shutil
-from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import islice
 from pathlib import Path
@@ -35,7 +34,6 @@ failed; complete; its record is of another row."""
 LAST, FETCHED = "ckpts/last.ckpt", "ckpts/fetched.ckpt"
 NOT_UPLOADED = ("ckpts/epoch=*", "ckpts/*-prev.ckpt", FETCHED, "ckpts/.*", "ckpts-*/*", "tb_logs/*")
 NOT_UPLOADED += (RESULT,)  # comes last
-ADOPTED = "ledger-adopted.jsonl"
 NUMBERS = ("seconds", "worker_seconds", "megabytes", "steps", "gaussians", "bytes", "attempts")
 """Entries of a record that are numbers, if it has them."""
 BATCH = 1000
@@ -179,29 +177,28 @@ class Place:
         return {"state": FINISHED, **record} if ours else None
 
     def discard(self, row: Row) -> None:
-        """Remove an asset that isn't finished."""
+        """Remove what this machine has of an asset that isn't finished."""
         shutil.rmtree(self.work_folder(row), ignore_errors=True)
-        if self.remote:
-            self.remove([part_of(row)])
 
-    def fetch_checkpoint(self, row: Row) -> None:
-        """Bring the last checkpoint beside what this machine has of the asset, of which
-        ``resume=auto`` takes the one with the highest step.
+    def fetch_checkpoint(self, row: Row, saves_memory: bool) -> None:
+        """Bring the last checkpoint that was made with the low-memory configuration, or without it,
+        beside what this machine has of the asset; ``resume=auto`` takes the one with the highest
+        step.
         """
         if self.remote:
             folder = self.work_folder(row)
             self.uploaded = {row.name: _written(folder / LAST)}  # may be older than the other
-            (content,) = self.read([part_of(row)])
+            (content,) = self.read([part_of(row, saves_memory)])
             if content is not None:
                 (folder / FETCHED).parent.mkdir(parents=True, exist_ok=True)
                 (folder / FETCHED).write_bytes(content)
 
-    def keep_checkpoint(self, row: Row) -> None:
+    def keep_checkpoint(self, row: Row, saves_memory: bool) -> None:
         """Make the work folder's last checkpoint available to other workers."""
         path = self.work_folder(row) / LAST
         if self.remote and _written(path) > self.uploaded.get(row.name, 0.0):
             written = _written(path)
-            self.upload(part_of(row), path)
+            self.upload(part_of(row, saves_memory), path)
             self.uploaded = {row.name: written}
 
     def publish(self, row: Row, result: Mapping[str, Any]) -> None:
@@ -215,6 +212,7 @@ class Place:
         self.remove([f"{name}/{FAILURE}"])
         if self.remote:
             self.discard(row)
+            self.remove(part_of(row, saves_memory) for saves_memory in (False, True))
 
     def records(self, rows: Iterable[Row]) -> Iterator[tuple[Row, dict[str, Any]]]:
         """Yield each row with the record of its asset: the content of ``result.json``, else of
@@ -242,9 +240,11 @@ def has_files(result: Mapping[str, Any]) -> bool:
     return "files" not in result or any(map(result.get, ("files", "picture", "page")))
 
 
-def part_of(row: Row) -> str:
-    """Return where the last checkpoint of an unfinished asset is; that of another row isn't."""
-    return f"{PARTS}/{row.name}/{row.key}.ckpt"
+def part_of(row: Row, saves_memory: bool) -> str:
+    """Return where the last checkpoint of an unfinished asset is; that of another row, or of the
+    other configuration, isn't.
+    """
+    return f"{PARTS}/{row.name}/{row.key}{'-saves_memory' * saves_memory}.ckpt"
 
 
 def uploads(folder: Path) -> Iterator[tuple[str, Path]]:
@@ -266,41 +266,3 @@ def _content(path: Path) -> Optional[bytes]:
 def _written(path: Path) -> float:
     """Return when a file was written; 0 without one."""
     return path.stat().st_mtime if path.exists() else 0.0
-
-
-def ledgers(place: Place) -> list[str]:
-    """List the files with the records of a farm of an earlier version."""
-    found = [f"ledger/{name}" for name in sorted(place.names("ledger"))]
-    return found or sorted({"ledger.jsonl"} & place.names(""))
-
-
-def adopt_ledger(place: Place) -> None:
-    """Write the records of a farm of an earlier version, which had them in ``ledger.jsonl``, or in
-    parts of it. An asset had a line whenever it started, finished or failed: the last one counts,
-    but seconds are added up. The ledger is kept under another name.
-    """
-    names = ledgers(place)
-    if not names or ADOPTED in place.names(""):  # killed while it removed the parts
-        place.remove(names)
-        return
-    content = b"".join(filter(None, place.read(names)))
-    spent: Counter = Counter()
-    last: dict[str, dict[str, Any]] = {}
-    for text in content.splitlines():
-        with contextlib.suppress(ValueError, TypeError, KeyError):  # half a line of a killed driver
-            line = json.loads(text)
-            name, made = line["name"], line["state"] == FINISHED and has_files(line)
-            more = line.pop("all_worker_seconds", spent[name] + line.get("worker_seconds", 0.0))
-            spent[name] = more = round(more, 3)
-            state = line["state"] if made or line["state"] == FAILED else STOPPED
-            last[name] = {**line, "key": line["key"], "state": state, "worker_seconds": more}
-    lines = iter(last.items())
-    while batch := list(islice(lines, BATCH)):
-        files = {n: RESULT if line["state"] == FINISHED else FAILURE for n, line in batch}
-        place.write({f"{ASSETS}/{n}/{files[n]}": json_text(line).encode() for n, line in batch})
-    for name in place.names(PARTS) & last.keys():
-        part = f"{place}/{PARTS}/{name}"
-        with contextlib.suppress(FileNotFoundError), place.reached(may_lack=True):
-            place.system.mv(f"{part}/last.ckpt", f"{part}/{last[name]['key']}.ckpt")
-    place.write({ADOPTED: content})
-    place.remove(names)

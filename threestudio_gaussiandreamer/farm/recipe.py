@@ -5,13 +5,14 @@ another."""
 import hashlib
 import json
 import shlex
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple, Optional
 
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
+from tqdm import tqdm
 
 from .. import __version__
 from ..core.errors import UserError
@@ -20,8 +21,8 @@ from ..launch.config_source import read_yaml
 from ..launch.experiment import read_source
 from ..launch.options import find_config
 from ..launch.run_folder import program_anywhere
-from .place import ASSETS, Place
-from .rows import Row
+from .place import ASSETS, CHANGED, FINISHED, AnotherRow, Place
+from .rows import Row, read_rows
 
 FARM = "farm.json"
 OF_MACHINES = ("device", "cores")
@@ -30,6 +31,8 @@ LOW_MEMORY = "gaussiandreamer-lowmem.yaml"
 MOST_CHECKS = 500
 """Rows of one list may have different overrides; so many are checked before any work, and further
 ones when it is their turn."""
+HERE = "exp_root_dir=outputs"
+"""Of a single run; the farm's may be a URL, which the launcher refuses."""
 MANAGED = {
     **dict.fromkeys(("exp_root_dir", "name"), "--out"),
     "tag": "the column name",
@@ -64,6 +67,8 @@ class Job(NamedTuple):
     """One attempt to make the asset of a row."""
 
     row: Row
+    sources: tuple[Source, ...] = ()
+    """The YAML files of the row."""
     saves_memory: bool = False
     """Whether the low-memory configuration is laid over the others."""
     spent: float = 0.0
@@ -78,9 +83,14 @@ class Job(NamedTuple):
 
 @cache
 def read_config(name: str) -> Source:
-    """Read a YAML file by its path, or by its name as the launcher does."""
+    """Read a YAML file by its path, or by its name as the launcher does; once in a process."""
     path = find_config(name)
     return Source(str(path), read_source(path))
+
+
+def job_of(row: Row, spent: float = 0.0, saves_memory: bool = False) -> Job:
+    """Return the job of a row, with its YAML files."""
+    return Job(row, tuple(map(read_config, row.config)), saves_memory, spent)
 
 
 def root_of(configs: Iterable[str]) -> str:
@@ -126,14 +136,13 @@ def require_unmanaged(recipe: Recipe, row: Row) -> None:
 def all_sources(recipe: Recipe, job: Job) -> list[Source]:
     """Return the YAML files of an asset, later ones taking precedence."""
     extra = [recipe.low_memory] if job.saves_memory and recipe.low_memory else []
-    return [*recipe.sources, *map(read_config, job.row.config), *extra]
+    return [*recipe.sources, *job.sources, *extra]
 
 
 def repeat_command(recipe: Recipe, job: Job) -> str:
     """Return the command that makes an asset by itself, in ``outputs/``."""
-    names = [*(source.name for source in recipe.sources), *job.row.config]
-    names += [recipe.low_memory.name] if job.saves_memory and recipe.low_memory else []
-    command = shlex.join([*program_anywhere(), *_arguments(recipe, job, names)])
+    arguments = _arguments(recipe, job, [source.name for source in all_sources(recipe, job)])
+    command = shlex.join([*program_anywhere(), *arguments, HERE])
     return f"OMP_NUM_THREADS={recipe.cores} {command}"
 
 
@@ -150,21 +159,22 @@ def check_recipe(recipe: Recipe, rows: Iterable[Row]) -> Recipe:
 
     register_parts()
     load_extensions()
-    checked: dict[tuple, Row] = {}
+    checked: dict[tuple, Job] = {}
     for row in rows:
         kind = row.config, row.overrides
         try:
             require_unmanaged(recipe, row)
+            job = job_of(row)
             if kind not in checked and len(checked) < MOST_CHECKS:
-                checked[kind] = row
-                check_job(recipe, Job(row))
+                checked[kind] = job
+                check_job(recipe, job)
         except UserError as error:
             if any(kind):
                 raise UserError(f"line {row.line} of the prompt list: {error}") from error
             raise
     try:
         saving = recipe._replace(low_memory=read_config(LOW_MEMORY))
-        check_job(saving, Job(next(iter(checked.values())), saves_memory=True))
+        check_job(saving, next(iter(checked.values()))._replace(saves_memory=True))
     except UserError:
         return recipe
     return saving
@@ -176,9 +186,27 @@ def check_job(recipe: Recipe, job: Job) -> None:
     from ..launch.config_check import check_config
 
     paths = [Path(source.name) for source in all_sources(recipe, job)]
-    # the farm's own exp_root_dir may be a URL, which a single run refuses
-    overrides = [*run_overrides(recipe, job), "exp_root_dir=outputs"]
-    check_config(load_config(*paths, cli_args=overrides))
+    check_config(load_config(*paths, cli_args=[*run_overrides(recipe, job), HERE]))
+
+
+def unfinished(place: Place, prompts: Path, total: int) -> tuple[int, Iterator[Job]]:
+    """Return the number of finished assets of a prompt list with ``total`` rows, and the others.
+
+    Raises:
+        AnotherRow: the record of an asset is of another row.
+    """
+    finished: set[int] = set()
+    begun: dict[int, tuple[float, bool]] = {}
+    rows = place.records(read_rows(prompts))
+    for row, record in tqdm(rows, "records", total, unit="asset", disable=None, delay=1):
+        if record["state"] == FINISHED:
+            finished.add(row.line)
+        elif record["state"] == CHANGED:
+            raise AnotherRow(row)
+        elif "worker_seconds" in record:
+            begun[row.line] = record["worker_seconds"], record.get("saves_memory", False)
+    rest = (row for row in read_rows(prompts) if row.line not in finished)
+    return len(finished), (job_of(row, *begun.get(row.line, (0.0, False))) for row in rest)
 
 
 def require_same_farm(place: Place, recipe: Recipe, *, before_ray: bool = False) -> None:

@@ -27,7 +27,6 @@ from ..models.loaded import keep_loaded, load_counts
 from .board import Beat
 from .place import FAILED, FINISHED, STOPPED, AnotherRow, Place, Unreachable, has_files
 from .recipe import Job, Recipe, all_sources, launch_arguments
-from .rows import Row
 
 BLOCKED, NO_MEMORY, REFUSED = "blocked", "no memory", "refused"
 """Outcomes beside the states of an asset: the results can't be written; out of memory; what there
@@ -118,10 +117,7 @@ class Worker:
     def _make(self, job: Job) -> dict[str, Any]:
         place = self.setting.place
         folder = place.work_folder(job.row)
-        if (folder / SAVES_MEMORY).is_file():
-            # an earlier session chose it, and this one resumes its checkpoint
-            job = job._replace(saves_memory=True)
-        elif job.saves_memory:
+        if job.saves_memory != (folder / SAVES_MEMORY).is_file():
             place.discard(job.row)  # what was made with the other configuration
         folder.mkdir(parents=True, exist_ok=True)
         if job.saves_memory:
@@ -131,13 +127,13 @@ class Worker:
             times = session_attempt - 1
             error = f"its worker died or hung {times} times, as if the memory didn't suffice"
             return {"state": NO_MEMORY, "error": error}
-        place.fetch_checkpoint(job.row)
+        place.fetch_checkpoint(job.row, job.saves_memory)
         began = time.monotonic()
         reset_peak_memory()
         with written_log(folder / "log.txt"):
             run, code = self._run(job, folder, attempt)
         if code:
-            place.keep_checkpoint(job.row)
+            place.keep_checkpoint(job.row, job.saves_memory)
             return {"state": STOPPED, "error": f"stopped by signal {code - 128}"}
         seconds = round(time.monotonic() - began, 3)
         result = {"state": FINISHED, **result_of(job, folder, run), "seconds": seconds}
@@ -153,7 +149,7 @@ class Worker:
         from ..launch.folder_lock import FolderInUse
         from ..launch.options import parse_arguments
 
-        heartbeat = Heartbeat(job.row, attempt, self.number, self.setting)
+        heartbeat = Heartbeat(job, attempt, self.number, self.setting)
         deadline = time.monotonic() + SECONDS_FOR_LOCK
         with tempfile.TemporaryDirectory() as temporary:
             names = []
@@ -206,13 +202,13 @@ class Heartbeat(pl.Callback):
     """Report the steps of a run, at most one a second, and stop it as SIGTERM does, with a
     checkpoint, when the farm is stopping."""
 
-    def __init__(self, row: Row, attempt: int, number: int, setting: Setting) -> None:
-        self.row, self.attempt, self.number, self.setting = row, attempt, number, setting
+    def __init__(self, job: Job, attempt: int, number: int, setting: Setting) -> None:
+        self.job, self.attempt, self.number, self.setting = job, attempt, number, setting
         self.due, self.asked = 0.0, False
         self.beat("starting", 0)
 
     def on_train_batch_end(self, trainer: Any, *args: Any) -> None:
-        self.setting.place.keep_checkpoint(self.row)
+        self.setting.place.keep_checkpoint(self.job.row, self.job.saves_memory)
         stopping = self.beat("training", trainer.global_step, max(trainer.max_steps, 0))
         if stopping and not self.asked:
             self.asked = True
@@ -231,7 +227,7 @@ class Heartbeat(pl.Callback):
     def beat(self, stage: str, step: int, steps: int = 0) -> bool:
         if time.monotonic() < self.due:
             return False
-        stopping = self.report(Beat(self.row.name, self.attempt, stage, step, steps))
+        stopping = self.report(Beat(self.job.row.name, self.attempt, stage, step, steps))
         self.due = time.monotonic() + SECONDS_BETWEEN
         return stopping
 
