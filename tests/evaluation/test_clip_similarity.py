@@ -208,16 +208,18 @@ def test_the_background_is_the_learned_one_or_named(tmp_path, capsys, kind, opti
     assert results.find_result(str(tmp_path)).background == color
 
 
-def test_a_prompt_of_a_library_is_compared_as_its_text(tmp_path):
+def test_a_prompt_of_a_library_is_compared_as_its_text(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     save(tmp_path / "save" / "it1-export" / "gaussians.ply", blob())
-    (tmp_path / "library.json").write_text('["a corgi in the snow", "a fox"]')
+    library = tmp_path / "load" / "prompt_library.json"
+    library.parent.mkdir()
+    library.write_text('["a corgi in the snow", "a fox"]')
     (tmp_path / "configs").mkdir()
-    processor = {"prompt": "lib:corgi", "prompt_library": str(tmp_path / "library.json")}
     (tmp_path / "configs" / "parsed.yaml").write_text(
-        json.dumps({"system": {"prompt_processor": processor}})
+        json.dumps({"system": {"prompt_processor": {"prompt": "lib:corgi"}}})
     )
     assert results.find_result(str(tmp_path)).prompt == "a corgi in the snow"
-    (tmp_path / "library.json").unlink()
+    library.unlink()
     with pytest.raises(UserError, match="Give --prompt"):
         module.prompts_for([results.find_result(str(tmp_path))], None, None)
 

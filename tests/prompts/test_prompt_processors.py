@@ -1,112 +1,146 @@
-"""Prompts with text encoders: agreement with diffusers' pipelines, the cache, directions, Perp-Neg,
-the library.
-"""
+"""Prompts with text encoders: agreement with diffusers' pipelines, the cache, the library."""
 
 import gc
 import json
 import os
+import shutil
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 import torch
 
 from tests.helpers import tiny_models
-from tests.prompts.prompt_processors_cases import processor
+from tests.prompts.conftest import processed
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.host import NAME, find
 from threestudio_gaussiandreamer.models import model_files, text_encoders
 from threestudio_gaussiandreamer.models.embedding_cache import EmbeddingCache
-from threestudio_gaussiandreamer.prompts import prompt_processors
+from threestudio_gaussiandreamer.models.text_encoders import T5_LENGTH, pack, unpack
+from threestudio_gaussiandreamer.prompts.known_words import WORDS_FILE
+from threestudio_gaussiandreamer.prompts.prompt_processors import StableDiffusionPromptProcessor
 
-pytest.importorskip("diffusers")
-
-
+diffusers = pytest.importorskip("diffusers")
 KINDS = ("stable-diffusion", "deep-floyd")
+CACHE = Path(".threestudio_cache/text_embeddings")
+pytestmark = pytest.mark.usefixtures("fox")
 
 
-@pytest.fixture(autouse=True)
-def in_an_empty_folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    # with transformers imported a collection takes a third of a second
-    monkeypatch.setattr(model_files, "gc", SimpleNamespace(collect=lambda: 0))
+def assert_same(mine, tokens, pooled=None):
+    found = (mine,) if pooled is None else unpack(mine, pooled.shape[-1])
+    for value, expected in zip(found, (tokens, pooled), strict=False):
+        # the same network on another batch size: rounding only
+        torch.testing.assert_close(value, expected, rtol=1e-5, atol=1e-5)
 
 
-@pytest.fixture
-def no_encoder(monkeypatch):
-    """Make running a text encoder a failure from here on."""
-    for name in ("CLIPTextModel", "T5EncoderModel"):
-        monkeypatch.setattr(
-            f"transformers.{name}.from_pretrained",
-            lambda *args, **kwargs: pytest.fail("loaded the text encoder"),
-        )
+def changed(model, folder, **settings):
+    """Return a copy of a model with other settings of its tokenizer."""
+    copy = Path(shutil.copytree(model, folder))
+    file = copy / "tokenizer" / "tokenizer_config.json"
+    known = json.loads(file.read_text()) | settings
+    file.write_text(json.dumps({k: value for k, value in known.items() if value is not None}))
+    return copy
 
 
 # What the encoders give
 # --------------------------------------------------------------------------------------------------
 
 
-def test_the_embeddings_are_those_of_diffusers_stable_diffusion(models):
-    from diffusers import StableDiffusionPipeline
-
-    out = processor(models)()
-    pipe = StableDiffusionPipeline.from_pretrained(
-        models["stable-diffusion"], local_files_only=True
-    )
+def test_the_embeddings_are_those_of_diffusers_stable_diffusion(models, fox):
+    folder, out = models["stable-diffusion"], fox()
+    pipe = diffusers.StableDiffusionPipeline.from_pretrained(folder, local_files_only=True)
     cond, uncond = pipe.encode_prompt("a fox", "cpu", 1, True, negative_prompt="ugly")
-    # the same network on another batch size: rounding only
-    torch.testing.assert_close(out.text_embeddings, cond, rtol=1e-5, atol=1e-6)
-    torch.testing.assert_close(out.uncond_text_embeddings, uncond, rtol=1e-5, atol=1e-6)
+    assert_same(out.text_embeddings, cond)
+    assert_same(out.uncond_text_embeddings, uncond)
 
 
 def test_the_embeddings_are_those_of_diffusers_deep_floyd(models):
-    from diffusers import IFPipeline
-
-    out = processor(models, "deep-floyd", prompt=" a Fox")()
-    pipe = IFPipeline.from_pretrained(models["deep-floyd"], local_files_only=True, watermarker=None)
+    folder = models["deep-floyd"]
+    out = processed(folder, "deep-floyd", prompt=" a Fox")
+    pipe = diffusers.IFPipeline.from_pretrained(folder, local_files_only=True, watermarker=None)
     cond, uncond = pipe.encode_prompt(" a Fox", device="cpu", negative_prompt="ugly")
-    torch.testing.assert_close(out.text_embeddings, cond, rtol=1e-5, atol=1e-6)
-    torch.testing.assert_close(out.uncond_text_embeddings, uncond, rtol=1e-5, atol=1e-6)
+    assert_same(out.text_embeddings, cond)
+    assert_same(out.uncond_text_embeddings, uncond)
 
 
-def test_stable_diffusion_2_is_padded_as_it_was_trained(models):
+def test_the_embeddings_are_those_of_diffusers_stable_diffusion_xl(models, tmp_path):
+    folder, kind = models["stable-diffusion-xl"], "stable-diffusion-xl"
+    pipe = diffusers.StableDiffusionXLPipeline.from_pretrained(folder, local_files_only=True)
+    for negative in ("ugly", ""):
+        out = processed(folder, kind, negative_prompt=negative)
+        # None is diffusers' way to have no negative prompt
+        cond, uncond, pooled, pooled_uncond = pipe.encode_prompt(
+            "a fox", device="cpu", negative_prompt=negative or None
+        )
+        assert_same(out.text_embeddings, cond, pooled)
+        assert_same(out.uncond_text_embeddings, uncond, pooled_uncond)
+        assert bool(out.uncond_text_embeddings.any()) == bool(negative)
+    # a model that was trained with an empty prompt gets one, though the cache is the same
+    other = Path(shutil.copytree(folder, tmp_path / "other"))
+    index = json.loads((other / "model_index.json").read_text())
+    index["force_zeros_for_empty_prompt"] = False
+    (other / "model_index.json").write_text(json.dumps(index))
+    assert processed(other, kind, negative_prompt="").uncond_text_embeddings.any()
+    assert not processed(folder, kind, negative_prompt="").uncond_text_embeddings.any()
+
+
+@pytest.mark.parametrize("use_t5", [True, False])
+def test_the_embeddings_are_those_of_diffusers_stable_diffusion_3(models, use_t5, tmp_path):
+    folder, kind = models["stable-diffusion-3"], "stable-diffusion-3"
+    out = processed(folder, kind, use_t5=use_t5)
+    without = {} if use_t5 else {"text_encoder_3": None, "tokenizer_3": None}
+    pipe = diffusers.StableDiffusion3Pipeline.from_pretrained(
+        folder, local_files_only=True, **without
+    )
+    cond, uncond, pooled, pooled_uncond = pipe.encode_prompt(
+        "a fox", None, None, device="cpu", negative_prompt="ugly"
+    )
+    assert_same(out.text_embeddings, cond, pooled)
+    assert_same(out.uncond_text_embeddings, uncond, pooled_uncond)
+    assert bool(out.text_embeddings[0, -T5_LENGTH - 1 : -1].any()) == use_t5
+    # both are in one cache; without T5 its files aren't needed
+    other = processed(folder, kind, use_t5=not use_t5).text_embeddings
+    assert not torch.equal(out.text_embeddings, other)
+    small = shutil.copytree(folder, tmp_path / "small", ignore=lambda *_: ["text_encoder_3"])
+    if use_t5:
+        with pytest.raises(UserError, match="text_encoder_3/config.json is missing"):
+            processed(small, kind)
+    else:
+        again = processed(small, kind, use_t5=False).text_embeddings
+        assert torch.equal(again, out.text_embeddings)
+
+
+def test_packing_keeps_tokens_and_vector():
+    tokens, vector = torch.randn(2, 3, 8), torch.randn(2, 5)
+    packed = pack(tokens, vector)
+    assert packed.shape == (2, 4, 8) and not packed[:, -1, 5:].any()
+    again = unpack(packed, 5)
+    assert torch.equal(again[0], tokens) and torch.equal(again[1], vector)
+
+
+def test_tokens_of_stable_diffusion_2(models, fox, tmp_path, caplog):
     """Its tokenizer pads with "!" (0); one of its two files contradicts this, and reading that one
     would change every embedding.
     """
     from transformers import AutoTokenizer
 
-    tokenizer = AutoTokenizer.from_pretrained(models["stable-diffusion"], subfolder="tokenizer")
+    folder = models["stable-diffusion"]
+    tokenizer = AutoTokenizer.from_pretrained(folder, subfolder="tokenizer")
     assert text_encoders._tokenize(tokenizer, ["a fox"], 77).input_ids[0, -1] == 0
+    # one that names no length takes what CLIP was trained with
+    endless = changed(folder, tmp_path / "endless", model_max_length=None)
+    assert torch.equal(processed(endless).text_embeddings, fox().text_embeddings)
+    assert not caplog.records
+    one, two = (fox(prompt="a fox " * 60 + end).text_embeddings for end in ("one", "two"))
+    assert "has no effect" in caplog.text and torch.equal(one, two)
 
 
-def test_a_prompt_that_is_too_long_is_cut_and_reported(models, caplog):
-    long = "a fox " * 60
-    out = processor(models, prompt=long + "one")()
-    assert "has no effect" in caplog.text
-    assert torch.equal(
-        out.text_embeddings, processor(models, prompt=long + "two")().text_embeddings
-    )
-
-
-def test_a_tokenizer_that_names_no_length_takes_what_clip_was_trained_with(models, tmp_path):
-    folder = tmp_path / "endless"
-    tiny_models.stable_diffusion(folder)
-    settings = json.loads((folder / "tokenizer" / "tokenizer_config.json").read_text())
-    del settings["model_max_length"]
-    (folder / "tokenizer" / "tokenizer_config.json").write_text(json.dumps(settings))
-    assert torch.equal(
-        processor({"stable-diffusion": folder})().text_embeddings,
-        processor(models)().text_embeddings,
-    )
-
-
-def test_the_encoder_is_freed(models, monkeypatch):
+def test_the_encoder_is_freed(fox, monkeypatch):
     from transformers import CLIPTextModel
 
     monkeypatch.setattr(model_files, "gc", gc)
     gc.collect()
     others = [thing for thing in gc.get_objects() if type(thing) is CLIPTextModel]
-    processor(models)
+    fox()
     left = [thing for thing in gc.get_objects() if type(thing) is CLIPTextModel]
     assert len(left) <= len(others)
 
@@ -124,75 +158,56 @@ def test_too_little_memory_on_the_gpu_means_the_cpu(monkeypatch, caplog):
     assert "runs on the CPU" in caplog.text
 
 
-@pytest.mark.slow
-def test_spawn_gives_the_same(models):
-    here, there = (
-        processor(models, use_cache=False)(),
-        processor(models, use_cache=False, spawn=True)(),
-    )
-    assert torch.equal(here.text_embeddings_vd, there.text_embeddings_vd)
-
-
-def test_a_damaged_model_is_reported(tmp_path):
-    folder = tmp_path / "broken"
-    tiny_models.stable_diffusion(folder)
-    (folder / "text_encoder" / "model.safetensors").write_bytes(b"not safetensors")
-    with pytest.raises(
-        UserError, match="text_encoder of the model in .* can't be loaded.*download it again"
-    ):
-        processor({"stable-diffusion": folder})
-
-
-def test_code_in_the_models_folder_is_not_offered_to_be_run(tmp_path, monkeypatch):
-    folder = tmp_path / "custom"
-    tiny_models.stable_diffusion(folder)
-    settings = json.loads((folder / "tokenizer" / "tokenizer_config.json").read_text())
-    settings |= {"tokenizer_class": "Mine", "auto_map": {"AutoTokenizer": ["mine.Mine", None]}}
-    (folder / "tokenizer" / "tokenizer_config.json").write_text(json.dumps(settings))
+def test_a_damaged_model_is_reported_and_its_code_not_offered_to_be_run(
+    models, tmp_path, monkeypatch
+):
+    code = {"tokenizer_class": "Mine", "auto_map": {"AutoTokenizer": ["mine.Mine", None]}}
+    folder = changed(models["stable-diffusion"], tmp_path / "custom", **code)
     (folder / "mine.py").write_text("import os\nos._exit(7)\n")
     monkeypatch.setattr("builtins.input", lambda *args: "y")
     with pytest.raises(UserError, match="tokenizer of the model in .* can't be loaded"):
-        processor({"stable-diffusion": folder})
+        processed(folder)
+    folder = changed(models["stable-diffusion"], tmp_path / "broken")
+    (folder / "text_encoder" / "model.safetensors").write_bytes(b"not safetensors")
+    with pytest.raises(UserError, match="text_encoder of the model .* can't be loaded.*again"):
+        processed(folder)
 
 
 # The cache
 # --------------------------------------------------------------------------------------------------
 
 
-def test_the_second_time_the_encoder_is_not_loaded(models, monkeypatch, request):
-    first = processor(models)()
-    request.getfixturevalue("no_encoder")
-    second = processor(models)()
+@pytest.mark.parametrize("kind", ["stable-diffusion", "stable-diffusion-xl", "stable-diffusion-3"])
+def test_the_second_time_the_encoder_is_not_loaded(models, kind, monkeypatch):
+    first = processed(models[kind], kind)
+    files = list(CACHE.iterdir())
+    # the prompt, four directions, the negative prompt
+    assert len(files) == 6 and all(path.suffix == ".safetensors" for path in files)
+    assert len(first.text_embeddings_vd.unique(dim=0)) == 4
+    monkeypatch.setattr(
+        text_encoders, "load_network", lambda *args, **options: pytest.fail("loaded again")
+    )
+    second = processed(models[kind], kind)
     assert torch.equal(first.text_embeddings_vd, second.text_embeddings_vd)
-    files = list(Path(".threestudio_cache/text_embeddings").iterdir())
-    assert len(files) == 6  # the prompt, four directions, the negative prompt
-    assert all(path.suffix == ".safetensors" for path in files)
 
 
-def test_another_model_or_text_is_another_entry(models):
-    mine = processor(models)().text_embeddings
-    assert not torch.equal(mine, processor(models, prompt="a foxy")().text_embeddings)
-    assert not torch.equal(mine, processor({"stable-diffusion": models["other"]})().text_embeddings)
-    assert torch.equal(mine, processor(models)().text_embeddings)
+def test_another_model_or_text_is_another_entry(models, fox):
+    mine = fox().text_embeddings
+    assert not torch.equal(mine, fox(prompt="a foxy").text_embeddings)
+    assert not torch.equal(mine, processed(models["other"]).text_embeddings)
+    for damage in (b"", b"\x00" * 40, b"half"):  # a damaged file is made again
+        for path in CACHE.iterdir():
+            path.write_bytes(path.read_bytes()[:50] if damage == b"half" else damage)
+        assert torch.equal(mine, fox().text_embeddings)
 
 
-def test_without_cache_no_file_is_written(models, tmp_path):
-    processor(models, use_cache=False)
+def test_without_cache_no_file_is_written(fox, tmp_path):
+    fox(use_cache=False)
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize(
-    "damage", [b"", b"\x00" * 40, b"half"], ids=["empty", "zeros", "truncated"]
-)
-def test_a_damaged_file_is_made_again(models, damage):
-    first = processor(models)().text_embeddings
-    for path in Path(".threestudio_cache/text_embeddings").iterdir():
-        path.write_bytes(path.read_bytes()[:50] if damage == b"half" else damage)
-    assert torch.equal(processor(models)().text_embeddings, first)
-
-
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="a process is killed in the middle")
-@pytest.mark.parametrize("size", [0, 60, 150])
+@pytest.mark.parametrize("size", [0, 150])
 def test_a_crash_while_writing_leaves_no_broken_entry(tmp_path, monkeypatch, size):
     cache = EmbeddingCache(str(tmp_path / "cache"), "model")
     embedding = torch.ones(3, 4)
@@ -202,92 +217,81 @@ def test_a_crash_while_writing_leaves_no_broken_entry(tmp_path, monkeypatch, siz
         )
         cache.write("a fox", embedding)
     assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 9
-    assert [path.stat().st_size for path in cache.folder.iterdir()] == [size], (
-        "it died in the middle"
-    )
+    assert [path.stat().st_size for path in cache.folder.iterdir()] == [size]  # in the middle
     assert cache.read("a fox") is None
     cache.write("a fox", embedding)
     assert torch.equal(cache.read("a fox"), embedding)
 
 
-def test_a_cache_folder_that_cannot_be_made(models, tmp_path):
+def test_a_cache_folder_is_checked_before_the_encoder_is_loaded(fox, tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
-    with pytest.raises(UserError, match="cache_dir"):
-        processor(models, cache_dir=str(tmp_path / "file" / "cache"))
-
-
-def test_a_cache_folder_is_checked_before_the_encoder_is_loaded(models, tmp_path, no_encoder):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(UserError, match="'[^']*file' is no folder.*cache_dir"):
-        processor(models, cache_dir=str(tmp_path / "file" / "cache"))
-
-
-def test_preflight_checks_the_cache_folder_and_makes_none(tmp_path, monkeypatch):
-    (tmp_path / "file").write_text("")
-    kind = prompt_processors.StableDiffusionPromptProcessor
+    preflight = StableDiffusionPromptProcessor.preflight
     for folder in ("file", "file/cache"):
         with pytest.raises(UserError, match="cache_dir"):
-            kind.preflight({"cache_dir": folder})
-        kind.preflight({"cache_dir": folder, "use_cache": False})
-    kind.preflight({"cache_dir": "new/cache"})
+            preflight({"cache_dir": folder})
+        preflight({"cache_dir": folder, "use_cache": False})
+    preflight({"cache_dir": "new/cache"})
     assert not (tmp_path / "new").exists()
+    fox(cache_dir="cache")
+    monkeypatch.setattr(
+        text_encoders, "load_network", lambda *args, **options: pytest.fail("loaded")
+    )
+    with pytest.raises(UserError, match="'[^']*file' is no folder.*cache_dir"):
+        fox(cache_dir="file/cache")
+    # a read-only cache that holds all embeddings is enough
     monkeypatch.setattr(os, "access", lambda path, mode: False)
     with pytest.raises(UserError, match="read-only"):
-        kind.preflight({"cache_dir": "new/cache"})
-
-
-def test_a_read_only_cache_that_holds_all_embeddings_is_enough(models, tmp_path, monkeypatch):
-    processor(models, cache_dir="cache")
-    monkeypatch.setattr(os, "access", lambda path, mode: False)
-    options = {"pretrained_model_name_or_path": str(models["stable-diffusion"])}
-    prompt_processors.StableDiffusionPromptProcessor.preflight(options | {"cache_dir": "cache"})
-    processor(models, cache_dir="cache")
+        preflight({"cache_dir": "new/cache"})
+    preflight({"cache_dir": "cache"})
+    fox(cache_dir="cache")
     with pytest.raises(UserError, match="read-only.*cache_dir"):
-        processor(models, cache_dir="cache", prompt="another fox")
+        fox(cache_dir="cache", prompt="another fox")
 
 
 # Which prompt
 # --------------------------------------------------------------------------------------------------
 
 
-def test_a_prompt_from_a_file_is_verbatim(models, tmp_path):
-    (tmp_path / "prompt.txt").write_text('robot #1: "${x}" [a] \U0001f98a\n', encoding="utf-8")
-    assert (
-        processor(models, prompt="", prompt_file="prompt.txt")().prompt
-        == 'robot #1: "${x}" [a] \U0001f98a'
+def test_prompts_of_the_user(models, fox, tmp_path, caplog):
+    text = 'robot #1: "${x}" [a] \U0001f98a'
+    (tmp_path / "prompt.txt").write_text(f"{text}\n", encoding="utf-8")
+    assert fox(prompt="", prompt_file="prompt.txt").prompt == text
+    copy = changed(models["stable-diffusion"], tmp_path / "model")
+    (copy / WORDS_FILE).write_text("a\n")
+    out = processed(
+        copy, view_dependent_left_and_right=True, prompt_side="a flank", prompt_back="a tail"
     )
-
-
-def test_no_prompt_is_an_error(models):
+    assert out.prompts_vd == ["a flank"] * 2 + [
+        "a fox, front view",
+        "a tail",
+        "a fox, overhead view",
+    ]
+    assert "'fox'" in caplog.text and "'tail'" in caplog.text  # which this model doesn't know
     with pytest.raises(UserError, match="no prompt"):
-        processor(models, prompt="  ")
+        fox(prompt="  ")
+    assert "bad proportions, unfocused" in StableDiffusionPromptProcessor.Config().negative_prompt
 
 
-@pytest.mark.parametrize("layout", ["list", "object"])
-def test_the_prompt_library(models, tmp_path, layout):
-    texts = ["a corgi plays the ukulele", "a Corgi in the snow", "a bald eagle"]
-    (tmp_path / "load").mkdir()
-    content = texts if layout == "list" else {"dreamfusion": texts[:2], "mine": texts[1:]}
-    (tmp_path / "load" / "prompt_library.json").write_text(json.dumps(content))
-    assert processor(models, prompt="lib:snow_corgi")().prompt == "a Corgi in the snow"
-    with pytest.raises(UserError, match="matches 2 texts.*add a word"):
-        processor(models, prompt="lib:corgi")
-    with pytest.raises(UserError, match="near: a bald eagle"):
-        processor(models, prompt="lib:bald_eagel")
-
-
-def test_an_invalid_prompt_library(models, tmp_path):
+def test_the_prompt_library(fox, tmp_path):
     with pytest.raises(UserError, match="prompt library .*does not exist"):
-        processor(models, prompt="lib:fox")
-    (tmp_path / "library.json").write_text('{"a": 1}')
-    with pytest.raises(UserError, match="list of texts"):
-        processor(models, prompt="lib:fox", prompt_library="library.json")
-    (tmp_path / "library.json").write_text("[")
-    with pytest.raises(UserError, match="no JSON"):
-        processor(models, prompt="lib:fox", prompt_library="library.json")
+        fox(prompt="lib:fox")
+    texts = ["a corgi plays the ukulele", "a Corgi in the snow", "a bald eagle"]
+    file = tmp_path / "load" / "prompt_library.json"
+    file.parent.mkdir()
+    for content in (texts, {"dreamfusion": texts[:2], "mine": texts[1:]}):
+        file.write_text(json.dumps(content))
+        assert fox(prompt="lib:snow_corgi").prompt == "a Corgi in the snow"
+        with pytest.raises(UserError, match="2 texts of .*corgi.*corgi plays"):
+            fox(prompt="lib:corgi")
+        with pytest.raises(UserError, match="no texts .*near: a bald eagle"):
+            fox(prompt="lib:bald_eagel")
+    for content in ('{"a": 1}', "[", "[3]", "3"):
+        file.write_text(content)
+        with pytest.raises(UserError, match="no JSON list of texts"):
+            fox(prompt="lib:fox")
 
 
-# Options
+# Models
 # --------------------------------------------------------------------------------------------------
 
 
@@ -295,30 +299,17 @@ def test_an_invalid_prompt_library(models, tmp_path):
 def test_a_missing_model_is_reported_at_once(kind, tmp_path, monkeypatch):
     tiny_models.nothing_cached(monkeypatch, tmp_path)
     with pytest.raises(UserError, match="hf download|no such folder"):
-        processor({kind: tmp_path / "none"}, kind)
-    default = (
-        find(f"gaussiandreamer-{kind}-prompt-processor").Config().pretrained_model_name_or_path
-    )
+        processed(tmp_path / "none", kind)
+    part = find(f"gaussiandreamer-{kind}-prompt-processor")
+    default = part.Config().pretrained_model_name_or_path
     with pytest.raises(UserError, match=f"{default}.*HF_HUB_OFFLINE"):
-        processor({kind: default}, kind)
+        processed(default, kind)
+    if NAME == "builtin":  # threestudio's names are its own parts' there
+        assert find(f"{kind}-prompt-processor") is part
 
 
-@pytest.mark.parametrize(
-    "name, value",
-    [("front_threshold", -1.0), ("back_threshold", 200.0), ("overhead_threshold", 91.0)],
-)
-def test_thresholds_are_angles(models, name, value):
-    with pytest.raises(UserError, match=f"prompt_processor.{name}"):
-        processor(models, **{name: value})
-
-
-@pytest.mark.skipif(NAME != "builtin", reason="inside threestudio its own parts have these names")
-@pytest.mark.parametrize("kind", KINDS)
-def test_threestudios_names_find_this_packages_parts(kind):
-    assert find(f"{kind}-prompt-processor") is find(f"gaussiandreamer-{kind}-prompt-processor")
-
-
-def test_the_default_negative_prompt_is_the_released_one():
-    assert prompt_processors.StableDiffusionPromptProcessor.Config().negative_prompt.endswith(
-        "bad proportions, unfocused"
-    )
+@pytest.mark.parametrize("kind", ["stable-diffusion-xl", "stable-diffusion-3"])
+def test_a_model_of_another_family_is_refused_by_name(models, kind):
+    (other,) = {"stable-diffusion-xl", "stable-diffusion-3"} - {kind}
+    with pytest.raises(UserError, match=f"but .*{other}-guidance.*{other}-prompt-processor"):
+        processed(models[other], kind)

@@ -1,4 +1,4 @@
-"""The plain prompt processor: the prompt is text, verbatim."""
+"""The plain prompt processor: the prompt is text, verbatim; words that a model doesn't know."""
 
 import tracemalloc
 
@@ -6,47 +6,25 @@ import pytest
 
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.host import find
-from threestudio_gaussiandreamer.prompts.prompts import PlainPromptProcessor
+from threestudio_gaussiandreamer.prompts.known_words import WORDS_FILE, warn_of_unknown_words
 
-TEXTS = [
-    "a fox",
-    "1984",
-    "yes",
-    "a fox: red",
-    "robot #1",
-    "[a] b",
-    "'quoted\" text",
-    "a/../../x",
-    "🦊 fox",
-    " spaces ",
-]
-TEXTS += ["x" * 4096, "two\nlines", ""]
+TEXTS = ["1984", "yes", "a fox: red", "robot #1", "[a] b", "'quoted\" text", "a/../../x"]
+TEXTS += ["🦊 fox", " spaces ", "x" * 4096, "two\nlines", "", "${x}", "${oc.env:HOME}"]
 
 
 def processed(**options):
     return find("plain-prompt-processor")(options)()
 
 
-def test_is_registered():
-    assert find("plain-prompt-processor") is PlainPromptProcessor
-
-
 @pytest.mark.parametrize("text", TEXTS)
-def test_prompts_are_text(text):
-    assert processed(prompt=text, negative_prompt=text).prompt == text
-    assert processed(negative_prompt=text).negative_prompt == text
-
-
-@pytest.mark.parametrize("text", [*TEXTS, "${x}", "${oc.env:HOME}"])
-@pytest.mark.parametrize("end", ["", "\n", "\r\n"])
-def test_a_prompt_file_is_the_prompt_but_for_its_last_line_end(tmp_path, text, end):
-    (tmp_path / "prompt.txt").write_bytes((text + end).encode())
-    assert processed(prompt_file=str(tmp_path / "prompt.txt")).prompt == text
-
-
-def test_only_one_line_end_is_stripped(tmp_path):
-    (tmp_path / "prompt.txt").write_bytes(b"a fox\n\n")
-    assert processed(prompt_file=str(tmp_path / "prompt.txt")).prompt == "a fox\n"
+def test_a_prompt_is_text_and_a_file_all_of_it_but_its_last_line_end(tmp_path, text):
+    if "${" not in text:
+        out = processed(prompt=text, negative_prompt=text)
+        assert out.prompt == out.negative_prompt == text
+    for end in ("", "\n", "\r\n", "\n\n"):
+        (tmp_path / "prompt.txt").write_bytes((text + end).encode())
+        found = processed(prompt_file=str(tmp_path / "prompt.txt")).prompt
+        assert found == text + ("\n" if end == "\n\n" else "")
 
 
 def test_view_dependent_prompts_are_in_the_order_of_the_host():
@@ -64,14 +42,40 @@ def test_of_a_huge_prompt_file_only_the_beginning_is_read(tmp_path):
     tracemalloc.stop()
 
 
-def test_bad_prompt_files_are_named(tmp_path):
+@pytest.mark.parametrize(
+    "options, match",
+    [
+        ({"prompt_file": "prompt.txt"}, "prompt.txt' is not UTF-8 text .byte 3."),
+        ({"prompt_file": "promt.txt"}, "does not exist; near names.*prompt.txt"),
+        ({"prompt_file": "prompt.txt", "prompt": "a fox"}, "both prompt and prompt_file"),
+    ],
+)
+def test_bad_prompt_files_are_named(tmp_path, monkeypatch, options, match):
+    monkeypatch.chdir(tmp_path)
     (tmp_path / "prompt.txt").write_bytes(b"caf\xe9")
-    with pytest.raises(UserError, match="prompt.txt' is not UTF-8 text .byte 3."):
-        processed(prompt_file=str(tmp_path / "prompt.txt"))
-    with pytest.raises(UserError, match="does not exist; near names.*prompt.txt"):
-        processed(prompt_file=str(tmp_path / "promt.txt"))
-    (tmp_path / "prompt.txt").write_bytes(b"a" * (1 << 21))
-    with pytest.raises(UserError, match="more than"):
-        processed(prompt_file=str(tmp_path / "prompt.txt"))
-    with pytest.raises(UserError, match="both prompt and prompt_file"):
-        processed(prompt="a fox", prompt_file=str(tmp_path / "prompt.txt"))
+    with pytest.raises(UserError, match=match):
+        processed(**options)
+
+
+@pytest.mark.parametrize(
+    "prompt, parts",
+    [
+        ("a readd zebra, a 3d ZEBRA", ["'readd' (near: red)", "'zebra'; it", "'zebra'"]),
+        ("a Red fox! 3d", []),
+        ("  ...", []),
+        ("赤い狐 " * 500, ["trained on"]),
+        ("x" * 4000, ["trained on"]),
+        ("🦊 \0 zebra", ["'zebra'"]),
+    ],
+)
+def test_words_that_a_model_does_not_know_are_named(tmp_path, caplog, prompt, parts):
+    warn_of_unknown_words(tmp_path, "a zebra")  # a model without a list
+    assert not caplog.text
+    (tmp_path / WORDS_FILE).parent.mkdir()
+    (tmp_path / WORDS_FILE).write_text("a\n3\nd\nfox\nred\n")
+    warn_of_unknown_words(tmp_path, prompt)
+    assert len(caplog.records) == bool(parts)
+    if parts:
+        message = caplog.records[0].getMessage()
+        assert message.count("zebra") == ("zebra" in prompt) and len(message) < 600
+        assert all(part in message for part in parts[:1] + parts[2:])

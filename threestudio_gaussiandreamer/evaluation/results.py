@@ -20,7 +20,7 @@ from ..formats.ply import is_gaussian_ply
 from ..gaussians.gaussians import Gaussians
 from ..host import find, get_device, warn
 from ..launch.config import load_config
-from ..prompts.prompt_processors import PROMPT_LIBRARY, resolve_prompt
+from ..prompts.prompt_processors import resolve_prompt
 from ..view.run_files import RunFiles, step_of
 
 BLACK = (0.0, 0.0, 0.0)
@@ -98,9 +98,8 @@ def _background_of(system: Mapping[str, Any], folder: Path) -> Sequence[float]:
 
 
 def _prompt_of(processor: Mapping[str, Any]) -> Optional[str]:
-    library = processor.get("prompt_library", PROMPT_LIBRARY)
     try:
-        return resolve_prompt(processor.get("prompt") or "", library) or None
+        return resolve_prompt(processor.get("prompt") or "")
     except UserError:  # the prompt library was removed; the prompt can be given as an option
         return None
 

@@ -149,7 +149,7 @@ def direction_indices(
     2 back, 3 overhead.
     """
     indices = torch.zeros_like(azimuth, dtype=torch.long)
-    for index, direction in enumerate(view_directions(45, 45, 60)):
+    for index, direction in enumerate(view_directions()):
         indices[direction.condition(elevation, azimuth, azimuth)] = index
     return indices
 

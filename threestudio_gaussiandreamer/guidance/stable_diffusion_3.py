@@ -33,7 +33,7 @@ from ..host import register
 from ..models.families import STABLE_DIFFUSION_3 as FAMILY
 from ..models.model_files import load_settings
 from ..models.text_encoders import unpack
-from ..prompts.pooled_prompt_processors import STABLE_DIFFUSION_3
+from ..prompts.prompt_processors import STABLE_DIFFUSION_3
 from .stable_diffusion import StableDiffusionGuidance
 from .types import Embeddings, Latents, Timesteps
 

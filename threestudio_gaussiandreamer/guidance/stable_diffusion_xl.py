@@ -20,7 +20,7 @@ from ..host import register
 from ..models.families import STABLE_DIFFUSION_XL as FAMILY
 from ..models.model_files import pipeline_settings
 from ..models.text_encoders import unpack
-from ..prompts.pooled_prompt_processors import STABLE_DIFFUSION_XL
+from ..prompts.prompt_processors import STABLE_DIFFUSION_XL
 from .stable_diffusion import StableDiffusionGuidance
 from .types import Embeddings, Latents, Timesteps
 

@@ -25,7 +25,6 @@ MODULES = (
     "guidance.stable_diffusion_3",
     "guidance.stable_diffusion_xl",
     "prompts.prompts",
-    "prompts.pooled_prompt_processors",
     "prompts.prompt_processors",
     "exporters.files",
     "training.system",

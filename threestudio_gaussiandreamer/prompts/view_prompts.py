@@ -15,7 +15,23 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 Condition = Callable[[Tensor, Tensor, Tensor], Tensor]
-Coefficients = Tuple[float, float, float]
+PERP_NEG = {
+    "sb": (1.0, 0.5, -0.606),
+    "fsb": (1.0, 0.5, 0.967),
+    "fs": (4.0, 0.5, -2.426),
+    "sf": (4.0, 0.5, -2.426),
+}
+"""threestudio's coefficients (a, b, c) of the weights -(a exp(-b r) + c) of the negative prompts:
+
+- for a view between front and side: ``fs`` for "front", with r the share of "front" in the
+  interpolated prompt, and ``sf`` for "side", with r the share of "side";
+- for a view between side and back: ``sb`` for "side" and ``fsb`` for "front", both with r the
+  share of "side".
+"""
+THRESHOLDS = {"front_threshold": 45.0, "back_threshold": 45.0, "overhead_threshold": 60.0}
+"""threestudio's half the width of front and back, and the elevation above which a view is overhead,
+degrees.
+"""
 
 
 class Direction(NamedTuple):
@@ -24,57 +40,33 @@ class Direction(NamedTuple):
     """
 
     name: str
-    prompt: Callable[[str], str]
     condition: Condition
     """Maps (elevation, azimuth, camera_distances), each (B,), to bool (B,): which views have this
     direction.
     """
 
 
-def view_directions(
-    front_threshold: float,
-    back_threshold: float,
-    overhead_threshold: float,
-    *,
-    prefix: bool = False,
-    left_and_right: bool = False,
-) -> List[Direction]:
+def view_directions(*, left_and_right: bool = False) -> List[Direction]:
     """Return threestudio's directions in its order: side, front, back, overhead.
 
     Args:
-        front_threshold, back_threshold: half the width of the front and the back, degrees of
-            azimuth.
-        overhead_threshold: elevation above which a view is overhead, degrees.
-        prefix: write "front view of a fox" instead of "a fox, front view".
         left_and_right: "left side", the object's own (azimuths in [0, 180)), and "right side" in
             place of "side".
     """
-    conditions: Dict[str, Condition] = {
-        **(LEFT_AND_RIGHT if left_and_right else SIDE),
-        "front": lambda elevation, azimuth, distance: shifted(azimuth).abs() < front_threshold,
-        "back": lambda elevation, azimuth, distance: shifted(azimuth).abs() > 180 - back_threshold,
-        "overhead": lambda elevation, azimuth, distance: elevation > overhead_threshold,
+    front, back, overhead = THRESHOLDS.values()
+    sides: Dict[str, Condition] = {
+        "left side": lambda elevation, azimuth, distance: shifted(azimuth) >= 0,
+        "right side": lambda elevation, azimuth, distance: shifted(azimuth) < 0,
     }
-    return [
-        Direction(name, _prompt_maker(name, prefix), condition)
-        for name, condition in conditions.items()
-    ]
-
-
-SIDE: Dict[str, Condition] = {
-    "side": lambda elevation, azimuth, distance: torch.ones_like(elevation, dtype=torch.bool)
-}
-LEFT_AND_RIGHT: Dict[str, Condition] = {
-    "left side": lambda elevation, azimuth, distance: shifted(azimuth) >= 0,
-    "right side": lambda elevation, azimuth, distance: shifted(azimuth) < 0,
-}
-
-
-def _prompt_maker(name: str, prefix: bool) -> Callable[[str], str]:
-    if not prefix:
-        return lambda prompt: f"{prompt}, {name} view"
-    view = "backside" if name == "back" else name
-    return lambda prompt: f"{view} view of {prompt}"
+    if not left_and_right:
+        sides = {"side": lambda elevation, *_: torch.ones_like(elevation, dtype=torch.bool)}
+    conditions: Dict[str, Condition] = {
+        **sides,
+        "front": lambda elevation, azimuth, distance: shifted(azimuth).abs() < front,
+        "back": lambda elevation, azimuth, distance: shifted(azimuth).abs() > 180 - back,
+        "overhead": lambda elevation, azimuth, distance: elevation > overhead,
+    }
+    return [Direction(*item) for item in conditions.items()]
 
 
 def shifted(azimuth: Float[Tensor, " B"]) -> Float[Tensor, " B"]:
@@ -87,14 +79,6 @@ class PromptEmbeddings:
     """The embeddings of one prompt; the names are those of threestudio's ``PromptProcessorOutput``.
 
     Each embedding has N tokens of F features; ``*_vd`` hold one per direction.
-
-    ``perp_neg_f_*`` are the coefficients (a, b, c) of the weights -(a exp(-b r) + c) of the
-    negative prompts:
-
-    - for a view between front and side: ``fs`` for "front", with r the share of "front" in the
-      interpolated prompt, and ``sf`` for "side", with r the share of "side";
-    - for a view between side and back: ``sb`` for "side" and ``fsb`` for "front", both with r the
-      share of "side".
     """
 
     text_embeddings: Float[Tensor, "1 N F"]
@@ -104,10 +88,6 @@ class PromptEmbeddings:
     directions: List[Direction]
     direction2idx: Dict[str, int]
     use_perp_neg: bool
-    perp_neg_f_sb: Coefficients
-    perp_neg_f_fsb: Coefficients
-    perp_neg_f_fs: Coefficients
-    perp_neg_f_sf: Coefficients
     prompt: str
     prompts_vd: List[str]
     empty: Optional[Callable[[], Float[Tensor, "1 N F"]]] = None
@@ -123,7 +103,7 @@ class PromptEmbeddings:
     ) -> Int[Tensor, " B"]:
         """Return the index of each view's direction, which is its row of ``*_vd``."""
         indices = torch.zeros_like(elevation, dtype=torch.long)
-        for name, _, condition in self.directions:
+        for name, condition in self.directions:
             indices[condition(elevation, azimuth, camera_distances)] = self.direction2idx[name]
         return indices
 
@@ -196,16 +176,12 @@ class PromptEmbeddings:
     def _negative_weights(
         self, angle: Float[Tensor, " B"], share: Float[Tensor, " B"]
     ) -> Float[Tensor, "B 2"]:
-        front_half = torch.stack(
-            [decay(self.perp_neg_f_fs, share), decay(self.perp_neg_f_sf, 1 - share)], dim=1
-        )
-        back_half = torch.stack(
-            [decay(self.perp_neg_f_sb, share), decay(self.perp_neg_f_fsb, share)], dim=1
-        )
+        front_half = torch.stack([decay("fs", share), decay("sf", 1 - share)], dim=1)
+        back_half = torch.stack([decay("sb", share), decay("fsb", share)], dim=1)
         return -torch.where((angle < 90)[:, None], front_half, back_half)
 
 
-def decay(coefficients: Coefficients, r: Tensor) -> Tensor:
-    """Compute a exp(-b r) + c."""
-    a, b, c = coefficients
+def decay(name: str, r: Tensor) -> Tensor:
+    """Compute a exp(-b r) + c with the coefficients of this name in ``PERP_NEG``."""
+    a, b, c = PERP_NEG[name]
     return a * torch.exp(-b * r) + c
