@@ -9,7 +9,6 @@ import torch.nn.functional as F
 from threestudio_gaussiandreamer.cameras import (
     focal_length,
     orbit_c2w,
-    ray_directions,
     surface_points,
 )
 from threestudio_gaussiandreamer.diffusion.consistent_noise import (
@@ -51,18 +50,6 @@ def table(seed=0, channels=4):
 def noise_of(size, table, view, draw=0, first=0):
     """Return the noise of latents of size x size pixels."""
     return attached_noise((size, size), table, draw, first, *view)
-
-
-def test_points_lie_on_the_surface():
-    depth, opacity, c2w, fovy = ball([0.0, 70.0], 64)
-    points = surface_points(depth[..., 0], c2w, focal_length(fovy, 64)).movedim(1, -1)
-    inside = opacity[..., 0] > 0
-    assert inside.float().mean() > 0.2
-    torch.testing.assert_close(
-        points[inside].norm(dim=-1), torch.ones(int(inside.sum())), rtol=0, atol=1e-5
-    )
-    rays = ray_directions(c2w, fovy, 64, 64, normalize=False)
-    torch.testing.assert_close(points, c2w[:, None, None, :3, 3] + depth * rays)
 
 
 def test_a_model_that_gets_renders_squeezed_sees_the_noise_of_the_same_points():

@@ -12,8 +12,6 @@ from threestudio_gaussiandreamer.diffusion.exact_score import (
     COLOR_MATRIX,
     LinearLatent,
     denoise,
-    log_density,
-    mode_variance,
     squared_distances,
 )
 
@@ -22,6 +20,13 @@ ABAR = sds.sd_alphas_cumprod()
 
 def randn(*shape, seed=0, dtype=torch.float64):
     return torch.randn(shape, generator=torch.Generator().manual_seed(seed), dtype=dtype)
+
+
+def log_density(z, abar, bank, std, log_prior):
+    """Compute log p_t(z) up to a constant."""
+    variance = abar * std**2 + 1 - abar
+    distances = (z[:, None] - abar.sqrt()[:, None, None] * bank).square().sum(-1)
+    return (log_prior - distances / (2 * variance[:, None])).logsumexp(1)
 
 
 @settings(max_examples=30, deadline=None)
@@ -35,27 +40,35 @@ def randn(*shape, seed=0, dtype=torch.float64):
 def test_eps_is_the_score_of_the_density(modes, dims, t, std, seed):
     """eps_hat = -sigma grad log p_t, against autograd, to 1e-10 relative to the gradient's size."""
     bank, z = randn(modes, dims, seed=seed), randn(3, dims, seed=seed + 1).requires_grad_()
-    abar = ABAR[t].expand(3)
-    log_prior = randn(modes, seed=seed + 2)
-    (score,) = torch.autograd.grad(
-        log_density(z, abar, bank, std=std, log_prior=log_prior).sum(), z
-    )
+    abar, log_prior = ABAR[t].expand(3), randn(modes, seed=seed + 2)
+    (score,) = torch.autograd.grad(log_density(z, abar, bank, std, log_prior).sum(), z)
     out = denoise(z.detach(), abar, bank, std=std, log_prior=log_prior)
     expected = -(1 - abar).sqrt()[:, None] * score
     torch.testing.assert_close(
         out.eps, expected, rtol=1e-10, atol=1e-10 * (1 + expected.abs().max().item())
     )
+    mixed = sds.add_noise(out.denoised, out.eps, abar)  # z = a D + sigma eps_hat
+    torch.testing.assert_close(mixed, z.detach(), rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize("name", sorted(sds.WEIGHTS))
-def test_one_sharp_mode_gives_a_weighted_squared_error_without_noise(name):
-    """K = 1, s = 0: w (eps_hat - eps) = w (a / sigma) (x - x_1), independent of eps."""
+def test_one_sharp_mode_gives_a_weighted_squared_error_without_noise():
+    """K = 1, s = 0: eps_hat - eps = (a / sigma) (x - x_1), independent of eps."""
     x, target, noise = randn(3, 4, 50)
     abar = ABAR[torch.tensor([20, 300, 600, 980])]
     eps = denoise(sds.add_noise(x, noise, abar), abar, target[:, None]).eps
-    weight = sds.weight(name, abar)[:, None]
-    expected = weight * (abar / (1 - abar)).sqrt()[:, None] * (x - target)
-    torch.testing.assert_close(weight * (eps - noise), expected, rtol=0, atol=1e-6)
+    expected = (abar / (1 - abar)).sqrt()[:, None] * (x - target)
+    torch.testing.assert_close(eps - noise, expected, rtol=0, atol=1e-6)
+
+
+def test_responsibilities_are_finite_and_perplexity_counts_the_modes_that_share_z():
+    z, bank, abar = 1e4 * randn(3, 6), randn(7, 6, seed=1), ABAR[torch.tensor([0, 400, 999])]
+    out = denoise(z, abar, bank)
+    ones = torch.ones(3, dtype=torch.float64)
+    torch.testing.assert_close(out.responsibilities.sum(1), ones, rtol=0, atol=1e-14)
+    assert torch.isfinite(out.eps).all()
+    corners = torch.eye(4, dtype=torch.float64)
+    for z, t, modes in ((torch.zeros_like(corners[:1]), 500, 4), (1e3 * corners[:1], 0, 1)):
+        assert math.isclose(denoise(z, ABAR[t : t + 1], corners).perplexity, modes, abs_tol=1e-12)
 
 
 @pytest.mark.parametrize("std", [0.3, 1.0])
@@ -107,60 +120,19 @@ def test_ddim_from_noise_lands_on_an_image_of_the_bank():
     assert len(nearest.indices.unique()) > 1
 
 
-def test_denoised_and_eps_agree():
-    """z = a D + sigma eps_hat."""
-    bank, z, abar = randn(5, 9), randn(4, 9, seed=1), ABAR[torch.tensor([10, 200, 600, 990])]
-    out = denoise(z, abar, bank, std=0.4)
-    torch.testing.assert_close(sds.add_noise(out.denoised, out.eps, abar), z, rtol=0, atol=1e-12)
-
-
-def test_responsibilities_sum_to_one_even_when_all_modes_are_far():
-    z, bank, abar = 1e4 * randn(3, 6), randn(7, 6, seed=1), ABAR[torch.tensor([0, 400, 999])]
-    out = denoise(z, abar, bank)
-    torch.testing.assert_close(
-        out.responsibilities.sum(1), torch.ones(3, dtype=torch.float64), rtol=0, atol=1e-14
-    )
-    assert torch.isfinite(out.eps).all()
-
-
-def test_perplexity_counts_the_modes_that_share_z():
-    bank = torch.eye(4, dtype=torch.float64)
-    middle = denoise(torch.zeros(1, 4, dtype=torch.float64), ABAR[500:501], bank)
-    corner = denoise(1e3 * bank[:1], ABAR[0:1], bank)
-    assert math.isclose(middle.perplexity, 4, abs_tol=1e-12) and math.isclose(
-        corner.perplexity, 1, abs_tol=1e-12
-    )
-
-
 def test_classifier_free_guidance_acts_on_the_means():
-    """eps_u + s (eps_c - eps_u) is the eps of the mean m_u + s (m_c - m_u) for equal widths; the
-    same holds for D.
-    """
-    bank, z, abar, scale = (
-        randn(6, 10),
-        randn(3, 10, seed=1),
-        ABAR[torch.tensor([100, 500, 800])],
-        7.5,
-    )
+    """eps_u + s (eps_c - eps_u) is the eps of the mean m_u + s (m_c - m_u) for equal widths."""
+    bank, z, abar = randn(6, 10), randn(3, 10, seed=1), ABAR[torch.tensor([100, 500, 800])]
     only_two = torch.tensor([0.0, 0.0] + [-torch.inf] * 4)
     distances = squared_distances(z, bank, abar)
     cond = denoise(z, abar, bank, std=0.3, log_prior=only_two, distances=distances)
     uncond = denoise(z, abar, bank, std=0.3)
     means = [out.responsibilities @ bank for out in (cond, uncond)]
-    guided_mean = means[1] + scale * (means[0] - means[1])
-    expected = denoise(z, abar, guided_mean[:, None], std=0.3)
-    torch.testing.assert_close(
-        sds.classifier_free(cond.eps, uncond.eps, scale), expected.eps, rtol=0, atol=1e-11
-    )
-    torch.testing.assert_close(
-        sds.classifier_free(cond.denoised, uncond.denoised, scale),
-        expected.denoised,
-        rtol=0,
-        atol=1e-11,
-    )
-    torch.testing.assert_close(
-        cond.eps, denoise(z, abar, bank[:2], std=0.3).eps, rtol=0, atol=1e-12
-    )
+    expected = denoise(z, abar, torch.lerp(means[1], means[0], 7.5)[:, None], std=0.3)
+    guided = sds.classifier_free(cond.eps, uncond.eps, 7.5)
+    torch.testing.assert_close(guided, expected.eps, rtol=0, atol=1e-11)
+    alone = denoise(z, abar, bank[:2], std=0.3)
+    torch.testing.assert_close(cond.eps, alone.eps, rtol=0, atol=1e-12)
 
 
 def test_items_are_independent_with_shared_and_with_separate_banks():
@@ -185,18 +157,6 @@ def test_distances_in_chunks_are_the_distances(monkeypatch):
     torch.testing.assert_close(squared_distances(z, bank, abar), whole, rtol=1e-15, atol=0)
 
 
-@pytest.mark.parametrize("shared", [True, False])
-def test_images_without_a_responsibility_do_not_change_the_mean(shared):
-    """At a small timestep an item has one image, and each item another one."""
-    bank, abar = randn(2, 7, 30), ABAR[torch.tensor([0, 0])]
-    bank = bank[0] if shared else bank
-    z = torch.stack([bank[..., 2, :].expand(2, -1)[0], bank[..., 5, :].expand(2, -1)[1]])
-    out = denoise(z, abar, bank, log_prior=torch.tensor([0.0] * 6 + [-torch.inf]))
-    assert ((out.responsibilities > 0).sum(1) < 7).all()
-    expected = torch.einsum("bk,bkd->bd", out.responsibilities, bank.expand(2, -1, -1))
-    torch.testing.assert_close(out.denoised, expected, rtol=0, atol=1e-14)
-
-
 def test_logits_in_float32_at_512_are_stable():
     """Differences keep the logits of float32 images within 0.01 nat of the exact ones; expanding
     the square does not.
@@ -208,7 +168,7 @@ def test_logits_in_float32_at_512_are_stable():
     )  # nearly equal images: the logits nearly cancel
     abar = ABAR[20:21]
     z = sds.add_noise(bank[:1], randn(1, size, seed=2, dtype=torch.float32), abar)
-    variance = 2 * mode_variance(abar, 0.0)
+    variance = 2 * (1 - abar)
     logits = -squared_distances(z, bank, abar) / variance[:, None]
     wide_z, wide_bank = z.double(), bank.double()
     exact = -(wide_z[:, None] - abar.sqrt() * wide_bank).square().sum(-1) / variance[:, None]
@@ -240,31 +200,16 @@ def test_the_latent_is_linear_and_its_adjoint_exact():
     )
 
 
-@pytest.mark.parametrize(("channels", "matrix"), [(3, None), (4, COLOR_MATRIX)], ids=str)
-def test_decode_inverts_encode_on_what_the_latent_holds(channels, matrix):
-    latent = LinearLatent(4, matrix, 2.5)
-    rgb = (
-        torch.rand(2, 3, 4, 4, generator=torch.Generator().manual_seed(0))
-        .repeat_interleave(4, 2)
-        .repeat_interleave(4, 3)
-    )
+@pytest.mark.parametrize("matrix", [None, COLOR_MATRIX], ids=["pixels", "colours"])
+def test_decode_inverts_encode_on_what_the_latent_holds(matrix):
+    pooled = torch.rand(20, 3, 4, 4, generator=torch.Generator().manual_seed(0)) * 0.1 + 0.3
+    latent = LinearLatent(4, matrix).normalised(pooled)
+    rgb = pooled.repeat_interleave(4, 2).repeat_interleave(4, 3)
     latents = latent.encode(rgb)
-    assert latents.shape == (2, channels, 4, 4)
-    torch.testing.assert_close(
-        latent.decode(latents), rgb, rtol=0, atol=1e-5
-    )  # float32 through a pseudo-inverse
-
-
-def test_the_color_matrix_has_orthonormal_columns():
+    assert latents.shape == (20, 3 if matrix is None else 4, 4, 4)
+    assert math.isclose(latents.std(), 1, rel_tol=1e-4)
+    # float32 through a pseudo-inverse
+    torch.testing.assert_close(latent.decode(latents), rgb, rtol=0, atol=1e-5)
     assert torch.equal(COLOR_MATRIX.T @ COLOR_MATRIX, torch.eye(3))
-
-
-def test_normalised_has_unit_variance_on_its_images():
-    images = torch.rand(20, 3, 8, 8, generator=torch.Generator().manual_seed(0)) * 0.1 + 0.3
-    latent = LinearLatent(1, COLOR_MATRIX).normalised(images)
-    assert math.isclose(latent.encode(images).std(), 1, rel_tol=1e-4)
-
-
-def test_latents_name_what_they_cannot_do():
     with pytest.raises(UserError, match="one colour"):
-        LinearLatent().normalised(torch.full((2, 3, 4, 4), 0.5))
+        latent.normalised(torch.full((2, 3, 4, 4), 0.5))

@@ -50,9 +50,3 @@ def test_items_beyond_the_end_of_the_table_continue_at_its_beginning(monkeypatch
     assert items.shape == (100, 2, 4)
     for item in (0, 40, 99):
         assert torch.equal(small.draw("a", 0, item, 1)[0], items[item])
-
-
-def test_the_parts_of_a_step_differ():
-    table = NoiseTable(0, (4, 64, 64))
-    starts = [float(table.draw("a", 0, 0, 1, part)[0, 0, 0, 0]) for part in range(1000)]
-    assert len(set(starts)) == 1000

@@ -11,7 +11,7 @@ from torch import nn
 from tests.helpers import tiny_guidance as tiny
 from tests.helpers import tiny_models
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.diffusion.noise_prediction import perp_neg, rescaled
+from threestudio_gaussiandreamer.diffusion.sds import perp_neg, rescaled
 from threestudio_gaussiandreamer.guidance.base import NonFiniteScore
 from threestudio_gaussiandreamer.guidance.types import view_of_row
 from threestudio_gaussiandreamer.prompts.prompts import PlainPrompt

@@ -258,13 +258,13 @@ def test_the_gradient_at_the_first_and_last_timestep_is_finite(name, measured):
     the first tenth of the timesteps.
     """
     abar = sds.sd_alphas_cumprod()
-    pull = sds.weight(name, abar) * (abar / (1 - abar)).sqrt()
+    pull = sds.WEIGHTS[name](abar) * (abar / (1 - abar)).sqrt()
     x, noise = torch.randn(2, 3, 4, 8, 8, generator=torch.Generator().manual_seed(0))
     t = torch.tensor([1, 500, 999])
     z = sds.add_noise(x, noise, abar[t])
     assert all(
         value.isfinite().all()
-        for value in (z, sds.predict_x0(z, noise, abar[t]), sds.weight(name, abar[t]))
+        for value in (z, sds.predict_x0(z, noise, abar[t]), sds.WEIGHTS[name](abar[t]))
     )
     measured(
         100 * pull[20:100].sum() / pull[20:981].sum(),

@@ -18,8 +18,7 @@ The closed-form denoiser memorises: for d above a few hundred it returns the nea
 (Scarvelis et al. 2023, "Closed-Form Diffusion Models"). The perplexity of the responsibilities
 measures this: it is then 1."""
 
-import math
-from typing import NamedTuple, Optional, Protocol, Union, runtime_checkable
+from typing import Any, NamedTuple, Optional
 
 import torch
 import torch.nn.functional as F
@@ -50,19 +49,6 @@ class Denoised(NamedTuple):
     """
 
 
-@runtime_checkable  # for --typecheck
-class KnownImages(Protocol):
-    """The known images x_k of the items of a batch."""
-
-    def squared_distances(
-        self, z: Float[Tensor, "B d"], abar: Float[Tensor, " B"]
-    ) -> Float[Tensor, "B K"]:
-        """Compute |z - sqrt(abar) x_k|^2 in float64; a single image may have any distance."""
-
-    def weighted_sum(self, weights: Float[Tensor, "B K"]) -> Float[Tensor, "B d"]:
-        """Sum the images with weights >= 0, in the weights' type."""
-
-
 class ImageTensor(NamedTuple):
     """Images in a tensor, shared or per item."""
 
@@ -71,11 +57,13 @@ class ImageTensor(NamedTuple):
     def squared_distances(
         self, z: Float[Tensor, "B d"], abar: Float[Tensor, " B"]
     ) -> Float[Tensor, "B K"]:
+        """Compute |z - sqrt(abar) x_k|^2 in float64; a single image may have any distance."""
         if self.images.shape[-2] == 1:  # its responsibility is 1 at any distance
             return z.new_zeros((len(z), 1), dtype=torch.float64)
         return squared_distances(z, self.images, abar)
 
     def weighted_sum(self, weights: Float[Tensor, "B K"]) -> Float[Tensor, "B d"]:
+        """Sum the images with weights >= 0, in the weights' type."""
         return weighted_sum(weights, self.images)
 
 
@@ -134,7 +122,7 @@ def responsibilities(
 def denoise(
     z: Float[Tensor, "B d"],
     abar: Float[Tensor, " B"],
-    bank: Union[Float[Tensor, "*batch K d"], KnownImages],
+    bank: Any,
     *,
     std: float = 0.0,
     log_prior: Optional[Float[Tensor, "*prior K"]] = None,
@@ -144,14 +132,15 @@ def denoise(
 
     Args:
         abar: cumulative product of 1 - beta, per item, in (0, 1).
-        bank: the images x_k, shared (K, d) or per item (B, K, d), or what takes their place.
+        bank: the images x_k, shared (K, d) or per item (B, K, d), or an object with the methods of
+            :class:`ImageTensor`.
         std: s, the standard deviation of each mode, >= 0.
         log_prior: log pi_k, not necessarily normalised; by default uniform.
         distances: the squared distances to the images if they are already known, for instance for
             two mixtures of one bank.
     """
     images = ImageTensor(bank) if isinstance(bank, Tensor) else bank
-    variance = mode_variance(abar, std)
+    variance = abar.double() * std**2 + 1 - abar.double()
     if distances is None:
         distances = images.squared_distances(z, abar)
     gamma = responsibilities(distances, variance, log_prior=log_prior)
@@ -174,28 +163,6 @@ def weighted_sum(
     used = (weights > 0).any(0).nonzero().flatten()
     weights, bank = weights[:, used], bank.index_select(-2, used).to(weights)
     return weights @ bank if bank.dim() == 2 else (weights[:, None] @ bank)[:, 0]
-
-
-def log_density(
-    z: Float[Tensor, "B d"],
-    abar: Float[Tensor, " B"],
-    bank: Float[Tensor, "*batch K d"],
-    *,
-    std: float = 0.0,
-    log_prior: Optional[Float[Tensor, "*prior K"]] = None,
-) -> Float[Tensor, " B"]:
-    """Compute log p_t(z) in float64; ``log_prior`` is normalised here, and uniform by default."""
-    variance = mode_variance(abar, std).to(z.device)
-    distances = squared_distances(z, bank, abar)
-    log_prior = torch.zeros_like(distances[:1]) if log_prior is None else log_prior
-    terms = torch.log_softmax(log_prior.to(distances), dim=-1) - distances / (2 * variance[:, None])
-    return terms.logsumexp(1) - z.shape[1] / 2 * torch.log(2 * math.pi * variance)
-
-
-def mode_variance(abar: Float[Tensor, " B"], std: float) -> Float[Tensor, " B"]:
-    """Compute v = abar s^2 + 1 - abar, the variance of each noised mode, float64."""
-    abar = abar.double()
-    return abar * std**2 + 1 - abar
 
 
 # The linear latent

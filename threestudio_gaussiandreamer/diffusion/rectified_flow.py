@@ -16,7 +16,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from .sds import per_item
+
+def per_item(values: Float[Tensor, " B"], like: Tensor) -> Tensor:
+    """Reshape (B,) to (B, 1, ..., 1) in the type and on the device of ``like``."""
+    return values.to(like).reshape(-1, *[1] * (like.dim() - 1))
 
 
 def abar_of_sigma(sigma: Float[Tensor, " B"]) -> Float[Tensor, " B"]:
@@ -36,23 +39,11 @@ def on_path(z: Float[Tensor, "B *d"], abar: Float[Tensor, " B"]) -> Float[Tensor
     return z / per_item(abar.sqrt() + (1 - abar).sqrt(), z)
 
 
-def velocity(x0: Float[Tensor, "B *d"], eps: Float[Tensor, "B *d"]) -> Float[Tensor, "B *d"]:
-    """Compute v = eps - x0, which a rectified flow predicts."""
-    return eps - x0
-
-
 def noise_of_velocity(
     v: Float[Tensor, "B *d"], z: Float[Tensor, "B *d"], abar: Float[Tensor, " B"]
 ) -> Float[Tensor, "B *d"]:
-    """Compute eps = z_sigma + (1 - sigma) v, where ``z`` is the noisy latent of the diffusion."""
+    """Compute eps = z_sigma + (1 - sigma) v; v = eps - x0, and ``z`` is the diffusion's latent."""
     return on_path(z, abar) + per_item(1 - sigma_of_abar(abar), z) * v
-
-
-def velocity_of_noise(
-    eps: Float[Tensor, "B *d"], z: Float[Tensor, "B *d"], abar: Float[Tensor, " B"]
-) -> Float[Tensor, "B *d"]:
-    """Compute v = (eps - z_sigma) / (1 - sigma), the inverse of :func:`noise_of_velocity`."""
-    return (eps - on_path(z, abar)) / per_item(1 - sigma_of_abar(abar), z)
 
 
 def shifted_sigmas(num_train: int, shift: float) -> Float[Tensor, " T"]:

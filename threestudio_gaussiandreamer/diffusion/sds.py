@@ -1,4 +1,5 @@
-"""Score distillation sampling as plain formulas: schedule, noising, guidance, weights, loss.
+"""Score distillation sampling as plain formulas: schedule, noising, guidance with Perp-Neg and
+rescaling, weights, loss, and conversions of a network's output.
 
 Notation of DDPM (Ho et al. 2020): ``abar`` is the cumulative product of 1 - beta, and
 
@@ -14,8 +15,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..core import streams
-from ..core.errors import UserError, unknown
+from ..core.errors import UserError
 from ..core.given_gradient import given_gradient
+from .rectified_flow import noise_of_velocity, per_item
 
 WEIGHTS: dict[str, Callable[[Tensor], Tensor]] = {
     "sds": lambda abar: 1 - abar,
@@ -42,15 +44,12 @@ def sd_alphas_cumprod(
 
 
 def step_range(min_percent: float, max_percent: float, num_train: int = 1000) -> tuple[int, int]:
-    """Convert a range in fractions of ``num_train`` to its first and last timestep, both clamped to
-    [1, num_train - 1].
+    """Convert a range in fractions of ``num_train``, in [0, 1], to its first and last timestep,
+    both clamped to [1, num_train - 1].
 
     Raises:
-        UserError: a fraction is outside [0, 1], or the minimum is above the maximum.
+        UserError: the minimum is above the maximum.
     """
-    for name, percent in (("min_step_percent", min_percent), ("max_step_percent", max_percent)):
-        if not 0 <= percent <= 1:
-            raise UserError(f"{name} must lie in [0, 1], not {percent}")
     if min_percent > max_percent:
         raise UserError(
             f"min_step_percent: {min_percent} is above max_step_percent, {max_percent}: if they "
@@ -78,23 +77,13 @@ def timesteps(
 
     Each item, numbered from ``first``, has its own random stream, so its timestep doesn't depend on
     ``batch``.
-
-    Raises:
-        UserError: ``min_step`` is above ``max_step``.
     """
-    if min_step > max_step:
-        raise UserError(f"the smallest timestep {min_step} is above the largest {max_step}")
     low, high = (min(max(value, 1), num_train - 1) for value in (min_step, max_step))
     draws = [
         torch.randint(low, high + 1, (), generator=streams.generator(seed, stream, step, item))
         for item in range(first, first + batch)
     ]
     return torch.stack(draws) if draws else torch.empty(0, dtype=torch.long)
-
-
-def per_item(values: Float[Tensor, " B"], like: Tensor) -> Tensor:
-    """Reshape (B,) to (B, 1, ..., 1) in the type and on the device of ``like``."""
-    return values.to(like).reshape(-1, *[1] * (like.dim() - 1))
 
 
 def stratified_timesteps(batch: int, num_train: int, rng: torch.Generator) -> Int[Tensor, " B"]:
@@ -130,13 +119,6 @@ def classifier_free(
     threestudio's formula is eps_c + g (eps_c - eps_u): its g = 100 is scale = 101 here.
     """
     return torch.lerp(eps_uncond, eps_cond, scale)
-
-
-def weight(name: str, abar: Float[Tensor, " B"]) -> Float[Tensor, " B"]:
-    """Compute the weight w(t) of the strategy with this name in ``WEIGHTS``."""
-    if name not in WEIGHTS:
-        raise unknown("weighting_strategy", name, WEIGHTS)
-    return WEIGHTS[name](abar)
 
 
 def sds_loss(x: Float[Tensor, "B *d"], grad: Float[Tensor, "B *d"]) -> Float[Tensor, ""]:
@@ -192,3 +174,61 @@ def ddim_sample(
         )
         z = ddim_step(z, predict(z, now), alphas_cumprod[now], abar_later)
     return z
+
+
+PREDICTIONS = {
+    "epsilon": lambda output, z, abar: output,
+    "v_prediction": lambda output, z, abar: (
+        per_item(abar.sqrt(), z) * output + per_item((1 - abar).sqrt(), z) * z
+    ),
+    "velocity": lambda output, z, abar: noise_of_velocity(output, z, abar),
+    "sample": lambda output, z, abar: (
+        (z - per_item(abar.sqrt(), z) * output) / per_item((1 - abar).sqrt(), z)
+    ),
+}
+"""Conversions of the network's output to the noise, by prediction type: the noise itself,
+v = sqrt(abar) eps - sqrt(1 - abar) x0 (Salimans and Ho 2022), the velocity eps - x0 of a rectified
+flow, or x0.
+"""
+
+
+def perp_neg(
+    cond: Float[Tensor, "B c h w"],
+    uncond: Float[Tensor, "B c h w"],
+    negative: Float[Tensor, "B 2 c h w"],
+    weights: Float[Tensor, "B 2"],
+) -> Float[Tensor, "B c h w"]:
+    """Compute eps_u + d + sum_i w_i (n_i - proj_d n_i), where d = eps_c - eps_u, n_i = eps_i -
+    eps_u (Armandpour et al. 2023, eq. 9).
+
+    Classifier-free guidance with scale s turns this into eps_u + s (d + ...), the paper's formula.
+    """
+    wanted = (cond - uncond)[:, None]
+    unwanted = negative - uncond[:, None]
+    inner = (unwanted * wanted).sum(dim=(2, 3, 4), keepdim=True)
+    length = wanted.square().sum(dim=(2, 3, 4), keepdim=True).clamp_min(1e-6)
+    perpendicular = unwanted - inner / length * wanted
+    return cond + (weights.to(cond)[:, :, None, None, None] * perpendicular).sum(dim=1)
+
+
+def rescaled(
+    guided: Float[Tensor, "B c h w"],
+    cond: Float[Tensor, "B c h w"],
+    z: Float[Tensor, "B c h w"],
+    abar: Float[Tensor, " B"],
+    share: float,
+) -> Float[Tensor, "B c h w"]:
+    """Rescale the guided noise so that its x0 has the standard deviation of the conditional x0 (Lin
+    et al. 2023, arXiv:2305.08891, section 3.4).
+
+    Args:
+        share: 0 for no effect, 1 for the full rescaling; linear between.
+    """
+    x0, reference = predict_x0(z, guided, abar), predict_x0(z, cond, abar)
+    factor = _deviation(reference) / _deviation(x0)
+    x0 = x0 * (share * factor + 1 - share)
+    return PREDICTIONS["sample"](x0, z, abar)
+
+
+def _deviation(x: Float[Tensor, "B c h w"]) -> Float[Tensor, "B 1 1 1"]:
+    return x.std(dim=(1, 2, 3), keepdim=True).clamp_min(1e-8)

@@ -55,7 +55,6 @@ from ..core.host_copies import DelayedReads, to_device
 from ..core.methods import require_method
 from ..core.options import checked_options, in_range, interval, one_of, schedule
 from ..diffusion import sds
-from ..diffusion.noise_prediction import rescaled
 from ..host import BaseObject, C, find, names, parse_structured, run_seed, warn
 from .types import Batch, Latents, Noised, Residual, State, Timesteps, items_of
 from .variants import Variant
@@ -335,7 +334,7 @@ class ScoreDistillation(BaseObject, ABC):
         Returns:
             the gradient, zero for items in which it isn't finite, and a mask of those.
         """
-        weight = sds.weight(self.options.weighting_strategy, abar)
+        weight = sds.WEIGHTS[self.options.weighting_strategy](abar)
         grad = sds.per_item(weight, residual) * residual
         bad = find_bad_items(grad)
         if may_have_any(bad):
@@ -427,7 +426,7 @@ class ScoreDistillation(BaseObject, ABC):
                     "returns no unconditional prediction"
                 )
         guided = sds.classifier_free(cond, uncond, scale)
-        return rescaled(guided, cond, z, self.abar_of(t), rescale) if rescale else guided
+        return sds.rescaled(guided, cond, z, self.abar_of(t), rescale) if rescale else guided
 
     def at_scale(self, z: Latents, t: Timesteps, condition: Any, scale: float) -> Optional[Latents]:
         """Predict the noise with guidance of this scale in one evaluation; None where the model

@@ -207,7 +207,7 @@ class ExactScoreGuidance(ScoreDistillation):
         self._size = tuple(size)
         pictures = self.truth.pictures.planes(c2w, fovy, *size)
         _, abar = self.draw_timesteps(rgb)
-        weight = sds.weight(self.options.weighting_strategy, abar).float()
+        weight = sds.WEIGHTS[self.options.weighting_strategy](abar).float()
         background, scale = background[:, 0, 0].contiguous(), (abar / (1 - abar)).sqrt().float()
         found = known_picture.known_gradient(rgb, pictures, background, scale, weight)
         # the latents' gradient is 2 weight scale (render - picture); plain numbers are faster

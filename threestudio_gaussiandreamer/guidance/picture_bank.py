@@ -1,6 +1,6 @@
 """Pictures of a mesh from views around it: the modes of the exact score's mixtures."""
 
-from typing import NamedTuple, Optional
+from typing import Any, NamedTuple, Optional
 
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
@@ -8,7 +8,6 @@ from torch import Tensor
 
 from ..diffusion.exact_score import (
     ImageTensor,
-    KnownImages,
     LinearLatent,
     expanded_distances,
     images_per_chunk,
@@ -100,7 +99,7 @@ class Modes(NamedTuple):
 
 def modes_of(
     mixtures: list[Mixture],
-) -> tuple[KnownImages, Optional[Float[Tensor, "B K"]]]:
+) -> tuple[Any, Optional[Float[Tensor, "B K"]]]:
     """Return the modes of mixtures with the same pictures, and the logarithms of their priors."""
     own, pictures = mixtures[0].own, mixtures[0].pictures
     if own is not None:

@@ -57,7 +57,7 @@ from torch import Tensor, nn
 from ..core.errors import UserError, unknown
 from ..core.extras import require_extra
 from ..core.options import in_range, one_of
-from ..diffusion.noise_prediction import PREDICTIONS, perp_neg
+from ..diffusion.sds import PREDICTIONS, perp_neg
 from ..host import debug, info, parse_structured, warn
 from ..models.families import STABLE_DIFFUSION, Family
 from ..models.hub import find_model
