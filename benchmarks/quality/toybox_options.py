@@ -19,7 +19,7 @@ from benchmarks.quality.toybox_jobs import (
     Variant,
 )
 from threestudio_gaussiandreamer.models.bundled import NAME
-from threestudio_gaussiandreamer.view.config_changes import leaves
+from threestudio_gaussiandreamer.view.run_index import leaves
 
 PAPER = "configs/toybox-paper.yaml"
 BALL = {

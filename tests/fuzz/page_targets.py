@@ -7,8 +7,8 @@ from pathlib import Path
 
 from tests.fuzz.target import require
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.view.gallery import write_gallery
 from threestudio_gaussiandreamer.view.run_files import RunFiles
+from threestudio_gaussiandreamer.view.run_index import write_gallery
 
 MARK = b"\n=====\n"
 RUN = {

@@ -14,7 +14,7 @@ from threestudio_gaussiandreamer.models.bundled import (
     digest_of,
     read_digests,
 )
-from threestudio_gaussiandreamer.view.config_changes import leaves
+from threestudio_gaussiandreamer.view.run_index import leaves
 
 register_parts()
 pytestmark = pytest.mark.skipif(

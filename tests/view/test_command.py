@@ -11,12 +11,14 @@ import pytest
 import torch
 
 from tests.helpers.ply_files import write_raw_gaussians
+from tests.helpers.pruning import ball
 from tests.view.clouds import cloud
 from threestudio_gaussiandreamer.convert import command as convert
-from threestudio_gaussiandreamer.formats.gaussian_files import write_cloud
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.formats.gaussian_files import StoredCloud, write_cloud
 from threestudio_gaussiandreamer.view import page
 from threestudio_gaussiandreamer.view.command import main, parse
-from threestudio_gaussiandreamer.view.run_files import RunFiles
+from threestudio_gaussiandreamer.view.run_files import RunFiles, read_any
 
 
 @pytest.fixture
@@ -33,12 +35,13 @@ def meta(path: Path) -> dict:
 def test_options_say_how_a_cloud_is_drawn(source, tmp_path):
     out = tmp_path / "out.html"
     given = "--eps2d 0.1 --preset accurate --antialias --no-bound-colors --background 0080ff"
-    assert main([str(source), "--html", str(out), "--title", "a box", *given.split()]) == 0
+    assert main([str(source), "--html", str(out), "--title", "a box \udcff", *given.split()]) == 0
     found = meta(out)
     settings = found["settings"]
     assert settings["eps2d"] == 0.1 and settings["alphaMin"] == 1 / 65536
     assert settings["antialias"] and not settings["boundColors"]
-    assert found["background"] == "#0080ff" and found["title"] == "a box"
+    assert found["background"] == "#0080ff" and found["title"] == "a box \udcff"
+    assert "<title>a box ?</title>" in out.read_text(encoding="utf-8")
 
 
 def test_a_cloud_of_a_run_is_drawn_as_the_run_has_drawn_it(run_folder):
@@ -50,11 +53,8 @@ def test_a_cloud_of_a_run_is_drawn_as_the_run_has_drawn_it(run_folder):
     assert settings["antialias"] and not settings["boundColors"]
     assert found["title"] == "a box" and found["background"] == "#00ff00"
     assert found["clouds"][0]["quality"] == "31.2 dB on held-out views"
-
-
-def test_the_scores_of_a_run_are_not_shown_for_another_step(run_folder):
     other = run_folder / "save" / "it3-export"
-    (run_folder / "save" / "it7-export").rename(other)
+    export.parent.rename(other)  # a step of which the scores aren't
     assert main([str(other / "gaussians.spz"), "--html"]) == 0
     assert meta(other / "gaussians.html")["clouds"][0]["quality"] == ""
 
@@ -89,41 +89,35 @@ def message(capsys, *argv: object) -> str:
     return capsys.readouterr().err
 
 
-def test_a_file_that_is_no_cloud(source, tmp_path, capsys):
-    text = tmp_path / "notes.txt"
-    text.write_text("hello")
-    assert ".ply" in message(capsys, text, "--html")
-    text.rename(tmp_path / "notes.ply")
-    assert "PLY" in message(capsys, tmp_path / "notes.ply", "--html")
-    assert "near names" in message(capsys, tmp_path / "boxx.ply", "--html")
-
-
-def test_mistakes_in_options(source, capsys):
-    assert "no folder" in message(capsys, source, "--html", source.parent / "a" / "out.html")
-    assert "--eps2d" in message(capsys, source, "--html", "--eps2d", "-1")
-    assert "--eps2d" in message(capsys, source, "--html", "--eps2d", "nan")
-    assert "--background" in message(capsys, source, "--html", "--background", "red")
-
-
-@pytest.mark.parametrize("name", ["~nosuchuser/a.ply", "a" * 5000])
-def test_a_path_that_can_be_no_file(name, capsys):
-    assert "not a usable file name" in message(capsys, name, "--html")
-
-
-def test_the_page_does_not_replace_its_cloud(source, tmp_path, capsys):
-    before, alias = source.read_bytes(), tmp_path / "alias.html"
+def test_what_is_wrong_is_named(source, tmp_path, run_folder, capsys, monkeypatch):
+    (tmp_path / "notes.txt").write_text("hello")
+    (tmp_path / "notes.ply").write_text("hello")
+    (tmp_path / "empty").mkdir()
+    alias, other, before = tmp_path / "alias.html", tmp_path / "other.ply", source.read_bytes()
     alias.symlink_to(source)
-    for out in (source, alias):
-        assert "OUT is PATH" in message(capsys, source, "--html", out)
-    assert source.read_bytes() == before and alias.is_symlink()
-
-
-def test_a_page_does_not_replace_another_kind_of_file(source, tmp_path, capsys):
-    """As someone would who wants the pages of two clouds."""
-    other = tmp_path / "other.ply"
-    other.write_bytes(source.read_bytes())
-    assert "expected a name that ends in .html" in message(capsys, source, "--html", other)
-    assert other.read_bytes() == source.read_bytes()
+    other.write_bytes(before)
+    for said, *arguments in (
+        (".ply", tmp_path / "notes.txt", "--html"),
+        ("PLY", tmp_path / "notes.ply", "--html"),
+        ("near names", tmp_path / "boxx.ply", "--html"),
+        ("no folder", source, "--html", source.parent / "a" / "out.html"),
+        ("--eps2d", source, "--html", "--eps2d", "-1"),
+        ("--eps2d", source, "--html", "--eps2d", "nan"),
+        ("--background", source, "--html", "--background", "red"),
+        ("not a usable file name", "~nosuchuser/a.ply", "--html"),
+        ("not a usable file name", "a" * 5000, "--html"),
+        ("OUT is PATH", source, "--html", source),
+        ("OUT is PATH", source, "--html", alias),
+        ("expected a name that ends in .html", source, "--html", other),
+        ("holds no run", tmp_path / "empty", "--html"),
+        ("is a folder", run_folder, "--html", "out.html"),
+        ("--eps2d", run_folder, "--html", "--eps2d", "1"),
+    ):
+        assert said in message(capsys, *arguments), arguments
+    assert source.read_bytes() == other.read_bytes() == before and alias.is_symlink()
+    monkeypatch.setattr(page, "MAX_GAUSSIANS", 29)
+    said = message(capsys, source, "--html")
+    assert "has 30 Gaussians" in said and "prune" in said and "--count" in said
 
 
 def test_an_axis_that_begins_with_a_hyphen_is_a_value():
@@ -141,12 +135,6 @@ def test_a_cloud_of_any_unit_has_no_far_plane(tmp_path):
     assert main([str(tmp_path / "large.ply"), "--html"]) == 0
     settings = meta(tmp_path / "large.html")["settings"]
     assert settings["far"] > 1e30 and settings["near"] > 1e10
-
-
-def test_a_title_whose_bytes_are_not_utf_8(source):
-    assert main([str(source), "--html", "--title", "box \udcff"]) == 0
-    page_file = source.with_suffix(".html")
-    assert "<title>box ?</title>" in page_file.read_text(encoding="utf-8")
 
 
 def test_an_empty_cloud_and_one_of_nan(tmp_path, capsys):
@@ -171,26 +159,40 @@ def test_a_run_gets_the_page_of_any_export_but_of_a_ply_first(run_folder, suffix
     assert RunFiles(run_folder).cloud == export / "gaussians.ply"
 
 
-def test_a_run_gets_an_index_and_a_page(run_folder, capsys):
+def test_a_run_gets_an_index_and_a_page_and_a_folder_of_runs_a_gallery(run_folder, capsys):
     assert main([str(run_folder), "--html"]) == 0
     assert meta(run_folder / "save" / "it7-export" / "view.html")["title"] == "a box"
     assert capsys.readouterr().out.strip().endswith(str(run_folder / "index.html"))
     assert "it7-export/view.html" in (run_folder / "index.html").read_text()
-
-
-def test_a_folder_of_runs_gets_a_gallery(run_folder, capsys):
     assert main([str(run_folder.parent), "--html"]) == 0
     assert "run/index.html" in (run_folder.parent / "index.html").read_text()
 
 
-def test_a_folder_without_runs_and_options_of_clouds(tmp_path, run_folder, capsys):
-    (tmp_path / "empty").mkdir()
-    assert "holds no run" in message(capsys, tmp_path / "empty", "--html")
-    assert "is a folder" in message(capsys, run_folder, "--html", "out.html")
-    assert "--eps2d" in message(capsys, run_folder, "--html", "--eps2d", "1")
+# -- files and checkpoints -----------------------------------------------------------------------
 
 
-def test_too_many_gaussians(source, monkeypatch, capsys):
-    monkeypatch.setattr(page, "MAX_GAUSSIANS", 29)
-    said = message(capsys, source, "--html")
-    assert "has 30 Gaussians" in said and "prune" in said and "--count" in said
+def checkpoint(folder):
+    cloud = ball(20)
+    names = {"sh0": cloud.sh, "sh_rest": torch.zeros(20, 0, 3)}
+    names |= {name: value for name, value in cloud._asdict().items() if name != "sh"}
+    folder.mkdir(parents=True)
+    state = {f"geometry.{name}": value for name, value in names.items()}
+    torch.save({"state_dict": state}, folder / "last.ckpt")
+    return folder / "last.ckpt"
+
+
+@pytest.mark.parametrize("option", ["true", "false", "1", "{}"])
+def test_a_checkpoint_has_the_antialiasing_of_its_run(tmp_path, option):
+    path = checkpoint(tmp_path / "run/ckpts")
+    (tmp_path / "run/configs").mkdir()
+    parsed = tmp_path / "run/configs/parsed.yaml"
+    parsed.write_text(f"system: {{renderer: {{antialias: {option}}}}}")
+    assert read_any(path).antialiased == (option == "true")
+    assert not read_any(checkpoint(tmp_path / "alone")).antialiased
+
+
+def test_files_are_read_by_their_extension(tmp_path):
+    write_cloud(str(tmp_path / "a.spz"), StoredCloud(ball(20).arrays(), antialiased=True))
+    assert read_any(tmp_path / "a.spz", "y").antialiased
+    with pytest.raises(UserError, match="IN"):
+        read_any(tmp_path / "a.png", option="IN")

@@ -5,6 +5,7 @@ import html
 import io
 import json
 import re
+import zlib
 from html.parser import HTMLParser
 
 import numpy as np
@@ -13,8 +14,16 @@ from PIL import Image
 
 from tests.view.clouds import PROMPT, cloud, options
 from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.formats.ply import gaussian_columns
 from threestudio_gaussiandreamer.view import page as page_module
-from threestudio_gaussiandreamer.view.page import Shown, decibels, page, write_page
+from threestudio_gaussiandreamer.view.page import (
+    COARSE_MEANS,
+    Shown,
+    coarse,
+    packed,
+    page,
+    write_page,
+)
 
 
 def meta(text: str) -> dict:
@@ -34,7 +43,8 @@ def test_5000_gaussians_and_their_prior_take_less_than_600_kB(tmp_path):
 
 def test_a_prompt_is_text_wherever_it_stands():
     text = page(Shown(cloud(3), "result"), options())
-    assert html.escape(PROMPT) in text and PROMPT not in text
+    title = re.search(r"<title>(.*?)</title>", text, re.S)[1]
+    assert html.unescape(title) == PROMPT and "<" not in title and PROMPT not in text
     assert meta(text)["title"] == PROMPT
     assert text.count("<script") == text.count("</script>") == 8  # four shaders, meta, data x 2
 
@@ -76,12 +86,6 @@ def test_the_policy_forbids_requests_and_foreign_scripts():
     assert set(re.findall(r'(?:src|href)="(.{5})', text)) == {"data:"}
 
 
-def test_the_page_knows_how_the_cloud_was_trained():
-    text = page(Shown(cloud(3), "result"), options(eps2d=0.1, antialias=True, alpha_min=1 / 255))
-    settings = meta(text)["settings"]
-    assert settings["eps2d"] == 0.1 and settings["antialias"] and settings["alphaMin"] == 1 / 255
-
-
 @pytest.mark.parametrize(
     "color, background, keep, expected",
     [
@@ -115,24 +119,46 @@ def test_gaussians_with_nan_are_left_out_with_a_warning(caplog):
     assert meta(text)["clouds"][0]["count"] == 9 and "1 of 10 Gaussians" in caplog.text
 
 
-def test_an_empty_cloud_is_refused():
-    with pytest.raises(UserError, match="no Gaussians"):
-        page(Shown(cloud(0), "result"), options())
-
-
-def test_gaussians_beyond_float32_are_refused():
+def test_what_can_not_be_shown_is_refused(monkeypatch):
     large = cloud(5)
     large.gaussians.log_scales[:] = 80.0
-    with pytest.raises(UserError, match="float32 can't render"):
-        page(Shown(large, "result"), options())
-
-
-def test_too_many_gaussians_are_refused_with_the_way_out(monkeypatch):
     monkeypatch.setattr(page_module, "MAX_GAUSSIANS", 100)
-    with pytest.raises(UserError, match="prune it first.*threestudio_gaussiandreamer.prune"):
-        page(Shown(cloud(101), "result"), options())
+    for stored, message in (
+        (cloud(0), "no Gaussians"),
+        (large, "float32 can't render"),
+        (cloud(101), "prune it first.*threestudio_gaussiandreamer.prune"),
+    ):
+        with pytest.raises(UserError, match=message):
+            page(Shown(stored, "result"), options())
 
 
-def test_unknown_dB_are_not_shown():
-    assert decibels(None) == decibels(float("nan")) == ""
-    assert decibels(33.213) == "33.2 dB on held-out views"
+# -- the data: every float to the bit, or rounded where it is for comparison -----------------------
+
+
+def unpacked(data: bytes, count: int) -> np.ndarray:
+    """Return the columns (P, N), as the page's scripts do."""
+    planes = np.frombuffer(zlib.decompress(data), np.uint8).reshape(-1, 4, count)
+    return np.ascontiguousarray(planes.transpose(0, 2, 1)).view("<f4")[..., 0]
+
+
+def test_packing_keeps_every_bit():
+    gaussians = cloud(50, degree=2).gaussians
+    columns = gaussian_columns(gaussians)
+    found = unpacked(packed(gaussians), 50)
+    assert np.array_equal(found[:3].T, columns[:, :3])
+    assert np.array_equal(found[3:].T, columns[:, 6:])
+    assert not columns[:, 3:6].any()  # the normals, which aren't stored
+
+
+def test_a_coarse_cloud_is_a_fraction_of_the_size_and_hardly_moves():
+    gaussians = cloud(4000, degree=1).gaussians
+    rounded = coarse(gaussians)
+    side = np.ptp(gaussians.means, axis=0).max()
+    assert np.abs(rounded.means - gaussians.means).max() <= side / COARSE_MEANS
+    assert rounded.sh.shape == (4000, 1, 3)
+    assert len(packed(rounded)) < 0.4 * len(packed(gaussians._replace(sh=gaussians.sh[:, :1])))
+
+
+def test_a_single_point_can_be_made_coarse():
+    point = cloud(1).gaussians
+    assert np.allclose(coarse(point).means, point.means)

@@ -17,12 +17,19 @@ from benchmarks.viewers.browser import chromium
 from benchmarks.viewers.devtools import open_page
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.core.images import write
-from threestudio_gaussiandreamer.view.cloud_page import cloud_page
-from threestudio_gaussiandreamer.view.gallery import write_gallery
-from threestudio_gaussiandreamer.view.run_index import note_time, write_index
+from threestudio_gaussiandreamer.view.page import cloud_page
+from threestudio_gaussiandreamer.view.run_index import (
+    LEFT,
+    WIDTH,
+    drawn,
+    note_time,
+    read_curves,
+    write_gallery,
+    write_index,
+)
 
 PROMPT = 'a <img src=x onerror="alert(1)"> & </title><script>alert(1)</script>'
-LOG = "dB,loss,gaussians,step\n10.0,5.0,200,1\n,,,2\n20.0,0.01,150,3\nnan,x,,4\n"
+LOG = "dB,loss,gaussians,step\n10.0,5.0,200,1\n,,,2\n20.0,0.01,150,123456\nnan,x,,4\n"
 
 
 PHONE = {"width": 320, "height": 600, "deviceScaleFactor": 1, "mobile": True}
@@ -68,41 +75,33 @@ def full_run(run_folder):
 
 
 def test_the_index_shows_what_the_run_has(full_run):
-    note_time(full_run, "train", datetime(2026, 1, 2, 3, 4, 5), 61.25)
+    """Numbers as in the terminal."""
+    for stage in ("train", "export"):
+        note_time(full_run, stage, datetime(2026, 1, 2, 3, 4, 5), 61.25)
+    scores = {"result": {"psnr": 31.25, "multi_face": 0.25, "gaussians": 12345678.0}}
+    (full_run / "save" / "metrics.json").write_text(json.dumps(scores))
+    (full_run / "save" / "it7-export" / "model.glb").write_bytes(b"glTF")
     text = write_index(full_run).read_text()
     for expected in (
-        "dB to the truth",
-        "loss, logarithmic",
-        "31.25",
-        "61.2 s",
-        "2026-01-02 03:04",
-        "&lt;x&gt;",
+        *("dB to the truth", "loss, logarithmic", "<td>31.25</td>", "61.2 s", "2026-01-02 03:04"),
+        *("&lt;x&gt;", "<td>train</td>", "<td>export</td>", ">123,456<", "sides look alike"),
+        *("<td>25 %</td><td>12,345,678</td>", "it7-export/view.html"),
     ):
-        assert expected in text
+        assert expected in text, expected
+    assert "e+0" not in text
+    (row,) = re.findall(r"Downloads</h2>(.*?)</section>", text, re.S)
+    for name in ("gaussians.spz", "model.glb", "view.html", "it7-test.mp4"):
+        assert f">{name}</a>" in row
+    assert text.index("Downloads") < text.index("In 3D")
     found = Tags(full_run / "index.html")
     assert found.tags.count("svg") == 3 and "iframe" in found.tags and "video" in found.tags
     assert found.tags.count("img") == 3  # poster, comparison, validation
     assert not {"button", "select", "input", "script"} & set(found.tags)  # none that needs a script
-
-
-def test_the_downloads_come_first(full_run):
-    (full_run / "save" / "it7-export" / "model.glb").write_bytes(b"glTF")
-    text = write_index(full_run).read_text()
-    (row,) = re.findall(r"Downloads</h2>(.*?)</section>", text)
-    for name in ("gaussians.spz", "model.glb", "view.html", "it7-test.mp4"):
-        assert f">{name}</a>" in row
-    assert text.index("Downloads") < text.index("In 3D")
-
-
-def test_numbers_are_written_as_in_the_terminal(full_run):
-    scores = {"result": {"psnr": 31.25, "multi_face": 0.25, "gaussians": 12345678.0}}
-    (full_run / "save" / "metrics.json").write_text(json.dumps(scores))
-    log = full_run / "csv_logs" / "version_0" / "metrics.csv"
-    log.write_text("gaussians,step\n10000,1\n20000,123456\n")
-    text = write_index(full_run).read_text()
-    assert ">10,000<" in text and ">123,456<" in text
-    assert "<td>25 %</td><td>12,345,678</td>" in text and "e+0" not in text
-    assert "sides look alike" in text
+    # a prompt, a name or a command adds no markup
+    assert "b" not in found.tags and "x" not in found.files
+    linked = {name for name in found.files if name != "data:,"}
+    files = {str(path.relative_to(full_run)) for path in full_run.rglob("*") if path.is_file()}
+    assert linked == files - {"index.html"}
 
 
 def test_a_background_that_a_command_has_set_is_kept(full_run):
@@ -121,28 +120,17 @@ def test_a_white_object_does_not_vanish_on_the_page(full_run):
 
 
 @pytest.mark.skipif(chromium() is None, reason="no Chromium is installed")
-def test_a_phone_shows_the_gallery_without_scrolling_sideways(full_run):
-    full_run.rename(full_run.with_name("a_long_path_" * 12))
-    with open_page(write_gallery(full_run.parent).as_uri()) as page:
+def test_a_phone_shows_the_pages_without_scrolling_sideways(full_run):
+    """And numbers in one line."""
+    run = full_run.rename(full_run.with_name("a_long_path_" * 12))
+    with open_page(write_gallery(run.parent).as_uri(), size=(320, 600)) as page:
         page.call("Emulation.setDeviceMetricsOverride", **PHONE)
         assert page.evaluate("document.documentElement.scrollWidth") <= 320
-
-
-@pytest.mark.skipif(chromium() is None, reason="no Chromium is installed")
-def test_a_phone_shows_a_runs_numbers_in_one_line(full_run):
-    with open_page(write_index(full_run).as_uri(), size=(320, 600)) as page:
-        page.call("Emulation.setDeviceMetricsOverride", **PHONE)
+        page.call("Page.navigate", url=(run / "index.html").as_uri())
+        page.evaluate("new Promise(done => setTimeout(done, 1000))")
         assert page.evaluate("document.documentElement.scrollWidth") <= 320
-        cells = (
-            "[...document.querySelector('table').querySelectorAll('td')].map(x => x.offsetHeight)"
-        )
-        assert max(page.evaluate(cells)) < 35
-
-
-def test_every_file_is_linked_and_every_link_leads_to_a_file(full_run):
-    linked = {name for name in Tags(write_index(full_run)).files if name != "data:,"}
-    files = {str(path.relative_to(full_run)) for path in full_run.rglob("*") if path.is_file()}
-    assert linked == files - {"index.html"}
+        cells = "[...document.querySelector('table').querySelectorAll('td')]"
+        assert max(page.evaluate(f"{cells}.map(x => x.offsetHeight)")) < 35
 
 
 def test_names_that_are_not_utf_8_are_linked(full_run):
@@ -154,13 +142,6 @@ def test_names_that_are_not_utf_8_are_linked(full_run):
     assert "save/it7-%FF.png" in write_index(full_run).read_text()
 
 
-def test_a_prompt_adds_no_markup(full_run):
-    found = Tags(write_index(full_run))
-    assert "script" not in found.tags and "b" not in found.tags and "x" not in found.files
-    write_gallery(full_run.parent)
-    assert "script" not in Tags(full_run.parent / "index.html").tags
-
-
 def test_the_changes_of_the_configuration_are_listed(full_run):
     text = write_index(full_run).read_text()
     rows = re.findall(r"<tr><td>([\w.]+)</td><td>([^<]*)</td><td>([^<]*)</td></tr>", text)
@@ -169,13 +150,6 @@ def test_the_changes_of_the_configuration_are_listed(full_run):
     assert changed["trainer.max_steps"] == ("–", "7")
     # neither what is equal, nor what is computed, nor what the base file refers to elsewhere
     assert not changed.keys() & {"seed", "exp_dir", "tag", "system.renderer.preset"}
-
-
-def test_times_of_several_stages_are_kept(full_run):
-    for stage in ("train", "export"):
-        note_time(full_run, stage, datetime.now(), 1.0)
-    text = write_index(full_run).read_text()
-    assert "<td>train</td>" in text and "<td>export</td>" in text
 
 
 @pytest.mark.parametrize("damage", [b"", b"{", b"[1]", b"\xff\xfe", b'{"result": {"psnr": "x"}}'])
@@ -206,8 +180,9 @@ def test_a_page_of_someone_else_is_not_replaced(full_run):
 def test_the_gallery_shows_prompt_poster_and_scores(full_run):
     page = write_gallery(full_run.parent)
     assert "31.2 dB" in page.read_text()
-    assert {"run/index.html", "run/save/it7-export/poster.png"} <= set(Tags(page).files)
-    assert not {"button", "select", "input", "script"} & set(Tags(page).tags)
+    found = Tags(page)
+    assert {"run/index.html", "run/save/it7-export/poster.png"} <= set(found.files)
+    assert not {"button", "select", "input", "script", "b"} & set(found.tags)
     assert (full_run / "index.html").is_file()
 
 
@@ -235,3 +210,35 @@ def test_a_gallery_needs_runs(tmp_path):
 def test_a_run_whose_index_cannot_be_written_stays_in_the_gallery(full_run):
     (full_run / "index.html").mkdir()
     assert "run" in Tags(write_gallery(full_run.parent)).files
+
+
+# -- curves ----------------------------------------------------------------------------------------
+
+
+def log(folder, version: int, text: str) -> None:
+    path = folder / "csv_logs" / f"version_{version}" / "metrics.csv"
+    path.parent.mkdir(parents=True)
+    path.write_text(text)
+
+
+def test_a_resumed_run_replaces_the_steps_that_it_repeats(tmp_path):
+    log(tmp_path, 2, "loss,alone,step\n1,1,1\n2,inf,2\n3,nan,3\n")
+    log(tmp_path, 10, "loss,step\n30,3\n40,4\n")
+    curves = read_curves(tmp_path, ["loss", "absent", "alone"])
+    assert curves == {"loss": [(1, 1), (2, 2), (3, 30), (4, 40)]}
+
+
+def points(curve, title="loss") -> list[tuple[float, float]]:
+    pairs = drawn(curve, title)["points"].split()
+    return [tuple(map(float, pair.split(","))) for pair in pairs]
+
+
+def test_curves_fill_their_axes():
+    (x0, y0), (x1, y1) = points([(0, 1.0), (10, 3.0)])
+    assert x0 == LEFT and x1 == WIDTH - 8 and y0 > y1
+    powers = [(0, 1.0), (1, 100.0), (2, 10_000.0)]
+    heights = [y for _, y in points(powers)]
+    assert abs(heights[0] - 2 * heights[1] + heights[2]) < 0.2
+    assert drawn(powers, "loss")["title"] == "loss, logarithmic"
+    assert len(points([(i, float(i)) for i in range(5000)])) <= 400
+    assert len({y for _, y in points([(0, 2.0), (1, 2.0)])}) == 1

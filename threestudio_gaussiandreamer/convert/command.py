@@ -35,7 +35,7 @@ from ..gaussians.axes import AXES, VIEWER_UP
 from ..gaussians.gaussians import finite
 from ..gaussians.sh import COEFFICIENTS, MAX_DEGREE
 from ..meshes.write import WRITERS
-from ..view.reading import read_any
+from ..view.run_files import read_any
 from . import to_mesh
 from .check import VIEWS, compare, reference
 from .losses import dropped, losses

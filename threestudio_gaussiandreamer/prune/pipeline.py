@@ -31,7 +31,7 @@ from ..gaussians.views import (
     bounds,
     views_around,
 )
-from ..view.reading import read_any
+from ..view.run_files import read_any
 from .options import (
     PruneOptions,
     budget_of,

@@ -29,8 +29,7 @@ from ..view.page import (
     decibels,
     page,
 )
-from ..view.poster import WHITE, picture
-from ..view.render import RenderSettings, first_pose
+from ..view.render import WHITE, RenderSettings, first_pose, picture
 from ..view.run_files import RunFiles
 from .background import FlatBackground
 from .renderer import SplattingRenderer

@@ -13,7 +13,7 @@ import functools
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Optional
+from typing import Optional
 
 from ..core.command import joined_values, run_command
 from ..core.errors import UserError
@@ -27,46 +27,16 @@ from ..core.files import (
 from ..gaussians.axes import AXES
 from ..gaussians.views import EPS2D
 from ..splatting import PRESETS
-from .cloud_page import cloud_page
-from .gallery import write_gallery
 from .live import LiveView, require_server, serve, serve_until_stopped
-from .page import write_page
-from .reading import read_any
-from .run_files import RunFiles, cloud_file, is_run
-from .run_index import write_index
+from .page import cloud_page, write_page
+from .run_files import RunFiles, cloud_file, is_run, read_any
+from .run_index import write_gallery, write_index
 
 LONG_WORK = 200_000
 """Gaussians from which writing a page takes seconds, so that it is announced."""
-OPTIONS: dict[str, dict[str, Any]] = {
-    "--title": {"help": "what the page is called (default: the run's prompt, or the file's name)"},
-    "--eps2d": {
-        "type": float,
-        "help": f"screen-space dilation, square pixels (default: the run's, or {EPS2D:g})",
-    },
-    "--preset": {
-        "choices": PRESETS,
-        "help": "smallest alpha that is drawn (default: the run's, or balanced)",
-    },
-    "--antialias": {
-        "action": argparse.BooleanOptionalAction,
-        "help": "keep the energy of small Gaussians (default: the run's, or not)",
-    },
-    "--bound-colors": {
-        "action": argparse.BooleanOptionalAction,
-        "help": "clamp the colour of each Gaussian to [0, 1] (default: the run's, or yes)",
-    },
-    "--background": {
-        "metavar": "RRGGBB",
-        "help": "colour behind the cloud (default: the run's, or ffffff)",
-    },
-    "--up": {
-        "choices": AXES,
-        "help": "which axis of PATH is up (default: from the file, else its format's convention)",
-    },
-}
-
+OPTIONS = ("title", "up", "eps2d", "preset", "antialias", "bound_colors", "background")
+"""Arguments of :func:`.page.cloud_page`; all but the first two are of pages only."""
 PAGE_SUFFIXES = (".html", ".htm")
-PAGE_OPTIONS = [name for name in OPTIONS if name not in ("--title", "--up")]
 
 
 def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
@@ -76,21 +46,25 @@ def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
         description="Serve a cloud of Gaussians to browsers, or write it as one HTML file, or the "
         "index of a run or of a folder of runs.",
     )
-    parser.add_argument(
-        "path", metavar="PATH", help="a file of Gaussians, a checkpoint, a run or runs"
-    )
-    parser.add_argument(
-        "--html",
-        metavar="OUT",
-        nargs="?",
-        const="",
-        help="write a file instead of serving (default: PATH with the ending .html, or "
-        "index.html in a folder)",
-    )
-    parser.add_argument("--host", default="127.0.0.1", help="address to serve on (this machine)")
-    parser.add_argument("--port", type=int, default=8080, help="port to serve on (8080)")
-    for name, settings in OPTIONS.items():
-        parser.add_argument(name, **settings)
+    add, flag = parser.add_argument, argparse.BooleanOptionalAction
+    add("path", metavar="PATH", help="a file of Gaussians, a checkpoint, a run or runs")
+    html = "write a file instead of serving (default: PATH with the ending .html, or index.html in "
+    add("--html", metavar="OUT", nargs="?", const="", help=f"{html}a folder)")
+    add("--host", default="127.0.0.1", help="address to serve on (this machine)")
+    add("--port", type=int, default=8080, help="port to serve on (8080)")
+    add("--title", help="what the page is called (default: the run's prompt, or the file's name)")
+    eps2d = f"screen-space dilation, square pixels (default: the run's, or {EPS2D:g})"
+    add("--eps2d", type=float, help=eps2d)
+    preset = "smallest alpha that is drawn (default: the run's, or balanced)"
+    add("--preset", choices=PRESETS, help=preset)
+    antialias = "keep the energy of small Gaussians (default: the run's, or not)"
+    add("--antialias", action=flag, help=antialias)
+    bound = "clamp the colour of each Gaussian to [0, 1] (default: the run's, or yes)"
+    add("--bound-colors", action=flag, help=bound)
+    background = "colour behind the cloud (default: the run's, or ffffff)"
+    add("--background", metavar="RRGGBB", help=background)
+    up = "which axis of PATH is up (default: from the file, else its format's convention)"
+    add("--up", choices=AXES, help=up)
     return parser.parse_args(joined_values(argv, ["--up"], AXES))
 
 
@@ -118,8 +92,7 @@ def run(args: argparse.Namespace) -> None:
 
 def write_cloud_page(source: Path, out: Path, args: argparse.Namespace) -> None:
     """Write the page of a file or checkpoint, as its run has drawn it or as the options say."""
-    given = {name[2:].replace("-", "_"): _value(args, name) for name in OPTIONS}
-    shown, options = cloud_page(source, **given)
+    shown, options = cloud_page(source, **{name: getattr(args, name) for name in OPTIONS})
     count = len(shown.cloud.gaussians.means)
     if count > LONG_WORK:
         print(f"{out}: packing {count:,} Gaussians", file=sys.stderr, flush=True)
@@ -133,7 +106,7 @@ def served(args: argparse.Namespace) -> LiveView:
     Raises:
         UserError: the options are for a page, or there is no cloud, viser or free port.
     """
-    if given := [name for name in PAGE_OPTIONS if _value(args, name) is not None]:
+    if given := _given(args, OPTIONS[2:]):
         raise UserError(f"{' '.join(given)}: is for the page that --html writes")
     require_server(args.host, args.port)
     source = cloud_file(args.path, ", or give --html for the gallery of a folder of runs")
@@ -147,7 +120,7 @@ def run_folder(folder: Path, args: argparse.Namespace) -> None:
     """Write the index of a run, and the page of its cloud if there is none, or the gallery of a
     folder of runs.
     """
-    given = [name for name in OPTIONS if _value(args, name) is not None]
+    given = _given(args, OPTIONS)
     if args.html or given:
         raise UserError(
             f"{' '.join(given) or '--html OUT'}: is for a cloud, and {args.path!r} is a folder, "
@@ -163,5 +136,6 @@ def run_folder(folder: Path, args: argparse.Namespace) -> None:
     print(write_index(folder))
 
 
-def _value(args: argparse.Namespace, option: str) -> Any:
-    return getattr(args, option[2:].replace("-", "_"))
+def _given(args: argparse.Namespace, names: Sequence[str]) -> list[str]:
+    """Return the options of these names that are given, as they are written."""
+    return [f"--{name.replace('_', '-')}" for name in names if getattr(args, name) is not None]

@@ -116,11 +116,14 @@ class LiveView:
         """
         import viser.transforms
 
-        turns = [viser.transforms.SO3.from_matrix(pose[:3, :3] @ FLIP_YZ).wxyz for pose in c2w]
         if len(self._frustums) != len(c2w):
-            self._add_frustums(len(c2w))
-        for frustum, turn, pose, angle in zip(self._frustums, turns, c2w, fovy, strict=True):
-            frustum.wxyz, frustum.position = turn, pose[:3, 3]
+            self.remove_cameras()
+            add = self.server.scene.add_camera_frustum
+            names = [f"/cameras/{i}" for i in range(len(c2w))]
+            self._frustums = [add(name, fov=1, aspect=1, scale=0.15) for name in names]
+        for frustum, pose, angle in zip(self._frustums, c2w, fovy, strict=True):
+            frustum.wxyz = viser.transforms.SO3.from_matrix(pose[:3, :3] @ FLIP_YZ).wxyz
+            frustum.position = pose[:3, 3]
             frustum.fov, frustum.aspect = float(angle), aspect
 
     def remove_cameras(self) -> None:
@@ -128,14 +131,6 @@ class LiveView:
         for frustum in self._frustums:
             frustum.remove()
         self._frustums = []
-
-    def _add_frustums(self, count: int) -> None:
-        """Replace the frustums by new ones, whose poses are set later."""
-        self.remove_cameras()
-        self._frustums = [
-            self.server.scene.add_camera_frustum(f"/cameras/{i}", fov=1, aspect=1, scale=0.15)
-            for i in range(count)
-        ]
 
     def close(self) -> None:
         """Stop serving."""

@@ -12,8 +12,7 @@ from typing import Any, NamedTuple
 
 from ..core.errors import UserError
 from ..core.files import is_folder
-from .cloud_page import cloud_page
-from .page import page
+from .page import cloud_page, page
 from .run_files import cloud_file
 
 MAX_BYTES = 20_000_000

@@ -7,11 +7,10 @@ its own."""
 
 import base64
 import hashlib
-import html
 import io
 import json
 import math
-import re
+import zlib
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
@@ -19,25 +18,40 @@ from typing import Any, NamedTuple, Optional
 
 import numpy as np
 
-from ..core.errors import UserError
+from ..core.errors import UserError, unknown
 from ..core.files import atomic_file
 from ..formats.gaussian_files import StoredCloud, ply_notes, spz_note
-from ..formats.ply import gaussian_properties, header_bytes
+from ..formats.ply import NORMALS, gaussian_columns, gaussian_properties, header_bytes
 from ..formats.spz import SPZ_UP, spz_bytes
-from ..gaussians.axes import WORLD_UP, rotation_between
-from ..gaussians.gaussians import finite
+from ..gaussians.axes import AXES, WORLD_UP, rotation_between
+from ..gaussians.gaussians import Gaussians, finite
+from ..gaussians.views import NEAR, bounds
+from ..splatting import PRESETS
 from ..splatting.options import RasterizeOptions
-from .page_data import coarse, packed
-from .poster import WHITE, Color, backdrop, hex_color, picture
-from .render import Pose, RenderSettings, first_pose, require_gaussians
+from .render import (
+    WHITE,
+    Color,
+    Pose,
+    RenderSettings,
+    backdrop,
+    first_pose,
+    hex_color,
+    picture,
+    require_gaussians,
+)
+from .run_files import RunFiles, read_any, step_of
+from .templates import WEB, fill
 
-WEB = Path(__file__).with_name("web")
 SCRIPTS = ("camera.js", "sorter.js", "cloud.js", "renderer.js", "controls.js", "main.js")
 SHADERS = ("splat.vert.glsl", "splat.frag.glsl", "screen.vert.glsl", "screen.frag.glsl")
 MAX_GAUSSIANS = 2_000_000
 """A browser takes minutes to open a page with more, or runs out of memory."""
 POSTER_SIZE = 320
 """Width and height in pixels of the picture that a browser without WebGL2 shows."""
+COARSE_MEANS = 1024
+"""Steps of coarse positions along the longest side of the cloud."""
+COARSE_LOG_SCALE, COARSE_SH, COARSE_QUAT, COARSE_LOGIT = 1 / 8, 1 / 16, 1 / 32, 1 / 8
+"""Steps of the other coarse attributes; that of the harmonics is 4.5 levels of 255 of a colour."""
 
 
 class Shown(NamedTuple):
@@ -82,30 +96,28 @@ def write_page(
 
 def page(shown: Shown, options: PageOptions, before: Optional[Shown] = None) -> str:
     """Make the page of :func:`write_page`; same arguments and errors."""
-    shown = _checked(shown, options.name)
-    clouds = [shown]
+    clouds = [_checked(shown, options.name)]
     if before is not None:
         before = _checked(before, before.label)
-        clouds.append(before._replace(cloud=_coarse(before.cloud)))
-    pose = first_pose(shown.cloud)
-    poster = picture(shown.cloud, options.settings, pose, POSTER_SIZE)
+        gaussians = coarse(before.cloud.gaussians)
+        clouds.append(before._replace(cloud=before.cloud._replace(gaussians=gaussians)))
+    cloud = clouds[0].cloud
+    pose = first_pose(cloud)
+    poster = picture(cloud, options.settings, pose, POSTER_SIZE)
     if not options.keep_background:
         options = options._replace(background=backdrop(poster, options.background))
-    script = sources(SCRIPTS)
-    style = sources(["page.css"])
-    fields = {
-        "policy": policy(script, style),
-        "title": html.escape(options.title),
-        "style": style,
-        "script": script,
-        "meta": _script_json(_meta(clouds, options, pose)),
-        "poster": _poster(poster, options.background),
-        "data": _data_blocks(clouds),
-        **{name: sources([name]) for name in SHADERS},
-    }
-    # in one pass, so that a prompt that holds "{{data}}" stays as it is
-    template = (WEB / "page.html").read_text(encoding="utf-8")
-    return re.sub(r"\{\{([\w.]+)\}\}", lambda match: fields[match[1]], template)
+    script, style = sources(SCRIPTS), sources(["page.css"])
+    return fill(
+        "page.html",
+        policy=policy(script, style),
+        title=options.title,
+        style=style,
+        script=script,
+        meta=_script_json(_meta(clouds, options, pose)),
+        poster=_poster(poster, options.background),
+        data=_data_blocks(clouds),
+        shaders={name: sources([name]) for name in SHADERS},
+    )
 
 
 def require_page_size(count: int, name: str) -> None:
@@ -126,10 +138,6 @@ def _checked(shown: Shown, name: str) -> Shown:
     return shown._replace(cloud=shown.cloud._replace(gaussians=gaussians))
 
 
-def _coarse(cloud: StoredCloud) -> StoredCloud:
-    return cloud._replace(gaussians=coarse(cloud.gaussians))
-
-
 def _meta(clouds: Sequence[Shown], options: PageOptions, pose: Pose) -> dict[str, Any]:
     """Return the facts that the page's scripts read."""
     cloud, settings = clouds[0].cloud, options.settings
@@ -140,7 +148,16 @@ def _meta(clouds: Sequence[Shown], options: PageOptions, pose: Pose) -> dict[str
         "name": options.name,
         "background": hex_color(options.background),
         "camera": pose._asdict(),
-        "clouds": [_facts(shown) for shown in clouds],
+        "clouds": [
+            {
+                "label": shown.label,
+                "quality": shown.quality,
+                "count": len(shown.cloud.gaussians.means),
+                "degree": shown.cloud.gaussians.sh_degree,
+                "toWorld": rotation_between(shown.cloud.up, WORLD_UP).tolist(),
+            }
+            for shown in clouds
+        ],
         "plyHeader": header.decode("ascii"),
         "settings": {
             "eps2d": settings.eps2d,
@@ -151,17 +168,6 @@ def _meta(clouds: Sequence[Shown], options: PageOptions, pose: Pose) -> dict[str
             "near": settings.near,
             "far": min(settings.far, float(np.finfo(np.float32).max)),
         },
-    }
-
-
-def _facts(shown: Shown) -> dict[str, Any]:
-    gaussians = shown.cloud.gaussians
-    return {
-        "label": shown.label,
-        "quality": shown.quality,
-        "count": len(gaussians.means),
-        "degree": gaussians.sh_degree,
-        "toWorld": rotation_between(shown.cloud.up, WORLD_UP).tolist(),
     }
 
 
@@ -179,6 +185,40 @@ def _data_blocks(clouds: Sequence[Shown]) -> str:
     )
 
 
+def packed(gaussians: Gaussians) -> bytes:
+    """Compress the columns of a PLY file of N Gaussians (arrays), except the normals, which are
+    zero.
+
+    The float32 values are kept to the bit, so that the page can save the file. Each column is
+    stored as four planes (the lowest bytes of all values, then the next ones, ...), since signs and
+    exponents repeat and the lowest bytes don't."""
+    names = [name for name, _ in gaussian_properties(gaussians.sh.shape[1])]
+    stored = [number for number, name in enumerate(names) if name not in NORMALS]
+    columns = np.ascontiguousarray(gaussian_columns(gaussians)[:, stored].T, dtype="<f4")
+    planes = columns.view(np.uint8).reshape(*columns.shape, 4).transpose(0, 2, 1)
+    return zlib.compress(np.ascontiguousarray(planes).tobytes(), 6)
+
+
+def coarse(gaussians: Gaussians) -> Gaussians:
+    """Round the attributes of a cloud that is shown for comparison only, and drop its harmonics
+    above degree 0. The rounded values are multiples of powers of two, whose lowest bytes are zero
+    and vanish when packed.
+    """
+    side = float(np.ptp(gaussians.means, axis=0).max(initial=0))
+    step = 2.0 ** np.ceil(np.log2(max(side, 1e-30) / COARSE_MEANS))
+    return Gaussians(
+        means=_rounded(gaussians.means, step),
+        quats=_rounded(gaussians.quats, COARSE_QUAT),
+        log_scales=_rounded(gaussians.log_scales, COARSE_LOG_SCALE),
+        logit_opacities=_rounded(gaussians.logit_opacities, COARSE_LOGIT),
+        sh=_rounded(gaussians.sh[:, :1], COARSE_SH),
+    )
+
+
+def _rounded(values: np.ndarray, step: float) -> np.ndarray:
+    return (np.rint(values / step) * step).astype(np.float32)
+
+
 def _poster(poster: Any, background: Color) -> str:
     """Return the first view as the address of an embedded WebP picture."""
     file, opaque = io.BytesIO(), poster.copy()
@@ -186,9 +226,6 @@ def _poster(poster: Any, background: Color) -> str:
     opaque.alpha_composite(poster)
     opaque.convert("RGB").save(file, "webp", quality=75)
     return "data:image/webp;base64," + base64.b64encode(file.getvalue()).decode()
-
-
-# ---- the page's own sources ----------------------------------------------------------------------
 
 
 @cache
@@ -227,3 +264,70 @@ def decibels(psnr: Optional[float]) -> str:
     """Format the PSNR of a cloud on held-out views; empty if it isn't known."""
     known = psnr is not None and math.isfinite(psnr)
     return f"{psnr:.1f} dB on held-out views" if known else ""
+
+
+# ---- the page of a file --------------------------------------------------------------------------
+
+
+def cloud_page(
+    source: Path,
+    *,
+    title: Optional[str] = None,
+    eps2d: Optional[float] = None,
+    preset: Optional[str] = None,
+    antialias: Optional[bool] = None,
+    bound_colors: Optional[bool] = None,
+    background: Optional[str] = None,
+    up: Optional[str] = None,
+) -> tuple[Shown, PageOptions]:
+    """Read a file of Gaussians or a checkpoint, and return what :func:`page` makes of it.
+
+    Options that aren't given are those of the run whose folder contains the file, else defaults.
+
+    Args:
+        title: by default the prompt of the run, or the file's name.
+        eps2d: screen-space dilation, square pixels.
+        preset: of the rasteriser, for the smallest alpha that is drawn.
+        background: RRGGBB; by default the run's or white, unless the object would vanish on it.
+        up: the axis of the file that is up; by default from the file or its format's convention.
+
+    Raises:
+        UserError: an option is invalid, which the message names as the command does; or the file
+            can't be read, or has no or too many Gaussians.
+    """
+    color = None if background is None else _color(background)
+    if eps2d is not None and not 0 <= eps2d < 1e6:
+        raise UserError(f"--eps2d: expected a number of square pixels from 0 on, got {eps2d:g}")
+    if preset is not None and preset not in PRESETS:
+        raise unknown("--preset", preset, PRESETS)
+    if up is not None and up not in AXES:
+        raise unknown("--up", up, AXES)
+    stored, run = read_any(source, up), RunFiles.around(source)
+    require_page_size(len(stored.gaussians.means), str(source))
+    if run:
+        settings = run.settings
+        # the scores are those of the last export
+        quality = decibels(run.psnr("result", step_of(source.resolve().parent)))
+    else:  # the cloud's units aren't known
+        near = NEAR * bounds(stored.gaussians.tensors())[1]
+        settings = RenderSettings(near=near, far=math.inf, antialias=stored.antialiased)
+        quality = ""
+    given = {"eps2d": eps2d, "antialias": antialias, "bound_colors": bound_colors}
+    given["alpha_min"] = preset and PRESETS[preset]
+    options = PageOptions(
+        title=title or (run.prompt if run else source.name),
+        name=source.stem,
+        settings=settings._replace(**{name: x for name, x in given.items() if x is not None}),
+        background=color or (run and run.background) or WHITE,
+        keep_background=bool(color or (run and run.background_is_given)),
+    )
+    return Shown(stored, "result", quality), options
+
+
+def _color(text: str) -> Color:
+    """Parse a colour such as ff8000."""
+    try:
+        red, green, blue = bytes.fromhex(text.removeprefix("#"))
+    except ValueError as error:
+        raise UserError(f"--background: expected RRGGBB, such as ff8000, got {text!r}") from error
+    return (red / 255, green / 255, blue / 255)

@@ -1,8 +1,11 @@
-"""Render a cloud with this package's rasteriser, and the settings and cameras of the page."""
+"""Render a cloud with this package's rasteriser: the settings and cameras of the page, pictures
+with a transparent background, and a colour that suits them as one."""
 
 import math
-from typing import Any, NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple, Optional
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -23,6 +26,13 @@ MARGIN = 1.1
 FAINT, GAP = 0.05, 0.1
 """What may lie outside the first view: Gaussians of a smaller opacity, and those that are further
 from the others than this share of the cloud's radius."""
+
+Color = tuple[float, float, float]
+"""RGB in [0, 1]."""
+WHITE: Color = (1.0, 1.0, 1.0)
+BACKDROPS: tuple[Color, ...] = (WHITE, (0.5, 0.5, 0.5), (0.125, 0.125, 0.125))
+LEAST_CONTRAST, OUTLINE_SHARE = 0.15, 0.25
+"""An object vanishes on a colour from which this share of its outline differs less in RGB."""
 
 
 class RenderSettings(NamedTuple):
@@ -153,3 +163,50 @@ def camera_of(pose: Pose, up: str) -> Float[Tensor, "1 4 4"]:
     c2w[:, :3, 3] += target
     c2w[:, :3] = torch.from_numpy(rotation_between(WORLD_UP, up)).float() @ c2w[:, :3]
     return c2w
+
+
+# ---- pictures ------------------------------------------------------------------------------------
+
+
+def picture(cloud: StoredCloud, settings: RenderSettings, pose: Pose, size: int) -> Any:
+    """Render one view as a Pillow image RGBA, ``size`` pixels each way."""
+    from PIL import Image
+
+    view = render(cloud, settings, [pose], size)[0]
+    alpha = view[..., 3:]
+    # files hold colours that aren't multiplied by alpha
+    straight = torch.cat([view[..., :3] / alpha.clamp_min(1e-6), alpha], -1)
+    return Image.fromarray((255 * straight.clamp(0, 1)).round().byte().numpy(), "RGBA")
+
+
+def backdrop(image: Any, wanted: Color) -> Color:
+    """Return ``wanted``, or the one of ``BACKDROPS`` with the most contrast if the object of a
+    Pillow image RGBA would vanish on it.
+    """
+    pixels = np.asarray(image) / 255
+    opaque = pixels[..., 3] > 0.5
+    moved = [np.roll(opaque, step, axis) for axis in (0, 1) for step in (-1, 1)]
+    outline = pixels[opaque & ~np.logical_and.reduce(moved)][:, :3]
+    if not len(outline):
+        return wanted
+
+    def contrast(color: Color) -> float:
+        return float(np.quantile(np.abs(outline - color).max(1), OUTLINE_SHARE))
+
+    return wanted if contrast(wanted) >= LEAST_CONTRAST else max(BACKDROPS, key=contrast)
+
+
+def backdrop_of_file(path: Path) -> Optional[Color]:
+    """Return the backdrop on a white page of a picture; None if it is opaque or can't be read."""
+    from PIL import Image
+
+    try:
+        image = Image.open(path)
+        return backdrop(image, WHITE) if image.mode == "RGBA" else None
+    except Exception:  # Pillow raises many kinds for damaged files
+        return None
+
+
+def hex_color(color: Color) -> str:
+    """Return a colour as #rrggbb."""
+    return "#" + bytes(round(255 * x) for x in color).hex()

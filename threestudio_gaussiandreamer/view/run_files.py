@@ -1,6 +1,6 @@
-"""Read what a run has left in its folder: configuration, scores, curves, pictures and files.
+"""Read what a run has left in its folder, and the Gaussians of any file.
 
-Nothing here trusts a file: what is missing or damaged is left out."""
+Of a run's folder no file is trusted: what is missing or damaged is left out."""
 
 import json
 import os
@@ -11,12 +11,25 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Optional, TypeVar
 
+import torch
 import yaml
+from torch import Tensor
 
+from ..core.checkpoint_file import load_file
 from ..core.errors import UserError
 from ..core.files import existing_file, is_folder
 from ..core.logs import warn
-from ..formats.gaussian_files import holds_gaussians, suffix_of
+from ..formats.gaussian_files import (
+    READ,
+    StoredCloud,
+    holds_gaussians,
+    read_cloud,
+    require_format,
+    suffix_of,
+)
+from ..gaussians.axes import WORLD_UP
+from ..gaussians.gaussians import Gaussians, drawable
+from ..gaussians.stored_state import require_cloud
 from .render import RenderSettings
 
 T = TypeVar("T", dict, list)
@@ -74,10 +87,9 @@ class RunFiles:
         from ..host.typed_config import parse_structured
         from ..training.renderer import SplattingRenderer
 
+        options = section(self.config, "system", "renderer")
         try:
-            cfg = parse_structured(
-                SplattingRenderer.Config, section(self.config, "system", "renderer")
-            )
+            cfg = parse_structured(SplattingRenderer.Config, options)
         except UserError as error:
             warn(f"{self.folder}: its renderer's options aren't known here ({error})")
             return RenderSettings()
@@ -93,7 +105,9 @@ class RunFiles:
     def background(self) -> Optional[tuple[float, float, float]]:
         """The colour that the run has shown its cloud on; None if it isn't known."""
         color = section(self.config, "system", "background").get("color")
-        return as_color(color)
+        numbers = color if isinstance(color, list) and len(color) == 3 else ["none"]
+        valid = all(isinstance(x, (int, float)) and 0 <= x <= 1 for x in numbers)
+        return tuple(map(float, numbers)) if valid else None
 
     @property
     def background_is_given(self) -> bool:
@@ -167,26 +181,21 @@ def section(content: Any, *keys: str) -> Mapping[str, Any]:
     return content if isinstance(content, Mapping) else {}
 
 
-def as_color(value: Any) -> Optional[tuple[float, float, float]]:
-    """Return three numbers in [0, 1] as a colour; None for anything else."""
-    numbers = value if isinstance(value, (list, tuple)) and len(value) == 3 else ()
-    valid = all(isinstance(x, (int, float)) and 0 <= x <= 1 for x in numbers)
-    return (float(numbers[0]), float(numbers[1]), float(numbers[2])) if numbers and valid else None
-
-
 def read_text(path: Path) -> str:
     """Read a text file; an empty text if there is none, it is too large or no UTF-8."""
     try:
-        return _text(path)
-    except (OSError, ValueError):
+        with open(path, "rb") as file:
+            content = file.read(MAX_BYTES + 1)
+        return content.decode() if len(content) <= MAX_BYTES else ""
+    except (OSError, UnicodeDecodeError):
         return ""
 
 
 def read_json(path: Path, kind: type[T]) -> T:
     """Read a JSON file that holds a ``kind``; an empty one if there is none or it is damaged."""
     try:
-        content = json.loads(_text(path))
-    except (OSError, ValueError, RecursionError):
+        content = json.loads(read_text(path))
+    except (ValueError, RecursionError):
         return kind()
     return content if isinstance(content, kind) else kind()
 
@@ -194,20 +203,67 @@ def read_json(path: Path, kind: type[T]) -> T:
 def read_yaml(path: Path) -> dict[str, Any]:
     """Read a mapping from a YAML file; an empty one if there is none or it is damaged."""
     try:
-        content = PlainLoader(_text(path)).get_single_data()
-    except (OSError, ValueError, RecursionError, yaml.YAMLError):
+        content = PlainLoader(read_text(path)).get_single_data()
+    except (ValueError, RecursionError, yaml.YAMLError):
         return {}
     return content if isinstance(content, dict) else {}
 
 
-def _text(path: Path) -> str:
-    """Read a file of at most ``MAX_BYTES``.
+# ---- Gaussians -----------------------------------------------------------------------------------
+
+CHECKPOINT_ENDINGS = (".ckpt", ".pt", ".pth")
+CHECKPOINTS = {
+    "state_dict": {
+        name: f"geometry.{name}"
+        for name in ("means", "quats", "log_scales", "logit_opacities", "sh0", "sh_rest")
+    },
+    "splats": {
+        "means": "means",
+        "quats": "quats",
+        "log_scales": "scales",
+        "logit_opacities": "opacities",
+        "sh0": "sh0",
+        "sh_rest": "shN",
+    },
+}
+"""The names of the Gaussians' tensors in checkpoints of this package and of gsplat's trainer."""
+
+
+def read_any(source: Path, up: Optional[str] = None, option: str = "PATH") -> StoredCloud:
+    """Read the Gaussians of a file or checkpoint, without those that can't be drawn. A checkpoint
+    in the folder of a run was trained with the run's antialiasing.
+
+    Args:
+        up: overrides the up axis that the file states.
+        option: names the argument in messages.
 
     Raises:
-        ValueError: it is larger, or no UTF-8.
+        UserError: the file is none of Gaussians, or damaged.
     """
-    with open(path, "rb") as file:
-        content = file.read(MAX_BYTES + 1)
-    if len(content) > MAX_BYTES:
-        raise ValueError(f"{path} is larger than {MAX_BYTES} bytes")
-    return content.decode()
+    if source.suffix in CHECKPOINT_ENDINGS:
+        gaussians, run = drawable(from_checkpoint(source), str(source)), RunFiles.around(source)
+        antialiased = run is not None and run.antialiased
+        return StoredCloud(gaussians, up or WORLD_UP, antialiased=antialiased)
+    require_format(source.name, option, READ)
+    return read_cloud(str(source), up=up)
+
+
+def from_checkpoint(file: Path) -> Gaussians:
+    """Read the Gaussians of a training checkpoint.
+
+    Raises:
+        UserError: it has none.
+    """
+    content = load_file(file)
+    for key, names in CHECKPOINTS.items():
+        state = content.get(key) if isinstance(content, dict) else None
+        state = state if isinstance(state, Mapping) else {}
+        if all(isinstance(state.get(stored), Tensor) for stored in names.values()):
+            require_cloud(state, names, str(file), allow_non_finite=True)
+            values = {name: state[stored].detach().float() for name, stored in names.items()}
+            harmonics = torch.cat([values.pop("sh0"), values.pop("sh_rest")], 1)
+            return Gaussians(sh=harmonics, **values).arrays()
+    raise UserError(
+        f"{file} holds no cloud of Gaussians: it has neither {CHECKPOINTS['state_dict']['means']} "
+        "nor gsplat's splats"
+    )

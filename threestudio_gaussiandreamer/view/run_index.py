@@ -1,18 +1,26 @@
-"""The index of a run, ``index.html`` in its folder: the viewer, pictures, scores, curves, what the
-configuration changes, times, and links to all files. It is static and opens from disk."""
+"""The index of a run and the gallery of a folder of runs, ``index.html`` in them: static pages that
+open from disk.
 
-from collections.abc import Iterator
+The index has the viewer, pictures, scores, curves, what the configuration changes, times, and links
+to all files; the gallery a picture, the prompt and the scores of each run."""
+
+import csv
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from datetime import datetime
 from itertools import groupby
 from pathlib import Path
-from typing import Any
+from typing import Any, Optional
 
+from ..core.errors import UserError
 from ..core.files import atomic_file, json_text
+from ..core.logs import warn
 from ..metrics import MULTI_FACE_NOTE
-from .config_changes import config_changes
-from .curves import number, read_curves, svg
-from .run_files import RunFiles, read_json, read_text, step_of
-from .static_page import address, backdrop_style, document, element, link, media, section, table
+from .page import decibels
+from .render import backdrop_of_file, hex_color
+from .run_files import RunFiles, is_run, read_json, read_text, read_yaml, step_of
+from .templates import address, write_static
 
 NAME = "index.html"
 CURVES = {
@@ -23,10 +31,19 @@ CURVES = {
 }
 """Columns of the logs and what they are called."""
 SCORES = {"psnr": "dB", "ssim": "SSIM", "multi_face": "multi-face", "gaussians": "Gaussians"}
-MAX_FILES, MAX_COMMANDS = 5000, 10
+MAX_FILES, MAX_COMMANDS, MAX_POINTS = 5000, 10, 400
 VALIDATION_PICTURES = 8
 TIMES = "times.json"
 """What the launcher notes of each stage: its name, when it began, and its seconds."""
+WIDTH, HEIGHT, LEFT, BOTTOM, TOP = 340, 180, 56, 160, 22
+"""Size of a curve's picture, and where its axes are, pixels."""
+SECTIONS = ("data", "system", "trainer", "checkpoint")
+USERS = ("name", "tag", "seed", "description", "exp_root_dir", "use_timestamp")
+"""Keys at the top level that users set; the others are computed."""
+MAX_DEPTH = 3
+"""Folders between the gallery's and a run's: an experiment's, and a sweep's above it."""
+OWN_PAGE = "script-src 'none'; object-src 'none'"
+"""Is in the head of every page of this module."""
 
 
 def write_index(folder: Path) -> Path:
@@ -35,145 +52,99 @@ def write_index(folder: Path) -> Path:
     Raises:
         UserError: it can't be written.
     """
-    run = RunFiles(folder)
-    path = folder / NAME
-    content = document(run.prompt, _parts(run)).encode(errors="replace")
-    with atomic_file(path, durable=False) as file:
-        file.write(content)
+    run, path = RunFiles(folder), folder / NAME
+    videos = sorted(run.save.glob("it*-test.mp4"), key=step_of)
+    exported = sorted(filter(Path.is_file, run.export.iterdir())) if run.export else []
+    page = run.export and run.export / "view.html"
+    animations = sorted(run.save.glob("it*-test.webp"))[-1:]
+    scores = [
+        [key, *(_shown(run.scores[key].get(name), name) for name in SCORES)]
+        for key in ("prior", "result")
+        if isinstance(run.scores.get(key), dict)
+    ]
+    curves = read_curves(folder, list(CURVES))
+    groups, more = _files(folder)
+    write_static(
+        path,
+        "run.html",
+        title=run.prompt,
+        folder=folder.name,
+        downloads=[_file(path, folder, path.name) for path in [*exported, *videos[-1:]]],
+        viewer=page and page.is_file() and address(page, folder),
+        video=videos and address(videos[-1], folder),
+        animation=animations and _picture(animations[0], run),
+        scores_head=("", *SCORES.values()),
+        scores=scores,
+        scores_note=MULTI_FACE_NOTE,
+        curves=[drawn(curves[name], CURVES[name]) for name in curves],
+        **{"width": WIDTH, "height": HEIGHT, "left": LEFT, "right": WIDTH - 8},
+        **{"top": TOP, "bottom": BOTTOM},
+        pictures=[_picture(path, run) for path in _pictures(run)],
+        commands=read_text(folder / "cmd.txt").splitlines()[-MAX_COMMANDS:],
+        changes=config_changes(folder / "configs"),
+        times=list(_times(run)),
+        groups=groups,
+        more_files=more,
+    )
     return path
 
 
-def _parts(run: RunFiles) -> Iterator[str]:
-    yield element("h1", run.prompt)
-    yield element("p", run.folder.name)
-    yield section("Downloads", _downloads(run))
-    yield section("In 3D", _viewer(run))
-    yield section("Turntable", _turntable(run))
-    yield section("Scores on held-out views", _scores(run))
-    yield section("Curves", *_curves(run))
-    yield section("Pictures", *_pictures(run))
-    yield section("Command", *_commands(run))
-    changes = config_changes(run.folder / "configs")
-    yield section(
-        "What differs from the base configuration", table(("key", "base", "run"), changes)
-    )
-    yield section("Times", _times(run))
-    yield section("Files", *_files(run.folder))
-
-
-def _commands(run: RunFiles) -> Iterator[str]:
-    """Yield the command lines of the run and of those that have gone on with it."""
-    lines = read_text(run.folder / "cmd.txt").splitlines()
-    yield from (f"<p>{element('code', line)}</p>" for line in lines[-MAX_COMMANDS:])
-
-
-def _downloads(run: RunFiles) -> str:
-    """Return a list of the export's files, the page and the meshes among them, and the video."""
-    exported = (path for path in run.export.iterdir() if path.is_file()) if run.export else ()
-    items = [_file(path, run.folder, path.name) for path in [*sorted(exported), *_videos(run)[-1:]]]
-    return f'<ul class="downloads">{"".join(items)}</ul>' if items else ""
-
-
-def _videos(run: RunFiles) -> list[Path]:
-    return sorted(run.save.glob("it*-test.mp4"), key=step_of)
-
-
-def _viewer(run: RunFiles) -> str:
-    page = run.export and run.export / "view.html"
-    if not page or not page.is_file():
-        return ""
-    where = address(page, run.folder)
-    options = {"title": "the cloud in 3D", "loading": "lazy", "allow": "fullscreen"}
-    frame = element("iframe", "", src=where, **options)
-    return frame + element("a", "open in a window of its own", href=where)
-
-
-def _turntable(run: RunFiles) -> str:
-    """Return the video of the latest test views, or the animated picture."""
-    videos = _videos(run)
-    if videos:
-        where = address(videos[-1], run.folder)
-        return media("video", src=where, controls="", loop="", muted="", width="384") + "</video>"
-    return "".join(_figure(path, run) for path in sorted(run.save.glob("it*-test.webp"))[-1:])
-
-
-def _scores(run: RunFiles) -> str:
-    rows = []
-    for key in ("prior", "result"):
-        found = run.scores.get(key)
-        if isinstance(found, dict):
-            rows.append([key, *(_shown(found.get(name), name) for name in SCORES)])
-    note = element("p", MULTI_FACE_NOTE) if rows else ""
-    return table(("", *SCORES.values()), rows) + note
+def number(value: float) -> str:
+    """Format a number with five digits, or all that are before its point; none is large enough for
+    an exponent.
+    """
+    return f"{value:,.0f}" if abs(value) >= 1e4 else f"{value:.5g}"
 
 
 def _shown(value: Any, name: str = "") -> str:
-    if isinstance(value, (int, float)) and name == "multi_face":
-        return f"{100 * value:.0f} %"
     if isinstance(value, (int, float)):
-        return number(value)
+        return f"{100 * value:.0f} %" if name == "multi_face" else number(value)
     return str("–" if value is None else value)
 
 
-def _curves(run: RunFiles) -> Iterator[str]:
-    curves = read_curves(run.folder, list(CURVES))
-    yield from (f"<figure>{svg(curves[name], CURVES[name])}</figure>" for name in curves)
-
-
-def _pictures(run: RunFiles) -> Iterator[str]:
-    """Yield the comparison with the truth, the poster, the prior and the last validations."""
+def _pictures(run: RunFiles) -> list[Path]:
+    """List the poster, the comparison with the truth, the prior and the last validations."""
     fixed = [run.save / "held_out" / "compare.png", run.save / "prior" / "turntable.gif"]
     poster = [run.export / "poster.png"] if run.export else []
     validations = sorted(run.save.glob("it*-*.png"), key=step_of)[-VALIDATION_PICTURES:]
-    for path in (*poster, *fixed, *validations):
-        if path.is_file():
-            yield _figure(path, run)
+    return [path for path in (*poster, *fixed, *validations) if path.is_file()]
 
 
-def _figure(path: Path, run: RunFiles) -> str:
-    where = address(path, run.folder)
-    picture = media("img", src=where, alt=path.name, loading="lazy", **backdrop_style(path))
-    caption = element("figcaption", str(path.relative_to(run.save)))
-    return f'<figure><a href="{where}">{picture}</a>{caption}</figure>'
+def _picture(path: Path, run: RunFiles, page_folder: Optional[Path] = None) -> dict[str, Any]:
+    """Return what a page shows of a picture, and a colour on which its object doesn't vanish."""
+    color, caption = backdrop_of_file(path), str(path.relative_to(run.save))
+    where = address(path, page_folder or run.folder)
+    color = color and hex_color(color)
+    return {"href": where, "name": path.name, "caption": caption, "color": color}
 
 
-def _times(run: RunFiles) -> str:
-    rows = [
-        (str(entry.get("stage")), str(entry.get("began")), f"{_shown(entry.get('seconds'))} s")
-        for entry in read_json(run.folder / TIMES, list)
-        if isinstance(entry, dict)
-    ]
+def _times(run: RunFiles) -> Iterator[tuple[str, str, str]]:
+    for entry in read_json(run.folder / TIMES, list):
+        if isinstance(entry, dict):
+            seconds = _shown(entry.get("seconds"))
+            yield str(entry.get("stage")), str(entry.get("began")), f"{seconds} s"
     training = {"seconds": "training alone", "cpu_seconds": "processor time of training"}
-    rows += [
-        (text, "", f"{_shown(run.scores[name])} s")
-        for name, text in training.items()
-        if name in run.scores
-    ]
-    return table(("stage", "began", "time"), rows)
+    for name, text in training.items():
+        if name in run.scores:
+            yield text, "", f"{_shown(run.scores[name])} s"
 
 
-def _files(folder: Path) -> Iterator[str]:
-    """Yield a list of links for every folder at the top, closed where it is long."""
+def _files(folder: Path) -> tuple[list[tuple[str, list[dict[str, str]]]], int]:
+    """Return the files of every folder at the top, and how many are left out."""
     files = sorted(path for path in folder.rglob("[!.]*") if path.is_file() and path.name != NAME)
+    groups = []
     for name, group in groupby(files[:MAX_FILES], lambda path: path.relative_to(folder).parts[0]):
         items = [_file(path, folder) for path in group]
-        text = f"{name} ({len(items)})" if (folder / name).is_dir() else name
-        yield f"<details>{element('summary', text)}<ul>{''.join(items)}</ul></details>"
-    if len(files) > MAX_FILES:
-        yield element("p", f"and {len(files) - MAX_FILES} more files")
+        groups.append((f"{name} ({len(items)})" if (folder / name).is_dir() else name, items))
+    return groups, max(len(files) - MAX_FILES, 0)
 
 
-def _file(path: Path, folder: Path, name: str = "") -> str:
-    text = (name or str(path.relative_to(folder))).encode(errors="replace").decode()
-    return f"<li>{link(path, folder, text)} {element('small', _size(path))}</li>"
-
-
-def _size(path: Path) -> str:
-    try:
-        size = float(path.stat().st_size)
-    except FileNotFoundError:  # another stage has replaced it since the folder was listed
-        return ""
-    return f"{size / 1e6:.1f} MB" if size >= 1e6 else f"{size / 1e3:.1f} kB"
+def _file(path: Path, folder: Path, name: str = "") -> dict[str, str]:
+    text, size = name or str(path.relative_to(folder)), ""
+    with suppress(FileNotFoundError):  # another stage has replaced it since the folder was listed
+        count = path.stat().st_size
+        size = f"{count / 1e6:.1f} MB" if count >= 1e6 else f"{count / 1e3:.1f} kB"
+    return {"href": address(path, folder), "text": text, "size": size}
 
 
 def note_time(folder: Path, stage: str, began: datetime, seconds: float) -> None:
@@ -182,11 +153,145 @@ def note_time(folder: Path, stage: str, began: datetime, seconds: float) -> None
     Raises:
         UserError: the file can't be written.
     """
-    times = read_json(folder / TIMES, list)
-    entry = {
-        "stage": stage,
-        "began": began.isoformat(sep=" ", timespec="seconds"),
-        "seconds": round(seconds, 1),
-    }
+    entry = {"stage": stage, "began": began.isoformat(sep=" ", timespec="seconds")}
+    times = [*read_json(folder / TIMES, list), entry | {"seconds": round(seconds, 1)}]
     with atomic_file(folder / TIMES, durable=False) as file:
-        file.write(json_text([*times, entry], indent=1).encode())
+        file.write(json_text(times, indent=1).encode())
+
+
+# ---- what differs from the base configuration ----------------------------------------------------
+
+
+def config_changes(folder: Path) -> list[tuple[str, str, str]]:
+    """Return key, value in the base file and value in the run, for those that differ.
+
+    Args:
+        folder: ``configs`` of the run: ``raw.yaml``, the file that the run names first, and
+            ``parsed.yaml``. Values of the base file that refer to others are left out.
+    """
+    base = dict(leaves(read_yaml(folder / "raw.yaml")))
+    return [
+        (key, _short(base.get(key, "–")), _short(value))
+        for key, value in leaves(read_yaml(folder / "parsed.yaml"))
+        if (key in USERS or key.partition(".")[0] in SECTIONS)
+        and "${" not in str(base.get(key))
+        and (key not in base or base[key] != value)
+    ]
+
+
+def leaves(content: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the dotted key and the value of everything that isn't a mapping."""
+    for name, value in content.items():
+        if isinstance(value, Mapping) and value:
+            yield from leaves(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", value
+
+
+def _short(value: Any) -> str:
+    text = str(value)
+    return text if len(text) <= 200 else f"{text[:200]}..."
+
+
+# ---- curves --------------------------------------------------------------------------------------
+
+Curve = list[tuple[float, float]]
+"""Steps and values, by step."""
+
+
+def read_curves(folder: Path, names: Sequence[str]) -> dict[str, Curve]:
+    """Read columns of the CSV logs of a run; a resumed run has several, of which later ones win.
+
+    Returns:
+        the curves that have at least two finite values.
+    """
+    values: dict[str, dict[float, float]] = {name: {} for name in names}
+    logs = folder.glob("csv_logs/version_*/metrics.csv")
+    for path in sorted(logs, key=lambda path: (len(path.parent.name), path.parent.name)):
+        # a page without a curve is better than none
+        with (
+            suppress(OSError, csv.Error),
+            open(path, newline="", encoding="utf-8", errors="replace") as file,
+        ):
+            for row in csv.DictReader(file):
+                for name in names:
+                    with suppress(KeyError, TypeError, ValueError):
+                        step, value = float(row["step"]), float(row[name])
+                        if math.isfinite(step) and math.isfinite(value):
+                            values[name][step] = value
+    return {name: sorted(found.items()) for name, found in values.items() if len(found) > 1}
+
+
+def drawn(curve: Curve, title: str) -> dict[str, Any]:
+    """Return the picture of a curve over steps; values that span several powers of ten are drawn on
+    a logarithmic axis.
+    """
+    curve = curve[:: -(-len(curve) // MAX_POINTS)]
+    steps, values = zip(*curve, strict=True)
+    low, high = min(values), max(values)
+    logarithmic = low > 0 and high > 100 * low
+    heights = [math.log10(value) for value in values] if logarithmic else values
+    xs, ys = _scaled(steps, LEFT, WIDTH - 8), _scaled(heights, BOTTOM, TOP)
+    title = f"{title}, logarithmic" if logarithmic else title
+    texts = [
+        (LEFT, 14, title, "start"),
+        (LEFT - 4, TOP + 8, number(high), "end"),
+        (LEFT - 4, BOTTOM, number(low), "end"),
+        (LEFT, HEIGHT - 6, f"step {number(steps[0])}", "start"),
+        (WIDTH - 8, HEIGHT - 6, number(steps[-1]), "end"),
+    ]
+    points = " ".join(f"{x:.1f},{y:.1f}" for x, y in zip(xs, ys, strict=True))
+    return {"title": title, "points": points, "texts": texts}
+
+
+def _scaled(values: Sequence[float], first: float, last: float) -> list[float]:
+    """Map the range of the values to ``first`` to ``last``; a constant lies in the middle."""
+    low, span = min(values), max(values) - min(values)
+    return [first + (last - first) * ((value - low) / span if span else 0.5) for value in values]
+
+
+# ---- the gallery ---------------------------------------------------------------------------------
+
+
+def write_gallery(folder: Path) -> Path:
+    """Write the gallery of the runs in a folder, and their own indices; returns its path.
+
+    Where a run's index can't be written, a warning is given, and its card leads to its folder.
+
+    Raises:
+        UserError: there is no run in the folder, or the gallery can't be written.
+    """
+    patterns = ["/".join(["*"] * depth) for depth in range(1, MAX_DEPTH + 1)]
+    found = [path for pattern in patterns for path in folder.glob(pattern) if is_run(path)]
+    if not found:
+        raise UserError(
+            f"{str(folder)!r} holds no run: expected the folder of a run, with "
+            f"configs/parsed.yaml, or one above such folders, up to {MAX_DEPTH} levels"
+        )
+    for run in found:
+        try:
+            write_index(run)
+        except UserError as error:
+            warn(str(error))
+    path = folder / NAME
+    if path.exists() and OWN_PAGE not in path.read_bytes()[:1000].decode(errors="replace"):
+        raise UserError(
+            f"{str(path)!r} isn't a page of this package, so it isn't replaced: move it"
+        )
+    cards = [_card(RunFiles(run), folder) for run in sorted(found)]
+    title = f"{len(cards)} runs in {folder.resolve().name}"
+    write_static(path, "gallery.html", title=title, cards=cards)
+    return path
+
+
+def _card(run: RunFiles, folder: Path) -> dict[str, Any]:
+    """Return what the gallery shows of a run: its poster, or else a picture of its test views."""
+    poster = [run.export / "poster.png"] if run.export else []
+    views = sorted(run.save.glob("it*-test/0.png"), key=lambda path: step_of(path.parent))
+    found = [path for path in (*poster, *reversed(views)) if path.is_file()]
+    index = run.folder / NAME
+    return {
+        "href": address(index if index.is_file() else run.folder, folder),
+        "picture": found and _picture(found[0], run, folder),
+        "texts": (run.prompt, decibels(run.psnr("result")), str(run.folder.relative_to(folder))),
+    }
