@@ -238,7 +238,7 @@ def point_e(folder: Path, seed: int = 0) -> tuple[Path, Path]:
     """Write ``base_40m_textvec.pt`` and ``upsample_40m.pt``, with one block each and random last
     layers.
     """
-    from threestudio_gaussiandreamer.priors.point_e_model import BaseModel, Upsampler
+    from threestudio_gaussiandreamer.priors.point_e import BaseModel, Upsampler
 
     torch.manual_seed(seed)
     folder.mkdir(parents=True, exist_ok=True)

@@ -1,5 +1,6 @@
-"""Fixtures of the prior tests."""
+"""Fixtures of the prior tests: one tiny model of each kind, written once."""
 
+import os
 import shutil
 import sys
 
@@ -9,13 +10,20 @@ import trimesh
 
 from tests.helpers import tiny_3d_models as tiny
 from tests.helpers.tiny_makehuman import tiny_makehuman
-from tests.priors.motion_cases import walk
-from tests.priors.priors_cases import rng
+from tests.priors.cases import rng, walk
 from threestudio_gaussiandreamer.formats import ply
 from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
 from threestudio_gaussiandreamer.gaussians.point_cloud import PointCloud
 from threestudio_gaussiandreamer.priors.makehuman import Person, load_body
 from threestudio_gaussiandreamer.priors.smpl_fit import load_body_model
+
+
+@pytest.fixture
+def no_code(monkeypatch):
+    """Fail if a file of the test has run code (``cases.Evil``)."""
+    monkeypatch.delenv("EVIL", raising=False)
+    yield
+    assert "EVIL" not in os.environ
 
 
 @pytest.fixture(scope="session")
@@ -51,17 +59,14 @@ def assets(tmp_path_factory):
     """Write small sources: a body-like capsule, a coloured mesh, points and Gaussians."""
     folder = tmp_path_factory.mktemp("assets")
     body = trimesh.creation.capsule(height=1.0, radius=0.3)  # along z
-    body.apply_transform(
-        trimesh.transformations.rotation_matrix(-np.pi / 2, [1, 0, 0])
-    )  # now along y, as OBJ has it
+    turn = trimesh.transformations.rotation_matrix(-np.pi / 2, [1, 0, 0])
+    body.apply_transform(turn)  # now along y, as OBJ has it
     body.export(folder / "body.obj")
     box = trimesh.creation.box(extents=[2, 1, 0.5]).subdivide().subdivide()
     box.visual.vertex_colors = (255 * (box.vertices / 2 + 0.5).clip(0, 1)).astype(np.uint8)
     box.export(folder / "box.ply")
-    ply.write_points(
-        folder / "points.ply",
-        PointCloud(points=rng(1).normal(size=(300, 3)), colors=rng(2).random((300, 3))),
-    )
+    points = PointCloud(points=rng(1).normal(size=(300, 3)), colors=rng(2).random((300, 3)))
+    ply.write_points(folder / "points.ply", points)
     harmonics, scales, turns = (rng(i).normal(size=(200, n)) for i, n in ((3, 12), (4, 3), (5, 4)))
     gaussians = Gaussians(
         means=rng(6).normal(size=(200, 3)),
@@ -72,6 +77,18 @@ def assets(tmp_path_factory):
     )
     ply.write_gaussians(folder / "gaussians.ply", gaussians, ["up: z"])
     return folder
+
+
+@pytest.fixture(scope="session")
+def clip(bodies):
+    return str(tiny.clip(bodies / "clip"))
+
+
+@pytest.fixture(scope="session")
+def point_e(tmp_path_factory, clip):
+    """Write a tiny Point-E with its upsampler; return the options of its files."""
+    base, upsampler = tiny.point_e(tmp_path_factory.mktemp("models") / "point-e")
+    return {"checkpoint": str(base), "upsampler": str(upsampler), "clip": clip}
 
 
 @pytest.fixture(scope="session")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from tests.priors.pose_cases import limb_angles, needs_anny, random_local, walked
+from tests.priors.cases import limb_angles, needs_anny, random_local, walked
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.priors.body_pose import (
     INDEX,
@@ -26,24 +26,18 @@ def direction(joints, start, end):
     return bone / np.linalg.norm(bone)
 
 
-@pytest.mark.parametrize(("name", "down"), [("T", 0.0), ("A", np.sin(np.pi / 4))])
-def test_arms_point_where_the_pose_says(stick_body, name, down):
-    joints = posed(stick_body, named_pose(stick_body, name)).joints
-    for side, sign in (("left", 1), ("right", -1)):
-        for start, end in (("shoulder", "elbow"), ("elbow", "wrist")):
-            found = direction(joints, f"{side} {start}", f"{side} {end}")
-            across = sign * np.sqrt(1 - down**2)
-            np.testing.assert_allclose(found, [across, -down, 0], atol=1e-9)
-
-
-def test_a_sitting_body_has_level_thighs_and_hanging_lower_legs(stick_body):
+def test_limbs_point_where_the_named_poses_say(stick_body):
+    for name, down in (("T", 0.0), ("A", np.sin(np.pi / 4))):
+        joints = posed(stick_body, named_pose(stick_body, name)).joints
+        for side, sign in (("left", 1), ("right", -1)):
+            for start, end in (("shoulder", "elbow"), ("elbow", "wrist")):
+                found = direction(joints, f"{side} {start}", f"{side} {end}")
+                across = sign * np.sqrt(1 - down**2)
+                np.testing.assert_allclose(found, [across, -down, 0], atol=1e-9)
     joints = posed(stick_body, named_pose(stick_body, "sitting")).joints
     for side in ("left", "right"):
         assert direction(joints, f"{side} hip", f"{side} knee")[2] > 0.95
         assert direction(joints, f"{side} knee", f"{side} ankle")[1] < -0.95
-
-
-def test_a_walking_body_swings_arms_against_legs(stick_body):
     joints = posed(stick_body, named_pose(stick_body, "walking")).joints
     ahead = {name: joints[INDEX[name], 2] for name in INDEX}
     assert ahead["left ankle"] > 0.2 > -0.2 > ahead["right ankle"]
@@ -58,8 +52,7 @@ def test_rotations_move_the_joints_of_a_t_pose_as_forward_kinematics_says(stick_
     np.testing.assert_allclose(found, walked(in_t_pose.joints, local), atol=1e-9)
 
 
-@pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize("size", [1.0, 170.0])
+@pytest.mark.parametrize(("seed", "size"), [(0, 1.0), (1, 170.0)])
 def test_positions_of_any_unit_give_limbs_their_directions(stick_body, seed, size):
     wanted = walked(stick_body.joints, random_local(seed, 25)) * size
     positions = {name: wanted[number] for name, number in INDEX.items()}
@@ -75,9 +68,6 @@ def test_the_needed_positions_alone_give_a_pose(stick_body):
     upright = {name: stick_body.joints[INDEX[name]] for name in NEEDED}
     pose = pose_of_positions(stick_body, upright)
     np.testing.assert_allclose(pose, np.tile(np.eye(3), (BODY_JOINTS, 1, 1)), atol=1e-9)
-
-
-def test_positions_on_one_line_have_no_pose(stick_body):
     with pytest.raises(UserError, match="hips and spine on one line"):
         pose_of_positions(stick_body, dict.fromkeys(NEEDED, np.zeros(3)))
 
@@ -115,9 +105,6 @@ def test_the_smallest_rotation_between_directions(target):
     np.testing.assert_allclose(found, np.array(target) / np.linalg.norm(target), atol=1e-9)
     np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-9)
     assert np.linalg.det(rotation) == pytest.approx(1)
-
-
-def test_bones_without_length_are_not_turned():
     np.testing.assert_array_equal(swing(np.zeros(3), np.ones(3)), np.eye(3))
 
 

@@ -1,4 +1,4 @@
-"""The prior runs once per (prior, options, their files, prompt, seed) and folder."""
+"""The prior runs once per (prior, options, their files, prompt, seed) and folder; its turntable."""
 
 import importlib.util
 import os
@@ -8,10 +8,16 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.formats.ply import read_points
 from threestudio_gaussiandreamer.gaussians.point_cloud import PointCloud
 from threestudio_gaussiandreamer.host import BaseObject
-from threestudio_gaussiandreamer.priors.cache import cache_key, cached_cloud
+from threestudio_gaussiandreamer.priors.cache import (
+    cache_key,
+    cached_cloud,
+    save_turntable,
+    turntable,
+)
 from threestudio_gaussiandreamer.priors.mesh import MeshPrior
 
 
@@ -21,6 +27,7 @@ class CountingPrior(BaseObject):
     @dataclass
     class Config(BaseObject.Config):
         size: float = 1.0
+        source: str = ""
 
     def __call__(self, prompt):
         type(self).calls += 1
@@ -28,45 +35,25 @@ class CountingPrior(BaseObject):
         return PointCloud(points, points / self.cfg.size)
 
 
-def test_a_second_run_in_the_same_folder_reads_the_first_ones_points(tmp_path):
+def test_the_prior_runs_again_for_another_prompt_option_seed_or_a_damaged_file(
+    tmp_path, monkeypatch
+):
     CountingPrior.calls = 0
     first = cached_cloud(CountingPrior({}), "a fox", tmp_path)
     again = cached_cloud(CountingPrior({}), "a fox", tmp_path)
-    assert CountingPrior.calls == 1
-    assert (
-        np.array_equal(first.points, again.points)
-        and np.array_equal(first.colors, again.colors)
-        and again.normals is None
-    )
-    assert len(read_points(tmp_path / "prior" / "points.ply").points) == 10
-
-
-@pytest.mark.slow
-def test_another_prompt_option_or_seed_runs_the_prior_again(tmp_path, monkeypatch):
-    CountingPrior.calls = 0
+    assert CountingPrior.calls == 1 and again.normals is None
+    for a, b in zip(first[:2], again[:2], strict=True):
+        np.testing.assert_array_equal(a, b)
+    path = tmp_path / "prior" / "points.npz"
+    assert len(read_points(path.with_suffix(".ply")).points) == 10
+    path.write_bytes(path.read_bytes()[:50])
     cached_cloud(CountingPrior({}), "a fox", tmp_path)
+    cached_cloud(CountingPrior({}), "a fox", None)  # no folder: no cache
     cached_cloud(CountingPrior({}), "a dog", tmp_path)
     cached_cloud(CountingPrior({"size": 2.0}), "a dog", tmp_path)
     monkeypatch.setenv("PL_GLOBAL_SEED", "3")
     cached_cloud(CountingPrior({"size": 2.0}), "a dog", tmp_path)
-    assert CountingPrior.calls == 4
-
-
-@pytest.mark.slow
-def test_a_damaged_cache_is_ignored_and_no_folder_means_no_cache(tmp_path):
-    CountingPrior.calls = 0
-    cached_cloud(CountingPrior({}), "a fox", tmp_path)
-    path = tmp_path / "prior" / "points.npz"
-    path.write_bytes(path.read_bytes()[:50])
-    cached_cloud(CountingPrior({}), "a fox", tmp_path)
-    cached_cloud(CountingPrior({}), "a fox", None)
-    assert CountingPrior.calls == 3
-
-
-class FilePrior(CountingPrior):
-    @dataclass
-    class Config(CountingPrior.Config):
-        source: str = ""
+    assert CountingPrior.calls == 6
 
 
 def test_a_changed_file_runs_the_prior_again(tmp_path):
@@ -75,16 +62,17 @@ def test_a_changed_file_runs_the_prior_again(tmp_path):
     file = tmp_path / "models" / "a.ply"
     for source in (file, tmp_path / "models"):
         file.write_text("red")
-        FilePrior.calls = 0
+        CountingPrior.calls, folder = 0, tmp_path / f"save {source.name}"
         for text in ("red", "red", "redder"):
             if file.read_text() != text:
                 file.write_text(text)
-            cached_cloud(
-                FilePrior({"source": str(source)}), "a fox", tmp_path / f"save {source.name}"
-            )
+            cached_cloud(CountingPrior({"source": str(source)}), "a fox", folder)
         os.utime(file, ns=(1, 1))  # as long as before
-        cached_cloud(FilePrior({"source": str(source)}), "a fox", tmp_path / f"save {source.name}")
-        assert FilePrior.calls == 3
+        cached_cloud(CountingPrior({"source": str(source)}), "a fox", folder)
+        assert CountingPrior.calls == 3
+    for text in ("grey", "", "no\0name", "~no-such-user/x", 300 * "x"):  # no files
+        prior = CountingPrior({"source": text})
+        assert cache_key(prior, "") == cache_key(prior, "")
 
 
 def test_a_changed_texture_beside_a_mesh_runs_the_prior_again(tmp_path, monkeypatch):
@@ -93,24 +81,16 @@ def test_a_changed_texture_beside_a_mesh_runs_the_prior_again(tmp_path, monkeypa
     (tmp_path / "a.obj").write_text(f"mtllib a.mtl\n{corners}usemtl m\nf 1/1 2/2 3/3\n")
     (tmp_path / "a.mtl").write_text("newmtl m\nmap_Kd textures/t.png\n")
     (tmp_path / "textures").mkdir()
-    colors = []
+    colors, prior = [], MeshPrior({"path": str(tmp_path / "a.obj")})
     for shade in (None, 40, 200, 200):
         if shade is not None:
             image = Image.new("RGB", (1, 1), (shade, 0, 0))
             image.save(tmp_path / "textures" / "t.png")
             os.utime(tmp_path / "textures" / "t.png", ns=(shade, shade))
-        prior = MeshPrior({"path": str(tmp_path / "a.obj")})
         colors.append(cached_cloud(prior, "a fox", tmp_path / "save").colors[0, 0] * 255)
     np.testing.assert_allclose(colors, [127.5, 40, 200, 200], atol=0.5)
     monkeypatch.setattr(MeshPrior, "generate", lambda self, prompt, generator: pytest.fail())
-    cached_cloud(MeshPrior({"path": str(tmp_path / "a.obj")}), "a fox", tmp_path / "save")
-
-
-@pytest.mark.parametrize("source", ["grey", "", "no\0name", "~no-such-user/x", 300 * "x"])
-def test_other_texts_are_no_files(source):
-    assert cache_key(FilePrior({"source": source}), "") == cache_key(
-        FilePrior({"source": source}), ""
-    )
+    cached_cloud(prior, "a fox", tmp_path / "save")
 
 
 def test_changed_code_runs_the_prior_again(tmp_path):
@@ -125,15 +105,46 @@ def test_changed_code_runs_the_prior_again(tmp_path):
             return cache_key(module.Own({}), "")
 
     code = f"from {__name__} import CountingPrior\nclass Own(CountingPrior):\n    pass\n"
-    path = tmp_path / "own.py"
+    path, other = tmp_path / "own.py", tmp_path / "shapes.py"
     path.write_text(code)
-    (tmp_path / "shapes.py").write_text("a = 1\n")
+    other.write_text("a = 1\n")
     first = key_of(path)
-    (tmp_path / "shapes.py").write_text("a = 2\n")
+    other.write_text("a = 2\n")
     assert key_of(path) == first
     path.write_text(code + "# other\n")
     second = key_of(path)
     (tmp_path / "__init__.py").touch()
     third = key_of(path)
-    (tmp_path / "shapes.py").write_text("a = 3\n")
+    other.write_text("a = 3\n")
     assert len({first, second, third, key_of(path)}) == 4
+
+
+@pytest.fixture(scope="module")
+def sphere():
+    """Return 20,000 points around a distant centre: red on the +x side, blue on the +y side, else
+    green.
+    """
+    points = np.random.default_rng(0).normal(size=(20_000, 3))
+    points *= 40 / np.linalg.norm(points, axis=1, keepdims=True)
+    x, y, _ = points.T
+    side = np.where(x > np.abs(y), 0, np.where(y > np.abs(x), 2, 1))
+    return PointCloud(points.astype(np.float32) + [100, -50, 7], np.eye(3, dtype=np.float32)[side])
+
+
+def test_the_turntable_begins_at_the_front_and_turns_to_plus_y(sphere, tmp_path):
+    pictures = turntable(sphere, views=4, size=64)
+    assert pictures.shape == (4, 64, 64, 3) and pictures.dtype == np.uint8
+    middle = pictures[:, 29:35, 29:35].mean(axis=(1, 2))
+    wanted = [[255, 0, 0], [0, 0, 255], [0, 255, 0]]
+    np.testing.assert_allclose(middle[:3], wanted, atol=25)  # a point's alpha is at most 0.95
+    border = [pictures[:, 0], pictures[:, -1], pictures[:, :, 0], pictures[:, :, -1]]
+    assert (np.concatenate(border, axis=1) == 255).all()
+    covered = (pictures < 250).any(axis=-1).mean()
+    assert 0.45 < covered < 0.6  # a disc of 1 / 1.3 of the height would be 0.46; its edges are soft
+    one = turntable(PointCloud(np.zeros((1, 3)), np.zeros((1, 3))), views=1, size=32)
+    assert (one < 128).any()
+    save_turntable(sphere, tmp_path / "prior.gif", views=5, size=32)
+    with Image.open(tmp_path / "prior.gif") as image:
+        assert image.n_frames == 5 and image.size == (32, 32) and image.info["loop"] == 0
+    with pytest.raises(UserError, match="cannot write"):
+        save_turntable(sphere, tmp_path / "nowhere" / "prior.gif", views=1, size=32)

@@ -6,15 +6,8 @@ import numpy as np
 import pytest
 import torch
 
+from tests.priors.cases import seeded
 from threestudio_gaussiandreamer.priors import karras
-
-
-def seeded(seed=0):
-    return torch.Generator().manual_seed(seed)
-
-
-# --------------------------------------------------------------------------------------------------
-# the sampler
 
 MEAN, SPREAD = 0.3, 0.5
 
@@ -24,53 +17,33 @@ def gaussian_denoiser(x, sigma):
     return MEAN + SPREAD**2 / (SPREAD**2 + sigma**2) * (x - MEAN)
 
 
-def flow_end(noise, sigma_max):
-    """Return the end point of the noise-free sampler: the probability flow keeps the quantile of
-    the widening normal distribution.
-    """
-    return MEAN + SPREAD / math.hypot(SPREAD, sigma_max) * (sigma_max * noise - MEAN)
-
-
-def test_sigmas_are_karras():
-    sigmas = karras.karras_sigmas(64, 1e-3, 160)
-    assert (
-        len(sigmas) == 65
-        and sigmas[0] == pytest.approx(160)
-        and sigmas[-2] == pytest.approx(1e-3)
-        and sigmas[-1] == 0
-    )
-    np.testing.assert_allclose(
-        np.diff(np.array(sigmas[:-1]) ** (1 / 7)),
-        (1e-3 ** (1 / 7) - 160 ** (1 / 7)) / 63,
-        rtol=1e-9,
-    )
-
-
 def test_the_sampler_follows_the_flow_to_second_order():
+    """The probability flow keeps the quantile of the widening normal distribution."""
+    sigmas = karras.karras_sigmas(64, 160)
+    assert len(sigmas) == 65 and sigmas[-1] == 0
+    assert (sigmas[0], sigmas[-2]) == pytest.approx((160, 1e-3))
+    steps = np.diff(np.array(sigmas[:-1]) ** (1 / 7))
+    np.testing.assert_allclose(steps, (1e-3 ** (1 / 7) - 160 ** (1 / 7)) / 63, rtol=1e-9)
     noise = torch.randn(200, generator=seeded(), dtype=torch.float64)
+    end = MEAN + SPREAD / math.hypot(SPREAD, 120) * (120 * noise - MEAN)
     errors = []
     for steps in (16, 32, 64, 128):
-        sigmas = karras.karras_sigmas(steps, 1e-3, 120)
+        sigmas = karras.karras_sigmas(steps, 120)
         sample = karras.sample_heun(gaussian_denoiser, noise, sigmas, generator=seeded())
-        errors.append((sample - flow_end(noise, 120)).abs().max().item())
+        errors.append((sample - end).abs().max().item())
     ratios = [coarse / fine for coarse, fine in zip(errors[:-1], errors[1:], strict=True)]
-    assert errors[-1] < 2e-3 and all(
-        3.7 < ratio < 4.7 for ratio in ratios
-    )  # order 2: a quarter of the error for twice the steps
+    assert errors[-1] < 2e-3 and all(3.7 < ratio < 4.7 for ratio in ratios)  # order 2
 
 
 def test_churn_keeps_the_distribution_and_needs_the_generator():
-    noise = torch.randn(20_000, generator=seeded())
-    sigmas = karras.karras_sigmas(64, 1e-3, 120)
-    sample = karras.sample_heun(gaussian_denoiser, noise, sigmas, churn=3.0, generator=seeded(1))
-    assert sample.mean().item() == pytest.approx(
-        MEAN, abs=0.02
-    ) and sample.std().item() == pytest.approx(SPREAD, abs=0.02)  # 5 sigma of 20,000
-    again, other = (
+    noise, sigmas = torch.randn(20_000, generator=seeded()), karras.karras_sigmas(64, 120)
+    first, again, other = (
         karras.sample_heun(gaussian_denoiser, noise, sigmas, churn=3.0, generator=seeded(seed))
-        for seed in (1, 2)
+        for seed in (1, 1, 2)
     )
-    assert torch.equal(sample, again) and not torch.allclose(sample, other)
+    found = first.mean().item(), first.std().item()
+    assert found == pytest.approx((MEAN, SPREAD), abs=0.02)  # 5 sigma of 20,000
+    assert torch.equal(first, again) and not torch.allclose(first, other)
 
 
 def test_a_network_of_timesteps_gives_the_exact_denoiser():
@@ -87,56 +60,37 @@ def test_a_network_of_timesteps_gives_the_exact_denoiser():
 
     denoise = karras.guided_denoiser(network, alphas_cumprod, prediction="epsilon")
     for timestep in (0, 10, 500, 900):
-        sigma = math.sqrt(1 / alphas_cumprod[timestep] - 1) * (
-            1 + 1e-9
-        )  # on the safe side of rounding
+        sigma = math.sqrt(1 / alphas_cumprod[timestep] - 1) * (1 + 1e-9)  # safe from rounding
         x = torch.linspace(-0.4, 0.4, 9, dtype=torch.float64) * math.hypot(1, sigma)
-        torch.testing.assert_close(
-            denoise(x, sigma), gaussian_denoiser(x, sigma).clamp(-1, 1), atol=1e-6, rtol=0
-        )
+        wanted = gaussian_denoiser(x, sigma).clamp(-1, 1)
+        torch.testing.assert_close(denoise(x, sigma), wanted, atol=1e-6, rtol=0)
 
 
-def test_timesteps_are_cut_and_bounded():
-    levels = karras.linear_alphas_cumprod()
-    between = 0.3 * levels[100] + 0.7 * levels[101]
-    assert karras.timestep_of(math.sqrt(1 / between - 1), levels) == 100
-    assert karras.timestep_of(1e-6, levels) == 0 and karras.timestep_of(1e6, levels) == 1023
-
-
-def test_schedules():
+def test_schedules_and_timesteps():
     """The end points given by the formulas; the linear schedule is Ho et al.'s, rescaled from 1000
     to 1024 timesteps.
     """
     cosine, linear = karras.cosine_alphas_cumprod(), karras.linear_alphas_cumprod()
-    assert (
-        len(cosine) == len(linear) == 1024
-        and (np.diff(cosine) < 0).all()
-        and (np.diff(linear) < 0).all()
-    )
-    assert (
-        cosine[511] == pytest.approx(0.494, abs=0.005) and 0 < cosine[-1] < 1e-8
-    )  # cos^2 near 45 degrees, and the cap
-    assert linear[0] == pytest.approx(1 - 1e-4 * 1000 / 1024) and linear[-1] == pytest.approx(
-        4.0e-5, rel=0.05
-    )
+    for levels in (cosine, linear):
+        assert len(levels) == 1024 and (np.diff(levels) < 0).all()
+    assert cosine[511] == pytest.approx(0.494, abs=0.005)  # cos^2 near 45 degrees
+    assert 0 < cosine[-1] < 1e-8  # the cap
+    assert linear[0] == pytest.approx(1 - 1e-4 * 1000 / 1024)
+    assert linear[-1] == pytest.approx(4.0e-5, rel=0.05)
+    between = 0.3 * linear[100] + 0.7 * linear[101]
+    assert karras.timestep_of(math.sqrt(1 / between - 1), linear) == 100
+    assert karras.timestep_of(1e-6, linear) == 0 and karras.timestep_of(1e6, linear) == 1023
 
 
-def test_guidance_clamps_before_it_combines():
+def test_guidance_clamps_before_it_combines_and_none_asks_once():
     def network(z, timesteps):
         assert len(z) == 2 and torch.equal(z[0], z[1])
         return torch.stack([torch.full_like(z[0], 4.0), torch.full_like(z[0], -0.5)])
 
-    denoise = karras.guided_denoiser(
-        network, np.linspace(0.99, 0.01, 20), scale=3.0, prediction="sample"
-    )
+    levels = np.linspace(0.99, 0.01, 20)
+    denoise = karras.guided_denoiser(network, levels, scale=3.0, prediction="sample")
     assert denoise(torch.zeros(1, 5), 1.0).unique().tolist() == [-0.5 + 3 * (1 - -0.5)]
-
-
-def test_no_guidance_asks_once():
-    def network(z, timesteps):
-        assert len(z) == 1
-        return z
-
-    karras.guided_denoiser(network, np.linspace(0.99, 0.01, 20), prediction="sample")(
-        torch.zeros(1, 5), 1.0
-    )
+    seen = []
+    alone = karras.guided_denoiser(lambda z, t: seen.append(len(z)) or z, levels)
+    alone(torch.zeros(1, 5), 1.0)
+    assert seen == [1]

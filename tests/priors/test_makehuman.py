@@ -8,8 +8,8 @@ import pytest
 from scipy.spatial import cKDTree
 
 from tests.helpers.tiny_makehuman import HEADS, TALLER
+from tests.priors.cases import needs_anny
 from tests.priors.make_anny_vertices import CLOSE, PATH, PERSON
-from tests.priors.pose_cases import needs_anny
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.priors.makehuman import (
     Person,

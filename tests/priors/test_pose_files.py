@@ -1,103 +1,84 @@
-"""Files of poses: the layouts of axis-angle rotations, their axes, and damage."""
+"""Files of poses: the layouts of axis-angle rotations, BVH by many programs, axes, and damage."""
+
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from tests.priors.pose_cases import bvh_text, limb_angles, random_local, walked
+from tests.priors.cases import MIXAMO, bvh_text, limb_angles, random_local, rng, walked
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.priors.body_pose import INDEX, named_pose, posed
-from threestudio_gaussiandreamer.priors.pose_files import read_axis_angles, read_pose
-from threestudio_gaussiandreamer.priors.skeleton import BODY_JOINTS
+from threestudio_gaussiandreamer.priors.pose_files import (
+    joint_names,
+    read_axis_angles,
+    read_bvh,
+    read_pose,
+)
+from threestudio_gaussiandreamer.priors.skeleton import BODY_JOINTS, JOINTS
 
 FRAMES = 5
+ANGLES = rng().normal(scale=0.4, size=(FRAMES, 52, 3))
+"""Rotations of 52 joints in all frames."""
+FLAT = ANGLES.reshape(FRAMES, -1)
 
 
-@pytest.fixture
-def angles():
-    """Rotations of 52 joints in all frames."""
-    return np.random.default_rng(0).normal(scale=0.4, size=(FRAMES, 52, 3))
+def saved(folder, content):
+    """Write the arrays of an NPZ, or that of an NPY."""
+    path = folder / ("pose.npz" if isinstance(content, dict) else "pose.npy")
+    np.savez(path, **content) if isinstance(content, dict) else np.save(path, content)
+    return path
 
 
-def saved(tmp_path, **arrays):
-    np.savez(tmp_path / "pose.npz", **arrays)
-    return tmp_path / "pose.npz"
+def of_frames(count, root, body):
+    """Return the same rotations as smplx's arguments; ``count`` 0 leaves the frames out."""
+    frames, joints = (count,) if count else (), np.prod(body) // 3
+    rows = ANGLES[:count] if count else ANGLES[0]
+    return {
+        "global_orient": rows[..., 0, :].reshape(*frames, *root),
+        "body_pose": rows[..., 1 : joints + 1, :].reshape(*frames, *body),
+    }
 
 
-def layouts(angles):
-    """Yield arrays of an NPZ, or the array of an NPY, with the joints of each."""
-    flat = angles.reshape(FRAMES, -1)
-    yield {"poses": flat}
-    yield {"poses": np.concatenate([flat, np.zeros((FRAMES, 9))], 1)}  # SMPL-X: 55 joints
-    yield {"global_orient": angles[:, 0], "body_pose": flat[:, 3:66]}
-    yield {"global_orient": angles[:, :1], "body_pose": angles[:, 1:24]}
-    yield flat[:, :72]
-    yield angles[:, :22].astype(np.float32)
-
-
-@pytest.mark.parametrize("layout", range(6))
-def test_all_layouts_give_the_rotations_of_the_body(layout, angles, tmp_path):
-    content = list(layouts(angles))[layout]
-    path = tmp_path / ("pose.npz" if isinstance(content, dict) else "pose.npy")
-    if isinstance(content, dict):
-        np.savez(path, **content)
-    else:
-        np.save(path, content)
-    found, up = read_axis_angles(path, 1)
-    wanted = Rotation.from_rotvec(angles[1, :BODY_JOINTS]).as_matrix()
+@pytest.mark.parametrize(
+    ("content", "frame"),
+    [
+        ({"poses": FLAT}, 1),
+        ({"poses": np.concatenate([FLAT, np.zeros((FRAMES, 9))], 1)}, 1),  # SMPL-X: 55 joints
+        (FLAT[:, :72], 1),
+        (ANGLES[:, :22].astype(np.float32), 1),
+        (FLAT[0, :66], 0),
+        (ANGLES[0, :22], 0),
+        (FLAT[:1, :72], 0),
+        *((of_frames(FRAMES, (3,), body), FRAMES - 1) for body in ((63,), (21, 3), (69,), (23, 3))),
+        (of_frames(FRAMES, (1, 3), (63,)), FRAMES - 1),
+        (of_frames(1, (3,), (63,)), 0),
+        (of_frames(0, (3,), (63,)), 0),
+        (of_frames(0, (1, 3), (21, 3)), 0),
+        (of_frames(0, (1, 1, 3), (1, 21, 3)), 0),
+    ],
+)
+def test_all_layouts_give_the_rotations_of_the_body(content, frame, tmp_path):
+    found, up = read_axis_angles(saved(tmp_path, content), frame)
+    wanted = Rotation.from_rotvec(ANGLES[frame, :BODY_JOINTS]).as_matrix()
     np.testing.assert_allclose(found, wanted, atol=1e-6)
     assert up == "y"
 
 
-@pytest.mark.parametrize("shape", [(66,), (22, 3), (1, 72)])
-def test_a_single_frame_needs_no_dimension(shape, angles, tmp_path):
-    one = angles[0].reshape(-1)[: np.prod(shape)].reshape(shape)
-    np.save(tmp_path / "pose.npy", one)
-    found, _ = read_axis_angles(tmp_path / "pose.npy", 0)
-    wanted = Rotation.from_rotvec(angles[0, :BODY_JOINTS]).as_matrix()
-    np.testing.assert_allclose(found, wanted, atol=1e-9)
-
-
-@pytest.mark.parametrize("frames", [1, 2, 3, 4, 21, 22])
-@pytest.mark.parametrize("root", [(3,), (1, 3)], ids=str)
-@pytest.mark.parametrize("body", [(63,), (21, 3), (69,), (23, 3)], ids=str)
-def test_body_poses_have_any_number_of_frames(frames, root, body, tmp_path):
-    """Also as many frames as joints."""
-    angles = np.random.default_rng(1).normal(scale=0.4, size=(frames, 24, 3))
-    joints = np.prod(body) // 3
-    path = saved(
-        tmp_path,
-        global_orient=angles[:, 0].reshape(frames, *root),
-        body_pose=angles[:, 1 : joints + 1].reshape(frames, *body),
-    )
-    found, _ = read_axis_angles(path, frames - 1)
-    wanted = Rotation.from_rotvec(angles[-1, :BODY_JOINTS]).as_matrix()
-    np.testing.assert_allclose(found, wanted, atol=1e-9)
-
-
-@pytest.mark.parametrize("root", [(3,), (1, 3), (1, 1, 3)], ids=str)
-@pytest.mark.parametrize("body", [(63,), (21, 3), (1, 63), (1, 21, 3)], ids=str)
-def test_a_single_body_pose_needs_no_dimension(root, body, angles, tmp_path):
-    path = saved(
-        tmp_path,
-        global_orient=angles[0, 0].reshape(root),
-        body_pose=angles[0, 1:BODY_JOINTS].reshape(body),
-    )
-    found, _ = read_axis_angles(path, 0)
-    wanted = Rotation.from_rotvec(angles[0, :BODY_JOINTS]).as_matrix()
-    np.testing.assert_allclose(found, wanted, atol=1e-9)
-
-
-def test_a_body_pose_alone_stands_upright(angles, tmp_path):
-    found, _ = read_axis_angles(saved(tmp_path, body_pose=angles[0, 1:22].reshape(-1)), 0)
-    np.testing.assert_array_equal(found[0], np.eye(3))
+def test_as_many_frames_as_joints_and_no_root(tmp_path):
+    angles = rng(1).normal(scale=0.4, size=(21, 22, 3))
+    arrays = {"global_orient": angles[:, 0], "body_pose": angles[:, 1:]}
+    found, _ = read_axis_angles(saved(tmp_path, arrays), 20)
+    np.testing.assert_allclose(found, Rotation.from_rotvec(angles[20]).as_matrix(), atol=1e-9)
+    alone, _ = read_axis_angles(saved(tmp_path, {"body_pose": FLAT[0, 3:66]}), 0)
+    np.testing.assert_array_equal(alone[0], np.eye(3))
 
 
 def test_amass_has_z_up(stick_body, tmp_path):
     """Its resting body is turned from y up to z up by its first rotation."""
     poses = np.zeros((1, 156))
     poses[0, 0] = np.pi / 2
-    path = saved(tmp_path, poses=poses, mocap_framerate=np.array(120.0))
+    path = saved(tmp_path, {"poses": poses, "mocap_framerate": np.array(120.0)})
     wanted = named_pose(stick_body, "T")
     np.testing.assert_allclose(read_pose(str(path), stick_body), wanted, atol=1e-9)
     lying = posed(stick_body, read_pose(str(path), stick_body, up="y")).joints
@@ -110,50 +91,171 @@ def test_a_bvh_gives_the_body_its_pose(up, stick_body, tmp_path):
     turns = {"z": [np.pi / 2, 0, 0], "-y": [np.pi, 0, 0], "auto": [0, 0, 0]}
     local[0] = Rotation.from_rotvec(turns[up]).as_matrix()
     path = tmp_path / "a.bvh"
-    path.write_text(bvh_text(stick_body.joints, [local]))
-    found = posed(stick_body, read_pose(str(path), stick_body, up=up)).joints
+    path.write_text(bvh_text(stick_body.joints, [random_local(0), local]))
+    found = posed(stick_body, read_pose(str(path), stick_body, frame=1, up=up)).joints
     local[0] = np.eye(3)
     assert limb_angles(found, walked(stick_body.joints, local)).max() < 1e-4
     assert found[INDEX["head"], 1] > found[INDEX["left ankle"], 1] + 0.5
 
 
+WRONG = "axis-angle rotations were expected"
+
+
 @pytest.mark.parametrize(
-    ("arrays", "problem"),
+    ("content", "problem"),
     [
-        ({"poses": np.zeros((2, 70))}, r"holds an array \(2, 70\) of float64: axis-angle"),
+        ({"poses": np.zeros((2, 70))}, rf"has poses \(2, 70\) of float64: {WRONG}"),
         ({"poses": np.zeros((2, 22, 3, 3))}, "matrices aren't read"),
-        ({"poses": np.zeros((0, 72))}, r"holds an array \(0, 72\)"),
+        ({"poses": np.zeros((0, 72))}, WRONG),
         ({"poses": np.full((1, 72), np.nan)}, "NaN or infinite in frame 0"),
-        ({"poses": np.array([["a"] * 72])}, "holds an array"),
-        ({"poses": np.zeros((1, 72), complex)}, "holds an array"),
+        ({"poses": np.array([["a"] * 72])}, WRONG),
+        ({"poses": np.zeros((1, 72), complex)}, WRONG),
         ({"poses": np.full((1, 72), 1e300)}, "too large"),
-        ({"trans": np.zeros((1, 3))}, "neither an array 'poses' nor 'body_pose'"),
+        ({"trans": np.zeros((1, 3))}, "has neither poses nor body_pose"),
         ({"body_pose": np.zeros((2, 63)), "global_orient": np.zeros((3, 3))}, "global_orient"),
-        ({"body_pose": np.zeros((0, 63))}, r"holds an array \(0, 66\)"),
-        ({"body_pose": np.zeros((0, 63)), "global_orient": np.zeros((0, 3))}, "holds an array"),
+        ({"body_pose": np.zeros((0, 63)), "global_orient": np.zeros((0, 3))}, WRONG),
         ({"body_pose": np.zeros((3, 63)), "global_orient": np.zeros(9)}, "global_orient"),
         ({"body_pose": np.zeros((4, 63)), "global_orient": np.zeros((2, 6))}, "global_orient"),
-        ({"body_pose": np.zeros((2, 63)), "global_orient": np.zeros((2, 3, 3))}, "global_orient"),
-        ({"body_pose": np.zeros((2, 60)), "global_orient": np.zeros((2, 3))}, "holds an array"),
+        ({"body_pose": np.zeros((2, 60)), "global_orient": np.zeros((2, 3))}, WRONG),
+        (np.array([{}], object), "has no array 'poses'"),
     ],
 )
-def test_wrong_arrays_are_refused(arrays, problem, stick_body, tmp_path):
+def test_wrong_arrays_are_refused(content, problem, stick_body, tmp_path):
     with pytest.raises(UserError, match=problem):
-        read_pose(str(saved(tmp_path, **arrays)), stick_body)
+        read_pose(str(saved(tmp_path, content)), stick_body)
 
 
-def test_a_frame_beyond_the_end_is_refused(stick_body, angles, tmp_path):
-    path = saved(tmp_path, poses=angles.reshape(FRAMES, -1))
+def test_wrong_files_and_frames_are_refused(stick_body, tmp_path):
+    path = saved(tmp_path, {"poses": FLAT})
     with pytest.raises(UserError, match="has 5 frames, numbered from 0; there is no 5"):
         read_pose(str(path), stick_body, frame=FRAMES)
-
-
-def test_missing_and_unknown_files_are_refused(stick_body, tmp_path):
     with pytest.raises(UserError, match="does not exist"):
         read_pose(str(tmp_path / "a.bvh"), stick_body)
     (tmp_path / "a.fbx").touch()
     with pytest.raises(UserError, match=r"format of the pose file .*\.fbx"):
         read_pose(str(tmp_path / "a.fbx"), stick_body)
-    np.save(tmp_path / "a.npy", np.array([{}], object), allow_pickle=True)
-    with pytest.raises(UserError, match="has no array 'poses'"):
-        read_pose(str(tmp_path / "a.npy"), stick_body)
+
+
+# BVH ----------------------------------------------------------------------------------------------
+
+CMU = (
+    "Hips LHipJoint LeftUpLeg LeftLeg LeftFoot LeftToeBase RHipJoint RightUpLeg RightLeg RightFoot "
+    "RightToeBase LowerBack Spine Spine1 Neck Neck1 Head LeftShoulder LeftArm LeftForeArm LeftHand "
+    "LeftFingerBase LThumb RightShoulder RightArm RightForeArm RightHand"
+)
+BIOVISION = (
+    "Hips LeftHip LeftKnee LeftAnkle RightHip RightKnee RightAnkle Chest LeftCollar LeftShoulder "
+    "LeftElbow LeftWrist RightCollar RightShoulder RightElbow RightWrist Neck Head"
+)
+DAZ = (
+    "hip abdomen chest neck head lCollar lShldr lForeArm lHand rCollar rShldr rForeArm rHand "
+    "lThigh lShin lFoot rThigh rShin rFoot"
+)
+SMPL = (
+    "pelvis left_hip left_knee left_ankle left_foot right_hip right_knee right_ankle spine1 neck "
+    "head left_collar left_shoulder left_elbow left_wrist left_hand right_shoulder right_elbow"
+)
+RIGIFY = (
+    "root spine thigh.L shin.L foot.L toe.L thigh.R shin.R foot.R neck head shoulder.L upper_arm.L "
+    "forearm.L hand.L upper_arm.R forearm.R hand.R"
+)
+MAKEHUMAN = (
+    "root spine05 upperleg01.L lowerleg01.L foot.L upperleg01.R lowerleg01.R foot.R neck01 head "
+    "clavicle.L shoulder01.L upperarm01.L lowerarm01.L wrist.L upperarm01.R lowerarm01.R wrist.R"
+)
+BIPED = (
+    "Pelvis,Spine,L Thigh,L Calf,L Foot,R Thigh,R Calf,R Foot,Neck,Head,L Clavicle,L UpperArm,"
+    "L Forearm,L Hand,R UpperArm,R Forearm"
+)
+EXPECTED = {
+    "CMU": (CMU.split(), {"left hip": "LeftUpLeg", "left shoulder": "LeftArm",
+                          "left ankle": "LeftFoot", "left foot": "LeftToeBase"}),
+    "Biovision": (BIOVISION.split(), {"left hip": "LeftHip", "left shoulder": "LeftShoulder",
+                                      "right wrist": "RightWrist"}),
+    "DAZ": (DAZ.split(), {"pelvis": "hip", "left shoulder": "lShldr", "right knee": "rShin"}),
+    "SMPL": (SMPL.split(), {"left ankle": "left_ankle", "left foot": "left_foot",
+                            "left wrist": "left_wrist", "right elbow": "right_elbow"}),
+    "Rigify": (RIGIFY.split(), {"left shoulder": "upper_arm.L", "left foot": "toe.L"}),
+    "MakeHuman": (MAKEHUMAN.split(), {"left shoulder": "upperarm01.L", "neck": "neck01"}),
+    "Biped": ([f"Bip01 {name}" for name in BIPED.split(",")],
+              {"pelvis": "Bip01 Pelvis", "left shoulder": "Bip01 L UpperArm"}),
+    "Mixamo": ([f"mixamorig:{name}" for name in MIXAMO],
+               {"left shoulder": "mixamorig:LeftArm", "lower spine": "mixamorig:Spine"}),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("program", EXPECTED)
+def test_joints_are_found_by_the_names_of_many_programs(program):
+    names, wanted = EXPECTED[program]
+    found = {joint: names[number] for joint, number in joint_names(names, Path("a.bvh")).items()}
+    assert found | wanted == found and set(wanted) <= set(JOINTS)
+    assert len(set(found.values())) == len(found)
+
+
+CHAIN = """HIERARCHY
+ROOT Hips
+{
+  OFFSET 0 0 0
+  CHANNELS 6 Xposition Yposition Zposition Zrotation Xrotation Yrotation
+  JOINT LeftUpLeg
+  {
+    OFFSET 10 0 0
+    CHANNELS 3 Zrotation Xrotation Yrotation
+    JOINT LeftLeg
+    {
+      OFFSET 0 -40 0
+      CHANNELS 3 Zrotation Xrotation Yrotation
+      End Site
+      {
+        OFFSET 0 -40 0
+      }
+    }
+  }
+%s}
+MOTION
+Frames: 2
+Frame Time: 0.0333
+1 90 2 0 0 0 0 0 0 0 0 0%s
+1 90 2 0 0 90 0 -90 0 0 0 0%s
+"""
+OTHERS = "RightUpLeg RightLeg LeftArm LeftForeArm RightArm RightForeArm".split()
+CASE = CHAIN % (
+    "".join(f"JOINT {name}\n{{\nOFFSET 0 1 0\nCHANNELS 1 Yrotation\n}}\n" for name in OTHERS),
+    *(2 * [" 0" * len(OTHERS)]),
+)
+
+
+def test_positions_follow_the_rotations(tmp_path):
+    """The hips turn by 90 degrees about y (x becomes -z), the leg swings forwards about its x."""
+    path = tmp_path / "chain.bvh"
+    path.write_text(CASE.replace("ROOT", "{\n}\nROOT", 1))  # braces before the root are ignored
+    still, moved = read_bvh(path, 0), read_bvh(path, 1)
+    np.testing.assert_allclose(still["left hip"], [11, 90, 2], atol=1e-9)
+    np.testing.assert_allclose(still["left knee"], [11, 50, 2], atol=1e-9)
+    np.testing.assert_allclose(moved["left hip"], [1, 90, -8], atol=1e-9)
+    np.testing.assert_allclose(moved["left knee"], [41, 90, -8], atol=1e-9)
+    with pytest.raises(UserError, match="has 2 frames, numbered from 0; there is no 2"):
+        read_bvh(path, 2)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "problem"),
+    [
+        ("LeftLeg", "Tentacle", "no joint that is known as the left knee: its joints are Hips"),
+        ("Frames: 2", "Frames: 2\n1 2 3", "12|18 finite numbers were expected"),
+        ("1 90 2 0 0 0", "1 90 nan 0 0 0", "finite numbers were expected in the line '1 90 nan"),
+        ("OFFSET 10 0 0", "OFFSET 10 0", "3 finite numbers were expected"),
+        ("OFFSET 10 0 0", "OFFSET 10 zero 0", "3 finite numbers were expected"),
+        ("6 Xposition", "6 Xpositoin", "channels Xpositoin.*expected different ones of Xposition"),
+        ("6 Xposition Yposition", "6 Xposition Xposition", "expected different ones of"),
+        ("OFFSET 10 0 0", "OFFSET 1e300 0 0", "3 finite numbers were expected"),
+        ("HIERARCHY\nROOT Hips\n{", "HIERARCHY\nROOT Hips\n{\n{", "is cut off"),
+        (CASE, "", "has no joints"),
+        (CASE, "\x00\xff binary", "has no joints"),
+    ],
+)
+def test_damaged_files_are_refused(tmp_path, old, new, problem):
+    assert old in CASE
+    (tmp_path / "chain.bvh").write_text(CASE.replace(old, new, 1))
+    with pytest.raises(UserError, match=problem):
+        read_bvh(tmp_path / "chain.bvh", 0)

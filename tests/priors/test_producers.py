@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import trimesh
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from tests.formats.test_producers import EXPORTS
 from threestudio_gaussiandreamer import register_parts
@@ -17,6 +18,7 @@ from threestudio_gaussiandreamer.host import find
 
 register_parts()
 SIZE, SCALE = 0.37, 1.25
+FILE_PRIORS = ("mesh-prior", "point-cloud-prior", "gaussians-prior")
 LARGEST_ERROR = 1.0
 """Degrees."""
 
@@ -58,8 +60,7 @@ def matched(points, colors, wanted_colors):
 
 
 def write_mesh(path, vertices, faces, colors):
-    mesh = trimesh.Trimesh(vertices, faces, vertex_colors=colors, process=False)
-    mesh.export(path)
+    trimesh.Trimesh(vertices, faces, vertex_colors=colors, process=False).export(path)
 
 
 def write_gaussians(path, vertices, colors):
@@ -82,9 +83,8 @@ CASES = [
 
 
 @pytest.mark.parametrize(("name", "kind", "suffix", "axes", "export"), CASES)
-@pytest.mark.parametrize("part", ["own", "point-cloud-prior"])
 def test_a_file_comes_in_upright_to_the_front_scaled_and_in_display_colours(
-    name, kind, suffix, axes, export, part, tmp_path
+    name, kind, suffix, axes, export, tmp_path
 ):
     mesh, colors = box()
     turn = export @ frame(axes) @ np.diag([1, np.linalg.det(export), 1])  # one renderer mirrors
@@ -94,23 +94,20 @@ def test_a_file_comes_in_upright_to_the_front_scaled_and_in_display_colours(
         write_gaussians(path, vertices, colors)
     else:
         write_mesh(path, vertices, mesh.faces, colors)
-    own = "gaussians-prior" if kind == GAUSSIANS else "mesh-prior"
-    prior = find(own if part == "own" else part)
-    cloud = prior({"path": str(path), "producer": name, "scale": SCALE})("")
-    points, found = matched(cloud.points, cloud.colors, colors / 255)
     wanted = in_world(mesh)
-    assert pose_error(points, wanted) < LARGEST_ERROR
-    np.testing.assert_allclose(points, wanted, atol=1e-4)
-    np.testing.assert_allclose(found, colors / 255, atol=1 / 254)
+    for part in ("gaussians-prior" if kind == GAUSSIANS else "mesh-prior", "point-cloud-prior"):
+        cloud = find(part)({"path": str(path), "producer": name, "scale": SCALE})("")
+        points, found = matched(cloud.points, cloud.colors, colors / 255)
+        assert pose_error(points, wanted) < LARGEST_ERROR
+        np.testing.assert_allclose(points, wanted, atol=1e-4)
+        np.testing.assert_allclose(found, colors / 255, atol=1 / 254)
 
 
 def test_the_pose_error_is_the_angle():
     wanted = in_world(box()[0])
-    turn = np.radians(3)
-    rotation = np.array(
-        [[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1]]
-    )
-    assert pose_error(wanted @ rotation.T, wanted) == pytest.approx(3)
+    turned = Rotation.from_euler("z", 3, degrees=True).apply(wanted)
+    assert pose_error(turned, wanted) == pytest.approx(3)
+    assert {kind for _, kind, *_ in CASES} == {GAUSSIANS, MESH}
 
 
 def test_a_baked_texture_is_taken_as_display_values(tmp_path):
@@ -122,12 +119,9 @@ def test_a_baked_texture_is_taken_as_display_values(tmp_path):
     )
     uv = np.random.default_rng(0).random((len(mesh.vertices), 2))
     visual = trimesh.visual.TextureVisuals(uv=uv, material=material)
-    trimesh.Trimesh(mesh.vertices, mesh.faces, visual=visual, process=False).export(
-        tmp_path / "a.glb"
-    )
-    colors = find("mesh-prior")({"path": str(tmp_path / "a.glb"), "producer": "trellis2"})(
-        ""
-    ).colors
+    path = tmp_path / "a.glb"
+    trimesh.Trimesh(mesh.vertices, mesh.faces, visual=visual, process=False).export(path)
+    colors = find("mesh-prior")({"path": str(path), "producer": "trellis2"})("").colors
     np.testing.assert_allclose(colors, np.tile([10, 128, 250], (len(colors), 1)) / 255, atol=1e-6)
 
 
@@ -142,43 +136,34 @@ def test_all_attributes_of_gaussians_are_scaled(tmp_path):
     assert np.ptp(still.means, axis=0).max() == pytest.approx(2 * SIZE, rel=1e-5)
 
 
-@pytest.mark.parametrize(
-    ("name", "producer"), [("gaussians-prior", "lgm"), ("point-cloud-prior", "triposg")]
-)
-def test_a_scale_that_is_not_applied_is_refused(name, producer):
-    options = {"path": "a.ply", "scale": SCALE}
-    with pytest.raises(UserError, match="scale has no effect without normalize or producer: leave"):
-        find(name)(options)
-    for used in ({"producer": producer}, {"normalize": True}, {"normalize": False}, {"scale": 1.0}):
-        find(name)(options | used)
+BOTH = "give it, or up and front"
+UNUSED = "scale has no effect without normalize or producer: leave"
 
 
-@pytest.mark.parametrize("name", ["mesh-prior", "point-cloud-prior", "gaussians-prior"])
 @pytest.mark.parametrize(
-    ("options", "problem"),
+    ("name", "options", "problem"),
     [
-        ({"producer": "trelis"}, "producer.*did you mean 'trellis'"),
-        ({"producer": "trellis", "up": "y"}, "up|give it, or up and front"),
+        *((name, {"producer": "trelis"}, "did you mean 'trellis'") for name in FILE_PRIORS),
+        ("gaussians-prior", {"producer": "lgm", "up": "y"}, BOTH),
+        ("mesh-prior", {"producer": "trellis", "up": "+y"}, BOTH),
+        ("point-cloud-prior", {"producer": "trellis", "front": "+y"}, BOTH),
+        ("gaussians-prior", {"scale": SCALE}, UNUSED),
+        ("point-cloud-prior", {"scale": SCALE}, UNUSED),
+        ("mesh-prior", {"producer": "diffsplat"}, "files of Gaussians.*producers of meshes are"),
+        ("gaussians-prior", {"producer": "triposr"}, "stands for files of meshes"),
     ],
 )
-def test_wrong_producers_are_refused_when_the_prior_is_built(name, options, problem):
-    if "up" in options and name != "gaussians-prior":
-        options = options | {"up": "+y"}
+def test_wrong_combinations_are_refused_when_the_prior_is_built(name, options, problem):
     with pytest.raises(UserError, match=problem):
         find(name)({"path": "a.glb"} | options)
+    for used in ({"normalize": True}, {"normalize": False}):
+        if problem == UNUSED:
+            find(name)({"path": "a.glb"} | options | used)
 
 
-def test_a_producer_of_other_files_is_refused(tmp_path):
-    with pytest.raises(UserError, match="stands for files of Gaussians.*producers of meshes are"):
-        find("mesh-prior")({"path": "a.glb", "producer": "diffsplat"})
-    with pytest.raises(UserError, match="stands for files of meshes"):
-        find("gaussians-prior")({"path": "a.ply", "producer": "triposr"})
+def test_a_producer_of_other_files_is_refused_by_the_file(tmp_path):
     mesh, colors = box()
     write_mesh(tmp_path / "a.glb", mesh.vertices, mesh.faces, colors)
     prior = find("point-cloud-prior")({"path": str(tmp_path / "a.glb"), "producer": "diffsplat"})
     with pytest.raises(UserError, match="stands for files of Gaussians"):
         prior("")
-
-
-def test_every_kind_is_tested():
-    assert {kind for _, kind, *_ in CASES} == {GAUSSIANS, MESH}

@@ -1,6 +1,12 @@
-"""Shap-E with tiny weights in the published files: files, sampling, the mesh and its pose, Cap3D's
-checkpoint.
+"""Shap-E with tiny weights in the published files: the mesh and its pose, sampling, Cap3D's
+checkpoint; and the files of models in folders, the hub's cache and on the hub.
 """
+
+import gc
+import pickle
+import shutil
+import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,17 +14,33 @@ import torch
 
 from tests.helpers import tiny_3d_models as tiny
 from tests.helpers.prior_contract import PriorContract, assert_valid
-from tests.priors.shap_e_cases import CPU, make, seeded
+from tests.priors.cases import Evil, seeded
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.host import find
 from threestudio_gaussiandreamer.models.clip import (
     load_text_encoder,
     load_tokenizer,
     text_condition,
 )
+from threestudio_gaussiandreamer.models.hub import locate
 from threestudio_gaussiandreamer.priors import shap_e as module
-from threestudio_gaussiandreamer.priors.karras import guided_denoiser, karras_sigmas, sample_heun
-from threestudio_gaussiandreamer.priors.shap_e import ShapEPrior, prior_network, read_schedule
+from threestudio_gaussiandreamer.priors.point_e import PointTransformer
+from threestudio_gaussiandreamer.priors.shap_e import (
+    SIGMA_MAX,
+    ShapEPrior,
+    load_original_prior,
+    read_schedule,
+)
+
+FAST = {"num_inference_steps": 2, "grid_size": 24}
+PARTS = ("text_encoder", "tokenizer")
+
+
+def make(folder, **options):
+    return ShapEPrior(FAST | {"model": str(folder)} | options)
+
+
+def sampled(folder, prompt="a fox", seed=0, **options):
+    return make(folder, **options)._sample(folder, prompt, seeded(seed))
 
 
 class TestContract(PriorContract):
@@ -27,12 +49,7 @@ class TestContract(PriorContract):
         return lambda **options: make(folder, **options)
 
 
-def test_registered(folder):
-    assert find("shap-e-prior") is ShapEPrior
-
-
-# -------------------------------------------------------------------------------------------------
-# the mesh in the world
+# The mesh in the world ----------------------------------------------------------------------------
 
 
 def world(values):
@@ -40,68 +57,37 @@ def world(values):
     return np.array([-values[1], values[0], values[2]])
 
 
-def test_the_front_is_plus_x_and_the_scale_is_the_papers(folder):
+def test_the_surface_is_where_the_shape_is_in_the_papers_scale(folder):
     cloud = make(folder, grid_size=64)("a fox")
     assert_valid(cloud)
-    shrunk = 1.6 * 63 / 65  # the border that closes the surface: see the module
-    low, high = cloud.points.min(axis=0), cloud.points.max(axis=0)
-    cell = 1.6 * 2 / 64
-    np.testing.assert_allclose((low + high) / 2, shrunk * world(tiny.SHAPE_CENTRE), atol=cell)
-    np.testing.assert_allclose(
-        (high - low) / 2, shrunk * np.abs(world(tiny.SHAPE_HALF_SIDES)), atol=cell
-    )
-    assert (low + high)[0] > 0  # the shape lies on the -y side of Shap-E's space
-
-
-def test_all_vertices_lie_on_the_surface_and_all_are_used(folder):
-    cloud = make(folder, grid_size=64)("a fox")
+    # the border that closes the surface makes it smaller: see the module
     centre, half = (1.6 * 63 / 65 * world(v) for v in (tiny.SHAPE_CENTRE, tiny.SHAPE_HALF_SIDES))
+    low, high, cell = cloud.points.min(axis=0), cloud.points.max(axis=0), 1.6 * 2 / 64
+    np.testing.assert_allclose((low + high) / 2, centre, atol=cell)
+    np.testing.assert_allclose((high - low) / 2, np.abs(half), atol=cell)
+    assert (low + high)[0] > 0  # the shape lies on the -y side of Shap-E's space
     distance = (np.abs(cloud.points - centre) / np.abs(half)).sum(axis=1)
     assert np.abs(distance - 1).mean() < 0.01
-    np.testing.assert_allclose(
-        distance, 1, atol=0.08
-    )  # half a cell, 1/64, in units of the narrowest half side, 0.2
+    # half a cell, 1/64, in units of the narrowest half side, 0.2
+    np.testing.assert_allclose(distance, 1, atol=0.08)
     assert set(cloud.faces.ravel()) == set(range(len(cloud.points)))
+    turned = make(folder, grid_size=64, scale=0.8, front="+x")("a fox").points
+    np.testing.assert_allclose(2 * turned, cloud.points[:, [1, 0, 2]] * [1, -1, 1], atol=1e-6)
 
 
 def test_colors_are_display_values_and_can_be_linear(folder):
     display, linear = make(folder)("a fox"), make(folder, colors="linear")("a fox")
     # the renderer asks for colours at the shrunk surface, so here the border plays no part
-    z = (display.points[:, 2] / 1.6 - tiny.SHAPE_CENTRE[2]) / tiny.SHAPE_HALF_SIDES[
-        2
-    ]  # in [-1, 1] up the shape
-    expected = np.stack([np.full_like(z, 2.0), z, np.zeros_like(z)], axis=1)
-    np.testing.assert_allclose(
-        display.colors, 1 / (1 + np.exp(-expected)), atol=0.005
-    )  # SiLU near z = 0
-    np.testing.assert_allclose(
-        linear.colors,
-        np.where(display.colors < 0.04045, 0, ((display.colors + 0.055) / 1.055) ** 2.4),
-        atol=1e-5,
-    )
+    up = (display.points[:, 2] / 1.6 - tiny.SHAPE_CENTRE[2]) / tiny.SHAPE_HALF_SIDES[2]
+    expected = np.stack([np.full_like(up, 2.0), up, np.zeros_like(up)], axis=1)
+    logistic = 1 / (1 + np.exp(-expected))
+    np.testing.assert_allclose(display.colors, logistic, atol=0.005)  # SiLU near 0
+    decoded = ((display.colors + 0.055) / 1.055) ** 2.4
+    wanted = np.where(display.colors < 0.04045, 0, decoded)
+    np.testing.assert_allclose(linear.colors, wanted, atol=1e-5)
 
 
-def test_queries_in_chunks_change_nothing(folder):
-    for a, b in zip(
-        make(folder, query_batch_size=1000)("a fox"), make(folder)("a fox"), strict=True
-    ):
-        if a is not None:
-            np.testing.assert_allclose(
-                a, b, atol=1e-6
-            )  # matrix products of other sizes round differently
-
-
-def test_normalize_and_front(folder):
-    cloud = make(folder, normalize=True, scale=0.7, front="+x")("a fox")
-    np.testing.assert_allclose(
-        np.abs([cloud.points.min(axis=0), cloud.points.max(axis=0)]).max(), 0.7, rtol=1e-6
-    )
-    plain = make(folder)("a fox")
-    sides, turned = np.ptp(plain.points, axis=0), np.ptp(cloud.points, axis=0)
-    np.testing.assert_allclose(turned / turned.max(), sides[[1, 0, 2]] / sides.max(), rtol=1e-5)
-
-
-def test_no_surface_is_a_message(copy):
+def test_no_surface_and_latents_that_are_not_finite_are_messages(copy):
     from diffusers.pipelines.shap_e.renderer import ShapERenderer
 
     renderer = ShapERenderer.from_pretrained(copy / "shap_e_renderer")
@@ -110,42 +96,30 @@ def test_no_surface_is_a_message(copy):
     renderer.save_pretrained(copy / "shap_e_renderer")
     with pytest.raises(UserError, match="no surface"):
         make(copy)("a fox")
-
-
-def test_latents_that_are_not_finite_are_a_message(folder):
     with pytest.raises(UserError, match="half_precision"):
-        module.decoded(
-            None,
-            torch.full((1, 16, 8), torch.nan),
-            grid_size=8,
-            query_batch_size=8,
-            colors="display",
-        )
+        module.decoded(None, torch.full((1, 16, 8), torch.nan), grid_size=8, colors="display")
 
 
-# --------------------------------------------------------------------------------------------------
-# sampling
+# Sampling -----------------------------------------------------------------------------------------
 
 
 def test_text_condition_equals_the_pipelines(folder):
     """Without padding, and with our loading; diffusers pads to 77 tokens."""
     from diffusers import ShapEPipeline
 
-    pipeline = ShapEPipeline.from_pretrained(folder)
-    ours = make(folder)._condition(folder, "a red fox", CPU)
-    theirs = pipeline._encode_prompt("a red fox", CPU, 1, True)
-    torch.testing.assert_close(
-        torch.cat([torch.zeros_like(ours), ours]), theirs, atol=1e-5, rtol=1e-5
+    prior = make(folder)
+    ours = prior.with_unconditional(prior.condition("Shap-E", folder, "a red fox", PARTS))
+    theirs = ShapEPipeline.from_pretrained(folder)._encode_prompt("a red fox", ours.device, 1, True)
+    torch.testing.assert_close(ours.flip(0), theirs, atol=1e-5, rtol=1e-5)
+    assert ours[0].square().mean().item() == pytest.approx(1, abs=1e-5)
+    own = make(folder, prompt="a red fox").condition("Shap-E", folder, "a toy", PARTS)
+    assert torch.equal(own, ours[:1])
+    encoder, tokenizer = (
+        load_text_encoder(folder, "text_encoder"),
+        load_tokenizer(folder, "tokenizer"),
     )
-    assert ours.square().mean().item() == pytest.approx(1, abs=1e-5)
-
-
-def test_a_prompt_beyond_77_tokens_is_cut(folder):
-    encoder = load_text_encoder(folder, "text_encoder")
-    tokenizer = load_tokenizer(folder, "tokenizer")
-    torch.testing.assert_close(
-        text_condition(tokenizer, encoder, "x" * 400), text_condition(tokenizer, encoder, "x" * 500)
-    )
+    cut, longer = (text_condition(tokenizer, encoder, "x" * count) for count in (400, 500))
+    torch.testing.assert_close(cut, longer)
 
 
 def test_our_sampler_agrees_with_the_pipelines(copy):
@@ -160,91 +134,46 @@ def test_our_sampler_agrees_with_the_pipelines(copy):
         prior.time_embedding.linear_1.weight.zero_()
         prior.proj_to_clip_embeddings.weight.mul_(0.02)
     prior.save_pretrained(copy / "prior")
-    ours = make(copy, num_inference_steps=6, guidance_scale=3.0)._sample(
-        copy, "a red fox", CPU, seeded()
-    )
+    options = {"num_inference_steps": 6, "guidance_scale": 3.0}
+    ours = sampled(copy, "a red fox", **options)
     pipeline = ShapEPipeline.from_pretrained(copy)
-    pipeline.scheduler.register_to_config(sigma_min=1e-3, sigma_max=160.0)
+    pipeline.scheduler.register_to_config(sigma_min=1e-3, sigma_max=SIGMA_MAX)
     noise = torch.randn(1, 16, 8, generator=seeded()).flatten(1)
-    theirs = pipeline(
-        "a red fox", num_inference_steps=6, guidance_scale=3.0, latents=noise, output_type="latent"
-    ).images
-    assert pipeline.scheduler.sigmas[0].item() == pytest.approx(160) and pipeline.scheduler.sigmas[
-        -2
-    ].item() == pytest.approx(1e-3)
-    assert ours.abs().max() < 1
-    torch.testing.assert_close(
-        ours, theirs, atol=2e-5, rtol=0
-    )  # 160 in float32 has a spacing of 1.5e-5
+    theirs = pipeline("a red fox", latents=noise, output_type="latent", **options).images
+    levels = [pipeline.scheduler.sigmas[place].item() for place in (0, -2)]
+    assert levels == pytest.approx([160, 1e-3]) and ours.abs().max() < 1
+    # 160 in float32 has a spacing of 1.5e-5
+    torch.testing.assert_close(ours, theirs, atol=2e-5, rtol=0)
 
 
-def test_what_the_scheduler_would_do_by_itself(folder):
+def test_the_schedule_and_what_the_scheduler_would_do_by_itself(folder):
     """The levels stated in the module's docstring, which are the reason for our own sampler."""
     from diffusers import HeunDiscreteScheduler
 
     scheduler = HeunDiscreteScheduler.from_pretrained(folder, subfolder="scheduler")
     scheduler.set_timesteps(64)
-    assert scheduler.sigmas[0].item() == pytest.approx(403.4, abs=0.1) and scheduler.sigmas[
-        -2
-    ].item() == pytest.approx(0.1085, abs=1e-3)
-
-
-def test_schedule_is_the_models(folder):
+    levels = [scheduler.sigmas[place].item() for place in (0, -2)]
+    assert levels == pytest.approx([403.4, 0.1085], rel=0.01)
     alphas_cumprod, prediction = read_schedule(folder)
     assert prediction == "sample" and len(alphas_cumprod) == 1024
-    np.testing.assert_allclose(
-        alphas_cumprod[[0, 511, 1023]], np.exp(-12 * np.array([1, 512, 1024]) / 1024), rtol=1e-3
-    )  # float32 betas
+    wanted = np.exp(-12 * np.array([1, 512, 1024]) / 1024)  # float32 betas
+    np.testing.assert_allclose(alphas_cumprod[[0, 511, 1023]], wanted, rtol=1e-3)
 
 
-def test_prompt_seed_guidance_and_steps_matter(folder):
-    base = make(folder)._sample(folder, "a fox", CPU, seeded())
-    torch.testing.assert_close(
-        make(folder)._sample(folder, "a fox", CPU, seeded()), base, rtol=0, atol=0
-    )
+def test_what_latents_depend_on(folder):
+    base = sampled(folder)
+    assert torch.equal(sampled(folder), base) and not base.requires_grad
     others = [
-        make(folder)._sample(folder, "a bear", CPU, seeded()),
-        make(folder)._sample(folder, "a fox", CPU, seeded(1)),
-        make(folder, guidance_scale=1.0)._sample(folder, "a fox", CPU, seeded()),
-        make(folder, num_inference_steps=3)._sample(folder, "a fox", CPU, seeded()),
+        sampled(folder, "a bear"),
+        sampled(folder, seed=1),
+        sampled(folder, guidance_scale=1.0),
+        sampled(folder, num_inference_steps=3),
     ]
     assert all((other - base).abs().max() > 1e-4 for other in others)
 
 
-def test_own_prompt_option(folder, monkeypatch):
-    asked = []
-    monkeypatch.setattr(
-        ShapEPrior,
-        "_sample",
-        lambda self, folder, prompt, *rest: asked.append(prompt) or torch.zeros(1, 16, 8),
-    )
-    make(folder)("a fox, highly detailed")
-    make(folder, prompt="a fox")("a fox, highly detailed")
-    assert asked == ["a fox, highly detailed", "a fox"]
-
-
-def test_no_prompt_is_the_second_half_of_the_condition():
-    seen = []
-
-    def prior(z, timesteps, conditions):
-        seen.append(conditions)
-        return type("Output", (), {"predicted_image_embedding": torch.cat([z, z], dim=-1)})
-
-    condition = torch.ones(1, 5)
-    denoise = guided_denoiser(
-        prior_network(prior, condition, 15.0, half=False),
-        np.linspace(0.99, 1e-4, 50),
-        scale=15.0,
-        prediction="sample",
-    )
-    assert denoise(torch.zeros(1, 4, 3), 1.0).shape == (1, 4, 3)
-    assert seen[0].tolist() == [[1.0] * 5, [0.0] * 5]
-
-
 def test_networks_are_freed(folder):
     """Stable Diffusion, which is loaded next, needs the memory."""
-    import gc
-
     from diffusers import ModelMixin
 
     make(folder)("a fox")
@@ -252,55 +181,241 @@ def test_networks_are_freed(folder):
     assert not [thing for thing in gc.get_objects() if isinstance(thing, ModelMixin)]
 
 
-# --------------------------------------------------------------------------------------------------
-# options
-
-
-@pytest.mark.parametrize(
-    "option",
-    [
+def test_options(folder):
+    cfg = ShapEPrior({}).cfg
+    found = (cfg.guidance_scale, cfg.num_inference_steps, SIGMA_MAX, cfg.grid_size, cfg.scale)
+    assert found == (15, 64, 160, 128, 1.6)
+    for option in (
         {"guidance_scale": 0.0},
         {"num_inference_steps": 0},
-        {"sigma_min": 200.0},
         {"grid_size": 1},
-        {"query_batch_size": 0},
         {"colors": "srgb"},
         {"front": "up"},
         {"scale": 0.0},
+    ):
+        with pytest.raises(UserError, match=next(iter(option)).split("_")[0]):
+            make(folder, **option)
+
+
+# Cap3D's checkpoint -------------------------------------------------------------------------------
+
+
+class OriginalShapE(PointTransformer):
+    """OpenAI's text model: Point-E's transformer with positions, other channels, and the text's
+    features first.
+    """
+
+    def __init__(self):
+        super().__init__(width=16, layers=2, heads=2)
+        self.input_proj, self.output_proj = torch.nn.Linear(8, 16), torch.nn.Linear(16, 16)
+        self.clip_embed = torch.nn.Linear(tiny.FEATURES, 16)
+        self.pos_emb = torch.nn.Parameter(torch.randn(16, 16))
+
+    def forward(self, z, timesteps, condition):
+        points = self.input_proj(z) + self.pos_emb
+        tokens = [self.clip_embed(condition)[:, None], self.time_token(timesteps), points]
+        h = self.backbone(self.ln_pre(torch.cat(tokens, dim=1)))
+        return self.output_proj(self.ln_post(h)[:, 2:])
+
+
+@pytest.fixture
+def finetuned(tmp_path):
+    """Return a network, and its weights as Cap3D saves them, with the training state."""
+    torch.manual_seed(5)
+    network, path = OriginalShapE(), tmp_path / "shapE_finetuned_with_330kdata.pth"
+    state = {f"wrapped.{name}": value for name, value in network.state_dict().items()}
+    optimizer = torch.optim.AdamW(network.parameters(), lr=1e-5).state_dict()
+    torch.save({"model_state_dict": state, "optimizer_state_dict": optimizer}, path)
+    return network, path
+
+
+@torch.no_grad()
+def test_converted_weights_are_the_original_network(finetuned, folder):
+    original, path = finetuned
+    loaded, generator = tiny.shap_e_prior(), seeded()
+    load_original_prior(loaded, str(path))
+    z, condition = (
+        torch.randn(shape, generator=generator) for shape in ((2, 16, 8), (2, tiny.FEATURES))
+    )
+    inputs = (z, torch.tensor([3, 700]), condition)
+    ours, theirs = loaded(*inputs).predicted_image_embedding, original(*inputs)
+    torch.testing.assert_close(ours, theirs, atol=1e-5, rtol=1e-5)
+    assert (sampled(folder) - sampled(folder, checkpoint=str(path))).abs().max() > 1e-4
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        (lambda state: state.pop("wrapped.ln_pre.bias"), 'Missing key.*"norm_in.bias"'),
+        (lambda state: state.update({"wrapped.extra.weight": torch.zeros(1)}), "wrapped.extra"),
+        (lambda state: state.update({"ln_pre.weight": torch.zeros(1)}), 'ed key.*"ln_pre.weight"'),
+        (lambda state: state.update({"wrapped.ln_pre.bias": torch.zeros(7)}), "size mismatch"),
+        (
+            lambda state: state.update(
+                {"wrapped.backbone.resblocks.0.attn.c_qkv.bias": torch.zeros(7)}
+            ),
+            "heads",
+        ),
+        (
+            lambda state: state.update({"wrapped.backbone.resblocks.7.ln_1.bias": torch.zeros(16)}),
+            "Unexpected",
+        ),
+        (lambda state: state.clear(), "no weights by name"),
     ],
 )
-def test_options_out_of_range(folder, option):
-    with pytest.raises(UserError, match=next(iter(option)).split("_")[0]):
-        make(folder, **option)
+def test_every_key_is_accounted_for(finetuned, change, message):
+    path = finetuned[1]
+    state = torch.load(path)["model_state_dict"]
+    change(state)
+    torch.save(state, path)
+    with pytest.raises(UserError, match=message):
+        load_original_prior(tiny.shap_e_prior(), str(path))
 
 
-def test_an_unknown_device_is_named(folder):
-    with pytest.raises(UserError, match="device: 'gpu'"):
-        make(folder, device="gpu").preflight()
+def test_a_checkpoint_cannot_run_code(finetuned, folder, monkeypatch, no_code):
+    path = finetuned[1]
+    for write, message in (
+        (lambda: torch.save({"model_state_dict": Evil()}, path), "not unpickled"),
+        (lambda: path.write_bytes(pickle.dumps(Evil())), "not unpickled"),
+        (lambda: path.write_bytes(b"not a checkpoint"), "checkpoint"),
+    ):
+        write()
+        with pytest.raises(UserError, match=message):
+            load_original_prior(tiny.shap_e_prior(), str(path))
+    monkeypatch.setattr(ShapEPrior, "_sample", lambda *args: pytest.fail("sampled"))
+    with pytest.raises(UserError, match="Shap-E checkpoint"):
+        make(folder, checkpoint="nothing.pth")("a fox")
 
 
-def test_defaults_are_the_papers():
-    cfg = ShapEPrior({}).cfg
-    assert (
-        cfg.guidance_scale,
-        cfg.num_inference_steps,
-        cfg.sigma_min,
-        cfg.sigma_max,
-        cfg.grid_size,
-        cfg.scale,
-    ) == (
-        15,
-        64,
-        1e-3,
-        160,
-        128,
-        1.6,
+# Files of models ----------------------------------------------------------------------------------
+
+
+def weights_of(folder, part):
+    return folder / part / "diffusion_pytorch_model.safetensors"
+
+
+@pytest.mark.parametrize(
+    "missing",
+    [
+        "prior/config.json",
+        "scheduler/scheduler_config.json",
+        "tokenizer",
+        "shap_e_renderer/diffusion_pytorch_model.safetensors",
+    ],
+)
+def test_an_incomplete_folder_is_named(copy, missing):
+    assert make(copy).preflight() is None
+    for path in [copy / missing] if (copy / missing).is_file() else (copy / missing).iterdir():
+        path.unlink()
+    with pytest.raises(UserError, match=missing.rsplit("/", 1)[0]):
+        make(copy).preflight()
+
+
+def test_a_bin_is_read_when_allowed_and_runs_no_code(copy, folder, no_code):
+    """As on the hub's main branch."""
+    from safetensors.torch import load_file
+
+    weights = weights_of(copy, "shap_e_renderer")
+    torch.save(load_file(weights), weights.with_suffix(".bin"))
+    weights.unlink()
+    with pytest.raises(UserError, match="allow_bin"):
+        make(copy).preflight()
+    found = make(copy, allow_bin=True)("a fox").points
+    np.testing.assert_array_equal(found, make(folder)("a fox").points)
+    torch.save({"weight": Evil()}, weights.with_suffix(".bin"))
+    with pytest.raises(UserError, match="shap_e_renderer"):
+        make(copy, allow_bin=True)("a fox")
+
+
+def test_half_precision_files_are_taken_where_there_are_no_others(copy, folder):
+    from diffusers import PriorTransformer
+
+    prior = PriorTransformer.from_pretrained(copy / "prior").half()
+    prior.save_pretrained(copy / "prior", variant="fp16")
+    weights_of(copy, "prior").unlink()
+    half, full = sampled(copy), sampled(folder)
+    assert half.dtype == torch.float32
+    assert 0 < (half - full).abs().max() < 0.05  # rounded weights, float32 arithmetic
+
+
+def test_weights_that_are_missing_or_damaged_are_no_noise(copy):
+    from safetensors.torch import load_file, save_file
+
+    weights = weights_of(copy, "prior")
+    state = load_file(weights)
+    del state["proj_in.weight"]
+    save_file(state, weights, metadata={"format": "pt"})
+    with pytest.raises(UserError, match="proj_in.weight"):
+        make(copy)("a fox")
+    weights.write_bytes(b"\0" * 100)
+    with pytest.raises(UserError, match="prior of the model .* can't be loaded"):
+        make(copy)("a fox")
+
+
+@pytest.fixture
+def hub(tmp_path, monkeypatch):
+    """Return the library's empty cache; it assumes that the hub is reachable."""
+    from huggingface_hub import constants
+
+    monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path / "hub"))
+    monkeypatch.setenv("HF_HUB_OFFLINE", "0")
+    monkeypatch.setattr(constants, "HF_HUB_OFFLINE", False)
+    return tmp_path / "hub"
+
+
+def test_offline(hub, folder, monkeypatch):
+    from huggingface_hub import constants
+
+    monkeypatch.setattr(constants, "HF_HUB_OFFLINE", True)
+    with pytest.raises(UserError, match="hf download openai/shap-e.*folder"):
+        ShapEPrior({}).preflight()
+    repository = hub / "models--openai--shap-e"
+    shutil.copytree(folder, repository / "snapshots" / ("0" * 40))
+    (repository / "refs").mkdir()
+    (repository / "refs" / "main").write_text("0" * 40)
+    np.testing.assert_array_equal(ShapEPrior(FAST)("a fox").points, make(folder)("a fox").points)
+
+
+def test_what_the_hub_refuses_names_the_option(hub, monkeypatch):
+    import huggingface_hub
+
+    def refuse(self, *args, **kwargs):
+        raise TimeoutError("timed out")
+
+    monkeypatch.setattr(huggingface_hub.HfApi, "model_info", refuse)
+    command = (
+        "hf download some/model --revision refs/pr/11 --include '\\*/\\*' --exclude "
+        "'renderer/\\*' --local-dir models/model"
     )
-    assert len(karras_sigmas(64, 1e-3, 160)) == 65
+    wanted = f"reached .timed out.*`{command}`; then set system.geometry.prior.model"
+    with pytest.raises(UserError, match=wanted):
+        ShapEPrior({"model": "some/model", "revision": "refs/pr/11"}).preflight()
 
 
-def test_sampling_is_without_gradients(folder):
-    assert not make(folder)._sample(folder, "a fox", CPU, seeded()).requires_grad
-    assert (
-        sample_heun(lambda x, sigma: x, torch.zeros(1), [1.0, 0.0], generator=seeded()).item() == 0
-    )
+def test_only_needed_files_are_downloaded_and_none_by_preflight(hub, folder, monkeypatch):
+    import huggingface_hub
+
+    names = [path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()]
+    files = [SimpleNamespace(rfilename=name, size=1) for name in [*names, "renderer/old.bin"]]
+    listing, fetched = SimpleNamespace(siblings=files), []
+    monkeypatch.setattr(huggingface_hub.HfApi, "model_info", lambda self, *args, **kwargs: listing)
+    make("some/model").preflight()
+    assert not hub.exists()
+
+    def download(model, **options):
+        if options.get("local_files_only"):
+            raise FileNotFoundError
+        fetched.extend(options["allow_patterns"])
+        return str(folder)
+
+    monkeypatch.setattr(huggingface_hub, "snapshot_download", download)
+    assert locate(make("some/model")._source()) == folder
+    needed = {"prior/diffusion_pytorch_model.safetensors", "tokenizer/tokenizer_config.json"}
+    assert needed <= set(fetched)
+    assert not any(name.startswith(("renderer", "vocabulary")) for name in fetched)
+
+
+def test_without_diffusers_the_extra_is_named(folder, monkeypatch):
+    monkeypatch.setitem(sys.modules, "diffusers", None)
+    with pytest.raises(UserError, match=r"pip install 'threestudio-gaussiandreamer\[diffusion\]'"):
+        make(folder)("a fox")

@@ -10,25 +10,15 @@ import scipy.sparse
 import torch
 
 from tests.helpers import tiny_3d_models as tiny
+from tests.priors.cases import Evil, joints_of
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.priors import smpl_fit
 from threestudio_gaussiandreamer.priors.smpl_fit import (
     beyond_limits,
     fit_bodies,
     load_body_model,
-    posed_joints,
     posed_vertices,
 )
-
-
-@pytest.fixture(scope="session")
-def body_file(tmp_path_factory):
-    return tiny.body_model(tmp_path_factory.mktemp("bodies") / "SMPL_NEUTRAL.npz")
-
-
-@pytest.fixture(scope="session")
-def body(body_file):
-    return load_body_model(str(body_file))
 
 
 def random_poses(count, seed=0, spread=0.25):
@@ -45,32 +35,13 @@ def random_poses(count, seed=0, spread=0.25):
     return pose
 
 
-def joints_of(body, pose, shape=None, translation=None):
-    shape = torch.zeros(len(pose), 10, dtype=torch.float64) if shape is None else shape
-    translation = (
-        torch.zeros(len(pose), 3, dtype=torch.float64) if translation is None else translation
-    )
-    return posed_joints(body, pose, shape, translation).numpy()
-
-
-class Evil:
-    def __reduce__(self):
-        return (exec, ("import os; os.environ['EVIL'] = '1'",))
-
-
-# --------------------------------------------------------------------------------------------------
-# the body model
-
-
-@pytest.mark.parametrize("protocol", range(pickle.HIGHEST_PROTOCOL + 1))
+@pytest.mark.parametrize("protocol", [0, 2, pickle.HIGHEST_PROTOCOL])
 def test_the_pkl_is_read_without_chumpy(tmp_path, body_file, monkeypatch, protocol):
     """SMPL's file has arrays of chumpy and a sparse matrix, MANO's a selection of chumpy's too."""
     arrays, ch = tiny.body_arrays(), types.ModuleType("chumpy.ch")
     for name in ("Ch", "Select"):
-        made = {
-            "__module__": "chumpy.ch",
-            "__init__": lambda self, **state: vars(self).update(state),
-        }
+        init = {"__init__": lambda self, **state: vars(self).update(state)}
+        made = {"__module__": "chumpy.ch", **init}
         setattr(ch, name, type(name, (), made))
     shapes = arrays["shapedirs"]
     arrays["J_regressor"] = scipy.sparse.csc_matrix(arrays["J_regressor"])
@@ -84,9 +55,8 @@ def test_the_pkl_is_read_without_chumpy(tmp_path, body_file, monkeypatch, protoc
         context.setitem(sys.modules, "chumpy", types.ModuleType("chumpy"))
         context.setitem(sys.modules, "chumpy.ch", ch)
         (tmp_path / "SMPL_NEUTRAL.pkl").write_bytes(pickle.dumps(arrays, protocol))
-    read, original = (
-        load_body_model(str(path)) for path in (tmp_path / "SMPL_NEUTRAL.pkl", body_file)
-    )
+    paths = (tmp_path / "SMPL_NEUTRAL.pkl", body_file)
+    read, original = (load_body_model(str(path)) for path in paths)
     for a, b in zip(read, original, strict=True):
         np.testing.assert_array_equal(a, b)
 
@@ -96,20 +66,16 @@ def test_bodies_with_hands_are_read(tmp_path, body):
     arrays, more = tiny.body_arrays(), 28
     vertices = len(arrays["v_template"])
     arrays["posedirs"] = np.zeros((vertices, 3, 9 * 51))
-    arrays["J_regressor"] = np.concatenate(
-        [arrays["J_regressor"], np.repeat(arrays["J_regressor"][20:21], more, axis=0)]
-    )
+    regressor, tree = arrays["J_regressor"], np.array([[20] * more, range(24, 52)], np.uint32)
+    arrays["J_regressor"] = np.concatenate([regressor, np.repeat(regressor[20:21], more, axis=0)])
     arrays["weights"] = np.concatenate([arrays["weights"], np.zeros((vertices, more))], axis=1)
-    arrays["kintree_table"] = np.concatenate(
-        [arrays["kintree_table"], np.array([[20] * more, range(24, 52)], np.uint32)], axis=1
-    )
+    arrays["kintree_table"] = np.concatenate([arrays["kintree_table"], tree], axis=1)
     np.savez(tmp_path / "SMPLH_NEUTRAL.npz", **arrays)
     model = load_body_model(str(tmp_path / "SMPLH_NEUTRAL.npz"))
     targets = joints_of(body, random_poses(1))
     fit = fit_bodies(model, targets)
-    assert (
-        fit.residuals.shape == (1, 22) and fit.residuals.mean() < 10
-    )  # joints 22 and 23 of SMPL are other ones here
+    # joints 22 and 23 of SMPL are other ones here
+    assert fit.residuals.shape == (1, 22) and fit.residuals.mean() < 10
     assert posed_vertices(model, fit).shape == (1, vertices, 3)
 
 
@@ -117,11 +83,11 @@ def test_bodies_with_hands_are_read(tmp_path, body):
     "change, message",
     [
         (lambda arrays: arrays.pop("posedirs"), "no array 'posedirs'"),
-        (lambda arrays: arrays.update(weights=arrays["weights"][:, :20]), "don't fit"),
         (
-            lambda arrays: arrays.update(J_regressor=np.array(Evil(), dtype=object)),
-            "could run code",
+            lambda arrays: arrays.update(weights=arrays["weights"][:, :20]),
+            "has other arrays.*fit each other",
         ),
+        (lambda arrays: arrays.update(J_regressor=np.array(Evil(), object)), "could run code"),
         (lambda arrays: arrays["v_template"].__setitem__(0, np.nan), "damaged"),
         (lambda arrays: arrays["kintree_table"].__setitem__((0, 5), 5), "damaged"),
         (lambda arrays: arrays["f"].__setitem__((0, 0), 10**6), "damaged"),
@@ -135,10 +101,6 @@ def test_other_body_files_are_refused(tmp_path, change, message):
         load_body_model(str(tmp_path / "body.npz"))
 
 
-# --------------------------------------------------------------------------------------------------
-# the fit
-
-
 @pytest.mark.parametrize("joints", [22, 24])
 def test_known_poses_are_found(body, joints):
     pose = random_poses(8)
@@ -149,6 +111,8 @@ def test_known_poses_are_found(body, joints):
     assert fit.residuals.shape == (8, joints)
     assert fit.residuals.mean() < 2 and fit.residuals.max() < 8  # mm; the pose prior pulls a little
     assert beyond_limits(fit.pose) < 1e-3  # square radians, of 8 bodies
+    if joints == 22:  # wrists, head and toes have no joints after them, and keep the rest pose
+        assert fit.pose[:, [10, 11, 15, 20, 21, 22, 23]].abs().max() < 1e-3
 
 
 def test_the_surface_is_where_the_body_was(body):
@@ -159,72 +123,41 @@ def test_the_surface_is_where_the_body_was(body):
     fit = fit_bodies(body, joints_of(body, pose))
     zeros = torch.zeros(3, 10, dtype=torch.float64), torch.zeros(3, 3, dtype=torch.float64)
     truth = posed_vertices(body, smpl_fit.BodyFit(pose, *zeros, fit.residuals))
-    assert (
-        np.linalg.norm(posed_vertices(body, fit) - truth, axis=-1).mean() < 0.02
-    )  # metres; tubes are 8 cm thick
+    apart = np.linalg.norm(posed_vertices(body, fit) - truth, axis=-1)
+    assert apart.mean() < 0.02  # metres; tubes are 8 cm thick
 
 
 def test_smplx_agrees_that_posed_joints_are_those_of_the_body(body):
     from smplx.lbs import lbs
 
-    pose = random_poses(2)
-    shape = torch.full((2, 10), 0.5, dtype=torch.float64)
-    arguments = (
-        body.template,
-        body.shape_directions,
-        body.pose_directions,
-        body.joint_regressor,
-        body.parents,
-        body.weights,
-    )
-    _, joints = lbs(shape, pose.flatten(1), *arguments)
+    pose, shape = random_poses(2), torch.full((2, 10), 0.5, dtype=torch.float64)
+    _, joints = lbs(shape, pose.flatten(1), *body[:-1])
     np.testing.assert_allclose(joints_of(body, pose, shape), joints.numpy(), atol=1e-12)
 
 
 def test_knees_bend_forwards(body):
     """A leg that is bent backwards is not fitted."""
     pose = torch.zeros(2, 24, 3, dtype=torch.float64)
+    assert beyond_limits(pose) == 0
     pose[0, 4, 0], pose[1, 4, 0] = 1.2, -1.2
     fit = fit_bodies(body, joints_of(body, pose))
     assert fit.pose[0, 4, 0] > 1.1 and fit.residuals[0].mean() < 2
     assert fit.pose[1, 4, 0] > -0.1 and fit.residuals[1].mean() > 5
-
-
-def test_unconstrained_joints_keep_the_rest_pose(body):
-    """Wrists, head and toes have no joints after them among the 22."""
-    fit = fit_bodies(body, joints_of(body, random_poses(2))[:, :22])
-    for joint in (10, 11, 15, 20, 21, 22, 23):
-        assert fit.pose[:, joint].abs().max() < 1e-3
-
-
-def test_mean_shape_without_fit_shape(body):
-    shape = torch.full((1, 10), 1.0, dtype=torch.float64)
-    targets = joints_of(body, torch.zeros(1, 24, 3, dtype=torch.float64), shape)
-    without, fitted = fit_bodies(body, targets, fit_shape=False), fit_bodies(body, targets)
-    assert (without.shape == 0).all() and without.residuals.mean() > 2 * fitted.residuals.mean()
+    pose[:, 4, 0] = torch.tensor([-0.5, 0.0])  # a knee the wrong way
+    pose[0, 18, 1] = -1.0  # an elbow the right way
+    assert beyond_limits(pose).item() == pytest.approx(0.25)
 
 
 def test_energys_gradient(body):
     """Finite differences of an energy of 1e5 with steps of 1e-6 have errors of about 1e-16 * 1e5 /
     1e-6 = 1e-5; its curvature adds larger ones.
     """
-    pose, shape, translation = (
-        0.3 * torch.randn(2, *s, dtype=torch.float64) for s in ((24, 3), (10,), (3,))
-    )
-    wanted = torch.from_numpy(joints_of(body, random_poses(2)))
-    inputs = [value.requires_grad_() for value in (pose, shape, translation)]
+    shapes, wanted = ((24, 3), (10,), (3,)), torch.from_numpy(joints_of(body, random_poses(2)))
+    inputs = [(0.3 * torch.randn(2, *s, dtype=torch.float64)).requires_grad_() for s in shapes]
     assert torch.autograd.gradcheck(
-        lambda *values: smpl_fit.energy(body, *values, wanted, 0.1),
+        lambda *values: smpl_fit.energy(body, values, wanted, 0.1),
         inputs,
         eps=1e-6,
         rtol=1e-4,
         atol=0.1,
     )
-
-
-def test_limits_in_known_cases():
-    pose = torch.zeros(1, 24, 3, dtype=torch.float64)
-    assert beyond_limits(pose) == 0
-    pose[0, 4, 0] = -0.5  # a knee the wrong way
-    pose[0, 18, 1] = -1.0  # an elbow the right way
-    assert beyond_limits(pose).item() == pytest.approx(0.25)

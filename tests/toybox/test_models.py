@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from threestudio_gaussiandreamer.priors.point_e_model import BaseModel
+from threestudio_gaussiandreamer.priors.point_e import BaseModel
 from threestudio_gaussiandreamer.toybox import models, words
 from threestudio_gaussiandreamer.toybox.tokens import open_tokenizer
 

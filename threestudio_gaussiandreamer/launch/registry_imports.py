@@ -12,7 +12,6 @@ MODULES = (
     "priors.point_cloud",
     "priors.gaussians",
     "priors.random",
-    "priors.body",
     "priors.shap_e",
     "priors.point_e",
     "priors.motion",

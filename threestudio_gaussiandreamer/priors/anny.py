@@ -8,7 +8,6 @@ pose          ``A``, ``T``, ``walking``, ``sitting``, or a file: BVH, or axis-an
               SMPL's joints in an NPZ or NPY (see ``pose_files.py``)
 frame         the frame of that file, from 0
 pose_up       the axis of that file that is up: ``y``, ``z``, ``-y``; ``auto``: y, but z for AMASS
-face_front    turn the body to look at azimuth 0; else it looks where the file says
 gender        ``male``, ``female``, ``neutral``, or a number from 0 (male) to 1 (female)
 age           ``baby``, ``child``, ``young``, ``old``, or a number from 0 (baby) to 1 (old)
 muscle, weight, height, proportions
@@ -29,7 +28,7 @@ body wears no clothes and has no hair; hands and face are at rest."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -52,7 +51,7 @@ from ..meshes.side_files import Budget, decode_texture
 from .base import COLOR, SCALE, Prior, points
 from .body_pose import POSES, named_pose, posed
 from .makehuman import Body, Person, data_folder, load_body
-from .mesh import colored_cloud
+from .mesh import centred, colored_cloud
 from .pose_files import SUFFIXES, TO_BODY, read_pose
 from .skeleton import world_mesh
 
@@ -89,7 +88,6 @@ class AnnyPrior(Prior):
         pose: str = field(default="A", metadata=rule(check_pose))
         frame: int = field(default=0, metadata=FRAME)
         pose_up: str = field(default="auto", metadata=one_of(("auto", *TO_BODY)))
-        face_front: bool = True
         gender: Any = field(default="neutral", metadata=named_share(GENDERS))
         age: Any = field(default="young", metadata=named_share(AGES))
         muscle: float = field(default=0.5, metadata=SHARE)
@@ -100,6 +98,10 @@ class AnnyPrior(Prior):
         scale: float = field(default=1.0, metadata=SCALE)
         num_points: int = field(default=50_000, metadata=points(0))
         color: Any = field(default="random", metadata=COLOR)
+        REMOVED: ClassVar[dict[str, Any]] = {
+            **Prior.Config.REMOVED,
+            "face_front": (True, "the body is turned to face the front"),
+        }
 
         @staticmethod
         def check(cfg: Any) -> None:
@@ -125,9 +127,7 @@ class AnnyPrior(Prior):
         mesh = Mesh(body.vertices, body.faces)
         if cfg.texture and cfg.color is None:
             mesh = textured(mesh, body, cfg.texture)
-        mesh = world_mesh(mesh, body.joints, scale=cfg.scale, face_front=cfg.face_front)
-        cloud = colored_cloud(mesh, cfg, generator)
-        return cloud._replace(points=cloud.points - cloud.points.mean(axis=0))
+        return centred(colored_cloud(world_mesh(mesh, body.joints, cfg.scale), cfg, generator))
 
     def _person(self) -> Person:
         cfg = self.cfg

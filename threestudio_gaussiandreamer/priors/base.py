@@ -8,19 +8,16 @@ ground           add the paper's layer of randomly coloured points below the obj
                  grows first (Algorithm 1), as if there were no ground
 ground_points    how many
 ground_size      side of the square they fill, in units of the longest side of the object's box
-ground_height    z of the square in world units, or ``auto``: the bottom of the object
 ===============  ===================================================================================
 
-Each prior has its own module: a registered subclass of :class:`Prior` that implements
-:meth:`~Prior.generate`."""
+Each prior is a registered subclass of :class:`Prior` that implements :meth:`~Prior.generate`."""
 
 import logging
 from abc import abstractmethod
 from dataclasses import dataclass, field
-from typing import Any, Optional
+from typing import Any, ClassVar, Optional
 
 import numpy as np
-import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
@@ -30,7 +27,6 @@ from ..core.methods import require_method
 from ..core.options import (
     Rule,
     check_options,
-    is_number,
     is_numbers,
     one_of,
     positive,
@@ -40,10 +36,8 @@ from ..core.options import (
 )
 from ..core.streams import numpy_generator
 from ..formats.producers import PRODUCERS, producer_axes
-from ..gaussians.grow import longest_side
 from ..gaussians.point_cloud import PointCloud
 from ..host import BaseObject, run_seed
-from ..meshes.load import AXES, pose_rotation
 from ..meshes.mesh import GREY, MAX_NON_FINITE
 
 logger = logging.getLogger(__name__)
@@ -65,45 +59,7 @@ def points(low: int) -> Rule:
 
 
 COLOR = satisfies("null, 'grey', 'random' or [red, green, blue] in [0, 1]", is_color)
-HEIGHT = satisfies("'auto' or a number in world units", lambda x: x == "auto" or is_number(x))
 SCALE = positive("world units", most=1e6)
-PATH = required("this prior reads a file; set path to it")
-PRODUCER = one_of(PRODUCERS)
-FRONT = one_of(("+x", "-x", "+y", "-y"))
-
-
-def require_axes(cfg: Any, kind: str) -> None:
-    """Raise UserError unless the options ``up`` and ``front`` name two axes that aren't parallel,
-    and aren't given beside a producer. The file's extension, ``kind``, has the default axes.
-    """
-    pose_rotation(kind, cfg.up, cfg.front)
-    require_no_axes_beside_producer(cfg, cfg.up, cfg.front)
-
-
-def require_no_axes_beside_producer(cfg: Any, up: str, front: Optional[str] = None) -> None:
-    """Raise UserError if both the producer and an axis of the file are given."""
-    if cfg.producer and (up != "auto" or front):
-        raise UserError("producer: it says which axes the file has; give it, or up and front")
-
-
-def file_axes(cfg: Any, kind: str) -> tuple[str, Optional[str]]:
-    """Return the axes of the file that are up and the front: the producer's, which must write files
-    of this ``kind`` (``GAUSSIANS`` or ``MESH`` of ``formats/producers.py``), or the options.
-    """
-    return producer_axes(cfg.producer, kind) if cfg.producer else (cfg.up, cfg.front)
-
-
-def is_normalized(cfg: Any) -> bool:
-    """Return whether points are centred and scaled: as ``normalize`` says, by default with a
-    producer.
-    """
-    return bool(cfg.producer) if cfg.normalize is None else cfg.normalize
-
-
-def require_used_scale(config_class: type, cfg: Any) -> None:
-    """Raise UserError if ``scale`` is set where nothing says that points are scaled."""
-    if cfg.normalize is None and not cfg.producer:
-        require_defaults(config_class, cfg, ("scale",), "without normalize or producer")
 
 
 def preflight_prior(prior: Any, keep_attributes: bool) -> None:
@@ -132,7 +88,9 @@ class Prior(BaseObject):
         ground: bool = False
         ground_points: int = field(default=20_000, metadata=points(1))
         ground_size: float = field(default=1.5, metadata=positive())
-        ground_height: Any = field(default="auto", metadata=HEIGHT)
+        REMOVED: ClassVar[dict[str, Any]] = {
+            "ground_height": ("auto", "the ground is at the bottom of the object")
+        }
 
     cfg: Config
 
@@ -176,6 +134,42 @@ class Prior(BaseObject):
         """
 
 
+class FilePrior(Prior):
+    """Base class of priors that read a file, in axes that options or its producer name."""
+
+    @dataclass
+    class Config(Prior.Config):
+        path: str = field(default="", metadata=required("this prior reads a file; set path to it"))
+        up: str = "auto"
+        producer: Optional[str] = field(default=None, metadata=one_of(PRODUCERS))
+        scale: float = field(default=1.0, metadata=SCALE)
+
+        @staticmethod
+        def check(cfg: Any) -> None:
+            if cfg.producer and (cfg.up != "auto" or getattr(cfg, "front", None)):
+                raise UserError(
+                    "producer: it says which axes the file has; give it, or up and front"
+                )
+            if getattr(cfg, "normalize", True) is None and not cfg.producer:
+                unused = "without normalize or producer"
+                require_defaults(FilePrior.Config, cfg, ("scale",), unused)
+
+    cfg: Config
+
+    @property
+    def normalizes(self) -> bool:
+        """Whether points are centred and scaled: ``normalize``, by default with a producer."""
+        given = self.cfg.normalize
+        return bool(self.cfg.producer) if given is None else given
+
+
+def file_axes(cfg: Any, kind: str) -> tuple[str, Optional[str]]:
+    """Return the axes of the file that are up and the front: the producer's, which must write files
+    of this ``kind`` (``GAUSSIANS`` or ``MESH`` of ``formats/producers.py``), or the options.
+    """
+    return producer_axes(cfg.producer, kind) if cfg.producer else (cfg.up, cfg.front)
+
+
 def chosen_colors(
     color: Any, count: int, generator: np.random.Generator
 ) -> Float[np.ndarray, "P 3"]:
@@ -211,13 +205,11 @@ def validated(cloud: PointCloud, name: str) -> PointCloud:
         raise UserError(
             f"{name} gave something else than arrays of points, colours and normals: {error}"
         ) from error
-    if points.ndim != 2 or points.shape[1:] != (3,) or colors.shape != points.shape:
-        shapes = f"points {points.shape} and colours {colors.shape}"
-        raise UserError(f"{name} gave {shapes}; expected (P, 3) for both")
-    if normals is not None and normals.shape != points.shape:
-        raise UserError(
-            f"{name} gave normals {normals.shape}; expected {points.shape}, as the points"
-        )
+    given = {"points": points, "colours": colors, "normals": normals}
+    shapes = {kind: values.shape for kind, values in given.items() if values is not None}
+    if points.ndim != 2 or set(shapes.values()) != {(len(points), 3)}:
+        shapes = ", ".join(f"{kind} {shape}" for kind, shape in shapes.items())
+        raise UserError(f"{name} gave {shapes}; expected (P, 3) for all")
     if not len(points):
         raise UserError(f"{name} gave no points: its source is empty")
     if cloud.faces is not None:
@@ -248,12 +240,14 @@ def _valid_faces(faces: Any, count: int, name: str) -> Int[np.ndarray, "F 3"]:
         raise UserError(f"{name} gave faces that are no array of integers: {error}") from error
     found = found if found.size else np.zeros((0, 3), np.int64)
     if found.ndim != 2 or found.shape[1] != 3 or found.dtype.kind not in "iu":
-        what = f"{found.shape} of type {found.dtype}; expected integers (F, 3)"
-    elif len(found) and not 0 <= found.min() <= found.max() < count:
-        what = f"of the points {found.min()} to {found.max()}; it has {count}"
-    else:
-        return found
-    raise UserError(f"{name} gave faces {what}")
+        raise UserError(
+            f"{name} gave faces {found.shape} of type {found.dtype}; expected integers (F, 3)"
+        )
+    if len(found) and not 0 <= found.min() <= found.max() < count:
+        raise UserError(
+            f"{name} gave faces of the points {found.min()} to {found.max()}; it has {count}"
+        )
+    return found
 
 
 def report_non_finite(bad: int, count: int, name: str) -> None:
@@ -285,48 +279,6 @@ def ground_layer(cloud: PointCloud, cfg: Any, generator: np.random.Generator) ->
     side = cfg.ground_size * ((high - low).max() or 1.0)
     places = generator.uniform(-0.5, 0.5, (cfg.ground_points, 3)) * [side, side, 0.0]
     points = (low + high) / 2 + places
-    points[:, 2] = low[2] if cfg.ground_height == "auto" else cfg.ground_height
+    points[:, 2] = low[2]
     colors = chosen_colors("random", len(points), generator)
     return PointCloud(points, colors, normals=np.tile(np.float32([0, 0, 1]), (len(points), 1)))
-
-
-# For priors with a network: their points in the world, the device, and random numbers
-
-
-def placed(cloud: PointCloud, *, front: str, scale: float, normalize: bool) -> PointCloud:
-    """Return ``cloud``, which has z up, rotated so that ``front`` becomes +x, and scaled.
-
-    Args:
-        scale: world units per unit of the cloud; with ``normalize``, half the longest side of the
-            bounding box in world units.
-        normalize: centre the bounding box at the origin, and scale it to ``scale``.
-    """
-    turn = np.stack([AXES[front], np.cross(AXES["+z"], AXES[front]), AXES["+z"]])
-    points = np.asarray(cloud.points, np.float64) @ turn.T
-    if normalize:
-        centre = (points.min(axis=0) + points.max(axis=0)) / 2
-        points = (points - centre) / (longest_side(points) / 2 or 1.0)
-    return cloud._replace(points=(scale * points).astype(np.float32))
-
-
-def chosen_device(name: str, default: torch.device) -> torch.device:
-    """Return the device called ``name``, or the run's for "auto".
-
-    Raises:
-        UserError: there is no such device.
-    """
-    if name == "auto":
-        return torch.device(default)
-    try:
-        torch.empty(0, device=name)
-        return torch.device(name)
-    except (RuntimeError, AssertionError) as error:  # a CPU build of PyTorch asserts
-        raise UserError(
-            f"device: {name!r} can't be used here ({str(error).splitlines()[0]}): give 'auto', "
-            "'cpu' or 'cuda'"
-        ) from error
-
-
-def torch_generator(generator: np.random.Generator) -> torch.Generator:
-    """Return a CPU generator of torch whose seed is drawn from ``generator``."""
-    return torch.Generator().manual_seed(int(generator.integers(2**62)))

@@ -107,9 +107,8 @@ def pose_of_positions(
 
     rest = {name: body.joints[number] for name, number in INDEX.items()}
     known = {name: rest[name] for name in rest if name in positions}
-    pelvis, chest = (
-        part_frame(positions, part) @ part_frame(known, part).T for part in ("hip", "shoulder")
-    )
+    frames = [[part_frame(p, part) for p in (positions, known)] for part in ("hip", "shoulder")]
+    pelvis, chest = (found @ resting.T for found, resting in frames)
     between = Slerp([0, 1], Rotation.from_matrix(np.stack([pelvis, chest])))
     pose = np.tile(pelvis, (BODY_JOINTS, 1, 1))
     for joint, parent in list(enumerate(PARENTS))[1:]:

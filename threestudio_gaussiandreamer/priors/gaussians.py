@@ -39,39 +39,26 @@ from ..gaussians.grow import longest_side
 from ..gaussians.point_cloud import PointCloud
 from ..gaussians.sh import COEFFICIENTS, sh0_colors
 from ..host import register
-from .base import (
-    PATH,
-    PRODUCER,
-    SCALE,
-    Prior,
-    is_normalized,
-    report_non_finite,
-    require_no_axes_beside_producer,
-    require_used_scale,
-)
+from .base import FilePrior, report_non_finite
 
 PLY_SUFFIXES = (".ply", ".compressed.ply")
 
 
 @register("gaussians-prior")
-class GaussiansPrior(Prior):
-    """The Gaussians of a PLY file."""
+class GaussiansPrior(FilePrior):
+    """The Gaussians of a file."""
 
     @dataclass
-    class Config(Prior.Config):
-        path: str = field(default="", metadata=PATH)
+    class Config(FilePrior.Config):
         up: str = field(default="auto", metadata=one_of(("auto", *AXES)))
-        producer: Optional[str] = field(default=None, metadata=PRODUCER)
         normalize: Optional[bool] = None
-        scale: float = field(default=1.0, metadata=SCALE)
         min_opacity: float = field(default=0.0, metadata=in_range(0, 1))
 
         @staticmethod
         def check(cfg: Any) -> None:
-            require_no_axes_beside_producer(cfg, cfg.up)
+            FilePrior.Config.check(cfg)
             if cfg.producer:
                 producer_axes(cfg.producer, GAUSSIANS)
-            require_used_scale(GaussiansPrior.Config, cfg)
 
     cfg: Config
 
@@ -91,24 +78,19 @@ class GaussiansPrior(Prior):
             )
 
     def generate(self, prompt: str, generator: np.random.Generator) -> PointCloud:
-        return self.cloud(self._read())
-
-    def gaussians(self, prompt: str) -> Gaussians:
-        """Return every attribute of the trained Gaussians, whatever the prompt.
-
-        Raises:
-            UserError: missing, damaged or empty, as :meth:`__call__`; or ``ground``, see
-                :meth:`preflight_attributes`.
-        """
-        self.preflight_attributes()
-        return self._read()
+        return self.cloud(self.gaussians(prompt))
 
     @staticmethod
     def cloud(arrays: Gaussians) -> PointCloud:
         """Return the coloured centres of Gaussians."""
         return PointCloud(points=arrays.means, colors=sh0_colors(arrays.sh[:, 0]))
 
-    def _read(self) -> Gaussians:
+    def gaussians(self, prompt: str) -> Gaussians:
+        """Return every attribute of the trained Gaussians, whatever the prompt.
+
+        Raises:
+            UserError: missing, damaged or empty, as :meth:`__call__`.
+        """
         path = gaussian_file(self.cfg.path)
         stored = read_stored(path, up=None if self.cfg.up == "auto" else self.cfg.up)
         harmonics = stored.gaussians.sh[:, : COEFFICIENTS[-1]]  # more can't be drawn
@@ -126,7 +108,7 @@ class GaussiansPrior(Prior):
                 f"more, among {len(keep)}"
             )
         kept = arrays.rows(keep)
-        return normalized(kept, self.cfg.scale) if is_normalized(self.cfg) else kept
+        return normalized(kept, self.cfg.scale) if self.normalizes else kept
 
 
 def gaussian_file(path: str) -> Path:
@@ -142,8 +124,7 @@ def gaussian_file(path: str) -> Path:
     elif suffix_of(file.name) not in READ and not is_gaussian_ply(file):
         advice = conversion(file.name)
         if file.suffix.lower() == ".ckpt":
-            how = f"export it first, with --export and resume={str(file)!r}"
-            advice = f"; it is a checkpoint: {how}"
+            advice = f"; export a checkpoint first, with --export and resume={str(file)!r}"
         raise UserError(
             f"file of Gaussians {str(file)!r}: {file.suffix or 'a name without extension'} isn't "
             f"one of the formats that are read: {', '.join(READ)}{advice}"
@@ -155,9 +136,7 @@ def normalized(gaussians: Gaussians, scale: float) -> Gaussians:
     """Translate and scale Gaussians so that the box of their centres is centred at the origin and
     half its longest side is ``scale``.
     """
-    low, high = gaussians.means.min(axis=0), gaussians.means.max(axis=0)
+    middle = (gaussians.means.min(axis=0) + gaussians.means.max(axis=0)) / 2
     factor = np.float32(scale / (longest_side(gaussians.means) / 2 or 1.0))
-    return gaussians._replace(
-        means=(gaussians.means - (low + high) / 2) * factor,
-        log_scales=gaussians.log_scales + np.log(factor),
-    )
+    log_scales = gaussians.log_scales + np.log(factor)
+    return gaussians._replace(means=(gaussians.means - middle) * factor, log_scales=log_scales)

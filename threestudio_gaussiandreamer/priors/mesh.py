@@ -1,57 +1,53 @@
 """``mesh-prior``: any triangle mesh as the coarse shape, in place of the output of a text-to-3D
+model; and ``body-prior``, a posed human body (SMPL-like), as the paper starts from a text-to-motion
 model.
 
 ================  ==================================================================================
 option            meaning
 ================  ==================================================================================
 path              GLB, glTF, OBJ, PLY, STL, OFF, ... with texture, vertex colours, face colours or
-                  none (grey)
-scale             half the longest side of the result, world units
+                  none (grey); no body comes with the package, since SMPL may not be passed on
+scale             half the longest side of the result, world units; of the released code's body
+                  about 1.7
 up, front         the file's axes, ``+x`` to ``-z``; ``auto`` and null: by the kind of file (see
                   ``meshes/load.py``)
 producer          the program that wrote the file (docs/formats.md), instead of ``up`` and
                   ``front``
 num_points        0: the mesh's vertices, as the paper uses those of Shap-E's mesh; else this many
-                  points, uniform over the surface
-color_smoothing   average each colour over this many nearest points, which imitates the coarse
-                  colours of a text-to-3D model
-color             null: the mesh's colours; ``grey``, ``random`` or [r, g, b] in [0, 1] replace
-                  them
-jitter            standard deviation of noise on the positions, in units of ``scale``, which
-                  imitates a coarse, inaccurate shape
+                  points, uniform over the surface; 50,000 of a body
+color_smoothing   of ``mesh-prior``: average each colour over this many nearest points, which
+                  imitates the coarse colours of a text-to-3D model
+color             null: the mesh's colours; ``grey``, ``random`` (of a body, as in the paper) or
+                  [r, g, b] in [0, 1] replace them
 ground, ...       see ``priors/base.py``
 ================  ==================================================================================
 
+The points of a body are recentred by their mean. Random colours are uniform in [0, 1]: the released
+code divides its random numbers by 255 before it takes them for spherical harmonics, so that every
+colour is between 0.5000 and 0.5011, a flat grey.
+
 Limits: the prompt is not read. Few vertices make a sparse start: give ``num_points`` for a
-low-polygon mesh."""
+low-polygon mesh. At ``scale`` above 1.5 the nearest cameras of the paper's range (1.5 to 4.0) are
+inside a body."""
 
 import logging
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Optional
+from typing import Any, ClassVar, Optional
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 
-from ..core.options import at_least, in_range
+from ..core.files import existing_file
+from ..core.options import at_least
 from ..formats.producers import MESH
 from ..gaussians.point_cloud import PointCloud
 from ..host import register
-from ..meshes.load import load_mesh, mesh_file
+from ..meshes.load import load_mesh, mesh_file, pose_rotation
 from ..meshes.mesh import Mesh, sample_surface, surface_colors, vertex_surface_colors
-from .base import (
-    COLOR,
-    PATH,
-    PRODUCER,
-    SCALE,
-    Prior,
-    chosen_colors,
-    file_axes,
-    points,
-    require_axes,
-)
+from .base import COLOR, FilePrior, Prior, chosen_colors, file_axes, points
 
 logger = logging.getLogger(__name__)
 
@@ -61,23 +57,19 @@ together. They bound the memory.
 """
 
 
-class MeshFilePrior(Prior):
+class MeshFilePrior(FilePrior):
     """Base class of priors that read a triangle mesh from a file."""
 
     @dataclass
-    class Config(Prior.Config):
-        path: str = field(default="", metadata=PATH)
-        scale: float = field(default=1.0, metadata=SCALE)
-        up: str = "auto"
+    class Config(FilePrior.Config):
         front: Optional[str] = None
-        producer: Optional[str] = field(default=None, metadata=PRODUCER)
         num_points: int = field(default=0, metadata=points(0))
         color: Any = field(default=None, metadata=COLOR)
 
         @staticmethod
         def check(cfg: Any) -> None:
-            require_axes(cfg, Path(cfg.path).suffix.lower().lstrip("."))
-            file_axes(cfg, MESH)
+            FilePrior.Config.check(cfg)
+            pose_rotation(Path(cfg.path).suffix.lower().lstrip("."), *file_axes(cfg, MESH))
 
     cfg: Config
 
@@ -97,7 +89,10 @@ class MeshPrior(MeshFilePrior):
     @dataclass
     class Config(MeshFilePrior.Config):
         color_smoothing: int = field(default=0, metadata=at_least(0))
-        jitter: float = field(default=0.0, metadata=in_range(0, 1e3))
+        REMOVED: ClassVar[dict[str, Any]] = {
+            **Prior.Config.REMOVED,
+            "jitter": (0, "positions have no noise"),
+        }
 
     cfg: Config
 
@@ -108,8 +103,32 @@ class MeshPrior(MeshFilePrior):
         cloud = colored_cloud(mesh, cfg, generator)
         if cfg.color_smoothing > 1:
             cloud = cloud._replace(colors=smoothed_colors(cloud, cfg.color_smoothing))
-        noise = generator.normal(scale=cfg.jitter * cfg.scale, size=cloud.points.shape)
-        return cloud._replace(points=cloud.points + noise)
+        return cloud
+
+
+@register("body-prior")
+class BodyPrior(MeshFilePrior):
+    """Points on a posed body, randomly coloured."""
+
+    @dataclass
+    class Config(MeshFilePrior.Config):
+        num_points: int = field(default=50_000, metadata=points(0))
+        color: Any = field(default="random", metadata=COLOR)
+
+    cfg: Config
+
+    def preflight(self) -> None:
+        existing_file(self.cfg.path, "body mesh")  # no bundled mesh is a body
+        super().preflight()
+
+    def generate(self, prompt: str, generator: np.random.Generator) -> PointCloud:
+        self.preflight()
+        return centred(colored_cloud(self.load(), self.cfg, generator))
+
+
+def centred(cloud: PointCloud) -> PointCloud:
+    """Return the cloud with the mean of its points at the origin."""
+    return cloud._replace(points=cloud.points - cloud.points.mean(axis=0))
 
 
 def colored_cloud(mesh: Mesh, cfg: Any, generator: np.random.Generator) -> PointCloud:

@@ -23,7 +23,7 @@ numbers up to 1; without any, the points are grey. Limits: the prompt is not rea
 import logging
 import re
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Optional
 
@@ -42,37 +42,24 @@ from ..gaussians.point_cloud import PointCloud
 from ..host import register
 from ..meshes.load import mesh_formats, pose_rotation, read_parts
 from ..meshes.mesh import GREY, vertex_surface_colors
-from .base import (
-    PATH,
-    PRODUCER,
-    SCALE,
-    Prior,
-    file_axes,
-    is_normalized,
-    require_axes,
-    require_used_scale,
-)
+from .base import FilePrior, file_axes
 
 logger = logging.getLogger(__name__)
 
 
 @register("point-cloud-prior")
-class PointCloudPrior(Prior):
+class PointCloudPrior(FilePrior):
     """Read points from a file."""
 
     @dataclass
-    class Config(Prior.Config):
-        path: str = field(default="", metadata=PATH)
-        normalize: Optional[bool] = None
-        scale: float = field(default=1.0, metadata=SCALE)
-        up: str = "auto"
+    class Config(FilePrior.Config):
         front: Optional[str] = None
-        producer: Optional[str] = field(default=None, metadata=PRODUCER)
+        normalize: Optional[bool] = None
 
         @staticmethod
         def check(cfg: Any) -> None:
-            require_axes(cfg, axes_kind(Path(cfg.path)))
-            require_used_scale(PointCloudPrior.Config, cfg)
+            FilePrior.Config.check(cfg)
+            pose_rotation(axes_kind(Path(cfg.path)), cfg.up, cfg.front)
 
     cfg: Config
 
@@ -81,10 +68,14 @@ class PointCloudPrior(Prior):
 
     def generate(self, prompt: str, generator: np.random.Generator) -> PointCloud:
         path = point_file(self.cfg.path)
-        cloud = load_points(path)
-        axes = file_axes(self.cfg, GAUSSIANS if is_gaussian_ply(path) else MESH)
-        cloud = rotated(cloud, to_world(path, *axes))
-        return normalized(cloud, self.cfg.scale) if is_normalized(self.cfg) else cloud
+        cloud, of_gaussians = load_points(path), is_gaussian_ply(path)
+        up, front = file_axes(self.cfg, GAUSSIANS if of_gaussians else MESH)
+        if up == "auto" and of_gaussians:
+            named = ply_up(path)
+            front = front or FRONTS[named]
+            up = named if named.startswith("-") else f"+{named}"
+        cloud = rotated(cloud, pose_rotation(axes_kind(path), up, front))
+        return normalized(cloud, self.cfg.scale) if self.normalizes else cloud
 
 
 def point_file(path: str) -> Path:
@@ -94,22 +85,13 @@ def point_file(path: str) -> Path:
         UserError: the file is missing, its format is unknown, or it isn't the PLY that its name
             says.
     """
-    file = existing_file(path, "point cloud")
-    if file.suffix.lower() not in READERS:
-        require_mesh_format(file)
-    elif file.suffix.lower() == ".ply":
+    file, known = existing_file(path, "point cloud"), [f".{name}" for name in mesh_formats()]
+    if file.suffix.lower() == ".ply":
         with open(file, "rb") as opened:
             read_header(opened, str(file))
+    elif file.suffix.lower() not in (*READERS, *known):
+        raise unknown("point cloud format", file.suffix, [*READERS, *known])
     return file
-
-
-def to_world(path: Path, up: str, front: Optional[str]) -> Float[np.ndarray, "3 3"]:
-    """Return the rotation of the file's axes to the world's."""
-    if up == "auto" and is_gaussian_ply(path):
-        named = ply_up(path)
-        front = front or FRONTS[named]
-        up = named if named.startswith("-") else f"+{named}"
-    return pose_rotation(axes_kind(path), up, front)
 
 
 def axes_kind(path: Path) -> str:
@@ -174,20 +156,12 @@ def read_text(path: Path) -> PointCloud:
 
 def read_mesh_points(path: Path) -> PointCloud:
     """Return the vertices and points of a mesh file, transformed by its scene graph."""
-    require_mesh_format(path)
     parts = [part for part in read_parts(path) if len(part.vertices)]
     if not parts:
         raise UserError(f"point cloud {str(path)!r} is empty: it has no vertices")
     colored = any(part.has_colors for part in parts)
     colors = np.concatenate([vertex_surface_colors(part) for part in parts]) if colored else None
     return _cloud(path, np.concatenate([part.vertices for part in parts]), colors)
-
-
-def require_mesh_format(path: Path) -> None:
-    """Raise UserError unless the extension is that of a mesh format."""
-    known = mesh_formats()
-    if path.suffix.lower().lstrip(".") not in known:
-        raise unknown("point cloud format", path.suffix, [*READERS, *("." + e for e in known)])
 
 
 def _from_columns(path: Path, rows: np.ndarray) -> PointCloud:
@@ -203,19 +177,16 @@ def _cloud(path: Path, points: np.ndarray, colors=None, normals=None) -> PointCl
     if colors is None:
         logger.warning("%s has no colours: grey is used", path)
         colors = np.full(np.shape(points), GREY, np.float32)
-    colors = np.asarray(colors)
     for name, values in (("points", points), ("colors", colors), ("normals", normals)):
         if values is not None and np.shape(values) != (len(points), 3):
             raise UserError(
                 f"point cloud {str(path)!r}: {name} has shape {np.shape(values)}, "
                 f"({len(points)}, 3) was expected"
             )
-    return PointCloud(
-        # not float32, which would round points far from the origin before they are centred
-        points=np.asarray(points, np.float64),
-        colors=unit_colors(colors.astype(np.float32), colors.dtype, path),
-        normals=None if normals is None else np.asarray(normals, np.float32),
-    )
+    # float64, since float32 would round points far from the origin before they are centred
+    colors = unit_colors(np.asarray(colors).astype(np.float32), np.asarray(colors).dtype, path)
+    normals = None if normals is None else np.asarray(normals, np.float32)
+    return PointCloud(np.asarray(points, np.float64), colors, normals)
 
 
 READERS: dict[str, Callable[[Path], PointCloud]] = {

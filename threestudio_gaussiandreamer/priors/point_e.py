@@ -8,67 +8,289 @@ checkpoint          ``base_40m_textvec.pt`` as OpenAI publishes it, or Cap3D's
 upsampler           ``upsample_40m.pt``; null: only the coarse points, without upsampling
 clip                OpenAI's CLIP ViT-L/14 in transformers' format, a folder or an id of the hub; or
                     ``toybox``
-prompt              replaces the run's prompt for Point-E
-guidance_scale      of the coarse points; 1 = none, 3 in the published sampler. The upsampler isn't
-                    guided
 num_points          number of coarse points; 1024
-num_upsampled       number of points that the upsampler adds; 3072
 num_steps           noise levels of each stage; 64
-sigma_min           lowest noise level of both stages; 1e-3
-sigma_max           highest noise levels of the base model and of the upsampler; 120 and 160
-churn               S_churn of Karras et al. for the base model and the upsampler; 3 and 0
-scale               world units per unit of Point-E, whose points lie in [-0.5, 0.5]; with
-                    ``normalize``: half the longest side
-normalize           centre the bounding box, and make half its longest side ``scale``
-front               the axis of Point-E's space that faces azimuth 0
-device              ``auto``: the run's GPU, or the CPU, where it takes minutes
+prompt, ...         see ``priors/karras.py``; the upsampler isn't guided
 ground, ...         see ``priors/base.py``
 ==================  ================================================================================
 
-Diffusers has no pipeline for Point-E, so the networks are implemented in ``point_e_model.py`` and
-the sampler in ``karras.py``. The user downloads the files (addresses in ``docs/models.md``); they
-are loaded with ``weights_only``.
+The user downloads the files (addresses in ``docs/models.md``); they are loaded with
+``weights_only``. On a CPU sampling takes minutes. The result has no faces. The axes are those of
+Shap-E, which was trained on renders of the same scenes: z up and front -y, which is rotated to +x.
 
-The result has no faces. The axes are those of Shap-E, which was trained on renders of the same
-scenes: z up and front -y, which is rotated to +x."""
+The networks, which diffusers lacks, are written from the architecture that the checkpoints fix
+(Nichol et al. 2022, "Point-E"; published by OpenAI under MIT): a plain transformer without
+positions, so a set of points in any order. The base model gets two tokens more, the text's features
+and the timestep; the upsampler one for the timestep, one for each of 256 cells of an image, which
+text-to-3D leaves empty, and one for each coarse point. All sizes are read off the weights; a head
+has 64 channels in every published model."""
 
+import math
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, Optional
+from typing import Any, ClassVar, NamedTuple, Optional
 
 import numpy as np
 import torch
-from jaxtyping import Float
-from torch import Tensor
+import torch.nn.functional as F
+from jaxtyping import Float, Real
+from torch import Tensor, nn
 
 from ..core.errors import UserError
 from ..core.extras import require_extra
 from ..core.files import existing_file
-from ..core.options import in_range, is_numbers, positive, required, satisfies
+from ..core.options import in_range, required
 from ..gaussians.point_cloud import PointCloud
 from ..host import info, register
 from ..models.bundled import NAME as BUNDLED
 from ..models.bundled import POINTS, model_part
-from ..models.clip import clip_source, load_text_encoder, load_tokenizer, text_condition
-from ..models.hub import Source, locate
+from ..models.clip import clip_source
+from ..models.hub import locate
 from ..models.loaded import loaded
 from ..models.model_files import free_memory
-from .base import FRONT, SCALE, Prior, chosen_device, placed, points, torch_generator
+from .base import points
 from .karras import (
     Network,
+    SampledPrior,
     cosine_alphas_cumprod,
     guided_denoiser,
     karras_sigmas,
     linear_alphas_cumprod,
     sample_heun,
+    torch_generator,
 )
-from .point_e_model import CHANNELS, HEAD_CHANNELS, BaseModel, Upsampler, sizes_of
 from .weights import load_exactly, read_state_dict
 
+UPSAMPLED = 3072
+"""Number of points that the upsampler adds."""
+SIGMA_MAX, CHURN = (120.0, 160.0), (3.0, 0.0)
+"""Highest noise level, and S_churn of Karras et al., of the base model and of the upsampler."""
+HEAD_CHANNELS = 64
+IMAGE_CELLS = 256
+"""16 x 16 patches of the ViT-L/14 that the upsampler was trained with."""
+CHANNELS = 6
+"""x, y, z, red, green, blue of a point; the networks give these and as many for the variance."""
 SCALES = torch.tensor([2.0] * 3 + [2 / 255] * 3)[:, None]
 BIASES = torch.tensor([0.0] * 3 + [-1.0] * 3)[:, None]
-"""Per channel (x, y, z, red, green, blue): the inputs of the networks are ``points * SCALES +
-BIASES``, in [-1, 1], of positions in [-0.5, 0.5] and colours in [0, 255].
+"""Per channel: the inputs of the networks are ``points * SCALES + BIASES``, in [-1, 1], of
+positions in [-0.5, 0.5] and colours in [0, 255].
 """
+CHECKPOINT = required(
+    "Point-E's weights are a file that you download; set checkpoint to base_40m_textvec.pt"
+)
+
+
+@register("point-e-prior")
+class PointEPrior(SampledPrior):
+    """Sample points for the prompt with Point-E."""
+
+    @dataclass
+    class Config(SampledPrior.Config):
+        checkpoint: str = field(default="", metadata=CHECKPOINT)
+        upsampler: Optional[str] = None
+        clip: str = "openai/clip-vit-large-patch14"
+        num_points: int = field(default=1024, metadata=points(1))
+        num_steps: int = field(default=64, metadata=in_range(1, 10_000))
+        REMOVED: ClassVar[dict[str, Any]] = {
+            **SampledPrior.Config.REMOVED,
+            "num_upsampled": (UPSAMPLED, f"it is {UPSAMPLED}"),
+            "sigma_max": (list(SIGMA_MAX), f"they are {SIGMA_MAX}"),
+            "churn": (list(CHURN), f"it is {CHURN}"),
+        }
+
+    cfg: Config
+
+    def preflight(self) -> None:
+        existing_file(model_part(self.cfg.checkpoint, POINTS), BASE.title, (BUNDLED,))
+        if self.cfg.upsampler:
+            existing_file(self.cfg.upsampler, UPSAMPLER.title)
+        require_extra("diffusion", "transformers")
+        locate(clip_source(self.cfg.clip), download=False)
+
+    def generate(self, prompt: str, generator: np.random.Generator) -> PointCloud:
+        self.preflight()
+        cfg, rng = self.cfg, torch_generator(generator)
+        info(f"Point-E: {cfg.prompt or prompt!r} on {self.device}")
+        condition = self.condition("Point-E", locate(clip_source(cfg.clip)), prompt)
+        points = self._coarse_points(condition, rng)
+        if cfg.upsampler:
+            network = kept_network(UPSAMPLER, cfg.upsampler, self.device)
+            denoise = guided_denoiser(mean_of(network, points), linear_alphas_cumprod())
+            points = torch.cat([points, self._sampled(denoise, UPSAMPLED, 1, rng)], dim=-1)
+        free_memory()
+        rows = points[0].T.cpu().numpy()
+        colors = rows[:, 3:].clip(0, 255).round() / np.float32(255)
+        return self.placed(PointCloud(points=rows[:, :3], colors=colors))
+
+    def _coarse_points(
+        self, condition: Float[Tensor, "1 D"], rng: torch.Generator
+    ) -> Float[Tensor, "1 6 N"]:
+        cfg, path = self.cfg, model_part(self.cfg.checkpoint, POINTS)
+        network = kept_network(BASE, path, self.device)
+        given, expected = condition.shape[-1], network.clip_embed.in_features
+        if given != expected:
+            raise UserError(
+                f"clip: {cfg.clip!r} has {given} features, but the checkpoint was trained "
+                f"with {expected}: use ViT-L/14"
+            )
+        predict = mean_of(network, self.with_unconditional(condition))
+        denoise = guided_denoiser(predict, cosine_alphas_cumprod(), scale=cfg.guidance_scale)
+        return self._sampled(denoise, cfg.num_points, 0, rng)
+
+    def _sampled(
+        self, denoise: Any, count: int, stage: int, rng: torch.Generator
+    ) -> Float[Tensor, "1 6 N"]:
+        """Return ``count`` points in Point-E's units: positions, and colours in [0, 255].
+
+        Args:
+            stage: 0 for the base model, 1 for the upsampler.
+        """
+        noise = torch.randn(1, CHANNELS, count, generator=rng).to(self.device)
+        sigmas = karras_sigmas(self.cfg.num_steps, SIGMA_MAX[stage])
+        title = ("Point-E", "Point-E upsampler")[stage]
+        options = {"churn": CHURN[stage], "generator": rng, "progress": title}
+        sample = sample_heun(denoise, noise, sigmas, **options)
+        return (sample - BIASES.to(self.device)) / SCALES.to(self.device)
+
+
+def mean_of(network: nn.Module, condition: Tensor) -> Network:
+    """Return a network under a condition, restricted to the mean, the first half of its output
+    channels. The second half is the variance.
+    """
+    return lambda z, timesteps: network(z, timesteps, condition)[:, :CHANNELS]
+
+
+# The networks, under the names of the published checkpoints ---------------------------------------
+
+
+class Mlp(nn.Module):
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.c_fc = nn.Linear(width, 4 * width)
+        self.c_proj = nn.Linear(4 * width, width)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.c_proj(F.gelu(self.c_fc(x)))
+
+
+class Attention(nn.Module):
+    """Self-attention whose packed projection is ordered head by head: query, key and value of the
+    first head come first.
+    """
+
+    def __init__(self, width: int, heads: int) -> None:
+        super().__init__()
+        self.heads = heads
+        self.c_qkv = nn.Linear(width, 3 * width)
+        self.c_proj = nn.Linear(width, width)
+
+    def forward(self, x: Float[Tensor, "B N W"]) -> Float[Tensor, "B N W"]:
+        packed = self.c_qkv(x).unflatten(-1, (self.heads, 3, -1)).permute(3, 0, 2, 1, 4)
+        attended = F.scaled_dot_product_attention(*packed)
+        return self.c_proj(attended.transpose(1, 2).flatten(2))
+
+
+class Block(nn.Module):
+    def __init__(self, width: int, heads: int) -> None:
+        super().__init__()
+        self.attn = Attention(width, heads)
+        self.ln_1 = nn.LayerNorm(width)
+        self.mlp = Mlp(width)
+        self.ln_2 = nn.LayerNorm(width)
+
+    def forward(self, x: Tensor) -> Tensor:
+        x = x + self.attn(self.ln_1(x))
+        return x + self.mlp(self.ln_2(x))
+
+
+class Backbone(nn.Module):
+    def __init__(self, width: int, layers: int, heads: int) -> None:
+        super().__init__()
+        self.resblocks = nn.Sequential(*(Block(width, heads) for _ in range(layers)))
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.resblocks(x)
+
+
+class PointTransformer(nn.Module):
+    """What both networks have: points and extra tokens through one transformer, and the points'
+    part of the result.
+    """
+
+    def __init__(self, width: int, layers: int, heads: Optional[int] = None) -> None:
+        super().__init__()
+        self.width = width
+        self.time_embed = Mlp(width)
+        self.ln_pre = nn.LayerNorm(width)
+        self.backbone = Backbone(width, layers, heads or width // HEAD_CHANNELS)
+        self.ln_post = nn.LayerNorm(width)
+        self.input_proj = nn.Linear(CHANNELS, width)
+        self.output_proj = nn.Linear(width, 2 * CHANNELS)
+
+    def time_token(self, timesteps: Real[Tensor, " B"]) -> Float[Tensor, "B 1 W"]:
+        return self.time_embed(timestep_embedding(timesteps, self.width))[:, None]
+
+    def transform(
+        self, points: Float[Tensor, "B 6 N"], tokens: list[Tensor]
+    ) -> Float[Tensor, "B 12 N"]:
+        h = torch.cat([*tokens, self.input_proj(points.transpose(1, 2))], dim=1)
+        h = self.ln_post(self.backbone(self.ln_pre(h)))
+        return self.output_proj(h[:, -points.shape[-1] :]).transpose(1, 2)
+
+
+class BaseModel(PointTransformer):
+    """From noise to coarse points, given the text's features (``base40M-textvec``)."""
+
+    def __init__(
+        self, width: int = 512, layers: int = 12, features: int = 768, heads: Optional[int] = None
+    ) -> None:
+        super().__init__(width, layers, heads)
+        self.clip_embed = nn.Linear(features, width)
+
+    def forward(
+        self, points: Float[Tensor, "B 6 N"], timesteps: Tensor, condition: Float[Tensor, "B D"]
+    ) -> Float[Tensor, "B 12 N"]:
+        tokens = [self.clip_embed(condition)[:, None], self.time_token(timesteps)]
+        return self.transform(points, tokens)
+
+
+class Upsampler(PointTransformer):
+    """From noise to further points, given the coarse ones (``upsample``)."""
+
+    def __init__(
+        self, width: int = 512, layers: int = 12, features: int = 1024, heads: Optional[int] = None
+    ) -> None:
+        super().__init__(width, layers, heads)
+        self.cond_point_proj = nn.Linear(CHANNELS, width)
+        self.clip_embed = nn.Sequential(nn.LayerNorm(features), nn.Linear(features, width))
+        self.register_buffer("channel_scales", SCALES[:, 0].clone())
+        self.register_buffer("channel_biases", BIASES[:, 0].clone())
+
+    def forward(
+        self, points: Float[Tensor, "B 6 N"], timesteps: Tensor, coarse: Float[Tensor, "B 6 M"]
+    ) -> Float[Tensor, "B 12 N"]:
+        """Take ``coarse`` in the points' own units: positions, and colours up to 255."""
+        features = self.clip_embed[0].normalized_shape[0]
+        no_image = self.clip_embed(points.new_zeros(len(points), 1, features))
+        scaled = coarse * self.channel_scales[:, None] + self.channel_biases[:, None]
+        tokens = [
+            self.time_token(timesteps),
+            no_image.expand(-1, IMAGE_CELLS, -1),
+            self.cond_point_proj(scaled.transpose(1, 2)),
+        ]
+        return self.transform(points, tokens)
+
+
+def timestep_embedding(timesteps: Real[Tensor, " B"], width: int) -> Float[Tensor, "B W"]:
+    """Return cosines, then sines, of frequencies that fall from 1 to 1/10000 (Vaswani et
+    al. 2017).
+    """
+    steps = torch.arange(width // 2, device=timesteps.device)
+    frequencies = torch.exp(-math.log(10000) * steps / (width // 2))
+    angles = timesteps.float()[:, None] * frequencies
+    return torch.cat([angles.cos(), angles.sin()], dim=-1)
+
+
+# Loading ------------------------------------------------------------------------------------------
 
 
 class Kind(NamedTuple):
@@ -87,126 +309,6 @@ BASE = Kind(BaseModel, "Point-E base checkpoint", "base_40m_textvec.pt", "clip_e
 UPSAMPLER = Kind(
     Upsampler, "Point-E upsampler checkpoint", "upsample_40m.pt", "clip_embed.1.weight"
 )
-CHECKPOINT = required(
-    "Point-E's weights are a file that you download; set checkpoint to base_40m_textvec.pt"
-)
-PAIR = satisfies(
-    "two numbers of 0 or more, for the base model and for the upsampler",
-    lambda value: is_numbers(value, 2) and min(value) >= 0,
-)
-
-
-@register("point-e-prior")
-class PointEPrior(Prior):
-    """Sample points for the prompt with Point-E."""
-
-    @dataclass
-    class Config(Prior.Config):
-        checkpoint: str = field(default="", metadata=CHECKPOINT)
-        upsampler: Optional[str] = None
-        clip: str = "openai/clip-vit-large-patch14"
-        prompt: Optional[str] = None
-        guidance_scale: float = field(default=3.0, metadata=positive())
-        num_points: int = field(default=1024, metadata=points(1))
-        num_upsampled: int = field(default=3072, metadata=points(1))
-        num_steps: int = field(default=64, metadata=in_range(1, 10_000))
-        sigma_min: float = field(default=1e-3, metadata=positive())
-        sigma_max: Any = field(default=(120.0, 160.0), metadata=PAIR)
-        churn: Any = field(default=(3.0, 0.0), metadata=PAIR)
-        scale: float = field(default=1.6, metadata=SCALE)
-        normalize: bool = False
-        front: str = field(default="-y", metadata=FRONT)
-        device: str = "auto"
-
-        @staticmethod
-        def check(cfg: Any) -> None:
-            if not all(value > cfg.sigma_min for value in cfg.sigma_max):
-                raise UserError(
-                    f"sigma_max: expected two numbers above sigma_min ({cfg.sigma_min}), got "
-                    f"{list(cfg.sigma_max)}"
-                )
-
-    cfg: Config
-
-    def preflight(self) -> None:
-        existing_file(self._checkpoint(), BASE.title, (BUNDLED,))
-        if self.cfg.upsampler:
-            existing_file(self.cfg.upsampler, UPSAMPLER.title)
-        require_extra("diffusion", "transformers")
-        chosen_device(self.cfg.device, self.device)
-        locate(self._clip(), download=False)
-
-    def generate(self, prompt: str, generator: np.random.Generator) -> PointCloud:
-        self.preflight()
-        device, rng = chosen_device(self.cfg.device, self.device), torch_generator(generator)
-        info(f"Point-E: {self.cfg.prompt or prompt!r} on {device}")
-        points = self._coarse_points(self._condition(self.cfg.prompt or prompt, device), rng)
-        if self.cfg.upsampler:
-            points = torch.cat([points, self._upsampled_points(points, rng)], dim=-1)
-        free_memory()
-        rows = points[0].T.cpu().numpy()
-        colors = rows[:, 3:].clip(0, 255).round() / np.float32(255)
-        cfg, cloud = self.cfg, PointCloud(points=rows[:, :3], colors=colors)
-        return placed(cloud, front=cfg.front, scale=cfg.scale, normalize=cfg.normalize)
-
-    def _checkpoint(self) -> str:
-        return model_part(self.cfg.checkpoint, POINTS)
-
-    def _clip(self) -> Source:
-        return clip_source(self.cfg.clip)
-
-    def _condition(self, prompt: str, device: torch.device) -> Float[Tensor, "1 D"]:
-        folder = locate(self._clip())
-        key = ("Point-E text_encoder", str(folder), device)
-        encoder = loaded(key, lambda: load_text_encoder(folder).to(device))
-        tokenizer = loaded(("Point-E tokenizer", str(folder)), lambda: load_tokenizer(folder))
-        return text_condition(tokenizer, encoder, prompt)
-
-    def _coarse_points(
-        self, condition: Float[Tensor, "1 D"], rng: torch.Generator
-    ) -> Float[Tensor, "1 6 N"]:
-        model = kept_network(BASE, self._checkpoint(), condition.device)
-        given, expected = condition.shape[-1], model.clip_embed.in_features
-        if given != expected:
-            raise UserError(
-                f"clip: {self.cfg.clip!r} has {given} features, but the checkpoint was trained "
-                f"with {expected}: use ViT-L/14"
-            )
-        scale, none = self.cfg.guidance_scale, torch.zeros_like(condition)
-        # with guidance a second row, the unconditional one
-        conditions = condition if scale == 1 else torch.cat([condition, none])
-        network = mean_of(lambda z, t: model(z, t, conditions))
-        denoise = guided_denoiser(network, cosine_alphas_cumprod(), scale=scale)
-        return self._sampled(denoise, self.cfg.num_points, 0, rng, condition.device)
-
-    def _upsampled_points(
-        self, coarse: Float[Tensor, "1 6 M"], rng: torch.Generator
-    ) -> Float[Tensor, "1 6 N"]:
-        model = kept_network(UPSAMPLER, self.cfg.upsampler, coarse.device)
-        network = mean_of(lambda z, t: model(z, t, coarse))
-        denoise = guided_denoiser(network, linear_alphas_cumprod())
-        return self._sampled(denoise, self.cfg.num_upsampled, 1, rng, coarse.device)
-
-    def _sampled(
-        self, denoise: Any, count: int, stage: int, rng: torch.Generator, device: torch.device
-    ) -> Float[Tensor, "1 6 N"]:
-        """Return ``count`` points in Point-E's units: positions, and colours in [0, 255].
-
-        Args:
-            stage: 0 for the base model, 1 for the upsampler.
-        """
-        cfg, noise = self.cfg, torch.randn(1, CHANNELS, count, generator=rng).to(device)
-        sigmas = karras_sigmas(cfg.num_steps, cfg.sigma_min, float(cfg.sigma_max[stage]))
-        title, churn = ("Point-E", "Point-E upsampler")[stage], float(cfg.churn[stage])
-        sample = sample_heun(denoise, noise, sigmas, churn=churn, generator=rng, progress=title)
-        return (sample - BIASES.to(device)) / SCALES.to(device)
-
-
-def mean_of(network: Network) -> Network:
-    """Return ``network`` restricted to the mean, the first half of its output channels. The second
-    half is the variance.
-    """
-    return lambda z, timesteps: network(z, timesteps)[:, :CHANNELS]
 
 
 def kept_network(kind: Kind, path: str, device: torch.device) -> Any:
@@ -221,13 +323,13 @@ def load_network(kind: Kind, path: str) -> Any:
         UserError: the file can't be read, or is of another model.
     """
     state = read_state_dict(path, kind.title)
-    sizes, projection = sizes_of(state), state.get(kind.projection)
-    fits = sizes["layers"] and sizes["width"] and sizes["width"] % HEAD_CHANNELS == 0
-    if projection is None or not fits:
+    layers = len({name.split(".")[2] for name in state if name.startswith("backbone.resblocks.")})
+    width, projection = len(state.get("ln_pre.weight", ())), state.get(kind.projection)
+    if projection is None or not layers or not width or width % HEAD_CHANNELS:
         raise UserError(
             f"{kind.title} {path!r} holds another model: give {kind.file} or a finetuned one "
             "of its format"
         )
-    network = kind.network(**sizes, features=projection.shape[1])
+    network = kind.network(width, layers, projection.shape[1])
     load_exactly(network, state, f"{kind.title} {path!r}")
     return network.eval().requires_grad_(False)

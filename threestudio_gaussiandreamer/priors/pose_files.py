@@ -13,7 +13,6 @@ Programs name joints in a BVH differently ("LeftUpLeg", "lThigh", "mixamorig:Lef
 further joints, as fingers, are ignored, and neither the file's unit nor its rest pose matter, since
 the body takes only directions from the positions."""
 
-import math
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -41,10 +40,6 @@ FRAME_RATES = ("mocap_framerate", "mocap_frame_rate")
 """Arrays that AMASS's files have."""
 JOINT_COUNTS = (22, 24, 52, 55)
 SUFFIXES = (".bvh", ".npz", ".npy")
-EXPECTED = (
-    "axis-angle rotations were expected: (frames, 3 x joints) or (frames, joints, 3) of "
-    f"{', '.join(map(str, JOINT_COUNTS[:-1]))} or {JOINT_COUNTS[-1]} joints"
-)
 CHANNELS = ("Xposition", "Yposition", "Zposition", "Xrotation", "Yrotation", "Zrotation")
 SIDE_WORDS = {"left": "left", "l": "left", "right": "right", "r": "right"}
 PREFIX = re.compile(r"^.*:|^mixamorig\d*_?|^bip\d*[ _]", re.IGNORECASE)
@@ -103,9 +98,17 @@ def read_axis_angles(path: Path, frame: int) -> tuple[Float[np.ndarray, "22 3 3"
     required = ["poses"] if path.suffix.lower() == ".npy" else []
     names = ("poses", "global_orient", "body_pose", *FRAME_RATES)
     arrays = read_arrays(path, "pose file", required, names)
-    angles = _frames(_rotations(arrays, path), path)
+    angles = _angles(arrays)
+    if angles is None:
+        given = ", ".join(f"{name} {a.shape} of {a.dtype}" for name, a in arrays.items())
+        raise UserError(
+            f"pose file {str(path)!r} has {given or 'neither poses nor body_pose'}: axis-angle "
+            "rotations were expected, (frames, 3 x joints) or (frames, joints, 3) of "
+            f"{', '.join(map(str, JOINT_COUNTS))} joints in poses, or in global_orient and "
+            "body_pose; matrices aren't read"
+        )
     require_frame(frame, len(angles), f"pose file {str(path)!r}")
-    chosen = np.asarray(angles[frame, :BODY_JOINTS], np.float64)
+    chosen = np.asarray(angles[frame, : 3 * BODY_JOINTS], np.float64).reshape(-1, 3)
     if not np.isfinite(chosen).all():
         raise UserError(
             f"pose file {str(path)!r} has rotations that are NaN or infinite in frame {frame}"
@@ -120,46 +123,24 @@ def require_frame(frame: int, count: int, name: str) -> None:
         raise UserError(f"frame: {name} has {count} frames, numbered from 0; there is no {frame}")
 
 
-def _rotations(arrays: dict[str, np.ndarray], path: Path) -> np.ndarray:
-    """Return the array of all rotations, in any of the layouts."""
-    if "poses" in arrays:
-        return arrays["poses"]
-    if "body_pose" not in arrays:
-        raise UserError(
-            f"pose file {str(path)!r} has neither an array 'poses' nor 'body_pose': {EXPECTED}"
-        )
-    flat = _flat(arrays["body_pose"])
-    root = _rows(arrays["global_orient"]) if "global_orient" in arrays else np.zeros((len(flat), 3))
-    if root.shape != (len(flat), 3):
-        raise UserError(
-            f"pose file {str(path)!r} has body_pose {arrays['body_pose'].shape} and global_orient "
-            f"{arrays['global_orient'].shape}: {EXPECTED}"
-        )
-    return np.concatenate([root, flat], axis=1)
-
-
-def _flat(values: np.ndarray) -> np.ndarray:
-    """Reshape (3 J,), (J, 3), (F, 3 J) or (F, J, 3) to (frames, 3 J)."""
-    return values.reshape(1, -1) if values.ndim == 2 and values.shape[1] == 3 else _rows(values)
-
-
-def _rows(values: np.ndarray) -> np.ndarray:
-    """Reshape (N,), (F, N) or (F, ...) to (frames, N)."""
-    if values.ndim < 2:
-        return values.reshape(1, -1)
-    return values.reshape(len(values), math.prod(values.shape[1:]))
-
-
-def _frames(values: np.ndarray, path: Path) -> Float[np.ndarray, "F J 3"]:
-    """Convert any of the layouts to (frames, joints, 3)."""
-    if values.dtype.kind in "fiu" and values.size and values.shape[-2:] != (3, 3):
-        flat = _flat(values)
-        if flat.shape[1] in [3 * count for count in JOINT_COUNTS]:
-            return flat.reshape(len(flat), -1, 3)
-    hint = "" if values.shape[-2:] != (3, 3) else "; matrices aren't read"
-    raise UserError(
-        f"pose file {str(path)!r} holds an array {values.shape} of {values.dtype}: {EXPECTED}{hint}"
-    )
+def _angles(arrays: dict[str, np.ndarray]) -> Optional[Float[np.ndarray, "F J3"]]:
+    """Return the rotations in any of the layouts as (frames, 3 x joints); None if they have none of
+    them.
+    """
+    found = arrays.get("poses", arrays.get("body_pose", np.zeros(0)))
+    if found.dtype.kind not in "fiu" or found.shape[-2:] == (3, 3) or not found.size:
+        return None
+    if found.ndim == 1 or found.ndim == 2 and found.shape[1] == 3:
+        found = found[None]  # one frame
+    found = found.reshape(len(found), -1)
+    if "poses" not in arrays:
+        root = arrays.get("global_orient", np.zeros((len(found), 3)))
+        root = root[None] if root.ndim == 1 else root
+        root = root.reshape(len(root), -1)
+        if root.shape != (len(found), 3):
+            return None
+        found = np.concatenate([root, found], axis=1)
+    return found if found.shape[1] in [3 * count for count in JOINT_COUNTS] else None
 
 
 # BVH -----------------------------------------------------------------------------------------
@@ -248,12 +229,12 @@ def _hierarchy(text: str, path: Path) -> list[Joint]:
         elif kind == "OFFSET" and joints:
             joints[-1].offset = _numbers(words, 3, path)
         elif kind == "CHANNELS" and joints:
-            for word in words[1:]:
-                if word not in CHANNELS:
-                    raise unknown(f"channel in the BVH file {str(path)!r}", word, CHANNELS)
             joints[-1].channels = words[1:]
-            if len(set(words[1:])) < len(words[1:]):
-                raise UserError(f"BVH file {str(path)!r} is damaged: a joint has a channel twice")
+            if len(set(words[1:]) & set(CHANNELS)) < len(words[1:]):
+                raise UserError(
+                    f"BVH file {str(path)!r} is damaged: channels {' '.join(words[1:])}; expected "
+                    f"different ones of {', '.join(CHANNELS)}"
+                )
     if not joints or above:
         what = "is cut off" if joints else "has no joints"
         raise UserError(f"BVH file {str(path)!r} is damaged: its hierarchy {what}")

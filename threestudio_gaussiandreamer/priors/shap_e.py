@@ -11,22 +11,14 @@ allow_bin            where a part has no safetensors, read its ``.bin`` (with ``
 checkpoint           ``.pth`` in OpenAI's format whose weights replace the text-to-latent network's:
                      Cap3D's finetuned ``shapE_finetuned_with_330kdata.pth``, as in the paper; null:
                      as published
-prompt               asked of Shap-E in place of the run's prompt
-guidance_scale       1 = none; 15 in the paper's code
 num_inference_steps  noise levels; 64
-sigma_min, _max      the lowest and highest of them; 1e-3 and 160
 grid_size            the signed distance is asked for on a grid of this many points along each axis
                      of [-1, 1]^3
-query_batch_size     points asked for at a time: less is less memory
 colors               ``display``: as a picture shows them; ``linear``: what the paper's code takes,
                      which is darker
-scale                world units for one of Shap-E's; 1.6 in the paper's code. With ``normalize``:
-                     half the longest side
-normalize            centre the box and make its longest half side ``scale``
-front                the axis of Shap-E's space that looks at azimuth 0
 half_precision       run the text-to-latent network in float16, on a GPU only, as the paper's code
                      does
-device               ``auto``: the run's GPU, or the CPU
+prompt, ...          see ``priors/karras.py``
 ground, ...          see ``priors/base.py``
 ===================  ===============================================================================
 
@@ -40,68 +32,68 @@ rather than before, and the pipeline offers no grid size. The signed distances t
 code surrounds the grid with make its surface smaller by ``(grid_size - 1) / (grid_size + 1)``; so
 does ours."""
 
+import re
 from collections.abc import Collection
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Optional
+from typing import Any, ClassVar, Optional
 
 import numpy as np
 import torch
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
 
 from ..core.errors import UserError
 from ..core.extras import require_extra
 from ..core.files import existing_file
-from ..core.memory import count_of, require_memory
+from ..core.memory import require_memory
 from ..core.options import in_range, one_of, positive
 from ..gaussians.point_cloud import PointCloud
 from ..host import info, register
 from ..meshes.mesh import linear_to_srgb
-from ..models.clip import load_text_encoder, load_tokenizer, text_condition
 from ..models.hub import Source, locate
 from ..models.loaded import loaded
 from ..models.model_files import free_memory, load_network, load_settings, needed_files
-from .base import FRONT, SCALE, Prior, chosen_device, placed, torch_generator
-from .karras import Network, guided_denoiser, karras_sigmas, sample_heun
-from .shap_e_checkpoint import load_original_prior
+from .karras import (
+    Network,
+    SampledPrior,
+    guided_denoiser,
+    karras_sigmas,
+    sample_heun,
+    torch_generator,
+)
+from .weights import load_exactly, read_state_dict
 
 COMPONENTS = ("tokenizer", "text_encoder", "prior", "scheduler", "shap_e_renderer")
-COLORS = ("display", "linear")
+SIGMA_MAX, QUERY_BATCH_SIZE = 160.0, 65536
+"""The highest noise level, and grid points that are asked for at a time."""
 GRID_BYTES = 32
 """Memory per grid point, bytes: position, distance, and the temporaries of marching cubes."""
 
 
 @register("shap-e-prior")
-class ShapEPrior(Prior):
+class ShapEPrior(SampledPrior):
     """Sample a mesh for the prompt with Shap-E, and return its vertices and faces."""
 
     @dataclass
-    class Config(Prior.Config):
+    class Config(SampledPrior.Config):
         model: str = "openai/shap-e"
         revision: Optional[str] = None
         allow_bin: bool = False
         checkpoint: Optional[str] = None
-        prompt: Optional[str] = None
         guidance_scale: float = field(default=15.0, metadata=positive())
         num_inference_steps: int = field(default=64, metadata=in_range(1, 10_000))
-        sigma_min: float = field(default=1e-3, metadata=positive())
-        sigma_max: float = field(default=160.0, metadata=positive())
         grid_size: int = field(default=128, metadata=in_range(2, 1024))
-        query_batch_size: int = field(default=65536, metadata=count_of("points", 1, 4096))
-        colors: str = field(default="display", metadata=one_of(COLORS))
-        scale: float = field(default=1.6, metadata=SCALE)
-        normalize: bool = False
-        front: str = field(default="-y", metadata=FRONT)
+        colors: str = field(default="display", metadata=one_of(("display", "linear")))
         half_precision: bool = True
-        device: str = "auto"
+        REMOVED: ClassVar[dict[str, Any]] = {
+            **SampledPrior.Config.REMOVED,
+            "sigma_max": (SIGMA_MAX, f"it is {SIGMA_MAX:g}"),
+            "query_batch_size": (QUERY_BATCH_SIZE, f"it is {QUERY_BATCH_SIZE}"),
+        }
 
         @staticmethod
         def check(cfg: Any) -> None:
-            if not cfg.sigma_min < cfg.sigma_max:
-                raise UserError(
-                    f"sigma_min: expected less than sigma_max, {cfg.sigma_max}, got {cfg.sigma_min}"
-                )
             what = f"a grid of {cfg.grid_size} points each way"
             require_memory("grid_size", GRID_BYTES * cfg.grid_size**3, what)
 
@@ -109,7 +101,6 @@ class ShapEPrior(Prior):
 
     def preflight(self) -> None:
         require_extra("diffusion", "diffusers", "transformers")
-        chosen_device(self.cfg.device, self.device)
         locate(self._source(), download=False)
         if self.cfg.checkpoint:
             existing_file(self.cfg.checkpoint, "Shap-E checkpoint")
@@ -117,16 +108,13 @@ class ShapEPrior(Prior):
     def generate(self, prompt: str, generator: np.random.Generator) -> PointCloud:
         self.preflight()
         folder = locate(self._source())
-        device = chosen_device(self.cfg.device, self.device)
-        info(f"Shap-E: {self.cfg.prompt or prompt!r} on {device}")
-        cfg, rng = self.cfg, torch_generator(generator)
-        latents = self._sample(folder, cfg.prompt or prompt, device, rng)
-        renderer = self._part(folder, "shap_e_renderer", device)
-        options = {"grid_size": cfg.grid_size, "query_batch_size": cfg.query_batch_size}
-        cloud = decoded(renderer, latents, colors=cfg.colors, **options)
+        info(f"Shap-E: {self.cfg.prompt or prompt!r} on {self.device}")
+        latents = self._sample(folder, prompt, torch_generator(generator))
+        renderer = self._part(folder, "shap_e_renderer")
+        cloud = decoded(renderer, latents, colors=self.cfg.colors, grid_size=self.cfg.grid_size)
         free_memory()
         info(f"Shap-E: a mesh of {len(cloud.points)} vertices and {len(cloud.faces)} faces")
-        return placed(cloud, front=cfg.front, scale=cfg.scale, normalize=cfg.normalize)
+        return self.placed(cloud)
 
     def _source(self) -> Source:
         def picks(names: Collection[str]) -> list[str]:
@@ -137,34 +125,24 @@ class ShapEPrior(Prior):
         option = "system.geometry.prior.model"
         return Source(self.cfg.model, picks, option, self.cfg.revision, download)
 
-    def _sample(
-        self, folder: Path, prompt: str, device: torch.device, rng: torch.Generator
-    ) -> Float[Tensor, "1 N D"]:
+    def _sample(self, folder: Path, prompt: str, rng: torch.Generator) -> Float[Tensor, "1 N D"]:
         """Return latents of the shape, from text features through the text-to-latent network; both
         are dropped on return.
         """
-        cfg, condition = self.cfg, self._condition(folder, prompt, device)
-        prior = self._part(folder, "prior", device)
+        cfg, parts = self.cfg, ("text_encoder", "tokenizer")
+        condition = self.condition("Shap-E", folder, prompt, parts, allow_bin=cfg.allow_bin)
+        prior = self._part(folder, "prior")
         alphas_cumprod, prediction = read_schedule(folder)
         shape = (1, prior.config.num_embeddings, prior.config.embedding_dim)
-        noise, scale = torch.randn(shape, generator=rng).to(device), cfg.guidance_scale
-        half = cfg.half_precision and device.type == "cuda"
-        network = prior_network(prior, condition, scale, half=half)
-        denoise = guided_denoiser(network, alphas_cumprod, scale=scale, prediction=prediction)
-        sigmas = karras_sigmas(cfg.num_inference_steps, cfg.sigma_min, cfg.sigma_max)
+        noise = torch.randn(shape, generator=rng).to(self.device)
+        half = cfg.half_precision and noise.device.type == "cuda"
+        network = prior_network(prior, self.with_unconditional(condition), half=half)
+        options = {"scale": cfg.guidance_scale, "prediction": prediction}
+        denoise = guided_denoiser(network, alphas_cumprod, **options)
+        sigmas = karras_sigmas(cfg.num_inference_steps, SIGMA_MAX)
         return sample_heun(denoise, noise, sigmas, generator=rng, progress="Shap-E")
 
-    def _condition(self, folder: Path, prompt: str, device: torch.device) -> Float[Tensor, "1 D"]:
-        def load() -> Any:
-            network = load_text_encoder(folder, "text_encoder", allow_bin=self.cfg.allow_bin)
-            return network.to(device)
-
-        encoder = loaded(("Shap-E text_encoder", str(folder), device, self.cfg.allow_bin), load)
-        key = ("Shap-E tokenizer", str(folder))
-        tokenizer = loaded(key, lambda: load_tokenizer(folder, "tokenizer"))
-        return text_condition(tokenizer, encoder, prompt)
-
-    def _part(self, folder: Path, part: str, device: torch.device) -> Any:
+    def _part(self, folder: Path, part: str) -> Any:
         """Return one network, always in float32: in half precision the renderer's encoding of
         positions loses all detail. ``checkpoint`` replaces the weights of the prior.
         """
@@ -178,9 +156,9 @@ class ShapEPrior(Prior):
             network = load_network(kind, folder, part, allow_bin=self.cfg.allow_bin).float()
             if checkpoint:
                 load_original_prior(network, checkpoint)
-            return network.to(device)
+            return network.to(self.device)
 
-        key = (f"Shap-E {part}", str(folder), device, self.cfg.allow_bin, checkpoint)
+        key = (f"Shap-E {part}", str(folder), self.device, self.cfg.allow_bin, checkpoint)
         return loaded(key, load)
 
 
@@ -200,13 +178,8 @@ def read_schedule(folder: Path) -> tuple[Float[np.ndarray, "T"], str]:
     return scheduler.alphas_cumprod.double().numpy(), prediction
 
 
-def prior_network(
-    prior: Any, condition: Float[Tensor, "1 D"], scale: float, *, half: bool
-) -> Network:
-    """Wrap diffusers' network with its condition: first the prompt's and then, with guidance, the
-    empty prompt's.
-    """
-    conditions = condition if scale == 1 else torch.cat([condition, torch.zeros_like(condition)])
+def prior_network(prior: Any, conditions: Float[Tensor, "N D"], *, half: bool) -> Network:
+    """Wrap diffusers' network with its conditions, one for each item."""
 
     def predict(z: Tensor, timesteps: Tensor) -> Tensor:
         with torch.autocast(z.device.type, torch.float16, enabled=half):
@@ -218,7 +191,7 @@ def prior_network(
 
 @torch.no_grad()
 def decoded(
-    renderer: Any, latents: Float[Tensor, "1 N D"], *, colors: str, grid_size: int, **options: int
+    renderer: Any, latents: Float[Tensor, "1 N D"], *, colors: str, grid_size: int
 ) -> PointCloud:
     """Return the mesh of ``latents`` by marching cubes, with the texture field's colours at its
     vertices.
@@ -232,11 +205,12 @@ def decoded(
         )
     hook = renderer.mesh_decoder.register_forward_hook(_refuse_empty)
     try:
-        mesh = renderer.decode_to_mesh(latents, latents.device, grid_size=grid_size, **options)
+        mesh = renderer.decode_to_mesh(
+            latents, latents.device, grid_size=grid_size, query_batch_size=QUERY_BATCH_SIZE
+        )
     except torch.OutOfMemoryError as error:
         raise UserError(
-            f"Shap-E's grid of {grid_size}^3 does not fit the memory: set grid_size or "
-            "query_batch_size lower"
+            f"Shap-E's grid of {grid_size}^3 does not fit the memory: set grid_size lower"
         ) from error
     finally:
         hook.remove()  # the renderer may be kept for the next prompt
@@ -258,3 +232,73 @@ def _refuse_empty(decoder: Any, inputs: tuple, mesh: Any) -> None:
             "Shap-E found no surface for this prompt: try another seed, another prompt or a "
             "larger grid_size"
         )
+
+
+# Weights in OpenAI's own format, as Cap3D publishes its finetuned ones ----------------------------
+
+RENAMED = {
+    "time_embed.c_fc": "time_embedding.linear_1",
+    "time_embed.c_proj": "time_embedding.linear_2",
+    "clip_embed": "embedding_proj",
+    "input_proj": "proj_in",
+    "output_proj": "proj_to_clip_embeddings",
+    "ln_pre": "norm_in",
+    "ln_post": "norm_out",
+    "ln_1": "norm1",
+    "ln_2": "norm3",
+    "attn.c_proj": "attn1.to_out.0",
+    "mlp.c_fc": "ff.net.0.proj",
+    "mlp.c_proj": "ff.net.2",
+}
+"""OpenAI's names of layers and diffusers', those of a block without the block's."""
+NAME = re.compile(r"wrapped\.(?:backbone\.resblocks\.(\d+)\.)?(.+)\.(weight|bias)")
+"""A block's number, the layer and the kind of weight."""
+UNUSED_BY_SHAP_E = ("clip_mean", "clip_std")
+"""Parameters that diffusers' class has for another model; Shap-E's checkpoint lacks them and its
+sampling ignores them.
+"""
+
+
+def load_original_prior(prior: nn.Module, path: str) -> None:
+    """Replace the weights of diffusers' ``prior`` by those of OpenAI's format in the file ``path``.
+
+    Raises:
+        UserError: the file can't be read, or its names or shapes are not those of this model.
+    """
+    heads = prior.config.num_attention_heads
+    state = to_diffusers(read_state_dict(path, "Shap-E checkpoint"), heads)
+    own = prior.state_dict()
+    state.update({name: own[name] for name in UNUSED_BY_SHAP_E if name in own})
+    load_exactly(prior, state, f"Shap-E checkpoint {path!r}")
+
+
+def to_diffusers(state: dict[str, Tensor], heads: int) -> dict[str, Tensor]:
+    """Convert OpenAI's names and layouts to those of ``PriorTransformer``, the same network with
+    query, key and value apart; other names stay.
+    """
+    converted: dict[str, Tensor] = {}
+    for name, value in state.items():
+        found = NAME.fullmatch(name)
+        block, layer, kind = found.groups() if found else (None, "", "")
+        start = "" if block is None else f"transformer_blocks.{block}."
+        if name == "wrapped.pos_emb":
+            converted["positional_embedding"] = value[None]
+        elif layer == "attn.c_qkv":
+            parts = zip("qkv", unpacked(value, heads), strict=True)
+            converted |= {f"{start}attn1.to_{part}.{kind}": rows for part, rows in parts}
+        else:
+            converted[f"{start}{RENAMED[layer]}.{kind}" if layer in RENAMED else name] = value
+    return converted
+
+
+def unpacked(value: Tensor, heads: int) -> tuple[Tensor, ...]:
+    """Query, key and value rows of a packed projection, whose rows are ordered head by head:
+    (heads, 3, channels).
+    """
+    if len(value) % (3 * heads):
+        raise UserError(
+            f"the checkpoint packs query, key and value into {len(value)} rows, which are not "
+            f"for {heads} heads"
+        )
+    rows = value.reshape(heads, 3, -1, *value.shape[1:])
+    return tuple(torch.flatten(part, 0, 1) for part in rows.unbind(dim=1))

@@ -43,17 +43,14 @@ def facing(joints: Float[np.ndarray, "K 3"]) -> Float[np.ndarray, "3 3"]:
     return np.array([[x, y, 0.0], [-y, x, 0.0], [0.0, 0.0, 1.0]])
 
 
-def world_mesh(
-    mesh: Mesh, joints: Float[np.ndarray, "K 3"], *, scale: float, face_front: bool
-) -> Mesh:
-    """Return a body with z up, its box centred, and ``scale`` as half the longest side.
+def world_mesh(mesh: Mesh, joints: Float[np.ndarray, "K 3"], scale: float) -> Mesh:
+    """Return a body with z up that faces +x, its box centred, and ``scale`` as half the longest
+    side.
 
     Args:
         mesh: y up, any unit.
         joints: the body's, in the mesh's axes.
-        face_front: rotate the body about the z axis, so that it faces +x.
     """
-    turn = facing(joints) if face_front else np.eye(3)
-    vertices = z_up(mesh.vertices) @ turn.T
+    vertices = z_up(mesh.vertices) @ facing(joints).T
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     return mesh._replace(vertices=scale * (vertices - (low + high) / 2) / ((high - low).max() / 2))

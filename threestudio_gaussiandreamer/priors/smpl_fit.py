@@ -1,18 +1,15 @@
 """SMPL's pose, and optionally its shape, from the positions of its joints: a small optimisation
 with priors.
 
-The body model is the user's own file, an NPZ or PKL of SMPL, SMPL-H or SMPL-X: their first 22
-joints are the same. The kinematics are smplx's. What is minimised, over the rotations of all joints
-(axis-angle), a translation and a few shape coefficients, summed over the frames, which share
-nothing:
+The body model is the user's own file of SMPL, SMPL-H or SMPL-X, whose first 22 joints are the same.
+The kinematics are smplx's. What is minimised, over the rotations of all joints (axis-angle), a
+translation and a few shape coefficients, summed over the frames, which share nothing:
 
-    sum_j |joint_j - target_j|^2 / s^2  +  pose |theta|^2  +  shape |beta|^2  +  limits sum max(0,
-                                        low - theta, theta - high)^2
+    sum_j |joint_j - target_j|^2 / s^2 + pose |theta|^2 + shape |beta|^2
+        + limits sum max(0, low - theta, theta - high)^2,   s = 10 mm
 
-with s = 10 mm: one centimetre on one joint weighs as one radian of a rotation does at ``pose`` = 1.
-The limits keep knees and elbows from bending backwards, which positions alone would allow. The way
-there: first where the whole body is and looks, then the pose under a strong prior, then under the
-final one."""
+The limits keep knees and elbows from bending backwards, which positions alone would allow. First
+the whole body is placed, then the pose is fitted under a strong prior, then under the final one."""
 
 import math
 from collections.abc import Callable
@@ -87,13 +84,9 @@ def load_body_model(path: str, *, num_shape: int = 10) -> BodyModel:
     Raises:
         UserError: missing, or not a body model; the message says what to do.
     """
-    try:
-        arrays = read_arrays(existing_file(path, "body model"), "body model", FIELDS)
-    except UserError as error:
-        expected = "the NPZ or PKL of SMPL, SMPL-H or SMPL-X was expected"
-        raise UserError(f"{error}: {expected}") from error
-    _check_shapes(arrays, path)
-    _check_values(arrays, path)
+    kind = "body model (the NPZ or PKL of SMPL, SMPL-H or SMPL-X)"
+    arrays = read_arrays(existing_file(path, kind), kind, FIELDS)
+    _check(arrays, path)
     vertices, joints = len(arrays["v_template"]), len(arrays["J_regressor"])
     parents = torch.from_numpy(arrays["kintree_table"][0].astype(np.int64))
     parents[0] = -1
@@ -113,7 +106,6 @@ def fit_bodies(
     model: BodyModel,
     targets: Float[np.ndarray, "F K 3"],
     *,
-    fit_shape: bool = True,
     iterations: int = 300,
 ) -> BodyFit:
     """Return bodies whose joints are where ``targets`` has them.
@@ -121,7 +113,6 @@ def fit_bodies(
     Args:
         targets: 22 or 24 joints in SMPL's order, metres, y up; the last two of 24 are used when the
             model has no more.
-        fit_shape: the shape coefficients too; else the model's mean shape.
         iterations: the most of the last stage.
     """
     require_extra("smpl", "smplx")
@@ -131,26 +122,25 @@ def fit_bodies(
     pose = torch.zeros(frames, joints, 3, dtype=torch.float64)
     pose[:, 0], translation = _placed(model, wanted)
     shape = torch.zeros(frames, model.shape_directions.shape[-1], dtype=torch.float64)
-    moved = [pose, translation, *([shape] if fit_shape else [])]
+    body = pose, shape, translation
     with torch_threads(1):
         for weight, share in STAGES:
-            loss = partial(energy, model, pose, shape, translation, wanted, weight)
-            _minimise(moved, loss, int(share * iterations))
-    found = posed_joints(model, pose, shape, translation)[:, : wanted.shape[1]]
-    residuals = 1000 * (found - wanted).norm(dim=-1)
-    return BodyFit(pose.detach(), shape.detach(), translation.detach(), residuals.detach().numpy())
+            _minimise(body, partial(energy, model, body, wanted, weight), int(share * iterations))
+    found = posed_joints(model, *body)[:, : wanted.shape[1]]
+    return BodyFit(*body, (1000 * (found - wanted).norm(dim=-1)).numpy())
 
 
 def energy(
-    model: BodyModel,
-    pose: Tensor,
-    shape: Tensor,
-    translation: Tensor,
-    wanted: Tensor,
-    weight: float,
+    model: BodyModel, body: tuple[Tensor, Tensor, Tensor], wanted: Tensor, weight: float
 ) -> Tensor:
-    """Compute the objective of the fit, summed over the frames; see the module's docstring."""
-    found = posed_joints(model, pose, shape, translation)[:, : wanted.shape[1]]
+    """Compute the objective of the fit, summed over the frames; see the module's docstring.
+
+    Args:
+        body: pose, shape and translation.
+        weight: of the pose prior.
+    """
+    pose, shape, _ = body
+    found = posed_joints(model, *body)[:, : wanted.shape[1]]
     data = ((found - wanted) / SCALE).square().sum()
     priors = weight * pose[:, 1:].square().sum() + SHAPE_WEIGHT * shape.square().sum()
     return data + priors + LIMITS_WEIGHT * beyond_limits(pose)
@@ -158,15 +148,11 @@ def energy(
 
 def beyond_limits(pose: Float[Tensor, "F J 3"]) -> Tensor:
     """Return the sum of squares of the angles, in radians, by which rotations exceed ``LIMITS``."""
-    rows = [
-        (joint, axis, low * DEGREES, high * DEGREES)
-        for joint, axes in LIMITS.items()
-        for axis, (low, high) in axes.items()
-    ]
-    joints, axes = torch.tensor([row[:2] for row in rows]).T
-    low, high = torch.tensor([row[2:] for row in rows], dtype=pose.dtype).T
-    angles = pose[:, joints, axes]
-    return (low - angles).clamp_min(0).square().sum() + (angles - high).clamp_min(0).square().sum()
+    rows = [(j, axis, *ends) for j, axes in LIMITS.items() for axis, ends in axes.items()]
+    joints, axes, low, high = torch.tensor(rows, dtype=pose.dtype).T
+    angles = pose[:, joints.long(), axes.long()]
+    under, over = low * DEGREES - angles, angles - high * DEGREES
+    return under.clamp_min(0).square().sum() + over.clamp_min(0).square().sum()
 
 
 def posed_joints(
@@ -218,12 +204,13 @@ def _placed(
     return _tensor(Rotation.from_matrix(rotation.numpy()).as_rotvec()), translation
 
 
-def _minimise(moved: list[Tensor], loss: Callable[[], Tensor], iterations: int) -> None:
-    """Minimise ``loss`` over the tensors ``moved`` with L-BFGS, in place."""
-    for tensor in moved:
+def _minimise(body: tuple[Tensor, ...], loss: Callable[[], Tensor], iterations: int) -> None:
+    """Minimise ``loss`` over the tensors of ``body`` with L-BFGS, in place."""
+    for tensor in body:
         tensor.requires_grad_(True)
     options = {"history_size": 20, "line_search_fn": "strong_wolfe", "tolerance_change": 1e-5}
-    optimiser = torch.optim.LBFGS(moved, max_iter=iterations, **options)
+    # the order of the parameters is that of the sums in the line search
+    optimiser = torch.optim.LBFGS([body[0], body[2], body[1]], max_iter=iterations, **options)
 
     def closure() -> Tensor:
         optimiser.zero_grad()
@@ -232,44 +219,38 @@ def _minimise(moved: list[Tensor], loss: Callable[[], Tensor], iterations: int) 
         return value
 
     optimiser.step(closure)
-    for tensor in moved:
+    for tensor in body:
         tensor.requires_grad_(False)
 
 
-def _check_shapes(arrays: dict[str, np.ndarray], path: str) -> None:
-    """Raise UserError unless the arrays are those of a body with SMPL's 22 joints or more."""
-    vertices, joints = len(arrays["v_template"]), len(arrays["J_regressor"])
-    fits = (
-        arrays["v_template"].shape == (vertices, 3)
-        and arrays["shapedirs"].shape[:2] == (vertices, 3)
-        and arrays["posedirs"].shape == (vertices, 3, 9 * (joints - 1))
-        and arrays["J_regressor"].shape == (joints, vertices)
-        and arrays["weights"].shape == (vertices, joints)
-        and arrays["kintree_table"].shape[-1] == joints
-        and arrays["f"].shape[1:] == (3,)
-    )
-    if not fits or joints < BODY_JOINTS:
-        shapes = ", ".join(f"{name} {arrays[name].shape}" for name in FIELDS)
-        raise UserError(
-            f"body model {path!r} has arrays that don't fit each other or too few joints "
-            f"({BODY_JOINTS} are needed): {shapes}"
-        )
-
-
-def _check_values(arrays: dict[str, np.ndarray], path: str) -> None:
-    """Raise UserError unless all are finite numbers, faces name vertices, and each joint hangs on
-    an earlier one.
+def _check(arrays: dict[str, np.ndarray], path: str) -> None:
+    """Raise UserError unless the arrays are those of a body with SMPL's 22 joints or more, of
+    finite numbers, whose faces name vertices and whose joints hang on earlier ones.
     """
-    parents, faces = arrays["kintree_table"][0, 1:].astype(np.int64), arrays["f"].astype(np.int64)
+    vertices, joints = len(arrays["v_template"]), len(arrays["J_regressor"])
+    expected = {
+        "v_template": (vertices, 3),
+        "shapedirs": (vertices, 3, *arrays["shapedirs"].shape[2:3]),
+        "posedirs": (vertices, 3, 9 * (joints - 1)),
+        "J_regressor": (joints, vertices),
+        "weights": (vertices, joints),
+        "kintree_table": (2, joints),
+        "f": (len(arrays["f"]), 3),
+    }
+    fits = joints >= BODY_JOINTS and all(arrays[n].shape == s for n, s in expected.items())
+    parents, faces = arrays["kintree_table"].astype(np.int64), arrays["f"].astype(np.int64)
     sound = (
-        all(np.isfinite(values).all() for values in arrays.values())
-        and ((parents >= 0) & (parents <= np.arange(len(parents)))).all()
-        and ((faces >= 0) & (faces < len(arrays["v_template"]))).all()
+        fits
+        and all(np.isfinite(values).all() for values in arrays.values())
+        and ((parents[0, 1:] >= 0) & (parents[0, 1:] < np.arange(1, joints))).all()
+        and ((faces >= 0) & (faces < vertices)).all()
     )
     if not sound:
+        shapes = ", ".join(f"{name} {arrays[name].shape}" for name in FIELDS)
+        problem = "is damaged" if fits else f"has other arrays ({shapes})"
         raise UserError(
-            f"body model {path!r} is damaged: numbers that aren't finite, or joints or faces "
-            "that don't exist; get it again"
+            f"body model {path!r} {problem}: finite numbers that fit each other, of {BODY_JOINTS} "
+            "joints or more, were expected; get it again"
         )
 
 

@@ -4,7 +4,7 @@ names must match those of the network exactly.
 
 import pickle
 import zipfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +17,6 @@ from ..core.files import existing_file
 
 WRAPPER = "model_state_dict"
 """The key of the weights in training checkpoints, which have further entries."""
-NAMED = 4
-"""Number of names that a message lists."""
 
 
 def read_state_dict(path: str, kind: str) -> dict[str, Tensor]:
@@ -36,15 +34,15 @@ def read_state_dict(path: str, kind: str) -> dict[str, Tensor]:
         require_plain_archive(file)
     try:
         content = _read(file)
-    except pickle.UnpicklingError as error:
-        raise UserError(
-            f"{kind} {path!r} holds more than tensors, or is no file of PyTorch, and is not "
-            f"unpickled, since that could run code: {str(error).strip().splitlines()[0][:200]}"
-        ) from error
     except Exception as error:  # torch raises various exceptions for damaged pickles
-        raise UserError(
-            f"{kind} {path!r} can't be read: {type(error).__name__}: {str(error).strip()[:200]}"
-        ) from error
+        problem = f"can't be read: {type(error).__name__}"
+        if isinstance(error, pickle.UnpicklingError):
+            problem = (
+                "holds more than tensors, or is no file of PyTorch, and is not unpickled, since "
+                "that could run code"
+            )
+        reason = str(error).strip().partition("\n")[0][:200]
+        raise UserError(f"{kind} {path!r} {problem}: {reason}") from error
     state = content.get(WRAPPER, content) if isinstance(content, Mapping) else {}
     if not state or not all(isinstance(value, Tensor) for value in state.values()):
         raise UserError(
@@ -70,23 +68,9 @@ def load_exactly(module: nn.Module, state: Mapping[str, Tensor], what: str) -> N
     Raises:
         UserError: names are missing or unknown, or shapes differ; the message lists some of them.
     """
-    own = module.state_dict()
-    shapes = {name: (state[name].shape, own[name].shape) for name in own.keys() & state.keys()}
-    found = {
-        "missing": own.keys() - state.keys(),
-        "unknown": state.keys() - own.keys(),
-        "of another shape": [
-            f"{name} {tuple(a)} for {tuple(b)}" for name, (a, b) in shapes.items() if a != b
-        ],
-    }
-    problems = [f"{len(names)} {word} ({named(names)})" for word, names in found.items() if names]
-    if problems:
-        raise UserError(f"{what} does not fit the model: names {', '.join(problems)}")
-    module.load_state_dict(state)
-
-
-def named(names: Iterable[str]) -> str:
-    """Return the first few of ``names``, sorted."""
-    names = sorted(names)
-    more = f", and {len(names) - NAMED} more" if len(names) > NAMED else ""
-    return ", ".join(names[:NAMED]) + more
+    try:
+        module.load_state_dict(state)
+    except RuntimeError as error:
+        problems = " ".join(str(error).split()).partition(": ")[2]
+        problems = problems if len(problems) < 400 else f"{problems[:400]} ..."
+        raise UserError(f"{what} does not fit the model: {problems}") from error

@@ -10,8 +10,7 @@ from torch import Tensor, nn
 
 from ..diffusion import sds
 from ..priors.karras import cosine_alphas_cumprod
-from ..priors.point_e import BIASES, SCALES, mean_of
-from ..priors.point_e_model import BaseModel
+from ..priors.point_e import BIASES, SCALES, BaseModel, mean_of
 from . import models
 from .clip_stage import text_features, trained_clip
 from .loop import Stage, StepData, normal, torch_generator
@@ -77,7 +76,7 @@ class PointsStage(Stage):
     def loss(self, model: nn.Module, batch: PointsBatch) -> tuple[Tensor, dict[str, Tensor]]:
         condition = self.condition(batch.ids) * ~batch.empty[:, None]
         z = sds.add_noise(batch.points, batch.noise, self.alphas_cumprod[batch.t])
-        predicted = mean_of(lambda z, t: model(z, t, condition))(z, batch.t).float()
+        predicted = mean_of(model, condition)(z, batch.t).float()
         errors = (predicted - batch.noise).square()
         parts = {"mse_points": errors[:, :3].mean(), "mse_colors": errors[:, 3:].mean()}
         return errors.mean(), parts

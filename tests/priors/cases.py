@@ -1,13 +1,72 @@
-"""Helpers of the tests of poses."""
+"""Helpers of the prior tests."""
 
 from importlib.util import find_spec
 
 import numpy as np
 import pytest
+import torch
 from scipy.spatial.transform import Rotation
 
+from threestudio_gaussiandreamer.host import find
 from threestudio_gaussiandreamer.priors.body_pose import INDEX, LIMBS
 from threestudio_gaussiandreamer.priors.skeleton import BODY_JOINTS, PARENTS
+from threestudio_gaussiandreamer.priors.smpl_fit import posed_joints
+
+OPTIONS = {
+    "mesh-prior": {"path": "box.ply"},
+    "body-prior": {"path": "body.obj", "num_points": 2000},
+    "point-cloud-prior": {"path": "points.ply"},
+    "gaussians-prior": {"path": "gaussians.ply"},
+    "random-prior": {"num_points": 500},
+}
+"""Needed options of each registered prior; a new prior is one row here."""
+UNIFORM = np.sqrt(1 / 12)
+"""Standard deviation of numbers that are uniform in [0, 1]."""
+
+
+class Evil:
+    """Runs code when it is unpickled; the fixture ``no_code`` notices."""
+
+    def __reduce__(self):
+        return (exec, ("import os; os.environ['EVIL'] = '1'",))
+
+
+def rng(seed=0):
+    return np.random.default_rng(seed)
+
+
+def seeded(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+def build(name, assets, **options):
+    options = {**OPTIONS.get(name, {}), **options}
+    if "path" in options:
+        options["path"] = str(assets / options["path"])
+    return find(name)(options)
+
+
+# Motions ------------------------------------------------------------------------------------------
+
+
+def joints_of(body, pose, shape=None, translation=None):
+    shape = torch.zeros(len(pose), 10, dtype=torch.float64) if shape is None else shape
+    zeros = torch.zeros(len(pose), 3, dtype=torch.float64)
+    return posed_joints(body, pose, shape, zeros if translation is None else translation).numpy()
+
+
+def walk(body, frames=6):
+    """Return a motion (F, 22, 3): standing, then raising the left knee while turning to the
+    left.
+    """
+    pose = torch.zeros(frames, 24, 3, dtype=torch.float64)
+    pose[:, 1, 0] = torch.linspace(0, -1.2, frames)
+    pose[:, 4, 0] = torch.linspace(0, 1.0, frames)
+    pose[:, 0, 1] = torch.linspace(0, np.pi / 2, frames)
+    return joints_of(body, pose)[:, :22]
+
+
+# Poses --------------------------------------------------------------------------------------------
 
 needs_anny = pytest.mark.skipif(find_spec("anny") is None, reason="anny isn't installed")
 MIXAMO = (
@@ -20,7 +79,7 @@ MIXAMO = (
 
 def random_local(seed: int, degrees: float = 40) -> np.ndarray:
     """Return random rotations of all joints relative to their parents, (22, 3, 3)."""
-    angles = np.random.default_rng(seed).normal(scale=np.radians(degrees), size=(BODY_JOINTS, 3))
+    angles = rng(seed).normal(scale=np.radians(degrees), size=(BODY_JOINTS, 3))
     return Rotation.from_rotvec(angles).as_matrix()
 
 
@@ -37,9 +96,7 @@ def walked(heads: np.ndarray, local: np.ndarray) -> np.ndarray:
 def limb_angles(found: np.ndarray, wanted: np.ndarray) -> np.ndarray:
     """Return the angles, degrees, between the limbs of two skeletons of any size."""
     ends = [(INDEX[name], INDEX[end]) for name, end in LIMBS.items()]
-    bones = [
-        np.array([joints[end] - joints[start] for start, end in ends]) for joints in (found, wanted)
-    ]
+    bones = [np.array([at[end] - at[start] for start, end in ends]) for at in (found, wanted)]
     cosines = np.einsum("lc,lc->l", *(b / np.linalg.norm(b, axis=1, keepdims=True) for b in bones))
     return np.degrees(np.arccos(cosines.clip(-1, 1)))
 
@@ -52,19 +109,13 @@ def bvh_text(heads: np.ndarray, frames: list[np.ndarray], names: list[str] = MIX
         order.append(joint)
         offset = heads[joint] - heads[PARENTS[joint]] if joint else np.zeros(3)
         position = "6 Xposition Yposition Zposition" if not joint else "3"
-        lines.extend(
-            [
-                f"{'JOINT' if joint else 'ROOT'} {names[joint]}",
-                "{",
-                "OFFSET " + " ".join(f"{100 * value:.9f}" for value in offset),
-                f"CHANNELS {position} Xrotation Yrotation Zrotation",
-            ]
-        )
+        lines.extend([f"{'JOINT' if joint else 'ROOT'} {names[joint]}", "{"])
+        lines.append("OFFSET " + " ".join(f"{100 * value:.9f}" for value in offset))
+        lines.append(f"CHANNELS {position} Xrotation Yrotation Zrotation")
         children = [child for child in range(BODY_JOINTS) if PARENTS[child] == joint]
         for child in children:
             write(child)
-        if not children:
-            lines.extend(["End Site", "{", "OFFSET 0 1 0", "}"])
+        lines.extend([] if children else ["End Site", "{", "OFFSET 0 1 0", "}"])
         lines.append("}")
 
     write(0)
