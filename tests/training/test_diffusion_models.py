@@ -60,14 +60,13 @@ def models(tmp_path_factory):
             clip=clip,
             num_steps=2,
             num_points=64,
-            num_upsampled=96,
         ),
         "motion": prior(
             motion=motion(folder),
             body_model=tiny_3d_models.body_model(folder / "body.npz"),
             clip=clip,
         )
-        | prior(num_frames=2, num_points=400),
+        | prior(num_points=400),
         "candidates": prior(
             candidates=f"[{bodies(folder)}]",
             motion="''",
