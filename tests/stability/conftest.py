@@ -10,10 +10,9 @@ from typing import Any, Callable, Optional
 
 import pytest
 
-from tests.stability.backends import cuda_on_the_host
+from tests.stability.backends import BACKENDS, cuda_on_the_host
 from tests.stability.rows import ROWS
-from tests.stability.run_failures_cases import EVERY_STEP
-from tests.stability.small_runs import Ended, launch
+from tests.stability.small_runs import EVERY_STEP, Ended, launch
 
 REPORT = pytest.StashKey[list]()
 
@@ -81,8 +80,8 @@ def said() -> Iterator[list[str]]:
 
 @pytest.fixture
 def fault(request):
-    """``fault(deviation, ours=..., emulation=..., at_most=...)``: assert that our implementation
-    holds the bar and that the emulated fault does not.
+    """``fault(deviation, ours, emulation, at_most)``: assert that our implementation holds the bar
+    and that the emulated fault does not.
 
     ``deviation`` is a function of an implementation; use ``at_least`` instead of ``at_most`` if
     more is better; ``raises`` names the exception of an emulation that crashes instead of returning
@@ -91,12 +90,12 @@ def fault(request):
 
     def hold(
         deviation: Callable[[Any], float],
-        *,
         ours: Any,
         emulation: Any,
         at_most: float = 0.0,
-        at_least: Optional[float] = None,
         unit: str = "",
+        *,
+        at_least: Optional[float] = None,
         raises: type[Exception] = AssertionError,
     ) -> None:
         bound = {"at_most": at_most} if at_least is None else {"at_least": at_least}
@@ -105,11 +104,17 @@ def fault(request):
         with pytest.raises(raises) as caught:
             emulated(deviation(emulation), unit, **bound)
         crashed = {"value": caught.type.__name__, "unit": "", "what": "", "worst": "max"}
-        request.node.user_properties.append(
-            ("emulation", emulated.properties[0][1] if emulated.properties else crashed)
-        )
+        measured = emulated.properties[0][1] if emulated.properties else crashed
+        request.node.user_properties.append(("emulation", measured))
 
     return hold
+
+
+def pytest_generate_tests(metafunc) -> None:
+    """Run a test with the argument ``backend`` with each of them, unless it names some."""
+    marks = metafunc.definition.iter_markers("parametrize")
+    if "backend" in metafunc.fixturenames and all("backend" not in mark.args[0] for mark in marks):
+        metafunc.parametrize("backend", BACKENDS)
 
 
 def pytest_addoption(parser) -> None:

@@ -5,7 +5,6 @@ import csv
 import io
 import json
 import os
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 from unittest import mock
@@ -15,6 +14,7 @@ from torch import Tensor
 
 from threestudio_gaussiandreamer.launch import experiment
 
+EVERY_STEP = ["checkpoint.every_n_train_steps=1", "trainer.max_steps=5"]
 DEMO = Path(__file__).parents[2] / "configs" / "demo.yaml"
 SMALL = [
     "data.width=24", "data.height=24", "data.eval_width=24", "data.eval_height=24",
@@ -60,34 +60,17 @@ def launch(folder: Path, *overrides: str, stage: str = "--train", config: Path =
     The prior's turntable is off, because it takes longer than the rest.
     """
     out, err = io.StringIO(), io.StringIO()
-    small = [
-        option
-        for option in SMALL
-        if not (other_prior(overrides) and option.startswith("system.geometry.prior."))
-    ]
-    arguments = [
-        "--config",
-        str(config),
-        stage,
-        "--gpu",
-        "cpu",
-        f"exp_root_dir={folder}",
-        *small,
-        *overrides,
-    ]
+    prior = any(option.startswith("system.geometry.prior_type=") for option in overrides)
+    small = [o for o in SMALL if not (prior and o.startswith("system.geometry.prior."))]
+    arguments = ["--config", str(config), stage, "--gpu", "cpu", f"exp_root_dir={folder}"]
     with (
         mock.patch.dict(os.environ),
         mock.patch("threestudio_gaussiandreamer.priors.cache.save_turntable"),
         contextlib.redirect_stdout(out),
         contextlib.redirect_stderr(err),
     ):
-        code = experiment.main(arguments)
+        code = experiment.main([*arguments, *small, *overrides])
     return Ended(code, out.getvalue(), err.getvalue(), Path(folder) / "demo" / "t")
-
-
-def other_prior(overrides: Sequence[str]) -> bool:
-    """Return whether the demo's prior, and so its options, is replaced."""
-    return any(option.startswith("system.geometry.prior_type=") for option in overrides)
 
 
 def training_state(checkpoint: dict[str, Any]) -> dict[str, Tensor]:

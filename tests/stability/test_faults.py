@@ -1,0 +1,761 @@
+"""A0: faults of other projects' code. Each test holds ours to the bar and shows that an emulation
+of the fault breaks it.
+"""
+
+import functools
+import math
+from pathlib import Path
+from types import SimpleNamespace
+from unittest.mock import MagicMock
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from torch import nn
+
+from tests.helpers.pixel_guidance import TowardsGrey
+from tests.helpers.splatting_scenes import (
+    NO_CUTOFFS,
+    Cloud,
+    cameras,
+    front_camera,
+    one_gaussian,
+    psnr,
+    random_cloud,
+    rasterize,
+)
+from tests.stability.rows import row
+from tests.stability.scenes import (
+    ball,
+    clamped_alpha,
+    clamped_slope,
+    drawn,
+    joined,
+    plain_image,
+    seeded,
+    stack,
+    started,
+)
+from threestudio_gaussiandreamer import cameras as host_cameras
+from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.core.streams import generator
+from threestudio_gaussiandreamer.diffusion import sds
+from threestudio_gaussiandreamer.gaussians import densify
+from threestudio_gaussiandreamer.gaussians.densify import PARAMETERS, Rules, Statistics
+from threestudio_gaussiandreamer.gaussians.grow import grow, nearest_distance_scales
+from threestudio_gaussiandreamer.gaussians.point_cloud import PointCloud
+from threestudio_gaussiandreamer.guidance.base import NonFiniteScore
+from threestudio_gaussiandreamer.splatting import tiles
+from threestudio_gaussiandreamer.splatting.projection import quats_to_rotations
+from threestudio_gaussiandreamer.training.density import DensityControl
+from threestudio_gaussiandreamer.training.geometry import LEARNING_RATES, STATISTICS, GaussianCloud
+from threestudio_gaussiandreamer.training.initialization import grow_points
+from threestudio_gaussiandreamer.training.system import GaussianDreamerSystem
+
+CONFIGS = Path(__file__).parents[2] / "configs"
+
+
+def central_difference(f, x: float, step: float = 1e-5) -> float:
+    above, below = (f(torch.tensor(x + h, dtype=torch.float64)) for h in (step, -step))
+    return (above - below).item() / (2 * step)
+
+
+def slope_of(f, x: float) -> float:
+    """Return autograd's derivative of ``f`` at ``x``."""
+    leaf = torch.tensor(x, dtype=torch.float64).requires_grad_()
+    return torch.autograd.grad(f(leaf), leaf)[0].item()
+
+
+def slope_error(f, x: float, truth) -> float:
+    """Return the relative error of the derivative of ``f`` at ``x`` against the finite difference
+    of ``truth``.
+    """
+    expected = central_difference(truth, x)
+    return abs(slope_of(f, x) - expected) / abs(expected)
+
+
+@row("A0", "F1")
+def test_f1_the_clamp_of_the_jacobian_depends_on_depth(backend, fault):
+    """At twice the half-width of the image; the emulation treats the clamped x = lim z as a
+    constant, without its derivative by z.
+    """
+    scales = (1.5, 0.8, 0.4)
+
+    def mean(z):
+        return torch.stack([3.2 * torch.ones_like(z), 0.1 * torch.ones_like(z), z])
+
+    def by_hand(z, slope=clamped_slope):
+        return clamped_alpha(mean(z), torch.tensor(scales).double(), 32, 20.0, 0.7, slope).sum()
+
+    def constant_x(x, z, limit):
+        clamped = (torch.clamp(x / z, -limit, limit) * z).detach()
+        return torch.where((x / z).abs() < limit, x, clamped) / z
+
+    def ours(z):
+        cloud = one_gaussian(scale=scales, opacity=0.7)._replace(means=mean(z)[None])
+        return drawn(backend, cloud, 32, 32, 20.0, **NO_CUTOFFS).alpha.double().sum()
+
+    emulation = lambda z: by_hand(z, constant_x)  # noqa: E731
+    fault(lambda f: slope_error(f, 2.0, by_hand), ours, emulation, 1e-4, "relative")
+
+
+@row("A0", "F2")
+def test_f2_no_gaussians_show_the_background(backend, fault):
+    background = torch.tensor([0.2, 0.5, 0.9])
+
+    def ours(cloud):
+        leaves = cloud.to(torch.float32).leaves()
+        image = drawn(backend, leaves, 8, 6, 8.0, background=background).image
+        image.sum().backward()
+        assert all(leaf.grad.shape == leaf.shape for leaf in leaves)
+        return image
+
+    def black_unless_there_are_some(cloud):
+        return ours(cloud) if len(cloud.means) else torch.zeros(1, 6, 8, 3)
+
+    fault(
+        lambda draw: (draw(random_cloud(0)) - background).abs().max(),
+        ours,
+        black_unless_there_are_some,
+    )
+
+
+@row("A0", "F3")
+def test_f3_no_gradient_flows_through_the_cap(backend, fault):
+    """Opacity 0.95 under a cap of 0.5: an increase changes nothing. The emulation caps the value
+    but passes the gradient.
+    """
+
+    def ours(opacity):
+        cloud = one_gaussian(scale=5.0)._replace(opacities=opacity[None])
+        return drawn(backend, cloud, 2, 2, 4.0, alpha_max=0.5).alpha.double().sum()
+
+    def through_the_cap(opacity):
+        alpha = opacity * torch.ones(2, 2)
+        return (alpha + (alpha.clamp(max=0.5) - alpha).detach()).sum()
+
+    def deviation(f):
+        return abs(slope_of(f, 0.95) - central_difference(f, 0.95, 1e-3))
+
+    fault(deviation, ours, through_the_cap, 1e-3)
+
+
+@row("A0", "F4")
+def test_f4_the_gaussian_that_crosses_the_stop_counts(backend, fault):
+    opacities = [0.9, 0.905, 0.99]
+
+    def ours(opacities):
+        return drawn(backend, stack(opacities, scale=10.0), 1, 1, 1.0).alpha.item()
+
+    def stops_before(opacities):
+        T = 1.0
+        for alpha in opacities:
+            if T * (1 - alpha) < 1e-4:
+                break
+            T *= 1 - alpha
+        return 1 - T
+
+    everything = 1 - np.prod(1 - np.array(opacities))
+    fault(lambda f: abs(f(opacities) - everything), ours, stops_before, 1e-4, "of alpha")
+
+
+@row("A0", "F5")
+def test_f5_the_threshold_of_alpha(backend, fault):
+    """4000 Gaussians of opacity 0.1 on a sphere, like an initial cloud. The emulation uses the
+    common threshold of 1/255.
+    """
+    means = torch.nn.functional.normalize(torch.randn(4000, 3, generator=seeded()), dim=1)
+    cloud = random_cloud(4000, seed=1)._replace(
+        means=means, scales=torch.full((4000, 3), 0.03), opacities=torch.full((4000,), 0.1)
+    )
+    scene = *cloud.to(torch.float32), *cameras(1, 64, 64, dtype=torch.float32), 64, 64
+
+    def ours(**options):
+        with torch.no_grad():
+            return rasterize(*scene, **{"backend": backend, **options}).image
+
+    truth = ours(**NO_CUTOFFS, backend="torch")
+    common = lambda: ours(alpha_min=1 / 255)  # noqa: E731
+    fault(lambda f: psnr(f(), truth), ours, common, at_least=55, unit="dB")
+
+
+@row("A0", "F6")
+@pytest.mark.parametrize(
+    "attribute, value", [("means", math.nan), ("scales", math.inf), ("opacities", math.nan)]
+)
+def test_f6_what_is_not_finite_is_culled(backend, attribute, value, fault):
+    """The emulation culls what is before the near plane or without area; both comparisons are false
+    for NaN.
+    """
+    scene = random_cloud(6, seed=2)
+    scene.means[:, 2] += 3
+    corrupted = Cloud(*(torch.cat([x, x[:1].clone()]) for x in scene))
+    getattr(corrupted, attribute)[6] = value
+
+    def numbers(image, leaves):
+        image.square().sum().backward()
+        return [image.detach(), *(leaf.grad[:6] for leaf in leaves if leaf.grad is not None)]
+
+    def ours(cloud):
+        leaves = cloud.to(torch.float32).leaves()
+        return numbers(drawn(backend, leaves, 10, 8, 8.0).image, leaves)
+
+    def comparisons_that_nan_passes(cloud):
+        leaves = cloud.leaves()
+        z, det = leaves.means[:, 2], leaves.scales[:, 0] ** 2
+        order = z.detach().argsort(stable=True)
+        return numbers(plain_image(leaves, 10, 8, 8.0, ~(z <= 0.2) & ~(det == 0), order), leaves)
+
+    def changed(draw):
+        return sum(float((a != b).sum()) for a, b in zip(draw(corrupted), draw(scene), strict=True))
+
+    fault(changed, ours, comparisons_that_nan_passes, unit="numbers changed")
+
+
+@row("A0", "F7")
+def test_f7_a_zero_quaternion_is_no_rotation(fault):
+    def divided_by_the_norm(q):
+        w, x, y, z = (q * q.square().sum(-1, keepdim=True).rsqrt()).unbind(-1)
+        sums = y * y + z * z, x * x + z * z, x * x + y * y
+        return torch.diag_embed(1 - 2 * torch.stack(sums, -1))
+
+    def deviation(rotation):
+        quats = torch.tensor([[0.0, 0, 0, 0], [1e-30, 0, 0, 0]], requires_grad=True)
+        matrices = rotation(quats)
+        matrices.sum().backward()
+        good = (matrices.detach() == torch.eye(3)).all(-1).all(-1) & (quats.grad == 0).all(-1)
+        return (~good).sum()
+
+    fault(deviation, quats_to_rotations, divided_by_the_norm, unit="of 2 wrong")
+
+
+@row("A0", "F8")
+def test_f8_tile_intersections_are_counted_in_64_bits(fault):
+    """524 288 Gaussians over all of 1024 x 1024 give 2^31 intersections with tiles of 16 pixels;
+    our tiles are smaller, so the count is larger.
+    """
+    n = 524_288
+
+    def ours(side):
+        rectangles = torch.tensor([[0], [0], [side], [side]]).expand(4, n)
+        bounds = tiles.Bounds(torch.empty(6, 0), rectangles, torch.zeros(n).long())
+        return sum((last - first) * side * side for first, last in tiles.slices(bounds))
+
+    def in_32_bits(side):
+        with np.errstate(over="ignore"):
+            return int(np.full(n, side * side, np.int32).cumsum(dtype=np.int32)[-1])
+
+    fault(lambda count: abs(count(64) / (n * 64 * 64) - 1), ours, in_32_bits, unit="relative")
+
+
+@row("A0", "F9")
+@pytest.mark.parametrize("n", [1, 2, 3])
+def test_f9_first_scales_of_very_few_points(n, fault):
+    points = np.eye(3, dtype=np.float32)[:n]
+
+    def three_nearest_or_the_largest_float(points):
+        distances = ((points[:, None] - points) ** 2).sum(-1) + np.diag([np.inf] * n)
+        best = np.full((n, 3), np.finfo(np.float32).max, np.float32)
+        best[:, : n - 1] = np.sort(distances)[:, : n - 1]
+        with np.errstate(over="ignore"):
+            return np.sqrt(best.sum(1, dtype=np.float32) / 3)
+
+    def deviation(scales_of):
+        log_scales = np.log(scales_of(points))
+        return (~(np.isfinite(log_scales) & (np.abs(log_scales) < 20))).sum()
+
+    emulation = three_nearest_or_the_largest_float
+    fault(deviation, nearest_distance_scales, emulation, unit="infinite scales")
+
+
+@row("A0", "F10")
+def test_f10_depth_has_a_gradient(backend, fault):
+    """The derivative of the rendered depth by the Gaussian's depth; the emulation's backward pass
+    ignores it.
+    """
+
+    def at(z):
+        return one_gaussian(scale=0.2)._replace(means=torch.stack([0 * z, 0 * z, z])[None])
+
+    def ours(z):
+        return drawn(backend, at(z), 8, 8, 8.0, **NO_CUTOFFS).depth.double().sum()
+
+    def truth(z):
+        camera = front_camera(8, 8, 8.0)
+        return rasterize(*at(z), *camera, 8, 8, backend="reference", **NO_CUTOFFS).depth.sum()
+
+    ignored = lambda z: truth(z).detach() + 0 * z  # noqa: E731
+    fault(lambda f: slope_error(f, 2.0, truth), ours, ignored, 1e-4, "relative")
+
+
+@row("A0", "F11")
+def test_f11_the_loss_scale_does_not_affect_the_selection(fault):
+    """Half of the gradients are above the threshold; mixed precision multiplies all of them by
+    65 536.
+    """
+    true = torch.randn(2, 1000, 2, generator=seeded()) * (2e-4 / 64)
+
+    def as_they_come(means2d_grad, width, height, loss_scale):
+        return densify.screen_gradients(means2d_grad, width, height)
+
+    def deviation(gradients):
+        selected = [gradients(true * scale, 128, 128, scale) > 2e-4 for scale in (1.0, 65536.0)]
+        return (selected[0] != selected[1]).float().mean() * 100
+
+    fault(deviation, densify.screen_gradients, as_they_come, unit="% selected differently")
+
+
+@row("A0", "F12")
+def test_f12_a_checkpoint_holds_the_cloud_and_its_statistics(fault):
+    """The emulation keeps the cloud in a plain object, which is not in a module's state. Ours does
+    not run the prior on loading.
+    """
+    names = (*PARAMETERS, *STATISTICS)
+
+    class PlainCloud(nn.Module):
+        def __init__(self, source=None):
+            super().__init__()
+            values = {name: getattr(source, name, torch.zeros(0)) for name in names}
+            self.cloud = SimpleNamespace(**values)
+
+    def trained():
+        geometry = started()
+        geometry.gradient_sum += 1
+        geometry.contribution += torch.rand(300, generator=seeded())
+        return geometry
+
+    def deviation(pair):
+        saved, fresh = pair()
+        fresh.load_state_dict(saved.state_dict())
+        one, other = (getattr(module, "cloud", module) for module in (saved, fresh))
+        return sum(not torch.equal(getattr(one, name), getattr(other, name)) for name in names)
+
+    fault(
+        deviation,
+        lambda: (trained(), GaussianCloud({"prior_type": "a-prior-that-does-not-exist"})),
+        lambda: (PlainCloud(trained()), PlainCloud()),
+        unit="tensors lost",
+    )
+
+
+def parameters(n: int) -> dict[str, torch.Tensor]:
+    shapes = dict(means=(n, 3), log_scales=(n, 3), quats=(n, 4), logit_opacities=(n,))
+    g = seeded()
+    return {
+        name: torch.randn(shape, generator=g) - 5.0 * (name == "log_scales")
+        for name, shape in (shapes | dict(sh0=(n, 1, 3), sh_rest=(n, 0, 3))).items()
+    }
+
+
+@row("A0", "F13")
+def test_f13_one_gaussian_keeps_its_shape(fault):
+    """Prunes no Gaussian. The emulation squeezes the (1, 1) mask to a scalar, which adds a
+    dimension to what it indexes.
+    """
+
+    def ours(params):
+        stats = Statistics(torch.zeros(1), torch.ones(1))
+        rules = Rules(min_opacity=0.0, max_scale=1e9, min_gaussians=1)
+        return densify.densify_and_prune(params, stats, rules, generator(0, "s")).values["means"]
+
+    def squeezed(params):
+        faint = (torch.sigmoid(params["logit_opacities"])[:, None] < 0).squeeze()
+        return params["means"][~faint]
+
+    def deviation(pruned):
+        return float(pruned(parameters(1)).shape != (1, 3))
+
+    fault(deviation, ours, squeezed, unit="wrong shapes")
+
+
+def grown(points, generator=None, **options):
+    """Return how many points grow around uncoloured ones."""
+    cloud = PointCloud(points, np.zeros_like(points))
+    return len(grow(cloud, generator=np.random.default_rng(0), **options).points) - len(points)
+
+
+def brute_force(points, radius, count=2000):
+    """Return the candidates in the bounding box that are near a point, of an absolute radius."""
+    candidates = np.random.default_rng(0).uniform(points.min(0), points.max(0), (count, 3))
+    return [c for c in candidates if np.linalg.norm(points - c, axis=1).min() < radius]
+
+
+@row("A0", "F14")
+def test_f14_without_grown_points_the_input_is_returned(fault):
+    """A cube of side 2 has eight corners; none of 100 candidates is near one."""
+    corners = np.float32([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+
+    def appended_to_an_empty_list(points):
+        kept = brute_force(points, 0.01, 100)
+        return len(np.concatenate((points, np.array(kept)))) - 8
+
+    fault(
+        lambda count: float(count(corners) != 0),
+        lambda points: grown(points, num_candidates=100),
+        appended_to_an_empty_list,
+        raises=ValueError,
+    )
+
+
+@row("A0", "F15")
+def test_f15_growth_does_not_depend_on_the_unit(fault):
+    """Metres, millimetres, kilometres: the fraction of accepted candidates."""
+
+    def deviation(accepted):
+        counts = np.array([accepted(ball().points * unit) for unit in (1e-3, 1.0, 1e3)])
+        return np.ptp(counts) / counts.mean()
+
+    fault(
+        deviation,
+        lambda points: grown(points, num_candidates=20_000, radius=0.05),
+        lambda points: len(brute_force(points, 0.05)),
+        0.01,
+        "relative",
+    )
+
+
+@row("A0", "F15")
+@pytest.mark.parametrize("axes", [(0, 1), (2,), ()], ids=["flat", "needle", "point"])
+def test_f15_a_degenerate_prior_does_not_explode(axes, fault):
+    """Every candidate in the box of a flat cloud is near it, so only the cap limits their number;
+    the emulation has none.
+    """
+    points = np.zeros((300, 3), np.float32)
+    points[:, axes] = ball().points[:, axes]
+    options = {"enabled": True, "num_candidates": 20_000, "radius": 0.9, "max_points": 500}
+
+    def ours(points):
+        cloud = PointCloud(points, np.zeros_like(points))
+        return len(grow_points(cloud, GaussianCloud({"grow": options}).cfg.grow).points)
+
+    without_a_cap = lambda points: 300 + len(brute_force(points, 0.9))  # noqa: E731
+    fault(lambda count: count(points), ours, without_a_cap, 800, "points")
+
+
+@row("A0", "F16")
+def test_f16_growing_leaves_the_process_generators_alone(fault):
+    def reseeding(points, **_):
+        np.random.seed(0)
+        np.random.uniform(-1, 1, (1000, 3))
+
+    def deviation(grow_from):
+        np.random.seed(7)
+        expected, torch_state = np.random.RandomState(7).random(), torch.get_rng_state()
+        grow_from(ball().points, num_candidates=1000)
+        moved = not torch.equal(torch.get_rng_state(), torch_state)
+        return float(np.random.random() != expected) + moved
+
+    fault(deviation, grown, reseeding, unit="generators moved")
+
+
+@row("A0", "F17")
+def test_f17_a_sphere_is_round_on_a_wide_image(backend, fault):
+    """Both axes have one focal length; the emulation uses the vertical field of view for
+    the width.
+    """
+    fovy = torch.tensor([math.radians(50.0)])
+
+    def one_angle_for_both(fovy, height, width):
+        Ks = host_cameras.intrinsics(fovy, height, width)
+        Ks[:, 0, 0] = 0.5 * width / torch.tan(0.5 * fovy)
+        return Ks
+
+    def deviation(intrinsics):
+        scene = *one_gaussian(scale=0.2).to(torch.float32), torch.eye(4)[None]
+        Ks = intrinsics(fovy, 64, 128)
+        alpha = rasterize(*scene, Ks, 128, 64, backend=backend).alpha[0, ..., 0]
+        across, down = ((alpha.sum(axis) > 0).sum() for axis in (0, 1))
+        return abs(across - down).item() / 2
+
+    fault(deviation, host_cameras.intrinsics, one_angle_for_both, 0.5, "px")
+
+
+@row("A0", "F18")
+def test_f18_densification_loses_no_step(fault):
+    """Selecting no Gaussian must change nothing. The emulation replaces the rows between backward
+    and step.
+    """
+    none_selected = dict(
+        enabled=True, start=1, stop=9, every=2, min_opacity=1e-9, grad_threshold=1e9, max_scale=1e9
+    )
+
+    def step_first(geometry, optimizer, step):
+        optimizer.step()
+        DensityControl(geometry).after_step(optimizer, step)
+
+    def densify_first(geometry, optimizer, step):
+        if geometry.cfg.densify.enabled and step % 2 == 0:
+            geometry.apply_change(DensityControl(geometry).densified(step), optimizer)
+        optimizer.step()
+
+    def trajectory(finish, **options):
+        geometry = started(**options)
+        groups = [{**group, "lr": 1e-2} for group in geometry.parameter_groups()]
+        optimizer = torch.optim.Adam(groups)
+        for step in range(1, 7):
+            sum((p**2).sum() for p in geometry.parameters()).backward()
+            finish(geometry, optimizer, step)
+            optimizer.zero_grad()
+        return geometry.means.detach()
+
+    plain = trajectory(step_first)
+    fault(
+        lambda f: (trajectory(f, densify=none_selected) - plain).abs().max(),
+        step_first,
+        densify_first,
+        unit="moved",
+    )
+
+
+@row("A0", "F19")
+def test_f19_a_negative_loss_is_back_propagated(fault):
+    """A whole training step on a loss of -p^2, with all other parts stubbed."""
+
+    def ours(parameter):
+        optimizer, taken = MagicMock(param_groups=[{"params": [parameter]}]), []
+        optimizer.step.side_effect = lambda: taken.append(parameter.grad)
+        system = MagicMock(global_step=1, return_value={"rasterized": None, "opacity": None})
+        system.optimizers.return_value = optimizer
+        system.losses.return_value = {"x": -(parameter**2).sum()}
+        system.manual_backward.side_effect = lambda loss: loss.backward()
+        system.loss_scale.value.return_value = 1.0
+        system.loss_scale.has_skipped.return_value = False
+        system.optimize = functools.partial(GaussianDreamerSystem.optimize, system)
+        GaussianDreamerSystem.training_step(system, {"width": 1, "height": 1}, 0)
+        return taken[0]
+
+    def if_positive(parameter):
+        loss = -(parameter**2).sum()
+        if loss > 0:
+            loss.backward()
+        return parameter.grad
+
+    def deviation(step):
+        parameter = torch.tensor([2.0, 3.0], requires_grad=True)
+        gradient = step(parameter)
+        gradient = torch.zeros(2) if gradient is None else gradient
+        return (gradient + 2 * parameter.detach()).abs().max()
+
+    fault(deviation, ours, if_positive)
+
+
+@row("A0", "F20")
+def test_f20_every_learning_rate_in_the_config_reaches_the_optimiser(fault):
+    """The emulation reads ``scaling_lr`` from a configuration that sets ``scale_lr``, and uses its
+    default.
+    """
+
+    def ours(rates):
+        geometry = started(sh_degree=1, **rates)
+        optimizer = torch.optim.Adam(geometry.parameter_groups())
+        geometry.set_learning_rates(optimizer, 0, 0)
+        return {LEARNING_RATES[group["name"]]: group["lr"] for group in optimizer.param_groups}
+
+    def misspelt(rates):
+        return {name: rates.get(name.replace("scales", "scaling"), 0.005) for name in rates}
+
+    def deviation(optimised):
+        rates = {name: 0.25 + 0.5**i for i, name in enumerate(LEARNING_RATES.values())}
+        found = optimised(rates)
+        return sum(found.get(name) != rate for name, rate in rates.items())
+
+    fault(deviation, ours, misspelt, unit="keys that are never read")
+
+
+@row("A0", "F21")
+def test_f21_the_cap_takes_what_contributes_least(fault):
+    contribution = torch.rand(500, generator=seeded(1))
+    best = contribution.sort(descending=True).values[:200].sum()
+
+    def ours(params):
+        stats = Statistics(torch.zeros(500), contribution)
+        rules = Rules(max_gaussians=200, min_opacity=0.0, max_scale=1e9, min_gaussians=1)
+        return densify.densify_and_prune(params, stats, rules, generator(0, "s")).parents
+
+    def random_choice(params):
+        return torch.randperm(500, generator=seeded())[:200]
+
+    def deviation(capped):
+        kept = capped(parameters(500))
+        return 1e9 if len(kept) != 200 else (1 - contribution[kept].sum() / best) * 100
+
+    fault(deviation, ours, random_choice, unit="% of the contribution lost")
+
+
+class Stub(TowardsGrey):
+    """Return NaN for the first item from step ``broken_from`` on."""
+
+    broken_from = 0
+
+    def predict(self, z, t, condition):
+        eps, _ = super().predict(z, t, condition)
+        eps[0] = torch.where(torch.tensor(self.step >= self.broken_from), torch.nan, eps[0])
+        return eps, None
+
+
+@row("A0", "F22")
+def test_f22_a_non_finite_score_is_reported(fault):
+    """The first of three items is NaN in every step; counts the steps of twenty that give no
+    message.
+    """
+    rgb = torch.rand(3, 4, 4, 3, generator=seeded())
+    guidance, healthy = Stub({"guidance_scale": 1.0}), Stub({"guidance_scale": 1.0})
+    healthy.broken_from = 1000
+
+    def gradient(guidance, step):
+        guidance.update_step(0, step)
+        image = rgb.clone().requires_grad_()
+        out = guidance(image)
+        out["loss_sds"].backward()
+        return image.grad, out["bad_items"]
+
+    def ours(step):
+        broken, counted = gradient(guidance, step)
+        whole, _ = gradient(healthy, step)
+        assert (broken[0] == 0).all() and torch.equal(broken[1:], whole[1:])
+        return counted > 0
+
+    def nan_to_num(step):  # zero from here on, and the step counts as a success
+        torch.nan_to_num(torch.full((3, 4, 4, 3), torch.nan))
+        return False
+
+    def deviation(said):
+        silent = 0
+        for step in range(20):
+            try:
+                silent += not said(step)
+            except NonFiniteScore:
+                assert step == 9  # the tenth
+                return silent
+        return silent
+
+    fault(deviation, ours, nan_to_num, unit="steps without a message")
+
+
+@row("A0", "F23")
+@pytest.mark.parametrize("percents", [(0.02, 1.0), (1.0, 1.0), (0.0, 0.0)])
+def test_f23_every_timestep_has_its_entry(percents, fault):
+    """The emulation draws up to and including 1000 of 1000."""
+    table = sds.sd_alphas_cumprod()
+
+    def ours():
+        steps = (sds.timesteps(50, *sds.step_range(*percents), seed=0, step=i) for i in range(20))
+        return torch.cat(list(steps))
+
+    def inclusive():
+        return torch.randint(int(1000 * percents[0]), 1001, (200_000,), generator=seeded())
+
+    def deviation(draw):
+        t = draw()
+        table[t]  # IndexError on a CPU, a device assert on a GPU
+        return ((t < 1) | (t > 999)).sum()
+
+    fault(deviation, ours, inclusive, raises=IndexError)
+
+
+@row("A0", "F23")
+def test_f23_an_empty_range_is_a_named_error(measured):
+    with pytest.raises(UserError, match="min"):
+        sds.step_range(0.98, 0.5)
+    measured("named error")
+
+
+@row("A0", "F24")
+def test_f24_the_guidance_scale_is_in_the_usual_convention(fault):
+    """s = 1 is no guidance, s = 100 is 100 differences from the unconditional score; the emulation
+    starts at the conditional one.
+    """
+    e_c, e_u = torch.randn(2, 4, 8, 8, generator=seeded())
+    exact = {1.0: e_c, 100.0: e_u + 100 * (e_c - e_u)}
+
+    def from_the_conditional(e_c, e_u, scale):
+        return e_c + scale * (e_c - e_u)
+
+    def deviation(guided):
+        return max(
+            (guided(e_c, e_u, scale) - true).abs().max() / true.abs().max()
+            for scale, true in exact.items()
+        )
+
+    fault(deviation, sds.classifier_free, from_the_conditional, 1e-6, "relative")
+
+
+@row("A0", "F25")
+def test_f25_each_preset_has_its_own_values(fault):
+    """Paper: scales 1e-3, rotations 1e-2, positions 5e-5. Released code: 5e-3, 1e-3, 5e-5 times the
+    extent 4 = 2e-4.
+    """
+    told = {"paper": (1e-3, 1e-2, 5e-5), "code": (5e-3, 1e-3, 2e-4)}
+    files = {"paper": "gaussiandreamer.yaml", "code": "gaussiandreamer-official.yaml"}
+
+    def rates(name):
+        geometry = yaml.safe_load((CONFIGS / name).read_text())["system"]["geometry"]
+        means = geometry["lr_means"]
+        first = means[1] if isinstance(means, list) else means
+        return geometry["lr_scales"], geometry["lr_quats"], first
+
+    def deviation(files):
+        pairs = (zip(rates(files[who]), told[who], strict=True) for who in told)
+        return sum(a != b for pair in pairs for a, b in pair)
+
+    one_for_both = dict.fromkeys(files, files["code"])
+    fault(deviation, files, one_for_both, unit="of 6 numbers wrong")
+
+
+@row("A0", "F26")
+def test_f26_nothing_behind_the_camera_and_equal_depths_by_index(backend, fault):
+    behind = one_gaussian((0.0, 0.0, -2.0), 0.3, 0.9)
+    colors = (1.0, 0, 0), (0, 1.0, 0)
+    red_and_green = joined(*(one_gaussian((0.0, 0.0, 2.0), 0.3, 0.9, color) for color in colors))
+
+    def ours(cloud):
+        return drawn(backend, cloud, 8, 8, 8.0).image[0]
+
+    def unclipped_and_unstable(cloud):
+        z = cloud.means[:, 2]
+        backwards = torch.arange(len(z) - 1, -1, -1)  # an unstable sort may give this order
+        order = backwards[z[backwards].argsort(stable=True)]
+        return plain_image(cloud, 8, 8, 8.0, torch.ones(len(z), dtype=torch.bool), order)
+
+    def deviation(draw):
+        in_front = draw(red_and_green)[4, 4]
+        return float((draw(behind) != 0).sum()) + float(in_front[0] < in_front[1])
+
+    fault(deviation, ours, unclipped_and_unstable, unit="pixels or swaps")
+
+
+@row("A0", "F27")
+def test_f27_any_size_and_a_gaussian_behind_the_camera(backend, fault):
+    """The emulation masks the means behind the camera but not the covariances, and renders
+    256 x 256.
+    """
+    places = (0.0, 0.0, 2.0), (0.0, 0.0, -2.0), (0.3, 0.0, 3.0)
+    scene = joined(*(one_gaussian(place, 0.3) for place in places))
+
+    def ours(cloud, width, height):
+        return drawn(backend, cloud, width, height, 8.0).image[0]
+
+    def half_masked(cloud, width, height):
+        in_front = cloud.means[:, 2] > 0
+        means, variances = cloud.means[in_front], cloud.scales[:, 0] ** 2
+        return (means[:, :2] / variances[:, None]).sum() * torch.ones(256, 256, 3)
+
+    def deviation(draw):
+        return (draw(scene, 17, 9) - draw(scene.pick([0, 2]), 17, 9)).abs().max()
+
+    fault(deviation, ours, half_masked, raises=RuntimeError)
+
+
+@row("A0", "F27")
+def test_f27_the_size_that_was_asked_for(backend, fault):
+    """Widths from 1 to 40, none of which is 256; counts missing or extra columns."""
+
+    def ours(width, height):
+        return drawn(backend, one_gaussian(scale=5.0), width, height, 8.0).alpha[0, ..., 0]
+
+    def deviation(draw):
+        sizes = [(1, 1), (40, 1), (17, 9), (31, 33)]
+        return sum(draw(*s).shape != s[::-1] or bool((draw(*s) == 0).any()) for s in sizes)
+
+    fault(deviation, ours, lambda width, height: torch.ones(256, 256), unit="of 4 sizes wrong")
