@@ -58,7 +58,7 @@ Report = Iterator[tuple[int, dict[str, Any]]]
 
 
 def try_files(name: str, seed: int, first: int, last: int) -> Report:
-    from tests.fuzz.runner import outcomes
+    from tests.fuzz.targets import outcomes
 
     for index, outcome in outcomes(name, range(first, last), seed):
         failures = [outcome.detail] if outcome.kind == "failed" else []
@@ -147,7 +147,7 @@ def work(name: str, seed: int, first: int, last: int) -> None:
     nothing = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nothing, 1)
     os.dup2(nothing, 2)
-    importlib.import_module(MODULES.get(name, "tests.fuzz.runner"))
+    importlib.import_module(MODULES.get(name, "tests.fuzz.targets"))
     report = kind_of(name)(name, seed, first, last)
     print(json.dumps({"ready": True}), file=output)
     libraries = (

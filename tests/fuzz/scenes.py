@@ -10,6 +10,7 @@ from torch import Tensor
 from tests.helpers.splatting_scenes import NAMES, Cloud, cotangents, rasterize
 from threestudio_gaussiandreamer.gaussians.sh import sh_to_colors
 from threestudio_gaussiandreamer.splatting import Rasterized
+from threestudio_gaussiandreamer.splatting.projection import quats_to_rotations
 
 MAX = 3.4028235e38
 DENORMAL = 1e-42
@@ -36,6 +37,7 @@ BRIGHT = (1e30, -1e30, MAX, -MAX)
 colour times focal length / depth.
 """
 NOT_FINITE = (math.nan, math.inf, -math.inf)
+NEAR = (0.01, 0.01, 1e-6, 0.5)
 FOVS_DEG = (1e-3, 0.1, 1.0, 30.0, 60.0, 120.0, 179.0, 179.999)
 
 
@@ -59,9 +61,6 @@ class Drawn(NamedTuple):
     grads: dict[str, Tensor]
 
 
-# ---- scenes --------------------------------------------------------------------------------------
-
-
 def extreme_scene(seed: int, most: int = 4000) -> Scene:
     """Draw a scene of up to ``most`` Gaussians; a tenth of the scenes contains NaN and infinity."""
     g = torch.Generator().manual_seed(seed)
@@ -83,16 +82,11 @@ def well_posed(scene: Scene) -> Scene:
     cloud, near = scene.cloud, scene.options["near"]
     lengths = torch.linalg.vector_norm(cloud.quats, dim=1)
     keep = (cloud.means.abs() <= 50).all(1) & (lengths >= 1e-3) & (lengths <= 1e3)
-    keep &= (
-        ((cloud.scales >= 1e-3) & (cloud.scales <= 10)).all(1)
-        & (cloud.opacities >= 0)
-        & (cloud.opacities <= 1)
-    )
+    keep &= ((cloud.scales >= 1e-3) & (cloud.scales <= 10)).all(1)
+    keep &= (cloud.opacities >= 0) & (cloud.opacities <= 1)
     keep &= (cloud.colors.abs() <= 10).flatten(1).all(1)
-    depths = (
-        scene.viewmats[:, 2, :3].double() @ cloud.means.double().T
-        + scene.viewmats[:, 2, 3:].double()
-    )
+    rotated = scene.viewmats[:, 2, :3].double() @ cloud.means.double().T
+    depths = rotated + scene.viewmats[:, 2, 3:].double()
     keep &= ((depths - near).abs() > 0.05).all(0)
     for view in depths:
         keep[keep.nonzero()[:, 0][_of_mixed_depth(cloud.means[keep], view[keep])]] = False
@@ -121,11 +115,9 @@ def _chance(g: torch.Generator, share: float) -> bool:
 
 def _count(g: torch.Generator, most: int) -> int:
     """Draw a count, uniform in the logarithm, or ``most``."""
-    return (
-        int(math.exp(torch.rand((), generator=g).item() * math.log(most + 1))) - 1
-        if _chance(g, 0.4)
-        else most
-    )
+    if not _chance(g, 0.4):
+        return most
+    return int(math.exp(torch.rand((), generator=g).item() * math.log(most + 1))) - 1
 
 
 def _size(g: torch.Generator, work: int) -> tuple[int, int]:
@@ -167,11 +159,7 @@ def _cloud(g: torch.Generator, count: int, non_finite: bool) -> Cloud:
 def _corrupt(g: torch.Generator, values: Tensor, extremes: tuple[float, ...], share: float) -> None:
     """Write extreme values into single entries, and one value into whole rows."""
     rows = torch.rand(len(values), generator=g) < share / 2
-    same = (
-        _picked(g, extremes, (len(values),))
-        .reshape(-1, *[1] * (values.dim() - 1))
-        .expand(values.shape)
-    )
+    same = _picked(g, extremes, (len(values), *[1] * (values.dim() - 1))).expand(values.shape)
     values[rows] = same[rows]
     entries = torch.rand(values.shape, generator=g) < share / 4
     values[entries] = _picked(g, extremes, tuple(values.shape))[entries]
@@ -181,42 +169,30 @@ def _cameras(g: torch.Generator, views: int, width: int, height: int) -> tuple[T
     """Draw cameras around the cloud; in two of five scenes unusual ones: inside or behind it, with
     any field of view and principal point.
     """
-    q = torch.nn.functional.normalize(
-        torch.randn(views, 4, generator=g, dtype=torch.float64), dim=-1
-    )
-    w, x, y, z = q.unbind(-1)
-    rotation = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    viewmats = torch.eye(4).repeat(views, 1, 1)
-    viewmats[:, :3, :3] = torch.stack([torch.stack(row, -1) for row in rotation], -2).float()
+    viewmats, Ks = torch.eye(4).repeat(views, 1, 1), torch.eye(3).repeat(views, 1, 1)
+    viewmats[:, :3, :3] = quats_to_rotations(
+        torch.randn(views, 4, generator=g, dtype=torch.float64)
+    ).float()
     odd = torch.rand(views, generator=g) < (0.7 if _chance(g, 0.4) else 0.0)
-    viewmats[:, 2, 3] = torch.where(
-        odd, _picked(g, (3.0, 0.5, 0.0, 100.0, -3.0), (views,)), torch.tensor(3.0)
-    )
-    fov = torch.where(odd, _picked(g, FOVS_DEG, (views,)), _picked(g, (40.0, 60.0), (views,)))
-    focal = 0.5 * height / torch.tan(torch.deg2rad(fov) / 2)
-    Ks = torch.eye(3).repeat(views, 1, 1)
+
+    def drawn(unusual: tuple[float, ...], usual: tuple[float, ...]) -> Tensor:
+        return torch.where(odd, _picked(g, unusual, (views,)), _picked(g, usual, (views,)))
+
+    viewmats[:, 2, 3] = drawn((3.0, 0.5, 0.0, 100.0, -3.0), (3.0,))
+    focal = 0.5 * height / torch.tan(torch.deg2rad(drawn(FOVS_DEG, (40.0, 60.0))) / 2)
     Ks[:, 0, 0], Ks[:, 1, 1] = focal * (2.0 if _chance(g, 0.1) else 1.0), focal
-    centre = torch.where(odd, _picked(g, (0.5, 0.5, 0.0, -3.0, 20.0), (views,)), torch.tensor(0.5))
+    centre = drawn((0.5, 0.5, 0.0, -3.0, 20.0), (0.5,))
     Ks[:, 0, 2], Ks[:, 1, 2] = centre * width, centre * height
     return viewmats, Ks
 
 
 def _options(g: torch.Generator, size: tuple[int, int]) -> dict[str, Any]:
-    options: dict[str, Any] = {
-        "preset": ("fast", "balanced", "accurate")[int(torch.randint(3, (), generator=g))]
-    }
+    preset = ("fast", "balanced", "accurate")[int(torch.randint(3, (), generator=g))]
+    options: dict[str, Any] = {"preset": preset, "near": _picked(g, NEAR, ()).item()}
     options |= {"antialias": _chance(g, 0.3), "absgrad": _chance(g, 0.3)}
-    options |= {"near": _picked(g, (0.01, 0.01, 1e-6, 0.5), ()).item()}
     if size[0] % 2 == size[1] % 2 == 0 and _chance(g, 0.3):
         options["downsample"] = 2
     return options
-
-
-# ---- rendering and checking ----------------------------------------------------------------------
 
 
 def draw(scene: Scene, backend: str, dtype: torch.dtype = torch.float32) -> Drawn:
@@ -224,30 +200,18 @@ def draw(scene: Scene, backend: str, dtype: torch.dtype = torch.float32) -> Draw
     cameras.
     """
     leaves = scene.cloud.to(dtype).leaves()
-    viewmats, background = scene.viewmats.to(dtype, copy=True).requires_grad_(), scene.background
+    viewmats = scene.viewmats.to(dtype, copy=True).requires_grad_()
+    background = scene.background
     background = None if background is None else background.to(dtype, copy=True).requires_grad_()
-    positions = -(viewmats.detach()[:, :3, :3].transpose(1, 2) @ viewmats.detach()[:, :3, 3:])[
-        ..., 0
-    ]
-    directions = torch.nn.functional.normalize(
-        leaves.means.detach()[None] - positions[:, None], dim=-1
-    )
-    colors = sh_to_colors(leaves.colors, directions)
-    out = rasterize(
-        *leaves[:4],
-        colors,
-        viewmats,
-        scene.Ks.to(dtype),
-        *scene.size,
-        background=background,
-        backend=backend,
-        **scene.options,
-    )
+    positions = -torch.einsum("vij,vi->vj", viewmats[:, :3, :3], viewmats[:, :3, 3]).detach()
+    directions = leaves.means.detach()[None] - positions[:, None]
+    directions = torch.nn.functional.normalize(directions, dim=-1)
+    view = viewmats, scene.Ks.to(dtype), *scene.size
+    options = {"background": background, "backend": backend, **scene.options}
+    out = rasterize(*leaves[:4], sh_to_colors(leaves.colors, directions), *view, **options)
     torch.autograd.backward([out.image, out.alpha, out.depth], cotangents(out))
-    grads = dict(zip(NAMES, (leaf.grad for leaf in leaves), strict=True)) | {
-        "viewmats": viewmats.grad,
-        "means2d": out.means2d.grad,
-    }
+    inputs = zip((*NAMES, "viewmats", "means2d"), (*leaves, viewmats, out.means2d), strict=True)
+    grads = {name: leaf.grad for name, leaf in inputs}
     return Drawn(out, grads if background is None else grads | {"background": background.grad})
 
 
@@ -279,18 +243,13 @@ def disagreement(pictures: dict[str, Drawn]) -> Optional[str]:
     *others, (first, one) = pictures.items()
     for name, other in others:
         for part in ("image", "alpha"):
-            difference = (
-                (getattr(one.out, part).double() - getattr(other.out, part).double()).abs().max()
-            )
-            scale = max(getattr(one.out, part).abs().max().item(), 1.0)
-            if difference > FLIPS * scale:
+            ours, theirs = (getattr(drawn.out, part).double() for drawn in (one, other))
+            difference = (ours - theirs).abs().max()
+            if difference > FLIPS * max(ours.abs().max().item(), 1.0):
                 return f"{part} of {first} and {name} differ by {difference:.2g}"
         for part, grad in one.grads.items():
             if (distance := _distance(other.grads[part], grad)) > GRADIENTS:
-                return (
-                    f"gradients of {part} of {first} and {name} differ by {distance:.2g} of "
-                    "their length"
-                )
+                return f"gradients of {part} of {first} and {name}: {distance:.2g} of their length"
     return None
 
 
@@ -300,10 +259,8 @@ def fault_of(scene: Scene, backend: str) -> Optional[str]:
 
 def disagreement_on(scene: Scene, backends: Sequence[str]) -> Optional[str]:
     """Return the disagreement of backends on a scene; the specification, in float64, comes last."""
-    return disagreement(
-        {name: draw(scene, name) for name in backends}
-        | {"float64": draw(scene, "reference", torch.float64)}
-    )
+    pictures = {name: draw(scene, name) for name in backends}
+    return disagreement(pictures | {"float64": draw(scene, "reference", torch.float64)})
 
 
 def _distance(a: Tensor, b: Tensor) -> float:

@@ -1,0 +1,167 @@
+"""A sample of `make fuzz`: damaged files for every reader and corpus/, the files of earlier
+defects; extreme Gaussians through every backend; random sequences of operations on a cloud.
+"""
+
+import functools
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import HealthCheck, Phase, settings
+from hypothesis.stateful import run_state_machine_as_test
+
+from tests.fuzz import mutations
+from tests.fuzz.scenes import (
+    Drawn,
+    Scene,
+    disagreement,
+    disagreement_on,
+    draw,
+    extreme_scene,
+    fault,
+    fault_of,
+    well_posed,
+)
+from tests.fuzz.sequences import CloudSequence
+from tests.fuzz.targets import TARGETS, Misread, Target, outcome_of, outcomes, seeds
+from tests.stability.backends import BACKENDS, cuda_on_the_host, each_backend
+from threestudio_gaussiandreamer.gaussians import densify
+
+pytestmark = pytest.mark.slow
+
+CORPUS = sorted(path for path in Path(__file__).with_name("corpus").rglob("*") if path.is_file())
+INPUTS = {"configuration": 25, "command-line": 15, "checkpoint": 30}
+"""Number of damaged files per target; 50 for the others."""
+SCENES, MOST = range(12), 600
+ORDINARY = 8
+"""Seed of a scene that is mostly well-posed."""
+
+
+@pytest.mark.parametrize("name", TARGETS)
+def test_files_are_read_correctly_or_refused(name):
+    """All valid ones are read."""
+    assert {outcome_of(TARGETS[name], data) for data in seeds(name)} == {("read", "")}
+    ended = dict(outcomes(name, range(INPUTS.get(name, 50)), seed=1))
+    failed = {index: outcome.detail for index, outcome in ended.items() if outcome.kind == "failed"}
+    assert not failed, failed
+    assert any(outcome.kind == "refused" for outcome in ended.values())
+
+
+@pytest.mark.parametrize("path", CORPUS, ids=lambda path: f"{path.parent.name}-{path.stem}")
+def test_a_file_of_an_earlier_defect_is_refused(path):
+    outcome = outcome_of(TARGETS[path.parent.name], path.read_bytes())
+    assert outcome.kind == "refused", outcome
+
+
+def crash(path: Path) -> None:
+    raise IndexError("list index out of range")
+
+
+def hang(path: Path) -> None:
+    while True:
+        try:
+            time.process_time()
+        except Exception:
+            pass
+
+
+def misread(path: Path) -> None:
+    raise Misread("another content")
+
+
+def memory(path: Path) -> None:
+    np.ones(200 << 20, np.uint8)
+
+
+@pytest.mark.parametrize("reader", [crash, hang, misread, memory])
+def test_a_faulty_reader_is_detected(reader, monkeypatch):
+    monkeypatch.setattr("tests.fuzz.targets.SECONDS", 0.2 if reader is hang else 60)
+    outcome = outcome_of(Target(".bin", list, reader), b"0123")
+    assert outcome.kind == "failed" and outcome.detail.startswith(f"{reader.__name__}: ")
+
+
+@pytest.mark.parametrize("mutators", [mutations.BINARY, mutations.TEXT])
+def test_mutants_are_repeatable_and_differ(mutators):
+    data = [b"element vertex 12\nproperty float x\n" * 5]
+    rngs = [[np.random.default_rng(i) for i in range(200)] for _ in range(2)]
+    ours, again = ([mutations.mutant(data, rng, mutators, None) for rng in same] for same in rngs)
+    assert ours == again and len(set(ours)) > 150
+
+
+@functools.cache
+def scene(seed: int) -> Scene:
+    return extreme_scene(seed, most=MOST)
+
+
+@pytest.fixture
+def stand_in_for_a_gpu(monkeypatch) -> None:
+    if "cuda" in BACKENDS:
+        cuda_on_the_host(monkeypatch)
+
+
+@each_backend
+def test_nothing_that_is_drawn_is_nan(backend, stand_in_for_a_gpu):
+    faults = {seed: fault_of(scene(seed), backend) for seed in SCENES}
+    assert not any(faults.values()), faults
+
+
+def test_backends_agree_on_what_is_well_posed(stand_in_for_a_gpu):
+    parts = {seed: well_posed(scene(seed)) for seed in SCENES}
+    faults = {seed: disagreement_on(part, BACKENDS) for seed, part in parts.items()}
+    assert not any(faults.values()), faults
+    assert sum(len(part.cloud.means) for part in parts.values()) > 500, "too little is well-posed"
+
+
+def test_wrong_renders_and_backends_that_differ_are_detected():
+    drawn = draw(scene(ORDINARY), "torch")
+    assert fault(scene(ORDINARY), drawn) is None
+    for name, value in {"image": float("nan"), "alpha": 1.5, "depth": float("inf")}.items():
+        wrong = getattr(drawn.out, name).detach().clone()
+        wrong[0, 0, 0] = value
+        assert fault(scene(ORDINARY), drawn._replace(out=drawn.out._replace(**{name: wrong})))
+    drawn.grads["quats"][0, 0] = float("nan")
+    assert fault(scene(ORDINARY), drawn)
+    part = well_posed(scene(ORDINARY))
+    one, other = draw(part, "reference"), draw(part, "torch")
+    assert disagreement({"one": one, "other": other}) is None
+    shifted = Drawn(other.out._replace(image=1.1 * other.out.image), other.grads)
+    assert "image" in disagreement({"one": one, "other": shifted})
+    wrong = Drawn(other.out, other.grads | {"means": torch.flip(other.grads["means"], [1])})
+    assert "means" in disagreement({"one": one, "other": wrong})
+
+
+def run_sequences(count: int, **options) -> None:
+    options |= {"derandomize": True, "deadline": None, "database": None}
+    options |= {"stateful_step_count": 20, "suppress_health_check": list(HealthCheck)}
+    run_state_machine_as_test(CloudSequence, settings=settings(max_examples=count, **options))
+
+
+def test_no_sequence_breaks_a_cloud(monkeypatch):
+    """Invariants hold after every rule: finite parameters, moments of the right rows, the cap."""
+    monkeypatch.setattr(CloudSequence, "steps", 0)
+    run_sequences(30)
+    assert CloudSequence.steps > 200
+
+
+def test_a_split_beyond_floats_is_detected(monkeypatch):
+    """Without the limit of densify, a Gaussian of infinite size has children at infinity."""
+    monkeypatch.setattr(densify, "LOG_SCALE_RANGE", (-1e30, 1e30))
+    sequence = CloudSequence()
+    sequence.start(count=20, floor=1, cap=500, seed=0)
+    with torch.no_grad():
+        sequence.cloud.log_scales.fill_(300.0)
+    with pytest.raises(AssertionError, match="isn't finite"):
+        sequence.densify(seed=1, threshold=0.0, split=0.05, faint=0.0, huge=1e30)
+        sequence.everything_fits()
+
+
+def test_misplaced_moments_are_detected(monkeypatch):
+    def rows(value, old, change):
+        moved = getattr(value, "shape", None) == old.shape
+        return value[change.parents.roll(1)] if moved else value
+
+    monkeypatch.setattr(densify, "_rows", rows)
+    with pytest.raises(AssertionError):
+        run_sequences(200, phases=[Phase.generate])
