@@ -9,7 +9,7 @@ import re
 from collections.abc import Callable
 
 from benchmarks.markdown import markdown
-from benchmarks.quality import default_against, formats, large_prune
+from benchmarks.quality import formats, large_prune
 from benchmarks.quality import mesh as mesh_quality
 from benchmarks.quality import tables as quality
 from benchmarks.quality import toybox_tables as toybox
@@ -79,10 +79,7 @@ SECTIONS: dict[str, dict[str, Callable[[], str]]] = {
         "thresholds": splatting.thresholds,
         "contenders": splatting.contenders,
         "gpu": splatting.gpu,
-        "step": start.step_parts,
         "start": start.first_step,
-        "default": default_against.table,
-        "farm": robustness.farm,
         "speed": viewers.page_speed,
     },
 }

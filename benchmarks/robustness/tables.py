@@ -1,6 +1,4 @@
-"""The measured parts of reports/robustness.md, from benchmarks/results/fuzz.csv and long_run.json,
-and of the farm in reports/speed.md, from farm.csv and farm_chaos.csv.
-"""
+"""The measured parts of reports/robustness.md, from fuzz.csv and long_run.json of results/."""
 
 import json
 from pathlib import Path
@@ -43,25 +41,3 @@ def long_run() -> str:
         ("duration on one thread", f"{run['minutes']:.0f} minutes"),
     )  # fmt: skip
     return markdown(("the interrupted run", ""), rows)
-
-
-KILLED = {"worker": "workers", "driver": "the driver", "node": "machines"}
-
-
-def farm() -> str:
-    """Return the costs of a farm beside its assets, and what a farm with killed processes made."""
-    measured: dict[str, list[str]] = {}
-    for row in read(RESULTS / "farm.csv"):
-        where = f"{int(row['rows']):,} {'assets' if row['workers'] else 'rows'}"
-        where += f", {row['workers']} workers" if row["workers"] else ""
-        value = f"{float(row['value']):.3g} {row['unit']}".strip()
-        measured.setdefault(f"{row['measured']}, {where}", []).append(value)
-    table = [(name, ", ".join(values)) for name, values in measured.items()]
-    (chaos,) = read(RESULTS / "farm_chaos.csv")
-    kills = ", ".join(f"{chaos[f'{kind}_kills']} of {name}" for kind, name in KILLED.items())
-    table += [
-        (f"SIGKILLs: {kills}; assets finished", f"{chaos['finished']} of {chaos['assets']}"),
-        ("of these equal to the bit to single runs", chaos["equal_to_single_runs"]),
-        ("of these finished twice", chaos["finished_twice"]),
-    ]
-    return markdown(("measured", "value"), table)
