@@ -4,6 +4,7 @@ and resuming in any order, with extreme values.
 Every Gaussian has an id in its colour and in its rows of the optimiser state, which reveals
 misplaced rows."""
 
+import copy
 from typing import Any
 
 import torch
@@ -13,6 +14,7 @@ from torch import Tensor
 
 from tests.fuzz.targets import require_picture
 from threestudio_gaussiandreamer.gaussians.densify import Change
+from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
 from threestudio_gaussiandreamer.splatting import Rasterized
 from threestudio_gaussiandreamer.training.density import DECAY, DensityControl
 from threestudio_gaussiandreamer.training.geometry import STATISTICS, GaussianCloud
@@ -41,23 +43,12 @@ class CloudSequence(RuleBasedStateMachine):
     )
     def start(self, count: int, floor: int, cap: int, seed: int) -> None:
         self.g = torch.Generator().manual_seed(seed)
-        self.cloud = GaussianCloud(
-            {
-                "min_gaussians": floor,
-                "max_gaussians": cap,
-                "densify": {"enabled": True, "start": 0, "stop": 10},
-            }
-        )
-        shapes = {
-            "means": (count, 3),
-            "log_scales": (count, 3),
-            "quats": (count, 4),
-            "logit_opacities": (count,),
-            "sh": (count, 1, 3),
-        }
-        self.cloud.set_arrays(
-            **{name: torch.randn(shape, generator=self.g) for name, shape in shapes.items()}
-        )
+        densify = {"enabled": True, "start": 0, "stop": 10}
+        limits = {"min_gaussians": floor, "max_gaussians": cap}
+        self.cloud = GaussianCloud({**limits, "densify": densify})
+        shapes = (count, 3), (count, 4), (count, 3), (count,), (count, 1, 3)
+        arrays = Gaussians(*(torch.randn(shape, generator=self.g) for shape in shapes))
+        self.cloud.set_arrays(**arrays._asdict())
         self.optimizer = torch.optim.Adam(self.cloud.parameter_groups(), lr=0.0)
         self.next_id, self.changes = 1, []
         self.step(seed)
@@ -85,19 +76,16 @@ class CloudSequence(RuleBasedStateMachine):
         CloudSequence.steps += 1
         g, n = torch.Generator().manual_seed(seed), len(self.cloud)
         means2d = torch.zeros(views, n, 2, requires_grad=True)
-        means2d.grad = torch.randn(views, n, 2, generator=g) * 10.0 ** torch.randint(
-            -8, 3, (views, n, 1), generator=g
-        )
+        sizes = 10.0 ** torch.randint(-8, 3, (views, n, 1), generator=g)
+        means2d.grad = torch.randn(views, n, 2, generator=g) * sizes
         if bad:
-            means2d.grad[torch.rand(views, n, generator=g) < 0.2] = torch.tensor(
-                [float("nan"), float("inf")]
-            )
+            rows = torch.rand(views, n, generator=g) < 0.2
+            means2d.grad[rows] = torch.tensor([float("nan"), float("inf")])
         seen = (torch.rand(views, n, generator=g) < 0.7).float()
         contribution = torch.rand(views, n, generator=g).mul(4).round() / 4 * seen
         nothing = torch.zeros(views, 1, 1, 1)
-        DensityControl(self.cloud).after_backward(
-            Rasterized(nothing, nothing, nothing, means2d, seen * 3, contribution), 64, 64
-        )
+        out = Rasterized(nothing, nothing, nothing, means2d, seen * 3, contribution)
+        DensityControl(self.cloud).after_backward(out, 64, 64)
 
     @rule(
         seed=SEEDS, threshold=st.sampled_from([0.0, 1e-6, 1e-3, 1e9]),
@@ -106,14 +94,8 @@ class CloudSequence(RuleBasedStateMachine):
     )  # fmt: skip
     def densify(self, seed: int, threshold: float, split: float, faint: float, huge: float) -> None:
         self.see(seed, bad=seed % 4 == 0, views=1)
-        options = {
-            "grad_threshold": threshold,
-            "split_scale": split,
-            "min_opacity": faint,
-            "max_scale": huge,
-            "every": 1,
-        }
-        self._round(budget=None, densify=options)
+        options = {"grad_threshold": threshold, "split_scale": split, "every": 1}
+        self._round(densify=options | {"min_opacity": faint, "max_scale": huge})
 
     @rule(
         budget=st.sampled_from([64, 65, 80, 400]),
@@ -143,19 +125,16 @@ class CloudSequence(RuleBasedStateMachine):
         """Set parameters to extreme finite values."""
         CloudSequence.steps += 1
         values, g = getattr(self.cloud, name), torch.Generator().manual_seed(seed)
+        extreme = EXTREMES[name][which % len(EXTREMES[name])]
         with torch.no_grad():
-            values[torch.rand(values.shape, generator=g) < share] = EXTREMES[name][
-                which % len(EXTREMES[name])
-            ]
+            values[torch.rand(values.shape, generator=g) < share] = extreme
 
     @rule()
     def resume(self) -> None:
         """Copy the state into another cloud and optimiser, as a checkpoint does."""
         CloudSequence.steps += 1
         other = GaussianCloud(self.cloud.cfg)
-        other.load_state_dict(
-            {key: value.clone() for key, value in self.cloud.state_dict().items()}
-        )
+        other.load_state_dict(copy.deepcopy(self.cloud.state_dict()))
         optimizer = torch.optim.Adam(other.parameter_groups(), lr=0.0)
         optimizer.load_state_dict(self.optimizer.state_dict())
         self.cloud, self.optimizer = other, optimizer
@@ -173,22 +152,14 @@ class CloudSequence(RuleBasedStateMachine):
     @invariant()
     def everything_fits(self) -> None:
         n, parameters = len(self.cloud), self.cloud.parameters_by_name()
+        statistics = [getattr(self.cloud, name) for name in STATISTICS]
         assert all(len(value) == n for value in parameters.values())
-        assert all(getattr(self.cloud, name).shape == (n,) for name in STATISTICS)
-        assert all(getattr(self.cloud, name).isfinite().all() for name in STATISTICS)
-        assert all(value.isfinite().all() for value in parameters.values()), (
-            "a parameter isn't finite"
-        )
-        held = [parameter for group in self.optimizer.param_groups for parameter in group["params"]]
-        mine = [
-            value
-            for value in parameters.values()
-            if value.numel() or value is not self.cloud.sh_rest
-        ]
-        assert [id(value) for value in held] == [id(value) for value in mine], (
-            "the optimiser holds stale tensors"
-        )
-        assert {id(value) for value in self.optimizer.state} <= {id(value) for value in held}
+        assert all(value.shape == (n,) and value.isfinite().all() for value in statistics)
+        assert all(v.isfinite().all() for v in parameters.values()), "a parameter isn't finite"
+        held = [id(p) for group in self.optimizer.param_groups for p in group["params"]]
+        mine = [v for v in parameters.values() if v.numel() or v is not self.cloud.sh_rest]
+        assert held == [id(value) for value in mine], "the optimiser holds stale tensors"
+        assert {id(value) for value in self.optimizer.state} <= set(held)
 
     @invariant()
     def moments_follow_their_gaussian(self) -> None:
@@ -196,23 +167,17 @@ class CloudSequence(RuleBasedStateMachine):
         assert len(ids.unique()) == len(ids), "two Gaussians with the same id"
         for value, state in self.optimizer.state.items():
             assert state["exp_avg"].shape == value.shape == state["exp_avg_sq"].shape
-            assert (state["exp_avg"].reshape(len(ids), -1) == ids[:, None]).all(), (
-                "a row of moments is misplaced"
-            )
+            rows = state["exp_avg"].reshape(len(ids), -1)
+            assert (rows == ids[:, None]).all(), "a row of moments is misplaced"
 
     def _round(
-        self,
-        *,
-        budget: Any,
-        densify: dict | None = None,
-        prune: dict | None = None,
+        self, budget: Any = None, densify: dict | None = None, prune: dict | None = None
     ) -> None:
         """Run one round of densification, pruning or both, and check its bounds."""
         CloudSequence.steps += 1
         rules, before = self.cloud.options, len(self.cloud)
-        old = {
-            name: value.detach().clone() for name, value in self.cloud.parameters_by_name().items()
-        }
+        parameters = self.cloud.parameters_by_name().items()
+        old = {name: value.detach().clone() for name, value in parameters}
         if budget == "auto":
             rates = {group["name"]: group["lr"] for group in self.optimizer.param_groups}
             old["logit_opacities"] -= DECAY * rates["logit_opacities"]
@@ -223,9 +188,8 @@ class CloudSequence(RuleBasedStateMachine):
         self.changes.clear()
         DensityControl(self.cloud).after_step(self.optimizer, 5)
         assert min(before, rules.min_gaussians) <= len(self.cloud), "below the floor"
-        assert len(self.cloud) <= (before if densify is None else rules.max_gaussians), (
-            "above the cap"
-        )
+        cap = before if densify is None else rules.max_gaussians
+        assert len(self.cloud) <= cap, "above the cap"
         for change in self.changes:
             self._check_change(change, old)
 
@@ -236,13 +200,10 @@ class CloudSequence(RuleBasedStateMachine):
         stays = ~change.is_new
         assert (change.parents[stays].diff() > 0).all(), "the order changed"
         for name, value in self.cloud.parameters_by_name().items():
-            assert torch.equal(value.detach()[stays], old[name][change.parents[stays]]), (
-                f"{name} of a Gaussian that stays changed"
-            )
+            kept = old[name][change.parents[stays]]
+            assert torch.equal(value.detach()[stays], kept), f"{name} of one that stays changed"
         for state in self.optimizer.state.values():
-            assert (state["exp_avg"][change.is_new] == 0).all() and (
-                state["exp_avg_sq"][change.is_new] == 0
-            ).all()
+            assert all((state[key][change.is_new] == 0).all() for key in ("exp_avg", "exp_avg_sq"))
         self._mark(change.is_new)
 
     def _record_changes(self) -> None:

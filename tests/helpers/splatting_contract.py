@@ -1,5 +1,6 @@
-"""The contract of every kernel, as a class of tests to subclass: the float64 specification, on
-ordinary and extreme clouds.
+"""The contract of every kernel, as a class of tests to subclass: the float64 specification on
+ordinary and extreme clouds, empty views, uses of autograd. ``tests/stability/test_rasteriser.py``
+has the limits of numbers, order and transparency for every backend.
 """
 
 import math
@@ -8,40 +9,42 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from torch.utils.checkpoint import checkpoint
 
 from tests.helpers.splatting_draws import BACKGROUND, compare, draw, repeatable
-from tests.helpers.splatting_limits_contract import LimitsContract
 from tests.helpers.splatting_scenes import (
     NAMES,
     NO_CUTOFFS,
     SINGLE,
-    Cloud,
     cameras,
+    cotangents,
+    equal,
     error,
     extreme_cloud,
     front_camera,
     one_gaussian,
     random_cloud,
     rasterize,
+    require_backward_twice_adds_up,
     run,
-    stacks_on_one_pixel,
     trimmed_error,
 )
 
+TWO_BACKGROUNDS = torch.tensor([[0.1, 0.2, 0.3], [0.9, 0.8, 0.7]])
+TILTED = torch.tensor([[0.9, 0.2, 0.1, 0.4]], dtype=torch.float64)
 
-class KernelContract(LimitsContract):
+
+def single(*size: int, views: int = 1) -> tuple:
+    """Return cameras in float32, and the size."""
+    return *cameras(views, *size, dtype=torch.float32), *size
+
+
+class KernelContract:
     """Subclass this with a fixture ``backend`` that returns the name of a backend."""
 
-    @pytest.mark.parametrize("width, height", [(1, 1), (1, 7), (17, 33), (31, 16), (67, 2)])
-    def test_sizes_that_are_no_multiple_of_a_tile(self, backend, width, height):
-        compare(
-            backend,
-            random_cloud(60, seed=width),
-            cameras(2, width, height),
-            width,
-            height,
-            BACKGROUND,
-        )
+    @pytest.mark.parametrize("size", [(1, 1), (1, 7), (17, 33), (31, 16), (67, 2)])
+    def test_sizes_that_are_no_multiple_of_a_tile(self, backend, size):
+        compare(backend, random_cloud(60, seed=size[0]), cameras(2, *size), *size, BACKGROUND)
 
     @pytest.mark.parametrize(
         "options",
@@ -53,11 +56,7 @@ class KernelContract(LimitsContract):
             {"alpha_max": 0.6, "absgrad": True},
             {"stop": 0.2},
             NO_CUTOFFS,
-            {
-                "near": 2.9,
-                "far": 3.2,
-                "background": torch.tensor([[0.1, 0.2, 0.3], [0.9, 0.8, 0.7]]),
-            },
+            {"near": 2.9, "far": 3.2, "background": TWO_BACKGROUNDS},
         ],
         ids=str,
     )
@@ -68,11 +67,10 @@ class KernelContract(LimitsContract):
     def test_the_backgrounds_gradient_where_there_is_nothing_else(self, backend, downsample):
         """Most tiles have no Gaussian; a loss of alpha alone doesn't depend on the background."""
         cloud = random_cloud(3, seed=2, size=0.02).to(torch.float32).leaves()
-        width, height = 150 * downsample, 90 * downsample
-        camera = cameras(2, width, height, dtype=torch.float32)
         background = torch.tensor(BACKGROUND.tolist(), requires_grad=True)
         options = {"background": background, "backend": backend, "downsample": downsample}
-        out = rasterize(*cloud, *camera, width, height, **options)
+        view = single(150 * downsample, 90 * downsample, views=2)
+        out = rasterize(*cloud, *view, **options)
         upstream = torch.rand(out.image.shape, generator=torch.Generator().manual_seed(0))
         (found,) = torch.autograd.grad(out.image, background, upstream, retain_graph=True)
         expected = ((1 - out.alpha.detach().double()) * upstream).sum((0, 1, 2))
@@ -106,53 +104,33 @@ class KernelContract(LimitsContract):
 
     def test_thousands_of_gaussians_on_hundreds_of_tiles(self, backend):
         """Against the torch backend in float64, which is exact and many times faster than the
-        specification.
+        specification, but for pixels in which two depths, or an alpha and its threshold, changed
+        places.
         """
         cloud, camera = random_cloud(8000, seed=5, size=0.02), cameras(2, 160, 144)
         truth = run(cloud, *camera, 160, 144, BACKGROUND, backend="torch")
         ours = draw(backend, cloud, camera, 160, 144, BACKGROUND)
-        for name in (
-            "image",
-            "alpha",
-            "depth",
-        ):  # pixels in which two depths, or an alpha and its threshold, changed places
-            assert (
-                trimmed_error(
-                    getattr(ours.out, name).flatten(0, 2), getattr(truth.out, name).flatten(0, 2)
-                )
-                < 2e-6
-            ), name
+        for name in ("image", "alpha", "depth"):
+            pictures = (getattr(drawn.out, name).flatten(0, 2) for drawn in (ours, truth))
+            assert trimmed_error(*pictures) < 2e-6, name
         for name in NAMES:
             assert trimmed_error(ours.grads[name], truth.grads[name]) < SINGLE, name
 
     @pytest.mark.parametrize("channels", [1, 2, 5])
     @pytest.mark.parametrize("per_view", [False, True])
     def test_channels_shared_or_per_view(self, backend, channels, per_view):
-        cloud = random_cloud(40, seed=2, channels=channels)
+        g = torch.Generator().manual_seed(0)
+        cloud, background = random_cloud(40, seed=2, channels=channels), torch.rand(channels)
         if per_view:
-            cloud = cloud._replace(
-                colors=torch.rand(
-                    3, 40, channels, generator=torch.Generator().manual_seed(0), dtype=torch.float64
-                )
-            )
-        compare(
-            backend,
-            cloud,
-            cameras(3, 14, 10),
-            14,
-            10,
-            torch.rand(channels, generator=torch.Generator().manual_seed(1)),
-        )
+            colors = torch.rand(3, 40, channels, generator=g, dtype=torch.float64)
+            cloud = cloud._replace(colors=colors)
+        compare(backend, cloud, cameras(3, 14, 10), 14, 10, background)
 
-    def test_a_gaussian_with_one_bad_channel_is_in_no_group_of_channels(self, backend):
+    def test_absgrad_of_five_channels_of_which_one_is_bad(self, backend):
         cloud = random_cloud(30, seed=3, channels=5)
+        compare(backend, cloud, cameras(1, 14, 10), 14, 10, absgrad=True)
         cloud.colors[4, 4] = math.nan
         compare(backend, cloud, cameras(1, 14, 10), 14, 10)
-
-    def test_absgrad_of_five_channels_is_exact(self, backend):
-        compare(
-            backend, random_cloud(30, seed=3, channels=5), cameras(1, 14, 10), 14, 10, absgrad=True
-        )
 
     @repeatable
     @given(seed=st.integers(0, 10**6), n=st.integers(1, 60), antialias=st.booleans())
@@ -161,20 +139,19 @@ class KernelContract(LimitsContract):
         finite, and the image is correct.
 
         Some opacities are alpha_min itself, so whole images depend on one rounding; either outcome
-        is correct.
+        is correct. One alpha on the other side of alpha_min = 1/1024 moves a pixel by that times
+        the range of colours, 3.
         """
-        cloud, camera = extreme_cloud(seed, n), cameras(2, 37, 13)
-        ours = draw(backend, cloud, camera, 37, 13, antialias=antialias, camera_gradient=True)
+        cloud, view = extreme_cloud(seed, n), (cameras(2, 37, 13), 37, 13)
+        ours = draw(backend, cloud, *view, antialias=antialias, camera_gradient=True)
         assert all(x.isfinite().all() for x in (*ours.out, *ours.grads.values()))
         options = {"antialias": antialias, "backend": "reference"}
         with torch.no_grad():
             truths = [
-                rasterize(*cloud, *camera, 37, 13, alpha_min=x / 1024, **options).image
+                rasterize(*cloud, *view[0], 37, 13, alpha_min=x / 1024, **options).image
                 for x in (1 - 1e-5, 1, 1 + 1e-5)
             ]
         distance = torch.stack([(ours.out.image - truth).abs() for truth in truths]).amin(0)
-        # One alpha on the other side of alpha_min = 1/1024 moves a pixel by that times the range of
-        # colours, 3.
         assert distance.max() < 3 / 1024 and (distance > 1e-4).float().mean() < 5e-3
 
     @repeatable
@@ -190,109 +167,131 @@ class KernelContract(LimitsContract):
         """Any size and shape. A few pixels may fall on the other side of a threshold, so the median
         error is tested.
         """
-        cloud, camera = (
-            random_cloud(n, seed, size=size, stretch=stretch),
-            cameras(1 + seed % 3, width, height),
-        )
-        ours, truth = (
-            draw(backend, cloud, camera, width, height),
-            run(cloud, *camera, width, height, backend="reference"),
-        )
+        cloud = random_cloud(n, seed, size=size, stretch=stretch)
+        camera = cameras(1 + seed % 3, width, height)
+        ours = draw(backend, cloud, camera, width, height)
+        truth = run(cloud, *camera, width, height, backend="reference")
         assert (ours.out.image - truth.out.image).abs().max() < 2 / 1024
-        largest = max(
-            (grad.abs().max() for grad in truth.grads.values() if grad.numel()), default=0
-        )
+        largest = max((g.abs().max() for g in truth.grads.values() if g.numel()), default=0)
         for name in NAMES:
             distance = (ours.grads[name] - truth.grads[name]).abs().flatten()
             assert n == 0 or distance.median() <= SINGLE * largest, name
 
-    def test_needles_and_discs(self, backend):
-        """Every combination of scales 1e-8 .. 1e4 and five rotations, one at a time: within 2e-5 of
-        float64 (stability.md A1).
-        """
-        steps = torch.tensor([1e-8, 1e-4, 1e-2, 1.0, 1e2, 1e4], dtype=torch.float64)
-        scales = torch.cartesian_prod(steps, steps, steps).repeat_interleave(5, 0)
-        quats = (
-            torch.randn(5, 4, generator=torch.Generator().manual_seed(2)).double().repeat(216, 1)
-        )
-        one = one_gaussian((0.1, -0.2, 2.0), 1.0, 0.8)
-        camera, worst = front_camera(16, 16, 20.0), 0.0
-        with torch.no_grad():
-            for i in range(0, len(scales), 3):
-                cloud = one._replace(scales=scales[i : i + 1], quats=quats[i : i + 1])
-                single = [x.to(torch.float32) for x in (*cloud, *camera)]
-                alphas = (
-                    rasterize(*single, 16, 16, alpha_min=1e-5, backend=backend).alpha,
-                    rasterize(*cloud, *camera, 16, 16, alpha_min=1e-5, backend="reference").alpha,
-                )
-                worst = max(worst, (alphas[0] - alphas[1]).abs().max().item())
-        assert worst < 2e-5
-
     def test_gradient_of_a_needle(self, backend):
         """1000 : 1 at an angle. The determinant of its covariance cancels in float32 unless it is
-        factored.
+        factored. A needle's edge moves by its length times any error of the angle.
         """
-        cloud = one_gaussian((0.02, -0.03, 2.0), (0.5, 5e-4, 5e-4), 0.7)._replace(
-            quats=torch.tensor([[0.9, 0.2, 0.1, 0.4]], dtype=torch.float64)
-        )
-        # 1e-3 is the bar of stability.md A1: a needle's edge moves by its length times any error of
-        # the angle.
+        cloud = one_gaussian((0.02, -0.03, 2.0), (0.5, 5e-4, 5e-4), 0.7)._replace(quats=TILTED)
         compare(backend, cloud, front_camera(64, 64, 200.0), 64, 64, tolerance=1e-3, alpha_min=1e-5)
 
     @pytest.mark.parametrize("slope", [0.99, 1.29, 1.31, 5.0])
     def test_gradient_beyond_the_edge_of_the_image(self, backend, slope):
         """Inside and outside the clamp of the Jacobian, whose gradient keeps its z-term."""
-        cloud = one_gaussian((2 * slope * 0.8, 0.1, 2.0), (1.5, 0.8, 0.4), 0.7)._replace(
-            quats=torch.tensor([[0.9, 0.2, 0.1, 0.4]], dtype=torch.float64)
-        )
-        compare(backend, cloud, front_camera(32, 32, 20.0), 32, 32, alpha_min=1e-6)
+        cloud = one_gaussian((2 * slope * 0.8, 0.1, 2.0), (1.5, 0.8, 0.4), 0.7)
+        camera = front_camera(32, 32, 20.0)
+        compare(backend, cloud._replace(quats=TILTED), camera, 32, 32, alpha_min=1e-6)
 
-    def test_ten_thousand_gaussians_on_one_pixel(self, backend):
-        camera = front_camera(3, 3, 4.0)
-        for stack in stacks_on_one_pixel():
-            truth, ours = (
-                run(stack, *camera, 3, 3, backend="reference"),
-                draw(backend, stack, camera, 3, 3),
-            )
-            assert error(ours.out.image, truth.out.image) < 1e-5
-            for name in ("scales", "opacities", "colors", "means"):
-                # Sums of up to ten thousand terms in float32; the bar of stability.md A1.
-                assert trimmed_error(ours.grads[name], truth.grads[name]) < 1e-4, name
+    @pytest.mark.parametrize("absgrad", [False, True])
+    @pytest.mark.parametrize("scale", [1, 2])
+    def test_nothing_to_see_is_the_background_bit_for_bit(self, backend, absgrad, scale):
+        away = random_cloud(5)._replace(means=torch.full((5, 3), 100.0).double())
+        options = {"downsample": scale, "absgrad": absgrad, "camera_gradient": True}
+        for cloud in (random_cloud(0), away):
+            out, grads = draw(backend, cloud, cameras(2, 10, 8), 10, 8, BACKGROUND, **options)
+            expected = BACKGROUND.expand(2, 8 // scale, 10 // scale, 3)
+            assert torch.equal(out.image, expected) and (out.alpha == 0).all()
+            assert all((grads[name] == 0).all() for name in (*NAMES, "viewmats", "means2d"))
+            for name, leaf in zip(NAMES, cloud, strict=True):
+                assert grads[name].shape == leaf.shape
+            assert error(grads["background"], cotangents(out)[0].sum((0, 1, 2))) < 1e-6
 
-    def test_the_gaussian_that_crosses_the_stop_counts(self, backend):
-        cloud = Cloud(*(x.repeat(4, *[1] * (x.dim() - 1)) for x in one_gaussian(scale=10.0)))
-        cloud = cloud._replace(opacities=torch.tensor([0.9, 0.905, 0.99, 0.5], dtype=torch.float64))
-        ours = draw(backend, cloud, front_camera(1, 1, 1.0), 1, 1)
-        assert ours.out.alpha.item() == pytest.approx(1 - 0.1 * 0.095 * 0.01, abs=1e-6)
-        assert ours.out.contribution[0, 3] == 0
+    def test_views_are_independent(self, backend):
+        cloud, (viewmats, Ks) = random_cloud(400, seed=3), cameras(4, 40, 24)
+        batch = draw(backend, cloud, (viewmats, Ks), 40, 24).out
+        for view in range(4):
+            camera = viewmats[view : view + 1], Ks[view : view + 1]
+            alone = draw(backend, cloud, camera, 40, 24).out
+            for ours, other in zip(batch, alone, strict=True):
+                assert torch.equal(ours[view], other[0])
 
-    def test_equal_depths_are_drawn_by_index(self, backend):
-        """64 Gaussians in one plane: the first is in front, for any permutation."""
-        cloud = Cloud(
-            *(x.repeat(64, *[1] * (x.dim() - 1)) for x in one_gaussian(scale=1.0, opacity=0.9))
-        )
-        colors = torch.rand(64, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-        for seed in range(3):
-            order = torch.randperm(64, generator=torch.Generator().manual_seed(seed))
-            compare(backend, cloud._replace(colors=colors[order]), front_camera(8, 8, 4.0), 8, 8)
+    @pytest.mark.parametrize("channels", [2, 3])
+    def test_gradients_may_come_in_any_layout(self, backend, channels):
+        """As from a convolution: the operation after the render decides the memory layout of its
+        gradient.
+        """
+        cloud, view = random_cloud(50, seed=14).to(torch.float32), single(14, 12, views=2)
+        cloud = cloud._replace(colors=cloud.colors[:, :channels])
+        weights, grads = torch.randn(2, 12, 14, channels), []
+        for layout in ((0, 1, 2, 3), (0, 2, 3, 1), (0, 3, 2, 1)):
+            leaves = cloud.leaves()
+            image = rasterize(*leaves, *view, backend=backend).image
+            product = image.permute(layout).contiguous() * weights.permute(layout).contiguous()
+            product.sum().backward()
+            grads.append([leaf.grad for leaf in leaves])
+        for others in grads[1:]:
+            assert all(torch.equal(a, b) for a, b in zip(grads[0], others, strict=True))
 
-    def test_depth_order_is_exact(self, backend):
-        """Depths one float apart, and over twenty orders of magnitude."""
-        depths = torch.tensor([2.0], dtype=torch.float32).repeat(40)
-        for i in range(1, 40):
-            depths[i] = (
-                torch.nextafter(depths[i - 1], torch.tensor(3.0)) if i < 20 else depths[i - 1] * 3
-            )
-        means = torch.stack([torch.zeros(40), torch.zeros(40), depths], 1).double()
-        order = torch.randperm(40, generator=torch.Generator().manual_seed(0))
-        cloud = random_cloud(40, seed=1)._replace(
-            means=means[order], scales=means[order][:, 2:].repeat(1, 3) * 0.2
-        )
-        truth, ours = (
-            run(c, *(x.to(c.means.dtype) for x in front_camera(4, 4, 3.0)), 4, 4, backend=b)
-            for c, b in ((cloud, "reference"), (cloud.to(torch.float32), backend))
-        )
-        assert (
-            error(ours.out.image, truth.out.image) < 1e-5
-            and error(ours.out.depth, truth.out.depth) < 1e-5
-        )
+    def test_what_is_not_read_of_a_camera_does_not_matter(self, backend):
+        cloud, (viewmats, Ks) = random_cloud(30, seed=15), cameras(1, 12, 12)
+        viewmats[:, 3] = Ks[:, 2] = Ks[:, 0, 1] = math.nan
+        compare(backend, cloud, (viewmats, Ks), 12, 12)
+
+    def test_several_forwards_before_their_backwards(self, backend):
+        """Each graph owns what its backward pass needs, for any order of calls."""
+        clouds = [random_cloud(n, seed=n).to(torch.float32) for n in (300, 40, 900)]
+        *camera, width, height = single(70, 40, views=2)
+        alone = [draw(backend, cloud, camera, width, height) for cloud in clouds]
+        leaves = [cloud.leaves() for cloud in clouds]
+        outs = [rasterize(*cloud, *camera, width, height, backend=backend) for cloud in leaves]
+        for i in (1, 2, 0):
+            out = outs[i]
+            torch.autograd.backward([out.image, out.alpha, out.depth], cotangents(out))
+        for cloud, expected in zip(leaves, alone, strict=True):
+            for name, leaf in zip(NAMES, cloud, strict=True):
+                assert torch.equal(leaf.grad, expected.grads[name])
+
+    def test_hooks_on_saved_tensors_may_replace_them(self, backend):
+        """As checkpointing and offloading do: what the kernel kept is recomputed."""
+        cloud, camera = random_cloud(30, seed=13), cameras(1, 40, 12)
+        plain = draw(backend, cloud, camera, 40, 12)
+        with torch.autograd.graph.saved_tensors_hooks(torch.clone, lambda x: x):
+            hooked = draw(backend, cloud, camera, 40, 12)
+        assert equal(plain, hooked)
+
+    @pytest.mark.parametrize("use_reentrant", [False, True])
+    def test_checkpointing(self, backend, use_reentrant):
+        """Without reentrance, each saved tensor may be read once."""
+
+        def gradients(run):
+            cloud = random_cloud(30, seed=13).to(torch.float32).leaves()
+            background = BACKGROUND.to(torch.float32).expand(1, 3).clone().requires_grad_()
+            run(*cloud, background).square().sum().backward()
+            return [leaf.grad for leaf in (*cloud, background)]
+
+        def image(*tensors):
+            options = {"background": tensors[-1], "backend": backend}
+            return rasterize(*tensors[:-1], *single(40, 12), **options).image
+
+        again = gradients(lambda *x: checkpoint(image, *x, use_reentrant=use_reentrant))
+        assert all(torch.equal(a, b) for a, b in zip(again, gradients(image), strict=True))
+
+    def test_backward_twice_adds_up(self, backend):
+        cloud, camera = random_cloud(30, seed=11).to(torch.float32).leaves(), single(12, 12)[:2]
+        require_backward_twice_adds_up(cloud, camera, backend, exact=True)
+
+    def test_absgrad_is_zero_without_a_gradient(self, backend):
+        """A loss may ignore a render."""
+        cloud = random_cloud(5).to(torch.float32).leaves()
+        out = rasterize(*cloud, *single(12, 12, views=2), backend=backend, absgrad=True)
+        assert torch.equal(out.means2d.absgrad, torch.zeros(2, 5, 2))
+
+    @pytest.mark.parametrize("names", [("image",), ("alpha",), ("depth",), ("image", "depth")])
+    def test_pictures_without_a_gradient_count_as_zero(self, backend, names):
+        cloud = random_cloud(50, seed=12).to(torch.float32)
+        sparse, full = cloud.leaves(), cloud.leaves()
+        for leaves, parts in ((sparse, names), (full, ("image", "alpha", "depth"))):
+            out = rasterize(*leaves, *single(40, 12), backend=backend)
+            losses = (getattr(out, part).square().sum() * (part in names) for part in parts)
+            sum(losses).backward()
+        for a, b in zip(sparse, full, strict=True):
+            assert a.grad is None or torch.equal(a.grad, b.grad)
