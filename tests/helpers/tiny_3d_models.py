@@ -6,13 +6,12 @@ for any latents, and the body's joints and limbs are at a person's positions.
 """
 
 import itertools
-import json
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from tests.helpers.tiny_models import _byte_vocabulary
+from tests.helpers.tiny_models import _byte_vocabulary, write_json
 
 FEATURES = 24
 """Of the tiny CLIP."""
@@ -22,8 +21,7 @@ SHAPE_HALF_SIDES = np.array([0.2, 0.3, 0.5])
 """Of the octahedron that the tiny Shap-E draws, in its own space."""
 
 
-# --------------------------------------------------------------------------------------------------
-# CLIP
+# ---- CLIP ----------------------------------------------------------------------------------------
 
 
 def clip(folder: Path, seed: int = 0) -> Path:
@@ -35,17 +33,12 @@ def clip(folder: Path, seed: int = 0) -> Path:
     torch.manual_seed(seed)
     config = CLIPConfig(
         text_config=_clip_text_config().to_dict(),
-        vision_config={
-            "image_size": IMAGE_SIZE,
-            "patch_size": 8,
-            "hidden_size": 32,
-            "intermediate_size": 48,
-            "num_hidden_layers": 1,
-            "num_attention_heads": 2,
-            "projection_dim": FEATURES,
-        },
+        vision_config=dict(
+            image_size=IMAGE_SIZE, patch_size=8, hidden_size=32, intermediate_size=48,
+            num_hidden_layers=1, num_attention_heads=2, projection_dim=FEATURES,
+        ),
         projection_dim=FEATURES,
-    )
+    )  # fmt: skip
     CLIPModel(config).save_pretrained(folder)
     _tokenizer(folder)
     return folder
@@ -55,37 +48,22 @@ def _clip_text_config():
     from transformers import CLIPTextConfig
 
     vocabulary = _byte_vocabulary()
-    return CLIPTextConfig(
-        vocab_size=len(vocabulary),
-        hidden_size=32,
-        intermediate_size=48,
-        num_hidden_layers=2,
-        num_attention_heads=2,
-        projection_dim=FEATURES,
-        bos_token_id=vocabulary["<|startoftext|>"],
-        eos_token_id=vocabulary["<|endoftext|>"],
-    )
+    ends = {"bos": vocabulary["<|startoftext|>"], "eos": vocabulary["<|endoftext|>"]}
+    sizes = {"hidden_size": 32, "intermediate_size": 48, "projection_dim": FEATURES}
+    sizes |= {"num_hidden_layers": 2, "num_attention_heads": 2, "vocab_size": len(vocabulary)}
+    return CLIPTextConfig(**sizes, **{f"{name}_token_id": value for name, value in ends.items()})
 
 
 def _tokenizer(folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "vocab.json").write_text(
-        json.dumps(_byte_vocabulary(), ensure_ascii=False), encoding="utf-8"
-    )
+    write_json(folder / "vocab.json", _byte_vocabulary())
     (folder / "merges.txt").write_text("#version: 0.2\nf o\nfo x</w>\n", encoding="utf-8")
-    special = {
-        "bos_token": "<|startoftext|>",
-        "eos_token": "<|endoftext|>",
-        "unk_token": "<|endoftext|>",
-        "pad_token": "<|endoftext|>",
-    }
-    (folder / "tokenizer_config.json").write_text(
-        json.dumps(special | {"model_max_length": 77, "tokenizer_class": "CLIPTokenizer"})
-    )
+    special = dict.fromkeys(("eos_token", "unk_token", "pad_token"), "<|endoftext|>")
+    special |= {"bos_token": "<|startoftext|>", "model_max_length": 77}
+    write_json(folder / "tokenizer_config.json", special | {"tokenizer_class": "CLIPTokenizer"})
 
 
-# --------------------------------------------------------------------------------------------------
-# Shap-E
+# ---- Shap-E --------------------------------------------------------------------------------------
 
 
 def shap_e(folder: Path, seed: int = 0) -> Path:
@@ -98,12 +76,9 @@ def shap_e(folder: Path, seed: int = 0) -> Path:
     torch.manual_seed(seed)
     _tokenizer(folder / "vocabulary")
     scheduler = HeunDiscreteScheduler(
-        beta_schedule="exp",
-        num_train_timesteps=1024,
-        prediction_type="sample",
-        use_karras_sigmas=True,
-        clip_sample=True,
-    )
+        beta_schedule="exp", num_train_timesteps=1024, prediction_type="sample",
+        use_karras_sigmas=True, clip_sample=True,
+    )  # fmt: skip
     ShapEPipeline(
         prior=shap_e_prior(),
         text_encoder=CLIPTextModelWithProjection(_clip_text_config()),
@@ -119,21 +94,11 @@ def shap_e_prior(heads: int = 2, layers: int = 2):
     from diffusers import PriorTransformer
 
     return PriorTransformer(
-        num_attention_heads=heads,
-        attention_head_dim=8,
-        num_layers=layers,
-        embedding_dim=8,
-        num_embeddings=16,
-        additional_embeddings=0,
-        time_embed_act_fn="gelu",
-        norm_in_type="layer",
-        embedding_proj_norm_type=None,
-        encoder_hid_proj_type=None,
-        added_emb_type=None,
-        time_embed_dim=4 * 8 * heads,
-        embedding_proj_dim=FEATURES,
-        clip_embed_dim=16,
-    )
+        num_attention_heads=heads, attention_head_dim=8, num_layers=layers, embedding_dim=8,
+        num_embeddings=16, additional_embeddings=0, time_embed_act_fn="gelu", norm_in_type="layer",
+        embedding_proj_norm_type=None, encoder_hid_proj_type=None, added_emb_type=None,
+        time_embed_dim=4 * 8 * heads, embedding_proj_dim=FEATURES, clip_embed_dim=16,
+    )  # fmt: skip
 
 
 def _shap_e_renderer():
@@ -143,35 +108,24 @@ def _shap_e_renderer():
     from diffusers.pipelines.shap_e.renderer import ShapERenderer
 
     names, shapes = ("nerstf.mlp.0.weight", "nerstf.mlp.1.weight"), ((8, 93), (8, 8))
-    renderer = ShapERenderer(
-        param_names=names,
-        param_shapes=shapes,
-        d_latent=8,
-        d_hidden=8,
-        n_output=12,
-        n_hidden_layers=2,
-        insert_direction_at=None,
-    )
-    steep = 200.0
-    first, bias = torch.zeros(8, 93), torch.zeros(8)
+    sizes = {"d_latent": 8, "d_hidden": 8, "n_output": 12, "n_hidden_layers": 2}
+    options = {"param_names": names, "param_shapes": shapes, "insert_direction_at": None}
+    renderer = ShapERenderer(**sizes, **options)
+    steep, first, bias, last = 200.0, torch.zeros(8, 93), torch.zeros(8), torch.zeros(12, 8)
     for axis, (centre, half) in enumerate(zip(SHAPE_CENTRE, SHAPE_HALF_SIDES, strict=True)):
         for row, sign in ((2 * axis, 1), (2 * axis + 1, -1)):
             first[row, axis], bias[row] = sign * steep / half, -sign * steep * centre / half
-    last = torch.zeros(12, 8)
     last[0, :6] = -1 / steep
-    last[4, 4], last[4, 5] = (
-        1 / steep,
-        -1 / steep,
-    )  # green rises with z, from sigmoid(-1) to sigmoid(1)
+    # green rises with z, from sigmoid(-1) to sigmoid(1)
+    last[4, 4], last[4, 5] = 1 / steep, -1 / steep
     with torch.no_grad():
         for name, weight in zip(names, (first, torch.eye(8)), strict=True):
             projection = renderer.params_proj.projections[name.replace(".", "__")]
             projection.norm.weight.zero_()  # so that the latents don't matter
             projection.norm.bias.zero_()
             projection.proj.bias.copy_(weight.flatten())
-        for layer, values in zip(
-            renderer.mlp.mlp, (bias, torch.zeros(8), torch.zeros(12)), strict=True
-        ):
+        biases = bias, torch.zeros(8), torch.zeros(12)
+        for layer, values in zip(renderer.mlp.mlp, biases, strict=True):
             layer.bias.copy_(values)
         renderer.mlp.mlp[2].weight.copy_(last)
         renderer.mlp.mlp[2].bias[0], renderer.mlp.mlp[2].bias[3] = 1.0, 2.0
@@ -230,8 +184,7 @@ def _fan(loop: list[int]) -> list[tuple[int, int, int]]:
     return [(loop[0], loop[i], loop[i + 1]) for i in range(1, len(loop) - 1)]
 
 
-# --------------------------------------------------------------------------------------------------
-# Point-E
+# ---- Point-E -------------------------------------------------------------------------------------
 
 
 def point_e(folder: Path, seed: int = 0) -> tuple[Path, Path]:
@@ -248,38 +201,17 @@ def point_e(folder: Path, seed: int = 0) -> tuple[Path, Path]:
     return base, upsampler
 
 
-# --------------------------------------------------------------------------------------------------
-# body
+# ---- body ----------------------------------------------------------------------------------------
 
 PARENTS = [-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19, 20, 21]
-JOINTS = np.array(  # metres, y up, looking along +z; the left side has x > 0
-    [
-        (0.00, 0.00, 0.00),
-        (0.07, -0.09, 0.00),
-        (-0.07, -0.09, 0.00),
-        (0.00, 0.11, -0.02),
-        (0.10, -0.47, 0.00),
-        (-0.10, -0.47, 0.00),
-        (0.00, 0.25, 0.00),
-        (0.09, -0.87, -0.04),
-        (-0.09, -0.87, -0.04),
-        (0.00, 0.30, 0.02),
-        (0.11, -0.93, 0.08),
-        (-0.11, -0.93, 0.08),
-        (0.00, 0.51, -0.02),
-        (0.08, 0.41, -0.01),
-        (-0.08, 0.41, -0.01),
-        (0.00, 0.60, 0.03),
-        (0.17, 0.45, -0.02),
-        (-0.17, 0.45, -0.02),
-        (0.43, 0.43, -0.04),
-        (-0.43, 0.43, -0.04),
-        (0.68, 0.44, -0.04),
-        (-0.68, 0.44, -0.04),
-        (0.76, 0.43, -0.05),
-        (-0.76, 0.43, -0.05),
-    ],
-)
+JOINTS = np.array([  # metres, y up, looking along +z; the left side has x > 0
+    (0.00, 0.00, 0.00), (0.07, -0.09, 0.00), (-0.07, -0.09, 0.00), (0.00, 0.11, -0.02),
+    (0.10, -0.47, 0.00), (-0.10, -0.47, 0.00), (0.00, 0.25, 0.00), (0.09, -0.87, -0.04),
+    (-0.09, -0.87, -0.04), (0.00, 0.30, 0.02), (0.11, -0.93, 0.08), (-0.11, -0.93, 0.08),
+    (0.00, 0.51, -0.02), (0.08, 0.41, -0.01), (-0.08, 0.41, -0.01), (0.00, 0.60, 0.03),
+    (0.17, 0.45, -0.02), (-0.17, 0.45, -0.02), (0.43, 0.43, -0.04), (-0.43, 0.43, -0.04),
+    (0.68, 0.44, -0.04), (-0.68, 0.44, -0.04), (0.76, 0.43, -0.05), (-0.76, 0.43, -0.05),
+])  # fmt: skip
 RING = 8
 
 
@@ -327,12 +259,8 @@ def _tube(start: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     faces = []
     for i in range(RING):
         j = (i + 1) % RING
-        faces += [
-            (i, j, RING + i),
-            (j, RING + j, RING + i),
-            (2 * RING, j, i),
-            (2 * RING + 1, RING + i, RING + j),
-        ]
+        faces += [(i, j, RING + i), (j, RING + j, RING + i)]
+        faces += [(2 * RING, j, i), (2 * RING + 1, RING + i, RING + j)]
     return np.concatenate([start + ring, end + ring, [start, end]]), np.array(faces)
 
 
@@ -340,7 +268,6 @@ def _regressor(vertices: np.ndarray) -> np.ndarray:
     """Return the regressor in which each joint is the mean of its own vertices: the centres of
     tubes that end in it.
     """
-    regressor = (np.linalg.norm(vertices[None] - JOINTS[:, None], axis=-1) < 1e-9).astype(
-        np.float64
-    )
+    distance = np.linalg.norm(vertices[None] - JOINTS[:, None], axis=-1)
+    regressor = (distance < 1e-9).astype(np.float64)
     return regressor / regressor.sum(axis=1, keepdims=True)

@@ -43,35 +43,26 @@ class Sizes(NamedTuple):
 
 
 TINY = Sizes(
-    unet={
-        "sample_size": 8,
-        "block_out_channels": (16, 32),
-        "layers_per_block": 1,
-        "down_block_types": ("CrossAttnDownBlock2D", "DownBlock2D"),
-        "up_block_types": ("UpBlock2D", "CrossAttnUpBlock2D"),
-        "attention_head_dim": (2, 4),
-        "norm_num_groups": 8,
-    },
-    vae={
-        "sample_size": 64,
-        "block_out_channels": (8, 8, 16, 16),
-        "layers_per_block": 1,
-        "norm_num_groups": 4,
-    },
+    unet=dict(
+        sample_size=8, block_out_channels=(16, 32), layers_per_block=1, norm_num_groups=8,
+        down_block_types=("CrossAttnDownBlock2D", "DownBlock2D"),
+        up_block_types=("UpBlock2D", "CrossAttnUpBlock2D"), attention_head_dim=(2, 4),
+    ),
+    vae=dict(
+        sample_size=64, block_out_channels=(8, 8, 16, 16), layers_per_block=1, norm_num_groups=4
+    ),
     text_width=TEXT_WIDTH,
-)
+)  # fmt: skip
 STABLE_DIFFUSION_2_1 = Sizes(
-    unet={
-        "sample_size": 64,
-        "block_out_channels": (320, 640, 1280, 1280),
-        "layers_per_block": 2,
-        "down_block_types": ("CrossAttnDownBlock2D",) * 3 + ("DownBlock2D",),
-        "up_block_types": ("UpBlock2D",) + ("CrossAttnUpBlock2D",) * 3,
-        "attention_head_dim": (5, 10, 20, 20),
-    },
-    vae={"sample_size": 512, "block_out_channels": (128, 256, 512, 512), "layers_per_block": 2},
+    unet=dict(
+        sample_size=64, block_out_channels=(320, 640, 1280, 1280), layers_per_block=2,
+        down_block_types=("CrossAttnDownBlock2D",) * 3 + ("DownBlock2D",),
+        up_block_types=("UpBlock2D",) + ("CrossAttnUpBlock2D",) * 3,
+        attention_head_dim=(5, 10, 20, 20),
+    ),
+    vae=dict(sample_size=512, block_out_channels=(128, 256, 512, 512), layers_per_block=2),
     text_width=1024,
-)
+)  # fmt: skip
 """The published UNet and VAE; of its text encoder, which a run frees at once, the width alone."""
 
 
@@ -123,18 +114,12 @@ def _stable_diffusion_scheduler(prediction: str) -> Any:
     """Write the published scheduler: PNDM for 2.1-base, DDIM for 2.1 (768, v-prediction)."""
     from diffusers import DDIMScheduler, PNDMScheduler
 
-    trained = {
-        "beta_start": 0.00085,
-        "beta_end": 0.012,
-        "beta_schedule": "scaled_linear",
-        "steps_offset": 1,
-        "set_alpha_to_one": False,
-    }
-    scheduler = (
-        PNDMScheduler(**trained, skip_prk_steps=True)
-        if prediction == "epsilon"
-        else DDIMScheduler(**trained, clip_sample=False)
-    )
+    trained = {"beta_start": 0.00085, "beta_end": 0.012, "beta_schedule": "scaled_linear"}
+    trained |= {"steps_offset": 1, "set_alpha_to_one": False}
+    if prediction == "epsilon":
+        scheduler = PNDMScheduler(**trained, skip_prk_steps=True)
+    else:
+        scheduler = DDIMScheduler(**trained, clip_sample=False)
     scheduler.register_to_config(prediction_type=prediction)
     return scheduler
 
@@ -150,13 +135,9 @@ def deep_floyd(folder: Path, *, seed: int = 0) -> Path:
     listen_to_text(unet)
     unet.save_pretrained(folder / "unet")
     t5_text_encoder(folder)
-    DDPMScheduler(
-        beta_schedule="squaredcos_cap_v2",
-        prediction_type="epsilon",
-        variance_type="learned_range",
-        thresholding=True,
-        sample_max_value=1.5,
-    ).save_pretrained(folder / "scheduler")
+    options = {"beta_schedule": "squaredcos_cap_v2", "prediction_type": "epsilon"}
+    options |= {"variance_type": "learned_range", "thresholding": True, "sample_max_value": 1.5}
+    DDPMScheduler(**options).save_pretrained(folder / "scheduler")
     return write_index(
         folder,
         "IFPipeline",
@@ -175,24 +156,15 @@ def _deep_floyd_unet() -> torch.nn.Module:
     from diffusers import UNet2DConditionModel
 
     return UNet2DConditionModel(
-        sample_size=16,
-        in_channels=3,
-        out_channels=6,
-        block_out_channels=(16, 32),
-        layers_per_block=1,
+        sample_size=16, in_channels=3, out_channels=6, block_out_channels=(16, 32),
+        layers_per_block=1, mid_block_type="UNetMidBlock2DSimpleCrossAttn",
         down_block_types=("ResnetDownsampleBlock2D", "SimpleCrossAttnDownBlock2D"),
-        mid_block_type="UNetMidBlock2DSimpleCrossAttn",
         up_block_types=("SimpleCrossAttnUpBlock2D", "ResnetUpsampleBlock2D"),
-        cross_attention_dim=64,
-        encoder_hid_dim=TEXT_WIDTH,
-        attention_head_dim=8,
-        addition_embed_type="text",
-        addition_embed_type_num_heads=2,
-        cross_attention_norm="group_norm",
-        resnet_time_scale_shift="scale_shift",
-        norm_num_groups=8,
-        act_fn="gelu",
-    )
+        cross_attention_dim=64, encoder_hid_dim=TEXT_WIDTH, attention_head_dim=8,
+        addition_embed_type="text", addition_embed_type_num_heads=2,
+        cross_attention_norm="group_norm", resnet_time_scale_shift="scale_shift",
+        norm_num_groups=8, act_fn="gelu",
+    )  # fmt: skip
 
 
 def listen_to_text(unet: torch.nn.Module) -> None:
@@ -219,17 +191,10 @@ def clip_text_encoder(
     vocabulary = _byte_vocabulary()
     start, end = vocabulary["<|startoftext|>"], vocabulary["<|endoftext|>"]
     config = CLIPTextConfig(
-        vocab_size=len(vocabulary),
-        hidden_size=width,
-        intermediate_size=48,
-        num_hidden_layers=2,
-        num_attention_heads=2,
-        hidden_act="gelu",
-        bos_token_id=start,
-        eos_token_id=end,
-        pad_token_id=0,
-        projection_dim=projection or 512,
-    )
+        vocab_size=len(vocabulary), hidden_size=width, intermediate_size=48, num_hidden_layers=2,
+        num_attention_heads=2, hidden_act="gelu", bos_token_id=start, eos_token_id=end,
+        pad_token_id=0, projection_dim=projection or 512,
+    )  # fmt: skip
     encoder = (CLIPTextModelWithProjection if projection else CLIPTextModel)(config)
     encoder.save_pretrained(folder / f"text_encoder{suffix}")
     _publish_clip(folder / f"text_encoder{suffix}" / "model.safetensors")
@@ -240,22 +205,11 @@ def _clip_tokenizer(tokenizer: Path, vocabulary: dict[str, int]) -> None:
     tokenizer.mkdir(parents=True)
     write_json(tokenizer / "vocab.json", vocabulary)
     (tokenizer / "merges.txt").write_text("#version: 0.2\nf o\nfo x</w>\n", encoding="utf-8")
-    special = {
-        "bos_token": "<|startoftext|>",
-        "eos_token": "<|endoftext|>",
-        "unk_token": "<|endoftext|>",
-    }
+    start, end = "<|startoftext|>", "<|endoftext|>"
+    special = {"bos_token": start, "eos_token": end, "unk_token": end}
     write_json(tokenizer / "special_tokens_map.json", special | {"pad_token": "!"})
-    write_json(
-        tokenizer / "tokenizer_config.json",
-        special
-        | {
-            "pad_token": "<|endoftext|>",
-            "model_max_length": 77,
-            "tokenizer_class": "CLIPTokenizer",
-            "do_lower_case": True,
-        },
-    )
+    special |= {"pad_token": end, "model_max_length": 77, "do_lower_case": True}
+    write_json(tokenizer / "tokenizer_config.json", special | {"tokenizer_class": "CLIPTokenizer"})
 
 
 def t5_text_encoder(folder: Path, width: int = TEXT_WIDTH, *, suffix: str = "") -> None:
@@ -271,14 +225,11 @@ def t5_text_encoder(folder: Path, width: int = TEXT_WIDTH, *, suffix: str = "") 
     tokenizer.mkdir(parents=True)
     (tokenizer / "spiece.model").write_bytes(_sentencepiece())
     special = {"eos_token": "</s>", "unk_token": "<unk>", "pad_token": "<pad>"}
-    write_json(
-        tokenizer / "tokenizer_config.json",
-        special | {"tokenizer_class": "T5Tokenizer", "model_max_length": 512, "extra_ids": 100},
-    )
+    special |= {"tokenizer_class": "T5Tokenizer", "model_max_length": 512, "extra_ids": 100}
+    write_json(tokenizer / "tokenizer_config.json", special)
     sizes = {"d_model": width, "d_kv": 8, "d_ff": 48, "num_layers": 2, "num_heads": 4}
-    config = T5Config(
-        vocab_size=200, **sizes, feed_forward_proj="gated-gelu", tie_word_embeddings=False
-    )
+    sizes |= {"vocab_size": 200, "feed_forward_proj": "gated-gelu"}
+    config = T5Config(**sizes, tie_word_embeddings=False)
     T5EncoderModel(config).save_pretrained(folder / f"text_encoder{suffix}")
 
 
@@ -311,21 +262,10 @@ def _byte_vocabulary() -> dict[str, int]:
     """Return CLIP's byte-level vocabulary with few merges: each byte, each byte at a word's end,
     two merges, start and end.
     """
-    printable = [
-        *range(ord("!"), ord("~") + 1),
-        *range(ord("¡"), ord("¬") + 1),
-        *range(ord("®"), ord("ÿ") + 1),
-    ]
-    others = [chr(256 + i) for i in range(256 - len(printable))]
-    letters = [*map(chr, printable), *others]
-    tokens = [
-        *letters,
-        *(letter + "</w>" for letter in letters),
-        "fo",
-        "fox</w>",
-        "<|startoftext|>",
-        "<|endoftext|>",
-    ]
+    printable = [i for a, b in ("!~", "¡¬", "®ÿ") for i in range(ord(a), ord(b) + 1)]
+    letters = [*map(chr, printable), *(chr(256 + i) for i in range(256 - len(printable)))]
+    tokens = [*letters, *(letter + "</w>" for letter in letters)]
+    tokens += ["fo", "fox</w>", "<|startoftext|>", "<|endoftext|>"]
     return {token: index for index, token in enumerate(tokens)}
 
 
@@ -334,24 +274,15 @@ def _sentencepiece() -> bytes:
 
     model = BytesIO()
     sentencepiece.SentencePieceTrainer.train(
-        sentence_iterator=iter([CORPUS] * 20),
-        model_writer=model,
-        vocab_size=60,
-        hard_vocab_limit=False,
-        pad_id=0,
-        eos_id=1,
-        unk_id=2,
-        bos_id=-1,
-        minloglevel=2,
-    )
+        sentence_iterator=iter([CORPUS] * 20), model_writer=model, vocab_size=60,
+        hard_vocab_limit=False, pad_id=0, eos_id=1, unk_id=2, bos_id=-1, minloglevel=2,
+    )  # fmt: skip
     return model.getvalue()
 
 
 def write_index(folder: Path, pipeline: str, **components) -> Path:
-    write_json(
-        folder / "model_index.json",
-        {"_class_name": pipeline, "_diffusers_version": "0.8.0", **components},
-    )
+    index = {"_class_name": pipeline, "_diffusers_version": "0.8.0", **components}
+    write_json(folder / "model_index.json", index)
     return folder
 
 

@@ -15,6 +15,9 @@ BACKENDS = [
 ]
 if unavailable() is None:
     BACKENDS.append("cuda")
+QUICK = [name for name in BACKENDS if name != "reference"]
+SLOW_REFERENCE = [*QUICK, pytest.param("reference", marks=pytest.mark.slow)]
+"""For tests that take the specification seconds."""
 each_backend = pytest.mark.parametrize("backend", BACKENDS)
 
 

@@ -13,6 +13,9 @@ import pytest
 from tests.stability.backends import BACKENDS, cuda_on_the_host
 from tests.stability.rows import ROWS
 from tests.stability.small_runs import EVERY_STEP, Ended, launch
+from threestudio_gaussiandreamer import register_parts
+
+register_parts()
 
 REPORT = pytest.StashKey[list]()
 

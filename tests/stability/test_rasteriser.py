@@ -16,7 +16,6 @@ from tests.helpers.splatting_scenes import (
     NAMES,
     NO_CUTOFFS,
     Cloud,
-    Run,
     cameras,
     cotangents,
     equal,
@@ -30,7 +29,7 @@ from tests.helpers.splatting_scenes import (
     run,
     stacks_on_one_pixel,
 )
-from tests.stability.backends import BACKENDS
+from tests.stability.backends import BACKENDS, QUICK, SLOW_REFERENCE
 from tests.stability.rows import row
 from tests.stability.scenes import clamped_alpha, drawn, finite, joined, pixels, seeded, stack
 from threestudio_gaussiandreamer.core.errors import UserError
@@ -41,7 +40,6 @@ from threestudio_gaussiandreamer.training.finite import require_finite
 from threestudio_gaussiandreamer.training.geometry import GaussianCloud
 
 EXACT = ["torch", "reference"]  # those that support float64
-QUICK = [name for name in BACKENDS if name != "reference"]
 THREADED = [name for name in QUICK if name != "cuda"]  # those that use torch's threads
 AROUND_THE_CLAMP = list(
     itertools.product((0.99, 1.0, 1.29, 1.3, 1.31, 5.0, 50.0), (0.01, 0.1, 1.0))
@@ -203,29 +201,43 @@ def test_opacities_near_0_and_1(backend, measured):
 
 
 @functools.cache
-def needles(**options) -> list[tuple[Cloud, Run]]:
+def needles() -> list[Cloud]:
     """Return every multiset of three scales in five rotations, which cover all orders of the axes,
-    and their float64 renders.
+    rounded to float32.
     """
     scales = itertools.combinations_with_replacement((1e-8, 1e-4, 1e-2, 1.0, 1e2, 1e4), 3)
-    found, camera = [], front_camera(16, 16, 20.0)
-    for scale, quat in itertools.product(scales, torch.randn(5, 4, generator=seeded(2)).double()):
-        cloud = one_gaussian((0.1, -0.2, 2.0), scale, 0.8)._replace(quats=quat[None])
-        cloud = rounded(cloud)
-        found.append((cloud, run(cloud, *camera, 16, 16, backend="reference", **options)))
-    return found
+    quats = torch.randn(5, 4, generator=seeded(2)).double()
+    clouds = (
+        one_gaussian((0.1, -0.2, 2.0), scale, 0.8)._replace(quats=quat[None])
+        for scale, quat in itertools.product(scales, quats)
+    )
+    return [rounded(cloud) for cloud in clouds]
+
+
+@functools.cache
+def needle_alphas() -> list[torch.Tensor]:
+    camera = front_camera(16, 16, 20.0)
+    with torch.no_grad():
+        return [rasterize(*c, *camera, 16, 16, backend="reference").alpha for c in needles()]
+
+
+@functools.cache
+def needle_gradients(**options) -> list[dict[str, torch.Tensor]]:
+    camera = front_camera(16, 16, 20.0)
+    return [run(c, *camera, 16, 16, backend="reference", **options).grads for c in needles()]
 
 
 @row("A1", "Needle, disc, scale 1e-8..1e4")
+@pytest.mark.parametrize("backend", SLOW_REFERENCE)
 def test_needles_and_discs(backend, measured):
     """The reference uses scales and quaternions rounded to float32; a pixel may fall on the other
     side of alpha_min.
     """
     worst = 0.0
-    for cloud, truth in needles():
-        alpha = draw(backend, cloud, front_camera(16, 16, 20.0), 16, 16).out.alpha.double()
-        flipped = (alpha == 0) != (truth.out.alpha == 0)
-        wrong = (alpha - truth.out.alpha).abs()
+    for cloud, truth in zip(needles(), needle_alphas(), strict=True):
+        with torch.no_grad():
+            alpha = drawn(backend, cloud, 16, 16, 20.0).alpha.double()
+        flipped, wrong = (alpha == 0) != (truth == 0), (alpha - truth).abs()
         worst = max(worst, wrong[~flipped].max().item())
         assert wrong.max() < 1.001 / 1024
     measured(worst, what="forward", at_most=2e-5)
@@ -244,12 +256,12 @@ def test_gradients_of_needles_and_discs(backend, antialias, measured):
     summation. Norms of an attribute meet it.
     """
     options = {"antialias": antialias, **NO_CUTOFFS}
-    for cloud, truth in needles(**options):
+    for cloud, truth in zip(needles(), needle_gradients(**options), strict=True):
         ours = draw(backend, cloud, front_camera(16, 16, 20.0), 16, 16, **options)
         assert finite(ours)
-        norms = {name: truth.grads[name].norm() for name in NAMES}
+        norms = {name: truth[name].norm() for name in NAMES}
         kept = [name for name in NAMES if norms[name] > 1e-6 * max(norms.values())]
-        worst = max(error(ours.grads[name], truth.grads[name]) for name in kept)
+        worst = max(error(ours.grads[name], truth[name]) for name in kept)
         measured(worst, what="gradients", at_most=1e-3)
 
 
@@ -420,6 +432,7 @@ def test_ten_thousand_on_one_pixel(backend, measured):
         measured(worst, what="gradients", at_most=1e-4)
 
 
+@pytest.mark.slow
 @row("A1", "Gradient check")
 @pytest.mark.parametrize("backend", EXACT)
 def test_gradcheck(backend, measured):
@@ -647,6 +660,7 @@ def corrupted(cloud: Cloud, name: str, rows: list[int], value: float) -> Cloud:
 
 
 @row("A1", "NaN/Inf inputs")
+@pytest.mark.parametrize("backend", SLOW_REFERENCE)
 def test_a_non_finite_gaussian_changes_no_bit_of_the_others(backend, measured):
     cloud, view, rest = random_cloud(300, seed=6), (cameras(2, 40, 24), 40, 24), torch.arange(300)
     rest = rest != 7

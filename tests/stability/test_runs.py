@@ -27,7 +27,6 @@ from tests.launch import test_shipped_configs as test_configs
 from tests.promises.commands import full_disk
 from tests.stability.rows import row
 from tests.stability.small_runs import DEMO, EVERY_STEP, Ended, launch, require_equal_ends
-from threestudio_gaussiandreamer import register_parts
 from threestudio_gaussiandreamer.core import images as pictures
 from threestudio_gaussiandreamer.core.checkpoint_file import (
     load_checkpoint,
@@ -49,8 +48,6 @@ from threestudio_gaussiandreamer.priors.smpl_fit import load_body_model
 from threestudio_gaussiandreamer.priors.weights import read_state_dict
 from threestudio_gaussiandreamer.training import system
 from threestudio_gaussiandreamer.training.system import GaussianDreamerSystem
-
-register_parts()
 
 PACKAGE = Path(threestudio_gaussiandreamer.__file__).parent
 FIVE = "trainer.max_steps=5"
