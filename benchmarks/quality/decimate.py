@@ -1,5 +1,5 @@
-"""Fewer Gaussians of a finished cloud: dB to the original, in the prune command's test views, of that
-command, of ``splat-transform --decimate`` and of the highest contributions or opacities.
+"""Fewer Gaussians of a finished cloud: dB to the original, in the test views of the prune command,
+by that command, by ``splat-transform --decimate``, and by the highest contributions or opacities.
 
     npm install @playcanvas/splat-transform    # its rows are left out where it isn't on the PATH
     python -m benchmarks.quality.decimate CLOUD.ply [--counts 10000 5000 2500 1250]"""
