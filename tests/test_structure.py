@@ -6,7 +6,7 @@ import ast
 import re
 import subprocess
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from pathlib import Path
 
 import pytest
@@ -116,29 +116,12 @@ def test_importing_the_package_is_cheap():
 # ---- texts --------------------------------------------------------------------------------------
 
 
-def in_the_locales_encoding(path: Path) -> Iterator[str]:
-    """Yield the calls of a file that read or write text without saying in which encoding."""
-    for call in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        if not isinstance(call, ast.Call) or "encoding" in {word.arg for word in call.keywords}:
-            continue
-        of_path = isinstance(call.func, ast.Attribute)
-        name = call.func.attr if of_path else getattr(call.func, "id", "")
-        modes = [*call.args[1:2], *(word.value for word in call.keywords if word.arg == "mode")]
-        binary = any("b" in str(getattr(mode, "value", "b")) for mode in modes)
-        if (
-            of_path
-            and (name == "read_text" and not call.args or name == "write_text")
-            or not of_path
-            and name == "open"
-            and not binary
-        ):
-            yield f"{named(path)}:{call.lineno}"
-
-
-def test_text_is_read_and_written_in_utf_8():
-    """Not in the locale's encoding, which differs between machines."""
-    code = sorted((ROOT / NAME).rglob("*.py"))
-    assert not [found for path in code for found in in_the_locales_encoding(path)]
+def test_ruff_finds_nothing():
+    """Short lines, no unused names, text in UTF-8 and not in the locale's encoding."""
+    pytest.importorskip("ruff")
+    command = [sys.executable, "-m", "ruff", "check", "--no-cache", "--output-format=concise"]
+    found = subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
+    assert found.returncode == 0, found.stdout
 
 
 # ---- duplicates ----------------------------------------------------------------------------------

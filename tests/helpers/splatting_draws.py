@@ -21,35 +21,15 @@ def draw(
     backend: str, cloud: Cloud, camera, width: int, height: int, background=None, **options
 ) -> Run:
     """Run forward and backward in float32."""
-    camera = [x.to(torch.float32) for x in camera]
-    return run(
-        cloud.to(torch.float32), *camera, width, height, background, backend=backend, **options
-    )
+    view = *(x.to(torch.float32) for x in camera), width, height, background
+    return run(cloud.to(torch.float32), *view, backend=backend, **options)
 
 
-def compare(
-    backend: str,
-    cloud: Cloud,
-    camera,
-    width: int,
-    height: int,
-    background=None,
-    tolerance=SINGLE,
-    **options,
-) -> Run:
+def compare(backend: str, cloud: Cloud, camera, *view, tolerance: float = SINGLE, **options) -> Run:
     """Assert that images and gradients, those of the cameras included, are within float32 rounding
-    of the specification in float64.
+    of the specification in float64; ``view`` is width, height and perhaps a background.
     """
-    truth = run(
-        cloud,
-        *camera,
-        width,
-        height,
-        background,
-        camera_gradient=True,
-        backend="reference",
-        **options,
-    )
-    ours = draw(backend, cloud, camera, width, height, background, camera_gradient=True, **options)
+    truth = run(cloud, *camera, *view, camera_gradient=True, backend="reference", **options)
+    ours = draw(backend, cloud, camera, *view, camera_gradient=True, **options)
     assert_close(ours, truth, tolerance, radii=options.get("alpha_min") != 0)
     return ours

@@ -64,9 +64,8 @@ def random_cloud(
     quats = torch.randn(n, 4, generator=g, dtype=torch.float64)
     scales = size * torch.exp(stretch * torch.randn(n, 3, generator=g, dtype=torch.float64))
     opacities = 0.05 + 0.9 * torch.rand(n, generator=g, dtype=torch.float64)
-    return Cloud(
-        means, quats, scales, opacities, torch.rand(n, channels, generator=g, dtype=torch.float64)
-    )
+    colors = torch.rand(n, channels, generator=g, dtype=torch.float64)
+    return Cloud(means, quats, scales, opacities, colors)
 
 
 EXTREMES = {
@@ -123,27 +122,19 @@ def require_backward_twice_adds_up(
 
 
 def cameras(
-    views: int,
-    width: int,
-    height: int,
-    distance: float = 3.0,
-    fov: float = 50.0,
-    dtype=torch.float64,
+    views: int, width: int, height: int, distance: float = 3.0, fov=50.0, dtype=torch.float64
 ) -> tuple[Tensor, Tensor]:
     """Return viewmats and Ks on a circle around the origin that look at it; ``fov`` vertical,
     degrees; square pixels.
     """
     focal = 0.5 * height / math.tan(math.radians(fov) / 2)
-    Ks = torch.tensor(
-        [[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], dtype=dtype
-    ).expand(views, 3, 3)
+    K = [[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]
+    Ks = torch.tensor(K, dtype=dtype).expand(views, 3, 3)
     viewmats = torch.eye(4, dtype=dtype).repeat(views, 1, 1)
     for view in range(views):
         angle, tilt = 0.3 + 2 * math.pi * view / views, 0.4
-        back = torch.tensor(
-            [math.cos(angle) * math.cos(tilt), math.sin(angle) * math.cos(tilt), math.sin(tilt)],
-            dtype=dtype,
-        )
+        along = math.cos(angle) * math.cos(tilt), math.sin(angle) * math.cos(tilt), math.sin(tilt)
+        back = torch.tensor(along, dtype=dtype)
         right = torch.linalg.cross(-back, torch.tensor([0.0, 0, 1], dtype=dtype))
         right /= right.norm()
         viewmats[view, :3, :3] = torch.stack([right, torch.linalg.cross(-back, right), -back])
@@ -179,33 +170,24 @@ def cotangents(out: Rasterized, seed: int = 1) -> tuple[Tensor, ...]:
 
 class Run(NamedTuple):
     out: Rasterized
-    grads: dict[
-        str, Tensor
-    ]  # of the five attributes, means2d, and of background and viewmats where given
+    grads: dict[str, Tensor]
+    """Of the five attributes, means2d, and of background and viewmats where given."""
 
 
 def run(
-    cloud: Cloud,
-    viewmats: Tensor,
-    Ks: Tensor,
-    width: int,
-    height: int,
-    background=None,
-    camera_gradient=False,
-    **options,
-) -> Run:
+    cloud: Cloud, viewmats: Tensor, Ks: Tensor, width: int, height: int, background=None,
+    camera_gradient=False, **options,
+) -> Run:  # fmt: skip
     """Run forward and backward in the cloud's precision with fixed cotangents."""
     dtype = cloud.means.dtype
     leaves = cloud.leaves()
     viewmats = viewmats.detach().to(dtype).requires_grad_(camera_gradient)
     background = None if background is None else background.detach().to(dtype).requires_grad_()
-    out = rasterize(
-        *leaves, viewmats, Ks.to(dtype), width, height, background=background, **options
-    )
+    view = viewmats, Ks.to(dtype), width, height
+    out = rasterize(*leaves, *view, background=background, **options)
     torch.autograd.backward([out.image, out.alpha, out.depth], cotangents(out))
-    grads = {name: leaf.grad for name, leaf in zip(NAMES, leaves, strict=True)} | {
-        "means2d": out.means2d.grad
-    }
+    inputs = zip((*NAMES, "means2d"), (*leaves, out.means2d), strict=True)
+    grads = {name: leaf.grad for name, leaf in inputs}
     if background is not None:
         grads["background"] = background.grad
     if camera_gradient:
@@ -241,12 +223,10 @@ def assert_close(ours: Run, truth: Run, tolerance: float = SINGLE, radii: bool =
         assert error(picture, true) < SINGLE or (picture - true).abs().max() < 1e-7, name
     assert not radii or torch.allclose(ours.out.radii.double(), truth.out.radii, rtol=1e-5)
     for name, grad in truth.grads.items():
-        by_gaussian = [
-            x.transpose(0, 1) if name == "means2d" else x for x in (ours.grads[name], grad)
-        ]
-        assert (
-            trimmed_error(*by_gaussian) < tolerance or (ours.grads[name] - grad).abs().max() < 1e-7
-        ), name
+        pair = ours.grads[name], grad
+        by_gaussian = [x.transpose(0, 1) if name == "means2d" else x for x in pair]
+        near = trimmed_error(*by_gaussian) < tolerance or (pair[0] - grad).abs().max() < 1e-7
+        assert near, name
     if hasattr(truth.out.means2d, "absgrad"):
         assert error(ours.out.means2d.absgrad, truth.out.means2d.absgrad) < SINGLE
 

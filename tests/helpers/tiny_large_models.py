@@ -25,19 +25,11 @@ CLIP_WIDTHS = (32, 32)
 T5_WIDTH = 96
 POOLED = 16
 """Width of the pooled embedding of each CLIP encoder."""
-MULTI_VIEW = {
-    "image_size": 8,
-    "in_channels": 4,
-    "out_channels": 4,
-    "model_channels": 32,
-    "attention_resolutions": [2, 1],
-    "num_res_blocks": 1,
-    "channel_mult": [1, 2],
-    "num_head_channels": 16,
-    "transformer_depth": 1,
-    "context_dim": 32,
-    "camera_dim": 16,
-}
+MULTI_VIEW = dict(
+    image_size=8, in_channels=4, out_channels=4, model_channels=32, attention_resolutions=[2, 1],
+    num_res_blocks=1, channel_mult=[1, 2], num_head_channels=16, transformer_depth=1,
+    context_dim=32, camera_dim=16,
+)  # fmt: skip
 """Settings of the tiny MVDream; the published ones have the same names."""
 
 
@@ -59,9 +51,8 @@ def stable_diffusion_xl(folder: Path, *, seed: int = 0, force_upcast: bool = Tru
     vae(folder, latent_channels=4, scaling_factor=0.13025, force_upcast=force_upcast)
     clip_text_encoder(folder, CLIP_WIDTHS[0])
     clip_text_encoder(folder, CLIP_WIDTHS[1], suffix="_2", projection=POOLED)
-    EulerDiscreteScheduler(
-        beta_start=0.00085, beta_end=0.012, beta_schedule="scaled_linear", steps_offset=1
-    ).save_pretrained(folder / "scheduler")
+    betas = {"beta_start": 0.00085, "beta_end": 0.012, "beta_schedule": "scaled_linear"}
+    EulerDiscreteScheduler(**betas, steps_offset=1).save_pretrained(folder / "scheduler")
     return write_index(
         folder,
         "StableDiffusionXLPipeline",
@@ -82,21 +73,17 @@ def stable_diffusion_3(folder: Path, *, seed: int = 0) -> Path:
 
     torch.manual_seed(seed)
     transformer = SD3Transformer2DModel(
-        sample_size=8,
-        patch_size=2,
-        in_channels=16,
-        num_layers=2,
-        attention_head_dim=8,
-        num_attention_heads=4,
-        joint_attention_dim=T5_WIDTH,
-        caption_projection_dim=32,
-        pooled_projection_dim=2 * POOLED,
-        out_channels=16,
-        pos_embed_max_size=12,
-    )
+        sample_size=8, patch_size=2, in_channels=16, num_layers=2, attention_head_dim=8,
+        num_attention_heads=4, joint_attention_dim=T5_WIDTH, caption_projection_dim=32,
+        pooled_projection_dim=2 * POOLED, out_channels=16, pos_embed_max_size=12,
+    )  # fmt: skip
     listen_to_text(transformer)
     transformer.save_pretrained(folder / "transformer")
-    _flow_vae_and_encoders(folder)
+    quant = {"use_quant_conv": False, "use_post_quant_conv": False}
+    vae(folder, latent_channels=16, scaling_factor=1.5305, shift_factor=0.0609, **quant)
+    for suffix, width in zip(("", "_2"), CLIP_WIDTHS, strict=True):
+        clip_text_encoder(folder, width, suffix=suffix, projection=POOLED)
+    t5_text_encoder(folder, T5_WIDTH, suffix="_3")
     FlowMatchEulerDiscreteScheduler(shift=3.0).save_pretrained(folder / "scheduler")
     clip = ["transformers", "CLIPTextModelWithProjection"]
     return write_index(
@@ -114,20 +101,6 @@ def stable_diffusion_3(folder: Path, *, seed: int = 0) -> Path:
     )
 
 
-def _flow_vae_and_encoders(folder: Path) -> None:
-    vae(
-        folder,
-        latent_channels=16,
-        scaling_factor=1.5305,
-        shift_factor=0.0609,
-        use_quant_conv=False,
-        use_post_quant_conv=False,
-    )
-    for suffix, width in zip(("", "_2"), CLIP_WIDTHS, strict=True):
-        clip_text_encoder(folder, width, suffix=suffix, projection=POOLED)
-    t5_text_encoder(folder, T5_WIDTH, suffix="_3")
-
-
 def mvdream(folder: Path, *, seed: int = 0, **settings: Any) -> Path:
     """Write a tiny MVDream in the layout of its conversion: Stable Diffusion 2.1, its UNet in
     CompVis's names with cameras, and the code of that UNet, which must not run.
@@ -142,10 +115,8 @@ def mvdream(folder: Path, *, seed: int = 0, **settings: Any) -> Path:
         file.unlink()
     tensors = {compvis_name(name, MULTI_VIEW): value for name, value in unet.state_dict().items()}
     save_file(tensors, folder / "unet" / "diffusion_pytorch_model.safetensors")
-    write_json(
-        folder / "unet" / "config.json",
-        {"_class_name": "MultiViewUNetModel"} | MULTI_VIEW | settings,
-    )
+    named = {"_class_name": "MultiViewUNetModel"}
+    write_json(folder / "unet" / "config.json", named | MULTI_VIEW | settings)
     (folder / "unet" / "mv_unet.py").write_text("raise SystemExit('this code must not run')\n")
     index = json.loads((folder / "model_index.json").read_text())
     index |= {"_class_name": "MVDreamPipeline", "unet": ["mv_unet", "MultiViewUNetModel"]}
