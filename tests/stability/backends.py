@@ -15,10 +15,23 @@ BACKENDS = [
 ]
 if unavailable() is None:
     BACKENDS.append("cuda")
-QUICK = [name for name in BACKENDS if name != "reference"]
-SLOW_REFERENCE = [*QUICK, pytest.param("reference", marks=pytest.mark.slow)]
-"""For tests that take the specification seconds."""
-each_backend = pytest.mark.parametrize("backend", BACKENDS)
+
+
+def backends_of(*too_slow: str, without: tuple[str, ...] = ()) -> list:
+    """Return the values of a parameter ``backend``; tests in emulation are slow, and those of
+    ``too_slow``.
+    """
+    marks = {name: pytest.mark.slow for name in ("cuda", *too_slow)}
+    names = (name for name in BACKENDS if name not in without)
+    return [pytest.param(name, marks=marks.get(name, ())) for name in names]
+
+
+def slow(*values) -> list:
+    """Mark values of a parameter as slow."""
+    return [pytest.param(value, marks=pytest.mark.slow) for value in values]
+
+
+each_backend = pytest.mark.parametrize("backend", backends_of())
 
 
 def cuda_on_the_host(monkeypatch: pytest.MonkeyPatch) -> None:

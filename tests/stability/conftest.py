@@ -10,7 +10,7 @@ from typing import Any, Callable, Optional
 
 import pytest
 
-from tests.stability.backends import BACKENDS, cuda_on_the_host
+from tests.stability.backends import backends_of, cuda_on_the_host
 from tests.stability.rows import ROWS
 from tests.stability.small_runs import EVERY_STEP, Ended, launch
 from threestudio_gaussiandreamer import register_parts
@@ -117,7 +117,7 @@ def pytest_generate_tests(metafunc) -> None:
     """Run a test with the argument ``backend`` with each of them, unless it names some."""
     marks = metafunc.definition.iter_markers("parametrize")
     if "backend" in metafunc.fixturenames and all("backend" not in mark.args[0] for mark in marks):
-        metafunc.parametrize("backend", BACKENDS)
+        metafunc.parametrize("backend", backends_of())
 
 
 def pytest_addoption(parser) -> None:

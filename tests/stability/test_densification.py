@@ -153,6 +153,7 @@ def test_a_trained_cloud_that_is_too_large_keeps_what_contributes(tmp_path, meas
     measured(better, "dB better than the best of 5 random choices", at_least=2.0)
 
 
+@pytest.mark.slow
 @row("A3", "Explosion")
 def test_a_first_cloud_that_is_too_large_is_thinned_evenly(measured, said):
     """Before training all Gaussians are equally opaque and equally important, and the outer ones
@@ -473,6 +474,7 @@ def test_neither_precision_nor_batch_affects_the_selection(other, absgrad, measu
     measured(len(expected ^ found), "selected differently, of 200", at_most=0)
 
 
+@pytest.mark.slow
 @row("A3", "Threshold's meaning")
 @each_gradient
 @pytest.mark.parametrize("size", [128, 256])
@@ -505,6 +507,7 @@ def test_gaussians_outside_every_view_are_never_selected(absgrad, measured):
     measured(len(chosen & set(range(50))), "of 50 selected", at_most=0)
 
 
+@pytest.mark.slow
 @row("A3", "Opacity reset")
 def test_nothing_resets_the_opacities(measured, monkeypatch):
     """There is no such option, and 35 rounds (others reset every 3000 steps) leave the opacities
@@ -523,6 +526,7 @@ def test_nothing_resets_the_opacities(measured, monkeypatch):
     measured((geometry.logit_opacities - before).abs().max(), "moved by 35 rounds", at_most=0.0)
 
 
+@pytest.mark.slow
 @row("A3", "Opacity reset")
 def test_a_reset_by_hand_is_recovered_from(measured):
     """To 0.01, after 100 steps; with an absolute error, because score distillation only acts on

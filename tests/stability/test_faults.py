@@ -25,7 +25,7 @@ from tests.helpers.splatting_scenes import (
     random_cloud,
     rasterize,
 )
-from tests.stability.backends import SLOW_REFERENCE
+from tests.stability.backends import backends_of
 from tests.stability.rows import row
 from tests.stability.scenes import (
     ball,
@@ -162,7 +162,7 @@ def test_f4_the_gaussian_that_crosses_the_stop_counts(backend, fault):
 
 
 @row("A0", "F5")
-@pytest.mark.parametrize("backend", SLOW_REFERENCE)
+@pytest.mark.parametrize("backend", backends_of("reference"))
 def test_f5_the_threshold_of_alpha(backend, fault):
     """4000 Gaussians of opacity 0.1 on a sphere, like an initial cloud. The emulation uses the
     common threshold of 1/255.

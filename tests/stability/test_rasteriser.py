@@ -29,7 +29,7 @@ from tests.helpers.splatting_scenes import (
     run,
     stacks_on_one_pixel,
 )
-from tests.stability.backends import BACKENDS, QUICK, SLOW_REFERENCE
+from tests.stability.backends import BACKENDS, backends_of
 from tests.stability.rows import row
 from tests.stability.scenes import clamped_alpha, drawn, finite, joined, pixels, seeded, stack
 from threestudio_gaussiandreamer.core.errors import UserError
@@ -40,7 +40,9 @@ from threestudio_gaussiandreamer.training.finite import require_finite
 from threestudio_gaussiandreamer.training.geometry import GaussianCloud
 
 EXACT = ["torch", "reference"]  # those that support float64
-THREADED = [name for name in QUICK if name != "cuda"]  # those that use torch's threads
+THREADED = [
+    name for name in BACKENDS if name not in ("reference", "cuda")
+]  # those that use torch's threads
 AROUND_THE_CLAMP = list(
     itertools.product((0.99, 1.0, 1.29, 1.3, 1.31, 5.0, 50.0), (0.01, 0.1, 1.0))
 )
@@ -228,7 +230,7 @@ def needle_gradients(**options) -> list[dict[str, torch.Tensor]]:
 
 
 @row("A1", "Needle, disc, scale 1e-8..1e4")
-@pytest.mark.parametrize("backend", SLOW_REFERENCE)
+@pytest.mark.parametrize("backend", backends_of("reference"))
 def test_needles_and_discs(backend, measured):
     """The reference uses scales and quaternions rounded to float32; a pixel may fall on the other
     side of alpha_min.
@@ -385,7 +387,7 @@ def test_interior_gradients_are_those_of_finite_differences(backend, measured):
 
 
 @row("A1", "Alpha cap and threshold, gradient discontinuity")
-@pytest.mark.parametrize("backend", QUICK)
+@pytest.mark.parametrize("backend", backends_of(without=("reference",)))
 def test_few_pixels_cross_the_threshold(backend, measured):
     """3000 faint Gaussians move by 1e-4 pixels, ten times; a pixel that crosses the threshold
     changes by more than half of alpha_min.
@@ -660,7 +662,7 @@ def corrupted(cloud: Cloud, name: str, rows: list[int], value: float) -> Cloud:
 
 
 @row("A1", "NaN/Inf inputs")
-@pytest.mark.parametrize("backend", SLOW_REFERENCE)
+@pytest.mark.parametrize("backend", backends_of("reference"))
 def test_a_non_finite_gaussian_changes_no_bit_of_the_others(backend, measured):
     cloud, view, rest = random_cloud(300, seed=6), (cameras(2, 40, 24), 40, 24), torch.arange(300)
     rest = rest != 7

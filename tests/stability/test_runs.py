@@ -25,6 +25,7 @@ from omegaconf import OmegaConf, open_dict
 import threestudio_gaussiandreamer
 from tests.launch import test_shipped_configs as test_configs
 from tests.promises.commands import full_disk
+from tests.stability.backends import slow
 from tests.stability.rows import row
 from tests.stability.small_runs import DEMO, EVERY_STEP, Ended, launch, require_equal_ends
 from threestudio_gaussiandreamer.core import images as pictures
@@ -192,6 +193,7 @@ def test_a_full_disk_in_the_middle_of_a_run(tmp_path, monkeypatch, measured):
     measured("named error, exit code 2, earlier file intact, no temporary")
 
 
+@pytest.mark.slow
 @row("A5", "Disk full, read-only")
 @pytest.mark.parametrize(
     "hook", ["ensure_cloud", "score", "on_test_start", "on_test_epoch_end", "export"]
@@ -373,8 +375,9 @@ def require_resumed_equal(tmp_path, ended, whole, measured) -> None:
 
 
 @row("A5", "Ctrl-C / SIGTERM")
-@pytest.mark.parametrize("name, code, step", [("INT", 130, 3), ("TERM", 143, 2), ("HUP", 129, 4)])
-def test_a_signal_at_a_random_step(name, code, step, whole, tmp_path, monkeypatch, measured):
+@pytest.mark.parametrize("stop", [("TERM", 143, 2), *slow(("INT", 130, 3), ("HUP", 129, 4))])
+def test_a_signal_at_a_random_step(stop, whole, tmp_path, monkeypatch, measured):
+    name, code, step = stop
     with monkeypatch.context() as patch:
         at_step(patch, step, lambda _: os.kill(os.getpid(), getattr(signal, f"SIG{name}")))
         ended = launch(tmp_path, FIVE)
@@ -385,6 +388,7 @@ def test_a_signal_at_a_random_step(name, code, step, whole, tmp_path, monkeypatc
     require_resumed_equal(tmp_path, ended, whole, measured)
 
 
+@pytest.mark.slow
 @row("A5", "Ctrl-C / SIGTERM")
 def test_a_signal_while_views_are_validated(whole, tmp_path, monkeypatch, measured):
     """The checkpoint of that step is written once the views are done."""
@@ -600,6 +604,7 @@ def test_every_option_of_every_part_misspelt_is_refused_with_the_right_one(measu
     measured(len(failed), unit, what=what, at_most=0)
 
 
+@pytest.mark.slow
 @row("A5", "Wrong config keys")
 def test_every_accepted_key_is_read(measured):
     read, classes = test_configs.names_that_are_read(), test_configs.config_classes()
@@ -632,15 +637,18 @@ PROMPTS = [
     "1984", "yes", "null", "it's: 3", "[a]", "{a: b}", "a fox # red", "\\", "%s", "a\tb",
     "\u202eabc", "e\u0301", "&anchor *x", "!!python/object:os.system", "a=b", "\u2028", "٣",
 ]  # fmt: skip
+ALIKE = "x" * 4095, "🦊" * 999, "a_.._.._x", "two_lines", "a?b", "a*b", "con", "a b", "a  b"
 
 
 @row("A5", "Prompt as path / YAML")
 @pytest.mark.parametrize("source", ["command line", "prompt file"])
 def test_a_prompt_stays_text_and_its_folder_below_the_root(source, tmp_path, measured):
     """The prompt is stored verbatim, also after parsed.yaml was read back; a folder of its name can
-    be created.
+    be created. Different prompts have different ones, also those that share their first 64 bytes,
+    or become equal when forbidden characters are replaced.
     """
-    for number, prompt in enumerate(PROMPTS[:: 4 if source == "prompt file" else 1]):
+    names, prompts = set(), PROMPTS[::4] if source == "prompt file" else [*PROMPTS, *ALIKE]
+    for number, prompt in enumerate(prompts):
         given = f"system.prompt_processor.prompt={prompt}"
         if source == "prompt file":
             (tmp_path / "prompt.txt").write_bytes(prompt.encode())
@@ -658,19 +666,8 @@ def test_a_prompt_stays_text_and_its_folder_below_the_root(source, tmp_path, mea
         # with a hyphen and eight digits of its hash, unless it is the prompt itself
         slug, at, _ = folder.name.partition("@")
         assert at and len(slug.encode()) <= 64 + 9
+        names.add(slug)  # an empty prompt has no tag at all, only a time
     measured("verbatim, below the root")
-
-
-@row("A5", "Prompt as path / YAML")
-def test_different_prompts_have_different_folders(measured):
-    """Also those that share their first 64 bytes, or become equal when forbidden characters are
-    replaced.
-    """
-    alike = "x" * 4095, "🦊" * 999, "a_.._.._x", "two_lines", "a?b", "a*b", "con", "a b", "a  b"
-    prompts = [*PROMPTS, *alike]
-    given = ([f"system.prompt_processor.prompt={prompt}"] for prompt in prompts)
-    names = {load_config(DEMO, cli_args=args).trial_name.partition("@")[0] for args in given}
-    # an empty prompt has no tag at all, only a time
     shared = len(prompts) - len(names)
     measured(shared, f"of {len(prompts)}", what="prompts that share a folder", at_most=0)
 

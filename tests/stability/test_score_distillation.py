@@ -11,6 +11,7 @@ import torch
 from lightning.pytorch.plugins import MixedPrecision
 
 from tests.helpers.pixel_guidance import TowardsGrey
+from tests.stability.backends import slow
 from tests.stability.rows import row
 from tests.stability.scenes import orbit, seeded, started
 from tests.stability.small_runs import Ended, launch, require_equal_ends
@@ -90,6 +91,7 @@ def test_bad_steps_are_counted_and_the_tenth_in_a_row_ends_the_run(tmp_path, mon
     measured("counted in the log; named error after 10")
 
 
+@pytest.mark.slow
 @row("A4", "fp16 overflow in VAE/UNet")
 @pytest.mark.parametrize("every, steps", [(14, 14), (100, 16)], ids=["checkpoint", "end"])
 def test_bad_steps_end_the_run_also_if_they_are_known_late(
@@ -131,7 +133,7 @@ def three_steps(tmp_path_factory) -> Ended:
 
 
 @row("A4", "GradScaler")
-@pytest.mark.parametrize("scale", [2.0**16, 2.0**24])
+@pytest.mark.parametrize("scale", [2.0**16, *slow(2.0**24)])
 def test_any_loss_scale_trains_the_same_bits_as_float32(
     scale, three_steps, tmp_path, monkeypatch, measured
 ):
@@ -265,7 +267,7 @@ def over_the_edge(tmp_path_factory) -> Ended:
 
 
 @row("A4", "Resume mid-schedule")
-@pytest.mark.parametrize("step", [4, 5, 6])
+@pytest.mark.parametrize("step", [5, *slow(4, 6)])
 def test_resumed_at_the_edge_of_every_schedule(step, over_the_edge, tmp_path, measured):
     """Timesteps, clip, resolution, learning rate and weight all jump from step 5 to step 6, like
     the paper's from 500 to 501.
@@ -286,12 +288,13 @@ def random_streams(tmp_path_factory) -> Ended:
 
 
 @row("A4", "RNG")
-@pytest.mark.parametrize("step", [1, 4, 8])
+@pytest.mark.parametrize("step", [4, *slow(1, 8)])
 def test_stopped_and_resumed_anywhere(step, random_streams, tmp_path, measured):
     ended = resumed(tmp_path, random_streams, step, *DENSIFYING, *EVERY_STEP)
     require_equal_ends(measured, random_streams, ended, "different")
 
 
+@pytest.mark.slow
 @row("A4", "RNG")
 @pytest.mark.parametrize("views, every", [(1, 3), (3, 1)])
 def test_validation_changes_nothing(views, every, random_streams, tmp_path, monkeypatch, measured):
@@ -522,6 +525,7 @@ def with_cameras(monkeypatch, change) -> None:
     monkeypatch.setattr(TrainCameras, "collate", changed)
 
 
+@pytest.mark.slow
 @row("A4", "Extreme cameras in a batch")
 def test_training_with_extreme_cameras_logs_each_items_gradient(tmp_path, monkeypatch, measured):
     """The whole step, with ray-cast targets, on a batch of an ordinary camera and all
@@ -543,7 +547,7 @@ def test_training_with_extreme_cameras_logs_each_items_gradient(tmp_path, monkey
 
 
 @row("A4", "Empty view in a batch")
-@pytest.mark.parametrize("empty", [(1,), (0, 1)], ids=["one", "all"])
+@pytest.mark.parametrize("empty", [(1,), *slow((0, 1))], ids=str)
 def test_an_empty_view_in_a_batch(empty, tmp_path, monkeypatch, measured):
     def turned_around(batch):
         c2w = batch["c2w"].clone()
