@@ -175,7 +175,7 @@ class CloudSequence(RuleBasedStateMachine):
     ) -> None:
         """Run one round of densification, pruning or both, and check its bounds."""
         CloudSequence.steps += 1
-        rules, before = self.cloud.options, len(self.cloud)
+        rules, before = self.cloud.cfg, len(self.cloud)
         parameters = self.cloud.parameters_by_name().items()
         old = {name: value.detach().clone() for name, value in parameters}
         if budget == "auto":

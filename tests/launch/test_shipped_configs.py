@@ -133,7 +133,9 @@ def test_the_papers_numbers_are_the_papers(tmp_path):
     cfg = loaded("gaussiandreamer.yaml", tmp_path)
     system = host.find(cfg.system_type)(cfg.system)
     geometry, data = system.geometry.cfg, cfg.data
-    assert [geometry[f"lr_{name}"] for name in ("means", "opacities", "sh", "scales", "quats")] == [
+    assert [
+        getattr(geometry, f"lr_{name}") for name in ("means", "opacities", "sh", "scales", "quats")
+    ] == [
         5e-5,
         1e-2,
         1.25e-2,

@@ -235,7 +235,7 @@ def test_very_few_keep_their_shapes(n, absgrad, measured):
         geometry = started(n, min_gaussians=1, densify=rules, prune=prune, budget=2 * n)
         training = Training(geometry)
         assert training.run(1) == [2 * n]
-        geometry.options.budget, geometry.options.densify.grad_threshold = 1, 1e9
+        geometry.cfg.budget, geometry.cfg.densify.grad_threshold = 1, 1e9
         assert training.run(1) == [max(1, int(0.8 * 2 * n))]
         shapes = geometry._shapes(len(geometry)) | {name: (len(geometry),) for name in STATISTICS}
         assert all(tuple(getattr(geometry, name).shape) == shape for name, shape in shapes.items())
@@ -444,7 +444,7 @@ def accumulated(
 
 
 def selected(geometry: GaussianCloud, threshold: float) -> set[int]:
-    geometry.options.densify.grad_threshold = threshold
+    geometry.cfg.densify.grad_threshold = threshold
     change = DensityControl(geometry).densified(1)
     return set(change.parents[change.is_new].tolist())
 

@@ -202,4 +202,4 @@ def test_a_derived_module_has_options_of_its_own():
     class Jitter(GaussianDreamerDataModule):
         Config = JitterConfig
 
-    assert Jitter({"jitter": 0.5}).options.jitter == 0.5
+    assert Jitter({"jitter": 0.5}).cfg.jitter == 0.5

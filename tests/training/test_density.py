@@ -103,7 +103,7 @@ def test_opacities_decay_only_between_the_rounds_of_auto():
         adam = torch.optim.Adam(density.cloud.parameter_groups())
         density.cloud.set_learning_rates(adam, 0, 0)
         before = density.cloud.logit_opacities.detach().clone()
-        density.options.prune.keep = 0.999  # nothing is dropped
+        density.cloud.cfg.prune.keep = 0.999  # nothing is dropped
         density.after_step(adam, step)
         fallen = before[: len(density.cloud)] - density.cloud.logit_opacities.detach()
         rate = 0.02 if decays else 0.0

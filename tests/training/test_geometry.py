@@ -157,7 +157,7 @@ def test_colours_see_the_direction_from_the_camera(sphere_points):
     seen = sh.sh_to_colors(geometry.sh, dirs)
     assert seen.max() > 1.5
     assert torch.allclose(geometry.colors(camera)[0], seen.clamp_max(1), atol=1e-6)
-    geometry.options.bound_colors = False
+    geometry.cfg.bound_colors = False
     assert torch.allclose(geometry.colors(camera)[0], seen, atol=1e-6)
 
 
@@ -171,7 +171,7 @@ def test_a_step_leaves_the_stored_colours_in_the_range_that_viewers_show(sphere_
     stored = sh.sh0_to_rgb(geometry.sh[:, 0])
     assert torch.allclose(stored, colors.clamp(0, 1).expand_as(stored), atol=1e-6)
     assert (geometry.sh_rest == 3.0).all()
-    geometry.options.bound_colors = False
+    geometry.cfg.bound_colors = False
     geometry.sh0.data[:] = sh.rgb_to_sh0(colors)
     geometry.clamp_colors()
     assert torch.allclose(sh.sh0_to_rgb(geometry.sh0[:, 0]), colors.expand_as(stored), atol=1e-6)

@@ -1,6 +1,7 @@
 """What parts need from outside is checked with all of their options, before any long work."""
 
 from dataclasses import dataclass
+from types import SimpleNamespace
 
 import pytest
 
@@ -48,13 +49,13 @@ def test_parts_that_the_system_can_not_train_are_refused(name, part, base, monke
     cfg = {"geometry_type": "gaussiandreamer-cloud", "renderer_type": "gaussiandreamer-splatting"}
     cfg |= {"guidance_type": "g", "prompt_processor_type": "p", f"{name}_type": "own"}
     with pytest.raises(UserError, match=f"{name}_type is 'own': .* derived from .*{base}"):
-        check_parts(cfg)
+        check_parts(SimpleNamespace(**cfg))
 
 
 def check(guidance_type, guidance=(), **prior):
     options = {"prompt_processor_type": "plain-prompt-processor", "prompt_processor": {}}
     cfg = options | {"guidance_type": guidance_type, "guidance": dict(guidance)}
-    preflight_parts(GaussianCloud(prior), cfg)
+    preflight_parts(GaussianCloud(prior), SimpleNamespace(**cfg))
 
 
 def test_a_guidance_gets_options_that_are_not_given():

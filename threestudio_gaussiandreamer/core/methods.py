@@ -59,8 +59,9 @@ def error_of_configure(error: Exception) -> Optional[UserError]:
     if not isinstance(error, AttributeError) or isinstance(part, type):
         return None
     found = [vars(base)["configure"] for base in type(part).__mro__ if "configure" in vars(base)]
-    names = [call.__code__.co_names for call in found if inspect.isfunction(call)]
-    # set by the configure of a base class, or a property that reads what it sets
+    codes = [call.__code__ for call in found if inspect.isfunction(call)]
+    names = [(*code.co_names, *code.co_consts) for code in codes]
+    # set by the configure of a base class, also as a buffer, or a property that reads what it sets
     missing = any(name in known for known in names[1:]) or hasattr(type(part), name or "")
     if not names or "configure" in names[0] or not missing:
         return None

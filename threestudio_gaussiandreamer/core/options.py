@@ -1,26 +1,34 @@
-"""Ranges of options, declared at the fields of a part's ``Config`` and read by one walker.
+"""Options: plain dataclasses, filled and checked once by :func:`parse_structured`.
 
     scale: float = field(default=1.0, metadata=positive())
     mode: str = field(default="fixed", metadata=one_of(MODES))
 
-:func:`check_options` checks every field, then calls ``Config.check(cfg)`` where the class has one:
-a static method for rules across fields, which raises UserError with a message that begins with the
-option's name; the walker prepends the path of the section. None is accepted where it is the default
-of a field. Every number must be representable in float32 or int64."""
+Names and types are those of the fields; ranges are declared in their metadata. A static method
+``Config.check(cfg)`` has rules across fields: it raises UserError with a message that begins with
+the option's name, to which the path of the section is prepended. None is accepted where it is the
+default of a field. Every number must be representable in float32 or int64."""
 
 import dataclasses
 import string
-from collections.abc import Callable, Collection, Mapping, Sequence
-from types import MappingProxyType, SimpleNamespace
-from typing import Any
+import types
+import typing
+from collections.abc import Callable, Collection, Mapping, MutableMapping, Sequence
+from types import MappingProxyType
+from typing import Any, Optional
 
 from .errors import UserError, unknown
+from .logs import info, warn
 from .schedule import parse_schedule, validate_schedule
 
 RULE = "option"
 """The key of a field's rule in its metadata."""
-SCHEDULE = "schedule"
-"""The key in the metadata of fields that are schedules."""
+MISSING = "???"
+"""A text that stands for a value that must be given."""
+SCALARS = {int: "a whole number", float: "a number", bool: "true or false", str: "a text"}
+SWITCHES = {
+    **dict.fromkeys(("true", "yes", "y", "on", "1"), True),
+    **dict.fromkeys(("false", "no", "n", "off", "0"), False),
+}
 FLOAT32_MAX = 3.4028234663852886e38
 FLOAT32_TINY = 1.1754943508222875e-38
 """Smallest normal float32: smaller positive options could be rounded to zero."""
@@ -100,7 +108,7 @@ def schedule(min: float = -FLOAT32_MAX, max: float = FLOAT32_MAX) -> Rule:
                 bound = f"{min:g} or more" if number < min else f"{max:g} or less"
                 raise UserError(f"{path}: expected values of {bound}, got {number:g}")
 
-    return rule(check) | {SCHEDULE: True}
+    return rule(check)
 
 
 def interval(low: float = -FLOAT32_MAX, high: float = FLOAT32_MAX, what: str = "numbers") -> Rule:
@@ -201,14 +209,164 @@ def require_representable(path: str, value: Any) -> None:
         raise UserError(f"{path}: expected a finite number that float32 can hold, got {value}")
 
 
-# -- the walker ------------------------------------------------------------------------------------
+# -- from values to options -----------------------------------------------------------------------
+
+
+def parse_structured(config_class: Any, values: Any = None, prefix: str = "") -> Any:
+    """Make the options ``config_class`` from values, and check names, types and ranges.
+
+    Args:
+        values: a mapping, or options that have been made already.
+        prefix: prepended to the names of options in messages, such as "system.geometry.".
+
+    Raises:
+        UserError: an unknown key, a value of the wrong type or out of range, or a missing one; the
+            message names the option.
+    """
+    cfg = _filled(config_class, {} if values is None else _plain(values), prefix)
+    check_options(config_class, cfg, prefix)
+    return cfg
+
+
+def _filled(config_class: Any, values: Any, prefix: str) -> Any:
+    if isinstance(values, config_class):
+        return values
+    require_mapping(prefix.rstrip("."), values)
+    drop_removed(config_class, values, prefix)
+    options = {option.name: option for option in dataclasses.fields(config_class)}
+    hints, given = typing.get_type_hints(config_class), {}
+    for key, value in values.items():
+        if key not in options:
+            raise unknown("key", key, options, prefix=prefix)
+        if callable(make := options[key].default_factory):
+            _check_table(prefix + key, value, make())
+        given[key] = _converted(prefix + key, value, hints[key])
+    try:
+        return config_class(**given)
+    except TypeError as error:
+        raise UserError(f"{config_class.__qualname__}: {error}") from error
+    except ValueError as error:  # of __post_init__
+        raise UserError(_located(str(error), prefix, options)) from error
+
+
+def _converted(path: str, value: Any, annotation: Any) -> Any:
+    """Return a value as the type of its field, to which text and whole numbers are converted."""
+    kind, inner = typing.get_origin(annotation) or annotation, typing.get_args(annotation)
+    if kind in (typing.Union, types.UnionType):
+        choices = [choice for choice in inner if choice is not type(None)]
+        is_open = value is None or len(choices) != 1
+        return value if is_open else _converted(path, value, choices[0])
+    if kind in SCALARS:
+        return _scalar(path, value, kind)
+    if kind in (list, tuple):
+        return _sequence(path, value, kind, inner)
+    if dataclasses.is_dataclass(annotation):
+        return _filled(annotation, value, f"{path}.")
+    if kind is dict:
+        require_mapping(path, value)
+    return value
+
+
+def _scalar(path: str, value: Any, kind: type) -> Any:
+    wrong = f"{path}: expected {SCALARS[kind]}, got {'null' if value is None else shown(value)}"
+    if is_list(value) or isinstance(value, Mapping) or value is None:
+        raise UserError(wrong)
+    require_representable(path, value)
+    if kind is str:
+        return str(value)
+    if kind is bool:
+        if (switch := str(value).lower()) not in SWITCHES:
+            raise UserError(wrong)
+        return SWITCHES[switch]
+    if isinstance(value, bool) or (kind is int and isinstance(value, float)):
+        raise UserError(wrong)
+    try:
+        number = kind(value)
+    except (TypeError, ValueError) as error:
+        raise UserError(wrong) from error
+    require_representable(path, number)
+    return number
+
+
+def _sequence(path: str, values: Any, kind: type, items: tuple) -> Any:
+    if not is_list(values):
+        raise UserError(f"{path}: expected a list, got {shown(values)}")
+    if kind is list:
+        annotations = items * len(values) or (Any,) * len(values)
+        return [_converted(f"{path}[{i}]", v, annotations[i]) for i, v in enumerate(values)]
+    if items and Ellipsis not in items:
+        if len(values) != len(items):
+            raise UserError(f"{path}: expected a list of {len(items)}, got {list(values)}")
+        for i, (value, annotation) in enumerate(zip(values, items, strict=True)):
+            if annotation in (int, float) and isinstance(value, str):
+                raise UserError(f"{path}[{i}]: expected {SCALARS[annotation]}, got {value!r}")
+            _converted(f"{path}[{i}]", value, annotation)
+    return tuple(values)
+
+
+def require_mapping(path: str, values: Any) -> None:
+    """Raise UserError if a section isn't a mapping."""
+    if not isinstance(values, Mapping):
+        leaf = path.rpartition(".")[2]
+        hint = f" (for none, write {leaf}: {{}})" if path else ""
+        raise UserError(f"{path or 'this'} is {shown(values)}; expected keys and values{hint}")
+
+
+def drop_removed(config_class: Any, values: MutableMapping, prefix: str = "") -> None:
+    """Drop the options that a part had in earlier versions from its section, in place.
+
+    ``Config.REMOVED`` has their names, each with the value that did nothing, or a function that
+    says whether a value did, and with what is the case now. Each that is given is named in a line,
+    a warning if it did something.
+    """
+    options = {option.name: option for option in dataclasses.fields(config_class)}
+    removed = getattr(config_class, "REMOVED", {})
+    for key in list(values):
+        if key in removed and key not in options:  # a derived part may have its own
+            neutral, now = removed[key]
+            did_nothing = neutral(values[key]) if callable(neutral) else values[key] == neutral
+            tell = info if did_nothing else warn
+            tell(f"{prefix}{key} is no option any more: {now}")
+            values.pop(key)
+        elif key in options and dataclasses.is_dataclass(options[key].type):
+            if isinstance(values[key], Mapping):
+                drop_removed(options[key].type, values[key], f"{prefix}{key}.")
+
+
+def _check_table(path: str, values: Any, default: Any) -> None:
+    """Check an option that is a dictionary by its default, which names its keys and shows their
+    types; one whose default is empty may have any.
+    """
+    if not isinstance(default, Mapping) or not default:
+        return
+    require_mapping(path, values)
+    for key, value in values.items():
+        if key not in default:
+            raise unknown("key", key, default, prefix=f"{path}.")
+        _check_table(f"{path}.{key}", value, default[key])
+        given, expected = _kind(value), _kind(default[key])
+        if None not in (given, expected) and given != expected:
+            raise UserError(f"{path}.{key}: expected {expected}, got {value!r}")
+
+
+def _kind(value: Any) -> Optional[str]:
+    kinds = {"true or false": bool, "a number": (int, float), "a text": str}
+    return next((name for name, kind in kinds.items() if isinstance(value, kind)), None)
+
+
+def _plain(value: Any) -> Any:
+    """Copy mappings and lists, also OmegaConf's, to dictionaries and lists."""
+    if isinstance(value, Mapping):
+        return {key: _plain(value[key]) for key in value}
+    if is_list(value) and not isinstance(value, tuple):
+        return [_plain(item) for item in value]
+    return value
 
 
 def check_options(config_class: type, cfg: Any, prefix: str = "") -> None:
-    """Check the options ``cfg`` against the rules that the fields of ``config_class`` declare.
+    """Check options against the rules that the fields of their dataclass declare.
 
     Args:
-        cfg: an instance of the dataclass, or OmegaConf's mapping of it.
         prefix: prepended to the names of options in messages, such as "system.geometry." or "--".
 
     Raises:
@@ -219,6 +377,8 @@ def check_options(config_class: type, cfg: Any, prefix: str = "") -> None:
         if dataclasses.is_dataclass(option.type):
             check_options(option.type, value, f"{path}.")
             continue
+        if isinstance(value, str) and value == MISSING:
+            raise UserError(f"{path}: no value is given")
         require_representable(path, value)
         if RULE in option.metadata and not (value is None and option.default is None):
             option.metadata[RULE](path, value)
@@ -233,16 +393,6 @@ def check_options(config_class: type, cfg: Any, prefix: str = "") -> None:
 def _written(name: str, prefix: str) -> str:
     """Return the name of an option as users write it: on a command line with hyphens."""
     return name.replace("_", "-") if prefix == "--" else name
-
-
-def checked_options(config_class: type, cfg: Any, prefix: str = "") -> SimpleNamespace:
-    """Check the options, see :func:`check_options`, and copy them to plain attributes.
-
-    Parts read these in every step: reading one value from OmegaConf takes up to 0.1 ms.
-    Nested sections are namespaces too, lists are lists, and schedules are parsed, for ``C``.
-    """
-    check_options(config_class, cfg, prefix)
-    return _copied_section(config_class, cfg)
 
 
 def require_defaults(
@@ -271,26 +421,6 @@ def require_defaults(
             raise UserError(
                 f"{prefix}{option.name} has no effect {reason}: leave it at {option.default}"
             )
-
-
-def _copied_section(config_class: type, cfg: Any) -> SimpleNamespace:
-    options = dataclasses.fields(config_class)
-    return SimpleNamespace(**{o.name: _copied_option(o, getattr(cfg, o.name)) for o in options})
-
-
-def _copied_option(option: dataclasses.Field, value: Any) -> Any:
-    if dataclasses.is_dataclass(option.type):
-        return _copied_section(option.type, value)
-    if SCHEDULE in option.metadata and value is not None:
-        return parse_schedule(value)
-    return _copied(value)
-
-
-def _copied(value: Any) -> Any:
-    """Copy OmegaConf's containers to lists and dictionaries."""
-    if isinstance(value, Mapping):
-        return {key: _copied(value[key]) for key in value}
-    return [_copied(item) for item in value] if is_list(value) else value
 
 
 def _located(message: str, prefix: str, names: Collection[str]) -> str:

@@ -59,7 +59,7 @@ import numpy as np
 
 from ..core.errors import UserError
 from ..core.methods import find_method, require_dataclass, require_method
-from ..core.options import Rule, check_options, each, in_range, one_of, rule
+from ..core.options import Rule, each, in_range, one_of, rule
 from ..formats.gaussian_files import FORMATS, StoredCloud, suffix_of
 from ..formats.glb import GLB_UP
 from ..formats.ply import padded_sh
@@ -128,10 +128,6 @@ class FileExporter(Exporter):
     """Set by the bundle exporter, which reads the Gaussians once for all formats."""
     drawing: Drawing = Drawing()
     """Set by the system before it calls the exporter."""
-
-    def configure(self, **parts: Any) -> None:
-        check_options(self.Config, self.cfg)
-        super().configure(**parts)
 
     def gaussians(self) -> Gaussians:
         """Return the Gaussians to export, in the world's axes; all values are finite."""
@@ -345,7 +341,6 @@ class BundleExporter(Exporter):
 
     def configure(self, **parts: Any) -> None:
         super().configure(**parts)
-        check_options(self.Config, self.cfg)
         self.parts = parts
 
     def __call__(self) -> List[ExporterOutput]:
@@ -358,7 +353,7 @@ class BundleExporter(Exporter):
         shared = functools.cache(lambda: read_gaussians(self.geometry))
 
         def outputs(name: str) -> List[ExporterOutput]:
-            exporter = find(name + SUFFIX)(options_of(name, self.cfg), **self.parts)
+            exporter = find(name + SUFFIX)(vars(options_of(name, self.cfg)), **self.parts)
             if isinstance(exporter, FileExporter):
                 exporter.shared, exporter.drawing = shared(), self.drawing
             return outputs_of(exporter)
@@ -377,9 +372,4 @@ def options_of(name: str, cfg: Any) -> Any:
     require_dataclass(exporter)
     if cfg.up is not None and "up" in exporter.Config.__dataclass_fields__:
         options = {"up": cfg.up, **options}
-    try:
-        parsed = parse_structured(exporter.Config, options)
-    except UserError as error:
-        raise UserError(f"options.{name}: {error}") from error
-    check_options(exporter.Config, parsed, f"options.{name}.")
-    return parsed
+    return parse_structured(exporter.Config, options, f"options.{name}.")

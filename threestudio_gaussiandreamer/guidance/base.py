@@ -53,7 +53,7 @@ from ..core.distributed import first_item
 from ..core.errors import UserError, unknown
 from ..core.host_copies import DelayedReads, to_device
 from ..core.methods import require_method
-from ..core.options import checked_options, in_range, interval, one_of, schedule
+from ..core.options import in_range, interval, one_of, schedule
 from ..diffusion import sds
 from ..host import BaseObject, C, find, names, parse_structured, run_seed, warn
 from .types import Batch, Latents, Noised, Residual, State, Timesteps, items_of
@@ -110,8 +110,7 @@ class ScoreDistillation(BaseObject, ABC):
             variant_class(cfg)
 
     cfg: Config
-    options: Any
-    """Of ``cfg``, as plain attributes."""
+    SECTION = "system.guidance."
     alphas_cumprod: Float[Tensor, " T"]
     """The noise schedule, float64; a subclass may set another in ``configure``."""
     evaluations: int
@@ -218,7 +217,6 @@ class ScoreDistillation(BaseObject, ABC):
     # ----------------------------------------------------------------------------------------------
 
     def configure(self) -> None:
-        self.options = checked_options(self.Config, self.cfg, "system.guidance.")
         self.alphas_cumprod = sds.sd_alphas_cumprod()
         self.evaluations, self._has_warned = 0, False
         self.variant = variant_class(self.cfg)(self.cfg.variant)
@@ -236,11 +234,11 @@ class ScoreDistillation(BaseObject, ABC):
         """Whether ``predict`` returns the unconditional score too: for classifier-free guidance, or
         since the variant needs it.
         """
-        return is_guided(self.options, self.variant)
+        return is_guided(self.cfg, self.variant)
 
     def update_step(self, epoch: int, global_step: int, on_load_weights: bool = False) -> None:
         """Evaluate the schedules at this step."""
-        self.step, options = global_step, self.options
+        self.step, options = global_step, self.cfg
         now = (epoch, global_step)
         percents = (C(p, *now) for p in (options.min_step_percent, options.max_step_percent))
         self.min_step, self.max_step = sds.step_range(*percents, len(self.alphas_cumprod))
@@ -334,7 +332,7 @@ class ScoreDistillation(BaseObject, ABC):
         Returns:
             the gradient, zero for items in which it isn't finite, and a mask of those.
         """
-        weight = sds.WEIGHTS[self.options.weighting_strategy](abar)
+        weight = sds.WEIGHTS[self.cfg.weighting_strategy](abar)
         grad = sds.per_item(weight, residual) * residual
         bad = find_bad_items(grad)
         if may_have_any(bad):
@@ -379,7 +377,7 @@ class ScoreDistillation(BaseObject, ABC):
         """Predict the noise with guidance: that of ``guidance_scale`` for items inside of
         ``guidance_interval``, none for others.
         """
-        options, count = self.options, len(self.alphas_cumprod)
+        options, count = self.cfg, len(self.alphas_cumprod)
         low, high = (share * count for share in options.guidance_interval)
         scale, rescale = options.guidance_scale, options.recon_std_rescale
         inside = None if (low, high) == (0, count) else (t >= low) & (t <= high)

@@ -207,7 +207,7 @@ class ExactScoreGuidance(ScoreDistillation):
         self._size = tuple(size)
         pictures = self.truth.pictures.planes(c2w, fovy, *size)
         _, abar = self.draw_timesteps(rgb)
-        weight = sds.WEIGHTS[self.options.weighting_strategy](abar).float()
+        weight = sds.WEIGHTS[self.cfg.weighting_strategy](abar).float()
         background, scale = background[:, 0, 0].contiguous(), (abar / (1 - abar)).sqrt().float()
         found = known_picture.known_gradient(rgb, pictures, background, scale, weight)
         # the latents' gradient is 2 weight scale (render - picture); plain numbers are faster
@@ -221,7 +221,7 @@ class ExactScoreGuidance(ScoreDistillation):
         """Return whether the score is that of one picture per item without width, of the pixels of
         renders of this size, and nothing but its weight is applied to it.
         """
-        options = self.options
+        options = self.cfg
         return (
             (options.mode, options.space, options.std) == ("view-exact", "pixel", 0)
             and self._picture_size(*size) == tuple(size)
@@ -301,7 +301,7 @@ class ExactScoreGuidance(ScoreDistillation):
         """Return sqrt(abar / (1 - abar)) (x - x_1) for mixtures of one picture without width, in
         whose score the noise cancels.
         """
-        if self.options.std or any(mixture.pictures is not None for mixture in condition):
+        if self.cfg.std or any(mixture.pictures is not None for mixture in condition):
             return None
         _, abar = self.draw_timesteps(latents)
         self._perplexity = 1.0
@@ -321,7 +321,7 @@ class ExactScoreGuidance(ScoreDistillation):
         items with the same pictures.
         """
         modes, log_prior = modes_of(mixtures)
-        options = {"std": self.options.std, "distances": modes.squared_distances(z, abar)}
+        options = {"std": self.cfg.std, "distances": modes.squared_distances(z, abar)}
         cond = denoise(z, abar, modes, log_prior=log_prior, **options)
         return cond, denoise(z, abar, modes, **options) if self.guided else None
 
@@ -330,11 +330,11 @@ class ExactScoreGuidance(ScoreDistillation):
 
     @property
     def _needs_own_view(self) -> bool:
-        return self.options.mode == "view-exact" or self.options.bank_includes_view
+        return self.cfg.mode == "view-exact" or self.cfg.bank_includes_view
 
     def _members(self, batch: dict[str, Any], count: int) -> Bool[Tensor, "B K"]:
         """Return a mask of the bank's views in the conditional mixture of each item."""
-        mode, views = self.options.mode, self.options.bank_views
+        mode, views = self.cfg.mode, self.cfg.bank_views
         if mode != "direction-bins":
             return torch.full((count, views), mode == "view-agnostic")
         bank = direction_indices(self.bank_orbit.elevation, self.bank_orbit.azimuth)
@@ -362,11 +362,11 @@ class ExactScoreGuidance(ScoreDistillation):
         return Bank.of((images * 255).round().byte(), pooled, latent)
 
     def _latent(self) -> LinearLatent:
-        return LinearLatent() if self.options.space == "pixel" else self.bank(*self._size).latent
+        return LinearLatent() if self.cfg.space == "pixel" else self.bank(*self._size).latent
 
     def _picture_size(self, height: int, width: int) -> tuple[int, int]:
         """Return the size of the compared pictures for a render of this size."""
-        return picture_size(self.options, self.guided, height, width)
+        return picture_size(self.cfg, self.guided, height, width)
 
 
 def picture_size(cfg: Any, guided: bool, height: int, width: int) -> tuple[int, int]:

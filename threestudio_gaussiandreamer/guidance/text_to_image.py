@@ -282,9 +282,8 @@ class TextToImageDistillation(ScoreDistillation):
                 network.to(memory_format=torch.channels_last)
             return prepare(network)
 
-        options = tuple(name for name in sorted(self.cfg) if name.startswith("enable_"))
-        chosen = tuple(bool(self.cfg[name]) for name in options)
-        return loaded((component, str(folder), dtype, self.device, options, chosen, *key), load)
+        chosen = sorted(name for name, on in vars(self.cfg).items() if name[:7] == "enable_" and on)
+        return loaded((component, str(folder), dtype, self.device, *chosen, *key), load)
 
     def prepare_denoiser(self, network: nn.Module) -> nn.Module:
         """Move the network that predicts the noise to its device, and apply this part's options."""
@@ -354,7 +353,7 @@ class TextToImageDistillation(ScoreDistillation):
 
     @classmethod
     def check_particle_model(cls, cfg: Any) -> None:
-        if found := [name for name in NOT_ADAPTABLE if cfg[name]]:
+        if found := [name for name in NOT_ADAPTABLE if getattr(cfg, name)]:
             raise UserError(
                 f"system.guidance.{found[0]}: vsd-variant trains a LoRA in the UNet, which needs "
                 f"the plain UNet: set {found[0]}=false"

@@ -4,11 +4,14 @@ This is the only module that selects the host. All others import these names fro
 same meaning in both hosts.
 """
 
+import dataclasses
 import os
 from collections.abc import Callable
+from typing import Any
 
 from ..core.distributed import rank
 from ..core.errors import UserError, unknown
+from ..core.options import parse_structured
 from ..core.schedule import C, validate_schedule
 from ..core.streams import derive_seed
 
@@ -38,18 +41,60 @@ def _threestudio_is_importable() -> bool:
 if _threestudio_is_importable():
     import pytorch_lightning as pl
     import threestudio
+    from omegaconf import OmegaConf
     from threestudio import debug, info, warn
-    from threestudio.models.background.base import BaseBackground
-    from threestudio.models.exporters.base import Exporter, ExporterOutput
-    from threestudio.models.geometry.base import BaseGeometry
-    from threestudio.models.materials.base import BaseMaterial
-    from threestudio.models.renderers.base import Rasterizer
-    from threestudio.systems.base import BaseLift3DSystem, BaseSystem
-    from threestudio.utils.base import BaseModule, BaseObject, Updateable
-    from threestudio.utils.config import parse_structured
+    from threestudio.models.background import base as backgrounds
+    from threestudio.models.exporters import base as exporters
+    from threestudio.models.exporters.base import ExporterOutput
+    from threestudio.models.geometry import base as geometries
+    from threestudio.models.materials import base as materials
+    from threestudio.models.renderers import base as renderers
+    from threestudio.systems import base as systems
+    from threestudio.utils import base as parts
+    from threestudio.utils.base import Updateable
     from threestudio.utils.misc import get_device, get_rank
 
     NAME = "threestudio"
+
+    class Checked:
+        """Puts checked options, an instance of ``Config``, in the place of those that threestudio's
+        base class parses.
+        """
+
+        SECTION = ""
+
+        def __init__(self, cfg: Any = None, *args: Any, **kwargs: Any) -> None:
+            given = {} if cfg is None else cfg
+            options = self.__dict__["_options"] = parse_structured(self.Config, given, self.SECTION)
+            # threestudio parses neither nested options nor those of earlier versions
+            names = [key for key, v in vars(options).items() if not dataclasses.is_dataclass(v)]
+            if OmegaConf.is_config(given):
+                given = OmegaConf.masked_copy(given, names)
+            else:
+                given = {name: given[name] for name in names if name in given}
+            super().__init__(given, *args, **kwargs)
+
+        @property
+        def cfg(self) -> Any:
+            return self._options
+
+        @cfg.setter
+        def cfg(self, parsed: Any) -> None:
+            """Ignore what threestudio has parsed."""
+
+    def _checked(host: type) -> type:
+        """Derive a class with checked options from a base class of threestudio."""
+        return type(host.__name__, (Checked, host), {"HOST": host})
+
+    BaseBackground = _checked(backgrounds.BaseBackground)
+    BaseGeometry = _checked(geometries.BaseGeometry)
+    BaseLift3DSystem = _checked(systems.BaseLift3DSystem)
+    BaseMaterial = _checked(materials.BaseMaterial)
+    BaseModule = _checked(parts.BaseModule)
+    BaseObject = _checked(parts.BaseObject)
+    BaseSystem = _checked(systems.BaseSystem)
+    Exporter = _checked(exporters.Exporter)
+    Rasterizer = _checked(renderers.Rasterizer)
 
     def run_seed() -> int:
         """Return the seed of this run, the same in all its processes; 0 if none is set."""
@@ -102,7 +147,7 @@ else:
 
     from ..core.devices import get_device
     from ..core.logs import debug, info, warn
-    from .builtin.base import BaseModule, BaseObject, Updateable, parse_structured, run_seed
+    from .builtin.base import BaseModule, BaseObject, Updateable, run_seed
     from .builtin.models import (
         BaseBackground,
         BaseGeometry,

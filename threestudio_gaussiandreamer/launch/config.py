@@ -18,9 +18,10 @@ from omegaconf.errors import OmegaConfBaseException
 
 from ..core.errors import UserError
 from ..core.files import atomic_file
+from ..core.interpolation import escape
+from ..core.options import parse_structured
 from ..core.schedule import C_max
 from ..host import find, info, names
-from ..host.typed_config import parse_structured
 from ..prompts.prompts import read_prompt
 from ..training.losses import foreign_weights
 from ..training.optimizer import foreign_arguments
@@ -96,7 +97,7 @@ def load_config(*paths: str | os.PathLike, cli_args: Sequence[str] = (), n_gpus:
     _require_mandatory(OmegaConf.to_container(merged))
     resolved = _resolve(merged)
     _zero_null_weights(resolved.get("system"))
-    cfg = parse_structured(ExperimentConfig, resolved)
+    cfg = OmegaConf.structured(parse_structured(ExperimentConfig, escape(resolved)))
     name_folders(cfg, paths)
     return cfg
 

@@ -4,23 +4,25 @@ The key ``x_type`` names the part that the section ``x`` beside it configures: `
 ``data``, ``system.geometry_type`` and ``system.geometry``, ``system.geometry.prior_type`` and
 ``system.geometry.prior``. The keys of a section are the fields of its part's ``Config``."""
 
-import dataclasses
 import inspect
 import os
 import types
 import typing
-from collections.abc import Mapping
 from typing import Any
 
 import torch
-from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
+from omegaconf import OmegaConf
 
 from ..core.errors import UserError, unknown
 from ..core.methods import require_dataclass
-from ..core.options import check_options, require_representable, shown
+from ..core.options import (
+    drop_removed,
+    parse_structured,
+    require_mapping,
+    require_representable,
+    shown,
+)
 from ..host import find, pl, validate_schedule
-from ..host.typed_config import parse_structured, without_removed
 from .live_viewer import ViewerConfig
 from .part_kinds import check_kind, find_part
 from .section_checks import check_sections
@@ -77,8 +79,7 @@ def check_config(cfg: Any) -> None:
     _check_arguments("trainer", cfg.trainer, pl.Trainer)
     _check_trainer_ranges(cfg.trainer)
     _check_strategy(cfg.trainer.get("strategy"))
-    _check_keys("viewer", cfg.viewer, ViewerConfig)
-    _typed("viewer", cfg.viewer, ViewerConfig)
+    parse_structured(ViewerConfig, cfg.viewer, "viewer.")
     check_part("data", cfg.data_type, cfg.data)
     check_part("system", cfg.system_type, cfg.system)
     _check_loss(cfg.system.get("loss"), getattr(find(cfg.system_type), "LOSSES", None))
@@ -109,93 +110,21 @@ def check_part(path: str, type_name: Any, values: Any) -> None:
         require_dataclass(part)
     except UserError as error:
         raise UserError(f"{path}_type: {error}") from error
-    _keep_only(without_removed(config_class, _mapping(path, values), f"{path}."), values)
-    _check_keys(path, values, config_class)
+    require_mapping(path, values)
+    drop_removed(config_class, values, f"{path}.")
     for key in values:  # before the part's own checks, whose messages don't name the key
         if key.endswith("_type") and key.removesuffix("_type") in values and values.get(key):
             find_part(f"{path}.{key}", values[key])
-    typed = _typed(path, values, config_class)
+    typed = vars(parse_structured(config_class, values, f"{path}."))
     for key in typed:
         section = key.removesuffix("_type")
         if section == key or section not in typed:
             continue
-        if not typed[key] and _default(config_class, key):
-            raise UserError(
-                f"{path}.{key} is empty: name a registered part, such as "
-                f"{_default(config_class, key)!r}"
-            )
+        if not typed[key] and (default := getattr(config_class, key, None)):
+            raise UserError(f"{path}.{key} is empty: name a registered part, such as {default!r}")
         if typed[key]:
             given = values.get(section)
             check_part(f"{path}.{section}", typed[key], typed[section] if given is None else given)
-
-
-def _keep_only(kept: Any, values: Any) -> None:
-    """Drop the keys that ``kept`` lacks, also from sections within."""
-    for key in list(values):
-        if key not in kept:
-            values.pop(key)
-        elif isinstance(kept[key], Mapping):
-            _keep_only(kept[key], values[key])
-
-
-def _default(config_class: type, key: str) -> Any:
-    return next(field.default for field in dataclasses.fields(config_class) if field.name == key)
-
-
-def _check_keys(path: str, values: Any, config_class: type) -> None:
-    fields = {field.name: field for field in dataclasses.fields(config_class)}
-    for key in _mapping(path, values):
-        if key not in fields:
-            raise unknown("key", key, fields, prefix=f"{path}.")
-        make = fields[key].default_factory
-        if dataclasses.is_dataclass(fields[key].type):
-            _check_keys(f"{path}.{key}", values[key], fields[key].type)
-        elif make is not dataclasses.MISSING:
-            _check_table(f"{path}.{key}", values[key], make())
-
-
-def _check_table(path: str, values: Any, default: Any) -> None:
-    """Check an option that is a dictionary by its default, which names its keys and shows their
-    types; one whose default is empty may have any.
-
-    Raises:
-        UserError: an unknown key, or a text, number or switch in place of another of these.
-    """
-    if not isinstance(default, Mapping) or not default:
-        return
-    for key, value in _mapping(path, values).items():
-        if key not in default:
-            raise unknown("key", key, default, prefix=f"{path}.")
-        _check_table(f"{path}.{key}", value, default[key])
-        given, expected = _scalar(value), _scalar(default[key])
-        if None not in (given, expected) and given != expected:
-            raise UserError(f"{path}.{key}: expected {expected}, got {value!r}")
-
-
-def _scalar(value: Any) -> typing.Optional[str]:
-    kinds = {"true or false": bool, "a number": (int, float), "a text": str}
-    return next((name for name, kind in kinds.items() if isinstance(value, kind)), None)
-
-
-def _typed(path: str, values: Any, config_class: type) -> DictConfig:
-    try:
-        cfg = parse_structured(config_class, values)
-    except UserError as error:
-        raise UserError(f"{path}.{error}") from error
-    try:
-        check_options(config_class, cfg, f"{path}.")
-    except OmegaConfBaseException as error:  # the default is "???"
-        raise UserError(f"{path}.{error.full_key or error.key}: no value is given") from error
-    return cfg
-
-
-def _mapping(path: str, values: Any) -> Any:
-    if not isinstance(values, Mapping):
-        raise UserError(
-            f"{path} is {values!r}; expected keys and values (for none, write "
-            f"{path.rpartition('.')[2]}: {{}})"
-        )
-    return values
 
 
 def _check_loss(loss: Any, known: Any) -> None:
@@ -216,7 +145,8 @@ def _check_loggers(loggers: Any) -> None:
     for name, options in (loggers or {}).items():
         if name != "wandb":
             raise unknown("key", name, ["wandb"], prefix="system.loggers.")
-        for key in _mapping(f"system.loggers.{name}", options):
+        require_mapping(f"system.loggers.{name}", options)
+        for key in options:
             if key not in LOGGER_KEYS:
                 raise unknown("key", key, LOGGER_KEYS, prefix="system.loggers.wandb.")
 
@@ -224,7 +154,8 @@ def _check_loggers(loggers: Any) -> None:
 def _check_arguments(section: str, values: Any, owner: type) -> None:
     parameters = dict(inspect.signature(owner.__init__).parameters)
     parameters.pop("self")
-    for key, value in _mapping(section, values).items():
+    require_mapping(section, values)
+    for key, value in values.items():
         if key in LAUNCHER_SETS:
             raise UserError(f"{section}.{key} is set by {LAUNCHER_SETS[key]}: remove it")
         if key not in parameters:
@@ -347,7 +278,7 @@ def _check_monitor(cfg: Any) -> None:
     logged = getattr(system, "logged", None)
     if monitor is None or logged is None:
         return
-    quantities = logged(_typed("system", cfg.system, system.Config))
+    quantities = logged(parse_structured(system.Config, cfg.system, "system."))
     if quantities is not None and monitor not in quantities | {"epoch", "step"}:
         raise unknown("checkpoint.monitor", monitor, quantities)
     if not cfg.trainer.get("log_every_n_steps", 1):

@@ -119,4 +119,6 @@ def _require_call(path: str, kind: str, part: type) -> None:
 
 def _kind_of(part: Any) -> Optional[str]:
     kinds = (kind for kind, base in KINDS.items() if isinstance(part, type))
-    return next((kind for kind in kinds if issubclass(part, KINDS[kind])), None)
+    # of threestudio's parts, the base class of threestudio
+    bases = {kind: vars(base).get("HOST", base) for kind, base in KINDS.items()}
+    return next((kind for kind in kinds if issubclass(part, bases[kind])), None)

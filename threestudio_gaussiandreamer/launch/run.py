@@ -14,8 +14,8 @@ from typing import Any, Optional
 from ..core.checkpoint_file import load_checkpoint
 from ..core.errors import UserError
 from ..core.logs import get_rank
+from ..core.options import parse_structured
 from ..host import find, info, pl, warn
-from ..host.typed_config import parse_structured
 from ..view.live import LiveView, serve_until_stopped
 from ..view.run_index import note_time, write_index
 from .callbacks import (

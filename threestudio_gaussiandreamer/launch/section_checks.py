@@ -30,7 +30,7 @@ def check_sections(cfg: Any) -> None:
     _check_view_groups(guidance, cfg.data)
     if hasattr(options, "check_render_size") and cfg.data_type in DATA:
         _check_render_sizes(options, guidance, cfg)
-    if "view_dependent_prompting" in guidance:
+    if hasattr(guidance, "view_dependent_prompting"):
         _check_prompts(guidance, cfg.system)
 
 
@@ -41,13 +41,13 @@ def check_shared_views(cfg: Any) -> None:
     data = parse_structured(find(cfg.data_type).Config, cfg.data)
     for *_, views in sizes_of_stages(data):
         require_shareable(
-            views, "data.batch_size", together=data.get("n_view", 1), processes=cfg.n_gpus
+            views, "data.batch_size", together=getattr(data, "n_view", 1), processes=cfg.n_gpus
         )
 
 
 def _check_view_groups(guidance: Any, data: Any) -> None:
     """Raise UserError unless a model that sees several views together gets them together."""
-    together, given = guidance.get("n_view", 1), data.get("n_view", 1)
+    together, given = getattr(guidance, "n_view", 1), data.get("n_view", 1)
     if together not in (1, given):
         raise UserError(
             f"data.n_view: the guidance sees {together} views of an object together, got {given}: "
@@ -73,11 +73,11 @@ def _check_prompts(guidance: Any, system: Any) -> None:
     if not (system.get("prompt_processor") or {}).get("use_perp_neg"):
         return
     refused = "system.prompt_processor.use_perp_neg: Perp-Neg compares the prompts of views"
-    if guidance.get("n_view", 1) > 1:
+    if getattr(guidance, "n_view", 1) > 1:
         raise UserError(f"{refused}, and this guidance has one prompt for all: set it to false")
     if not guidance.view_dependent_prompting:
         raise UserError(f"{refused}: set system.guidance.view_dependent_prompting=true")
-    if guidance.get("view_contrast"):
+    if getattr(guidance, "view_contrast", 0):
         raise UserError(
             "view_contrast and Perp-Neg both compare the prompts of views: set "
             "system.prompt_processor.use_perp_neg=false, or system.guidance.view_contrast=0"

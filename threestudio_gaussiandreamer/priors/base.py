@@ -26,7 +26,6 @@ from ..core.memory import count_of
 from ..core.methods import require_method
 from ..core.options import (
     Rule,
-    check_options,
     is_numbers,
     one_of,
     positive,
@@ -98,7 +97,6 @@ class Prior(BaseObject):
         cls = type(self)
         if cls.__call__ is Prior.__call__:
             require_method(cls, "generate", "prompt", "generator")
-        check_options(self.Config, self.cfg)
 
     def preflight(self) -> None:
         """Check within seconds that ``generate`` can run; called before any long work.

@@ -6,14 +6,13 @@ import json
 import math
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Optional
 
 import numpy as np
 import torch
 from jaxtyping import UInt8
-from omegaconf import OmegaConf
 
 from .. import __version__
 from ..cameras import orbit_c2w, to_opencv
@@ -73,8 +72,7 @@ def cache_key(prior: Any, prompt: str) -> str:
     """Return a digest of what the prior's output depends on: also of the files that its options
     name and of the code of its class, which may have changed between two runs.
     """
-    cfg = prior.cfg
-    options = OmegaConf.to_container(cfg) if OmegaConf.is_config(cfg) else vars(cfg)
+    options = dict(prior.cfg) if isinstance(prior.cfg, Mapping) else vars(prior.cfg)
     content = [type(prior).__module__, type(prior).__qualname__, options, prompt, run_seed()]
     content += [__version__, *_files(options), *_code(type(prior))]
     return hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()

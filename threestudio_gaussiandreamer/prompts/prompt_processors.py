@@ -40,7 +40,6 @@ from torch import Tensor
 from ..core.errors import UserError
 from ..core.extras import require_extra
 from ..core.files import existing_file, is_folder
-from ..core.options import check_options
 from ..host import BaseObject, info, parse_structured, register, register_builtin
 from ..models.embedding_cache import EmbeddingCache, require_cache_folder
 from ..models.families import STABLE_DIFFUSION_3 as SD3_FAMILY
@@ -114,6 +113,7 @@ class TextEncoderPromptProcessor(BaseObject):
         }
 
     cfg: Config
+    SECTION = "system.prompt_processor."
     components: ClassVar[tuple[str, ...]] = ("tokenizer", "text_encoder")
     family: ClassVar[Optional[Family]] = None
     """The models that this processor takes; None for any with these components."""
@@ -140,7 +140,6 @@ class TextEncoderPromptProcessor(BaseObject):
             require_cache_folder(folder)
 
     def configure(self) -> None:
-        check_options(self.Config, self.cfg, "system.prompt_processor.")
         require_extra("diffusion", "diffusers", "transformers")
         self.prompt = resolve_prompt(given_prompt(self.cfg))
         folder = find_model(

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from ..core.distributed import first_item
 from ..core.host_copies import to_device
-from ..core.options import checked_options, each, in_range, one_of, schedule
+from ..core.options import each, in_range, one_of, schedule
 from ..core.streams import generator
 from ..host import BaseBackground, C, register, run_seed
 
@@ -41,9 +41,8 @@ class FlatBackground(BaseBackground):
     cfg: Config
 
     def configure(self) -> None:
-        self.options = checked_options(self.Config, self.cfg, "system.background.")
-        color = torch.tensor(self.options.color, dtype=torch.float32)
-        if self.options.mode == "learned":
+        color = torch.tensor(self.cfg.color, dtype=torch.float32)
+        if self.cfg.mode == "learned":
             self.logit = nn.Parameter(torch.logit(color.clamp(1e-3, 1 - 1e-3)))
         else:
             self.register_buffer("fixed", color, persistent=False)
@@ -56,20 +55,20 @@ class FlatBackground(BaseBackground):
         """Return the optimiser's group of the learned colour; none for the other modes."""
         return (
             [{"params": [self.logit], "name": "background", "lr": 0.0}]
-            if self.options.mode == "learned"
+            if self.cfg.mode == "learned"
             else []
         )
 
     def set_learning_rates(self, optimizer: torch.optim.Optimizer, epoch: int, step: int) -> None:
         for group in optimizer.param_groups:
             if group.get("name") == "background":
-                group["lr"] = C(self.options.lr, epoch, step)
+                group["lr"] = C(self.cfg.lr, epoch, step)
 
     def color(self, batch_size: int) -> Float[Tensor, "B 3"]:
         """Return a colour per view, in [0, 1]; random ones are a function of (seed, step, view)."""
-        if self.options.mode == "learned":
+        if self.cfg.mode == "learned":
             return torch.sigmoid(self.logit).expand(batch_size, 3)
-        if self.options.mode == "random" and self.training:
+        if self.cfg.mode == "random" and self.training:
             first = first_item(batch_size)
             colors = [
                 torch.rand(3, generator=generator(run_seed(), "background", self.step, item))

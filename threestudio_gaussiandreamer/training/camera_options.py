@@ -74,7 +74,7 @@ class CameraConfig:
         what is asked for.
         """
         for name in LISTED:
-            values = plain(cfg[name])
+            values = getattr(cfg, name)
             if isinstance(values, list) and len(values) not in (
                 1,
                 len(cfg.resolution_milestones) + 1,
@@ -97,7 +97,7 @@ def _check_milestones(cfg: Any) -> None:
             f"resolution_milestones: expected increasing steps above 0, got {milestones}"
         )
     if milestones and not any(
-        isinstance(plain(cfg[name]), list) and len(cfg[name]) > 1
+        isinstance(getattr(cfg, name), list) and len(getattr(cfg, name)) > 1
         for name in ("height", "width", "batch_size")
     ):
         raise UserError(
@@ -134,15 +134,9 @@ def _check_memory(cfg: Any) -> None:
 def sizes_of_stages(cfg: Any) -> list[tuple[int, int, int]]:
     """Return height, width and number of the views in a step of each stage."""
     stages = range(len(cfg.resolution_milestones) + 1)
-    return list(zip(*(_per_stage(cfg[name], stages) for name in LISTED), strict=True))
+    return list(zip(*(_per_stage(getattr(cfg, name), stages) for name in LISTED), strict=True))
 
 
 def _per_stage(given: Any, stages: range) -> list[int]:
-    values = plain(given)
-    values = values if isinstance(values, list) else [values]
+    values = given if isinstance(given, (list, tuple)) else [given]
     return [values[min(i, len(values) - 1)] for i in stages]
-
-
-def plain(value: Any) -> Any:
-    """Convert an OmegaConf list to a list; return anything else as it is."""
-    return value if isinstance(value, (int, float, str)) or value is None else list(value)

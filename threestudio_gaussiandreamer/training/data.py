@@ -44,10 +44,9 @@ from torch.utils.data import DataLoader, Dataset, IterableDataset
 from .. import cameras
 from ..cameras import Orbit, OrbitRanges
 from ..core.distributed import own_rows, require_shareable
-from ..core.options import checked_options
 from ..core.streams import generator
 from ..host import Updateable, parse_structured, pl, register, register_builtin, run_seed
-from .camera_options import CameraConfig, plain
+from .camera_options import CameraConfig
 
 
 def make_batch(
@@ -99,7 +98,7 @@ class TrainCameras(IterableDataset, Updateable):
         self._views_by_size: dict[tuple[int, int], dict[str, Any]] = {}
         sizes = [
             v if isinstance(v, (list, tuple)) else [v]
-            for v in map(plain, (cfg.height, cfg.width, cfg.batch_size))
+            for v in (cfg.height, cfg.width, cfg.batch_size)
         ]
         stages = max(map(len, sizes))
         for batch_size in sizes[2]:
@@ -271,14 +270,13 @@ class GaussianDreamerDataModule(pl.LightningDataModule):
 
     def __init__(self, cfg: Any = None) -> None:
         super().__init__()
-        self.cfg = parse_structured(self.Config, cfg)
-        self.options = checked_options(self.Config, self.cfg, "data.")
+        self.cfg = parse_structured(self.Config, cfg, "data.")
 
     def setup(self, stage: str | None = None) -> None:
         if stage in (None, "fit"):
-            self.train_dataset = TrainCameras(self.options)
-        self.val_dataset = EvalCameras(self.options, "val")
-        self.test_dataset = EvalCameras(self.options, "test")
+            self.train_dataset = TrainCameras(self.cfg)
+        self.val_dataset = EvalCameras(self.cfg, "val")
+        self.test_dataset = EvalCameras(self.cfg, "test")
 
     def train_dataloader(self) -> DataLoader:
         trainer = self.trainer

@@ -29,7 +29,6 @@ from ..core.distributed import all_max, all_sum, draw_shared
 from ..core.errors import UserError
 from ..core.host_copies import to_device
 from ..core.methods import require_method
-from ..core.options import checked_options
 from ..core.streams import generator
 from ..gaussians import densify, importance
 from ..gaussians.densify import Change, Rules, Statistics
@@ -84,15 +83,14 @@ class DensityRule:
     cfg: Any
 
     def __init__(self, cloud: Any) -> None:
-        self.cloud, self.options = cloud, cloud.options
-        given = parse_structured(self.Config, cloud.cfg.density)
-        self.cfg = checked_options(self.Config, given, "system.geometry.density.")
+        self.cloud = cloud
+        self.cfg = parse_structured(self.Config, cloud.cfg.density, "system.geometry.density.")
 
     def schedule_problem(self, step: int, max_steps: int) -> Optional[str]:
         """Describe what keeps the rule from its aim between ``step`` and ``max_steps`` (-1:
         unlimited), for a warning; None if nothing does.
         """
-        if not self.options.densify.enabled and self.options.budget is None:
+        if not self.cloud.cfg.densify.enabled and self.cloud.cfg.budget is None:
             return None
         return (
             f"{type(self).__name__} reads neither system.geometry.densify nor budget: they are of "
@@ -157,23 +155,24 @@ class DensityControl(DensityRule):
     @property
     def prune_rounds(self) -> range:
         """The steps after which a round of pruning takes place."""
-        return rounds_of(self.options.prune)
+        return rounds_of(self.cloud.cfg.prune)
 
     def kept_share(self, count: int, step: int) -> float:
         """Return the fraction of ``count`` Gaussians that the round at ``step`` keeps:
         ``prune.keep``, or less if the remaining rounds couldn't meet the budget otherwise.
         """
         left = sum(later >= step for later in self.prune_rounds)
-        if self.options.budget in (None, AUTO) or not left:
-            return self.options.prune.keep
-        return min(self.options.prune.keep, (min_count(self.options) / max(count, 1)) ** (1 / left))
+        if self.cloud.cfg.budget in (None, AUTO) or not left:
+            return self.cloud.cfg.prune.keep
+        to_least = (min_count(self.cloud.cfg) / max(count, 1)) ** (1 / left)
+        return min(self.cloud.cfg.prune.keep, to_least)
 
     def pruning_at(self, step: int) -> bool:
         """Return whether the step after ``step`` finished ones is before a round of pruning, or
         between two.
         """
         rounds = self.prune_rounds
-        return bool(rounds) and rounds[0] - self.options.prune.every <= step < rounds[-1]
+        return bool(rounds) and rounds[0] - self.cloud.cfg.prune.every <= step < rounds[-1]
 
     def schedule_problem(self, step: int, max_steps: int) -> Optional[str]:
         """Describe why the rounds between ``step`` and ``max_steps`` (-1: unlimited) can't meet the
@@ -190,7 +189,11 @@ class DensityControl(DensityRule):
 
     def _limit_problem(self, step: int) -> Optional[str]:
         """Describe a cloud, which can only be a checkpoint's, that stays larger than allowed."""
-        count, limit, densify = len(self.cloud), self.options.max_gaussians, self.options.densify
+        count, limit, densify = (
+            len(self.cloud),
+            self.cloud.cfg.max_gaussians,
+            self.cloud.cfg.densify,
+        )
         if count <= limit or (densify.enabled and max(rounds_of(densify), default=0) > step):
             return None
         return (
@@ -200,14 +203,14 @@ class DensityControl(DensityRule):
         )
 
     def _densification_problem(self, step: int, end: float) -> Optional[str]:
-        if not self.options.densify.enabled:
+        if not self.cloud.cfg.densify.enabled:
             return None
-        rounds, count = rounds_of(self.options.densify), len(self.cloud)
+        rounds, count = rounds_of(self.cloud.cfg.densify), len(self.cloud)
         if not rounds:
             return f"densification has no round: {SET_ROUNDS.format('densify')}"
         if late := late_rounds("densification", "densify", rounds, end):
             return late
-        if rounds[-1] > step and count >= self.options.max_gaussians:
+        if rounds[-1] > step and count >= self.cloud.cfg.max_gaussians:
             return (
                 f"densification can only replace what it drops: there are {count} Gaussians, the "
                 "most that system.geometry.max_gaussians allows"
@@ -215,7 +218,7 @@ class DensityControl(DensityRule):
         return None
 
     def _pruning_problem(self, step: int, end: float) -> Optional[str]:
-        budget, rounds, count = self.options.budget, self.prune_rounds, len(self.cloud)
+        budget, rounds, count = self.cloud.cfg.budget, self.prune_rounds, len(self.cloud)
         if budget is None:
             return None
         if not rounds:
@@ -233,7 +236,7 @@ class DensityControl(DensityRule):
 
     def _shortage(self, remaining: list[int]) -> Optional[str]:
         """Describe why these rounds are too few for the budget; return None if they suffice."""
-        budget, keep, count = self.options.budget, self.options.prune.keep, len(self.cloud)
+        budget, keep, count = self.cloud.cfg.budget, self.cloud.cfg.prune.keep, len(self.cloud)
         if not remaining:
             return (
                 f"no round of pruning remains, so {count} Gaussians are kept instead of {budget}: "
@@ -265,8 +268,8 @@ class DensityControl(DensityRule):
         """
         if not self.samples_removal(step):
             return
-        if self.options.budget == AUTO:
-            likely = 10 ** (-0.1 * self.options.prune.likeness)
+        if self.cloud.cfg.budget == AUTO:
+            likely = 10 ** (-0.1 * self.cloud.cfg.prune.likeness)
             mean = max(float(error()), LEAST_ERROR) if error else likely
             pixels = pictures["comp_rgb"].numel()
             self.cloud.error += all_sum(torch.full_like(self.cloud.error, mean * pixels))
@@ -286,11 +289,11 @@ class DensityControl(DensityRule):
 
     def samples_removal(self, step: int) -> bool:
         """Return whether a sample of the removal error is due after ``step`` finished steps."""
-        cfg = self.options.prune
-        budget = self.options.budget
+        cfg = self.cloud.cfg.prune
+        budget = self.cloud.cfg.budget
         if budget is None or (cfg.score != "removal" and budget != AUTO):
             return False
-        if not self.pruning_at(step) or len(self.cloud) <= min_count(self.options):
+        if not self.pruning_at(step) or len(self.cloud) <= min_count(self.cloud.cfg):
             return False
         return step % max(1, round(cfg.every / importance.SAMPLES)) == 0
 
@@ -306,7 +309,7 @@ class DensityControl(DensityRule):
             loss_scale: the factor of automatic mixed precision on the gradients.
         """
         cloud = self.cloud
-        if out.means2d.grad is not None and self.options.densify.enabled:
+        if out.means2d.grad is not None and self.cloud.cfg.densify.enabled:
             pixels = out.means2d.absgrad if cloud.wants_absgrad else out.means2d.grad
             cloud.gradient_sum += all_sum(
                 densify.screen_gradients(pixels, width, height, loss_scale).sum(0)
@@ -324,10 +327,10 @@ class DensityControl(DensityRule):
             step: number of finished optimiser steps.
         """
         before, needed = len(self.cloud), None
-        if self.options.budget == AUTO and self.pruning_at(step - 1):
+        if self.cloud.cfg.budget == AUTO and self.pruning_at(step - 1):
             self.decay_opacities(optimizer)
         change = self._densify(step)
-        if self.options.budget is not None and step in self.prune_rounds:
+        if self.cloud.cfg.budget is not None and step in self.prune_rounds:
             change, needed = self._prune(step, change)
         if change is not None:
             self.cloud.apply_change(change, optimizer)
@@ -344,7 +347,7 @@ class DensityControl(DensityRule):
         """Return the change by a round of densification at ``step``; None if there is no round or
         nothing is cloned, split or dropped.
         """
-        if not self.options.densify.enabled or step not in rounds_of(self.options.densify):
+        if not self.cloud.cfg.densify.enabled or step not in rounds_of(self.cloud.cfg.densify):
             return None
         change = self.densified(step)
         self.cloud.gradient_sum.zero_()
@@ -353,14 +356,14 @@ class DensityControl(DensityRule):
 
     def densified(self, step: int) -> Change:
         """Clone, split and drop Gaussians according to the statistics."""
-        cfg, cloud = self.options.densify, self.cloud
+        cfg, cloud = self.cloud.cfg.densify, self.cloud
         rules = Rules(
             cfg.grad_threshold,
             cfg.split_scale,
             cfg.min_opacity,
             cfg.max_scale,
             self._cap(),
-            self.options.min_gaussians,
+            self.cloud.cfg.min_gaussians,
         )
         gradient = cloud.gradient_sum / cloud.gradient_count.clamp_min(1)
         return densify.densify_and_prune(
@@ -374,9 +377,9 @@ class DensityControl(DensityRule):
         """Return the largest number of Gaussians after densification: ``max_gaussians``, and with a
         budget that is a number at most the larger of it and the current number.
         """
-        if self.options.budget in (None, AUTO):
-            return self.options.max_gaussians
-        return min(self.options.max_gaussians, max(self.options.budget, len(self.cloud)))
+        if self.cloud.cfg.budget in (None, AUTO):
+            return self.cloud.cfg.max_gaussians
+        return min(self.cloud.cfg.max_gaussians, max(self.cloud.cfg.budget, len(self.cloud)))
 
     def _prune(self, step: int, first: Optional[Change]) -> tuple[Change, Optional[Need]]:
         """Prune once towards the budget.
@@ -387,15 +390,15 @@ class DensityControl(DensityRule):
         Returns:
             the combined change of the current cloud, and what ``auto`` has found.
         """
-        cloud, cfg = self.cloud, self.options.prune
+        cloud, cfg = self.cloud, self.cloud.cfg.prune
         values = cloud.parameters_by_name() if first is None else first.values
         rows = slice(None) if first is None else first.parents
         stats = importance.VisibilityStats(cloud.contribution[rows], cloud.removal[rows])
         rng = generator(run_seed(), "prune", step)
         scores = importance.importance_by(cfg.score, values["logit_opacities"], stats, rng)
         share = self.kept_share(len(scores), step)
-        count, needed = importance.next_count(len(scores), share, min_count(self.options)), None
-        if self.options.budget == AUTO:
+        count, needed = importance.next_count(len(scores), share, min_count(self.cloud.cfg)), None
+        if self.cloud.cfg.budget == AUTO:
             error = float(cloud.error)
             needed = importance.needed_count(scores, stats.removal, error, cfg.gain, cfg.keep)
             count = max(count, needed.count)
@@ -404,7 +407,7 @@ class DensityControl(DensityRule):
         return importance.keep_highest(values, scores, count, first), needed
 
     def summary(self) -> str:
-        budget, gain = self.options.budget, float(self.cloud.gain)
+        budget, gain = self.cloud.cfg.budget, float(self.cloud.gain)
         needed = (
             str(Need(len(self.cloud), gain)) if gain >= 0 else "a round would have lost too much"
         )

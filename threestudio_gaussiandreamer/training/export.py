@@ -215,7 +215,7 @@ def export_pruned(system: Any) -> None:
 
 def prune_options(system: Any) -> PruneOptions:
     """Return ``system.prune``, with the dilation and antialiasing of our renderer unless given."""
-    options, drawn = PruneOptions(**dict(system.cfg.prune)), drawing(system)
+    options, drawn = PruneOptions(**vars(system.cfg.prune)), drawing(system)
     if options.eps2d is None:
         options.eps2d = drawn.eps2d
     if options.antialias is None:

@@ -54,11 +54,9 @@ from ..core.errors import UserError
 from ..core.host_copies import DelayedReads
 from ..core.lazy_mapping import LazyMapping
 from ..core.methods import require_method
-from ..core.nested import adopt_nested
 from ..core.options import (
     at_least,
     between,
-    checked_options,
     in_range,
     one_of,
     positive,
@@ -119,7 +117,6 @@ class GaussianCloud(BaseGeometry):
         density: dict = field(default_factory=dict)
 
         def __post_init__(self) -> None:
-            adopt_nested(self)
             self.budget = as_budget(self.budget)
 
         @staticmethod
@@ -132,9 +129,9 @@ class GaussianCloud(BaseGeometry):
             check_budget(cfg)
 
     cfg: Config
+    SECTION = "system.geometry."
 
     def configure(self) -> None:
-        self.options = checked_options(self.Config, self.cfg, "system.geometry.")
         self.bands = (self.cfg.sh_degree + 1) ** 2
         self._warned, self.reads = False, DelayedReads()
         self._allocate(0)
@@ -234,7 +231,7 @@ class GaussianCloud(BaseGeometry):
                 self.means.detach()[None] - camera_positions[:, None], dim=-1
             )
             colors = sh.sh_to_unclamped_colors(self.sh, dirs)
-        return sh.bounded_colors(colors) if self.options.bound_colors else colors.clamp_min(0.0)
+        return sh.bounded_colors(colors) if self.cfg.bound_colors else colors.clamp_min(0.0)
 
     @torch.no_grad()
     def clamp_colors(self) -> None:
@@ -243,7 +240,7 @@ class GaussianCloud(BaseGeometry):
         Called after each step of the optimiser, so that what is stored and exported is in the
         range too. The bands above it add to this colour by direction and aren't changed.
         """
-        if self.options.bound_colors:
+        if self.cfg.bound_colors:
             self.sh0.clamp_(*(sh.rgb_to_sh0(bound) for bound in (0.0, 1.0)))
 
     # -- start -------------------------------------------------------------------------------------
@@ -364,12 +361,12 @@ class GaussianCloud(BaseGeometry):
     def set_learning_rates(self, optimizer: torch.optim.Optimizer, epoch: int, step: int) -> None:
         for group in optimizer.param_groups:
             if group.get("name") in LEARNING_RATES:
-                group["lr"] = C(getattr(self.options, LEARNING_RATES[group["name"]]), epoch, step)
+                group["lr"] = C(getattr(self.cfg, LEARNING_RATES[group["name"]]), epoch, step)
 
     @property
     def wants_absgrad(self) -> bool:
         """Whether densification reads absolute gradients, which the rasteriser then collects."""
-        return self.options.densify.enabled and self.options.densify.absgrad
+        return self.cfg.densify.enabled and self.cfg.densify.absgrad
 
     def apply_change(self, change: Change, optimizer: torch.optim.Optimizer) -> None:
         """Apply ``change`` to the cloud and to the rows of the optimiser's state, and reset the

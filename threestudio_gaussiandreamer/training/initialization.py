@@ -48,7 +48,7 @@ def grow_points(cloud: PointCloud, cfg: GrowConfig, ground: int = 0) -> PointClo
     if ground:
         figure, layer = cloud.split(len(cloud.points) - ground)
         return grow_points(figure, cfg).followed_by(layer)
-    options = {k: v for k, v in dict(cfg).items() if k not in ("enabled", "color_range")}
+    options = {k: v for k, v in vars(cfg).items() if k not in ("enabled", "color_range")}
     rng = numpy_generator(run_seed(), "grow")
     return grow(cloud, color_range=tuple(cfg.color_range), **options, generator=rng)
 

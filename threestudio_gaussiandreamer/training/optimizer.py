@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from typing import Any, Optional
 
 import torch
-from omegaconf import ListConfig
 
 from ..core.devices import get_device
 from ..core.errors import UserError, unknown
@@ -31,8 +30,8 @@ def make_optimizer(options: Any, groups: Groups) -> torch.optim.Optimizer:
     name = options.get("name", "Adam")
     foreign, arguments = foreign_arguments(name, DEFAULTS), options.get("args") or {}
     ours = {key: value for key, value in DEFAULTS.items() if key not in foreign}
-    given = {  # OmegaConf's lists, which checkpoints can't hold, as tuples
-        key: tuple(value) if isinstance(value, ListConfig) else value
+    given = {
+        key: tuple(value) if is_list(value) else value
         for key, value in arguments.items()
         if value is not None
     }

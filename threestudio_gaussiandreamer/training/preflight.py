@@ -21,13 +21,13 @@ def check_parts(cfg: Any) -> None:
     """
     for name in ("geometry", "renderer", "guidance", "prompt_processor"):
         key = f"{name}_type"
-        if not cfg[key]:
+        if not getattr(cfg, key):
             raise UserError(f"{key} is empty: name a registered part")
     for name, ours in OURS.items():
         key, base = f"{name}_type", find(ours)
-        if not issubclass(find(cfg[key]), base):
+        if not issubclass(find(part := getattr(cfg, key)), base):
             raise UserError(
-                f"{key} is {cfg[key]!r}: gaussiandreamer-system needs {ours}, or a class that is "
+                f"{key} is {part!r}: gaussiandreamer-system needs {ours}, or a class that is "
                 f"derived from {base.__module__}.{base.__name__}"
             )
 
@@ -47,11 +47,11 @@ def preflight_parts(geometry: Any, cfg: Any) -> None:
         with _named("system.geometry.prior"):
             preflight_prior(geometry.prior(), geometry.cfg.keep_attributes)
     for name in ("prompt_processor", "guidance"):
-        part = find(cfg[f"{name}_type"])
+        part = find(getattr(cfg, f"{name}_type"))
         if hasattr(part, "preflight"):
             require_class_method(part, "preflight")
             with _named(f"system.{name}"):
-                part.preflight(parse_structured(part.Config, cfg[name]))
+                part.preflight(parse_structured(part.Config, getattr(cfg, name)))
 
 
 @contextlib.contextmanager

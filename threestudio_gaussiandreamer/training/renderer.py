@@ -28,7 +28,7 @@ from .. import cameras
 from ..core.devices import get_device, without_autocast
 from ..core.errors import UserError, unknown
 from ..core.lazy_mapping import LazyMapping
-from ..core.options import at_least, checked_options, in_range, one_of, positive, rule
+from ..core.options import at_least, in_range, one_of, positive, rule
 from ..gaussians.gaussians import require_attributes
 from ..host import Rasterizer, register
 from ..splatting import PRESETS, Rasterized, available_backends, rasterize
@@ -96,7 +96,6 @@ class SplattingRenderer(Rasterizer):
     def configure(self, geometry: Any, material: Any, background: Any) -> None:
         require_attributes(geometry, ("means", "quats", "scales", "opacities", "colors"))
         super().configure(geometry, material, background)
-        self.options = checked_options(self.Config, self.cfg, "system.renderer.")
 
     def forward(
         self, c2w: Tensor, fovy: Tensor, height: int, width: int, **batch: Any
@@ -116,7 +115,7 @@ class SplattingRenderer(Rasterizer):
             error is differentiated by. ``depth`` and ``comp_normal`` are computed when they are
             first read.
         """
-        options, cloud, device = self.options, self.geometry, self.geometry.means.device
+        options, cloud, device = self.cfg, self.geometry, self.geometry.means.device
         c2w, fovy = c2w.to(device, torch.float32), fovy.to(device, torch.float32)
         with without_autocast(device.type):
             flat = FlatBackground.is_flat(self.background)

@@ -39,8 +39,6 @@ from torch import Tensor
 from ..core.distributed import average_gradients, from_first, rank
 from ..core.errors import UserError
 from ..core.host_copies import flush_reads
-from ..core.nested import adopt_nested
-from ..core.options import checked_options
 from ..gaussians.stored_state import SHAPES, require_cloud
 from ..guidance.external import (
     call_guidance,
@@ -104,9 +102,6 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
             )
         }
 
-        def __post_init__(self) -> None:
-            adopt_nested(self)
-
         @staticmethod
         def check(cfg: Any) -> None:
             check_parts(cfg)
@@ -116,6 +111,7 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
             check_optimizer(cfg.optimizer, cfg.scheduler)
 
     cfg: Config
+    SECTION = "system."
 
     @staticmethod
     def logged(cfg: Any) -> Optional[set[str]]:
@@ -142,8 +138,7 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
     # -- start -------------------------------------------------------------------------------------
 
     def configure(self) -> None:
-        self.options = checked_options(self.Config, self.cfg, "system.")
-        self.loss_weights = weight_schedules(self.options.loss)
+        self.loss_weights = weight_schedules(self.cfg.loss)
         self.part_rates = PartRates(self.cfg.optimizer)
         super().configure()
         self.density = density_rule(self.geometry)
@@ -258,7 +253,7 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         guided = self.guide(out, batch)
         self.density.before_backward(out, self.global_step, self.error_of(out, batch, guided))
         losses = self.losses(guided, out)
-        self.manual_backward(total(losses, self.options.guidance_type))
+        self.manual_backward(total(losses, self.cfg.guidance_type))
         self.optimize(optimizer, out, batch, losses)
         self.control_density(optimizer)
         self.report(out, batch, guided, losses)
@@ -362,7 +357,7 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
     def on_train_batch_end(self, outputs: Any, batch: Any, batch_idx: int) -> None:
         super().on_train_batch_end(outputs, batch, batch_idx)
         self.step_log.reads.poll()
-        every = self.options.evaluation.every
+        every = self.cfg.evaluation.every
         if every and self.global_step % every == 0:
             self.score("curve")
 

@@ -84,7 +84,7 @@ class RunFiles:
     def settings(self) -> RenderSettings:
         """How the run has drawn its cloud."""
         # only here, since the commands for files need neither Lightning nor the configuration
-        from ..host.typed_config import parse_structured
+        from ..core.options import parse_structured
         from ..training.renderer import SplattingRenderer
 
         options = section(self.config, "system", "renderer")

@@ -14,7 +14,7 @@ from typing import Any, ClassVar
 from torch import Tensor
 
 from ...core.errors import UserError
-from ...core.options import checked_options, in_range, require_defaults
+from ...core.options import in_range, require_defaults
 from ...host import BaseObject, warn
 from ..types import Batch, Good, Latents, Residual, State
 
@@ -39,8 +39,7 @@ class Variant(BaseObject, ABC):
         pass
 
     cfg: Config
-    options: Any
-    """Of ``cfg``, as plain attributes."""
+    SECTION = "system.guidance.variant."
 
     NEEDS_UNCONDITIONAL: ClassVar[bool] = False
     """Whether the unconditional score is needed even if ``guidance_scale`` is 1."""
@@ -62,9 +61,6 @@ class Variant(BaseObject, ABC):
         if "error" in vars(cls) and "residual" not in vars(cls):
             warn(f"{cls.__name__}.error is called residual now: rename the method")
             cls.residual = cls.error
-
-    def configure(self) -> None:
-        self.options = checked_options(self.Config, self.cfg, "system.guidance.variant.")
 
     @classmethod
     def preflight(cls, guidance: type, cfg: Any) -> None:

@@ -45,8 +45,8 @@ class ISM(Variant):
 
     def residual(self, guidance: Any, latents: Latents, condition: Any, batch: Batch) -> Residual:
         t, abar = guidance.draw_timesteps(latents)
-        interval = self._timesteps(guidance, self.options.interval)
-        stride = self._timesteps(guidance, self.options.stride)
+        interval = self._timesteps(guidance, self.cfg.interval)
+        stride = self._timesteps(guidance, self.cfg.stride)
         s = (t - interval).clamp_min(0)
 
         def predict(step: Step) -> Tensor:

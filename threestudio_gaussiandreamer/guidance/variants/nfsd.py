@@ -44,6 +44,6 @@ class NFSD(Variant):
         cond, negative = guidance.both(noised.z, noised.t, condition)
         empty = guidance.empty_prompt(noised.z, noised.t, condition)
         empty = negative if empty is None else empty
-        small = noised.t < self.options.threshold * len(guidance.alphas_cumprod)
+        small = noised.t < self.cfg.threshold * len(guidance.alphas_cumprod)
         domain = empty - torch.where(per_item(small, cond) > 0, 0.0, negative)
         return domain + guidance.cfg.guidance_scale * (cond - empty), noised.abar

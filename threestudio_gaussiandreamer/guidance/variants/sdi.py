@@ -56,8 +56,8 @@ class SDI(Variant):
     def residual(self, guidance: Any, latents: Latents, condition: Any, batch: Batch) -> Residual:
         t, abar = guidance.draw_timesteps(latents)
         # rounded up, since each step costs predictions and the option limits their number
-        stride = -(-len(guidance.alphas_cumprod) // self.options.inversion_steps)
-        scale, eta = self.options.inversion_scale, self.options.eta
+        stride = -(-len(guidance.alphas_cumprod) // self.cfg.inversion_steps)
+        scale, eta = self.cfg.inversion_scale, self.cfg.eta
         table, count = self._table_for(latents), len(latents)
         first = first_item(count)
 

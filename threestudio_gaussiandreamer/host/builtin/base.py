@@ -9,7 +9,7 @@ from torch import nn
 from ...core.checkpoint_file import load_module_weights
 from ...core.devices import get_device
 from ...core.errors import UserError
-from ..typed_config import parse_structured
+from ...core.options import parse_structured
 
 
 class Updateable:
@@ -94,10 +94,12 @@ class Part(Updateable):
         pass
 
     cfg: Config
+    SECTION = ""
+    """The path of the options in messages, such as "system.geometry."."""
 
     def __init__(self, cfg: Any = None, *args: Any, **kwargs: Any) -> None:
         super().__init__()
-        self.cfg = parse_structured(self.Config, cfg)
+        self.cfg = parse_structured(self.Config, cfg, self.SECTION)
         self.device = get_device()
         self.configure(*args, **kwargs)
 

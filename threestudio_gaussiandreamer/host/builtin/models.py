@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from ...core.distributed import draw_shared
-from ...core.options import check_options, one_of
+from ...core.options import one_of
 from ...core.streams import generator
 from .base import BaseModule, BaseObject, run_seed
 from .registry import register
@@ -63,9 +63,7 @@ class NoMaterial(BaseMaterial):
         color_activation: str = field(default="sigmoid", metadata=one_of(COLOR_ACTIVATIONS))
 
     cfg: Config
-
-    def configure(self) -> None:
-        check_options(self.Config, self.cfg, "system.material.")
+    SECTION = "system.material."
 
     def forward(self, features: Tensor, **kwargs: Any) -> Tensor:
         return COLOR_ACTIVATIONS[self.cfg.color_activation](features)

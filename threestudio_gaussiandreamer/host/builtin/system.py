@@ -12,11 +12,11 @@ import torch
 from ...core.checkpoint_file import load_module_weights
 from ...core.errors import UserError
 from ...core.logs import info, warn
+from ...core.options import parse_structured
 from ...core.schedule import C
 from .base import (
     Updateable,
     load_parameters,
-    parse_structured,
     update_end_if_possible,
     update_if_possible,
 )
@@ -52,7 +52,7 @@ class BaseSystem(pl.LightningModule, Updateable, SaverMixin):
 
     def __init__(self, cfg: Any, resumed: bool = False) -> None:
         super().__init__()
-        self.cfg = parse_structured(self.Config, cfg)
+        self.cfg = parse_structured(self.Config, cfg, "system.")
         self._save_dir = None
         self._resumed = resumed
         self._resumed_eval: Optional[tuple[int, int]] = None
