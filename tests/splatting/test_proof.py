@@ -53,12 +53,12 @@ def use(monkeypatch, tmp_path):
 
     def begin(device: HostDevice) -> HostDevice:
         monkeypatch.setattr(driver, "device", lambda _: device)
-        proof._failure.cache_clear()
+        proof.failure.cache_clear()
         backends._warn_once.cache_clear()
         return device
 
     yield begin
-    proof._failure.cache_clear()
+    proof.failure.cache_clear()
 
 
 def picture(backend: str = "auto") -> torch.Tensor:
@@ -258,7 +258,7 @@ def test_memory_that_is_short_is_no_verdict(use, tmp_path, error):
     assert not (tmp_path / "cubins").exists()
 
 
-@pytest.mark.parametrize("failing", ["_require_torch", "reference"])
+@pytest.mark.parametrize("failing", ["require_torch", "reference"])
 def test_an_error_of_earlier_work_or_of_torch_is_no_verdict(use, tmp_path, monkeypatch, failing):
     def fails(*_):
         raise RuntimeError("CUDA error: device-side assert triggered")

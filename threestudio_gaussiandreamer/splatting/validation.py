@@ -2,7 +2,7 @@
 
 import math
 from numbers import Integral, Real
-from typing import Optional
+from typing import Any, Optional
 
 import torch
 from torch import Tensor
@@ -44,10 +44,13 @@ def check(
         UserError: a tensor has the wrong type, device or shape, a number is out of its range, or,
             with the policy "error", a value isn't finite.
     """
-    check_tensors(tensors)
-    check_shapes(tensors)
-    check_numbers(width, height, options)
-    check_finite(policy, tensors)
+    _check_tensors(tensors)
+    _check_shapes(tensors)
+    _check_numbers(width, height, options)
+    if policy not in ("drop", "error"):
+        raise unknown("non_finite policy", policy, ("drop", "error"))
+    if policy == "error":
+        _check_finite(tensors)
     check_ranges(tensors)
 
 
@@ -76,103 +79,70 @@ def as_scene(tensors: dict[str, Tensor], width: int, height: int) -> Scene:
     return Scene(**tensors, width=int(width), height=int(height))
 
 
-def check_tensors(tensors: dict[str, Tensor]) -> None:
-    """Check that all are floating-point tensors on the device of the means.
-
-    Raises:
-        UserError: one isn't.
-    """
+def _check_tensors(tensors: dict[str, Tensor]) -> None:
+    device = getattr(tensors["means"], "device", None)
     for name, tensor in tensors.items():
         if not isinstance(tensor, Tensor):
             raise UserError(f"{name} must be a torch.Tensor; got {type(tensor).__name__}.")
-        if not tensor.is_floating_point():
-            raise UserError(
-                f"{name} must be floating point; got {tensor.dtype}. Convert it with .float()."
-            )
-        if tensor.device != tensors["means"].device:
-            raise UserError(
-                f"{name} must be on the device of means ({tensors['means'].device}); got "
-                f"{tensor.device}."
-            )
+        _require(
+            tensor.is_floating_point(), name, "floating point", f"{tensor.dtype}: call .float()"
+        )
+        _require(tensor.device == device, name, f"on the device of means ({device})", tensor.device)
         if tensor.is_meta:
             raise UserError(f"{name} is on the device meta, and has no values to draw.")
 
 
-def check_shapes(tensors: dict[str, Tensor]) -> None:
-    """Check shapes, with N from the means, B from the viewmats and C from the colours.
-
-    Raises:
-        UserError: a shape doesn't match, or there is no view or no channel.
-    """
-    n, views = _length(tensors, "means", "(N, 3)"), _length(tensors, "viewmats", "(B, 4, 4)")
-    channels = tensors["colors"].shape[-1] if tensors["colors"].dim() else 0
+def _check_shapes(tensors: dict[str, Tensor]) -> None:
+    """Check shapes, with N from the means, B from the viewmats and C from the colours."""
+    shapes = {name: tuple(tensor.shape) for name, tensor in tensors.items()}
+    for name, wanted in (("means", "(N, 3)"), ("viewmats", "(B, 4, 4)")):
+        _require(shapes[name], name, f"of the shape {wanted}", "a single number")
+    n, views = shapes["means"][0], shapes["viewmats"][0]
+    channels = shapes["colors"][-1] if shapes["colors"] else 0
     if views == 0 or channels == 0:
-        got = f"viewmats {_shape(tensors['viewmats'])}, colors {_shape(tensors['colors'])}"
+        got = f"viewmats {shapes['viewmats']}, colors {shapes['colors']}"
         raise UserError(f"at least one view and one colour channel are needed; got {got}.")
     expected = {
-        "means": [("(N, 3)", (n, 3))],
-        "quats": [("(N, 4)", (n, 4))],
-        "scales": [("(N, 3)", (n, 3))],
-        "opacities": [("(N,)", (n,))],
-        "colors": [("(N, C)", (n, channels)), ("(B, N, C)", (views, n, channels))],
-        "viewmats": [("(B, 4, 4)", (views, 4, 4))],
-        "Ks": [("(B, 3, 3)", (views, 3, 3))],
-        "background": [("(C,)", (channels,)), ("(B, C)", (views, channels))],
+        "means": {"(N, 3)": (n, 3)},
+        "quats": {"(N, 4)": (n, 4)},
+        "scales": {"(N, 3)": (n, 3)},
+        "opacities": {"(N,)": (n,)},
+        "colors": {"(N, C)": (n, channels), "(B, N, C)": (views, n, channels)},
+        "viewmats": {"(B, 4, 4)": (views, 4, 4)},
+        "Ks": {"(B, 3, 3)": (views, 3, 3)},
+        "background": {"(C,)": (channels,), "(B, C)": (views, channels)},
     }
-    for name, tensor in tensors.items():
-        if tuple(tensor.shape) not in [shape for _, shape in expected[name]]:
-            wanted = " or ".join(f"{words} = {shape}" for words, shape in expected[name])
+    for name, shape in shapes.items():
+        if shape not in expected[name].values():
+            wanted = " or ".join(f"{words} = {known}" for words, known in expected[name].items())
             sizes = f"N={n} is from means, B={views} from viewmats, C={channels} from colors"
-            raise UserError(f"{name} must have the shape {wanted}; got {_shape(tensor)}. {sizes}.")
+            raise UserError(f"{name} must have the shape {wanted}; got {shape}. {sizes}.")
 
 
-def _length(tensors: dict[str, Tensor], name: str, wanted: str) -> int:
-    if tensors[name].dim() == 0:
-        raise UserError(f"{name} must have the shape {wanted}; got a single number.")
-    return tensors[name].shape[0]
-
-
-def _shape(tensor: Tensor) -> str:
-    return str(tuple(tensor.shape))
-
-
-def check_numbers(width: int, height: int, options: RasterizeOptions) -> None:
+def _check_numbers(width: int, height: int, options: RasterizeOptions) -> None:
+    o, whole = options, f"a whole number of pixels, at least 1 and at most {LARGEST_SIDE}"
     for name, size in (("width", width), ("height", height)):
-        if not _is_whole(size) or not 1 <= size <= LARGEST_SIDE:
-            raise UserError(
-                f"{name} must be a whole number of pixels, at least 1 and at most "
-                f"{LARGEST_SIDE}; got {size!r}."
-            )
-        if (
-            not _is_whole(options.downsample)
-            or options.downsample not in (1, 2)
-            or size % options.downsample
-        ):
-            raise UserError(
-                "downsample must be 1 or 2 and divide the size; got "
-                f"downsample={options.downsample!r} with {name}={size}."
-            )
+        _require(_is_whole(size) and 1 <= size <= LARGEST_SIDE, name, whole, repr(size))
+        got = f"downsample={o.downsample!r} with {name}={size}"
+        divides = _is_whole(o.downsample) and o.downsample in (1, 2) and not size % o.downsample
+        _require(divides, "downsample", "1 or 2 and divide the size", got)
     for name in ("near", "far", "eps2d", "alpha_min", "alpha_max", "stop"):
-        if not isinstance(getattr(options, name), Real):
-            raise UserError(f"{name} must be a number; got {getattr(options, name)!r}.")
-    ranges = {
-        "near, far": (
-            0 < options.near < options.far,
-            "0 < near < far",
-            (options.near, options.far),
-        ),
-        "eps2d": (0 <= options.eps2d < float("inf"), "a finite number >= 0", options.eps2d),
-        "alpha_min": (0 <= options.alpha_min < 1, "in [0, 1)", options.alpha_min),
-        "alpha_max": (
-            options.alpha_min < options.alpha_max <= 1,
-            "in (alpha_min, 1]",
-            options.alpha_max,
-        ),
-        "stop": (0 <= options.stop < 1, "in [0, 1)", options.stop),
-    }
-    for name, (holds, wanted, got) in ranges.items():
-        if not holds:
-            raise UserError(f"{name} must be {wanted}; got {got}.")
+        value = getattr(o, name)
+        _require(isinstance(value, Real), name, "a number", repr(value))
+    _require(0 < o.near < o.far, "near, far", "0 < near < far", (o.near, o.far))
+    _require(0 <= o.eps2d < math.inf, "eps2d", "a finite number >= 0", o.eps2d)
+    _require(0 <= o.alpha_min < 1, "alpha_min", "in [0, 1)", o.alpha_min)
+    _require(o.alpha_min < o.alpha_max <= 1, "alpha_max", "in (alpha_min, 1]", o.alpha_max)
+    _require(0 <= o.stop < 1, "stop", "in [0, 1)", o.stop)
+
+
+def _require(holds: Any, name: str, wanted: str, got: Any) -> None:
+    if not holds:
+        raise UserError(f"{name} must be {wanted}; got {got}.")
+
+
+def _is_whole(number: Any) -> bool:
+    return isinstance(number, Integral) and not isinstance(number, bool)
 
 
 def check_ranges(tensors: dict[str, Tensor]) -> None:
@@ -192,8 +162,7 @@ def check_ranges(tensors: dict[str, Tensor]) -> None:
         ("scales", math.inf, "0 or more", "exp() of logarithms"),
         ("opacities", 1 + ROUNDING, "in [0, 1]", "sigmoid() of logits"),
     ):
-        low, high = (value.item() for value in tensors[name].detach().aminmax())
-        for found in (low, high):
+        for found in (value.item() for value in tensors[name].detach().aminmax()):
             if math.isfinite(found) and not -ROUNDING <= found <= most:
                 raise UserError(f"{name} must be {wanted}, but one is {found:g}: pass {hint}.")
 
@@ -201,23 +170,12 @@ def check_ranges(tensors: dict[str, Tensor]) -> None:
 _looked_at: set[torch.device] = set()
 
 
-def _is_whole(number) -> bool:
-    return isinstance(number, Integral) and not isinstance(number, bool)
-
-
-def check_finite(policy: str, tensors: dict[str, Tensor]) -> None:
-    if policy not in ("drop", "error"):
-        raise unknown("non_finite policy", policy, ("drop", "error"))
-    if policy == "error":
-        for name, tensor in tensors.items():
-            if (
-                tensor.detach().sum().isfinite()
-            ):  # a finite sum implies finite values, so the usual case takes one pass
-                continue
-            bad = (~tensor.isfinite()).nonzero()
-            if len(bad):
-                first = tuple(bad[0].tolist())
-                raise UserError(
-                    f"{name} holds {len(bad)} values that aren't finite, the first at {first}: "
-                    f"{tensor[first].item()}."
-                )
+def _check_finite(tensors: dict[str, Tensor]) -> None:
+    for name, tensor in tensors.items():
+        # a finite sum implies finite values, so that the usual case takes one pass
+        if not tensor.detach().sum().isfinite() and len(bad := (~tensor.isfinite()).nonzero()):
+            first = tuple(bad[0].tolist())
+            raise UserError(
+                f"{name} holds {len(bad)} values that aren't finite, the first at {first}: "
+                f"{tensor[first].item()}."
+            )

@@ -22,8 +22,7 @@ from torch import Tensor
 
 from ...core.errors import UserError
 from .. import autograd
-from ..autograd import Drawn, SceneGradients, Upstream
-from ..channels import CHANNELS
+from ..autograd import CHANNELS, Drawn, SceneGradients, Upstream
 from ..options import RasterizeOptions
 from ..output import Rasterized
 from ..scene import Scene

@@ -54,6 +54,7 @@ Results = dict[str, dict[str, Tensor]]
 """Outputs and gradients by name, of each draw."""
 
 
+@functools.cache
 def failure(device: torch.device) -> Optional[str]:
     """Return why the kernels must not be used on this GPU, or None if they are right.
 
@@ -61,11 +62,6 @@ def failure(device: torch.device) -> Optional[str]:
         UserError, RuntimeError: the GPU has no memory left, or fails without the kernels too;
             nothing is cached.
     """
-    return _failure(device)
-
-
-@functools.cache
-def _failure(device: torch.device) -> Optional[str]:
     try:
         gpu = driver.device(device).describe()
     except UserError as error:
@@ -116,7 +112,7 @@ def compare(device: torch.device) -> str:
             which says nothing about the kernels.
         OSError, AttributeError: a library can't be loaded, or lacks a function.
     """
-    _require_torch(device)
+    require_torch(device)
     with _default_algorithms(), torch_threads(1), ThreadPoolExecutor(1) as pool:
         expected = pool.submit(reference)
         try:
@@ -126,22 +122,16 @@ def compare(device: torch.device) -> str:
                 raise
             return f"its kernels fail on a small scene: {error}"
         errors = relative_errors(found, expected.result())
-    wrong = [
-        f"with {draw}, {', '.join(names)}"
-        for draw, sizes in errors.items()
-        if (names := _wrong(sizes))
-    ]
+    wrong = []
+    for draw, sizes in errors.items():  # "not <=", so that NaN counts as wrong
+        names = [f"{name} by {size:.1e}" for name, size in sizes.items() if not size <= TOLERANCE]
+        wrong += [f"with {draw}, {', '.join(names)}"] if names else []
     if not wrong:
         return ""
     return (
         f"on a small scene its kernels differ from plain torch: {'; '.join(wrong)} (rounding is "
         f"at most {TOLERANCE:.0e})"
     )
-
-
-def _wrong(errors: dict[str, float]) -> list[str]:
-    """List what differs by more than rounding; ``not <=`` so that NaN counts as wrong."""
-    return [f"{name} by {size:.1e}" for name, size in errors.items() if not size <= TOLERANCE]
 
 
 @contextlib.contextmanager
@@ -161,10 +151,8 @@ def _default_algorithms() -> Iterator[None]:
         torch.use_deterministic_algorithms(True, warn_only=warns)
 
 
-def _require_torch(device: torch.device) -> None:
-    """Let torch compute on the device, where an error of earlier work is raised, and one that has
-    nothing to do with the kernels.
-    """
+def require_torch(device: torch.device) -> None:
+    """Let torch compute on the device, where errors that the kernels don't cause are raised."""
     torch.ones(2, device=device)
     if device.type == "cuda":
         torch.cuda.synchronize(device)
