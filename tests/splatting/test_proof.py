@@ -103,10 +103,6 @@ def test_a_broken_kernel_means_plain_torch_and_one_warning(use, caplog, fault):
         picture("cuda")
 
 
-def test_every_kernel_is_broken_in_some_test():
-    assert {fault.kernel for fault in FAULTS.values()} == set(driver.UNITS)
-
-
 def test_broken_kernels_are_refused_before_a_run_begins(use):
     use(BrokenDevice(FAULTS["blend"]))
     with pytest.raises(UserError, match="a.backend: cuda can't be used here: .*differ from plain"):
@@ -160,15 +156,6 @@ def test_another_driver_is_compared_again(use, monkeypatch, tmp_path):
         assert compared[-1] == (expected not in known)
         known.add(expected)
     assert compared == [True, True, True, False]
-
-
-def test_another_text_of_a_kernel_or_torch_is_compared_again(use, monkeypatch):
-    names = {proof._key("a GPU"), proof._key("a GPU"), proof._key("another GPU")}
-    with monkeypatch.context() as patch:
-        patch.setattr(nvrtc, "headers", lambda: {"splat_math.h": "other"})
-        names.add(proof._key("a GPU"))
-    monkeypatch.setattr(torch, "__version__", "other")
-    assert len(names | {proof._key("a GPU")}) == 4
 
 
 def test_a_nan_is_a_difference(use):
@@ -273,33 +260,12 @@ def test_an_error_of_earlier_work_or_of_torch_is_no_verdict(use, tmp_path, monke
     assert "blend" in device.launched
 
 
-def test_the_scene_is_the_same_whatever_the_default_device_is():
-    expected = proof._scene(CPU, torch.float32, proof.CULLED)
-    assert len(expected.means) == proof.GAUSSIANS + proof.CULLED
-    with torch.device("meta"):
-        scene = proof._scene(CPU, torch.float32, proof.CULLED)
-    assert all(torch.equal(a, b) for a, b in zip(scene.tensors, expected.tensors, strict=True))
-
-
 def test_a_gradient_of_a_culled_gaussian_is_a_difference(use):
     use(HostDevice())
     found = proof.drawn_on(CPU)
     found[DEFAULT]["gradient of means"][-1, 0] = 100.0
     errors = proof.relative_errors(found, proof.reference())[DEFAULT]
     assert [name for name, size in errors.items() if size > 0.1] == ["gradient of means"]
-
-
-def test_all_sorts_are_of_more_than_torch_sorts_by_another_kernel(use, monkeypatch):
-    lengths, sort = [], torch.Tensor.sort
-
-    def noted(values, *arguments, **options):
-        lengths.append(values.shape[-1])
-        return sort(values, *arguments, **options)
-
-    use(HostDevice())
-    monkeypatch.setattr(torch.Tensor, "sort", noted)
-    proof.drawn_on(CPU)
-    assert len(lengths) == 2 * len(proof.OPTIONS) and min(lengths) > 4096
 
 
 @pytest.mark.parametrize("warns", [False, True])

@@ -1,7 +1,0 @@
-"""Helpers of the specification tests."""
-
-SPECIFICATION = {"backend": "reference"}
-
-
-# float64 against the same formula in another order: rounding only.
-ROUNDING = 1e-10
