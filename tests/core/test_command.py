@@ -17,11 +17,6 @@ def raising(error):
     return run
 
 
-def test_the_work_gets_what_was_parsed():
-    seen = []
-    assert run_command(len, seen.append, ["a", "b"]) == 0 and seen == [2]
-
-
 @pytest.mark.parametrize(
     ("error", "code", "message"),
     [
@@ -39,14 +34,6 @@ def test_what_ends_a_command_is_one_message(error, code, message, capsys, monkey
 def test_an_internal_error_keeps_its_traceback_in_verbose_mode():
     with pytest.raises(ZeroDivisionError):
         run_command(len, raising(ZeroDivisionError()), [])
-
-
-@pytest.mark.parametrize(("asked", "code"), [(0, 0), (None, 0), (2, 2)])
-def test_usage_has_argparses_code(asked, code):
-    def parse(argv):
-        raise SystemExit(asked)
-
-    assert run_command(parse, len) == code
 
 
 def test_nobody_reads_the_message_about_a_closed_pipe_either(monkeypatch):
@@ -93,8 +80,3 @@ def test_a_signal_during_the_import_is_one_line(module, name, code, lost, capsys
         stop = f"try:\n    {stop}\nexcept BaseException:\n    pass"
     assert run_main(module(f"import os, signal\n{stop}\ndef main():\n    return 7")) == code
     assert capsys.readouterr().err == "stopped\n"
-
-
-def test_an_error_of_the_import_keeps_its_traceback(module):
-    with pytest.raises(ModuleNotFoundError, match="no_such_library"):
-        run_main(module("import no_such_library"))

@@ -8,11 +8,6 @@ import torch
 from threestudio_gaussiandreamer.core.devices import get_device, torch_threads, without_autocast
 
 
-def test_without_a_gpu_it_is_the_cpu(monkeypatch):
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    assert get_device() == torch.device("cpu")
-
-
 @pytest.mark.parametrize(
     ("ranks", "index"),
     [({}, 0), ({"LOCAL_RANK": "3"}, 3), ({"SLURM_LOCALID": "2"}, 2)],

@@ -61,14 +61,6 @@ SCRIPT = """
 """
 
 
-def test_a_single_process_changes_nothing():
-    parameter = torch.nn.Parameter(torch.zeros(2))
-    parameter.grad = torch.ones(2)
-    distributed.average_gradients([parameter])
-    assert torch.equal(parameter.grad, torch.ones(2)) and distributed.rank() == 0
-    assert torch.equal(distributed.all_max(torch.tensor([3.0])), torch.tensor([3.0]))
-
-
 @pytest.fixture
 def processes(monkeypatch):
     """Makes this process one of several that don't talk to each other."""

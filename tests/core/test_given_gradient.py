@@ -24,11 +24,3 @@ def test_the_given_gradient_is_neither_changed_nor_shared():
     assert torch.equal(x.grad, torch.full((4,), 2.0)) and torch.equal(gradient, torch.ones(4))
     x.grad.zero_()
     assert torch.equal(gradient, torch.ones(4))
-
-
-def test_a_second_derivative_is_refused():
-    x = torch.zeros(4, requires_grad=True)
-    number = given_gradient(x, torch.ones(4), torch.tensor(0.0))
-    (first,) = torch.autograd.grad(number, x, create_graph=True)
-    with pytest.raises(RuntimeError):
-        first.sum().backward()

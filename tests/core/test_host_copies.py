@@ -9,7 +9,6 @@ from threestudio_gaussiandreamer.core.host_copies import (
     DelayedReads,
     HostCopy,
     flush_reads,
-    to_device,
 )
 
 
@@ -53,12 +52,3 @@ def test_what_the_use_raises_is_raised_once(arrive):
         reads.flush()
     reads.flush()
     assert used == [2]
-
-
-def test_a_copy_has_no_graph():
-    assert not HostCopy(torch.ones(2, requires_grad=True)).values().requires_grad
-
-
-def test_to_the_cpu_nothing_is_copied():
-    values = torch.ones(2)
-    assert to_device(values, "cpu") is values

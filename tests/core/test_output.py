@@ -67,13 +67,6 @@ def test_a_closed_pipe_is_still_an_error(monkeypatch):
     os.dup2(os.open(os.devnull, os.O_WRONLY), write_end)  # what is left in the buffers goes there
 
 
-def test_the_streams_are_put_back(monkeypatch):
-    earlier = sys.stdout, sys.stderr
-    with tolerant_output():
-        pass
-    assert (sys.stdout, sys.stderr) == earlier
-
-
 @pytest.mark.parametrize("name", ["stdout", "stderr"])
 def test_a_stream_that_was_closed_before_the_start_takes_any_text(monkeypatch, name):
     """Python sets it to None, as after ``command >&-``."""

@@ -95,17 +95,3 @@ RUN = {
     "system.exporter.save_video": "false",
     "system.exporter.formats": "[ply,spz,sog,points,glb,compressed-ply,surface,usda]",
 }  # fmt: skip
-
-
-@pytest.mark.slow
-def test_a_run_that_writes_every_format_and_prunes_passes_the_checks(tmp_path):
-    options = [f"{key}={value}" for key, value in RUN.items()]
-    command = [sys.executable, "launch.py", "--config", "demo.yaml", "--train", "--gpu", "cpu"]
-    ended = subprocess.run(
-        [*command, "--typecheck", *options, f"exp_root_dir={tmp_path}"],
-        capture_output=True,
-        text=True,
-        cwd=REPOSITORY,
-    )
-    assert ended.returncode == 0, ended.stderr[-2000:]
-    assert len(list(tmp_path.glob("demo/*/save/it3-export/gaussians.*"))) >= 4

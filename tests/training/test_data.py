@@ -54,14 +54,6 @@ def test_a_training_batch_has_the_hosts_keys_shapes_and_units():
     assert torch.equal(batch["camera_positions"], batch["c2w"][:, :3, 3])
 
 
-def test_a_batch_stays_as_it_is_on_the_cpu_and_is_copied_to_other_devices():
-    data = module()
-    (batch,) = batches(data, 1)
-    assert data.transfer_batch_to_device(batch, torch.device("cpu"), 0) is batch
-    moved = data.transfer_batch_to_device(batch, torch.device("meta"), 0)
-    assert moved["c2w"].is_meta and moved["height"] == 32
-
-
 def test_rays_are_there_when_asked_for():
     (batch,) = batches(module(rays=True), 1)
     assert batch["rays_o"].shape == batch["rays_d"].shape == (4, 32, 48, 3)
@@ -89,11 +81,6 @@ def test_groups_of_views_share_all_but_their_evenly_spaced_azimuths():
         assert batch["elevation"][0] != batch["elevation"][4]
 
 
-def test_views_in_groups_of_one_are_those_without_groups():
-    for one, other in zip(batches(module(n_view=1), 3), batches(module(), 3), strict=True):
-        assert torch.equal(one["c2w"], other["c2w"])
-
-
 def test_validation_and_test_batches_hold_one_view_and_its_index():
     data = module(n_val_views=4, n_test_views=5, eval_height=20, eval_width=30)
     val, test = list(data.val_dataloader()), list(data.test_dataloader())
@@ -113,11 +100,6 @@ def test_a_stream_that_starts_at_step_3_continues_the_one_that_never_stopped():
     )
     for a, b in zip(whole[3:], rest, strict=True):
         assert torch.equal(a["c2w"], b["c2w"]) and torch.equal(a["fovy"], b["fovy"])
-
-
-def test_no_batch_is_degenerate():
-    for batch in batches(module(), 6):
-        assert batch["elevation"].unique().numel() == 4 and batch["azimuth"].unique().numel() == 4
 
 
 def test_a_resolution_milestone_takes_effect_at_its_step():

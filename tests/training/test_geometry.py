@@ -1,6 +1,5 @@
 """The cloud: its start from points, its size, its learning rates, its checkpoint."""
 
-import numpy as np
 import pytest
 import torch
 
@@ -12,8 +11,7 @@ from threestudio_gaussiandreamer.gaussians import densify, sh
 from threestudio_gaussiandreamer.gaussians.densify import screen_gradients
 from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
 from threestudio_gaussiandreamer.gaussians.grow import nearest_distance_scales
-from threestudio_gaussiandreamer.gaussians.point_cloud import PointCloud
-from threestudio_gaussiandreamer.host import BaseGeometry, find, register
+from threestudio_gaussiandreamer.host import BaseGeometry, find
 from threestudio_gaussiandreamer.splatting import Rasterized
 from threestudio_gaussiandreamer.training.density import DensityControl
 from threestudio_gaussiandreamer.training.geometry import GaussianCloud
@@ -100,11 +98,6 @@ def test_the_object_grows_first_and_the_ground_is_added_then():
     assert torch.equal(with_ground.means[-100:, 2], bottom.expand(100))
 
 
-def test_some_options_of_a_group_keep_the_defaults_of_the_others():
-    cfg = GaussianCloud({"densify": {"every": 50}}).cfg
-    assert cfg.densify.every == 50 and cfg.densify.stop == 900 and cfg.grow.radius == 0.01
-
-
 def test_the_cap_holds_at_the_start(sphere_points):
     assert len(started(sphere_points, max_gaussians=123)) == 123
 
@@ -161,22 +154,6 @@ def test_colours_see_the_direction_from_the_camera(sphere_points):
     assert torch.allclose(geometry.colors(camera)[0], seen, atol=1e-6)
 
 
-@pytest.mark.parametrize("degree", [0, 1])
-def test_a_step_leaves_the_stored_colours_in_the_range_that_viewers_show(sphere_points, degree):
-    geometry = started(sphere_points, sh_degree=degree)
-    colors = torch.tensor([-0.7, 0.25, 2.2])
-    geometry.sh0.data[:] = sh.rgb_to_sh0(colors)
-    geometry.sh_rest.data.fill_(3.0)
-    geometry.clamp_colors()
-    stored = sh.sh0_to_rgb(geometry.sh[:, 0])
-    assert torch.allclose(stored, colors.clamp(0, 1).expand_as(stored), atol=1e-6)
-    assert (geometry.sh_rest == 3.0).all()
-    geometry.cfg.bound_colors = False
-    geometry.sh0.data[:] = sh.rgb_to_sh0(colors)
-    geometry.clamp_colors()
-    assert torch.allclose(sh.sh0_to_rgb(geometry.sh0[:, 0]), colors.expand_as(stored), atol=1e-6)
-
-
 def test_a_colour_outside_the_range_returns_to_it(sphere_points):
     """A stored cloud may have such colours; the gradient of clamp would keep them there."""
     geometry = started(sphere_points, bound_colors=True)
@@ -202,10 +179,6 @@ def test_learning_rates_follow_their_schedules(sphere_points):
     assert len(rates) == 6
 
 
-def test_degree_zero_has_no_group_for_bands_it_does_not_have(sphere_points):
-    assert "sh_rest" not in {group["name"] for group in started(sphere_points).parameter_groups()}
-
-
 def test_densification_happens_at_its_steps_only_and_the_optimiser_follows(sphere_points):
     densify = {
         "enabled": True,
@@ -228,34 +201,6 @@ def test_densification_happens_at_its_steps_only_and_the_optimiser_follows(spher
     assert sizes == [400] * 3 + [800] * 4 + [1600] * 5
     assert optimizer.param_groups[0]["params"][0] is geometry.means
     assert optimizer.state[geometry.means]["exp_avg"].shape == (1600, 3)
-
-
-def test_a_densification_that_selects_no_gaussian_changes_nothing(sphere_points):
-    plain = started(sphere_points)
-    idle = started(
-        sphere_points,
-        densify={
-            "enabled": True,
-            "start": 1,
-            "stop": 9,
-            "every": 1,
-            "min_opacity": 1e-9,
-            "grad_threshold": 1e9,
-            "max_scale": 1e9,
-        },
-    )
-    for geometry in (plain, idle):
-        optimizer = torch.optim.Adam(
-            [{**group, "lr": 1e-2} for group in geometry.parameter_groups()]
-        )
-        for step in range(1, 6):
-            sum((p**2).sum() for p in geometry.parameters()).backward()
-            optimizer.step()
-            optimizer.zero_grad()
-            DensityControl(geometry).after_step(optimizer, step)
-    assert all(
-        torch.equal(a, b) for a, b in zip(plain.parameters(), idle.parameters(), strict=True)
-    )
 
 
 @pytest.mark.parametrize("absgrad", [False, True])
@@ -313,21 +258,6 @@ def test_colours_by_direction_that_are_dropped_are_told(
     geometry.initialize("anything")
     assert (f"system.geometry.sh_degree={degree} drops the bands" in caplog.text) == told
     assert geometry.sh_rest.shape[1] == (degree + 1) ** 2 - 1
-
-
-@register("test-two-points-prior")
-class TwoPoints:
-    def __init__(self, cfg):
-        pass
-
-    def __call__(self, prompt):
-        return PointCloud(np.float32([[0, 0, 0], [1, 0, 0]]), np.float32([[1, 0, 0], [0, 1, 0]]))
-
-
-def test_initialize_runs_the_prior_by_its_name():
-    geometry = GaussianCloud({"prior_type": "test-two-points-prior", "grow": NO_GROWTH})
-    cloud = geometry.initialize("anything")
-    assert len(geometry) == len(cloud.points) == 2
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,6 @@
 
 import pytest
 import torch
-from omegaconf import OmegaConf
 
 from tests.training.runs import CONFIGS, SMALL, launch, mocked_config, run_folder
 from threestudio_gaussiandreamer import register_parts
@@ -10,7 +9,7 @@ from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.launch.config import load_config
 from threestudio_gaussiandreamer.launch.experiment import main
 from threestudio_gaussiandreamer.training.geometry import GaussianCloud
-from threestudio_gaussiandreamer.training.optimizer import check_optimizer, make_optimizer
+from threestudio_gaussiandreamer.training.optimizer import check_optimizer
 
 COLOR = "background.env_color"
 
@@ -137,11 +136,3 @@ def test_a_parameter_of_an_own_geometry_is_not_left_untrained(
         lambda self: groups(self) + [{"params": [self.bright]} | group for group in own],
     )
     assert launch(tmp_path, painted_box, "trainer.max_steps=1") == 0
-
-
-@pytest.mark.parametrize(("name", "key"), [("Adam", "betas"), ("Rprop", "etas")])
-def test_pairs_are_tuples_in_checkpoints(name, key):
-    """Before 2.7, Adam's pair too stayed OmegaConf's list, which isn't read from a checkpoint."""
-    options = OmegaConf.create({"name": name, "args": {key: [0.5, 1.5 if key == "etas" else 0.9]}})
-    made = make_optimizer(options, [{"params": [torch.nn.Parameter(torch.zeros(2))], "name": "x"}])
-    assert type(made.param_groups[0][key]) is type(made.defaults[key]) is tuple
