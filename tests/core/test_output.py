@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from threestudio_gaussiandreamer.core.output import tolerant_output
+from threestudio_gaussiandreamer.core.command import tolerant_output
 
 
 def text_file(path, encoding="utf-8") -> io.TextIOWrapper:

@@ -9,6 +9,7 @@ import io
 import math
 import os
 import pickle
+import pickletools
 import re
 import shutil
 import zipfile
@@ -18,7 +19,6 @@ from typing import Any, Optional
 
 import torch
 
-from .archive import require_plain_archive
 from .errors import UserError
 from .files import atomic_file, temporaries_of
 from .logs import warn
@@ -35,6 +35,16 @@ SHARING = 2
 """Largest total size of the tensors, in units of the file's size: tensors may share a storage, so
 the total may exceed the file.
 """
+
+ALLOWED_CALLS = re.compile(
+    r"collections (OrderedDict|Counter)|builtins (set|complex)"
+    r"|torch (Size|device|\w+Storage|u?int\d+|b?float\d+\w*|bool|complex\d+)"
+    r"|torch\.storage UntypedStorage|torch\.serialization _get_layout"
+    r"|torch\._utils (_rebuild_tensor|_rebuild_tensor_v2|_rebuild_parameter\w*)"
+)
+WATCHED_MODULES = re.compile(r"torch\b|builtins\b|_codecs\b|collections\b")
+"""Modules whose names are checked here; ``weights_only`` refuses names of all other modules."""
+MAX_OPCODES = 10_000_000
 
 
 def save_file(path: str | os.PathLike, content: Any) -> None:
@@ -81,10 +91,9 @@ def load_file(path: str | os.PathLike, map_location: Any = "cpu") -> Any:
         raise UserError(
             f"{path} holds Python objects that could run code when read, so it isn't read{what}"
         ) from error
-    except (
-        Exception
-    ) as error:  # torch's unpickler raises exceptions of many types for a damaged file
-        raise UserError(f"{path} isn't a checkpoint, or is damaged: {_reason(error)}") from error
+    except Exception as error:  # of many types for a damaged file
+        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
+        raise UserError(f"{path} isn't a checkpoint, or is damaged: {reason}") from error
     _require_stored(content, path)
     return content
 
@@ -202,30 +211,20 @@ def load_checkpoint(path: str | os.PathLike, map_location: Any = "cpu") -> dict:
         UserError: as in :func:`load_file`, or one of these keys is missing or of a wrong type.
     """
     checkpoint = load_file(path, map_location)
-    missing = {"state_dict", "epoch", "global_step"} - set(
-        checkpoint if isinstance(checkpoint, dict) else ()
-    )
-    if missing:
-        raise UserError(
-            f"{path} isn't a training checkpoint: it has no {', '.join(sorted(missing))}"
-        )
-    for key, kind in (("state_dict", Mapping), ("epoch", int), ("global_step", int)):
-        if not isinstance(checkpoint[key], kind):
-            raise UserError(
-                f"{path} isn't a training checkpoint: its {key} is of type "
-                f"{type(checkpoint[key]).__name__}"
-            )
-    for key in ("epoch", "global_step"):
-        if not is_count(checkpoint[key]):
-            raise UserError(
-                f"{path} isn't a training checkpoint: its {key} is {shown(checkpoint[key])}"
-            )
-    for name, value in checkpoint["state_dict"].items():
+    known = checkpoint if isinstance(checkpoint, dict) else {}
+    wrong = []
+    for key, kind in (("epoch", int), ("global_step", int), ("state_dict", Mapping)):
+        if key not in known:
+            wrong.append(f"it has no {key}")
+        elif not isinstance(known[key], kind):
+            wrong.append(f"its {key} is of type {type(known[key]).__name__}")
+        elif kind is int and not is_count(known[key]):
+            wrong.append(f"its {key} is {shown(known[key])}")
+    for name, value in () if wrong else known["state_dict"].items():
         if not (isinstance(name, str) and isinstance(value, torch.Tensor)):
-            raise UserError(
-                f"{path} isn't a training checkpoint: {shown(name)} in its state_dict is of type "
-                f"{type(value).__name__}"
-            )
+            wrong.append(f"{shown(name)} in its state_dict is of type {type(value).__name__}")
+    if wrong:
+        raise UserError(f"{path} isn't a training checkpoint: {', '.join(wrong[:3])}")
     return checkpoint
 
 
@@ -262,7 +261,10 @@ def _verify(path: Path) -> None:
         if not tail.startswith(_MARK):
             return _verify_foreign(path, tail)
         file.seek(0)
-        digest = _digest(file, mark_at + len(_MARK))
+        digest, left = hashlib.sha256(), mark_at + len(_MARK)
+        while left > 0:
+            digest.update(file.read(min(_BLOCK_BYTES, left)))
+            left -= _BLOCK_BYTES
     if digest.hexdigest().encode() != tail[len(_MARK) :]:
         raise UserError(
             f"the checkpoint {path} is damaged: its checksum doesn't match{_siblings(path)}"
@@ -292,39 +294,71 @@ def _verify_foreign(path: Path, tail: bytes) -> None:
         )
 
 
-def _digest(file: Any, count: int) -> Any:
-    digest = hashlib.sha256()
-    for start in range(0, count, _BLOCK_BYTES):
-        digest.update(file.read(min(_BLOCK_BYTES, count - start)))
-    return digest
-
-
 def _keep_previous(path: Path) -> None:
-    if not path.exists():
-        return
     kept = previous_of(path)
-    if kept.exists() and kept.samefile(path):
-        # The last save was killed after os.replace below: both names are hard links to one file,
-        # and renaming one of them to the other would do nothing.
+    # both names are hard links to one file where the last save was killed after os.replace below,
+    # and renaming one of them to the other would do nothing
+    if not path.exists() or kept.exists() and kept.samefile(path):
         return
     temporary = kept.with_name(f".{kept.name}.tmp")
     temporary.unlink(missing_ok=True)
     try:
         os.link(path, temporary)
-    except OSError:
-        # a file system without hard links
+    except OSError:  # a file system without hard links
         shutil.copyfile(path, temporary)
     os.replace(temporary, kept)
 
 
 def _siblings(path: Path) -> str:
-    others = (
-        sorted(str(other) for other in path.parent.glob("*.ckpt") if other != path)
-        if path.parent.is_dir()
-        else []
-    )
+    others = sorted(str(other) for other in path.parent.glob("*.ckpt") if other != path)
     return f"; others in this folder, not checked: {', '.join(others)}" if others else ""
 
 
-def _reason(error: Exception) -> str:
-    return str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
+# ---- what reading an archive may do --------------------------------------------------------------
+
+
+def require_plain_archive(path: Path) -> None:
+    """Check that reading an archive of ``torch.save`` allocates no more than the file's size: its
+    records are stored uncompressed, and its pickle calls only what rebuilds tensors and containers.
+    torch's ``weights_only`` also allows calls such as ``bytearray(10**10)``.
+
+    Raises:
+        UserError: the file is no zip archive, its records are compressed or overlap, or its pickle
+            calls a function that isn't in ``ALLOWED_CALLS``.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            _require_stored_records(archive, path)
+            for record in archive.infolist():
+                if record.filename.endswith("data.pkl"):
+                    _require_plain_pickle(archive.read(record), path)
+    except (zipfile.BadZipFile, NotImplementedError, OSError, ValueError, RuntimeError) as error:
+        if isinstance(error, UserError):
+            raise
+        raise UserError(f"{path} isn't a checkpoint, or is damaged: {error}") from error
+
+
+def _require_stored_records(archive: zipfile.ZipFile, path: Path) -> None:
+    records, size = archive.infolist(), os.path.getsize(path)
+    if any(record.compress_type != zipfile.ZIP_STORED for record in records):
+        raise UserError(f"{path} is no checkpoint of torch.save: its records are compressed")
+    if sum(record.file_size for record in records) > size:
+        raise UserError(f"{path} is damaged: its records are larger than the file")
+
+
+def _require_plain_pickle(content: bytes, path: Path) -> None:
+    for name in _called(content):
+        if WATCHED_MODULES.match(name) and not ALLOWED_CALLS.fullmatch(name):
+            raise UserError(
+                f"{path} calls {name.replace(' ', '.')} when it is read, which no checkpoint "
+                "needs, so it isn't read"
+            )
+
+
+def _called(content: bytes) -> Iterator[str]:
+    """Yield every global that a pickle looks up, as "module name"."""
+    for count, (opcode, argument, _) in enumerate(pickletools.genops(content)):
+        if opcode.name == "GLOBAL":
+            yield str(argument)
+        if count > MAX_OPCODES:
+            raise ValueError(f"its pickle has more than {MAX_OPCODES} instructions")

@@ -16,8 +16,6 @@ from .errors import UserError
 
 ABANDONED_SECONDS = 3600
 """Age from which a temporary file is taken for that of a killed process."""
-
-
 PLACEHOLDERS = {
     b"version https://git-lfs": "a pointer of Git LFS, not the file itself: run `git lfs pull` "
     "where it is from, or download it again",
@@ -74,11 +72,8 @@ def near_names(path: Path, bundled: Collection[str] = ()) -> str:
     similar names, or files with the same extension.
     """
     folder = path.parent
-    names = (
-        sorted(entry.name for entry in folder.iterdir() if entry.is_file())
-        if folder.is_dir()
-        else []
-    )
+    entries = folder.iterdir() if folder.is_dir() else ()
+    names = sorted(entry.name for entry in entries if entry.is_file())
     near = get_close_matches(path.name, names, n=3, cutoff=0.5)
     if meant := get_close_matches(path.name, bundled, n=1, cutoff=0.5):
         others = f" Near names in {str(folder)!r}: {', '.join(near)}." if near else ""
@@ -86,11 +81,9 @@ def near_names(path: Path, bundled: Collection[str] = ()) -> str:
     if not folder.is_dir():
         return f": there is no folder {str(folder)!r} either."
     near = near or [name for name in names if Path(name).suffix == path.suffix][:3]
-    return (
-        f"; near names in {str(folder)!r}: {', '.join(near)}."
-        if near
-        else f"; no file in {str(folder)!r} has a near name."
-    )
+    if not near:
+        return f"; no file in {str(folder)!r} has a near name."
+    return f"; near names in {str(folder)!r}: {', '.join(near)}."
 
 
 @contextmanager
@@ -207,8 +200,7 @@ def require_other_file(
     Raises:
         UserError: both are the same existing file.
     """
-    both_exist = os.path.exists(source) and os.path.exists(path)
-    if both_exist and os.path.samefile(source, path):
+    if os.path.exists(source) and os.path.exists(path) and os.path.samefile(source, path):
         raise UserError(f"{what}: give it another name, so that {_quoted(Path(source))} is kept")
 
 
@@ -255,13 +247,9 @@ def _sync_folder(folder: Path) -> None:
     """Flush a folder to the disk, so that a renaming in it is durable; does nothing on systems that
     can't open folders (Windows).
     """
-    try:
+    with suppress(OSError):  # some network file systems can't either; the file itself is synced
         descriptor = os.open(folder, os.O_RDONLY)
-    except OSError:
-        return
-    try:
-        os.fsync(descriptor)
-    except OSError:
-        pass  # some network file systems can't; the file itself is synced
-    finally:
-        os.close(descriptor)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)

@@ -77,15 +77,10 @@ def grayscale(
         raise ValueError(
             f"unknown colour map {cmap!r}; expected None or one of {', '.join(_COLOR_MAPS)}"
         )
-    knots = np.array(
-        [list(bytes.fromhex(knot)) for knot in _COLOR_MAPS[cmap].split()], dtype=np.float64
-    )
+    knots = np.array([list(bytes.fromhex(knot)) for knot in _COLOR_MAPS[cmap].split()], np.float64)
     positions = np.linspace(0, 1, len(knots))
-    return (
-        np.stack([np.interp(values, positions, knots[:, c]) for c in range(3)], axis=-1)
-        .round()
-        .astype(np.uint8)
-    )
+    channels = [np.interp(values, positions, knots[:, c]) for c in range(3)]
+    return np.stack(channels, axis=-1).round().astype(np.uint8)
 
 
 def grid(cells: list, *, align: Any = "max") -> np.ndarray:
@@ -98,9 +93,7 @@ def grid(cells: list, *, align: Any = "max") -> np.ndarray:
     if isinstance(cells[0], list):
         rows = [grid(row, align=align) for row in cells]
         width = max(row.shape[1] for row in rows)
-        return np.concatenate(
-            [np.pad(row, ((0, 0), (0, width - row.shape[1]), (0, 0))) for row in rows], axis=0
-        )
+        return np.concatenate([_padded(row, 0, width - row.shape[1]) for row in rows], axis=0)
     makers = {"rgb": rgb, "grayscale": grayscale}
     images = [makers[cell["type"]](cell["img"], **cell.get("kwargs", {})) for cell in cells]
     height, width = _cell_size(images, align)
@@ -112,15 +105,10 @@ def with_texts(image: np.ndarray, texts: list) -> np.ndarray:
     from PIL import Image, ImageDraw
 
     canvas = Image.fromarray(image)
-    draw = ImageDraw.Draw(canvas)
+    draw, band = ImageDraw.Draw(canvas), image.shape[0] // max(len(texts), 1)
+    black_on_white = {"fill": (0, 0, 0), "stroke_width": 1, "stroke_fill": (255, 255, 255)}
     for row, text in enumerate(texts):
-        draw.text(
-            (2, row * (image.shape[0] // len(texts))),
-            str(text),
-            fill=(0, 0, 0),
-            stroke_width=1,
-            stroke_fill=(255, 255, 255),
-        )
+        draw.text((2, row * band), str(text), **black_on_white)
     return np.asarray(canvas)
 
 
@@ -170,7 +158,8 @@ def write_video(path: str, frames: list[Path], *, fps: int) -> None:
         with imageio.get_writer(part, mode="I", **options) as writer:
             for frame in frames:
                 image = imageio.imread(frame)[..., :3]
-                writer.append_data(_even(image) if mp4 else image)
+                odd = image.shape[0] % 2, image.shape[1] % 2
+                writer.append_data(_padded(image, *odd, "edge") if mp4 else image)
         if mp4:
             _require_whole_mp4(part)
         os.replace(part, path)
@@ -233,9 +222,8 @@ def _to_bytes(values: np.ndarray) -> np.ndarray:
     return (values * 255).round().astype(np.uint8)
 
 
-def _even(image: np.ndarray) -> np.ndarray:
-    height, width = image.shape[:2]
-    return np.pad(image, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
+def _padded(image: np.ndarray, rows: int, columns: int, mode: str = "constant") -> np.ndarray:
+    return np.pad(image, ((0, rows), (0, columns), (0, 0)), mode=mode)
 
 
 def _cell_size(images: list[np.ndarray], align: Any) -> tuple[int, int]:

@@ -13,8 +13,10 @@ Integer end steps count optimiser steps, those written as ``10.0`` epochs. Rando
 endless epoch, in threestudio too, so that with them a schedule in epochs stays at its first value.
 """
 
+import functools
 import logging
 import math
+from itertools import pairwise
 from numbers import Real
 from typing import Any, NamedTuple
 
@@ -65,21 +67,13 @@ def validate_schedule(value: Any, name: str = "the schedule", minimum: float = -
     if lowest < minimum:
         raise UserError(f"{name}: expected values of {minimum:g} or more, got {lowest:g}")
     if schedule.in_epochs:
-        _warn_of_epochs(name, value)
+        # once for the part and the launcher, which call the option by its name and by its path
+        _warn_of_epochs(name.rpartition(".")[2], str(value))
     return value
 
 
-_warned: set[tuple[str, str]] = set()
-
-
-def _warn_of_epochs(name: str, value: Any) -> None:
-    """Warn that a schedule counts epochs, once for the part and the launcher, which call the option
-    by its name and by its whole path.
-    """
-    key = name.rpartition(".")[2], str(value)
-    if key in _warned:
-        return
-    _warned.add(key)
+@functools.cache
+def _warn_of_epochs(name: str, value: str) -> None:
     logger.warning(
         "%s: its end steps have decimal points and count epochs; random cameras are one endless "
         "epoch, so that it stays at its first value: write whole numbers to count steps",
@@ -98,7 +92,10 @@ def parse_schedule(value: Any, name: str = "the schedule") -> Schedule:
         return value
     if _is_number(value):
         return Schedule([0], [_finite(value, name)], in_epochs=False)
-    knots = _as_list(value, name)
+    # OmegaConf's list is neither list nor tuple, but a sequence of plain numbers when iterated
+    if isinstance(value, (str, bytes)) or hasattr(value, "keys") or not hasattr(value, "__len__"):
+        raise UserError(f"{name} is {value!r}; expected {FORMS}")
+    knots = list(value)
     if len(knots) == 3:
         knots = [0, *knots]
     if len(knots) < 4 or len(knots) % 2:
@@ -106,58 +103,10 @@ def parse_schedule(value: Any, name: str = "the schedule") -> Schedule:
     knots = [_finite(knot, name) for knot in knots]
     # the first pair is (step, value), all later pairs are (value, step)
     steps, values, ends = [knots[0], *knots[3::2]], [knots[1], *knots[2::2]], knots[3::2]
-    return Schedule(_increasing(steps, name), values, in_epochs=_in_epochs(ends, name))
-
-
-def _interpolate(schedule: Schedule, now: float, interpolation: str) -> float:
-    steps, values, _ = schedule
-    if now <= steps[0]:
-        return values[0]
-    for i in range(1, len(steps)):
-        if now < steps[i]:
-            t = (now - steps[i - 1]) / (steps[i] - steps[i - 1])
-            return _between(values[i - 1], values[i], t, interpolation)
-    return values[-1]
-
-
-def _between(start: float, end: float, t: float, interpolation: str) -> float:
-    if interpolation == "linear":
-        return start + (end - start) * t
-    if interpolation == "exp":
-        return math.exp(math.log(start) * (1 - t) + math.log(end) * t)
-    raise UserError(f"unknown interpolation {interpolation!r}: expected 'linear' or 'exp'")
-
-
-def _as_list(value: Any, name: str) -> list:
-    # a ListConfig is neither list nor tuple, but a sequence of plain numbers when iterated
-    if (
-        isinstance(value, (str, bytes, dict))
-        or not hasattr(value, "__len__")
-        or hasattr(value, "keys")
-    ):
-        raise UserError(f"{name} is {value!r}; expected {FORMS}")
-    return list(value)
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, Real) and not isinstance(value, bool)
-
-
-def _finite(value: Any, name: str) -> float:
-    if not _is_number(value) or not math.isfinite(value):
-        raise UserError(f"{name} contains {value!r}, which isn't a finite number; expected {FORMS}")
-    return value
-
-
-def _increasing(steps: list[float], name: str) -> list[float]:
-    if any(later <= earlier for earlier, later in zip(steps, steps[1:], strict=False)):
+    if any(later <= earlier for earlier, later in pairwise(steps)):
         raise UserError(
             f"{name}: its steps {steps} must increase (for a hard switch write [500, v0, v1, 501])"
         )
-    return steps
-
-
-def _in_epochs(ends: list[float], name: str) -> bool:
     fractional = [isinstance(end, float) for end in ends]
     if any(fractional) and not all(fractional):
         raise UserError(
@@ -168,4 +117,30 @@ def _in_epochs(ends: list[float], name: str) -> bool:
             f"{name}: the end step {broken[0]:g} is no whole number of steps or epochs; expected "
             f"{FORMS}"
         )
-    return all(fractional)
+    return Schedule(steps, values, in_epochs=all(fractional))
+
+
+def _interpolate(schedule: Schedule, now: float, interpolation: str) -> float:
+    steps, values, _ = schedule
+    if interpolation not in ("linear", "exp"):
+        raise UserError(f"unknown interpolation {interpolation!r}: expected 'linear' or 'exp'")
+    if now <= steps[0]:
+        return values[0]
+    for i in range(1, len(steps)):
+        if now < steps[i]:
+            t = (now - steps[i - 1]) / (steps[i] - steps[i - 1])
+            start, end = values[i - 1], values[i]
+            if interpolation == "linear":
+                return start + (end - start) * t
+            return math.exp(math.log(start) * (1 - t) + math.log(end) * t)
+    return values[-1]
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, Real) and not isinstance(value, bool)
+
+
+def _finite(value: Any, name: str) -> float:
+    if not _is_number(value) or not math.isfinite(value):
+        raise UserError(f"{name} contains {value!r}, which isn't a finite number; expected {FORMS}")
+    return value

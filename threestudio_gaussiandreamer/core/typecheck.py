@@ -30,9 +30,8 @@ def check(function: Callable) -> Callable:
     def checked(*args: Any, **kwargs: Any) -> Any:
         bound = signature.bind(*args, **kwargs)
         for name, value in bound.arguments.items():
-            _require(
-                value, signature.parameters[name].annotation, f"{function.__qualname__}: {name}"
-            )
+            annotation = signature.parameters[name].annotation
+            _require(value, annotation, f"{function.__qualname__}: {name}")
         result = function(*args, **kwargs)
         _require(result, signature.return_annotation, f"{function.__qualname__}: result")
         return result
@@ -42,11 +41,8 @@ def check(function: Callable) -> Callable:
 
 def _require(value: Any, annotation: Any, what: str) -> None:
     if not matches(value, annotation):
-        found = (
-            f"{type(value).__name__} {getattr(value, 'dtype', '')} "
-            f"{tuple(getattr(value, 'shape', ()))}"
-        )
-        raise TypeError(f"{what} is {found}; expected {annotation}")
+        found = f"{getattr(value, 'dtype', '')} {tuple(getattr(value, 'shape', ()))}"
+        raise TypeError(f"{what} is {type(value).__name__} {found}; expected {annotation}")
 
 
 def matches(value: Any, annotation: Any) -> bool:
@@ -55,18 +51,13 @@ def matches(value: Any, annotation: Any) -> bool:
         return True
     origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
     if origin in (typing.Union, types.UnionType):
-        return any(
-            matches(value, argument)
-            if _speaks_of_arrays(argument)
-            else _is_instance(value, argument)
-            for argument in arguments
-        )
+        arrays = [argument for argument in arguments if _speaks_of_arrays(argument)]
+        others = tuple(typing.get_origin(a) or a for a in arguments if a not in arrays)
+        known = any(other is Any or isinstance(value, other) for other in others)
+        return known or any(matches(value, argument) for argument in arrays)
     if origin is tuple and Ellipsis not in arguments:
-        return (
-            isinstance(value, tuple)
-            and len(value) == len(arguments)
-            and all(map(matches, value, arguments))
-        )
+        same_length = isinstance(value, tuple) and len(value) == len(arguments)
+        return same_length and all(map(matches, value, arguments))
     return isinstance(value, annotation) if inspect.isclass(annotation) else True
 
 
@@ -74,11 +65,3 @@ def _speaks_of_arrays(annotation: Any) -> bool:
     if inspect.isclass(annotation) and issubclass(annotation, jaxtyping.AbstractArray):
         return True
     return any(map(_speaks_of_arrays, typing.get_args(annotation)))
-
-
-def _is_instance(value: Any, annotation: Any) -> bool:
-    return (
-        isinstance(value, typing.get_origin(annotation) or annotation)
-        if annotation is not Any
-        else True
-    )

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.lib import format as npy
 
 from ..core.errors import UserError
-from ..core.file_memory import require_file_memory
+from ..core.memory import require_file_memory
 
 MOST_DEFLATE_SAVES = 1032
 """Bytes that one byte of a deflate stream stands for at most (zlib's technical notes)."""

@@ -22,8 +22,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from ..core.file_memory import require_file_memory
 from ..core.files import existing_file
+from ..core.memory import require_file_memory
 from ..gaussians.axes import placed, rotate
 from ..gaussians.gaussians import Gaussians, finite, joined
 from ..gaussians.sh import COEFFICIENTS, sh0_colors

@@ -44,8 +44,8 @@ import numpy as np
 from jaxtyping import Float, Integer
 
 from ..core.errors import UserError
-from ..core.file_memory import require_file_memory
 from ..core.files import atomic_file, existing_file
+from ..core.memory import require_file_memory
 from ..gaussians.axes import VIEWER_UP
 from ..gaussians.gaussians import Gaussians, finite
 from ..gaussians.sh import COEFFICIENTS

@@ -20,9 +20,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Optional
 
-from ..core.command import exit_code, run_command
+from ..core.command import exit_code, run_command, tolerant_output
 from ..core.errors import Terminated, UserError
-from ..core.output import tolerant_output
 from ..core.signals import raised_signals
 from .options import (
     LIST_PARTS,

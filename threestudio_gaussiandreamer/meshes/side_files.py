@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from ..core.errors import UserError
-from ..core.file_memory import BYTES_PER_FILE_BYTE
+from ..core.memory import BYTES_PER_FILE_BYTE
 
 log = logging.getLogger(__name__)
 

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from ..core.archive import require_plain_archive
+from ..core.checkpoint_file import require_plain_archive
 from ..core.errors import UserError
 from ..core.files import existing_file
 
