@@ -52,16 +52,11 @@ class StepLog:
                 logger.log_metrics(values | {"epoch": epoch}, step=step)
                 logger.save()
 
-        self.reads.submit(_joined(on_gpu.values()), log)
+        flat = [number.reshape(1).double() for number in on_gpu.values()]
+        self.reads.submit(torch.cat(flat or [torch.empty(0, dtype=torch.float64)]), log)
         # a monitored number must be that of the step whose checkpoint is written
         if any(getattr(saver, "monitor", None) for saver in trainer.checkpoint_callbacks):
             self.reads.flush()
-
-
-def _joined(numbers: Iterable[Tensor]) -> Float[Tensor, " N"]:
-    """Return tensors of one element as one of float64."""
-    flat = [number.reshape(1).double() for number in numbers]
-    return torch.cat(flat) if flat else torch.empty(0, dtype=torch.float64)
 
 
 def log_scores(

@@ -7,7 +7,7 @@ check such a run would end without an error, and with holes in the object.
 
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
-from typing import Optional
+from typing import Any, Optional
 
 import torch
 from jaxtyping import Float
@@ -137,3 +137,36 @@ def warn_if_invisible(opacity: Float[Tensor, "B H W 1"], step: int) -> None:
             "no Gaussian is visible in the first step's views, so it trains none: check size and "
             "place of the prior, system.geometry.init_opacity, and the cameras' distances"
         )
+
+
+class LossScale:
+    """The loss scale of automatic mixed precision, a factor on all gradients: if it makes them
+    infinite, it is halved and the step is skipped, which this counts.
+    """
+
+    def __init__(self) -> None:
+        self.skipped_steps = 0
+
+    @property
+    def numbers(self) -> dict[str, float]:
+        """Return what is logged."""
+        return {"train/skipped_steps": self.skipped_steps}
+
+    def value(self, trainer: Any) -> float:
+        """Return the current factor on the gradients; 1 without mixed precision."""
+        scaler = getattr(trainer.precision_plugin, "scaler", None)
+        return 1.0 if scaler is None else float(scaler.get_scale())
+
+    def has_skipped(self, trainer: Any, before: float) -> bool:
+        """Return whether the step that began with the scale ``before`` was skipped; if so, count
+        and report it.
+        """
+        if self.value(trainer) >= before:
+            return False
+        self.skipped_steps += 1
+        warn(
+            f"step {trainer.global_step}: gradients overflowed at the loss scale {before:g}, "
+            "so its update was skipped; schedules continue "
+            f"({self.skipped_steps} such steps so far)"
+        )
+        return True

@@ -55,9 +55,7 @@ class EvaluationConfig:
 
 
 class HeldOut:
-    """The held-out views and their ground truth, which ``caster`` (a :class:`raycast.MeshCaster`)
-    casts on first use.
-    """
+    """The held-out views and their ground truth, which a :class:`raycast.MeshCaster` casts."""
 
     RING = 24  # number of azimuths that the multi-face rate compares with
     RING_SIZE = 32
@@ -137,11 +135,8 @@ class HeldOut:
         2 % of the longest side of its bounding box.
         """
         distances = torch.from_numpy(self.surface_distance(means.double().cpu().numpy()))
-        return metrics.floater_mass(
-            distances,
-            opacities.double().cpu(),
-            extent=float(np.ptp(self.caster.mesh.vertices, axis=0).max()),
-        )
+        extent = float(np.ptp(self.caster.mesh.vertices, axis=0).max())
+        return metrics.floater_mass(distances, opacities.double().cpu(), extent=extent)
 
 
 CLOCKS = ("seconds", "cpu_seconds")
@@ -236,18 +231,17 @@ class Measurements:
         return Snapshot(step, self._elapsed(), images, backgrounds, means, opacities)
 
     def _score(self, key: str, cloud: Snapshot) -> dict[str, Any]:
-        images = cloud.images.clamp(0, 1)
-        truth = self.held_out.truth_on(cloud.backgrounds)
-        scores = {"step": cloud.step, **cloud.elapsed, "gaussians": len(cloud.means)}
-        scores |= {
+        images, held_out = cloud.images.clamp(0, 1), self.held_out
+        truth = held_out.truth_on(cloud.backgrounds)
+        relative = metrics.saturation(images) / max(metrics.saturation(truth), 1e-6)
+        scores = {"step": cloud.step, **cloud.elapsed, "gaussians": len(cloud.means)} | {
             "psnr": round(float(metrics.psnr(images, truth).mean()), 3),
             "ssim": round(float(metrics.ssim(images, truth).mean()), 4),
+            "multi_face": round(held_out.multi_face(images, cloud.backgrounds), 4),
+            "floater_mass": round(held_out.floaters(cloud.means, cloud.opacities), 5),
+            "out_of_gamut": round(metrics.out_of_gamut(cloud.images), 5),
+            "saturation": round(relative, 4),
         }
-        scores["multi_face"] = round(self.held_out.multi_face(images, cloud.backgrounds), 4)
-        scores["floater_mass"] = round(self.held_out.floaters(cloud.means, cloud.opacities), 5)
-        scores["out_of_gamut"] = round(metrics.out_of_gamut(cloud.images), 5)
-        relative = metrics.saturation(images) / max(metrics.saturation(truth), 1e-6)
-        scores["saturation"] = round(relative, 4)
         if key == "curve":
             self.values.setdefault("curve", []).append(scores)
         else:

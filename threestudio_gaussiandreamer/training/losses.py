@@ -130,14 +130,12 @@ def loggable(guided: Mapping[str, Any], losses: Mapping[str, Tensor]) -> dict[st
     scalars = {
         name: value
         for name, value in guided.items()
-        if not name.startswith("loss_") and name != "error_to_truth" and _is_one_number(value)
+        if not name.startswith("loss_")
+        and name != "error_to_truth"
+        and (isinstance(value, (int, float)) or isinstance(value, Tensor) and value.numel() == 1)
     }
     weighted = {f"loss_{name}": value.detach() for name, value in losses.items()}
     return {f"train/{name}": value for name, value in (scalars | weighted).items()}
-
-
-def _is_one_number(value: Any) -> bool:
-    return isinstance(value, (int, float)) or isinstance(value, Tensor) and value.numel() == 1
 
 
 def logged_names(guidance: type, options: Iterable[str]) -> Optional[set[str]]:
@@ -146,16 +144,8 @@ def logged_names(guidance: type, options: Iterable[str]) -> Optional[set[str]]:
     """
     if not issubclass(guidance, ScoreDistillation):
         return None
-    losses = [name.replace("lambda_", "loss_", 1) for name in options]
-    guided = [
-        *losses,
-        "grad_norm",
-        "min_step",
-        "max_step",
-        "bad_items",
-        "evaluations",
-        *guidance.REPORTS,
-    ]
+    guided = [name.replace("lambda_", "loss_", 1) for name in options]
+    guided += ["grad_norm", "min_step", "max_step", "bad_items", "evaluations", *guidance.REPORTS]
     known = {"loss", "gaussians", *(f"train/{name}" for name in guided)}
     return known | {"dB"} if guidance.KNOWS_TRUTH else known
 

@@ -1,15 +1,20 @@
-"""Rows of validation pictures, in the format of the host's ``save_image_grid``."""
+"""Rows of validation pictures, in the format of the host's ``save_image_grid``, and ground-truth
+pictures of a run's views, for guidances that have them (``known_truth.py``).
+"""
 
+import math
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Optional
 
 import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
 from ..guidance.base import ScoreDistillation
+from ..guidance.known_truth import truth_of
+from .data import GaussianDreamerDataModule
 from .events import log_picture
-from .truth import true_views
+from .renderer import SplattingRenderer
 
 Panel = dict[str, Any]
 SCORE_PICTURES = ("imgs_noisy", "imgs_1step", "imgs_final")
@@ -62,8 +67,34 @@ def rgb_panel(image: Float[Tensor, "H W 3"]) -> Panel:
 
 
 def _grey_panel(image: Float[Tensor, "H W"], data_range: Any, cmap: Any) -> Panel:
-    return {
-        "type": "grayscale",
-        "img": image,
-        "kwargs": {"cmap": cmap, "data_range": data_range},
-    }
+    options = {"cmap": cmap, "data_range": data_range}
+    return {"type": "grayscale", "img": image, "kwargs": options}
+
+
+def true_views(
+    guidance: Any, batch: dict[str, Any], out: Mapping[str, Any]
+) -> Optional[Float[Tensor, "B H W 3"]]:
+    """Render the ground truth of a batch, with the background and size of its renders ``out``; None
+    if ``guidance`` has none.
+    """
+    truth = truth_of(guidance)
+    if truth is None:
+        return None
+    return truth.render(batch, out["comp_rgb_bg"].detach(), size=out["comp_rgb"].shape[1:3])
+
+
+def prefetch_truth(system: Any) -> None:
+    """Announce all cameras of a fixed pool to the ground truth, if the run of ``system`` will use
+    most of them.
+    """
+    truth, trainer = truth_of(system.guidance), system.trainer
+    if truth is None or not isinstance(trainer.datamodule, GaussianDreamerDataModule):
+        return
+    steps = math.inf if trainer.max_steps < 0 else trainer.max_steps - system.global_step
+    views = trainer.datamodule.views_to_prefetch(steps)
+    if views is None:
+        return
+    ours = isinstance(system.renderer, SplattingRenderer)
+    downsample = system.renderer.cfg.downsample if ours else 1
+    size = views["height"] // downsample, views["width"] // downsample
+    truth.prefetch(views["c2w"].to(system.device), views["fovy"].to(system.device), *size)

@@ -58,6 +58,7 @@ from .events import StepLog, log_scores
 from .export import GaussianSavers, export, exported_files
 from .finite import (
     CHECK_EVERY,
+    LossScale,
     RecentLosses,
     require_finite,
     require_optimised,
@@ -65,7 +66,6 @@ from .finite import (
     warn_if_invisible,
 )
 from .held_out import EvaluationConfig, HeldOut, Measurements
-from .loss_scale import LossScale
 from .losses import (
     check_losses,
     loggable,
@@ -77,10 +77,9 @@ from .losses import (
 )
 from .optimizer import PartRates, check_optimizer, drop_gradients, make_optimizer, restore_arguments
 from .pages import discard_turntable, save_first_cloud, turntable_name, write_turntable
-from .pictures import rgb_panel, save_pictures
+from .pictures import prefetch_truth, rgb_panel, save_pictures, true_views
 from .preflight import check_parts, preflight_parts
 from .renderer import require_outputs
-from .truth import prefetch_truth, true_views
 
 GUIDANCE_LR = 1e-4
 """Learning rate of parameters that a guidance trains itself, such as the LoRA of VSD."""
