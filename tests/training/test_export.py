@@ -94,24 +94,6 @@ def test_test_validate_and_export_use_the_checkpoint_and_no_prior(tmp_path, pain
     assert np.array_equal(exported.means, means[:, [1, 2, 0]] * np.float32([1, -1, -1]))
 
 
-@pytest.mark.parametrize(
-    ("options", "said"),
-    [
-        (["system.prune.count=0"], "system.prune.count: expected a whole number from 1 on"),
-        (
-            ["system.prune.count=9", "system.prune.psnr=40"],
-            "system.prune.psnr: give one budget only; count is set too",
-        ),
-        (["system.prune.bytes=lots"], "system.prune.bytes: expected a size such as 500kB"),
-    ],
-)
-def test_a_wrong_pruning_budget_is_found_before_the_run(
-    tmp_path, painted_box, capsys, options, said
-):
-    assert launch(tmp_path, painted_box, *options) == 2
-    assert said in capsys.readouterr().err
-
-
 def test_every_format_is_exported_and_says_that_it_was_trained_antialiased(tmp_path, painted_box):
     options = [
         "system.renderer.antialias=true",
@@ -213,22 +195,3 @@ def test_a_mesh_is_exported_beside_the_cloud_as_the_run_draws(tmp_path, painted_
     name = (export / "mesh.obj").read_text("utf-8").splitlines()[1].removeprefix("o ")
     assert f'"name":"{name}"' in (export / "mesh.glb").read_bytes().decode(errors="ignore")
     assert name not in ("", "mesh")  # but the prompt's
-
-
-@pytest.mark.parametrize(
-    "option, said",
-    [
-        ("faces=7", "system.exporter.faces: expected a whole number from 100"),
-        ("texture=9999999", "system.exporter.texture: expected a whole number from 64"),
-        ("save_name=a.fbx", "system.exporter.save_name: expected the name of a .glb"),
-    ],
-)
-def test_wrong_options_of_the_mesh_are_refused_before_training(
-    tmp_path, painted_box, capsys, option, said
-):
-    options = [
-        "system.exporter_type=mesh-exporter",
-        f"system.exporter={{{option.replace('=', ': ')}}}",
-    ]
-    assert launch(tmp_path, painted_box, *options) == 2
-    assert said in capsys.readouterr().err

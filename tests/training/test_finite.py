@@ -11,6 +11,7 @@ from threestudio_gaussiandreamer.training.finite import (
     RecentLosses,
     optimizer_tensors,
     require_finite,
+    warn_if_invisible,
 )
 from threestudio_gaussiandreamer.training.system import GaussianDreamerSystem
 
@@ -59,6 +60,13 @@ NON_FINITE = {  # each makes a run's parameters or moments NaN or infinite in it
 }
 
 
+def test_renders_that_are_all_empty_are_named_in_the_first_step(caplog):
+    for step, opacity in ((0, 1e-9), (1, 0.0), (0, 0.0)):
+        assert not caplog.text
+        warn_if_invisible(torch.full((1, 4, 4, 1), opacity), step)
+    assert "no Gaussian is visible in the first step's views" in caplog.text
+
+
 @pytest.mark.parametrize("cause", NON_FINITE)
 def test_a_run_that_turns_non_finite_stops_and_saves_nothing_of_it(
     tmp_path, painted_box, monkeypatch, capsys, cause
@@ -96,10 +104,7 @@ def test_a_non_finite_state_never_replaces_a_good_checkpoint(tmp_path, painted_b
     assert launch(tmp_path, painted_box, *every, f"resume={last}") == 0
 
 
-@pytest.mark.parametrize("stage", ["--test", "--export"])
-def test_a_cloud_that_is_not_finite_is_neither_shown_nor_exported(
-    tmp_path, painted_box, monkeypatch, capsys, stage
-):
+def test_a_cloud_that_is_not_finite_is_not_exported(tmp_path, painted_box, monkeypatch, capsys):
     ensure_cloud = GaussianDreamerSystem.ensure_cloud
 
     def with_nan(self):
@@ -107,7 +112,7 @@ def test_a_cloud_that_is_not_finite_is_neither_shown_nor_exported(
         self.geometry.sh0.data[7] = torch.inf
 
     monkeypatch.setattr(GaussianDreamerSystem, "ensure_cloud", with_nan)
-    assert launch(tmp_path, painted_box, stage=stage) == 2
+    assert launch(tmp_path, painted_box, stage="--export") == 2
     assert "3 of the 600 numbers of geometry.sh0 are NaN or infinite" in capsys.readouterr().err
     assert not list(tmp_path.rglob("it*"))
 
@@ -122,15 +127,7 @@ def test_finite_numbers_of_a_cloud_that_no_camera_sees_are_named():
 
 def test_a_run_that_loses_its_cloud_ends_with_an_error(tmp_path, painted_box, capsys):
     steps = ["trainer.max_steps=3", "system.pages=false"]
-    assert launch(tmp_path, painted_box, *steps, "system.geometry.lr_means=1e30") == 2
-    assert "lr_means: expected values of 1e+06 or less" in capsys.readouterr().err
     assert launch(tmp_path, painted_box, *steps, "system.geometry.lr_scales=20") == 2
     errors = capsys.readouterr().err
     assert "numbers of geometry.log_scales are beyond 30" in errors and "lr_*" in errors
     assert not [*tmp_path.rglob("*.ckpt"), *tmp_path.rglob("it*")]
-
-
-@pytest.mark.parametrize("option", ["prior.scale=1e30", "grow.radius=1e38"])
-def test_sizes_beyond_any_use_are_refused(tmp_path, painted_box, capsys, option):
-    assert launch(tmp_path, painted_box, f"system.geometry.{option}") == 2
-    assert f"system.geometry.{option.split('=')[0]}: expected a number" in capsys.readouterr().err

@@ -268,6 +268,8 @@ def test_colours_by_direction_that_are_dropped_are_told(
         ({"sh_degree": 4}, "sh_degree"),
         ({"min_gaussians": 10, "max_gaussians": 5}, "min_gaussians"),
         ({"grow": {"radius": 0}}, "grow.radius"),
+        ({"grow": {"radius": 1e38}}, "grow.radius"),
+        ({"lr_means": 1e30}, "lr_means: expected values of 1e\\+06 or less"),
         ({"grow": {"color_range": [0.2, 0.0]}}, "color_range"),
         ({"lr_means": [1, 2, 3, 4, 5]}, "lr_means"),
     ],

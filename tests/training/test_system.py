@@ -22,40 +22,10 @@ from tests.training.runs import (
 from threestudio_gaussiandreamer.formats.ply import read_gaussians
 from threestudio_gaussiandreamer.gaussians.sh import sh0_to_rgb
 from threestudio_gaussiandreamer.guidance.known_truth import MeshTruth
-from threestudio_gaussiandreamer.launch.checkpoints import AtomicCheckpointIO
 from threestudio_gaussiandreamer.launch.experiment import main
 from threestudio_gaussiandreamer.training import held_out as evaluate
 from threestudio_gaussiandreamer.training import system as system_module
 from threestudio_gaussiandreamer.training.system import GaussianDreamerSystem
-
-
-def test_a_run_with_a_mocked_guidance_goes_from_prior_to_files(tmp_path, painted_box):
-    overrides = [
-        f"exp_root_dir={tmp_path}",
-        *SMALL,
-        "trainer.max_steps=6",
-        "trainer.val_check_interval=3",
-    ]
-    assert (
-        main(
-            [
-                "--config",
-                str(mocked_config(tmp_path, painted_box)),
-                "--train",
-                "--gpu",
-                "cpu",
-                *overrides,
-            ]
-        )
-        == 0
-    )
-    save = run_folder(tmp_path) / "save"
-    assert (save / "it3-0.png").is_file() and (save / "it6-0.png").is_file()
-    assert (save / "it6-test.mp4").stat().st_size > 0 and (save / "it6-test" / "2.png").is_file()
-    assert len(read_gaussians(save / "it6-export" / "gaussians.ply").means) == 200
-    assert (run_folder(tmp_path) / "ckpts" / "last.ckpt").is_file() and (
-        run_folder(tmp_path) / "cmd.txt"
-    ).is_file()
 
 
 @pytest.fixture
@@ -66,11 +36,11 @@ def no_models(monkeypatch):
     )
 
 
-@pytest.mark.parametrize("path", ["nosuch.glb", "${system.guidance.mesh}s"])
 def test_a_missing_prior_file_is_found_before_any_model_is_loaded(
-    tmp_path, painted_box, capsys, no_models, path
+    tmp_path, painted_box, capsys, no_models
 ):
-    assert launch(tmp_path, painted_box, f"system.geometry.prior.path={path}") == 2
+    path = "system.geometry.prior.path=${system.guidance.mesh}s"
+    assert launch(tmp_path, painted_box, path) == 2
     assert "does not exist" in capsys.readouterr().err
 
 
@@ -117,26 +87,6 @@ def test_training_against_a_known_truth_improves_on_held_out_views(tmp_path, pai
     assert logged == [(0, metrics["prior"]["psnr"]), (60, metrics["result"]["psnr"])]
     assert [event.step for event in events.Images("validation/0")] == [60]
     assert events.Images("validation/0")[0].width > events.Images("validation/0")[0].height
-
-
-def test_the_prior_is_scored_after_the_first_step_and_before_a_checkpoint(
-    tmp_path, painted_box, monkeypatch
-):
-    happened = []
-
-    def record(owner, name, what):
-        body = getattr(owner, name)
-        monkeypatch.setattr(
-            owner, name, lambda *args, **options: (happened.append(what), body(*args, **options))[1]
-        )
-
-    record(GaussianDreamerSystem, "training_step", "step")
-    record(evaluate.Measurements, "_score", "score")
-    record(AtomicCheckpointIO, "save_checkpoint", "checkpoint")
-    options = ["trainer.max_steps=2", "checkpoint.every_n_train_steps=1"]
-    assert launch(tmp_path, painted_box, *options, "system.exporter.save_video=false") == 0
-    assert happened[:3] == ["step", "score", "checkpoint"]
-    assert happened.count("score") == 2  # prior and result
 
 
 def tensorboard_events(folder):
@@ -197,9 +147,7 @@ def test_looking_at_pictures_is_no_training_time(tmp_path, painted_box, monkeypa
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("changes", "stop"), [(DENSIFY, 3), (DENSIFY, 4), (DENSIFY, 5), (PRUNE, 2), (PRUNE, 4)]
-)
+@pytest.mark.parametrize(("changes", "stop"), [(DENSIFY, 3), (DENSIFY, 4), (PRUNE, 4)])
 def test_a_stopped_and_resumed_run_equals_the_run_that_never_stopped(
     tmp_path, painted_box, changes, stop
 ):
@@ -250,10 +198,3 @@ def test_a_learned_background_learns_and_is_in_the_checkpoint(tmp_path, painted_
     assert (
         color[0] > 0.7 and color[1] < 0.35 and color[2] < 0.3
     )  # on its way from grey to the mock's (0.9, 0.2, 0.1)
-
-
-@pytest.mark.parametrize(("opacity", "warned"), [("1e-6", True), ("0.1", False)])
-def test_a_first_cloud_that_no_view_shows_is_named(tmp_path, painted_box, capsys, opacity, warned):
-    options = [f"system.geometry.init_opacity={opacity}", "trainer.max_steps=1"]
-    assert launch(tmp_path, painted_box, *options, "trainer.log_every_n_steps=0") == 0
-    assert ("no Gaussian is visible in the first step's views" in capsys.readouterr().err) == warned
