@@ -18,6 +18,7 @@ from torch import Tensor
 from ...core.errors import UserError
 from ...core.host_copies import HostCopy
 from . import nvrtc
+from .nvrtc import release
 from .stages import Argument
 
 # The .cu file of each kernel.
@@ -68,7 +69,7 @@ class Gpu:
         """Return the names and releases that the kernels' results may depend on."""
         return (
             f"{torch.cuda.get_device_name(self.index)}, {self.target}, driver {driver_build()}of "
-            f"CUDA {_release(driver_version())}, NVRTC of CUDA {_release(nvrtc.version())}"
+            f"CUDA {release(driver_version())}, NVRTC of CUDA {release(nvrtc.version())}"
         )
 
     def launch(self, name: str, grid: tuple[int, int], threads: int, *arguments: Argument) -> None:
@@ -78,13 +79,10 @@ class Gpu:
         values = [ctypes.c_void_p(x.data_ptr()) if isinstance(x, Tensor) else x for x in arguments]
         pointers = (ctypes.c_void_p * len(values))(*(ctypes.addressof(x) for x in values))
         with torch.cuda.device(self.index):
-            function, stream = (
-                self._function(name),
-                ctypes.c_void_p(torch.cuda.current_stream().cuda_stream),
-            )
-            status = _driver().cuLaunchKernel(
-                function, *grid, 1, threads, 1, 1, 0, stream, pointers, None
-            )
+            function = self._function(name)
+            stream = ctypes.c_void_p(torch.cuda.current_stream().cuda_stream)
+            sizes = (*grid, 1, threads, 1, 1, 0)
+            status = _driver().cuLaunchKernel(function, *sizes, stream, pointers, None)
         _check(status, f"launching the kernel {name}")
 
     def read_async(self, ends: Tensor) -> "Readback":
@@ -97,24 +95,18 @@ class Gpu:
         """
         _check(_driver().cuCtxSetCurrent(self.context), "using the GPU")
         if name not in self.functions:
-            function = ctypes.c_void_p()
-            status = _driver().cuModuleGetFunction(
-                ctypes.byref(function), self._module(UNITS[name]), name.encode()
-            )
+            function, module = ctypes.c_void_p(), self._module(UNITS[name])
+            status = _driver().cuModuleGetFunction(ctypes.byref(function), module, name.encode())
             _check(status, f"finding the kernel {name}")
             self.functions[name] = function
         return self.functions[name]
 
     def _module(self, unit: str) -> ctypes.c_void_p:
         if unit not in self.modules:
-            module = ctypes.c_void_p()
-            status = _driver().cuModuleLoadData(
-                ctypes.byref(module), nvrtc.machine_code(unit, self.target)
-            )
-            releases = (
-                f"NVRTC of CUDA {_release(nvrtc.version())}, driver of CUDA "
-                f"{_release(driver_version())}"
-            )
+            module, code = ctypes.c_void_p(), nvrtc.machine_code(unit, self.target)
+            status = _driver().cuModuleLoadData(ctypes.byref(module), code)
+            compiler, driver = release(nvrtc.version()), release(driver_version())
+            releases = f"NVRTC of CUDA {compiler}, driver of CUDA {driver}"
             _check(status, f"loading {unit}.cu for {self.target} ({releases})")
             self.modules[unit] = module
         return self.modules[unit]
@@ -142,9 +134,9 @@ def _gpu(index: int) -> Gpu:
 
 def driver_version() -> tuple[int, int]:
     """Return (major, minor) of the newest CUDA release that the driver supports."""
-    release = ctypes.c_int()
-    _check(_driver().cuDriverGetVersion(ctypes.byref(release)), "asking for the driver's version")
-    return release.value // 1000, release.value % 1000 // 10
+    found = ctypes.c_int()
+    _check(_driver().cuDriverGetVersion(ctypes.byref(found)), "asking for the driver's version")
+    return found.value // 1000, found.value % 1000 // 10
 
 
 def driver_build() -> str:
@@ -171,13 +163,9 @@ def _unsuitable() -> Optional[str]:
     if knows[0] < compiler[0]:
         advice = f"update the driver, or install a torch built for CUDA {knows[0]}"
         return (
-            f"the NVIDIA driver knows CUDA up to {_release(knows)}, the compiler is of CUDA "
-            f"{_release(compiler)}: {advice}"
+            f"the NVIDIA driver knows CUDA up to {release(knows)}, the compiler is of CUDA "
+            f"{release(compiler)}: {advice}"
         )
-
-
-def _release(version: tuple[int, int]) -> str:
-    return ".".join(map(str, version))
 
 
 def _primary_context(index: int) -> ctypes.c_void_p:
@@ -185,9 +173,8 @@ def _primary_context(index: int) -> ctypes.c_void_p:
     torch.cuda.init()
     device, context = ctypes.c_int(), ctypes.c_void_p()
     _check(_driver().cuInit(0), "starting the driver")
-    _check(
-        _driver().cuDeviceGet(ctypes.byref(device), index), "finding the GPU"
-    )  # torch and the driver both number the devices in CUDA_VISIBLE_DEVICES
+    # torch and the driver both number the devices in CUDA_VISIBLE_DEVICES
+    _check(_driver().cuDeviceGet(ctypes.byref(device), index), "finding the GPU")
     _check(_driver().cuDevicePrimaryCtxRetain(ctypes.byref(context), device), "using the GPU")
     return context
 

@@ -16,14 +16,10 @@ HEADROOM = 1.5
 STEP = 8192
 """Intersections. Rounding up makes torch's caching allocator reuse blocks; up to 4096 numbers are
 sorted by another kernel of torch, which would have to be loaded too."""
-MAX_INTERSECTIONS = (
-    2**31 - 1 - STEP
-)  # intersections; torch's sort and the kernels use 32-bit indices
+MAX_INTERSECTIONS = 2**31 - 1 - STEP  # torch's sort and the kernels use 32-bit indices
 DECAY = 0.99  # of the estimate, per call
-LIST_BYTES = (
-    4 + 4 + 4 + 8 + 20
-)  # per intersection: tile, owner, sorted tile, position, and the temporaries of the sort
-ROW_BYTES = 4 * 12  # per intersection: the backward pass's row of sums
+# per intersection: tile, owner, sorted tile, position, temporaries of the sort, and a row of sums
+BACKWARD_BYTES = (4 + 4 + 4 + 8 + 20) + 4 * 12
 Result = TypeVar("Result")
 
 
@@ -79,15 +75,13 @@ class CapacityEstimate:
 
     def _learn(self, totals, gaussians: int) -> None:
         """Update the estimate: at once to a larger number, slowly to a smaller one."""
-        self.per_gaussian = max(
-            DECAY * (self.per_gaussian or 0.0), sum(totals.values()) / gaussians
-        )
+        found = sum(totals.values()) / gaussians
+        self.per_gaussian = max(DECAY * (self.per_gaussian or 0.0), found)
 
     def _capacity(self, gaussians: int) -> int:
         expected = math.ceil(self.per_gaussian * gaussians)
-        return round_up_capacity(
-            max(expected, min(math.ceil(HEADROOM * expected), MAX_INTERSECTIONS))
-        )
+        most = min(math.ceil(HEADROOM * expected), MAX_INTERSECTIONS)
+        return round_up_capacity(max(expected, most))
 
 
 def halve_on_oom(work: Callable[[int, int], Result], first: int, last: int) -> list[Result]:
@@ -109,10 +103,8 @@ def halve_on_oom(work: Callable[[int, int], Result], first: int, last: int) -> l
 
 def too_large(intersections: int) -> UserError:
     """Make the error for a single view that doesn't fit into the GPU's memory."""
-    needed, free = (
-        intersections * (LIST_BYTES + ROW_BYTES) / 2**30,
-        torch.cuda.mem_get_info()[0] / 2**30 if torch.cuda.is_available() else 0.0,
-    )
+    needed = intersections * BACKWARD_BYTES / 2**30
+    free = torch.cuda.mem_get_info()[0] / 2**30 if torch.cuda.is_available() else 0.0
     return UserError(
         f"one view's Gaussians overlap {intersections} tiles of the image; their gradients need "
         f"about {needed:.1f} GiB on the GPU, "

@@ -25,11 +25,8 @@ from ...core.files import atomic_file
 
 KERNELS = Path(__file__).parent
 SHARED = KERNELS.parent / "shared"  # formulas, which the CPU kernel includes too
-OPTIONS = (
-    "--std=c++17",
-    "--ptxas-options=-v",
-    "--generate-line-info",
-)  # lines are for profilers and sanitizers
+# line numbers are for profilers and sanitizers
+OPTIONS = ("--std=c++17", "--ptxas-options=-v", "--generate-line-info")
 # Blending divides by 1 - alpha and takes powers once per pair of splat and pixel; subnormal numbers
 # and the last bit of a quotient are not visible there.
 UNIT_OPTIONS = {name: ("--ftz=true", "--prec-div=false") for name in ("blend", "blend_backward")}
@@ -58,6 +55,10 @@ def version() -> tuple[int, int]:
     return major.value, minor.value
 
 
+def release(version: tuple[int, int]) -> str:
+    return ".".join(map(str, version))
+
+
 def architectures() -> list[int]:
     """List the compute capabilities that the compiler supports, times ten: 75, 80, ..."""
     count = ctypes.c_int()
@@ -78,15 +79,12 @@ def target_for(capability: tuple[int, int]) -> str:
         UserError: the device is older than what the kernels or the compiler support.
     """
     device, known = 10 * capability[0] + capability[1], architectures()
-    older = [
-        architecture for architecture in known if OLDEST_ARCHITECTURE <= architecture <= device
-    ]
+    older = [number for number in known if OLDEST_ARCHITECTURE <= number <= device]
     if not older:
         oldest = max(OLDEST_ARCHITECTURE, min(known))
         raise UserError(
-            f"this GPU has compute capability {capability[0]}.{capability[1]}; the CUDA "
-            "backend, compiled by the NVRTC of CUDA "
-            f"{'.'.join(map(str, version()))}, needs {oldest // 10}.{oldest % 10} or later: "
+            f"this GPU has compute capability {release(capability)}; the CUDA backend, compiled by "
+            f"the NVRTC of CUDA {release(version())}, needs {oldest // 10}.{oldest % 10} or later: "
             "use backend='torch'."
         )
     return f"sm_{device}" if device in known else f"compute_{max(older)}"
@@ -110,32 +108,19 @@ def compile_unit(unit: str, target: str) -> Compiled:
         UserError: the compiler rejects it.
     """
     nvrtc, program, texts = _library(), ctypes.c_void_p(), headers()
-    sources = (
-        source(unit).encode(),
-        f"{unit}.cu".encode(),
-        len(texts),
-        _strings(texts.values()),
-        _strings(texts),
-    )
-    _check(nvrtc.nvrtcCreateProgram(ctypes.byref(program), *sources))
+    sources = (source(unit).encode(), f"{unit}.cu".encode())
+    included = (len(texts), _strings(texts.values()), _strings(texts))
+    _check(nvrtc.nvrtcCreateProgram(ctypes.byref(program), *sources, *included))
     try:
         options = options_of(unit, target)
         status = nvrtc.nvrtcCompileProgram(program, len(options), _strings(options))
-        messages = (
-            _bytes(nvrtc.nvrtcGetProgramLogSize, nvrtc.nvrtcGetProgramLog, program)
-            .rstrip(b"\0")
-            .decode()
-        )
+        messages = _bytes("ProgramLog", program).rstrip(b"\0").decode()
         if status:
-            release = ".".join(map(str, version()))
             raise UserError(
-                f"the NVRTC of CUDA {release} can't compile {unit}.cu for {target}: "
+                f"the NVRTC of CUDA {release(version())} can't compile {unit}.cu for {target}: "
                 f"{_error(status)}\n{messages}"
             )
-        kind = "CUBIN" if target.startswith("sm_") else "PTX"
-        code = _bytes(
-            getattr(nvrtc, f"nvrtcGet{kind}Size"), getattr(nvrtc, f"nvrtcGet{kind}"), program
-        )
+        code = _bytes("CUBIN" if target.startswith("sm_") else "PTX", program)
         return Compiled(code, messages)
     finally:
         nvrtc.nvrtcDestroyProgram(ctypes.byref(program))
@@ -168,25 +153,16 @@ def cache_folder() -> Path:
         RuntimeError: neither the variables nor the system say where the user's home is, as in some
             containers.
     """
-    folder = os.environ.get("GAUSSIANDREAMER_CACHE")
-    if folder:
+    if folder := os.environ.get("GAUSSIANDREAMER_CACHE"):
         return Path(folder).expanduser()
-    return (
-        Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-        / "gaussiandreamer"
-        / "cubins"
-    )
+    caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    return caches / "gaussiandreamer" / "cubins"
 
 
 def _key(unit: str, target: str) -> str:
     """Return a hash of everything that determines the machine code."""
-    parts = [
-        source(unit),
-        *headers(),
-        *headers().values(),
-        *options_of(unit, target),
-        str(version()),
-    ]
+    texts = [source(unit), *headers(), *headers().values()]
+    parts = [*texts, *options_of(unit, target), str(version())]
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:24]
 
 
@@ -263,11 +239,12 @@ def _candidates() -> list[str]:
     return [*dict.fromkeys(found), f"libnvrtc.so.{release}", "libnvrtc.so.12", "libnvrtc.so"]
 
 
-def _bytes(size_of, get, program: ctypes.c_void_p) -> bytes:
+def _bytes(kind: str, program: ctypes.c_void_p) -> bytes:
+    """Return the result of ``nvrtcGet<kind>``."""
     size = ctypes.c_size_t()
-    _check(size_of(program, ctypes.byref(size)))
+    _check(getattr(_library(), f"nvrtcGet{kind}Size")(program, ctypes.byref(size)))
     buffer = ctypes.create_string_buffer(size.value)
-    _check(get(program, buffer))
+    _check(getattr(_library(), f"nvrtcGet{kind}")(program, buffer))
     return buffer.raw
 
 

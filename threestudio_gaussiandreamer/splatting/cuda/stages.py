@@ -162,12 +162,8 @@ def project(batch: Batch, means2d: Tensor) -> tuple[Splats, Tensor, Tensor]:
     which are still zero.
     """
     shape, new = batch.scene.shape, batch.scene.means.new_empty
-    splats, depth_keys, radii, contribution = (
-        new(*shape, SPLAT),
-        new(shape, dtype=torch.int32),
-        new(shape),
-        new(shape),
-    )
+    splats, depth_keys = new(*shape, SPLAT), new(shape, dtype=torch.int32)
+    radii, contribution = new(shape), new(shape)
     outputs = (splats, depth_keys, means2d.detach(), radii, contribution)
     grid = _per_gaussian(shape)
     batch.launch("project", grid, THREADS, batch.context.settings, *outputs)
@@ -276,25 +272,21 @@ def _per_tile(batch: Batch) -> tuple[int, int]:
 
 class Settings(ctypes.Structure):
     _fields_ = [
-        (name, ctypes.c_float)
-        for name in ("near", "far", "eps2d", "log2_alpha_min", "alpha_max", "stop")
+        *((n, ctypes.c_float) for n in "near far eps2d log2_alpha_min alpha_max stop".split()),
+        *((n, ctypes.c_int) for n in "antialias downsample".split()),
     ]
-    _fields_ += [(name, ctypes.c_int) for name in ("antialias", "downsample")]
 
     @classmethod
     def of(cls, o: RasterizeOptions) -> "Settings":
-        log2_alpha_min = math.log2(o.kernel_alpha_min)
-        return cls(
-            o.near, o.far, o.eps2d, log2_alpha_min, o.alpha_max, o.stop, o.antialias, o.downsample
-        )
+        limits = (o.near, o.far, o.eps2d, math.log2(o.kernel_alpha_min), o.alpha_max, o.stop)
+        return cls(*limits, o.antialias, o.downsample)
 
 
 class _Lists(ctypes.Structure):
     _fields_ = [
-        (name, ctypes.c_void_p)
-        for name in ("splats", "order", "ends", "owners", "sorted", "begins")
+        *((n, ctypes.c_void_p) for n in "splats order ends owners sorted begins".split()),
+        ("capacity", ctypes.c_int64),
     ]
-    _fields_ += [("capacity", ctypes.c_int64)]
 
 
 class _Images(ctypes.Structure):
