@@ -82,16 +82,3 @@ except TypeError as error:
         [sys.executable, "-c", code], cwd=REPOSITORY, capture_output=True, text=True
     )
     assert done.stdout == "TypeCheckError\n", done.stdout + done.stderr
-
-
-RUN = {
-    "trainer.max_steps": 3, "trainer.val_check_interval": 3, "trainer.enable_progress_bar": "false",
-    "data.width": 32, "data.height": 32, "data.n_test_views": 2, "data.train_views": 4,
-    "data.eval_width": 32, "data.eval_height": 32,
-    "system.evaluation.views": 2, "system.evaluation.size": 16,
-    "system.geometry.prior.num_points": 300, "system.geometry.prior.color_smoothing": 0,
-    "system.geometry.grow.num_candidates": 2000, "system.geometry.grow.max_points": 200,
-    "system.geometry.densify.enabled": "true", "system.prune.count": 100,
-    "system.exporter.save_video": "false",
-    "system.exporter.formats": "[ply,spz,sog,points,glb,compressed-ply,surface,usda]",
-}  # fmt: skip

@@ -313,22 +313,6 @@ def test_a_non_finite_gaussian_equals_a_transparent_one(name, value):
     assert all((with_it.grads[attribute][4] == 0).all() for attribute in NAMES)
 
 
-@pytest.mark.parametrize(
-    "mean", [(0.0, 0.0, 0.0), (0.0, 0.0, -1.0), (1.0, 1.0, 0.0), (0.0, 0.0, 1e38), (1e38, 0.0, 1.0)]
-)
-def test_at_or_behind_the_camera_or_absurdly_far(mean):
-    cloud = Cloud(
-        *(torch.cat(pair) for pair in zip(one_gaussian(mean), one_gaussian(), strict=True))
-    ).to(torch.float32)
-    camera = front_camera(6, 6, 5.0)
-    with_it, alone = (
-        run(cloud, *camera, 6, 6, far=1e30, **SPECIFICATION),
-        run(cloud.pick([1]), *camera, 6, 6, far=1e30, **SPECIFICATION),
-    )
-    assert torch.equal(with_it.out.image, alone.out.image) and with_it.out.radii[0, 0] == 0
-    assert all((with_it.grads[name][0] == 0).all() for name in NAMES)
-
-
 def test_a_non_finite_camera_affects_its_own_view_only():
     cloud, (viewmats, Ks) = random_cloud(10, seed=13), cameras(2, 6, 5)
     background = torch.tensor([0.3, 0.5, 0.7], dtype=torch.float64)
