@@ -82,3 +82,13 @@ except TypeError as error:
         [sys.executable, "-c", code], cwd=REPOSITORY, capture_output=True, text=True
     )
     assert done.stdout == "TypeCheckError\n", done.stdout + done.stderr
+
+
+@pytest.mark.slow
+def test_a_run_that_exports_and_prunes_passes_the_checks(tmp_path):
+    options = ["system.geometry.densify.enabled=true", "system.prune.count=100"]
+    options += ["system.exporter.formats=[ply,spz,sog,points,glb,compressed-ply,surface,usda]"]
+    command = [sys.executable, "launch.py", "--config", "smoke.yaml", "--train", "--typecheck"]
+    command += ["--gpu", "cpu", f"exp_root_dir={tmp_path}", *options]
+    done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-2000:]
