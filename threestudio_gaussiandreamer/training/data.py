@@ -33,7 +33,7 @@ rays                      add rays_o and rays_d (B, H, W, 3) to every batch
 import bisect
 import itertools
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any, Optional
 
 import torch
@@ -81,10 +81,10 @@ def make_batch(
     return batch
 
 
-def orbit_batch(orbit: Orbit, height: int, width: int) -> dict[str, Any]:
+def orbit_batch(orbit: Orbit, height: int, width: int, *rays: bool) -> dict[str, Any]:
     """Make the host's batch of the views of ``orbit``, with the lights at the cameras."""
     c2w = orbit.c2w
-    return make_batch(orbit, c2w, c2w[:, :3, 3].clone(), height, width)
+    return make_batch(orbit, c2w, c2w[:, :3, 3].clone(), height, width, *rays)
 
 
 class TrainCameras(IterableDataset, Updateable):
@@ -104,22 +104,11 @@ class TrainCameras(IterableDataset, Updateable):
         for batch_size in sizes[2]:
             require_shareable(batch_size, "data.batch_size", together=cfg.n_view)
         self.sizes = list(zip(*[v * stages if len(v) == 1 else v for v in sizes], strict=True))
-        self.ranges = OrbitRanges(
-            *(
-                tuple(r)
-                for r in (
-                    cfg.elevation_range,
-                    cfg.azimuth_range,
-                    cfg.camera_distance_range,
-                    cfg.fovy_range,
-                )
-            )
-        )
-        self.pool = (
-            cameras.camera_pool(cfg.train_views, self.ranges, run_seed())
-            if cfg.train_views
-            else None
-        )
+        angles = cfg.elevation_range, cfg.azimuth_range
+        self.ranges = OrbitRanges(*map(tuple, (*angles, cfg.camera_distance_range, cfg.fovy_range)))
+        self.pool = None
+        if cfg.train_views:
+            self.pool = cameras.camera_pool(cfg.train_views, self.ranges, run_seed())
 
     def __iter__(self):
         yield from itertools.count(self.next_step())
@@ -134,28 +123,16 @@ class TrainCameras(IterableDataset, Updateable):
         if self.pool and not (self.moves or self.cfg.rays):
             views = self._views_of_pool(height, width)
             lights = self._lights(views["c2w"][index], rng)[rows]
-            index = index[rows]
-            # half the time of v[index]
-            batch = {
-                k: v.index_select(0, index) if torch.is_tensor(v) else v for k, v in views.items()
-            }
+            batch = {k: v[index[rows]] if torch.is_tensor(v) else v for k, v in views.items()}
             return batch | {"light_positions": lights}
-        orbit = (
-            self.pool.rows(index)
-            if self.pool
-            else self._sample(batch_size, self._ranges(step), rng)
-        )
+        if self.pool:
+            orbit = self.pool.rows(index)
+        else:
+            orbit = self._sample(batch_size, self._ranges(step), rng)
         c2w = self._perturbed(orbit, rng)
         lights = self._lights(c2w, rng)
-        return make_batch(
-            orbit.rows(rows),
-            c2w[rows],
-            lights[rows],
-            height,
-            width,
-            self.cfg.rays,
-            self.cfg.rays_d_normalize,
-        )
+        own, rays = (orbit.rows(rows), c2w[rows], lights[rows]), self.cfg.rays
+        return make_batch(*own, height, width, rays, self.cfg.rays_d_normalize)
 
     def _views_of_pool(self, height: int, width: int) -> dict[str, Any]:
         """Return one batch of all views of the pool, with any lights."""
@@ -216,15 +193,6 @@ class TrainCameras(IterableDataset, Updateable):
         return towards * (low + (high - low) * torch.rand(count, 1, generator=rng))
 
 
-class StepLoader(DataLoader):
-    """Loads the batches of :class:`TrainCameras` in this process. Torch's iterator would record
-    each for its profiler, which takes a sixth of the time of making one.
-    """
-
-    def __iter__(self) -> Iterator[dict[str, Any]]:
-        return map(self.collate_fn, iter(self.dataset))
-
-
 class EvalCameras(Dataset, Updateable):
     """A ring of cameras at the evaluation elevation and distance, one view per batch."""
 
@@ -249,18 +217,9 @@ class EvalCameras(Dataset, Updateable):
 
     def collate(self, indices: list[int]) -> dict[str, Any]:
         index = torch.tensor(indices)
-        orbit = self.orbit.rows(index)
-        c2w, cfg = orbit.c2w, self.cfg
-        batch = make_batch(
-            orbit,
-            c2w,
-            c2w[:, :3, 3].clone(),
-            cfg.eval_height,
-            cfg.eval_width,
-            cfg.rays,
-            cfg.rays_d_normalize,
-        )
-        return {"index": index, **batch}
+        orbit, cfg = self.orbit.rows(index), self.cfg
+        rays = cfg.rays, cfg.rays_d_normalize
+        return {"index": index, **orbit_batch(orbit, cfg.eval_height, cfg.eval_width, *rays)}
 
 
 @register_builtin("random-camera-datamodule")
@@ -282,17 +241,8 @@ class GaussianDreamerDataModule(pl.LightningDataModule):
         trainer = self.trainer
         if trainer is not None:  # which is at a later step in a resumed run or a later epoch
             self.train_dataset.next_step = lambda: trainer.global_step
-        return StepLoader(
-            self.train_dataset, batch_size=None, collate_fn=self.train_dataset.collate
-        )
-
-    def transfer_batch_to_device(
-        self, batch: Any, device: torch.device, dataloader_idx: int
-    ) -> Any:
-        """Return a batch on a device: itself on the CPU, where it was made."""
-        if device.type == "cpu":
-            return batch
-        return super().transfer_batch_to_device(batch, device, dataloader_idx)
+        cameras = self.train_dataset
+        return DataLoader(cameras, batch_size=None, collate_fn=cameras.collate)
 
     def pool_views(self) -> Optional[dict[str, Any]]:
         """Return ``c2w``, ``fovy``, ``height``, ``width``, ``batch_size`` of all views of a fixed
