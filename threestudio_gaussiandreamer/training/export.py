@@ -36,6 +36,8 @@ SUMMARY = ("held_out/compare.png", "it*-test.*", "it*-export/*.*", "it*-export/p
 """Files below the folder of results that the last message of a run names."""
 
 
+Spent = Optional[float]
+"""PSNR in dB that a cloud has been pruned to."""
 CLOUDS = ("ply", "spz", "gaussians")
 """Types of exports that hold all attributes of the Gaussians."""
 
@@ -45,17 +47,11 @@ class GaussianSavers:
     below the system's folder and returns the path.
     """
 
-    def save_ply(
-        self, filename: str, stored: StoredCloud, pruned_to: Optional[float] = None
-    ) -> str:
+    def save_ply(self, filename: str, stored: StoredCloud, pruned_to: Spent = None) -> str:
         return self.save_gaussians(filename, stored, ".ply", pruned_to)
 
     def save_spz(
-        self,
-        filename: str,
-        stored: StoredCloud,
-        pruned_to: Optional[float] = None,
-        version: int = VERSION,
+        self, filename: str, stored: StoredCloud, pruned_to: Spent = None, version: int = VERSION
     ) -> str:
         return self.save_gaussians(filename, stored, ".spz", pruned_to, spz_version=version)
 
@@ -64,7 +60,7 @@ class GaussianSavers:
         filename: str,
         stored: StoredCloud,
         suffix: str,
-        pruned_to: Optional[float] = None,
+        pruned_to: Spent = None,
         **options: Any,
     ) -> str:
         path = self.get_save_path(filename)
@@ -172,7 +168,10 @@ def save(system: Any, out: ExporterOutput, path: str, noted: Mapping[str, Any]) 
     Raises:
         UserError: the system can't save its type, or the type has other params.
     """
-    write, params = saver(system, out.save_type), {**noted, **out.params}
+    write, params = getattr(system, f"save_{out.save_type}", None), {**noted, **out.params}
+    if write is None:
+        known = [name.removeprefix("save_") for name in dir(system) if name.startswith("save_")]
+        raise unknown("save_type of an exporter", out.save_type, known)
     try:
         inspect.signature(write).bind(path, **params)
     except TypeError as error:
@@ -181,19 +180,6 @@ def save(system: Any, out: ExporterOutput, path: str, noted: Mapping[str, Any]) 
             f"{inspect.signature(write)}"
         ) from error
     write(path, **params)
-
-
-def saver(system: Any, save_type: str) -> Callable[..., Any]:
-    """Return the system's ``save_<save_type>``.
-
-    Raises:
-        UserError: it has none.
-    """
-    found = getattr(system, f"save_{save_type}", None)
-    if found is None:
-        known = [name.removeprefix("save_") for name in dir(system) if name.startswith("save_")]
-        raise unknown("save_type of an exporter", save_type, known)
-    return found
 
 
 def export_pruned(system: Any) -> None:

@@ -22,13 +22,7 @@ from ..formats.gaussian_files import StoredCloud, read_cloud, write_cloud
 from ..gaussians.axes import VIEWER_UP
 from ..gaussians.gaussians import Gaussians
 from ..host import warn
-from ..view.page import (
-    MAX_GAUSSIANS,
-    PageOptions,
-    Shown,
-    decibels,
-    page,
-)
+from ..view.page import MAX_GAUSSIANS, PageOptions, Shown, decibels, page
 from ..view.render import WHITE, RenderSettings, first_pose, picture
 from ..view.run_files import RunFiles
 from .background import FlatBackground
@@ -108,11 +102,9 @@ def write_turntable(system: Any) -> None:
 
 
 def _page_options(system: Any, run: RunFiles) -> PageOptions:
-    renderer = system.renderer
-    settings = RenderSettings()
-    if isinstance(renderer, SplattingRenderer):
-        bound = getattr(system.geometry.cfg, "bound_colors", True)
-        settings = RenderSettings.of(renderer.cfg, bound_colors=bound)
+    settings, bound = RenderSettings(), getattr(system.geometry.cfg, "bound_colors", True)
+    if isinstance(system.renderer, SplattingRenderer):
+        settings = RenderSettings.of(system.renderer.cfg, bound_colors=bound)
     return PageOptions(
         title=prompt_of(system) or run.folder.name,
         name="gaussians",
@@ -132,11 +124,8 @@ def _background(background: Any) -> tuple[float, float, float]:
     """Return the colour that test views are shown on; white for backgrounds that aren't flat."""
     if not FlatBackground.is_flat(background):
         return WHITE
-    if background.cfg.mode == "learned":
-        red, green, blue = background.color(1)[0].tolist()
-    else:
-        red, green, blue = background.cfg.color
-    return (red, green, blue)
+    learned = background.cfg.mode == "learned"
+    return tuple(background.color(1)[0].tolist() if learned else background.cfg.color)
 
 
 def _first_cloud(run: RunFiles) -> Optional[Shown]:
