@@ -1,17 +1,11 @@
 """The CUDA backend: every launch processes all views, the forward pass doesn't synchronise with the
 GPU, and results are bitwise reproducible.
 
-The number of tile intersections (pairs of a splat and a tile) is only known on the GPU. Their lists
-therefore get 1.5 times the capacity that earlier calls of the same size needed. A scene that needs
-more is still rendered exactly, but without lists, which is slower; its backward pass makes complete
-lists, and later calls get a larger capacity. If memory is short, fewer views are processed at a
-time.
-
-Only the first call of a size waits for the number. A backward pass waits until the GPU has counted
-the intersections of its forward pass, since gradients from incomplete lists would be wrong; the
-count is usually there long before the loss.
-
-All sums are computed in a fixed order."""
+The number of tile intersections (pairs of a splat and a tile) is only known on the GPU, so their
+lists get 1.5 times the capacity that earlier calls of the same size needed; the first call waits
+for the number. A scene that needs more is still rendered exactly, but without lists, which is
+slower. Its backward pass, which waits for the number, makes complete lists, and later calls get a
+larger capacity. If memory is short, fewer views are processed at a time."""
 
 import functools
 import logging

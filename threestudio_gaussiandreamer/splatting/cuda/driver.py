@@ -116,7 +116,6 @@ class Readback:
     """Integers that are copied from the GPU asynchronously, given as cumulative sums."""
 
     def __init__(self, ends: Tensor):
-        """Start the copy of ``ends``, cumulative sums of the numbers."""
         self.copy = HostCopy(ends.contiguous())
 
     def ready(self) -> bool:

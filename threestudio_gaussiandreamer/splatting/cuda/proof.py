@@ -1,11 +1,9 @@
 """Compare the CUDA kernels with plain torch on a GPU, once, before they are used there.
 
-A small fixed scene is rendered and differentiated by the kernels in float32 and by plain torch in
-float64 on the CPU: on the GPU its many small kernels would have to be loaded, which takes many
-times longer than the comparison. Both run at the same time, since the kernels have to be loaded
-too. ``OPTIONS`` has the options of each draw. The result is cached
-beside the compiled kernels; it is computed again for another GPU, driver, compiler, torch version
-or source text of the CUDA backend."""
+A small fixed scene is rendered and differentiated by the kernels in float32 and, at the same time,
+by plain torch in float64 on the CPU: on the GPU torch's many small kernels would have to be loaded,
+which takes many times longer. The result is cached beside the compiled kernels; it is computed
+again for another GPU, driver, compiler, torch version or source text of the CUDA backend."""
 
 import contextlib
 import functools
@@ -32,24 +30,18 @@ TOLERANCE = 1e-3
 Gaussian that falls on the other side of a threshold in float64 gives 1e-4."""
 GAUSSIANS, WIDTH, HEIGHT = 150, 36, 20  # more than a batch of ``blend``; 3 x 2 tiles
 CULLED = 4096
-"""Gaussians behind the cameras, which the kernels are given too. Without them torch would sort the
-depths by a kernel for up to 4096 numbers, which larger scenes don't need, and which takes longer to
-load than all other kernels together."""
-ANGLES = (0.0, 0.7)
-"""Azimuths of the two cameras, radians."""
+"""Gaussians behind the cameras, which the kernels get too: torch sorts up to 4096 numbers by a
+kernel that larger scenes don't need, and that takes longer to load than all others together."""
+ANGLES = (0.0, 0.7)  # azimuths of the two cameras, radians
+HALVED = {"downsample": 2, "antialias": True}
 OPTIONS = {
     "default options": RasterizeOptions(),
-    "downsample and antialias": RasterizeOptions(downsample=2, antialias=True),
-    "downsample, antialias and absgrad": RasterizeOptions(
-        downsample=2, antialias=True, absgrad=True
-    ),
+    "downsample and antialias": RasterizeOptions(**HALVED),
+    "downsample, antialias and absgrad": RasterizeOptions(**HALVED, absgrad=True),
 }
-"""The options of each draw: with these, all kernels and all their branches on options run. The
-backward pass has another kernel with ``absgrad``."""
+"""The options of each draw; all kernels and all their branches on options run."""
 DIFFERENTIATED = ("means", "quats", "scales", "opacities", "viewmats", "colors")
-"""The inputs whose gradients the kernels compute; torch computes that of the background."""
-LIBRARY_ERRORS = (OSError, AttributeError)
-"""What ctypes raises for a library that can't be loaded, or that lacks a function."""
+LIBRARY_ERRORS = (OSError, AttributeError)  # of ctypes: no such library, or no such function in it
 Results = dict[str, dict[str, Tensor]]
 """Outputs and gradients by name, of each draw."""
 
@@ -136,9 +128,8 @@ def compare(device: torch.device) -> str:
 
 @contextlib.contextmanager
 def _default_algorithms() -> Iterator[None]:
-    """Let torch use its default algorithms: an operation that
-    ``torch.use_deterministic_algorithms`` refuses is no failure of the kernels. That function
-    imports torch's compiler, so it is called only if they are on.
+    """Let torch use its default algorithms: an operation that the deterministic ones refuse is no
+    failure of the kernels. Switching them imports torch's compiler, so only if they are on.
     """
     if not torch.are_deterministic_algorithms_enabled():
         yield
@@ -159,14 +150,12 @@ def require_torch(device: torch.device) -> None:
 
 
 def reference() -> Results:
-    """Return the outputs and gradients of plain torch in float64, on the CPU. The two draws that
+    """Return the outputs and gradients of plain torch in float64, on the CPU; the two draws that
     differ only in ``absgrad`` share one.
     """
     default, *_, absolute = OPTIONS.values()
-    plain, full = (
-        _drawn(torch_backend, torch.device("cpu"), torch.float64, options)
-        for options in (default, absolute)
-    )
+    cpu = torch.device("cpu"), torch.float64
+    plain, full = (_drawn(torch_backend, *cpu, options) for options in (default, absolute))
     return {draw: full if options.downsample > 1 else plain for draw, options in OPTIONS.items()}
 
 
@@ -197,8 +186,8 @@ def _relative(found: Tensor, true: Tensor) -> float:
 def _drawn(
     backend: ModuleType, device: torch.device, dtype: torch.dtype, options: RasterizeOptions
 ) -> dict[str, Tensor]:
-    """Render and differentiate the scene, and wait for the results, so that errors of the GPU are
-    raised here. One view is enough for a second draw.
+    """Render and differentiate the scene, a second time with one view, and wait for the results, so
+    that errors of the GPU are raised here.
     """
     with torch.inference_mode(False), torch.enable_grad():
         views = 1 if options.downsample > 1 else len(ANGLES)
@@ -225,17 +214,14 @@ def _draw(backend: ModuleType, scene: Scene, options: RasterizeOptions) -> dict[
 
 
 def _weighted_sum(image: Tensor) -> Tensor:
-    """Return a sum in which each entry has another weight, computed on the CPU: on the GPU each of
-    torch's kernels would have to be loaded.
-    """
+    """Return a sum in which each entry has another weight, computed on the CPU."""
     image = image.cpu().flatten()
     return (image * torch.linspace(-1, 1, len(image)).to(image)).sum()
 
 
 def _scene(device: torch.device, dtype: torch.dtype, culled: int) -> Scene:
-    """Return the scene: Gaussians of all sizes and opacities in front of two cameras, and some of
-    them again behind these. The first one covers all tiles, more than the first rows that
-    ``sum_rows`` adds.
+    """Return the scene: Gaussians of all sizes and opacities in front of two cameras, the first one
+    over all tiles, and some of them again behind the cameras.
     """
     generator = torch.Generator("cpu").manual_seed(0)
 

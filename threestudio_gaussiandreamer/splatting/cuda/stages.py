@@ -25,19 +25,19 @@ Argument = Union[Tensor, ctypes.Structure, ctypes._SimpleCData]
 
 
 class AsyncReadback(Protocol):
-    """Numbers that are being copied from the GPU."""
+    """Numbers that are being copied from the GPU; ``values`` waits until they have arrived."""
 
     def ready(self) -> bool: ...
 
-    def values(self) -> list[int]:
-        """Return the numbers; wait until they have arrived."""
+    def values(self) -> list[int]: ...
 
 
 class Device(Protocol):
     """Interface of `driver.Gpu`, which launches kernels."""
 
-    def launch(self, name: str, grid: tuple[int, int], threads: int, *arguments: Argument) -> None:
-        """Queue a kernel; ``arguments`` are tensors, structures and C numbers."""
+    def launch(
+        self, name: str, grid: tuple[int, int], threads: int, *arguments: Argument
+    ) -> None: ...
 
     def read_async(self, numbers: Tensor) -> AsyncReadback: ...
 
