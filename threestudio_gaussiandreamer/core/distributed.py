@@ -2,8 +2,7 @@
 statistics are reduced over all of them.
 
 Random numbers belong to a view, not to the process that renders it, so a step with several
-processes is the same as with one but for the order of floating-point sums. In a single-process run
-these functions return their input unchanged.
+processes is the same as with one but for the order of floating-point sums.
 """
 
 from collections.abc import Callable, Iterable
@@ -42,11 +41,8 @@ def own_rows(total: int) -> slice:
 
 
 def draw_shared(count: int, draw: Callable[[int], Tensor]) -> Tensor:
-    """Draw numbers for the views of all processes, and return the rows of this one's.
-
-    Args:
-        count: views of this process.
-        draw: returns a tensor with as many rows as asked for, the same in all processes.
+    """Draw numbers for the views of all processes, ``count`` each, by a function of their number
+    that returns the same in all, and return the rows of this one's.
     """
     total = count * world_size()
     return draw(total)[own_rows(total)]
@@ -85,18 +81,16 @@ def from_first(make: Callable[[], Any]) -> Any:
     return shared[0]
 
 
-def all_sum(tensor: Tensor) -> Tensor:
+def all_sum(tensor: Tensor, op: str = "SUM") -> Tensor:
     """Sum over all processes, in place."""
     if is_active():
-        dist.all_reduce(tensor, op=dist.ReduceOp.SUM)
+        dist.all_reduce(tensor, op=getattr(dist.ReduceOp, op))
     return tensor
 
 
 def all_max(tensor: Tensor) -> Tensor:
     """Take the elementwise maximum over all processes, in place."""
-    if is_active():
-        dist.all_reduce(tensor, op=dist.ReduceOp.MAX)
-    return tensor
+    return all_sum(tensor, "MAX")
 
 
 def average_gradients(parameters: Iterable[torch.nn.Parameter]) -> None:

@@ -16,9 +16,7 @@ FOR_TESTS = ("test", "farm-test")
 
 
 def extras() -> dict[str, list[str]]:
-    """Return the modules of each extra, by the installed package's metadata; nothing where it runs
-    from a folder without having been installed.
-    """
+    """Return the modules of each extra, by the metadata of the package, if it is installed."""
     found: dict[str, list[str]] = {}
     try:
         requirements = metadata.requires("threestudio-gaussiandreamer") or []

@@ -88,9 +88,8 @@ def near_names(path: Path, bundled: Collection[str] = ()) -> str:
 
 @contextmanager
 def atomic_file(path: str | os.PathLike, *, durable: bool = True) -> Iterator[BinaryIO]:
-    """Open a binary file for writing that replaces ``path`` only if the block succeeds.
-
-    The content is written to a temporary file in the same folder, which is renamed at the end.
+    """Open a binary file for writing that replaces ``path`` only if the block succeeds: a temporary
+    file in the same folder, which is renamed at the end.
 
     Args:
         durable: also flush it to the disk, so that it is complete even after a power failure.
@@ -155,19 +154,15 @@ def _shortened(name: str, size: int = 100) -> str:
 
 
 def through_link(path: str | os.PathLike) -> Path:
-    """Return the file that a user names for writing: where a link leads to, if ``path`` is one, as
-    :func:`atomic_file` would replace the link. Names that a program makes itself aren't followed:
-    a link in a folder of results may lead to a file that has to be kept.
+    """Return where a link that a user names for writing leads to. :func:`atomic_file` replaces
+    links, since one in a folder of results may lead to a file that has to be kept.
     """
     return Path(os.path.realpath(path) if os.path.islink(path) else path)
 
 
 def require_writable(path: str | os.PathLike, what: str) -> None:
-    """Check that a file can be written, before the work that makes its content.
-
-    Args:
-        path: the file; it may exist already.
-        what: names the file in messages.
+    """Check that a file, which ``what`` names in messages, can be written, before the work that
+    makes its content.
 
     Raises:
         UserError: the name contains NUL or is too long, its folder is missing or can't be written,
@@ -192,13 +187,8 @@ def require_writable(path: str | os.PathLike, what: str) -> None:
 def require_other_file(
     path: str | os.PathLike, source: str | os.PathLike, what: str = "OUT is IN"
 ) -> None:
-    """Check that a file to be written isn't the one that it is made from.
-
-    Args:
-        what: the beginning of the message.
-
-    Raises:
-        UserError: both are the same existing file.
+    """Raise UserError, with a message that begins with ``what``, if a file to be written is the
+    existing one that it is made from.
     """
     if os.path.exists(source) and os.path.exists(path) and os.path.samefile(source, path):
         raise UserError(f"{what}: give it another name, so that {_quoted(Path(source))} is kept")

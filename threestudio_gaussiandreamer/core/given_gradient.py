@@ -11,9 +11,8 @@ from torch.autograd.function import once_differentiable
 def given_gradient(
     x: Float[Tensor, "*d"], gradient: Float[Tensor, "*d"], value: Float[Tensor, ""]
 ) -> Float[Tensor, ""]:
-    """Return the number ``value``, a constant, as a function of ``x`` with this gradient.
-
-    torch's own way, ``torch.autograd.backward(x, gradient)``, imports all of its symbolic shapes.
+    """Return the number ``value``, a constant, as a function of ``x`` with this gradient; torch's
+    ``torch.autograd.backward(x, gradient)`` imports all of its symbolic shapes.
     """
     return _GivenGradient.apply(x, gradient, value)
 

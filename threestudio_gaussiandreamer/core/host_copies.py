@@ -12,9 +12,7 @@ from torch import Tensor
 
 
 class HostCopy:
-    """A copy of a tensor to the host. That of a GPU's tensor is under way; that of a CPU's is the
-    tensor itself.
-    """
+    """A copy of a tensor to the host, which may be under way; of a CPU's the tensor itself."""
 
     def __init__(self, values: Tensor) -> None:
         self._values, self._arrived = values.detach(), None

@@ -143,9 +143,7 @@ def write(path: str | os.PathLike, image: np.ndarray) -> None:
 
 
 def write_video(path: str, frames: list[Path], *, fps: int) -> None:
-    """Write the images as an mp4 (H.264, yuv420p, index first) or gif.
-
-    An mp4 of odd size is padded to an even one, which H.264 requires.
+    """Write the images as an mp4 (H.264, yuv420p, index first; padded to an even size) or gif.
 
     Raises:
         UserError: the disk is full, there is no ffmpeg, or the images differ in size.

@@ -44,11 +44,8 @@ def interrupt(signum: int) -> NoReturn:
 
 @contextlib.contextmanager
 def raised_signals() -> Iterator[list[int]]:
-    """Let stop signals raise exceptions in this context, so that ``finally`` blocks run.
-
-    Yields:
-        the list of received signals. It is needed because an exception raised during an import may
-        be replaced by another one, or be lost.
+    """Let stop signals raise exceptions in this context, so that ``finally`` blocks run; yield the
+    list of those received, since an exception during an import may be replaced or lost.
     """
     received: list[int] = []
 

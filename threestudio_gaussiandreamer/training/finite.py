@@ -28,9 +28,7 @@ Named = Iterable[tuple[str, Tensor]]
 
 
 class RecentLosses:
-    """The losses of the steps since the last check. They stay on their device, and are read only if
-    parameters turn out not to be finite.
-    """
+    """The losses of the steps since the last check, read only if parameters aren't finite."""
 
     def __init__(self) -> None:
         self._steps: deque[tuple[int, dict[str, Tensor]]] = deque(maxlen=CHECK_EVERY)
@@ -52,9 +50,8 @@ class NonFiniteParameters(UserError):
 
 
 def optimizer_tensors(optimizer: torch.optim.Optimizer) -> Iterator[tuple[str, Tensor]]:
-    """Yield every parameter and every state tensor of an optimiser with its name.
-
-    A parameter is named after its group, a state tensor ``group.key``, such as ``means.exp_avg``.
+    """Yield every parameter of an optimiser with the name of its group, and every state tensor with
+    its own, such as ``means.exp_avg``.
     """
     for group in optimizer.param_groups:
         name = group.get("name", "parameters")
@@ -76,17 +73,12 @@ def training_tensors(
 
 @torch.no_grad()
 def require_finite(tensors: Named, step: int, losses: Optional[RecentLosses] = None) -> None:
-    """Check that no tensor contains NaN, infinity or, of a cloud, numbers beyond ``LIMITS``;
-    synchronises with the device once.
-
-    Args:
-        tensors: (name, values of any shape).
-        step: finished optimiser steps, for the message.
-        losses: those that may be the cause, for the message.
+    """Check that no tensor, of any shape, contains NaN, infinity or, of a cloud, numbers beyond
+    ``LIMITS``; synchronises with the device once.
 
     Raises:
-        NonFiniteParameters: the message has the name of the first tensor that isn't finite, and the
-            number of its bad values.
+        NonFiniteParameters: the message has the name of the first tensor that isn't finite, the
+            number of its bad values, and the loss that may be the cause.
     """
     named = [(name, values) for name, values in tensors if values.numel()]
     ranges = [torch.stack(values.aminmax()) for _, values in named]

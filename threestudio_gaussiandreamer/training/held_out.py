@@ -155,10 +155,8 @@ class Snapshot(NamedTuple):
 
 
 class Measurements:
-    """The scores and training time of a run, stored in ``metrics.json`` and continued on resume.
-
-    ``seconds`` is wall-clock time. ``cpu_seconds`` is the processor time of all threads, which
-    excludes time that other programs use the processor."""
+    """The scores and training time of a run, stored in ``metrics.json`` and continued on resume:
+    ``seconds`` of wall-clock time, and ``cpu_seconds``, the processor time of all threads."""
 
     def __init__(self, held_out: HeldOut, folder: Path) -> None:
         self.held_out, self.folder = held_out, folder
@@ -172,9 +170,7 @@ class Measurements:
         self._started = _now()
 
     def stop_clock(self) -> None:
-        """Add the time since :meth:`start_clock` to the training time, with that of the work which
-        the GPU has left.
-        """
+        """Add the time since :meth:`start_clock`, and of what the GPU has left to do."""
         if self._started is not None:
             if torch.cuda.is_available():
                 torch.cuda.synchronize()
@@ -194,15 +190,9 @@ class Measurements:
 
     @torch.no_grad()
     def score(self, key: str, renderer: Any, step: int) -> dict[str, dict[str, Any]]:
-        """Score the renderer's cloud, after the postponed ones, and store the scores in
-        ``metrics.json``.
-
-        Args:
-            key: "prior" or "result", or "curve", a list to which the scores are appended.
-            step: number of finished optimiser steps.
-
-        Returns:
-            the scores by key.
+        """Score the renderer's cloud after ``step`` optimiser steps, and before it the postponed
+        ones; store the scores in ``metrics.json``, and return them by key: "prior" or "result", or
+        "curve", a list to which they are appended.
         """
         scores = self.score_postponed()
         with self.paused_clock():
