@@ -18,7 +18,7 @@ from typing import Any, NamedTuple, Optional
 from benchmarks.markdown import markdown, read
 from benchmarks.quality.runs import CHARTS, append_rows
 from tests.helpers.object_clouds import ball
-from threestudio_gaussiandreamer.convert.check import round_trip
+from threestudio_gaussiandreamer.convert.losses import compare, reference
 from threestudio_gaussiandreamer.formats.gaussian_files import (
     StoredCloud,
     read_cloud,
@@ -129,7 +129,7 @@ def rows(name: str, cloud: StoredCloud) -> Iterator[dict[str, Any]]:
             written = time.process_time()
             after = read_cloud(str(path))
             done = time.process_time()
-            found = round_trip(cloud, after, SIZE)
+            found = compare(reference(cloud, SIZE), after)
             yield {
                 "object": name,
                 "degree": cloud.gaussians.sh_degree,

@@ -14,13 +14,13 @@ from torch import Tensor
 from benchmarks.quality.toybox_jobs import PROMPT_SEED, Prompt
 from threestudio_gaussiandreamer import metrics
 from threestudio_gaussiandreamer.core.streams import numpy_generator
-from threestudio_gaussiandreamer.evaluation.results import Pictures
-from threestudio_gaussiandreamer.evaluation.text_to_3d import (
+from threestudio_gaussiandreamer.evaluation.asset_metrics import (
     ATTRIBUTES,
     Scores,
     prior_of,
     result_of,
 )
+from threestudio_gaussiandreamer.evaluation.results import Pictures
 from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
 from threestudio_gaussiandreamer.meshes.mesh import Mesh
 from threestudio_gaussiandreamer.toybox import recognition

@@ -30,7 +30,7 @@ from benchmarks.quality.toybox_jobs import (
     setup,
     setup_of_samples,
 )
-from threestudio_gaussiandreamer.evaluation.intervals import Estimate, bootstrap, per_prompt
+from threestudio_gaussiandreamer.evaluation.scorecard import Estimate, bootstrap, per_prompt
 from threestudio_gaussiandreamer.models.bundled import FOLDER, RECORD
 from threestudio_gaussiandreamer.toybox.words import attributes_in
 

@@ -2,7 +2,9 @@
 
 import csv
 import json
+import math
 
+import numpy as np
 import pytest
 import torch
 
@@ -10,7 +12,7 @@ from tests.evaluation.clip_similarity_cases import blob, save
 from tests.helpers import tiny_3d_models as tiny
 from tests.helpers import tiny_image_reward
 from threestudio_gaussiandreamer.evaluation import t3bench
-from threestudio_gaussiandreamer.evaluation.scorecard import main
+from threestudio_gaussiandreamer.evaluation.scorecard import bootstrap, main, paired, per_prompt
 from threestudio_gaussiandreamer.formats.gaussian_files import read_cloud, write_cloud
 from threestudio_gaussiandreamer.toybox import export, models
 
@@ -53,52 +55,40 @@ def test_rows_and_intervals_over_prompts(tmp_path, judge, capsys):
     assert "multi_face: no value for 2 of the prompts ('a blue mug with white dots'; 'a" in printed
 
 
-def test_links_to_runs_and_to_folders_above_are_followed_once(tmp_path, judge):
-    runs = finished(tmp_path / "runs", PROMPTS[:2])
-    folder = tmp_path / "links"
-    folder.mkdir()
-    (folder / "first").symlink_to(runs / "gaussiandreamer/run0")
-    (folder / "up").symlink_to(tmp_path / "links")
-    arguments = ["--metrics", "judge", "--judge", judge, "--output", str(tmp_path / "out")]
-    assert main([str(folder), *arguments]) == 0
-    assert len((tmp_path / "out/scorecard.csv").read_text().splitlines()) == 2
-
-
-def test_a_damaged_asset_is_named_and_the_others_are_scored(tmp_path, judge, capsys):
-    runs = finished(tmp_path / "runs", PROMPTS)
-    ply = runs / "gaussiandreamer/run1/save/it5-export/gaussians.ply"
-    ply.write_bytes(ply.read_bytes()[:-100])
-    arguments = ["--metrics", "judge", "--judge", judge, "--output", str(tmp_path / "out")]
-    assert main([str(runs), *arguments]) == 2
-    assert "1 of the assets can't be scored: PLY file" in capsys.readouterr().err
-    with open(tmp_path / "out/scorecard.csv", newline="") as file:
-        assert len(list(csv.DictReader(file))) == len(PROMPTS) - 1
-
-
-def test_runs_without_a_ply_are_scored_or_named(tmp_path, judge, capsys):
-    runs = finished(tmp_path / "runs", PROMPTS[:3])
-    exports = [runs / f"gaussiandreamer/run{i}/save/it5-export" for i in range(3)]
-    write_cloud(str(exports[0] / "gaussians.spz"), read_cloud(str(exports[0] / "gaussians.ply")))
-    (exports[1] / "model.obj").write_text("v 0 0 0")
-    for exported in exports[:2]:
-        (exported / "gaussians.ply").unlink()
-    arguments = ["--metrics", "judge", "--judge", judge, "--output", str(tmp_path / "out")]
-    assert main([str(runs), *arguments]) == 2
-    said = capsys.readouterr().err
-    assert "1 of the assets can't be scored" in said and f"{str(exports[1].parents[1])!r}" in said
-    with open(tmp_path / "out/scorecard.csv", newline="") as file:
-        rows = list(csv.DictReader(file))
-    assert [row["prompt"] for row in rows] == [PROMPTS[0], PROMPTS[2]]
+def table(folder):
+    with open(folder / "scorecard.csv", newline="") as file:
+        return [row["prompt"] for row in csv.DictReader(file)]
 
 
 def test_a_run_in_several_folders_is_scored_once(tmp_path, judge, monkeypatch):
+    """Also behind links, of which one leads to a folder above."""
     runs = finished(tmp_path / "runs", PROMPTS[:2])
-    (tmp_path / "link").symlink_to(runs)
+    links = tmp_path / "links"
+    links.mkdir()
+    for name, where in (("first", runs / "gaussiandreamer/run0"), ("up", links), ("all", runs)):
+        (links / name).symlink_to(where)
     monkeypatch.chdir(tmp_path)
-    again = ["runs/gaussiandreamer/run1", str(runs), "runs", "link"]
+    again = ["runs/gaussiandreamer/run1", str(runs), "runs", "links"]
     assert main([*again, "--metrics", "judge", "--judge", judge, "--output", "out"]) == 0
-    with open("out/scorecard.csv", newline="") as file:
-        assert sorted(row["prompt"] for row in csv.DictReader(file)) == sorted(PROMPTS[:2])
+    assert sorted(table(tmp_path / "out")) == sorted(PROMPTS[:2])
+
+
+def test_what_can_not_be_scored_is_named_and_the_others_are_scored(tmp_path, judge, capsys):
+    """A damaged file, an export without Gaussians, and a run without a prompt."""
+    runs = finished(tmp_path / "runs", [*PROMPTS, ""])
+    exports = [runs / f"gaussiandreamer/run{i}/save/it5-export" for i in range(5)]
+    plys = [exported / "gaussians.ply" for exported in exports]
+    plys[1].write_bytes(plys[1].read_bytes()[:-100])
+    write_cloud(str(exports[0] / "gaussians.spz"), read_cloud(str(plys[0])))
+    (exports[2] / "model.obj").write_text("v 0 0 0")
+    for ply in (plys[0], plys[2]):
+        ply.unlink()
+    arguments = ["--metrics", "judge", "--judge", judge, "--output", str(tmp_path / "out")]
+    assert main([str(runs), *arguments]) == 2
+    said = capsys.readouterr().err
+    assert "3 of the assets can't be scored: " in said and "PLY file" in said
+    assert f"{str(exports[2].parents[1])!r}" in said and "has no prompt" in said
+    assert table(tmp_path / "out") == [PROMPTS[0], PROMPTS[3]]
 
 
 def test_clip_of_two_folders_is_compared_by_prompt(tmp_path):
@@ -131,7 +121,6 @@ def test_rewards_of_views(tmp_path, monkeypatch):
     ("arguments", "message"),
     [
         (["{}", "--metrics", "clop"], "clip"),
-        (["{}", "--metrics", "alignment"], "GPT-4"),
         (["{}", "--metrics", ","], "--metrics is empty"),
         (["{}", "--metrics", "clip"], "--clip FOLDER"),
         (["{}", "--metrics", "quality"], "--imagereward FOLDER, after `hf download"),
@@ -154,18 +143,28 @@ def test_wrong_input_is_named(tmp_path, judge, capsys, arguments, message):
     assert message in capsys.readouterr().err
 
 
-def test_a_run_without_a_prompt_is_named(tmp_path, judge, capsys):
-    run = finished(tmp_path / "runs", [""])
-    assert main([str(run), "--metrics", "judge", "--judge", judge]) == 2
-    assert "has no prompt" in capsys.readouterr().err
+# -- intervals over prompts and paired differences ------------------------------------------------
 
 
-def test_a_run_without_a_prompt_is_named_after_the_others_are_scored(tmp_path, judge, capsys):
-    runs = finished(tmp_path / "runs", ["", PROMPTS[0]])
-    output = tmp_path / "out"
-    arguments = ["--metrics", "judge", "--judge", judge, "--output", str(output)]
-    assert main([str(runs), *arguments]) == 2
-    assert "1 of the assets can't be scored" in (error := capsys.readouterr().err)
-    assert "run0" in error and "has no prompt" in error
-    with open(output / "scorecard.csv", newline="") as file:
-        assert [row["prompt"] for row in csv.DictReader(file)] == [PROMPTS[0]]
+def test_the_interval_of_many_values_is_that_of_the_normal_distribution():
+    values = np.random.default_rng(0).normal(3.0, 2.0, 400)
+    found, error = bootstrap(values), values.std() / math.sqrt(len(values))
+    assert found.mean == pytest.approx(values.mean())
+    assert found.low == pytest.approx(values.mean() - 1.96 * error, abs=0.15 * error)
+    assert found.high == pytest.approx(values.mean() + 1.96 * error, abs=0.15 * error)
+
+
+def test_undefined_values_are_left_out():
+    assert bootstrap(np.array([1.0, np.nan, 1.0])) == (1.0, 1.0, 1.0, 2)
+    empty = bootstrap(np.array([np.nan]))
+    assert math.isnan(empty.mean) and empty.count == 0
+
+
+def test_seeds_of_a_prompt_count_once():
+    means = per_prompt(["a", "a", "b", "c"], np.array([0.0, 1.0, 3.0, np.nan]))
+    assert means["a"] == 0.5 and means["b"] == 3.0 and math.isnan(means["c"])
+
+
+def test_differences_are_of_common_prompts():
+    first, second = {"a": 2.0, "b": 5.0, "c": 9.0}, {"b": 4.0, "a": 1.0, "d": 0.0}
+    assert paired(first, second) == (1.0, 1.0, 1.0, 2)

@@ -82,12 +82,6 @@ def test_invalid_options_are_named(farm, arguments, message):
     assert code == 2 and message in err
 
 
-def test_a_cluster_that_is_out_of_reach_is_named(farm):
-    pytest.importorskip("ray")
-    code, err = farm("a fox", "--address", "127.0.0.1:1")
-    assert code == 2 and "--address 127.0.0.1:1: no Ray cluster answers there" in err
-
-
 @pytest.mark.parametrize(
     ("address", "said"),
     [
@@ -103,6 +97,9 @@ def test_an_address_of_the_environment_is_named_as_such(farm, monkeypatch, addre
     code, err = farm("a fox")
     assert code == 2 and f"RAY_ADDRESS {address}: no Ray cluster answers there" in err
     assert said in err and "`unset RAY_ADDRESS`" in err and "--address" not in err
+    if address == "127.0.0.1:1":
+        code, err = farm("a fox", "--address", address)
+        assert code == 2 and "--address 127.0.0.1:1: no Ray cluster answers there" in err
 
 
 def test_without_ray_the_extra_is_named(farm, monkeypatch):
@@ -214,22 +211,11 @@ def test_the_low_memory_configuration_is_used_where_it_is_valid():
     assert check_recipe(paper, row).low_memory.name.endswith("gaussiandreamer-lowmem.yaml")
 
 
-def test_overrides_in_another_order_are_shown_whole(tmp_path):
-    require_same_farm(Place(tmp_path), RECIPE._replace(overrides=("y=2", "y=3")))
-    whole = r'its overrides is \["y=2", "y=3"\], here \["y=3", "y=2"\]; choose'
-    with pytest.raises(ValueError, match=whole):
-        require_same_farm(Place(tmp_path), RECIPE._replace(overrides=("y=3", "y=2")))
-
-
 @pytest.mark.parametrize(
     ("other", "message"),
     [
         (RECIPE._replace(sources=(Source("a.yaml", b"x: 2"),)), "its configurations is"),
         (RECIPE._replace(overrides=("y=3",)), 'its overrides is \\["y=2"\\], here \\["y=3"\\]'),
-        (
-            RECIPE._replace(overrides=("y=2", "z=3")),
-            r'its overrides is \[\], here \["z=3"\] \(without what is in both\)',
-        ),
         (RECIPE._replace(cores=2), "its cores is 1, here 2"),
         (RECIPE._replace(cpu=False), 'its device is "cpu", here "gpu"'),
     ],
@@ -240,9 +226,3 @@ def test_a_folder_of_another_farm_is_refused(tmp_path, other, message):
     require_same_farm(Place(tmp_path), RECIPE._replace(sources=moved))
     with pytest.raises(ValueError, match=f"belongs to another farm: {message}"):
         require_same_farm(Place(tmp_path), other)
-
-
-def test_a_damaged_farm_file_is_named(tmp_path):
-    (tmp_path / "farm.json").write_text("{")
-    with pytest.raises(ValueError, match="farm.json is damaged .*: delete it, or"):
-        require_same_farm(Place(tmp_path), RECIPE)

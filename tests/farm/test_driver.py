@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import pytest
 
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.farm.driver import Driver
+from threestudio_gaussiandreamer.farm.driver import Driver, plan_workers
 from threestudio_gaussiandreamer.farm.place import FAILED, FINISHED, STOPPED, WAITING, Place
 from threestudio_gaussiandreamer.farm.recipe import Job, Recipe, Source
 from threestudio_gaussiandreamer.farm.rows import Row
@@ -105,13 +105,73 @@ class Bench:
         return [record["state"] for record in self.records()]
 
 
-@pytest.fixture
-def path(tmp_path):
-    return tmp_path
+FAILS = {"state": FAILED, "error": "no surface"}
+NO = {"state": NO_MEMORY, "error": "out of memory"}
+REST = [FINISHED] * 5
 
 
-def test_a_step_collects_all_outcomes_and_looks_after_workers_now_and_then(path):
-    bench = Bench(path, finished, workers=3)
+def first_is(outcome, **when):
+    """Return answers that finish every asset but the first, unless its job is another one."""
+
+    def answers(job):
+        alike = all(getattr(job, name) == value for name, value in when.items())
+        return outcome if job.row == ROWS[0] and alike else finished(job)
+
+    return answers
+
+
+def stopped_once():
+    outcomes = [{"state": STOPPED, "error": "stopped by signal 15"}]
+    return lambda job: outcomes.pop() if outcomes else finished(job)
+
+
+@pytest.mark.parametrize(
+    ("answers", "low_memory", "states", "error"),
+    [
+        (finished, LOW, [FINISHED, *REST], None),
+        (first_is(FAILS), LOW, [FAILED, *REST], "no surface"),
+        (first_is(FakeRay.exceptions.RayActorError("killed")), LOW, [FAILED, *REST], "its worker"),
+        (first_is(NO, saves_memory=False), LOW, [FINISHED, *REST], None),
+        (first_is(NO), LOW, [FAILED, *REST], "out of memory"),
+        (first_is(NO), None, [FAILED, *REST], "out of memory"),
+        # nothing is written beside what another row has made
+        (first_is({"state": REFUSED, "error": "of another"}), LOW, [WAITING, *REST], None),
+        # as when its machine is drained
+        (stopped_once(), LOW, [FINISHED, *REST], None),
+        (lambda job: FAILS | {"error": job.row.name}, LOW, [FAILED] * 6, "toy0"),
+    ],
+)
+def test_an_outcome_decides_what_becomes_of_an_asset(
+    tmp_path, capsys, answers, low_memory, states, error
+):
+    bench = Bench(tmp_path, answers, low_memory=low_memory)
+    noted = []
+    write = bench.place.write
+
+    def watched(files):
+        noted.extend(json.loads(content) for content in files.values())
+        write(files)
+
+    bench.place.write = watched
+    bench.driver.run()
+    assert bench.states() == states and not bench.stops
+    record, said = bench.records()[0], capsys.readouterr().err
+    assert "toy5: f" in said and (answers is not finished or "(1 of 6, 00:00 left)" in said)
+    tries = [job for job in bench.worker.made if job.row == ROWS[0]]
+    saving = any(job.saves_memory for job in tries)
+    assert len(bench.ray.restarted) == saving
+    assert tries[0].spent == 100 and all(job.spent >= 100 for job in tries)
+    if error:
+        assert record["error"].startswith(error) and record["worker_seconds"] >= 100
+        assert "prompt=toy 0" in record["command"] and ("low.yaml" in record["command"]) == saving
+    elif saving:  # noted before the second attempt, for a driver that is killed
+        (first,) = (note for note in noted if "error" in note)
+        assert first["saves_memory"] is True and "low.yaml" in first["command"]
+    assert (tmp_path / "assets/toy0/failed.json").exists() == bool(error)
+
+
+def test_a_step_collects_all_outcomes_and_looks_after_workers_now_and_then(tmp_path):
+    bench = Bench(tmp_path, finished, workers=3)
     bench.driver.fill()
     bench.driver.step()
     assert bench.driver.counts[FINISHED] == 3
@@ -122,111 +182,29 @@ def test_a_step_collects_all_outcomes_and_looks_after_workers_now_and_then(path)
     assert bench.reads == 2
 
 
-def test_the_seconds_of_every_attempt_are_kept(path):
-    def answers(job):
-        if job.saves_memory:
-            return finished(job) | {"worker_seconds": job.worker_seconds(job.handed_out + 5)}
-        return {"state": NO_MEMORY if job.row == ROWS[0] else FAILED, "error": job.row.name}
-
-    bench = Bench(path, answers)
-    bench.driver.run()
-    found = [record["worker_seconds"] for record in bench.records()]
-    assert found[0] >= 105 and all(100 <= seconds < 105 for seconds in found[1:])
-    assert not (path / "assets/toy0/failed.json").exists()
-
-
-def test_every_asset_is_made_once(path, capsys):
-    bench = Bench(path, finished)
-    bench.driver.run()
-    assert [job.row for job in bench.worker.made] == ROWS
-    assert bench.states() == [FINISHED] * 6
-    said = capsys.readouterr().err
-    assert "toy0: finished: 1.0 s (1 of 6, 00:00 left)" in said and "toy5: finished: 1.0 s" in said
-
-
-def test_a_failed_asset_stops_no_other_and_is_reported_with_its_command(path):
-    def answers(job):
-        failed = {"state": FAILED, "error": "no surface"}
-        return failed if job.row == ROWS[1] else finished(job)
-
-    bench = Bench(path, answers)
-    bench.driver.run()
-    assert bench.states() == [FINISHED, FAILED, *[FINISHED] * 4]
-    line = bench.records()[1]
-    assert line["error"] == "no surface" and "prompt=toy 1" in line["command"]
-
-
-def test_an_asset_whose_worker_can_not_be_restarted_is_given_up(path):
-    def answers(job):
-        dead = FakeRay.exceptions.RayActorError("killed")
-        return dead if job.row == ROWS[0] else finished(job)
-
-    bench = Bench(path, answers)
-    bench.driver.run()
-    assert bench.states() == [FAILED, *[FINISHED] * 5]
-    assert bench.records()[0]["error"] == "its worker is lost: killed"
-
-
-def test_an_asset_without_memory_is_tried_with_less(path):
-    def answers(job):
-        none = {"state": NO_MEMORY, "error": "out of memory"}
-        return none if job.row == ROWS[0] and not job.saves_memory else finished(job)
-
-    bench = Bench(path, answers)
-    noted = []
-    write = bench.place.write
-
-    def watched(files):
-        noted.extend(json.loads(content) for content in files.values())
-        write(files)
-
-    bench.place.write = watched
-    bench.driver.run()
-    assert bench.states() == [FINISHED] * 6 and len(bench.ray.restarted) == 1
-    (failed,) = (record for record in noted if "error" in record)  # for a driver that is killed
-    assert failed["saves_memory"] is True and "low.yaml" in failed["command"]
-    tries = [job.saves_memory for job in bench.worker.made if job.row == ROWS[0]]
-    assert tries == [False, True]
-
-
-@pytest.mark.parametrize("low_memory", [LOW, None])
-def test_an_asset_without_memory_is_reported_at_last(path, low_memory):
-    def answers(job):
-        none = {"state": NO_MEMORY, "error": "out of memory"}
-        return none if job.row == ROWS[0] else finished(job)
-
-    bench = Bench(path, answers, low_memory=low_memory)
-    bench.driver.run()
-    assert bench.states() == [FAILED, *[FINISHED] * 5]
-    assert ("low.yaml" in bench.records()[0]["command"]) == bool(low_memory)
-
-
-def test_a_full_disk_ends_the_farm_and_leaves_the_assets_to_the_next(path):
-    def answers(job):
-        full = {"state": BLOCKED, "error": "No space left"}
-        return full if job.row == ROWS[2] else finished(job)
-
-    bench = Bench(path, answers)
+def test_obstacles_end_the_farm_and_leave_the_assets_to_the_next(tmp_path, monkeypatch):
+    full = {"state": BLOCKED, "error": "No space left"}
+    bench = Bench(tmp_path / "a", lambda job: full if job.row == ROWS[2] else finished(job))
     with pytest.raises(UserError, match="No space left"):
         bench.driver.run()
     assert bench.states() == [FINISHED, FINISHED, STOPPED, *[WAITING] * 3] and bench.stops
-
-
-def test_assets_that_all_fail_alike_end_the_farm(path):
-    bench = Bench(path, lambda job: {"state": FAILED, "error": "no model"})
+    bench = Bench(tmp_path / "b", lambda job: {"state": FAILED, "error": "no model"})
     with pytest.raises(UserError, match="first 3 assets have failed alike.*no model"):
         bench.driver.run()
     assert len(bench.worker.made) == 3
+    bench = Bench(tmp_path / "c", lambda job: FAILS)
+
+    def refuse(folder, *args, **options):
+        raise OSError(errno.ENOSPC, "no space left")
+
+    monkeypatch.setattr("pathlib.Path.mkdir", refuse)  # the record of the failure
+    with pytest.raises(UserError, match="no space left"):
+        bench.driver.run()
+    assert len(bench.worker.made) == 1 and bench.stops
 
 
-def test_assets_that_fail_differently_do_not(path):
-    bench = Bench(path, lambda job: {"state": FAILED, "error": job.row.name})
-    bench.driver.run()
-    assert bench.states() == [FAILED] * 6
-
-
-def test_a_worker_that_hangs_is_restarted_once_for_each_standstill(path):
-    bench = Bench(path, finished, rows=ROWS[:1])
+def test_a_worker_that_hangs_is_restarted_once_for_each_standstill(tmp_path):
+    bench = Bench(tmp_path, finished, rows=ROWS[:1])
     bench.driver.fill()
     for beat, seconds, restarts in (
         (Beat("toy0", 1, "training", 3, 9), 9.0, 0),
@@ -240,42 +218,7 @@ def test_a_worker_that_hangs_is_restarted_once_for_each_standstill(path):
         assert len(bench.ray.restarted) == restarts, beat
 
 
-def test_an_asset_whose_worker_was_told_to_stop_is_handed_out_again(path):
-    """As when its machine is drained."""
-
-    def answers(job):
-        if job.row == ROWS[0] and not bench.states()[0] == STOPPED:
-            return {"state": STOPPED, "error": "stopped by signal 15"}
-        return finished(job)
-
-    bench = Bench(path, answers)
-    bench.driver.run()
-    assert bench.states() == [FINISHED] * 6 and not bench.stops
-    again = [job for job in bench.worker.made if job.row == ROWS[0]]
-    assert len(again) == 2 and again[1].spent >= 100
-
-
-def test_a_row_that_was_given_an_option_of_the_farm_later_fails_alone(path):
-    def answers(job):
-        failed = {"state": FAILED, "error": "resume is set by the farm"}
-        return failed if job.row.overrides else finished(job)
-
-    bench = Bench(path, answers, rows=[ROWS[0]._replace(overrides=("resume=a",)), *ROWS[1:]])
-    bench.driver.run()
-    assert bench.driver.counts == {FAILED: 1, FINISHED: 5}
-
-
-def test_a_refused_row_leaves_no_record_beside_what_the_other_has_made(path):
-    def answers(job):
-        refused = {"state": REFUSED, "error": "was begun with another prompt"}
-        return refused if job.row == ROWS[0] else finished(job)
-
-    bench = Bench(path, answers)
-    bench.driver.run()
-    assert bench.states() == [WAITING, *[FINISHED] * 5] and bench.driver.counts[FAILED] == 1
-
-
-def test_ctrl_c_lets_the_workers_write_checkpoints(path):
+def test_ctrl_c_lets_the_workers_write_checkpoints(tmp_path):
     def answers(job):
         if job.row == ROWS[1]:
             bench.driver.fill = interrupted
@@ -284,19 +227,37 @@ def test_ctrl_c_lets_the_workers_write_checkpoints(path):
     def interrupted():
         raise KeyboardInterrupt
 
-    bench = Bench(path, answers)
+    bench = Bench(tmp_path, answers)
     with pytest.raises(KeyboardInterrupt):
         bench.driver.run()
     assert bench.stops == 1 and bench.states() == [FINISHED, STOPPED, *[WAITING] * 4]
 
 
-def test_a_record_that_can_not_be_written_ends_the_farm_and_not_ctrl_c(path, monkeypatch):
-    bench = Bench(path, lambda job: {"state": FAILED, "error": "x"})
+# -- the cluster -----------------------------------------------------------------------------------
 
-    def full(folder, *args, **options):
-        raise OSError(errno.ENOSPC, "no space left")
+CPU, GPUS = {"CPU": 8.0}, {"CPU": 8.0, "GPU": 2.0}
 
-    monkeypatch.setattr("pathlib.Path.mkdir", full)
-    with pytest.raises(UserError, match="no space left"):
-        bench.driver.run()
-    assert len(bench.worker.made) == 1 and bench.stops
+
+@pytest.mark.parametrize(
+    ("resources", "gpus", "cores", "workers", "plan"),
+    [
+        (GPUS, None, 1, None, (2, 1)),
+        (GPUS, 1, 1, None, (1, 1)),
+        (GPUS, None, 5, None, (1, 1)),
+        (GPUS, 0, 1, None, (8, 0)),
+        (CPU, None, 3, None, (2, 0)),
+        (CPU, None, 1, 3, (3, 0)),
+        (CPU, 1, 1, None, "--gpus 1: the cluster has no GPU; give none"),
+        (CPU, None, 9, None, "--cores 9: the cluster has 8 cores"),
+        (CPU, None, 4, 3, "with 4 cores each, 2 fit"),
+        (GPUS, None, 1, 3, "with 1 GPU each, 2 fit"),
+    ],
+)
+def test_as_many_workers_start_as_fit_with_a_gpu_each_where_there_are_some(
+    resources, gpus, cores, workers, plan
+):
+    if isinstance(plan, tuple):
+        assert plan_workers(resources, gpus, cores, workers) == plan
+        return
+    with pytest.raises(UserError, match=plan):
+        plan_workers(resources, gpus, cores, workers)

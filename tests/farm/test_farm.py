@@ -5,13 +5,12 @@ import os
 import signal
 import subprocess
 import sys
-import tempfile
 import time
+from pathlib import Path
 
 import pytest
 
 from tests.helpers.tiny_farm import ROOT, make_alone, write_farm
-from threestudio_gaussiandreamer.farm import driver
 from threestudio_gaussiandreamer.farm.worker import digest, exported
 
 pytest.importorskip("ray", reason="Ray isn't installed: pip install -e .[cluster]")
@@ -44,18 +43,18 @@ class Farm:
         command = [sys.executable, "-m", "threestudio_gaussiandreamer.farm", *arguments]
         self.command = [*command, "--out", str(self.out), "--gpus", "0", "--workers", "2"]
 
-    def start(self, *more):
+    def start(self, *more, cluster="", **environment):
         return subprocess.Popen(
-            [*self.command, *more],
+            [*self.command, *(["--address", cluster] if cluster else []), *more],
             cwd=self.place,
-            env={**os.environ, "PYTHONPATH": str(ROOT)},
+            env={**os.environ, "PYTHONPATH": str(ROOT), **environment},
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
         )
 
-    def run(self, *more):
-        process = self.start(*more)
+    def run(self, *more, **options):
+        process = self.start(*more, **options)
         said, _ = process.communicate(timeout=SECONDS)
         return process.returncode, said
 
@@ -78,18 +77,35 @@ def wait_for(condition, process):
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory):
-    """A farm whose worker was killed, whose driver was killed, and which was then left alone."""
+def cluster():
+    """The address of a cluster on this machine, which serves all farms but one."""
+    import ray
+
+    options = {"include_dashboard": False, "log_to_driver": False, "logging_level": "ERROR"}
+    context = ray.init("local", num_cpus=2, object_store_memory=100 << 20, **options)
+    yield context.address_info["gcs_address"]
+    ray.shutdown()
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory, cluster):
+    """A farm whose worker was killed, whose driver was killed, and which was then left alone: on a
+    cluster of its own, with a long folder for temporary files and with proxies that are dead.
+    """
     folder = tmp_path_factory.mktemp("farm")
     farm = Farm(folder, write_farm(folder, COUNT, STEPS))
-    process = farm.start()
+    process = farm.start(cluster=cluster)
     asset = wait_for(farm.checkpointed, process)[0]
     worker = int((asset / "attempts.txt").read_text().split()[-1])
     os.kill(worker, signal.SIGKILL)
     wait_for(lambda: len((asset / "attempts.txt").read_text().splitlines()) == 2, process)
     process.kill()
     process.communicate()
-    code, said = farm.run()
+    proxies = ("http_proxy", "https_proxy", "all_proxy", "grpc_proxy")
+    environment = dict.fromkeys(proxies, "http://127.0.0.1:9") | {"no_proxy": ""}
+    environment["TMPDIR"] = str(folder / ("x" * 90))
+    Path(environment["TMPDIR"]).mkdir()
+    code, said = farm.run(**environment)
     assert code == 0, said
     return farm
 
@@ -99,41 +115,32 @@ def test_a_killed_worker_goes_on_from_the_last_checkpoint(made):
     assert any("resume=auto: resuming from" in log for log in logs)
 
 
-def test_every_asset_is_finished(made):
-    assert list(made.records()) == [f"toy{i}" for i in range(COUNT)]
-    assert not made.records("failed.json")
-
-
 def test_the_assets_are_those_of_single_runs_to_the_bit(made):
-    name, result = max(made.records().items(), key=lambda item: item[1]["attempts"])
+    results = made.records()
+    assert list(results) == [f"toy{i}" for i in range(COUNT)] and not made.records("failed.json")
+    for result in results.values():
+        assert set(result["loads"].values()) == {1} and "unet" in result["loads"]
+    name, result = max(results.items(), key=lambda item: item[1]["attempts"])
     alone = make_alone(made.out.parent, int(name.removeprefix("toy")), STEPS)
     assert result["hash"] == digest(alone) == digest(made.out / "assets" / name)
 
 
-def test_a_worker_loads_each_network_at_most_once(made):
-    for result in made.records().values():
-        assert set(result["loads"].values()) == {1} and "unet" in result["loads"]
-
-
-def test_the_same_command_finds_nothing_left(made):
+def test_the_same_command_finds_nothing_left_and_another_configuration_is_refused(made):
+    attempts = [path.read_text() for path in made.out.glob("assets/*/attempts.txt")]
     code, said = made.run()
     assert code == 0 and f"{COUNT} finished, 0 failed" in said
-    attempts = [path.read_text() for path in made.out.glob("assets/*/attempts.txt")]
     assert made.run("--report")[0] == 0
     assert attempts == [path.read_text() for path in made.out.glob("assets/*/attempts.txt")]
-
-
-def test_another_configuration_is_refused_in_its_folder(made):
     code, said = made.run("system.geometry.init_opacity=0.2")
     assert code == 2 and "belongs to another farm: its overrides is" in said
 
 
-def test_ctrl_c_leaves_checkpoints_and_a_failed_asset_is_reported(tmp_path):
+def test_ctrl_c_leaves_checkpoints_and_a_failed_asset_is_reported(tmp_path, cluster):
     farm = Farm(tmp_path, write_farm(tmp_path, 1, 100_000))
     rows = [{"prompt": "a toy", "name": "long", "seed": 1}]
     rows.append({"prompt": "b", "name": "fails", "overrides": "system.geometry.prior.path=no.glb"})
     (tmp_path / "prompts.jsonl").write_text("\n".join(map(json.dumps, rows)))
-    process = farm.start()
+    process = farm.start(cluster=cluster)
     wait_for(lambda: any(folder.name == "long" for folder in farm.checkpointed()), process)
     process.send_signal(signal.SIGINT)
     said, _ = process.communicate(timeout=SECONDS)
@@ -145,12 +152,12 @@ def test_ctrl_c_leaves_checkpoints_and_a_failed_asset_is_reported(tmp_path):
     assert "system.geometry.prior.path=no.glb" in failed["fails"]["command"]
 
 
-def test_prompts_of_any_length_and_characters_have_an_asset_each_with_its_files(tmp_path):
+def test_prompts_of_any_length_and_characters_have_an_asset_each_with_its_files(tmp_path, cluster):
     farm = Farm(tmp_path, write_farm(tmp_path, 1, 2))
     long = "a photo of a very long and winding road through the hills with "
     rows = [{"prompt": text} for text in (f"{long}a fox", f"{long}a cat", "\U0001f98a/..", "con.x")]
     (tmp_path / "prompts.jsonl").write_text("\n".join(map(json.dumps, rows)))
-    code, said = farm.run()
+    code, said = farm.run(cluster=cluster)
     assert code == 0 and f"{len(rows)} finished, 0 failed" in said, said
     folders = [folder for folder in (farm.out / "assets").iterdir() if folder.is_dir()]
     assert len(folders) == len(rows)
@@ -158,28 +165,12 @@ def test_prompts_of_any_length_and_characters_have_an_asset_each_with_its_files(
     assert len(hashes) == len(rows) and all(any(exported(folder)) for folder in folders)
 
 
-def test_an_asset_that_hangs_is_made_again(tmp_path):
+def test_an_asset_that_hangs_is_made_again(tmp_path, cluster):
     (tmp_path / "custom").mkdir()
     (tmp_path / "custom/hanging.py").write_text(HANGS_ONCE)
     arguments = [*write_farm(tmp_path, 1), "system.geometry.prior_type=hanging-prior"]
     farm = Farm(tmp_path, arguments, start=tmp_path)
-    code, said = farm.run("--time-limit", "20", "--retries", "9")
+    code, said = farm.run("--time-limit", "20", "--retries", "9", cluster=cluster)
     assert code == 0 and "toy0: restarted: no step for" in said, said
     assert farm.records()["toy0"]["attempts"] >= 2
     assert farm.records()["toy0"]["worker_seconds"] > 20
-
-
-def test_a_long_folder_for_temporary_files_and_proxies_do_not_matter(tmp_path, monkeypatch):
-    long = tmp_path / ("x" * 90)
-    long.mkdir()
-    for name in ("http_proxy", "https_proxy", "all_proxy", "grpc_proxy"):
-        monkeypatch.setenv(name, "http://127.0.0.1:9")
-    monkeypatch.delenv("no_proxy", raising=False)
-    monkeypatch.delenv("RAY_TMPDIR", raising=False)
-    monkeypatch.setenv("TMPDIR", str(long))
-    monkeypatch.setattr(tempfile, "tempdir", None)
-    ray = driver.connect(None)
-    try:
-        assert ray.get(ray.remote(lambda: 5).remote(), timeout=60) == 5
-    finally:
-        ray.shutdown()

@@ -32,7 +32,7 @@ from threestudio_gaussiandreamer.farm.place import (
 from threestudio_gaussiandreamer.farm.recipe import Job, Recipe, Source, job_of, unfinished
 from threestudio_gaussiandreamer.farm.report import write_report
 from threestudio_gaussiandreamer.farm.rows import Row, read_rows
-from threestudio_gaussiandreamer.farm.worker import Setting, Worker
+from threestudio_gaussiandreamer.farm.worker import Setting
 
 FOX, CAT, DOG = Row("fox", "a fox"), Row("cat", "a cat", line=2), Row("dog", "a dog")
 
@@ -87,15 +87,13 @@ def wait_for(endpoint):
     raise RuntimeError("the S3 server doesn't start")
 
 
+LEFT_OUT = ("ckpts/epoch=0-step=5.ckpt", "ckpts/fetched.ckpt", "ckpts-2/last.ckpt", "ckpts-2/.a")
+
+
 def made(place, row=FOX):
     """Write what a run leaves in an asset's work folder."""
     folder = place.work_folder(row)
-    for name in (
-        "save/it5-export/a.ply",
-        "ckpts/last.ckpt",
-        "ckpts/epoch=0-step=5.ckpt",
-        "cmd.txt",
-    ):
+    for name in ("save/it5-export/a.ply", "ckpts/last.ckpt", "cmd.txt", *LEFT_OUT):
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_text(name)
     return folder
@@ -123,9 +121,9 @@ def life_of_a_farm(url, elsewhere):
     first.publish(FOX, RESULT)
     assert second.finished(FOX)["hash"] == "ab" and not folder.exists()
     assert dict(second.records([CAT, FOX]))[FOX] == {"state": FINISHED, **RESULT}
-    files = ("save/it5-export/a.ply", "ckpts/epoch=0-step=5.ckpt", "failed.json")
+    files = ("save/it5-export/a.ply", "failed.json", *LEFT_OUT)
     found = first.read([f"assets/fox/{name}" for name in files])
-    assert found == [b"save/it5-export/a.ply", None, None]
+    assert found == [b"save/it5-export/a.ply", None, *[None] * len(LEFT_OUT)]
     assert first.read([module.part_of(FOX, False)]) == [None]
     write_report(first, [FOX], 1)
     assert b"fox" in first.read(["report/table.csv"])[0]
@@ -137,14 +135,6 @@ def test_a_farm_in_memory(memory, tmp_path):
 
 def test_a_farm_on_s3(s3, tmp_path):
     life_of_a_farm(s3, tmp_path / "elsewhere")
-
-
-def test_checkpoints_of_earlier_attempts_are_not_uploaded(tmp_path):
-    made = ("ckpts/last.ckpt", "ckpts/fetched.ckpt", "ckpts-2/last.ckpt", "ckpts-2/.part")
-    for name in (*made, "result.json"):
-        (tmp_path / name).parent.mkdir(exist_ok=True)
-        (tmp_path / name).touch()
-    assert list(module.uploads(tmp_path)) == [("ckpts/last.ckpt", tmp_path / "ckpts/last.ckpt")]
 
 
 def test_the_result_is_uploaded_last_and_a_reader_sees_no_half_asset(memory, monkeypatch):
@@ -162,37 +152,35 @@ def test_the_result_is_uploaded_last_and_a_reader_sees_no_half_asset(memory, mon
     assert len(seen) == 3 and Place(memory).finished(FOX)
 
 
-def test_a_store_that_is_gone_is_named(memory, monkeypatch):
-    place = Place(memory)
+@pytest.mark.parametrize("error", [ConnectionError("no route"), FileNotFoundError("no bucket")])
+def test_a_store_that_is_gone_is_named_and_a_bucket_that_does_not_exist_is_empty(
+    memory, monkeypatch, error
+):
+    place, lacks = Place(memory), isinstance(error, FileNotFoundError)
 
     def gone(*args, **options):
-        raise ConnectionError("no route to host")
-
-    for name in ("cat_file", "pipe_file", "ls"):
-        monkeypatch.setattr(place.system, name, gone)
-    for act in (place.finished, lambda row: place.write({"a": b""}), lambda row: place.names("a")):
-        with pytest.raises(Unreachable, match="memory://farm can't be reached: .*no route to host"):
-            act(FOX)
-
-
-def test_a_bucket_that_does_not_exist_is_empty_and_can_not_be_written(memory, monkeypatch):
-    place = Place(memory)
-
-    def missing(*args, **options):
-        raise FileNotFoundError("The specified bucket does not exist")
+        raise error
 
     for name in ("cat_file", "pipe_file", "put_file", "ls", "rm_file"):
-        monkeypatch.setattr(place.system, name, missing)
-    place.remove(["a"])
-    assert place.names("a") == set() and place.read(["a"]) == [None]
-    for act in (lambda: place.write({"a": b""}), lambda: place.upload("a")):
-        with pytest.raises(Unreachable, match="bucket does not exist"):
+        monkeypatch.setattr(place.system, name, gone)
+    for write, act in (
+        (False, lambda: place.finished(FOX)),
+        (False, lambda: place.names("a")),
+        (False, lambda: place.remove(["a"])),
+        (True, lambda: place.write({"a": b""})),
+        (True, lambda: place.upload("a")),
+    ):
+        if lacks and not write:
+            assert not act()
+            continue
+        with pytest.raises(Unreachable, match=f"memory://farm can't be reached: .*{error}"):
             act()
 
 
 def test_a_file_may_be_removed_while_it_is_read(tmp_path, monkeypatch):
+    (tmp_path / "file").touch()
     monkeypatch.setattr("pathlib.Path.is_file", lambda path: True)
-    assert Place(tmp_path).read(["none"]) == [None]
+    assert Place(tmp_path).read(["none", "file/none", "."]) == [None] * 3
 
 
 def checkpoint(place, step):
@@ -215,20 +203,30 @@ def test_the_newer_checkpoint_wins_on_every_machine(memory, tmp_path):
     assert newest_readable(third.work_folder(FOX) / "ckpts")[1] == 7
 
 
-def test_what_a_stopped_worker_has_saved_is_there_for_others(memory, tmp_path, monkeypatch):
+def test_every_machine_goes_on_with_the_checkpoint_of_its_configuration(
+    memory, tmp_path, monkeypatch
+):
+    """What a stopped worker has saved is there for others; what was made with the low-memory
+    configuration only for those that use it.
+    """
+    seen = []
+
     def stopped(self, job, folder, attempt):
-        checkpoint(place, 4278)
+        place = self.setting.place
+        seen.append((job.saves_memory, (newest_readable(folder / "ckpts") or [0, None])[1]))
+        checkpoint(place, 90 - 80 * job.saves_memory + len(seen))
         return None, 128 + signal.SIGTERM
 
     monkeypatch.setattr(worker.Worker, "_run", stopped)
     monkeypatch.setattr(worker, "keep_loaded", lambda: None)
     monkeypatch.chdir(tmp_path)
-    place = Place(memory)
-    setting = Setting(Recipe((), (), True, 1), place, None, ".", "now", 1)
-    assert Worker().make(Job(FOX), 0, setting)["state"] == worker.STOPPED
-    other = Place(memory, scratch=tmp_path / "other")
-    other.fetch_checkpoint(FOX, False)
-    assert newest_readable(other.work_folder(FOX) / "ckpts")[1] == 4278
+    recipe = Recipe((), (), True, 1, Source("low.yaml", b""))
+    normal, low = Job(FOX), Job(FOX, saves_memory=True)
+    for machine, job in (("a", normal), ("b", normal), ("b", low), ("a", low), ("c", low)):
+        place = Place(memory, scratch=tmp_path / machine)
+        outcome = worker.Worker().make(job, 0, Setting(recipe, place, None, ".", "now", 9))
+        assert outcome["state"] == worker.STOPPED
+    assert seen == [(False, None), (False, 91), (True, None), (True, 13), (True, 14)]
 
 
 # -- records ---------------------------------------------------------------------------------------
@@ -282,20 +280,16 @@ def test_many_records_are_read_in_the_order_of_the_rows(tmp_path, monkeypatch):
     assert found == [(i, None if i % 2 else i) for i in range(7)]
 
 
-def test_a_server_that_refuses_the_connection_is_one_message(monkeypatch):
-    fsspec = pytest.importorskip("fsspec")
+def test_a_url_that_can_not_be_used_is_one_message(monkeypatch):
+    with pytest.raises(UserError, match="nothing://farm can't be used"):
+        Place("nothing://farm")
 
     def refuses(*args, **options):
         raise ConnectionRefusedError("Connection refused")
 
-    monkeypatch.setattr(fsspec.core, "url_to_fs", refuses)
+    monkeypatch.setattr("fsspec.core.url_to_fs", refuses)
     with pytest.raises(UserError, match="ftp://host/farm can't be used: Connection refused"):
         Place("ftp://host/farm")
-
-
-def test_an_unknown_protocol_is_refused():
-    with pytest.raises(UserError, match="nothing://farm can't be used"):
-        Place("nothing://farm")
 
 
 def test_a_folder_is_a_place_too(tmp_path):
@@ -308,28 +302,6 @@ def test_a_folder_is_a_place_too(tmp_path):
     assert (tmp_path / "assets/fox/ckpts/last.ckpt").exists()
     place.discard(FOX)
     assert place.finished(FOX) is None
-
-
-def test_the_low_memory_configuration_goes_on_on_any_machine(memory, tmp_path, monkeypatch):
-    """Of an asset that one machine begins with it, others resume that checkpoint and no other."""
-    seen = []
-
-    def stopped(self, job, folder, attempt):
-        place = self.setting.place
-        seen.append((job.saves_memory, (newest_readable(folder / "ckpts") or [0, None])[1]))
-        checkpoint(place, 90 - 80 * job.saves_memory + len(seen))
-        return None, 128 + signal.SIGTERM
-
-    monkeypatch.setattr(worker.Worker, "_run", stopped)
-    monkeypatch.setattr(worker, "keep_loaded", lambda: None)
-    monkeypatch.chdir(tmp_path)
-    recipe = Recipe((), (), True, 1, Source("low.yaml", b""))
-    normal, low = Job(FOX), Job(FOX, saves_memory=True)
-    for machine, job in (("a", normal), ("b", low), ("a", low), ("c", low)):
-        place = Place(memory, scratch=tmp_path / machine)
-        outcome = worker.Worker().make(job, 0, Setting(recipe, place, None, ".", "now", 9))
-        assert outcome["state"] == worker.STOPPED
-    assert seen == [(False, None), (True, None), (True, 12), (True, 13)]
 
 
 def test_unfinished_assets_are_handed_out_with_what_their_records_say(tmp_path):

@@ -70,7 +70,7 @@ def test_parquet_has_the_same_rows(tmp_path, place, monkeypatch):
 def test_the_pages_show_pictures_and_failures_escaped(tmp_path, place, monkeypatch):
     monkeypatch.setattr(report, "PER_PAGE", 1)
     first = write(place, price=2.0)
-    assert "no &lt;space&gt;" in first and "launch &#x27;a b&#x27;" in first
+    assert "no &lt;space&gt;" in first and "launch &#39;a b&#39;" in first
     assert "page-2.html" in first and "page-3.html" not in first
     assert "0.04, 0.02 per finished asset" in first
     page = (tmp_path / "report/page-1.html").read_text()

@@ -9,6 +9,7 @@ import torch
 from threestudio_gaussiandreamer import __version__
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.farm import worker
+from threestudio_gaussiandreamer.farm.board import Beat, Board
 from threestudio_gaussiandreamer.farm.place import (
     FAILED,
     STOPPED,
@@ -22,6 +23,7 @@ from threestudio_gaussiandreamer.farm.worker import (
     BLOCKED,
     NO_MEMORY,
     REFUSED,
+    Heartbeat,
     Setting,
     Worker,
     count_attempts,
@@ -63,17 +65,14 @@ def test_attempts_are_counted_in_the_session_and_in_all(tmp_path):
     (tmp_path / "attempts.txt").write_text("zero host 7\n")  # of an earlier version
     assert [count_attempts(tmp_path, "one", JOB) for _ in range(2)] == [(2, 1), (3, 2)]
     assert count_attempts(tmp_path, "two", JOB) == (4, 1)
-
-
-def test_a_row_that_has_changed_does_not_go_on_with_the_checkpoints_of_the_other(tmp_path):
-    count_attempts(tmp_path, "one", JOB)
+    # a row that has changed doesn't go on with the checkpoints of the other
     with pytest.raises(UserError, match="line 7 .*'fox' was begun in this farm with another"):
         count_attempts(tmp_path, "two", JOB._replace(row=JOB.row._replace(prompt="b", line=7)))
 
 
-def setting(place, **options):
+def setting(place):
     recipe = Recipe((Source("a.yaml", b""),), (), True, 1, Source("low.yaml", b""))
-    return Setting(recipe, place, None, options.pop("start", "."), "now", retries=1)
+    return Setting(recipe, place, None, ".", "now", retries=1)
 
 
 @pytest.fixture
@@ -97,18 +96,6 @@ def dies(*args):
     raise KeyboardInterrupt  # nothing of the worker goes on after it, as after a kill
 
 
-def test_what_was_made_with_much_memory_is_not_gone_on_with(place, monkeypatch):
-    monkeypatch.setattr(Worker, "_run", dies)
-    saving = JOB._replace(saves_memory=True)
-    folder = place.work_folder(JOB.row)
-    (folder / "ckpts").mkdir(parents=True)
-    for expected in (False, True):
-        with pytest.raises(KeyboardInterrupt):
-            Worker().make(saving, 0, setting(place))
-        assert (folder / "ckpts").exists() == expected
-        (folder / "ckpts").mkdir(exist_ok=True)
-
-
 def test_a_folder_that_a_dying_process_still_holds_is_waited_for(place, monkeypatch):
     monkeypatch.setattr(worker.time, "sleep", lambda seconds: None)
     monkeypatch.setattr(worker.Heartbeat, "report", lambda self, beat: False)
@@ -128,16 +115,12 @@ def test_a_folder_that_a_dying_process_still_holds_is_waited_for(place, monkeypa
     assert len(made) == 3 and not codes
 
 
-def test_a_machine_without_the_folder_is_named(place):
-    outcome = Worker().make(JOB, 0, setting(place, start="/nowhere"))
-    assert outcome["state"] == FAILED and "has no folder /nowhere" in outcome["error"]
-
-
-def test_a_machine_with_another_version_is_named(place):
+def test_a_machine_with_another_version_or_without_the_folder_is_named(place):
     with pytest.raises(UserError, match=f"has threestudio-.* {__version__}; the farm is of 9.9"):
         Worker().hello("9.9", ".", 1)
-    outcome = Worker().make(JOB, 0, setting(place)._replace(version="9.9"))
-    assert outcome["state"] == FAILED and "the farm is of 9.9" in outcome["error"]
+    for wrong, said in (("version", "9.9"), ("start", "/nowhere")):
+        outcome = Worker().make(JOB, 0, setting(place)._replace(**{wrong: said}))
+        assert outcome["state"] == FAILED and said in outcome["error"]
 
 
 def test_an_asset_without_files_has_failed(place, monkeypatch):
@@ -155,19 +138,57 @@ def test_an_exit_of_a_part_fails_its_asset_and_one_of_ray_ends_the_worker(place,
     def exits(self, *args):
         exec("raise SystemExit(3)", {"__name__": module})
 
+    def fails(*args):
+        raise ValueError("no such thing")
+
     monkeypatch.setattr(Worker, "_run", exits)
     module = "a_part"
     outcome = Worker().make(JOB, 0, setting(place))
     assert outcome["state"] == FAILED and "ended the run with sys.exit(3)" in outcome["error"]
+    monkeypatch.setattr(Worker, "_run", fails)
+    other = Job(Row("cat", "a cat"))
+    assert Worker().make(other, 0, setting(place))["error"] == "ValueError: no such thing"
+    assert "Traceback" in (place.work_folder(other.row) / "log.txt").read_text()
+    monkeypatch.setattr(Worker, "_run", exits)
     module = "ray._private.worker"
     with pytest.raises(SystemExit):
         Worker().make(JOB, 0, setting(place))
 
 
-def test_an_error_is_in_the_log_of_its_asset(place, monkeypatch):
-    def fails(*args):
-        raise ValueError("no such thing")
+# -- reports of workers, and how the farm's stop reaches them -----------------------------------
 
-    monkeypatch.setattr(Worker, "_run", fails)
-    assert Worker().make(JOB, 0, setting(place))["error"] == "ValueError: no such thing"
-    assert "Traceback" in (place.work_folder(JOB.row) / "log.txt").read_text()
+BEAT = Beat("fox", 1, "training", 3, 12)
+
+
+def test_the_board_knows_since_when_nothing_has_changed(monkeypatch):
+    now = SimpleNamespace(seconds=0.0)
+    monkeypatch.setattr(worker.time, "monotonic", lambda: now.seconds)
+    found = Board()
+    assert found.report(0, BEAT) is False
+    now.seconds = 5.0
+    found.report(0, BEAT)
+    assert found.read() == {0: (BEAT, 5.0)}
+    found.report(0, BEAT._replace(step=4))
+    assert found.read()[0][1] == 0.0
+    found.stop()
+    assert found.report(0, BEAT) is True
+
+
+def test_reports_are_rare_and_a_run_is_stopped_once(monkeypatch):
+    now = SimpleNamespace(seconds=0.0)
+    monkeypatch.setattr(worker.time, "monotonic", lambda: now.seconds)
+    told, stops, steps = [], [], []
+    monkeypatch.setattr(worker.signal, "raise_signal", stops.append)
+    monkeypatch.setattr(Heartbeat, "report", lambda _, beat: told.append(beat) or len(told) > 2)
+    setting = SimpleNamespace(
+        place=SimpleNamespace(keep_checkpoint=lambda *asset: steps.append(asset))
+    )
+    beats = Heartbeat(Job(Row("fox", "a fox")), 1, 0, setting)
+    for _ in range(4):
+        now.seconds += 0.5
+        beats.on_train_batch_end(SimpleNamespace(global_step=3, max_steps=12))
+    assert [beat.stage for beat in told] == ["starting", "training", "training"]
+    now.seconds = 9.0
+    beats.on_train_batch_end(SimpleNamespace(global_step=4, max_steps=12))
+    assert told[-1] == BEAT._replace(step=4) and len(steps) == 5
+    assert stops == [worker.signal.SIGTERM]

@@ -5,7 +5,10 @@ import time
 
 import pytest
 
+from tests.helpers.pruning import ball
 from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.formats.gaussian_files import StoredCloud
+from threestudio_gaussiandreamer.gaussians.simplify import Budget
 from threestudio_gaussiandreamer.prune.command import parse
 from threestudio_gaussiandreamer.prune.options import (
     PruneOptions,
@@ -14,8 +17,8 @@ from threestudio_gaussiandreamer.prune.options import (
     parse_bytes,
     parse_number,
     psnr_for_loss,
-    remaining_psnr_budget,
 )
+from threestudio_gaussiandreamer.prune.pipeline import remaining_budget
 
 
 @pytest.mark.parametrize(
@@ -29,8 +32,13 @@ from threestudio_gaussiandreamer.prune.options import (
     ],
 )
 def test_the_remaining_budget(asked, spent, left):
-    assert remaining_psnr_budget(asked, spent) == (left and pytest.approx(left, abs=5e-3))
-    assert left is None or combined_psnr(spent, left) == pytest.approx(asked, abs=2e-3)
+    stored = StoredCloud(ball(7).arrays(), pruned_to=spent)
+    found = remaining_budget(Budget(psnr=asked), stored)
+    assert found.psnr == (left and pytest.approx(left, abs=5e-3))
+    if left is None:
+        assert found.count == 7
+    else:
+        assert combined_psnr(spent, left) == pytest.approx(asked, abs=2e-3)
 
 
 def test_the_psnr_that_loses_a_tenth_of_a_decibel():
@@ -39,11 +47,10 @@ def test_the_psnr_that_loses_a_tenth_of_a_decibel():
     assert 10 ** (-3.5) + 10 ** (-psnr / 10) == pytest.approx(10 ** (-3.49))
 
 
-@pytest.mark.parametrize(
-    ("text", "size"), [("500kB", 500_000), (" 2 MB ", 2_000_000), ("1.5g", 1_500_000_000), (7, 7)]
-)
-def test_sizes(text, size):
-    assert parse_bytes(text, "bytes") == size
+def test_sizes_and_decibels_are_read_with_their_units():
+    sizes = {"500kB": 500_000, " 2 MB ": 2_000_000, "1.5g": 1_500_000_000, 7: 7}
+    assert [parse_bytes(text, "bytes") for text in sizes] == [*sizes.values()]
+    assert {parse_number(text, "psnr", "dB") for text in ("40", " 40dB ", "40 db", 40.0)} == {40.0}
 
 
 @pytest.mark.parametrize(
@@ -59,6 +66,25 @@ def test_a_size_that_is_none_is_named_in_a_short_message(text, message):
     with pytest.raises(UserError, match=re.escape(message)) as caught:
         parse_bytes(text, "bytes")
     assert len(str(caught.value)) < 200
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"count": "0"}, "--count: expected a whole number from 1 on"),
+        ({"count": "1.5"}, "--count: expected a whole number"),
+        ({"count": "many"}, "--count: expected a number, got 'many'"),
+        ({"bytes": "2 potatoes"}, "--bytes: expected a size such as"),
+        ({"psnr": "nan"}, "--psnr: expected a number"),
+        ({"psnr": "-3"}, "--psnr: expected a number above 0"),
+        ({"within": "0", "quality": 35}, "--within: expected a loss from 0.001 to 30 dB, "),
+        ({"within": "5000", "quality": 35}, "--within: expected a loss"),
+        *(({"auto": text}, "--auto: expected a") for text in ("0", "-1", "100", "6", "nan", "x")),
+    ],
+)
+def test_a_budget_that_is_none_is_named(given, said):
+    with pytest.raises(UserError, match=re.escape(said)):
+        budget_of(PruneOptions(**given), "--")
 
 
 @pytest.mark.parametrize(
@@ -80,17 +106,6 @@ def test_a_gain_is_a_budget(given, gain, error):
 )
 def test_auto_may_stand_anywhere(words, gain):
     assert parse(words.split()).auto == gain
-
-
-@pytest.mark.parametrize("text", ["0", "-1", "100", "6", "nan", "much"])
-def test_a_gain_that_is_none_is_named(text):
-    with pytest.raises(UserError, match="--auto: expected a"):
-        budget_of(PruneOptions(auto=text), "--")
-
-
-@pytest.mark.parametrize("text", ["40", " 40dB ", "40 db", 40.0])
-def test_decibels_with_and_without_their_unit(text):
-    assert parse_number(text, "psnr", "dB") == 40.0
 
 
 def test_numbers_are_read_in_linear_time():

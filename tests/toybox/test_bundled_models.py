@@ -6,7 +6,7 @@ import yaml
 from tests.toybox.test_text_to_3d import PROMPT, run
 from tests.training.runs import CONFIGS
 from threestudio_gaussiandreamer import register_parts
-from threestudio_gaussiandreamer.evaluation.text_to_3d import Scores, result_of
+from threestudio_gaussiandreamer.evaluation.asset_metrics import Scores, result_of
 from threestudio_gaussiandreamer.models.bundled import (
     FOLDER,
     NAME,

@@ -68,21 +68,6 @@ def test_a_damaged_configuration_leaves_the_defaults(run_folder, damage):
     assert found["settings"]["eps2d"] == 0.3 and found["title"] == "run"
 
 
-def test_a_checkpoint_of_gsplat_can_be_viewed(tmp_path):
-    gaussians = cloud(20).gaussians.tensors()
-    splats = {
-        "means": gaussians.means,
-        "quats": gaussians.quats,
-        "scales": gaussians.log_scales,
-        "opacities": gaussians.logit_opacities,
-        "sh0": gaussians.sh,
-        "shN": torch.zeros(20, 0, 3),
-    }
-    torch.save({"splats": splats}, tmp_path / "gsplat.pt")
-    assert main([str(tmp_path / "gsplat.pt"), "--html"]) == 0
-    assert meta(tmp_path / "gsplat.html")["clouds"][0]["count"] == 20
-
-
 def message(capsys, *argv: object) -> str:
     """Run a command line that must fail; return what it says."""
     assert main([str(argument) for argument in argv]) == 2

@@ -44,21 +44,15 @@ def test_of_a_run_its_own_page_is_shown(run_folder):
     assert '"eps2d": 0.7' in show(run_folder, eps2d=0.7).content
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
+def test_what_can_not_be_shown_is_named(tmp_path, ply, monkeypatch):
+    for options, message in (
         ({"preset": "acurate"}, "unknown --preset 'acurate': did you mean 'accurate'"),
         ({"up": "w"}, "unknown --up 'w'"),
         ({"background": "red"}, "--background: expected RRGGBB"),
         ({"eps2d": -1.0}, "--eps2d: expected a number of square pixels"),
-    ],
-)
-def test_bad_options_are_named(ply, options, message):
-    with pytest.raises(UserError, match=message):
-        show(ply, **options)
-
-
-def test_what_can_not_be_shown_is_named(tmp_path, ply, monkeypatch):
+    ):
+        with pytest.raises(UserError, match=message):
+            show(ply, **options)
     with pytest.raises(UserError, match="is no run with an exported cloud"):
         show(tmp_path)
     with pytest.raises(UserError, match="'.*bax.ply' does not exist"):

@@ -13,7 +13,7 @@ import os
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Optional
+from typing import Optional
 
 from ..core.command import joined_values, run_command
 from ..core.errors import UserError
@@ -31,14 +31,14 @@ from ..formats.gaussian_files import (
 )
 from ..formats.producers import GAUSSIANS, from_producer, producers_of
 from ..formats.spz import SPZ_UP, SYSTEM_OF, VERSION, VERSIONS, ZSTD_VERSION, require_version
-from ..gaussians.axes import AXES, VIEWER_UP
+from ..gaussians.axes import AXES, VIEWER_UP, WORLD_UP, rotation_between
 from ..gaussians.gaussians import finite
 from ..gaussians.sh import COEFFICIENTS, MAX_DEGREE
-from ..meshes.write import WRITERS
+from ..gaussians.views import EPS2D
+from ..meshes.write import WRITERS, companions, write_textured_mesh
+from ..surface.textured import METHODS, MeshOptions, mesh_from_gaussians, require_mesh_libraries
 from ..view.run_files import read_any
-from . import to_mesh
-from .check import VIEWS, compare, reference
-from .losses import dropped, losses
+from .losses import VIEWS, compare, dropped, losses, reference
 
 SIZE = 256
 """Width and height of the views of ``--check`` unless given, pixels."""
@@ -52,46 +52,8 @@ class ConvertOptions:
     size: Optional[int] = field(default=None, metadata=in_range(16, 4096, "pixels"))
 
 
-OPTIONS: dict[str, dict[str, Any]] = {
-    "--from": {
-        "dest": "producer",
-        "choices": producers_of(GAUSSIANS),
-        "help": "the program that wrote IN, which determines the axes",
-    },
-    "--up": {
-        "choices": AXES,
-        "help": "which axis of IN is up (default: from the file, else its format's convention)",
-    },
-    "--up-out": {
-        "choices": AXES,
-        "help": f"which axis of OUT is up, for PLYs (default: {VIEWER_UP}, as viewers expect) and "
-        f"SPZ of version 4 ({' or '.join(SYSTEM_OF)}; default: {SPZ_UP})",
-    },
-    "--gaussians": {
-        "action": "store_true",
-        "help": "write the Gaussians themselves into a .glb (KHR_gaussian_splatting), not a mesh",
-    },
-    "--spz-version": {
-        "type": int,
-        "choices": VERSIONS,
-        "default": VERSION,
-        "help": "version of an SPZ file (default: %(default)s)",
-    },
-    "--harmonics": {
-        "type": int,
-        "metavar": "DEGREE",
-        "help": "drop the harmonics above this degree, 0 to 3",
-    },
-    "--antialiased": {
-        "action": argparse.BooleanOptionalAction,
-        "help": "whether the Gaussians were trained with antialiasing (default: what IN says)",
-    },
-    "--check": {"action": "store_true", "help": f"measure the PSNR of OUT to IN in {VIEWS} views"},
-    "--size": {
-        "type": int,
-        "help": f"width and height of the views of --check, pixels (default: {SIZE})",
-    },
-}
+MESH_OPTIONS = ("faces", "texture", "views", "view_size", "method", "resolution", "eps2d")
+"""Those of :class:`.textured.MeshOptions` that can be given; None unless they are."""
 
 
 def main(argv: Optional[Sequence[str]] = None) -> int:
@@ -106,11 +68,41 @@ def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
         description="Convert a file of Gaussians to another format, or to a textured mesh, by "
         "the extensions of IN and OUT.",
     )
-    for name, settings in OPTIONS.items():
-        parser.add_argument(name, **settings)
-    meshes = parser.add_argument_group("for meshes, .glb and .obj")
-    for name, settings in to_mesh.OPTIONS.items():
-        meshes.add_argument(name, **settings)
+    add = parser.add_argument
+    producer = "the program that wrote IN, which determines the axes"
+    add("--from", dest="producer", choices=producers_of(GAUSSIANS), help=producer)
+    up = "which axis of IN is up (default: from the file, else its format's convention)"
+    add("--up", choices=AXES, help=up)
+    up = f"which axis of OUT is up, for PLYs (default: {VIEWER_UP}, as viewers expect) and SPZ of "
+    up += f"version 4 ({' or '.join(SYSTEM_OF)}; default: {SPZ_UP})"
+    add("--up-out", choices=AXES, help=up)
+    inside = "write the Gaussians themselves into a .glb (KHR_gaussian_splatting), not a mesh"
+    add("--gaussians", action="store_true", help=inside)
+    version = "version of an SPZ file (default: %(default)s)"
+    add("--spz-version", type=int, choices=VERSIONS, default=VERSION, help=version)
+    harmonics = "drop the harmonics above this degree, 0 to 3"
+    add("--harmonics", type=int, metavar="DEGREE", help=harmonics)
+    flag = "whether the Gaussians were trained with antialiasing (default: what IN says)"
+    add("--antialiased", action=argparse.BooleanOptionalAction, help=flag)
+    check = f"measure the PSNR of OUT to IN in {VIEWS} views"
+    add("--check", action="store_true", help=check)
+    size = f"width and height of the views of --check, pixels (default: {SIZE})"
+    add("--size", type=int, help=size)
+    add, default = parser.add_argument_group("for meshes, .glb and .obj").add_argument, MeshOptions
+    add("--faces", type=int, help=f"largest number of triangles (default: {default.faces})")
+    texture = f"texture width and height, texels (default: {default.texture})"
+    add("--texture", type=int, help=texture)
+    add("--views", type=int, help=f"number of renders to bake (default: {default.views})")
+    view_size = f"width and height of a render, pixels (default: {default.view_size})"
+    add("--view-size", type=int, help=view_size)
+    method = f"how the surface is found (default: {default.method})"
+    add("--method", choices=METHODS, help=method)
+    resolution = f"grid cells along the longest side (default: {default.resolution})"
+    add("--resolution", type=int, help=resolution)
+    eps2d = f"screen-space dilation of the renders, square pixels (default: {EPS2D:g})"
+    add("--eps2d", type=float, help=eps2d)
+    unlit = "ask viewers to show the texture without lighting"
+    add("--unlit", action="store_const", const=True, help=unlit)
     parser.add_argument("source", metavar="IN", help="a file of Gaussians, or a checkpoint")
     parser.add_argument("output", metavar="OUT", help="the file to write")
     return parser.parse_args(joined_values(argv, ["--up", "--up-out"], AXES))
@@ -123,7 +115,7 @@ def run(args: argparse.Namespace) -> None:
         UserError: an option is invalid, a file can't be read or written, or it holds no Gaussians.
     """
     args.output = str(through_link(args.output))
-    mesh = to_mesh.writes_mesh(args)
+    mesh = suffix_of(args.output) in WRITERS and not args.gaussians
     formats = WRITTEN if args.gaussians else tuple(dict.fromkeys((*WRITTEN, *WRITERS)))
     suffix = suffix_of(args.output) if mesh else require_format(args.output, "OUT", formats)
     _check_options(args, suffix, mesh)
@@ -132,7 +124,7 @@ def run(args: argparse.Namespace) -> None:
     whole = _read(source, args)
     stored = of_degree(whole, args.harmonics)
     if mesh:
-        to_mesh.write_mesh(args, stored)
+        write_mesh(args, stored)
         return
     size = args.size or SIZE
     # before anything is written, since it refuses clouds that can't be rendered
@@ -172,7 +164,18 @@ def _check_options(args: argparse.Namespace, suffix: str, mesh: bool) -> None:
         raise UserError("--size: has no effect without --check")
     if args.gaussians and suffix != ".glb":
         raise UserError(f"--gaussians: OUT is a {suffix} file, which always holds Gaussians")
-    to_mesh.check_mesh_options(args)
+    if not mesh:
+        given = [name for name in (*MESH_OPTIONS, "unlit") if getattr(args, name) is not None]
+        if given:
+            option = given[0].replace("_", "-")
+            raise UserError(f"--{option}: OUT is a file of Gaussians; it is for meshes")
+        return
+    for path in companions(args.output):
+        require_writable(path, "OUT")
+    if args.check:
+        raise UserError("--check: OUT is a mesh; it is for files of Gaussians")
+    check_options(MeshOptions, mesh_options(args, False), "--")
+    require_mesh_libraries()
 
 
 def _axes_of(suffix: str, spz_version: int, mesh: bool) -> Collection[str]:
@@ -207,3 +210,28 @@ def of_degree(stored: StoredCloud, degree: Optional[int]) -> StoredCloud:
         return stored
     sh = stored.gaussians.sh[:, : COEFFICIENTS[degree]]
     return stored._replace(gaussians=stored.gaussians._replace(sh=sh), pruned_to=None)
+
+
+def mesh_options(args: argparse.Namespace, antialias: bool) -> MeshOptions:
+    """Collect the mesh options; those that aren't given have their defaults."""
+    given = {name: getattr(args, name) for name in MESH_OPTIONS}
+    given = {name: value for name, value in given.items() if value is not None}
+    return MeshOptions(**given, antialias=antialias)
+
+
+def write_mesh(args: argparse.Namespace, stored: StoredCloud) -> None:
+    """Convert a cloud and write the mesh; print what was written.
+
+    Raises:
+        UserError: the Gaussians form no surface, or a file can't be written.
+    """
+    gaussians = stored.in_axes(WORLD_UP).gaussians
+    mesh = mesh_from_gaussians(gaussians, mesh_options(args, stored.antialiased), "--")
+    rotation = rotation_between(WORLD_UP, "y")
+    mesh = mesh._replace(vertices=mesh.vertices @ rotation.T)
+    write_textured_mesh(args.output, mesh, unlit=bool(args.unlit))
+    size = sum(map(os.path.getsize, (Path(args.output), *companions(args.output))))
+    print(
+        f"{args.output}: {len(mesh.faces):,} triangles, a texture of {mesh.texture.shape[0]} x "
+        f"{mesh.texture.shape[1]}, {size_text(size)}"
+    )

@@ -1,8 +1,13 @@
-"""Describe in sentences what a cloud loses when it is written in a format."""
+"""What a cloud loses when it is written in a format: in sentences, and in dB of renders of the file
+that is read back."""
 
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from ..formats.compressed_ply import MAX_STORED_LOG, SH_REACH
 from ..formats.gaussian_files import StoredCloud
@@ -16,7 +21,12 @@ from ..formats.spz import (
     out_of_range,
     position_step,
 )
+from ..gaussians.axes import WORLD_UP, rotation_between
 from ..gaussians.gaussians import Gaussians
+from ..gaussians.views import Views, render_all, views_around
+from ..metrics import psnr
+
+VIEWS = 8
 
 ROUNDING = {
     ".spz": "scales are rounded to 6 %, opacities and colours to 8 bits, rotations to 10",
@@ -99,3 +109,42 @@ def _of_sog(cloud: StoredCloud) -> Iterator[str]:
     count = len(cloud.gaussians.means)
     if cloud.gaussians.sh_degree and (entries := palette_size(count)) < count:
         yield f"harmonics above degree 0 come from a palette of {entries:,} for {count:,} Gaussians"
+
+
+# ---- dB ------------------------------------------------------------------------------------------
+
+
+class RoundTrip(NamedTuple):
+    """PSNR of a cloud after a round trip to the cloud before, dB."""
+
+    mean: float
+    """Over all pixels of all views."""
+    worst: float
+    """Of the worst view."""
+
+
+@torch.no_grad()
+def reference(before: StoredCloud, size: int) -> tuple[str, Views, Float[Tensor, "V H W 3"]]:
+    """Render a cloud from ``VIEWS`` directions around it, with or without antialiasing as it was
+    trained; return its up axis, the views and the images.
+
+    Args:
+        size: width and height of the images, pixels.
+
+    Raises:
+        UserError: the cloud is too large to be rendered.
+    """
+    cloud = before.gaussians.tensors()
+    to_z_up = torch.from_numpy(rotation_between(before.up, WORLD_UP))
+    views = views_around(cloud, VIEWS, size, to_z_up=to_z_up)
+    views = views._replace(antialias=before.antialiased)
+    return before.up, views, render_all(cloud, views)
+
+
+@torch.no_grad()
+def compare(truth: tuple[str, Views, Float[Tensor, "V H W 3"]], after: StoredCloud) -> RoundTrip:
+    """Render the cloud after the round trip as :func:`reference` did, and compare the images."""
+    up, views, images = truth
+    found = render_all(after.in_axes(up).gaussians.tensors(), views)
+    worst = min(float(psnr(*pair)) for pair in zip(found, images, strict=True))
+    return RoundTrip(float(psnr(found, images)), worst)

@@ -6,7 +6,8 @@ toybox doesn't know, is NaN.
 import math
 from argparse import Namespace
 from functools import lru_cache
-from typing import ClassVar, NamedTuple, Optional
+from pathlib import Path
+from typing import Any, ClassVar, NamedTuple, Optional
 
 import numpy as np
 import torch
@@ -14,19 +15,20 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..cameras import Orbit
+from ..formats.array_files import read_arrays
 from ..gaussians.gaussians import Gaussians
+from ..gaussians.point_cloud import PointCloud
 from ..host import get_device
-from ..models.clip import PictureText
 from ..prompts.view_prompts import view_directions
 from ..toybox import recognition
 from ..toybox.kinds import KINDS
-from ..toybox.models import Judge
 from ..toybox.views import BACKGROUND, SIZE
 from ..toybox.words import attributes_in
+from ..training.initialization import gaussians_on_points
 from . import t3bench
 from .clip_similarity import Protocol, open_clip, protocol_for, score
 from .image_reward import ImageReward
-from .results import Pictures, Result
+from .results import Pictures, Result, find_result, read_result
 
 Color = tuple[float, float, float]
 
@@ -58,9 +60,13 @@ class Metric:
 
 
 @lru_cache(maxsize=1)
-def shared_clip(folder: str) -> PictureText:
-    """Load a CLIP once for all metrics that use it."""
-    return open_clip(folder)
+def shared_image_reward(folder: str) -> ImageReward:
+    return ImageReward(folder, get_device())
+
+
+# one of each for all metrics
+shared_clip = lru_cache(maxsize=1)(open_clip)
+shared_judge = lru_cache(maxsize=1)(recognition.load_judge)
 
 
 class Clip(Metric):
@@ -89,7 +95,7 @@ class Directions(Metric):
     def score(self, asset: Asset) -> dict[str, float]:
         azimuth = torch.tensor([float(a) for group in self.AZIMUTHS.values() for a in group])
         pictures = rendered(asset, self.protocol.at(azimuth), self.protocol.size)
-        texts = {d.name: d.prompt(asset.prompt) for d in view_directions(45, 45, 60)}
+        texts = {d.name: d.prompt(asset.prompt) for d in view_directions()}
         found = np.stack(
             [self.clip.similarities(pictures, texts[name]) for name in self.AZIMUTHS], axis=1
         ).argmax(axis=1)
@@ -140,27 +146,30 @@ class Recognized(Metric):
         self.judge = shared_judge(args.judge)
 
     def score(self, asset: Asset) -> dict[str, float]:
-        wanted = attributes_in(asset.prompt)
+        pictures = rendered(asset, recognition.views(), SIZE, background=BACKGROUND)
+        views = torch.from_numpy(pictures).movedim(-1, 1)
+        return self.of_pictures(views, asset.prompt) or dict.fromkeys(self.columns, math.nan)
+
+    def of_pictures(self, views: Float[Tensor, "V 3 s s"], prompt: str) -> dict[str, float]:
+        """Score pictures from the judge's views; empty if the prompt names no object."""
+        wanted = attributes_in(prompt)
         if wanted is None:
-            return dict.fromkeys(self.columns, math.nan)
-        found = recognition.recognized(judged(self.judge, asset), wanted)
-        return {name: float(found[name]) for name in self.columns}
+            return {}
+        return self.compared(recognition.probabilities(self.judge, views), wanted)
+
+    def compared(self, found: dict[str, Tensor], wanted: Any) -> dict[str, float]:
+        right = recognition.recognized(found, wanted)
+        return {name: float(right[name]) for name in self.columns}
 
 
-class Janus(Metric):
+class Janus(Recognized):
     """The share of views that the judge takes for views from another quadrant."""
 
     columns = ("multi_face",)
     undefined = f"{Recognized.undefined}; or the object has no front"
 
-    def __init__(self, args: Namespace) -> None:
-        self.judge = shared_judge(args.judge)
-
-    def score(self, asset: Asset) -> dict[str, float]:
-        wanted = attributes_in(asset.prompt)
-        if wanted is None:
-            return {"multi_face": math.nan}
-        return {"multi_face": recognition.multi_face(judged(self.judge, asset), wanted)}
+    def compared(self, found: dict[str, Tensor], wanted: Any) -> dict[str, float]:
+        return {"multi_face": recognition.multi_face(found, wanted)}
 
 
 METRICS: dict[str, type[Metric]] = {
@@ -173,24 +182,6 @@ METRICS: dict[str, type[Metric]] = {
 }
 
 
-@lru_cache(maxsize=1)
-def shared_image_reward(folder: str) -> ImageReward:
-    """Load an ImageReward once for all metrics that use it."""
-    return ImageReward(folder, get_device())
-
-
-@lru_cache(maxsize=1)
-def shared_judge(path: str) -> Judge:
-    """Load a judge once for all metrics that use it."""
-    return recognition.load_judge(path)
-
-
-def judged(judge: Judge, asset: Asset) -> dict[str, Tensor]:
-    """Return the judge's probabilities in its views of an asset."""
-    pictures = rendered(asset, recognition.views(), SIZE, background=BACKGROUND)
-    return recognition.probabilities(judge, torch.from_numpy(pictures).movedim(-1, 1))
-
-
 def rendered(
     asset: Asset, orbit: Orbit, size: int, *, background: Optional[Color] = None
 ) -> Float[np.ndarray, "V s s 3"]:
@@ -198,3 +189,48 @@ def rendered(
     result = asset.result
     pictures = Pictures(asset.gaussians, background or result.background, result.antialiased)
     return np.concatenate(list(pictures.render(orbit.c2w, orbit.fovy, size)))
+
+
+# ---- the stages of a run by the toybox's judge -------------------------------------------------
+
+ATTRIBUTES = Recognized.columns
+OPAQUE = 0.95
+
+
+class Scores:
+    """Scores by the judge and the CLIP in one folder.
+
+    Args:
+        models: ``toybox``, or the folder of an export.
+    """
+
+    def __init__(self, models: str) -> None:
+        args = Namespace(judge=models, clip=models, size=SIZE)
+        self.judged = (Recognized(args), Janus(args))
+        self.metrics: tuple[Metric, ...] = (*self.judged, Clip(args))
+
+    def of_asset(self, asset: Asset) -> dict[str, float]:
+        """Return the attributes of :data:`ATTRIBUTES`, ``multi_face`` and ``clip``."""
+        return {k: v for metric in self.metrics for k, v in metric.score(asset).items()}
+
+    def of_pictures(self, pictures: Float[Tensor, "V 3 s s"], prompt: str) -> dict[str, float]:
+        """Score pictures from the judge's views; empty if the prompt names no object."""
+        found = (metric.of_pictures(pictures, prompt) for metric in self.judged)
+        return {k: v for scores in found for k, v in scores.items()}
+
+
+def result_of(run: Path, prompt: str) -> Asset:
+    """Return the cloud that a finished run has exported."""
+    result = find_result(str(run))
+    return Asset(result, prompt, read_result(result), 0)
+
+
+def prior_of(run: Path, asset: Asset) -> Asset:
+    """Return the points that a run started from, drawn nearly opaque and as large as their
+    distances.
+    """
+    arrays = read_arrays(run / "save/prior/points.npz", "prior", ["points", "colors"])
+    cloud = PointCloud(arrays["points"], arrays["colors"])
+    size = {"scale_rule": "nearest", "scale_factor": 1.0, "init_opacity": OPAQUE}
+    options = Namespace(max_gaussians=len(cloud.points), **size)
+    return asset._replace(gaussians=gaussians_on_points(cloud, options))

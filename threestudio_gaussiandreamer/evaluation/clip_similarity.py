@@ -4,14 +4,10 @@
 [--prompt TEXT] [--output FOLDER]``
 
 The paper's protocol (appendix; from Instant3D): of 120 views at radius 4 and elevation 15 degrees,
-evenly spaced in azimuth, ten are drawn at random, and their similarities with the text averaged.
-This module repeats that for several seeds: each seed draws ten views of every result, and its score
-is the mean over the results. Mean and standard deviation over the seeds are reported.
-
-A similarity is 100 times the cosine of CLIP's features of picture and text. The paper gives no
-formula, but its values, 27.23 (ViT-L/14) and 41.88 (ViT-bigG-14), have that magnitude. It doesn't
-give field of view, size and background either; 70 degrees, 1024 pixels and the run's background
-(black) are those of the released code. The azimuths are -180, -177, ..., 177 degrees."""
+at azimuths -180, -177, ..., 177, ten are drawn at random, and their similarities with the text, 100
+times the cosine of CLIP's features, averaged. Here each of several seeds draws ten views of every
+result, and its score is the mean over the results; mean and standard deviation over the seeds are
+reported. docs/evaluation.md has what the paper leaves open."""
 
 import argparse
 import functools
@@ -140,15 +136,6 @@ def _mean_and_spread(per_seed: Float[np.ndarray, " S"]) -> dict[str, Any]:
     return {"mean": float(per_seed.mean()), "std": spread, "per_seed": per_seed.tolist()}
 
 
-def contact_sheet(prompts: Sequence[str], scores: Sequence[Scored]) -> np.ndarray:
-    """Draw a row of the first seed's views for each result, and its prompt and score over them."""
-    rows = []
-    for prompt, scored in zip(prompts, scores, strict=True):
-        text = f"{scored.per_seed.mean():.2f}  {prompt}"
-        rows.append(picture_files.with_texts(np.concatenate(scored.thumbnails, axis=1), [text]))
-    return np.concatenate(rows, axis=0)
-
-
 def _thumbnail(image: Float[np.ndarray, "H W 3"]) -> np.ndarray:
     from PIL import Image
 
@@ -264,20 +251,24 @@ def evaluate(
     protocol: Protocol,
     output: Path,
 ) -> None:
-    """Score all results, print the scores, and write ``clip.json`` and ``clip.png``."""
-    clip, scores, each = open_clip(clip_folder), [], []
+    """Score all results, print the scores, and write ``clip.json`` and ``clip.png``, which has a
+    row of the first seed's views for each result.
+    """
+    clip, scores, each, rows = open_clip(clip_folder), [], [], []
     for item, (result, prompt) in enumerate(zip(results, prompts, strict=True)):
         scored = score(result, prompt, item, clip, protocol)
-        scores.append(scored)
+        scores.append(scored.per_seed)
         numbers = _mean_and_spread(scored.per_seed)
+        views, text = np.concatenate(scored.thumbnails, axis=1), f"{numbers['mean']:.2f}  {prompt}"
+        rows.append(picture_files.with_texts(views, [text]))
         each.append({"result": str(result.file), "prompt": prompt, **numbers})
         print(f"{numbers['mean']:6.2f}  {prompt}  {result.file}", flush=True)
-    total = _mean_and_spread(np.mean([scored.per_seed for scored in scores], axis=0))
+    total = _mean_and_spread(np.mean(scores, axis=0))
     about = {"clip": clip_folder, "unit": "100 * cosine", "protocol": protocol._asdict()}
     text = json_text({**about, **total, "results": each}, indent=2, ensure_ascii=False)
     with atomic_file(output / "clip.json") as file:
         file.write(text.encode(errors="surrogateescape"))  # paths may hold invalid UTF-8
-    picture_files.write(output / "clip.png", contact_sheet(prompts, scores))
+    picture_files.write(output / "clip.png", np.concatenate(rows, axis=0))
     spread = total["std"] and f" +- {total['std']:.2f} over {len(protocol.seeds)} seeds"
     print(f"{total['mean']:6.2f}{spread or ''}: {output / 'clip.json'}, {output / 'clip.png'}")
 

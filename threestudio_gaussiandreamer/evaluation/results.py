@@ -15,13 +15,13 @@ from torch import Tensor
 from ..core.checkpoint_file import load_module_weights
 from ..core.errors import UserError
 from ..core.files import existing_file
-from ..formats.gaussian_files import holds_gaussians, is_antialiased, suffix_of
+from ..formats.gaussian_files import is_antialiased
 from ..formats.ply import is_gaussian_ply
 from ..gaussians.gaussians import Gaussians
 from ..host import find, get_device, warn
 from ..launch.config import load_config
 from ..prompts.prompt_processors import resolve_prompt
-from ..view.run_files import RunFiles, step_of
+from ..view.run_files import RunFiles
 
 BLACK = (0.0, 0.0, 0.0)
 FLAT = ("gaussiandreamer-background", "solid-color-background")
@@ -56,19 +56,14 @@ def find_result(place: str) -> Result:
                 "save/it*-export/gaussians.ply"
             )
         return Result(file, None, BLACK, is_antialiased(file))
-    clouds = sorted(filter(holds_gaussians, folder.glob("save/it*-export/*.*")), key=_rank)
-    if not clouds:
+    run = RunFiles(folder)
+    if not run.cloud:
         raise UserError(
             f"{place!r} is no run's folder with Gaussians in save/it*-export: export it first, "
             "with --export and system.exporter.formats=[ply], or name a PLY file"
         )
     prompt, background = _prompt_and_background(folder / "configs" / "parsed.yaml")
-    return Result(clouds[-1], prompt, background, RunFiles(folder).antialiased)
-
-
-def _rank(path: Path) -> tuple[int, bool, str]:
-    """Order files of Gaussians by step; of one step, PLYs, which round nothing, are the last."""
-    return step_of(path.parent), suffix_of(path.name) == ".ply", path.name
+    return Result(run.cloud, prompt, background, run.antialiased)
 
 
 def _prompt_and_background(parsed: Path) -> tuple[Optional[str], tuple[float, float, float]]:

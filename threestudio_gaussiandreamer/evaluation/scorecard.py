@@ -17,9 +17,10 @@ import os
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, Optional
+from typing import Any, NamedTuple, Optional
 
 import numpy as np
+from jaxtyping import Float
 from tqdm import tqdm
 
 from .. import register_parts
@@ -27,16 +28,28 @@ from ..core.command import run_command
 from ..core.errors import UserError, unknown
 from ..core.files import atomic_file, json_text, output_folder
 from ..core.options import shown
+from ..core.streams import numpy_generator
 from ..models.bundled import NAME
 from ..training.camera_options import MAX_SIDE
 from .asset_metrics import METRICS, Asset, Metric
 from .clip_similarity import Protocol, has_own_cameras
 from .image_reward import SOURCES
-from .intervals import Estimate, bootstrap, paired, per_prompt
 from .results import Result, find_result, read_result
 
 FILES = ("scorecard.csv", "scorecard.json")
+DRAWS, LEVEL = 2000, 0.95
+"""Of the bootstrap: samples, and level of the intervals."""
 Rows = list[dict[str, Any]]
+
+
+class Estimate(NamedTuple):
+    """A mean with its interval; NaN where there are no values."""
+
+    mean: float
+    low: float
+    high: float
+    count: int
+    """Number of prompts."""
 
 
 def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
@@ -87,8 +100,6 @@ def open_metrics(args: argparse.Namespace) -> list[Metric]:
     """
     names = [name.strip() for name in args.metrics.split(",") if name.strip()]
     for name in names:
-        if name in NOT_LOCAL:
-            raise UserError(f"--metrics {name}: {NOT_LOCAL[name]}")
         if name not in METRICS:
             raise unknown("metric", name, METRICS)
     if not names:
@@ -106,13 +117,6 @@ def open_metrics(args: argparse.Namespace) -> list[Metric]:
 def has_size(name: str, clip: Optional[str]) -> bool:
     """Return whether ``--size`` is that of a metric's pictures; the toybox's CLIP has its own."""
     return name == "imagereward" or name in ("clip", "directions") and not has_own_cameras(clip)
-
-
-NOT_LOCAL = {
-    "alignment": "T3Bench's alignment is the answer of GPT-4, a service without weights to load; "
-    "clip_similarity --t3bench FOLDER writes what its own scripts read (docs/evaluation.md)"
-}
-"""Metrics that can't be computed here, and why."""
 
 
 def require_models(name: str, args: argparse.Namespace) -> None:
@@ -193,22 +197,51 @@ def scored(
             yield row
 
 
+# ---- means over prompts with confidence intervals -----------------------------------------------
+
+
+def bootstrap(values: Float[np.ndarray, " N"], *, seed: int = 0) -> Estimate:
+    """Return the mean and its percentile bootstrap interval (Efron 1979) of level LEVEL.
+
+    Args:
+        values: one for each prompt; NaN where the metric isn't defined, which is left out.
+    """
+    values = values[~np.isnan(values)]
+    if not len(values):
+        return Estimate(np.nan, np.nan, np.nan, 0)
+    rows = numpy_generator(seed, "bootstrap").integers(len(values), size=(DRAWS, len(values)))
+    low, high = np.quantile(values[rows].mean(axis=1), [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
+    return Estimate(float(values.mean()), float(low), float(high), len(values))
+
+
+def per_prompt(prompts: list[str], values: Float[np.ndarray, " N"]) -> dict[str, float]:
+    """Return the mean over the results of each prompt; NaNs are left out."""
+    groups: dict[str, list[float]] = {prompt: [] for prompt in prompts}
+    for prompt, value in zip(prompts, values, strict=True):
+        if not np.isnan(value):
+            groups[prompt].append(float(value))
+    return {prompt: float(np.mean(v)) if v else float("nan") for prompt, v in groups.items()}
+
+
+def paired(first: dict[str, float], second: dict[str, float], *, seed: int = 0) -> Estimate:
+    """Return the mean of first minus second over the prompts that both have."""
+    common = [prompt for prompt in first if prompt in second]
+    return bootstrap(np.array([first[p] - second[p] for p in common], float), seed=seed)
+
+
 def summary(metrics: Sequence[Metric], first: Rows, second: Rows) -> dict[str, Any]:
     """Return the content of ``scorecard.json``."""
 
-    def prompt_means(rows: Rows, column: str) -> dict[str, float]:
-        values = np.array([row[column] for row in rows], float)
-        return per_prompt([row["prompt"] for row in rows], values)
-
-    def estimate(means: dict[str, float]) -> Estimate:
-        return bootstrap(np.array(list(means.values()), float))
-
     content: dict[str, Any] = {}
     for column in (name for metric in metrics for name in metric.columns):
-        means = [prompt_means(rows, column) for rows in (first, second)]
-        entry = {"mean": estimate(means[0])}
+        means = [
+            per_prompt([row["prompt"] for row in rows], np.array([row[column] for row in rows]))
+            for rows in (first, second)
+        ]
+        own, other = (bootstrap(np.array(list(mean.values()), float)) for mean in means)
+        entry = {"mean": own}
         if second:
-            entry |= {"against": estimate(means[1]), "difference": paired(*means)}
+            entry |= {"against": other, "difference": paired(*means)}
         content[column] = {name: value._asdict() for name, value in entry.items()}
     return content
 

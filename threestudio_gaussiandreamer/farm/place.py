@@ -36,6 +36,7 @@ NOT_UPLOADED = ("ckpts/epoch=*", "ckpts/*-prev.ckpt", FETCHED, "ckpts/.*", "ckpt
 NOT_UPLOADED += (RESULT,)  # comes last
 NUMBERS = ("seconds", "worker_seconds", "megabytes", "steps", "gaussians", "bytes", "attempts")
 """Entries of a record that are numbers, if it has them."""
+MISSING = (FileNotFoundError, IsADirectoryError, NotADirectoryError)
 BATCH = 1000
 """Records that are read together."""
 
@@ -64,13 +65,14 @@ class Place:
     """
 
     def __init__(self, out: str | os.PathLike, scratch: Optional[Path] = None) -> None:
+        import fsspec
+
         self.remote = "://" in str(out)
         self.folder = Path(out).expanduser().absolute()
         self.url = str(out).rstrip("/") if self.remote else str(self.folder)
+        self.system = fsspec.filesystem("file")
         if not self.remote:
             return
-        import fsspec
-
         cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
         scratch = scratch or Path(cache, "threestudio_gaussiandreamer", "farm")
         self.folder = scratch / hashlib.sha256(self.url.encode()).hexdigest()[:16]
@@ -94,7 +96,7 @@ class Place:
         try:
             yield
         except Exception as error:  # each file system of fsspec has its own
-            if not self.remote or may_lack and isinstance(error, FileNotFoundError):
+            if not self.remote or may_lack and isinstance(error, MISSING):
                 raise
             raise Unreachable(
                 f"{self.url} can't be reached: {type(error).__name__}: {error}; check the address "
@@ -103,9 +105,7 @@ class Place:
 
     def names(self, below: str) -> set[str]:
         """List what is in a folder of the farm."""
-        with contextlib.suppress(FileNotFoundError), self.reached(may_lack=True):
-            if not self.remote:
-                return set(os.listdir(self.folder / below))
+        with contextlib.suppress(*MISSING), self.reached(may_lack=True):
             found = self.system.ls(f"{self.url}/{below}", detail=False)
             return {path.rstrip("/").rpartition("/")[2] for path in found}
         return set()
@@ -113,12 +113,10 @@ class Place:
     def read(self, names: Sequence[str]) -> list[Optional[bytes]]:
         """Return the contents of files of the farm; None for those that don't exist."""
         with self.reached(may_lack=True):
-            if not self.remote:
-                return [_content(self.folder / name) for name in names]
             paths = [f"{self.url}/{name}" for name in names]
             found = self.system.cat_ranges(paths, None, None, on_error="return")
             for content in found:
-                if not isinstance(content, (bytes, FileNotFoundError)):
+                if not isinstance(content, (bytes, *MISSING)):
                     raise content
             return [content if isinstance(content, bytes) else None for content in found]
 
@@ -160,11 +158,8 @@ class Place:
 
     def remove(self, names: Iterable[str]) -> None:
         for name in names:
-            with contextlib.suppress(FileNotFoundError), self.reached(may_lack=True):
-                if not self.remote:
-                    (self.folder / name).unlink()
-                else:
-                    self.system.rm_file(f"{self.url}/{name}")
+            with contextlib.suppress(*MISSING), self.reached(may_lack=True):
+                self.system.rm_file(f"{self.url}/{name}")
 
     def work_folder(self, row: Row) -> Path:
         """Return the folder in which an asset is made."""
@@ -253,14 +248,6 @@ def uploads(folder: Path) -> Iterator[tuple[str, Path]]:
         name = path.relative_to(folder).as_posix()
         if not any(fnmatch.fnmatch(name, pattern) for pattern in NOT_UPLOADED):
             yield name, path
-
-
-def _content(path: Path) -> Optional[bytes]:
-    """Return the content of a file, which another process may be removing; None without one."""
-    try:
-        return path.read_bytes()
-    except (FileNotFoundError, IsADirectoryError, NotADirectoryError):
-        return None
 
 
 def _written(path: Path) -> float:

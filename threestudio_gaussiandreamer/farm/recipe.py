@@ -232,15 +232,9 @@ def require_same_farm(place: Place, recipe: Recipe, *, before_ray: bool = False)
             place.write({FARM: json_text(ours, indent=1).encode()})
         return
     for name, here in ours.items():
-        there, note = theirs.get(name), ""
-        if there == here or before_ray and name in OF_MACHINES:
-            continue
-        if isinstance(there, list) and isinstance(here, list):
-            only = [x for x in there if x not in here], [x for x in here if x not in there]
-            # else only their order differs, or nothing is in both
-            if any(only) and only != (there, here):
-                (there, here), note = only, " (without what is in both)"
-        raise UserError(
-            f"{place} belongs to another farm: its {name} is {json.dumps(there)[:300]}, here "
-            f"{json.dumps(here)[:300]}{note}; choose another --out"
-        )
+        there = theirs.get(name)
+        if there != here and not (before_ray and name in OF_MACHINES):
+            raise UserError(
+                f"{place} belongs to another farm: its {name} is {json.dumps(there)[:1000]}, here "
+                f"{json.dumps(here)[:1000]}; choose another --out"
+            )

@@ -2,20 +2,19 @@
 and Parquet. It is written as it is read: the memory doesn't grow with the number of assets."""
 
 import csv
-import html
 import io
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
 from itertools import islice
 from pathlib import Path
 from typing import Any, Optional
-from urllib.parse import quote
 
 from tqdm import tqdm
 
 from ..core.files import atomic_file
-from .place import ASSETS, FAILED, FINISHED, Place
+from ..view.templates import write_static
+from .place import FAILED, FINISHED, Place
 from .rows import Row
 
 FOLDER, CSV, PARQUET = "report", "table.csv", "table.parquet"
@@ -33,11 +32,6 @@ COLUMNS = (
 WHOLE = ("seed", "steps", "gaussians", "bytes", "attempts")
 NUMBERS = ("seconds", "worker_seconds", "megabytes", "psnr", "ssim", "multi_face", "cost")
 """Columns that are no texts."""
-STYLE = """body{font:15px/1.4 system-ui,sans-serif;margin:2rem;max-width:80rem}
-main{display:grid;grid-template-columns:repeat(auto-fill,minmax(180px,1fr));gap:1rem}
-figure{margin:0}img{width:100%;background:#eee;aspect-ratio:1;object-fit:cover}
-figcaption{overflow-wrap:anywhere}.failed{color:#b00020}code{overflow-wrap:anywhere}
-table{border-collapse:collapse}td,th{padding:.2rem .8rem .2rem 0;text-align:left}"""
 
 
 def write_report(
@@ -51,7 +45,7 @@ def write_report(
     """
     folder = place.folder / FOLDER
     folder.mkdir(parents=True, exist_ok=True)
-    states, seconds, failures, figures, pages = Counter(), 0.0, [], [], 0
+    states, seconds, failures, finished, pages = Counter(), 0.0, [], [], []
     with ExitStack() as stack:
         write = tables(stack, folder)
         bar = tqdm(place.records(rows), "report", total, unit="asset", disable=None, delay=1)
@@ -62,32 +56,32 @@ def write_report(
             write(batch)
             states.update(line["state"] for line in batch)
             seconds += sum(line["worker_seconds"] or 0.0 for line in batch)
-            failures += [failure(line) for line in batch if line["state"] == FAILED]
+            failures += [line for line in batch if line["state"] == FAILED]
             del failures[MOST_FAILURES:]
-            figures += [figure(line) for line in batch if line["state"] == FINISHED]
-            while len(figures) >= PER_PAGE or figures and not batch:
-                pages += 1
-                body = f"<main>{''.join(figures[:PER_PAGE])}</main>"
-                write_page(folder / f"page-{pages}.html", f"Assets, page {pages}", body)
-                del figures[:PER_PAGE]
+            finished += [line for line in batch if line["state"] == FINISHED]
+            while len(finished) >= PER_PAGE or finished and not batch:
+                pages.append(f"page-{len(pages) + 1}.html")
+                write_page(folder / pages[-1], assets=finished[:PER_PAGE])
+                del finished[:PER_PAGE]
     numbers = {state: f"{states[state]}" for state in sorted(states)}
     numbers["worker time"] = tqdm.format_interval(seconds)
     if price is not None:
         cost = seconds / 3600 * price
         each = f", {cost / states[FINISHED]:.4g} per finished asset" if states[FINISHED] else ""
         numbers["cost"] = f"{cost:.4g}{each}"
-    cells = "".join(f"<tr><th>{name}</th><td>{text}</td></tr>" for name, text in numbers.items())
-    names = [name for name in (CSV, PARQUET) if (folder / name).exists()]
-    names += [f"page-{i + 1}.html" for i in range(pages)]
-    links = " ".join(f'<a href="{name}">{name}</a>' for name in names)
+    files = [*(name for name in (CSV, PARQUET) if (folder / name).exists()), *pages]
     more = states[FAILED] - len(failures)
-    left_out = f"<p>{more} more are in {CSV}.</p>" if more else ""
-    failed = f"<h2>Failures</h2>{''.join(failures)}{left_out}" if failures else ""
     first = folder / "index.html"
-    write_page(first, "Report", f"<table>{cells}</table><p>{links}</p>{failed}")
+    write_page(first, numbers=numbers, files=files, failures=failures, more=more)
     for path in sorted(folder.iterdir()):
         place.upload(f"{FOLDER}/{path.name}")
     return first, states
+
+
+def write_page(path: Path, *, assets: Sequence = (), **values: Any) -> None:
+    title = "Assets, page " + path.stem.removeprefix("page-") if assets else "Report"
+    shared = {"numbers": None, "failures": None, "interval": tqdm.format_interval}
+    write_static(path, "farm.html", title=title, assets=assets, **shared | values)
 
 
 def table_line(row: Row, record: dict[str, Any], price: Optional[float]) -> dict[str, Any]:
@@ -129,33 +123,3 @@ def tables(stack: ExitStack, folder: Path) -> Callable[[list[dict[str, Any]]], N
         parquet.write_table(pa.Table.from_pylist(lines, schema))
 
     return write
-
-
-def figure(line: dict[str, Any]) -> str:
-    """Return the picture of an asset with its prompt and numbers."""
-    folder = f"../{ASSETS}/{quote(line['name'])}"
-    picture = line["picture"]
-    image = f'<img loading="lazy" src="{folder}/{quote(picture)}" alt="">' if picture else ""
-    score = f", {line['psnr']:.1f} dB" if line["psnr"] is not None else ""
-    numbers = (
-        f"{line['gaussians'] or 0} Gaussians, {tqdm.format_interval(line['seconds'] or 0)}{score}"
-    )
-    caption = f"{html.escape(line['prompt'])}<br><small>{numbers}</small>"
-    linked = f'<a href="{folder}/{quote(line["page"] or "")}">{image}</a>'
-    return f"<figure>{linked}<figcaption>{caption}</figcaption></figure>"
-
-
-def failure(line: dict[str, Any]) -> str:
-    """Return a failed asset, its error, and the command that repeats it."""
-    error, command = html.escape(str(line["error"])), html.escape(str(line["command"]))
-    name, prompt = html.escape(line["name"]), html.escape(line["prompt"])
-    return (
-        f'<p><b>{name}</b>: {prompt}<br><span class="failed">{error}</span><br>'
-        f"<code>{command}</code></p>"
-    )
-
-
-def write_page(path: Path, title: str, body: str) -> None:
-    with atomic_file(path, durable=False) as file:
-        text = f'<!doctype html><meta charset="utf-8"><title>{title}</title><style>{STYLE}</style>'
-        file.write(f"{text}<h1>{title}</h1>{body}\n".encode())

@@ -6,6 +6,7 @@ import hashlib
 import json
 import shlex
 import unicodedata
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple, Optional
@@ -211,12 +212,9 @@ def _from_jsonl(texts: Iterator[str]) -> Iterator[dict[str, Any]]:
 
 
 def _named_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    found: dict[str, Any] = {}
-    for name, value in pairs:
-        if name in found:
-            raise ValueError(f"{name!r} is given twice")
-        found[name] = value
-    return found
+    if twice := [name for name, count in Counter(name for name, _ in pairs).items() if count > 1]:
+        raise ValueError(f"{twice[0]!r} is given twice")
+    return dict(pairs)
 
 
 FORMATS: dict[str, Callable[[Iterator[str]], Iterator[dict[str, Any]]]] = {

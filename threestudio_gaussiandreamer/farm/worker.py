@@ -214,17 +214,14 @@ class Heartbeat(pl.Callback):
             self.asked = True
             signal.raise_signal(signal.SIGTERM)
 
-    def on_validation_batch_end(
-        self, trainer: Any, module: Any, outputs: Any, batch: Any, batch_idx: int, *args: Any
-    ) -> None:
-        self.beat("validating", batch_idx + 1)
+    def on_validation_batch_end(self, *args: Any) -> None:
+        self.beat("validating", args[4] + 1)
 
-    def on_test_batch_end(
-        self, trainer: Any, module: Any, outputs: Any, batch: Any, batch_idx: int, *args: Any
-    ) -> None:
-        self.beat("rendering", batch_idx + 1)
+    def on_test_batch_end(self, *args: Any) -> None:
+        self.beat("rendering", args[4] + 1)
 
     def beat(self, stage: str, step: int, steps: int = 0) -> bool:
+        """Tell the board, unless it is being restarted; return whether the farm is stopping."""
         if time.monotonic() < self.due:
             return False
         stopping = self.report(Beat(self.job.row.name, self.attempt, stage, step, steps))
@@ -232,7 +229,6 @@ class Heartbeat(pl.Callback):
         return stopping
 
     def report(self, beat: Beat) -> bool:
-        """Tell the board, unless it is being restarted; return whether the farm is stopping."""
         import ray
 
         try:

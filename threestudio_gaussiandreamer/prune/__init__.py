@@ -1,11 +1,10 @@
 """Prune a finished cloud to a budget: ``python -m threestudio_gaussiandreamer.prune IN OUT``.
 
-``options.py`` has the options, ``pipeline.py`` reads and prunes, ``report.py`` measures and writes
-the report, ``command.py`` is the command line."""
+``options.py`` has the options, ``pipeline.py`` reads, prunes and reports, ``command.py`` is the
+command line."""
 
 from .command import main
 from .options import PruneOptions
-from .pipeline import prune_to_budget
-from .report import write_report
+from .pipeline import prune_to_budget, write_report
 
 __all__ = ["PruneOptions", "main", "prune_to_budget", "write_report"]

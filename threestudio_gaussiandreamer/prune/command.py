@@ -26,48 +26,9 @@ from ..formats.gaussian_files import PRUNED_FORMATS, require_format, write_cloud
 from ..gaussians.axes import AXES, VIEWER_UP
 from ..gaussians.views import EPS2D
 from .options import PruneOptions
-from .pipeline import prune_to_budget, read
-from .report import REPORTS, write_report
+from .pipeline import REPORTS, prune_to_budget, read, write_report
 
-BUDGETS = {
-    "--count": "how many Gaussians to keep",
-    "--bytes": "the largest size of OUT, such as 500kB or 2MB",
-    "--psnr": "smallest PSNR of the pruned cloud's views to the unpruned one's, dB, such as 40",
-    "--within": "what the pruned cloud may lose against the truth, such as 0.1dB: see --quality",
-}
-AUTO = "as many as are needed, so that twice as many would gain less than DB (default: 0.5)"
 GAIN = r"[-+]?[\d.]+(e[-+]?\d+)?\s*(dB)?"
-OPTIONS: dict[str, dict[str, Any]] = {
-    "--quality": {
-        "type": float,
-        "help": "dB of the unpruned cloud to the truth, such as 35: --within needs it, and for "
-        "--auto it is 40 if it isn't given",
-    },
-    "--size": {
-        "type": int,
-        "default": PruneOptions.size,
-        "help": "pixels each way of the views, for which all dB hold (default: %(default)d)",
-    },
-    "--steps": {
-        "type": int,
-        "default": PruneOptions.steps,
-        "help": "recovery steps after each round (default: %(default)d)",
-    },
-    "--eps2d": {
-        "type": float,
-        "default": EPS2D,
-        "help": "screen-space dilation of the viewer, square pixels (default: %(default)g)",
-    },
-    "--antialias": {
-        "action": "store_true",
-        "help": "the viewer keeps the energy of small Gaussians (default: if IN says that it was "
-        "trained so)",
-    },
-    "--up": {
-        "choices": AXES,
-        "help": "which axis of IN is up (default: from the file, else its format's convention)",
-    },
-}
 
 
 def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
@@ -80,12 +41,32 @@ def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
     parser.add_argument("source", metavar="IN", help="a file of Gaussians, or a checkpoint")
     parser.add_argument("output", metavar="OUT", help="the PLY or SPZ file to write")
     group = parser.add_argument_group("the budget, one of")
-    budget = group.add_mutually_exclusive_group(required=True)
-    for name, text in BUDGETS.items():
-        budget.add_argument(name, help=text)
-    budget.add_argument("--auto", metavar="DB", nargs="?", const="0.5", help=AUTO)
-    for name, settings in OPTIONS.items():
-        parser.add_argument(name, **settings)
+    add = group.add_mutually_exclusive_group(required=True).add_argument
+    add("--count", help="how many Gaussians to keep")
+    add("--bytes", help="the largest size of OUT, such as 500kB or 2MB")
+    psnr = "smallest PSNR of the pruned cloud's views to the unpruned one's, dB, such as 40"
+    add("--psnr", help=psnr)
+    within = "what the pruned cloud may lose against the truth, such as 0.1dB: see --quality"
+    add("--within", help=within)
+    auto = "as many as are needed, so that twice as many would gain less than DB (default: 0.5)"
+    add("--auto", metavar="DB", nargs="?", const="0.5", help=auto)
+    add = parser.add_argument
+    quality = (
+        "dB of the unpruned cloud to the truth, such as 35: --within needs it, and for --auto "
+    )
+    add("--quality", type=float, help=f"{quality}it is 40 if it isn't given")
+    size = "pixels each way of the views, for which all dB hold (default: %(default)d)"
+    add("--size", type=int, default=PruneOptions.size, help=size)
+    steps = "recovery steps after each round (default: %(default)d)"
+    add("--steps", type=int, default=PruneOptions.steps, help=steps)
+    eps2d = "screen-space dilation of the viewer, square pixels (default: %(default)g)"
+    add("--eps2d", type=float, default=EPS2D, help=eps2d)
+    flag = (
+        "the viewer keeps the energy of small Gaussians (default: if IN says that it was trained "
+    )
+    add("--antialias", action="store_true", help=f"{flag}so)")
+    up = "which axis of IN is up (default: from the file, else its format's convention)"
+    add("--up", choices=AXES, help=up)
     words = list(sys.argv[1:] if argv is None else argv)
     for at, word in enumerate(words):
         if word == "--auto" and not re.fullmatch(GAIN, "".join(words[at + 1 : at + 2])):
@@ -100,9 +81,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         UserError: an option is invalid, a file can't be read or written, or the budget can't be
             met.
     """
-    options = PruneOptions(
-        **{option.name: getattr(args, option.name) for option in fields(PruneOptions)}
-    )
+    options = PruneOptions(**{x.name: getattr(args, x.name) for x in fields(PruneOptions)})
     check_options(PruneOptions, options, "--")
     args.output = str(through_link(args.output))
     suffix = require_format(args.output, "OUT", PRUNED_FORMATS)

@@ -89,7 +89,13 @@ def budget_of(
             raise UserError(f"{where}psnr: expected a number above 0, got {psnr:g}")
         return Budget(psnr=psnr)
     if options.within is not None:
-        return Budget(psnr=psnr_for_loss(parse_loss(options.within, where), options.quality))
+        loss = parse_number(options.within, f"{where}within", "dB")
+        if not LOSSES[0] <= loss <= LOSSES[1]:
+            raise UserError(
+                f"{where}within: expected a loss from {LOSSES[0]:g} to {LOSSES[1]:g} dB, got "
+                f"{loss:g}"
+            )
+        return Budget(psnr=psnr_for_loss(loss, options.quality))
     if options.auto is not None:
         gain = parse_number(options.auto, f"{where}auto", "dB")
         if not 0 < gain < 6:
@@ -97,9 +103,6 @@ def budget_of(
         error = Budget().error if options.quality is None else error_of(options.quality)
         return Budget(gain=gain, error=error)
     return Budget()
-
-
-# ---- numbers that users write --------------------------------------------------------------------
 
 
 def parse_number(value: Any, option: str, unit: str = "") -> float:
@@ -148,23 +151,6 @@ def parse_bytes(value: Any, option: str) -> int:
     return int(size)
 
 
-def parse_loss(value: Any, where: str) -> float:
-    """Parse ``within``, a loss in dB.
-
-    Raises:
-        UserError: it is outside the range :data:`LOSSES`.
-    """
-    loss = parse_number(value, f"{where}within", "dB")
-    if not LOSSES[0] <= loss <= LOSSES[1]:
-        raise UserError(
-            f"{where}within: expected a loss from {LOSSES[0]:g} to {LOSSES[1]:g} dB, got {loss:g}"
-        )
-    return loss
-
-
-# ---- dB ------------------------------------------------------------------------------------------
-
-
 def psnr_for_loss(loss: float, quality: float) -> float:
     """Return the PSNR to the original at which the PSNR to the ground truth is ``loss`` below
     ``quality``, all in dB.
@@ -172,20 +158,6 @@ def psnr_for_loss(loss: float, quality: float) -> float:
     For independent errors ``10^(loss / 10) = 1 + 10^((quality - psnr) / 10)``.
     """
     return quality - 10 * math.log10(10 ** (loss / 10) - 1)
-
-
-def remaining_psnr_budget(asked: float, spent: float) -> Optional[float]:
-    """Return the PSNR budget for pruning a cloud again.
-
-    Args:
-        asked: required PSNR to the original cloud, dB.
-        spent: PSNR of the already pruned cloud to the original, dB.
-
-    Returns:
-        the required PSNR to the already pruned cloud, dB; None if it may lose nothing more.
-    """
-    left = error_of(asked) - error_of(spent)
-    return -10 * math.log10(left) if left > LEAST_ERROR else None
 
 
 def combined_psnr(*psnrs: float) -> float:

@@ -1,4 +1,4 @@
-"""Read a cloud of Gaussians and prune it to a budget.
+"""Read a cloud of Gaussians, prune it to a budget, and write the report beside the file.
 
 Three disjoint sets of views are used: Gaussians are ranked and optimised on the training views; the
 validation views decide whether a PSNR budget is met, with a margin of two standard errors; the
@@ -8,15 +8,21 @@ look inwards, which suits objects but not rooms."""
 
 import bisect
 import logging
+import math
+import statistics
 import time
-from typing import NamedTuple, Optional
+from dataclasses import asdict
+from typing import Any, NamedTuple, Optional
 
 import numpy as np
 import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
 
 from ..core.devices import get_device
 from ..core.errors import UserError
-from ..core.files import existing_file
+from ..core.files import atomic_file, existing_file, json_text
+from ..core.images import write as write_image
 from ..formats.gaussian_files import StoredCloud, as_stored, file_size
 from ..formats.spz import COLOR_REACH
 from ..gaussians.axes import rotation_between
@@ -29,6 +35,8 @@ from ..gaussians.views import (
     LEAST_ERROR,
     Views,
     bounds,
+    psnr_to_original,
+    render_all,
     views_around,
 )
 from ..view.run_files import read_any
@@ -39,13 +47,15 @@ from .options import (
     error_of,
     parse_bytes,
     parse_count,
-    remaining_psnr_budget,
 )
 
 logger = logging.getLogger(__name__)
 TRAIN_VIEWS, VAL_VIEWS, TEST_VIEWS = 64, 32, 48
 TURNS = (0.0, 45.0, 60.0)
 """Azimuth of the first view of each set, degrees."""
+REPORTS = (".json", ".png")
+"""Suffixes of the report's files, appended to the name of OUT."""
+SHEET_VIEWS, TIMED_VIEWS = 6, 5
 
 
 class PruneResult(NamedTuple):
@@ -56,9 +66,6 @@ class PruneResult(NamedTuple):
     seconds: float
     met: bool = True
     """Whether the budget is met."""
-
-
-# ---- reading -------------------------------------------------------------------------------------
 
 
 def read(path: str, up: Optional[str] = None) -> StoredCloud:
@@ -75,9 +82,6 @@ def read(path: str, up: Optional[str] = None) -> StoredCloud:
     if not len(stored.gaussians.means):
         raise UserError(f"{path} holds no Gaussians that can be drawn: there is nothing to prune")
     return stored
-
-
-# ---- pruning -------------------------------------------------------------------------------------
 
 
 def prune_to_budget(
@@ -98,10 +102,19 @@ def prune_to_budget(
     started = time.perf_counter()
     file_size(stored, suffix)  # raises for values that the format can't store, before any work
     asked = budget_of(options, where, lambda size: _count_within(size, stored, suffix, where))
-    after, reached = _simplify(stored, _remaining_budget(asked, stored), options, suffix)
+    after, reached = _simplify(stored, remaining_budget(asked, stored), options, suffix)
     if options.bytes is not None:
         limit = parse_bytes(options.bytes, f"{where}bytes")
-        after, reached = _shrink(stored, after, reached, limit, options, suffix, where)
+        # what is left may compress worse than the subset from which the count was estimated
+        while True:
+            size = file_size(after._replace(pruned_to=_spent(stored, reached)), suffix)
+            if size <= limit:
+                break
+            count = len(after.gaussians.means)
+            fewer = min(int(count * limit / size), count - 1)
+            fewer = parse_count(fewer, f"{where}bytes: the number of Gaussians that fit")
+            after, again = _simplify(after, Budget(count=fewer), options, suffix)
+            reached = combined_psnr(reached, again)
     spent = _spent(stored, reached)
     met = asked.psnr is None or error_of(spent) <= error_of(asked.psnr) + 2 * LEAST_ERROR
     if not met:
@@ -111,7 +124,12 @@ def prune_to_budget(
             suffix,
             spent,
         )
-    after = after._replace(pruned_to=_psnr_note(stored, after, asked, spent, met))
+    unchanged = len(after.gaussians.means) == len(stored.gaussians.means)
+    if asked.psnr is not None and met:
+        spent = asked.psnr
+    elif asked.psnr is None and stored.pruned_to is None and unchanged:
+        spent = None  # it has never been pruned
+    after = after._replace(pruned_to=spent)
     return PruneResult(stored, after, time.perf_counter() - started, met)
 
 
@@ -120,19 +138,7 @@ def _spent(stored: StoredCloud, reached: float) -> float:
     return reached if stored.pruned_to is None else combined_psnr(stored.pruned_to, reached)
 
 
-def _psnr_note(
-    stored: StoredCloud, after: StoredCloud, asked: Budget, spent: float, met: bool
-) -> Optional[float]:
-    """Return the PSNR to the original that is stored in the file; None if a cloud that has never
-    been pruned keeps all Gaussians.
-    """
-    if asked.psnr is not None and met:
-        return asked.psnr
-    unchanged = len(after.gaussians.means) == len(stored.gaussians.means)
-    return None if asked.psnr is None and stored.pruned_to is None and unchanged else spent
-
-
-def _remaining_budget(asked: Budget, stored: StoredCloud) -> Budget:
+def remaining_budget(asked: Budget, stored: StoredCloud) -> Budget:
     """Return the part of a PSNR budget that earlier pruning has not used; if all of it is used, a
     budget that keeps all Gaussians. The error of earlier pruning counts for a gain, too.
     """
@@ -141,9 +147,9 @@ def _remaining_budget(asked: Budget, stored: StoredCloud) -> Budget:
     asked = asked._replace(error=asked.error + error_of(stored.pruned_to))
     if asked.psnr is None:
         return asked
-    left = remaining_psnr_budget(asked.psnr, stored.pruned_to)
-    if left is not None:
-        return Budget(psnr=left)
+    left = error_of(asked.psnr) - error_of(stored.pruned_to)
+    if left > LEAST_ERROR:
+        return Budget(psnr=-10 * math.log10(left))
     print(
         f"no Gaussian is removed: this cloud has been pruned to {stored.pruned_to:g} dB before, as "
         "measured then"
@@ -169,29 +175,6 @@ def _count_within(size: int, stored: StoredCloud, suffix: str, where: str) -> in
             f"a {suffix} file"
         )
     return bisect.bisect_left(range(1, whole + 1), True, key=lambda count: bytes_of(count) > size)
-
-
-def _shrink(
-    stored: StoredCloud,
-    after: StoredCloud,
-    reached: float,
-    limit: int,
-    options: PruneOptions,
-    suffix: str,
-    where: str,
-) -> tuple[StoredCloud, float]:
-    """Prune further until the file, with the note of its PSNR, has at most ``limit`` bytes.
-
-    This is needed because the remaining Gaussians may compress worse than the subset from which the
-    count was estimated.
-    """
-    while (size := file_size(after._replace(pruned_to=_spent(stored, reached)), suffix)) > limit:
-        count = len(after.gaussians.means)
-        fewer = min(int(count * limit / size), count - 1)
-        budget = Budget(count=parse_count(fewer, f"{where}bytes: the number of Gaussians that fit"))
-        after, again = _simplify(after, budget, options, suffix)
-        reached = combined_psnr(reached, again)
-    return after, reached
 
 
 def _simplify(
@@ -249,3 +232,57 @@ def views_of(stored: StoredCloud, options: PruneOptions) -> list[Views]:
         )
         for count, turn in zip((TRAIN_VIEWS, VAL_VIEWS, TEST_VIEWS), TURNS, strict=True)
     ]
+
+
+# ---- the report ----------------------------------------------------------------------------------
+
+
+def write_report(
+    path: str, result: PruneResult, suffix: str, options: PruneOptions
+) -> dict[str, Any]:
+    """Print the report, write ``path``.json and ``path``.png, and return the content of the JSON.
+
+    Raises:
+        UserError: a file can't be written; an existing one is left unchanged.
+    """
+    views = views_of(result.before, options)[-1]
+    grey = views._replace(backgrounds=None)
+    shown = grey.rows(torch.linspace(0, len(views.viewmats) - 1, SHEET_VIEWS).long())
+    files = [result.before, as_stored(result.after, suffix)]
+    clouds = [file.gaussians.tensors(get_device()) for file in files]
+    sizes = [file_size(stored, suffix) for stored in (result.before, result.after)]
+    before, after = (
+        {"gaussians": len(cloud.means), "bytes": size, "ms_per_frame": frame_time(cloud, grey)}
+        for cloud, size in zip(clouds, sizes, strict=True)
+    )
+    quality = psnr_to_original(clouds[1], views, render_all(clouds[0], views))
+    report = {"before": before, "after": after, "psnr_on_unseen_views": quality}
+    report |= {"met": result.met, "seconds": round(result.seconds, 1)}
+    with atomic_file(f"{path}.json") as file:
+        file.write(json_text(report | {"options": asdict(options)}, indent=2).encode())
+    write_image(f"{path}.png", sheet([render_all(cloud, shown) for cloud in clouds]))
+    for name in ("before", "after"):
+        count, size, ms = report[name].values()
+        cost = f"{count:8d} Gaussians {size / 1e6:8.2f} MB as {suffix} {ms:8.2f} ms a frame"
+        print(f"{name:7} {cost}")
+    again = result.before.pruned_to is not None
+    source = "the input, which had been pruned before" if again else "the original"
+    print(f"{quality:.2f} dB to {source}, on the test views; {path}.json, {path}.png")
+    return report
+
+
+def sheet(images: list[Float[Tensor, "V H W 3"]]) -> UInt8[np.ndarray, "rows columns 3"]:
+    """Arrange each set of images in a row, as bytes."""
+    rows = [torch.cat(list(views), 1) for views in images]
+    return (torch.cat(rows, 0).clamp(0, 1).cpu().numpy() * 255).round().astype("uint8")
+
+
+def frame_time(cloud: Gaussians, views: Views) -> float:
+    """Measure how long one view takes to render, milliseconds, the median over five."""
+    times = []
+    for view in range(min(TIMED_VIEWS, len(views.viewmats))):
+        one = views.rows(slice(view, view + 1))
+        started = time.perf_counter()
+        render_all(cloud, one).sum().item()
+        times.append(time.perf_counter() - started)
+    return round(1e3 * statistics.median(times), 3)

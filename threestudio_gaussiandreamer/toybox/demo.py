@@ -31,8 +31,14 @@ from ..core.files import atomic_file, json_text, output_folder
 from ..core.signals import interrupt, raised_signals
 from ..core.streams import generator
 from ..diffusion import sds
-from ..evaluation.asset_metrics import Asset, rendered
-from ..evaluation.text_to_3d import ATTRIBUTES, Scores, prior_of, result_of
+from ..evaluation.asset_metrics import (
+    ATTRIBUTES,
+    Asset,
+    Scores,
+    prior_of,
+    rendered,
+    result_of,
+)
 from ..host import find
 from ..launch.folder_lock import RunFolder, claim, claim_new
 from ..models.bundled import NAME, is_export
