@@ -16,7 +16,6 @@ from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.exporters.files import outputs_of
 from threestudio_gaussiandreamer.formats import ply
 from threestudio_gaussiandreamer.formats.gaussian_files import read_cloud, write_cloud
-from threestudio_gaussiandreamer.formats.obj import write_obj
 from threestudio_gaussiandreamer.formats.ply import read_comments
 from threestudio_gaussiandreamer.formats.spz import read_spz
 from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
@@ -31,7 +30,7 @@ from threestudio_gaussiandreamer.host import (
 )
 from threestudio_gaussiandreamer.launch.part_kinds import check_kind
 from threestudio_gaussiandreamer.meshes.load import load_mesh
-from threestudio_gaussiandreamer.meshes.write import write_textured_mesh
+from threestudio_gaussiandreamer.meshes.write import write_obj, write_textured_mesh
 from threestudio_gaussiandreamer.training.export import save
 
 register_parts()
@@ -40,17 +39,13 @@ for module in pkgutil.iter_modules(exporters.__path__):
 
 WRITERS = {
     "ply": lambda path, stored: write_cloud(str(path), stored, ".ply"),
-    "spz": lambda path, stored, version: write_cloud(
-        str(path), stored, ".spz", spz_version=version
-    ),
+    "spz": lambda path, stored, version: write_cloud(str(path), stored, spz_version=version),
     "gaussians": lambda path, stored, suffix: write_cloud(str(path), stored, suffix),
     "points": lambda path, cloud: ply.write_points(path, cloud),
     "surface": lambda path, surface: write_obj(path, surface),
     "textured_mesh": lambda path, mesh, unlit: write_textured_mesh(path, mesh, unlit=unlit),
 }
-SMALL = {
-    "mesh-exporter": dict(faces=200, texture=64, views=8, view_size=64, resolution=16),
-}
+SMALL = {"mesh-exporter": dict(faces=200, texture=64, views=8, view_size=64, resolution=16)}
 """Options that make an exporter fast."""
 EXPORTERS = sorted(
     {
@@ -67,9 +62,8 @@ class Cloud(BaseGeometry):
 
 def geometry(count=40, degree=1):
     generator, cloud = torch.Generator().manual_seed(0), Cloud({})
-    for name, shape in dict(
-        means=(3,), sh=((degree + 1) ** 2, 3), logit_opacities=(), log_scales=(3,), quats=(4,)
-    ).items():
+    shapes = dict(means=(3,), sh=((degree + 1) ** 2, 3), logit_opacities=())
+    for name, shape in (shapes | dict(log_scales=(3,), quats=(4,))).items():
         setattr(cloud, name, torch.nn.Parameter(torch.randn(count, *shape, generator=generator)))
     return cloud
 
@@ -85,39 +79,40 @@ def write(output, folder):
     return path
 
 
-@pytest.mark.parametrize("name", EXPORTERS)
-class TestContract:
-    def test_gives_files_that_the_savers_write(self, name, tmp_path):
-        outputs = build(name)()
-        assert outputs and all(isinstance(output, ExporterOutput) for output in outputs)
-        paths = [write(output, tmp_path) for output in outputs]
-        assert len(set(paths)) == len(paths) and all(path.stat().st_size > 0 for path in paths)
+def values_of(source):
+    return {name: getattr(source, name).detach().numpy() for name in Gaussians._fields}
 
-    def test_an_empty_cloud_is_exported(self, name, tmp_path):
-        if name == "mesh-exporter":
-            pytest.skip("a mesh needs a surface: tests/surface/test_textured.py")
+
+@pytest.mark.parametrize("name", EXPORTERS)
+def test_the_contract_of_exporters(name, tmp_path):
+    """Files that the savers write, a geometry that is left as it is, also an empty one."""
+    source = geometry()
+    before = {key: value.copy() for key, value in values_of(source).items()}
+    exporter = build(name, source, save_video=True)
+    outputs = exporter()
+    assert exporter.cfg.save_video is True
+    assert outputs and all(isinstance(output, ExporterOutput) for output in outputs)
+    paths = [write(output, tmp_path) for output in outputs]
+    assert len(set(paths)) == len(paths) and all(path.stat().st_size > 0 for path in paths)
+    assert all(np.array_equal(before[key], value) for key, value in values_of(source).items())
+    if name != "mesh-exporter":  # a mesh needs a surface: tests/surface/test_textured.py
         paths = [write(output, tmp_path) for output in build(name, geometry(count=0))()]
         assert paths and all(path.is_file() for path in paths)
 
-    def test_the_geometry_is_not_changed(self, name):
-        source = geometry()
-        before = {key: value.detach().clone() for key, value in source.named_parameters()}
-        build(name, source)()
-        assert all(torch.equal(before[key], value) for key, value in source.named_parameters())
-
-    def test_save_video_is_an_option(self, name):
-        assert build(name, save_video=True).cfg.save_video is True
-
 
 @pytest.mark.parametrize("degree", [0, 3])
-def test_gaussians_read_back_bit_for_bit(tmp_path, degree):
+def test_gaussians_and_points_read_back_bit_for_bit(tmp_path, degree):
     source = geometry(degree=degree)
     (output,) = build("ply-exporter", source, up="z")()
     read = ply.read_gaussians(write(output, tmp_path))
-    for name in Gaussians._fields:
-        assert getattr(read, name).tobytes() == getattr(source, name).detach().numpy().tobytes(), (
-            name
-        )
+    for name, values in values_of(source).items():
+        assert getattr(read, name).tobytes() == values.tobytes(), name
+    (output,) = build("points-exporter", source)()
+    points, cloud = ply.read_points(write(output, tmp_path)), output.params["cloud"]
+    assert points.points.tobytes() == cloud.points.tobytes() == read.means.tobytes()
+    assert points.colors.tobytes() == cloud.colors.tobytes()
+    expected = (0.5 + 0.28209479 * read.sh[:, 0]).clip(0, 1)
+    np.testing.assert_allclose(cloud.colors, expected, atol=1e-6)
 
 
 @pytest.mark.parametrize("name", ["ply", "spz"])
@@ -128,7 +123,7 @@ def test_gaussians_are_exported_in_the_axes_of_the_viewers(tmp_path, name, degre
     source.means.data[:] = torch.tensor([[4.0, 1.0, 2.0]])  # front, left, up in our world
     (output,) = build(f"{name}-exporter", source)()
     path = write(output, tmp_path)
-    raw = ply.read_gaussians(path) if name == "ply" else read_spz(path)
+    raw = ply.read_gaussians(path) if name == "ply" else read_spz(path)[0]
     expected = [[1, -2, -4]] if name == "ply" else [[1, 2, 4]]
     np.testing.assert_allclose(raw.means, expected, atol=1e-3)
     stored = read_cloud(str(path))
@@ -144,25 +139,20 @@ def test_gaussians_are_exported_in_the_axes_of_the_viewers(tmp_path, name, degre
 def test_a_ply_without_its_comment_is_read_upright(tmp_path):
     source = geometry()
     (output,) = build("ply-exporter", source)()
-    path = write(output, tmp_path)
+    path, means = write(output, tmp_path), values_of(source)["means"]
     path.write_bytes(path.read_bytes().replace(b"comment up: -y\n", b""))
-    read = read_cloud(str(path)).in_axes("z").gaussians
-    np.testing.assert_array_equal(read.means, source.means.detach().numpy())
+    np.testing.assert_array_equal(read_cloud(str(path)).in_axes("z").gaussians.means, means)
     prior = find("gaussians-prior")({"path": str(path)}).gaussians("")
-    np.testing.assert_array_equal(prior.means, source.means.detach().numpy())
     points = find("point-cloud-prior")({"path": str(path)})("").points
-    np.testing.assert_array_equal(points, source.means.detach().numpy())
+    np.testing.assert_array_equal(prior.means, means)
+    np.testing.assert_array_equal(points, means)
 
 
 def test_axes_of_the_world_can_be_asked_for(tmp_path):
     source = geometry()
-    outputs = build(
-        "gaussiandreamer-exporter",
-        source,
-        formats=["ply", "surface", "points"],
-        options={"surface": {"up": "-y", "resolution": 16}},
-        up="z",
-    )()
+    surface = {"surface": {"up": "-y", "resolution": 16}}
+    bundle = {"formats": ["ply", "surface", "points"], "options": surface, "up": "z"}
+    outputs = build("gaussiandreamer-exporter", source, **bundle)()
     path = write(outputs[0], tmp_path)
     assert read_comments(path) == ["up: z"] and read_cloud(str(path)).up == "z"
     assert ply.read_gaussians(path).means.tobytes() == source.means.detach().numpy().tobytes()
@@ -193,36 +183,19 @@ def test_the_exported_surface_is_read_back_in_the_pose_of_the_gaussians(tmp_path
     assert low[:, 0].max() > 0.1 and low[:, 0].max() == mesh.vertices[:, 0].max()
 
 
-def test_points_read_back_bit_for_bit(tmp_path):
-    source = geometry()
-    (output,) = build("points-exporter", source)()
-    read, cloud = ply.read_points(write(output, tmp_path)), output.params["cloud"]
-    assert (
-        read.points.tobytes() == cloud.points.tobytes() == source.means.detach().numpy().tobytes()
-    )
-    assert read.colors.tobytes() == cloud.colors.tobytes()
-    np.testing.assert_allclose(
-        cloud.colors, (0.5 + 0.28209479 * source.sh[:, 0].detach().numpy()).clip(0, 1), atol=1e-6
-    )
-
-
-def test_faint_points_can_be_left_out():
-    source = geometry()
-    (output,) = build("points-exporter", source, min_opacity=0.5)()
-    np.testing.assert_array_equal(
-        output.params["cloud"].points, source.means.detach()[source.logit_opacities >= 0].numpy()
-    )
-    with pytest.raises(UserError, match="min_opacity"):
-        build("points-exporter", min_opacity=1.5)
-
-
-def test_harmonics_can_be_padded():
+def test_options_of_points_and_of_a_ply():
     source = geometry(degree=0)
+    (output,) = build("points-exporter", source, min_opacity=0.5)()
+    kept = source.means.detach()[source.logit_opacities >= 0].numpy()
+    np.testing.assert_array_equal(output.params["cloud"].points, kept)
     (output,) = build("ply-exporter", source, pad_sh_degree=3)()
     sh = output.params["stored"].gaussians.sh
     assert sh.shape == (40, 16, 3) and not sh[:, 1:].any()
-    with pytest.raises(UserError, match="pad_sh_degree"):
-        build("ply-exporter", pad_sh_degree=4)
+    (output,) = build("ply-exporter", geometry(degree=2), pad_sh_degree=1)()
+    assert output.params["stored"].gaussians.sh.shape == (40, 9, 3)  # never cuts
+    for name, option in ("points", {"min_opacity": 1.5}), ("ply", {"pad_sh_degree": 4}):
+        with pytest.raises(UserError, match=next(iter(option))):
+            build(f"{name}-exporter", **option)
 
 
 def test_nothing_that_is_not_finite_is_exported_and_that_is_reported_once(tmp_path, caplog):
@@ -236,7 +209,7 @@ def test_nothing_that_is_not_finite_is_exported_and_that_is_reported_once(tmp_pa
     files = [write(output, tmp_path) for output in outputs]
     assert caplog.text.count("3 of 40 Gaussians hold NaN or infinity: left out") == 1
     assert len([r for r in caplog.records if r.levelname == "WARNING"]) == 1
-    for gaussians in (ply.read_gaussians(files[0]), read_spz(files[1])):
+    for gaussians in (ply.read_gaussians(files[0]), read_spz(files[1])[0]):
         assert len(gaussians.means) == 37
         assert all(np.isfinite(values).all() for values in gaussians)
     assert len(ply.read_points(files[2]).points) == 37
@@ -253,52 +226,36 @@ def test_one_gaussian_beyond_the_range_of_spz_aborts_no_export(tmp_path, caplog)
     outputs = build("gaussiandreamer-exporter", source, formats=["spz", "ply"])()
     spz_file, ply_file = (write(output, tmp_path) for output in outputs)
     assert "1 of 40 Gaussians are farther away" in caplog.text
-    assert len(read_spz(spz_file).means) == len(ply.read_gaussians(ply_file).means) == 40
+    assert len(read_spz(spz_file)[0].means) == len(ply.read_gaussians(ply_file).means) == 40
 
 
-class TestBundle:
-    def test_gives_the_files_of_every_format_in_order(self):
-        outputs = build("gaussiandreamer-exporter")()
-        assert [output.save_type for output in outputs] == ["ply", "spz", "points"]
-        assert [
-            output.save_type for output in build("gaussiandreamer-exporter", formats=["points"])()
-        ] == ["points"]
+def test_the_bundle_gives_the_files_of_every_format_in_order_and_hands_options_on():
+    outputs = build("gaussiandreamer-exporter")()
+    assert [output.save_type for output in outputs] == ["ply", "spz", "points"]
+    options = {"ply": {"pad_sh_degree": 2, "save_name": "x.ply"}}
+    (output,) = build("gaussiandreamer-exporter", formats=["ply"], options=options)()
+    assert output.params["stored"].gaussians.sh.shape == (40, 9, 3)
+    assert output.save_name == "x.ply"
 
-    def test_hands_options_on(self):
-        (output,) = build(
-            "gaussiandreamer-exporter",
-            formats=["ply"],
-            options={"ply": {"pad_sh_degree": 2, "save_name": "x.ply"}},
-        )()
-        assert (
-            output.params["stored"].gaussians.sh.shape == (40, 9, 3) and output.save_name == "x.ply"
-        )
 
-    def test_mistakes_are_named_when_built(self):
-        with pytest.raises(UserError, match="unknown formats.1. 'pyl': did you mean 'ply'"):
-            build("gaussiandreamer-exporter", formats=["points", "pyl"])
-        with pytest.raises(UserError, match="gaussiandreamer"):
-            build("gaussiandreamer-exporter", formats=["gaussiandreamer"])
-        with pytest.raises(UserError, match="options.points"):
-            build("gaussiandreamer-exporter", formats=["ply"], options={"points": {}})
-        with pytest.raises((UserError, TypeError), match="pad"):
-            build("gaussiandreamer-exporter", formats=["ply"], options={"ply": {"pad": 2}})
-
-    @pytest.mark.parametrize(
-        ("options", "message"),
-        [
-            ({"spz": {"save_name": "gaussians.ply"}}, "is the file of the format ply"),
-            ({"ply": {"save_name": "Points.PLY"}}, "is the file of the format ply"),
-            ({"ply": {"save_name": "x\0.ply"}}, "at most 255 bytes and no NUL"),
-            ({"ply": {"save_name": "ü" * 128}}, "at most 255 bytes and no NUL"),
-            ({"ply": {"save_name": "pruned"}}, "a name that a run uses itself"),
-            ({"ply": {"save_name": "a/b.ply"}}, "without folders"),
-        ],
-    )
-    def test_a_name_that_would_fail_or_overwrite_is_named_when_built(self, options, message):
-        with pytest.raises(UserError, match=f"options.{'|'.join(options)}|options.points") as info:
-            build("gaussiandreamer-exporter", formats=["ply", "spz", "points"], options=options)
-        assert message in str(info.value)
+@pytest.mark.parametrize(
+    ("formats", "options", "message"),
+    [
+        ("points,pyl", {}, "unknown formats.1. 'pyl': did you mean 'ply'"),
+        ("gaussiandreamer", {}, "gaussiandreamer"),
+        ("ply", {"points": {}}, "options.points"),
+        ("ply", {"ply": {"pad": 2}}, "options.ply.*pad"),
+        ("ply,spz", {"spz": {"save_name": "gaussians.ply"}}, "is the file of the format ply"),
+        ("ply,points", {"ply": {"save_name": "Points.PLY"}}, "is the file of the format ply"),
+        ("ply", {"ply": {"save_name": "x\0.ply"}}, "options.ply.*at most 255 bytes and no NUL"),
+        ("ply", {"ply": {"save_name": "ü" * 128}}, "options.ply.*at most 255 bytes and no NUL"),
+        ("ply", {"ply": {"save_name": "pruned"}}, "a name that a run doesn't use itself"),
+        ("ply", {"ply": {"save_name": "a/b.ply"}}, "options.ply.*without folders"),
+    ],
+)
+def test_mistakes_are_named_when_built(formats, options, message):
+    with pytest.raises((UserError, TypeError), match=message):
+        build("gaussiandreamer-exporter", formats=formats.split(","), options=options)
 
 
 @pytest.mark.parametrize("name", ["compressed-ply", "sog", "glb"])
@@ -323,7 +280,7 @@ def test_the_extension_selects_a_variant(tmp_path, name, file, head):
     assert len(read_cloud(str(path)).gaussians.means) == 60
 
 
-def test_the_axis_of_a_mesh_is_for_its_obj(monkeypatch, tmp_path):
+def test_the_axis_of_a_mesh_is_for_its_obj():
     """glTF is y up by definition, whatever ``up`` says."""
     pytest.importorskip("skimage")
     source, rng = geometry(400, 0), torch.Generator().manual_seed(1)
@@ -331,24 +288,19 @@ def test_the_axis_of_a_mesh_is_for_its_obj(monkeypatch, tmp_path):
     source.log_scales.data[:], source.logit_opacities.data[:] = -3, 4
     small = dict(method="density", resolution=32, views=8, view_size=64, texture=64, faces=200)
     outputs = build("gaussiandreamer-mesh-exporter", source, up="z", **small)()
-    tall = {
-        output.save_name: np.ptp(output.params["mesh"].vertices, axis=0).argmax()
-        for output in outputs
-    }
+    sizes = {output.save_name: np.ptp(output.params["mesh"].vertices, axis=0) for output in outputs}
+    tall = {name: size.argmax() for name, size in sizes.items()}
     assert tall == {"mesh.glb": 1, "mesh.obj": 2}
 
 
-def test_the_version_of_spz_is_an_option(tmp_path):
+def test_the_version_of_spz_is_an_option(tmp_path, monkeypatch):
+    with pytest.raises(UserError, match="version"):
+        build("spz-exporter", version=2)
     pytest.importorskip("zstandard")
     (output,) = build("spz-exporter", version=4)()
     assert write(output, tmp_path).read_bytes()[:8] == b"NGSP\4\0\0\0"
-    with pytest.raises(UserError, match="version"):
-        build("spz-exporter", version=2)
-
-
-def test_a_version_that_cant_be_packed_is_found_before_the_run(monkeypatch):
     monkeypatch.setitem(sys.modules, "zstandard", None)
-    with pytest.raises(UserError, match="pip install zstandard"):
+    with pytest.raises(UserError, match="pip install zstandard"):  # before the run
         build("gaussiandreamer-exporter", formats=["spz"], options={"spz": {"version": 4}})
 
 

@@ -95,23 +95,18 @@ def test_the_two_layouts_are_told_apart(tmp_path):
 @pytest.mark.parametrize(
     ("data", "said"),
     [
-        (BY_HAND[:-1], "'vertex' are announced, but the file ends before"),
-        (header(count=2) + BOUNDS + WORDS, "'vertex' are announced, but the file ends before"),
-        (header(chunks=2) + BOUNDS + WORDS, "2 chunks don't fit 1 Gaussians"),
-        (header(10**12, 256 * 10**12), "'chunk' are announced, but the file ends before"),
-        (header(rest=10) + BOUNDS + WORDS, "properties aren't those of the format"),
-        (header(limits=LIMITS[::-1]) + BOUNDS + WORDS, "properties aren't those of the format"),
-        (header(encoding="ascii"), "it is text"),
-        (b"ply\nformat binary_little_endian 1.0\nend_header\n", "chunk, vertex, sh were expected"),
-        (BY_HAND.replace(b"uint packed_color", b"list uint uint packed_color"), "lists"),
+        (BY_HAND[:-1], "'vertex' are announced, but 15 bytes follow"),
+        (header(count=2) + BOUNDS + WORDS, "2 rows of 'vertex' are announced"),
+        (header(10**12, 256 * 10**12), "rows of 'chunk' are announced"),
+        (header(chunks=2) + BOUNDS + WORDS, "'chunk' has other .* rows"),
+        (header(rest=10) + BOUNDS + WORDS, "'sh' has other properties"),
+        (header(limits=LIMITS[::-1]) + BOUNDS + WORDS, "'chunk' has other properties"),
+        (header(encoding="ascii"), "isn't binary"),
+        (b"ply\nformat binary_little_endian 1.0\nend_header\n", "or has other elements"),
+        (BY_HAND.replace(b"uint packed_color", b"list uint uint packed_color"), "'vertex' has oth"),
     ],
     ids=range(9),
-)  # fmt: skip
+)
 def test_damaged_files_are_refused(tmp_path, data, said):
-    with pytest.raises(UserError, match=said):
+    with pytest.raises(UserError, match=f"a.compressed.ply': .*{said}"):
         read_compressed_ply(stored(tmp_path, data))
-
-
-def test_what_follows_is_reported(tmp_path, caplog):
-    read_compressed_ply(stored(tmp_path, BY_HAND + b"more"))
-    assert "4 bytes follow its elements" in caplog.text

@@ -8,11 +8,7 @@ import pytest
 
 from tests.helpers.object_clouds import ball
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.formats.gaussian_files import (
-    StoredCloud,
-    read_cloud,
-    write_cloud,
-)
+from threestudio_gaussiandreamer.formats.gaussian_files import StoredCloud, read_cloud, write_cloud
 from threestudio_gaussiandreamer.formats.producers import (
     GAUSSIANS,
     MESH,
@@ -116,12 +112,9 @@ def test_plain_axes_agree_with_the_option_up(name, up):
     np.testing.assert_allclose(to_y_up(producer_axes(name, GAUSSIANS)), AXES[up], atol=1e-12)
 
 
-def test_an_unknown_producer_is_refused_with_the_nearest():
+def test_an_unknown_producer_and_one_of_other_files_are_refused():
     with pytest.raises(UserError, match="unknown producer 'triposplt': did you mean 'triposplat'"):
         from_producer(StoredCloud(ball(1)), "triposplt")
-
-
-def test_a_producer_of_other_files_is_refused_with_those_that_fit():
     with pytest.raises(UserError, match="'triposr' stands for files of meshes.* are 3dgs, "):
         from_producer(StoredCloud(ball(1)), "triposr")
     with pytest.raises(UserError, match="'diffsplat' stands for files of Gaussians.*hunyuan3d"):

@@ -25,7 +25,7 @@ import torch
 import zstandard
 from PIL import Image
 
-from tests.formats.test_ksplat import stored as ksplat_file
+from tests.formats.test_splat import ksplat_file
 from tests.fuzz import mutations, oracles
 from tests.fuzz.mutations import BINARY, TEXT, Mutator, Packing
 from tests.helpers.object_clouds import ball
@@ -35,7 +35,7 @@ from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.formats import ply
 from threestudio_gaussiandreamer.formats.compressed_ply import read_compressed_ply
 from threestudio_gaussiandreamer.formats.gaussian_files import StoredCloud, read_cloud, write_cloud
-from threestudio_gaussiandreamer.formats.sog import load_sog
+from threestudio_gaussiandreamer.formats.sog import read_sog
 from threestudio_gaussiandreamer.formats.splat import RECORD, read_ksplat, read_splat
 from threestudio_gaussiandreamer.formats.spz import read_spz, spz_bytes
 from threestudio_gaussiandreamer.formats.usda import read_usda
@@ -333,11 +333,11 @@ def files(suffix: str, *shapes: tuple[int, int], **options: Any) -> Callable[[],
 
 def spz_files() -> list[bytes]:
     first, second, third = (some_gaussians(*shape) for shape in ((12, 0), (9, 1), (3, 3)))
-    return [spz_bytes(first), spz_bytes(second, comment="up: y"), spz_bytes(third)]
+    return [spz_bytes(first), spz_bytes(second, ["up: y"]), spz_bytes(third)]
 
 
 def exercise_spz(path: Path) -> None:
-    arrays = read_spz(path)
+    arrays, _ = read_spz(path)
     count = int.from_bytes(strictly(oracles.gunzipped, path)[8:12], "little")
     require(len(arrays.means) == count, f"{len(arrays.means)} Gaussians, but the file says {count}")
     require(usable(arrays).all(), "values aren't finite")
@@ -395,7 +395,7 @@ def glb_count(data: bytes) -> int:
 
 
 def exercise_splat(path: Path) -> None:
-    read = read_splat(path)
+    read, _ = read_splat(path)
     rows = np.frombuffer(path.read_bytes(), RECORD)
     same(read.means, rows["mean"], "means")
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -695,8 +695,8 @@ def npy_files() -> list[bytes]:
 
 PLY, ZIP, GLB = mutations.PLY, mutations.ZIP, mutations.GLB
 count_spz, count_glb = exercise_counted(spz_count), exercise_counted(glb_count)
-read_archive = exercise_means(lambda path: load_sog(path)[0], oracles.sog_means)
-read_folder = exercise_means(lambda path: load_sog(unpacked(path))[0], oracles.sog_means)
+read_archive = exercise_means(lambda path: read_sog(path)[0], oracles.sog_means)
+read_folder = exercise_means(lambda path: read_sog(unpacked(path))[0], oracles.sog_means)
 read_layer = exercise_means(lambda path: read_usda(path)[0], oracles.usda_means)
 read_compressed = exercise_means(read_compressed_ply, oracles.compressed_means)
 compressed_files = files(".compressed.ply", (12, 0), (260, 1))
@@ -724,7 +724,9 @@ TARGETS: dict[str, Target] = {
     "spz-4": Target(".spz", files(".spz", spz_version=4), count_spz, packing=SPZ_4),
     "sog": Target(".sog", files(".sog"), read_archive, packing=SOG),
     "sog-folder": Target(".sog", files(".sog"), read_folder, packing=SOG),
-    "ksplat": Target(".ksplat", ksplats, exercise_means(read_ksplat, oracles.ksplat_means)),
+    "ksplat": Target(
+        ".ksplat", ksplats, exercise_means(lambda path: read_ksplat(path)[0], oracles.ksplat_means)
+    ),
     "glb-gaussians": Target(".glb", files(".glb"), count_glb, packing=GLB),
     "compressed-ply": Target(".compressed.ply", compressed_files, read_compressed, packing=PLY),
     "splat": Target(".splat", splats, exercise_splat),

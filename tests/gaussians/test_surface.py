@@ -5,9 +5,9 @@ exported by a run.
 import numpy as np
 import pytest
 
-from threestudio_gaussiandreamer.formats.obj import write_obj
 from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
 from threestudio_gaussiandreamer.gaussians.surface import gaussian_surface, surface_nets
+from threestudio_gaussiandreamer.meshes.write import write_obj
 
 trimesh = pytest.importorskip("trimesh")
 CENTER = np.array([0.3, 0.0, -0.2])

@@ -1,5 +1,8 @@
 """Generated glTF files with one feature each: positions and colours are those of the standard."""
 
+import tracemalloc
+import zlib
+
 import numpy as np
 import pytest
 
@@ -14,9 +17,11 @@ from tests.helpers.gltf_builder import (
     WHITE,
     Gltf,
     color_at,
+    png,
     textured_quad,
 )
 from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.meshes import side_files as budget
 from threestudio_gaussiandreamer.meshes.gltf import read_gltf
 from threestudio_gaussiandreamer.meshes.load import load_mesh
 from threestudio_gaussiandreamer.meshes.mesh import surface_colors
@@ -279,13 +284,13 @@ def changed(made, path, value):
         (("asset",), {"version": "1.0"}, "glTF of version 1.0"),
         (("nodes", 0, "extensions"), {"EXT_mesh_gpu_instancing": {}}, "EXT_mesh_gpu_instancing"),
         (("nodes", 0, "children"), [0], "node 0 has two parents"),
-        (("nodes", 0, "rotation"), [1, 2], "rotation of a node should be 4 numbers"),
+        (("nodes", 0, "rotation"), [1, 2], "4 numbers were expected"),
         (("nodes", 0, "mesh"), 7, "names number 7 of 1 meshes"),
         (("nodes", 0, "mesh"), -1, "names number -1 of 1 meshes"),
         (("meshes", 0, "primitives", 0, "mode"), 9, "mode 9 is unknown"),
         (("meshes", 0, "primitives", 0, "indices"), 1, "SCALAR was expected"),
-        (("accessors", 1, "count"), 10**6, "buffer view"),
-        (("accessors", 1, "count"), 3, "names vertex 3 of 3|rows for"),
+        (("accessors", 1, "count"), 10**6, "damaged"),
+        (("accessors", 1, "count"), 3, "vertex beyond the last of 3"),
         (("accessors", 1, "componentType"), 1, "component type 1"),
         (
             ("accessors", 1),
@@ -293,11 +298,11 @@ def changed(made, path, value):
             "aren't in the file",
         ),
         (("bufferViews", 0, "byteLength"), 10**12, "ends after its buffer"),
-        (("samplers", 0, "wrapS"), 5, "wraps by"),
+        (("samplers", 0, "wrapS"), 5, "damaged"),
         (("textures", 0), {"extensions": {"KHR_texture_basisu": {}}}, "KHR_texture_basisu"),
         (("images", 0), {"uri": "https://example.org/a.png"}, "only files beside the mesh"),
-        (("images", 0, "bufferView"), 1, "texture 0 is in none of the formats"),
-        (("scenes",), 5, "isn't that of a glTF file"),
+        (("images", 0, "bufferView"), 1, "texture 0 .* in none of the formats"),
+        (("scenes",), 5, "damaged"),
     ],
 )
 def test_damage_is_one_message(path, value, message, saved):
@@ -317,3 +322,57 @@ def test_a_glb_of_something_else_is_named_as_such(tmp_path, content, said):
     (tmp_path / "a.glb").write_bytes(content)
     with pytest.raises(UserError, match=said):
         load_mesh(tmp_path / "a.glb")
+
+
+# ---- one memory budget for everything in a file --------------------------------------------------
+
+
+def refused(made, saved):
+    """Return the message of a rejection, and the peak memory before it."""
+    path = saved(made)
+    tracemalloc.start()
+    try:
+        with pytest.raises(UserError) as caught:
+            load_mesh(path)
+        return str(caught.value), tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+
+
+def test_textures_count_together(saved, monkeypatch):
+    """Two images of half a megabyte in a small file: one fits, two do not."""
+    monkeypatch.setattr(budget, "FIXED_BYTES", 700_000)
+    monkeypatch.setattr(budget, "BYTES_PER_FILE_BYTE", 0)
+    flat = np.zeros((256, 256, 3), np.uint8)
+    made = textured_quad(flat)
+    assert load_mesh(saved(made)).texture.shape == (256, 256, 3)
+    made.document["meshes"][0]["primitives"].append(
+        made.document["meshes"][0]["primitives"][0]
+        | {"material": made.material(made.texture(flat))}
+    )
+    message, taken = refused(made, saved)
+    assert "the texture 1 of 256 x 256 texels is too large" in message and taken < 1 << 20
+
+
+def test_instances_count(saved, monkeypatch):
+    """2,000 nodes that show one mesh are rejected before they are created; the texture is stored
+    once.
+    """
+    monkeypatch.setattr(budget, "FIXED_BYTES", 1 << 20)
+    monkeypatch.setattr(budget, "BYTES_PER_FILE_BYTE", 0)
+    made = textured_quad(np.zeros((64, 64, 3), np.uint8))
+    made.document["nodes"] = [{"mesh": 0, "translation": [i, 0, 0]} for i in range(500)]
+    made.document["scenes"][0]["nodes"] = list(range(500))
+    assert load_mesh(saved(made)).texture.size == 64 * 64 * 3
+    made.document["nodes"] *= 4
+    made.document["scenes"][0]["nodes"] = list(range(2000))
+    assert "too large" in refused(made, saved)[0]
+
+
+def test_a_large_header_is_refused_before_anything_is_allocated(saved):
+    """A PNG that announces 12,000 x 12,000 pixels in its header."""
+    data = bytearray(png(FOUR))
+    data[16:24] = (12000).to_bytes(4, "big") * 2
+    data[29:33] = zlib.crc32(bytes(data[12:29])).to_bytes(4, "big")
+    message, taken = refused(textured_quad(bytes(data)), saved)
+    assert "12000 x 12000 texels is too large" in message and taken < 4 << 20

@@ -1,3 +1,5 @@
+"""Meshes of all formats: their pose, their colours, and files that are refused."""
+
 import logging
 import time
 
@@ -5,11 +7,8 @@ import numpy as np
 import pytest
 
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.meshes.load import find_mesh, load_mesh
-from threestudio_gaussiandreamer.meshes.mesh import (
-    sample_surface,
-    surface_colors,
-)
+from threestudio_gaussiandreamer.meshes.load import AXES, find_mesh, load_mesh
+from threestudio_gaussiandreamer.meshes.mesh import sample_surface, surface_colors
 
 trimesh = pytest.importorskip("trimesh")
 THIRDS = np.full((1, 3), 1 / 3)
@@ -52,20 +51,12 @@ def facing(mesh, direction):
 
 
 def test_the_box_is_centred_and_its_longest_half_side_is_the_scale(tmp_path):
-    mesh = load_mesh(saved(box((2, 5, 1), (100, -3, 7)), tmp_path / "box.stl"), scale=1.5)
-    low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
-    np.testing.assert_allclose(high, [0.6, 1.5, 0.3], atol=1e-6)  # STL holds float32
-    np.testing.assert_allclose(low, -high, atol=1e-6)
-
-
-@pytest.mark.parametrize("scale", [1e-3, 1e3])
-def test_units_do_not_matter(tmp_path, scale):
-    mesh = box((2, 5, 1))
-    plain = load_mesh(saved(mesh, tmp_path / "a.ply"))
-    mesh.apply_scale(scale)
-    np.testing.assert_allclose(
-        load_mesh(saved(mesh, tmp_path / "b.ply")).vertices, plain.vertices, atol=1e-6
-    )
+    for unit in (1, 1e3):
+        made = box((2 * unit, 5 * unit, unit), (100 * unit, -3, 7))
+        mesh = load_mesh(saved(made, tmp_path / "box.stl"), scale=1.5)
+        low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+        np.testing.assert_allclose(high, [0.6, 1.5, 0.3], atol=2e-6)  # STL holds float32
+        np.testing.assert_allclose(low, -high, atol=1e-6)
 
 
 def arrow(direction, side):
@@ -85,9 +76,8 @@ def test_y_up_files_face_plus_z(tmp_path, name):
     mesh = load_mesh(saved(arrow((0, 0, 1), (0, 1, 0)), tmp_path / name), scale=1.5)
     corner = mesh.vertices[mesh.vertices[:, 0].argmax()] - mesh.vertices.min(axis=0)
     top = mesh.vertices[mesh.vertices[:, 2].argmax()] - mesh.vertices.min(axis=0)
-    np.testing.assert_allclose(
-        corner, [3, 1, 0], atol=1e-5
-    )  # third = z cross y = -x, so y starts at -1
+    # third = z cross y = -x, so y starts at -1
+    np.testing.assert_allclose(corner, [3, 1, 0], atol=1e-5)
     np.testing.assert_allclose(top, [0, 1, 2], atol=1e-5)
 
 
@@ -95,24 +85,19 @@ def test_y_up_files_face_plus_z(tmp_path, name):
 def test_z_up_files_keep_their_axes(tmp_path, name):
     mesh = arrow((1, 0, 0), (0, 0, 1))
     loaded = load_mesh(saved(mesh, tmp_path / name), scale=1.5)
-    np.testing.assert_allclose(
-        np.ptp(loaded.vertices, axis=0), np.ptp(mesh.vertices, axis=0), atol=1e-5
-    )
+    sizes = [np.ptp(each.vertices, axis=0) for each in (loaded, mesh)]
+    np.testing.assert_allclose(*sizes, atol=1e-5)
     assert loaded.vertices[:, 0].argmax() == 0
 
 
 @pytest.mark.parametrize(("up", "front"), [("+y", "-x"), ("-z", "+y"), ("+x", None), ("-y", "+z")])
 def test_up_and_front_can_be_given_and_nothing_is_mirrored(tmp_path, up, front):
-    from threestudio_gaussiandreamer.meshes.load import AXES
-
     path = saved(arrow((1, 0, 0), (0, 1, 0)), tmp_path / "a.ply")
     mesh, plain = load_mesh(path, up=up, front=front), load_mesh(path, up="+z", front="+x")
     front = front or "+y"  # the axis after x
-    side = np.cross(AXES[up], AXES[front])
-    np.testing.assert_allclose(
-        mesh.vertices, plain.vertices @ np.stack([AXES[front], side, AXES[up]]).T, atol=1e-12
-    )
-    assert np.isclose(np.linalg.det(np.stack([AXES[front], side, AXES[up]])), 1)
+    turn = np.stack([AXES[front], np.cross(AXES[up], AXES[front]), AXES[up]])
+    np.testing.assert_allclose(mesh.vertices, plain.vertices @ turn.T, atol=1e-12)
+    assert np.isclose(np.linalg.det(turn), 1)
 
 
 def test_a_scene_is_merged_with_its_transforms(tmp_path):
@@ -127,101 +112,57 @@ def test_a_scene_is_merged_with_its_transforms(tmp_path):
 # Colours
 
 
-def test_a_mesh_without_colours_is_grey(tmp_path):
+def test_colours_of_vertices_faces_and_materials(tmp_path):
     mesh = load_mesh(saved(box(), tmp_path / "plain.glb"))
     assert not mesh.has_colors
     np.testing.assert_array_equal(center_color(mesh), 0.5)
-
-
-def test_vertex_colours_are_interpolated(tmp_path):
-    source = trimesh.Trimesh(
-        [[0, 0, 0], [1, 0, 0], [0, 1, 0]],
-        [[0, 1, 2]],
-        vertex_colors=np.eye(3, 4) * 255 + [0, 0, 0, 255],
-    )
-    mesh = load_mesh(saved(source, tmp_path / "a.ply"))
-    assert mesh.has_colors
-    weights = np.array([[0.2, 0.3, 0.5]])
+    colors = np.eye(3, 4) * 255 + [0, 0, 0, 255]
+    corners, faces = [[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]]
+    source = trimesh.Trimesh(corners, faces, vertex_colors=colors)
+    mesh, weights = load_mesh(saved(source, tmp_path / "a.ply")), np.array([[0.2, 0.3, 0.5]])
     np.testing.assert_allclose(surface_colors(mesh, np.array([0]), weights), weights, atol=1e-6)
-
-
-def test_face_colours(tmp_path):
     source = box()
     source.visual.face_colors = np.random.default_rng(0).integers(0, 255, (12, 4))
     mesh = load_mesh(saved(source, tmp_path / "a.ply"))
     expected = source.visual.face_colors[:, :3] / 255
-    np.testing.assert_allclose(
-        [center_color(mesh, face) for face in range(12)], expected, atol=1e-6
-    )
-
-
-def test_a_material_without_texture_colours_the_mesh_in_srgb(tmp_path):
-    source = box()
-    source.visual = trimesh.visual.TextureVisuals(
-        material=trimesh.visual.material.PBRMaterial(baseColorFactor=[255, 0, 55, 255])
-    )
-    mesh = load_mesh(saved(source, tmp_path / "a.glb"))
-    linear = 55 / 255
-    np.testing.assert_allclose(
-        center_color(mesh), [1, 0, 1.055 * linear ** (1 / 2.4) - 0.055], atol=1e-6
-    )
-
-
-IMAGE = [[[255, 0, 0], [0, 255, 0]], [[0, 0, 255], [255, 255, 255]]]  # red green / blue white
-
-
-def test_the_textures_first_row_is_at_v_1(tmp_path):
-    mesh = load_mesh(saved(textured_quad(IMAGE), tmp_path / "a.glb"))
-    near_corners = surface_colors(mesh, np.array([0, 0, 0]), np.eye(3) * 0.75 + 0.25 / 3)
-    blue, white, green = near_corners  # at uv (0, 0), (1, 0), (1, 1)
-    assert (
-        blue.argmax() == 2
-        and green.argmax() == 1
-        and white.min() > blue.min()
-        and white.min() > 0.3
-    )
+    found = [center_color(mesh, face) for face in range(12)]
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+    material = trimesh.visual.material.PBRMaterial(baseColorFactor=[255, 0, 55, 255])
+    source.visual = trimesh.visual.TextureVisuals(material=material)
+    mesh = load_mesh(saved(source, tmp_path / "a.glb"))  # its colour is linear
+    expected = [1, 0, 1.055 * (55 / 255) ** (1 / 2.4) - 0.055]
+    np.testing.assert_allclose(center_color(mesh), expected, atol=1e-6)
 
 
 def test_a_texture_is_tinted_by_its_material(tmp_path):
     quad = textured_quad(np.full((2, 2, 3), 255))
-    quad.visual.material.baseColorFactor = [255, 0, 255, 255]
-    np.testing.assert_allclose(
-        center_color(load_mesh(saved(quad, tmp_path / "a.glb"))), [1, 0, 1], atol=1e-6
-    )
-    quad.visual.material.baseColorFactor = [102, 102, 102, 255]  # trimesh's "no colour given"
-    np.testing.assert_allclose(
-        center_color(load_mesh(saved(quad, tmp_path / "b.glb"))), 1, atol=1e-6
-    )
+    for tint, seen in ([255, 0, 255, 255], [1, 0, 1]), ([102, 102, 102, 255], 1):
+        quad.visual.material.baseColorFactor = tint  # the second is trimesh's "no colour given"
+        found = center_color(load_mesh(saved(quad, tmp_path / "a.glb")))
+        np.testing.assert_allclose(found, seen, atol=1e-6)
 
 
 def test_a_scene_of_textures_and_colours_keeps_them_apart(tmp_path):
     """Two textures of different sizes (one of them repeating), vertex colours and a plain part."""
-    red, checks = (
-        np.tile([[[255, 0, 0]]], (3, 5, 1)),
-        np.tile([[[0, 0, 255], [0, 255, 0]]], (1, 1, 1)),
-    )
+    red, checks = np.tile([[[255, 0, 0]]], (3, 5, 1)), [[[0, 0, 255], [0, 255, 0]]]
     repeated = textured_quad(checks, uv=((0, 0), (4, 0), (4, 1), (0, 1)), y=1.0)
     coloured = box(center=(5, 0, 0))
     coloured.visual.vertex_colors = [255, 255, 0, 255]
     scene = trimesh.Scene([textured_quad(red), repeated, coloured, box(center=(9, 0, 0))])
     mesh = load_mesh(saved(scene, tmp_path / "a.glb"))
     assert len(mesh.faces) == 28 and mesh.tile_index.shape == (28,)
-    order = np.lexsort(
-        mesh.vertices[mesh.faces].mean(axis=1)[:, 1:].T[::-1]
-    )  # by the file's x, then y
-    red_face, striped_face = sorted(
-        (face for face in range(28) if mesh.tile_index[face] >= 0),
-        key=lambda f: mesh.vertices[mesh.faces[f], 2].mean(),
-    )[::2]
+    centres = mesh.vertices[mesh.faces].mean(axis=1)
+    order = np.lexsort(centres[:, 1:].T[::-1])  # by the file's x, then y
+    textured = np.flatnonzero(mesh.tile_index >= 0)
+    red_face, striped_face = textured[np.argsort(centres[textured, 2], kind="stable")][::2]
     np.testing.assert_allclose(center_color(mesh, red_face), [1, 0, 0], atol=1e-6)
     across = mesh.uv[mesh.faces[striped_face], 0]
     weights = [
         np.linalg.lstsq(np.stack([across, np.ones(3)]), [4 * u, 1], rcond=None)[0]
         for u in (0.0625, 0.1875, 0.3125, 0.8125)
     ]
-    stripes = surface_colors(
-        mesh, np.full(4, striped_face), np.array(weights)
-    )  # at u = 1/4, 3/4, 5/4 and 13/4 of the texture
+    # at u = 1/4, 3/4, 5/4 and 13/4 of the texture
+    stripes = surface_colors(mesh, np.full(4, striped_face), np.array(weights))
     np.testing.assert_allclose(stripes, [[0, 0, 1], [0, 1, 0], [0, 0, 1], [0, 0, 1]], atol=1e-5)
     np.testing.assert_allclose(center_color(mesh, order[-13]), [1, 1, 0], atol=1e-6)
     np.testing.assert_allclose(center_color(mesh, order[-1]), 0.5, atol=1e-6)
@@ -230,11 +171,16 @@ def test_a_scene_of_textures_and_colours_keeps_them_apart(tmp_path):
 # Bad input
 
 
-def test_a_few_bad_vertices_are_dropped_with_a_count(tmp_path, caplog):
+@pytest.mark.parametrize("bad", [2, 40])
+def test_a_few_bad_vertices_are_dropped_with_a_count(tmp_path, caplog, bad):
     source = trimesh.creation.icosphere(3)  # 642 vertices
     vertices = np.array(source.vertices)
-    vertices[7], vertices[50] = np.nan, np.inf
+    vertices[7 : 7 + bad : 2], vertices[8 : 8 + bad : 2] = np.nan, np.inf
     path = saved(trimesh.Trimesh(vertices, source.faces, process=False), tmp_path / "a.off")
+    if bad > 0.05 * 642:
+        with pytest.raises(UserError, match=f"{bad} of 642 vertices"):
+            load_mesh(path)
+        return
     with caplog.at_level(logging.WARNING):
         mesh = load_mesh(path)
     assert "dropped 2 of 642" in caplog.text
@@ -280,12 +226,8 @@ def test_a_binary_stl_may_begin_like_text_and_have_more_bytes(tmp_path, header):
     assert len(load_mesh(tmp_path / "a.stl").faces) == 1
 
 
-def test_many_bad_vertices_are_an_error(tmp_path):
-    source = trimesh.creation.icosphere(2)
-    vertices = source.vertices.copy()
-    vertices[:20] = np.nan
-    with pytest.raises(UserError, match="20 of 162 vertices"):
-        load_mesh(saved(trimesh.Trimesh(vertices, source.faces, process=False), tmp_path / "a.off"))
+XYZ = b"".join(b"property float %c\n" % axis for axis in b"xyz")
+PLY_HEAD = b"ply\nformat ascii 1.0\nelement vertex 1\n" + XYZ + b"end_header\n"
 
 
 @pytest.mark.parametrize(
@@ -293,32 +235,19 @@ def test_many_bad_vertices_are_an_error(tmp_path):
     [
         ("missing.glb", None, "does not exist"),
         ("a.xlsx", b"x", "unknown mesh format"),
-        ("noise.glb", b"not a glb at all" * 9, "can't read "),
-        ("empty.obj", b"", "no faces|can't read"),
-        (
-            "points.ply",
-            b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float "
-            b"y\nproperty float z\nend_header\n0 0 0\n",
-            "no faces",
-        ),
+        ("noise.glb", b"not a glb at all" * 9, "isn't a GLB file"),
+        ("empty.obj", b"", "no faces|damaged"),
+        ("points.ply", PLY_HEAD + b"0 0 0\n", "no faces"),
         ("flat.obj", b"v 1 1 1\nv 1 1 1\nv 1 1 1\nf 1 2 3\n", "zero area"),
         ("line.obj", b"v 0 0 0\nv 1 1 1\nv 2 2 2\nf 1 2 3\n", "zero area"),
-        (
-            "zero.obj",
-            b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 0 2 3\n",
-            "line 4 is no vertex or face: 'f 0 2 3'",
-        ),
+        ("zero.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 0 2 3\n", "line 4 is no vertex or face: 'f"),
         ("two.obj", b"v 0 0\nv 1 0\nv 0 1\nf 1 2 3\n", "line 1 is no vertex or face"),
         ("back.obj", b"v 0 0 0\nv 1 0 0\nf -3 -2 -1\nv 0 0 1\n", "names number -3 of 2 vertices"),
         ("cut.stl", bytes(80) + b"\2\0\0\0" + bytes(60), "184 bytes were expected, not 144"),
-        (
-            "accessor.gltf",
-            b'{"asset": {"version": "2.0"}, "meshes": [{}], "scenes": [{}]}',
-            "no faces",
-        ),
-        ("list.gltf", b"[]", "isn't that of a glTF"),
+        ("a.gltf", b'{"asset": {"version": "2.0"}, "scenes": [{}]}', "no faces"),
+        ("list.gltf", b"[]", "damaged"),
         ("chunk.glb", b"glTF\2\0\0\0\x20\0\0\0\xff\xff\xff\x7fJSON{}", "chunks"),
-        ("range.off", b"OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 7\n", "names vertex 7|can't read"),
+        ("range.off", b"OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 7\n", "damaged"),
     ],
 )
 def test_what_cannot_be_used_is_named(tmp_path, name, content, message):
@@ -365,6 +294,52 @@ def test_bad_options_are_named(tmp_path, options, message):
         load_mesh(saved(box(), tmp_path / "a.ply"), **options)
 
 
+# Colours of OFF files, which trimesh doesn't read
+
+
+OFF_FACES = "3 0 2 1\n3 0 1 3\n3 0 3 2\n3 1 2 3\n"
+CORNERS = ("0 0 0", "1 0 0", "0 1 0", "0 0 1")
+
+
+@pytest.mark.parametrize(
+    ("head", "colors"),
+    [
+        ("COFF\n4 4 6\n", ["255 0 0 255", "0 255 0 255", "0 0 255 255", "51 51 51 0"]),
+        ("OFF 4 4 6 # a comment\n\n", ["1.0 0 0", "0 1.0 0", "0 0 1.0", "0.2 0.2 0.2"]),
+        ("\ufeffCOFF\n4 4 6\n", ["1 0 0 1", "0 1 0 1", "0 0 1 1", "0.2 0.2 0.2 1"]),
+    ],
+)
+def test_colours_of_an_off_files_vertices(tmp_path, head, colors):
+    path = tmp_path / "a.off"
+    rows = [f"{corner} {color}\n" for corner, color in zip(CORNERS, colors, strict=True)]
+    path.write_text(head + "".join(rows) + OFF_FACES)
+    mesh = load_mesh(path)
+    expected = np.float32([[1, 0, 0], [0, 1, 0], [0, 0, 1], [0.2, 0.2, 0.2]])
+    np.testing.assert_allclose(mesh.vertex_colors, expected, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("head", "of_vertices", "of_faces", "warned"),
+    [
+        ("OFF", "", " 255 0 0", "faces"),
+        ("OFF", "", "", None),
+        ("NOFF", " 0 0 1", "", None),
+        ("CNOFF", " 0 0 1 255 0 0", "", "vertices"),
+        ("COFF", " 1 0 red", "", "vertices"),
+        ("COFF", " nan 0 0 1", "", "vertices"),
+    ],
+)
+def test_other_colours_of_an_off_file_are_reported(
+    tmp_path, caplog, head, of_vertices, of_faces, warned
+):
+    path = tmp_path / "a.off"
+    vertices = "".join(f"{corner}{of_vertices}\n" for corner in CORNERS)
+    path.write_text(f"{head}\n4 4 6\n" + vertices + OFF_FACES.replace("\n", f"{of_faces}\n"))
+    assert not load_mesh(path).has_colors
+    found = f"colours of its {warned} aren't read" in caplog.text
+    assert found if warned else "colours" not in caplog.text
+
+
 # Real meshes
 
 
@@ -403,9 +378,6 @@ def test_shared_meshes(shared_folder, name, front, faces):
     assert colors.min() >= 0 and colors.max() <= 1
     red, green, blue = colors.T
     # the duck's orange beak, the cow's pink snout: in front
-    nose = (
-        (red > 0.9) & (green < 0.6) & (blue < 0.3)
-        if name == "duck"
-        else (red > 0.9) & (blue > 0.5) & (blue < 0.75)
-    )
+    beak, snout = (green < 0.6) & (blue < 0.3), (blue > 0.5) & (blue < 0.75)
+    nose = (red > 0.9) & (beak if name == "duck" else snout)
     assert nose.sum() > 200 and points[nose, 0].mean() > 0.5

@@ -136,12 +136,15 @@ def test_doubles_keep_their_digits(tmp_path):
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (lambda text: text[:-1], "its faces are truncated or damaged"),
-        (lambda text: text[:-14], "its faces are truncated or damaged"),
-        (lambda text: text[:-4] + struct.pack("<I", 4), "names vertex 4 of 4"),
-        (lambda text: text.replace(b"face 2", b"face 9999999"), "9999999 are announced"),
-        (lambda text: text.replace(b"face 2", b"face 3"), "its faces are truncated or damaged"),
-        (lambda text: text.replace(b"float z", b"float w"), "its vertices have no z"),
+        (lambda text: text[:-1], "truncated"),
+        (lambda text: text[:-14], "truncated"),
+        (lambda text: text[:-4] + struct.pack("<I", 4), "a vertex beyond the last of 4"),
+        (
+            lambda text: text.replace(b"face 2", b"face 9999999"),
+            "9999999 rows of .face.",
+        ),
+        (lambda text: text.replace(b"face 2", b"face 3"), "truncated"),
+        (lambda text: text.replace(b"float z", b"float w"), "its vertices have no x, y, z"),
     ],
 )
 def test_damaged_files_are_refused(tmp_path, change, said):

@@ -1,3 +1,7 @@
+"""The ray caster: perspective, colours and coverage are as the cameras say, by Embree and by the
+z-buffer; the z-buffer sees what single rays see.
+"""
+
 import logging
 import math
 import sys
@@ -11,37 +15,36 @@ from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.meshes import raycast
 from threestudio_gaussiandreamer.meshes.load import load_mesh
 from threestudio_gaussiandreamer.meshes.mesh import Mesh
-from threestudio_gaussiandreamer.meshes.raycast import MeshCaster, TargetCache, over_background
+from threestudio_gaussiandreamer.meshes.raycast import (
+    MeshCaster,
+    TargetCache,
+    ZBuffer,
+    over_background,
+)
 
 trimesh = pytest.importorskip("trimesh")
-
-COLORS = {
-    "+x": (1, 0, 0),
-    "-x": (0, 1, 1),
-    "+y": (0, 1, 0),
-    "-y": (1, 0, 1),
-    "+z": (0, 0, 1),
-    "-z": (1, 1, 0),
-}
+SIDES = {"+x": (0, 0), "+y": (0, 90), "-x": (0, 180), "-y": (0, -90), "+z": (89.9, 0)}
+SIDES["-z"] = (-89.9, 0)
+COLORS = {"+x": (1, 0, 0), "-x": (0, 1, 1), "+y": (0, 1, 0), "-y": (1, 0, 1), "+z": (0, 0, 1)}
+COLORS["-z"] = (1, 1, 0)
 
 
-@pytest.fixture(params=["embree", "zbuffer"], autouse=True)
+@pytest.fixture(params=["embree", "zbuffer"])
 def caster_name(request, monkeypatch):
-    """Run every test with both casters."""
-    if request.param == "zbuffer":
-        monkeypatch.setitem(
-            sys.modules, "embreex.mesh_construction", None
-        )  # importing it is an ImportError now
+    """Run a test with both casters."""
+    if request.param == "zbuffer":  # importing it is an ImportError now
+        monkeypatch.setitem(sys.modules, "embreex.mesh_construction", None)
     else:
         pytest.importorskip("embreex")
     return request.param
 
 
+both = pytest.mark.usefixtures("caster_name")
+
+
 def look(elevation, azimuth, distance):
-    angles = (
-        torch.tensor([float(value)], dtype=torch.float64)
-        for value in (elevation, azimuth, distance)
-    )
+    values = (elevation, azimuth, distance)
+    angles = (torch.tensor([float(value)], dtype=torch.float64) for value in values)
     return cameras.orbit_c2w(*angles)[0].numpy()
 
 
@@ -50,11 +53,8 @@ def cube(size=1.0):
     source = trimesh.creation.box((size, size, size))
     sides = source.face_normals.round().astype(int)
     names = ["+-"[int(side.sum() < 0)] + "xyz"[int(np.abs(side).argmax())] for side in sides]
-    return Mesh(
-        np.array(source.vertices),
-        np.array(source.faces),
-        face_colors=np.array([COLORS[name] for name in names], dtype=np.float32),
-    )
+    colors = np.array([COLORS[name] for name in names], dtype=np.float32)
+    return Mesh(np.array(source.vertices), np.array(source.faces), face_colors=colors)
 
 
 def sphere(radius=1.0, subdivisions=5):
@@ -62,9 +62,9 @@ def sphere(radius=1.0, subdivisions=5):
     return Mesh(np.array(source.vertices), np.array(source.faces))
 
 
+@both
 @pytest.mark.parametrize(
-    ("distance", "fovy", "size"),
-    [(2.0, 70.0, (96, 96)), (3.0, 40.0, (80, 120)), (5.0, 25.0, (96, 80))],
+    ("distance", "fovy", "size"), [(2.0, 70.0, (96, 96)), (3.0, 40.0, (80, 120))]
 )
 def test_the_silhouette_of_a_sphere(distance, fovy, size):
     """In perspective a sphere of radius r at distance d subtends the angle asin(r / d): a disc of
@@ -84,33 +84,20 @@ def test_the_silhouette_of_a_sphere(distance, fovy, size):
         assert abs(span + 1 - 2 * radius) < 1.5
 
 
-@pytest.mark.parametrize(
-    ("side", "elevation", "azimuth"),
-    [
-        ("+x", 0, 0),
-        ("+y", 0, 90),
-        ("-x", 0, 180),
-        ("-y", 0, -90),
-        ("+z", 89.9, 0),
-        ("-z", -89.9, 0),
-    ],
-)
-def test_each_side_of_a_cube_is_seen_from_its_side(side, elevation, azimuth):
-    image = MeshCaster(cube()).render(look(elevation, azimuth, 3), math.radians(40), 32, 32)
-    np.testing.assert_allclose(image[16, 16], [*COLORS[side], 1], atol=1e-6)
-
-
-def test_the_picture_is_not_mirrored():
+@both
+def test_sides_of_a_cube_are_seen_upright_and_not_mirrored():
     """From the front, +y is on the right and +z on top."""
-    image = MeshCaster(cube()).render(look(30, 30, 3), math.radians(40), 64, 64)
-    rows, columns = np.nonzero(
-        (image[..., 1] > 0.9) & (image[..., 0] < 0.1) & (image[..., 2] < 0.1)
-    )  # green: +y
-    assert columns.mean() > 36
-    rows, columns = np.nonzero((image[..., 2] > 0.9) & (image[..., 0] < 0.1))  # blue: +z
-    assert rows.mean() < 24
+    caster = MeshCaster(cube())
+    for side, angles in SIDES.items():
+        image = caster.render(look(*angles, 3), math.radians(40), 32, 32)
+        np.testing.assert_allclose(image[16, 16], [*COLORS[side], 1], atol=1e-6)
+    image = caster.render(look(30, 30, 3), math.radians(40), 64, 64)
+    red, green, blue = image[..., 0] > 0.1, image[..., 1] > 0.9, image[..., 2] > 0.9
+    assert np.nonzero(green & ~red & (image[..., 2] < 0.1))[1].mean() > 36  # +y
+    assert np.nonzero(blue & ~red)[0].mean() < 24  # +z
 
 
+@both
 def test_a_point_lands_where_the_intrinsics_say():
     position = np.array([0.3, -0.2, 0.4])
     mesh = sphere(0.02, 2)
@@ -120,55 +107,42 @@ def test_a_point_lands_where_the_intrinsics_say():
     viewmats, Ks = cameras.to_opencv(torch.tensor(c2w)[None], torch.tensor([fovy]), height, width)
     projected = Ks[0].double() @ (viewmats[0, :3, :3] @ torch.tensor(position) + viewmats[0, :3, 3])
     weights = image[..., 3] / image[..., 3].sum()
-    center = [
-        (weights * (np.arange(width) + 0.5)).sum(),
-        (weights * (np.arange(height) + 0.5)[:, None]).sum(),
-    ]
-    np.testing.assert_allclose(
-        center, (projected[:2] / projected[2]).numpy(), atol=0.05
-    )  # the disc is 2 pixels wide
+    columns, rows = np.arange(width) + 0.5, (np.arange(height) + 0.5)[:, None]
+    center = [(weights * columns).sum(), (weights * rows).sum()]  # the disc is 2 pixels wide
+    np.testing.assert_allclose(center, (projected[:2] / projected[2]).numpy(), atol=0.05)
 
 
 def test_gltf_files_show_their_front_at_azimuth_0(tmp_path):
     """glTF is y up and faces +z; its +x is the model's left, which is the world's +y."""
     source = cube()
-    corners, colors = (
-        source.vertices[source.faces].reshape(-1, 3),
-        (source.face_colors.repeat(3, axis=0) * 255).astype(np.uint8),
-    )
-    trimesh.Trimesh(
-        corners, np.arange(36).reshape(-1, 3), vertex_colors=colors, process=False
-    ).export(tmp_path / "cube.glb")
+    corners = source.vertices[source.faces].reshape(-1, 3)
+    colors = (source.face_colors.repeat(3, axis=0) * 255).astype(np.uint8)
+    faces = np.arange(36).reshape(-1, 3)
+    made = trimesh.Trimesh(corners, faces, vertex_colors=colors, process=False)
+    made.export(tmp_path / "cube.glb")
     caster = MeshCaster(load_mesh(tmp_path / "cube.glb"))
     for elevation, azimuth, side in ((0, 0, "+z"), (0, 90, "+x"), (89.9, 0, "+y")):
         image = caster.render(look(elevation, azimuth, 4), math.radians(40), 16, 16)
         np.testing.assert_allclose(image[8, 8, :3], COLORS[side], atol=1e-6)
 
 
-def test_colour_is_premultiplied_and_coverage_partial_at_edges():
-    image = MeshCaster(cube()).render(look(0, 0, 3), math.radians(40), 30, 30, supersample=4)
+@both
+def test_colour_is_premultiplied_and_supersampling_is_the_mean_of_a_larger_picture(monkeypatch):
+    caster = MeshCaster(cube())
+    image = caster.render(look(0, 0, 3), math.radians(40), 30, 30, supersample=4)
     edge = (image[..., 3] > 0) & (image[..., 3] < 1)
     assert edge.any()
     np.testing.assert_allclose(image[..., 0], image[..., 3], atol=1e-6)  # the front is red
     over = over_background(image, np.array([0.0, 1.0, 0.0]))
     np.testing.assert_allclose(over[..., :2].sum(axis=-1), 1, atol=1e-6)
-
-
-def test_supersampling_is_the_mean_of_a_larger_picture():
-    caster = MeshCaster(cube())
     view = look(30, 40, 2.5), math.radians(50)
     large = caster.render(*view, 48, 72, 1).reshape(16, 3, 24, 3, 4).mean(axis=(1, 3))
     np.testing.assert_allclose(caster.render(*view, 16, 24, 3), large, atol=1e-6)
+    monkeypatch.setattr(raycast, "RAYS_PER_CAST", 1)
+    np.testing.assert_allclose(caster.render(*view, 16, 24, 3), large, atol=1e-6)
 
 
-def test_casting_in_parts_changes_nothing(monkeypatch):
-    caster = MeshCaster(cube())
-    view = look(30, 40, 2.5), math.radians(50), 20, 20, 4
-    whole = caster.render(*view)
-    monkeypatch.setattr("threestudio_gaussiandreamer.meshes.raycast.RAYS_PER_CAST", 1)
-    np.testing.assert_allclose(caster.render(*view), whole, atol=1e-6)  # sums in another order
-
-
+@both
 def test_cameras_inside_beside_and_away():
     caster = MeshCaster(cube())
     inside, away = look(10, 20, 0.1), look(10, 20, 3)
@@ -178,22 +152,32 @@ def test_cameras_inside_beside_and_away():
     beside = look(0, 0, 3)
     beside[1, 3] += 50
     assert caster.render(beside, 1.0, 8, 8).max() == 0
+    with pytest.raises(UserError, match="at least 1"):
+        caster.render(look(0, 0, 3), 0.7, 0, 8)
 
 
-def test_many_views_are_the_single_views():
+@both
+@pytest.mark.parametrize("terminal", [True, False])
+def test_many_views_are_the_single_views(terminal, capfd, monkeypatch):
+    """With a progress bar in terminals, where it has a name."""
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal)
     caster = MeshCaster(cube())
     views = [(look(10 * i, 40 * i, 2 + 0.1 * i), 0.8) for i in range(6)]
+    capfd.readouterr()
     together = caster.render_views(views, 12, 18, supersample=2)
+    assert not capfd.readouterr().err
     for image, view in zip(together, views, strict=True):
         np.testing.assert_array_equal(image, caster.render(*view, 12, 18, 2))
     assert caster.render_views([], 12, 18).shape == (0, 12, 18, 4)
+    caster.render_views(views[:2], 4, 4, progress="bank of views")
+    assert ("bank of views" in capfd.readouterr().err) == terminal
 
 
 def orbit_tensors(*azimuths):
     azimuth = torch.tensor([float(a) for a in azimuths])
-    return cameras.orbit_c2w(
-        torch.zeros_like(azimuth), azimuth, torch.full_like(azimuth, 3)
-    ), torch.full_like(azimuth, 0.7)
+    distance = torch.full_like(azimuth, 3)
+    c2w = cameras.orbit_c2w(torch.zeros_like(azimuth), azimuth, distance)
+    return c2w, torch.full_like(azimuth, 0.7)
 
 
 def test_the_cache_returns_the_pictures_and_casts_each_once(monkeypatch):
@@ -216,20 +200,11 @@ def test_the_cache_is_bounded_and_drops_the_oldest_use():
     kept = {np.frombuffer(key[0], dtype=np.float32).tobytes() for key in cache._pictures}
     assert len(cache) == 3
     assert kept == {orbit_tensors(a)[0][0].numpy().tobytes() for a in (20, 0, 30)}
-    assert cache(*orbit_tensors(1, 2, 3, 4, 5), 4, 4).shape == (
-        5,
-        4,
-        4,
-        4,
-    )  # a batch larger than the cache
+    larger = cache(*orbit_tensors(1, 2, 3, 4, 5), 4, 4)  # a batch larger than the cache
+    assert larger.shape == (5, 4, 4, 4)
     cache(*orbit_tensors(5), 4, 4)
     cache(*orbit_tensors(5), 8, 4)
     assert len(cache) == 3
-
-
-def test_sizes_are_checked():
-    with pytest.raises(UserError, match="at least 1"):
-        MeshCaster(cube()).render(look(0, 0, 3), 0.7, 0, 8)
 
 
 def test_a_missing_embree_is_reported_once(caster_name, caplog):
@@ -237,19 +212,165 @@ def test_a_missing_embree_is_reported_once(caster_name, caplog):
     with caplog.at_level(logging.WARNING, logger=raycast.__name__):
         MeshCaster(cube())
         MeshCaster(cube())
-    lines = [
-        record.getMessage()
-        for record in caplog.records
-        if "pip install embreex" in record.getMessage()
-    ]
-    assert len(lines) == (1 if caster_name == "zbuffer" else 0)
+    said = caplog.text.count("pip install embreex")
+    assert said == (1 if caster_name == "zbuffer" else 0)
 
 
-@pytest.mark.parametrize("terminal", [True, False])
-def test_the_progress_bar_is_for_terminals(terminal, capfd, monkeypatch):
-    monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal)
-    views = [(look(0, 0, 3), 0.8)] * 2
-    MeshCaster(cube()).render_views(views, 4, 4, progress="bank of views")
-    assert ("bank of views" in capfd.readouterr().err) == terminal
-    MeshCaster(cube()).render_views(views, 4, 4)
-    assert not capfd.readouterr().err
+# ---- the z-buffer --------------------------------------------------------------------------------
+
+FOCAL = 20.0
+PLACES = np.arange(-16, 16) + 0.5
+
+
+def draw(vertices, faces, c2w=None, rows=PLACES, columns=PLACES):
+    """Return the hits of a camera, by default at the origin along -z."""
+    return ZBuffer(np.array(vertices, dtype=float), np.array(faces)).hits(
+        np.eye(4) if c2w is None else c2w, FOCAL, rows, columns
+    )
+
+
+def cast(vertices, faces, rows=PLACES, columns=PLACES):
+    """Return the nearest face of each sample by intersecting every ray with every triangle (Moeller
+    and Trumbore 1997), in float64.
+    """
+    y, x = np.meshgrid(-rows / FOCAL, columns / FOCAL, indexing="ij")
+    rays = np.stack([x, y, -np.ones_like(x)], axis=-1)[:, :, None]
+    a, b, c = np.moveaxis(np.array(vertices, dtype=float)[np.array(faces)], 1, 0)
+    p = np.cross(rays, c - a)
+    det = np.einsum("hwfc,fc->hwf", p, b - a)
+    u = np.einsum("hwfc,fc->hwf", p, -a) / det
+    q = np.cross(-a, b - a)
+    v = np.einsum("hwfc,fc->hwf", np.broadcast_to(rays, p.shape), q) / det
+    t = np.einsum("fc,fc->f", c - a, q) / det
+    depth = np.where((u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0), t, np.inf)
+    nearest = depth.argmin(axis=-1)
+    weights = np.take_along_axis(
+        np.stack([1 - u - v, u, v], axis=-1), nearest[..., None, None], axis=2
+    )[:, :, 0]
+    hit = np.isfinite(depth.min(axis=-1))
+    return np.where(hit, nearest, -1), np.where(hit[..., None], weights, 0)
+
+
+def soup(seed, count=150):
+    """Return random triangles on all sides of the camera, small and large; many cross its plane."""
+    rng = np.random.default_rng(seed)
+    corners = rng.normal(size=(count, 1, 3)) * 2 + rng.normal(size=(count, 3, 3)) * rng.uniform(
+        0.1, 0.6, (count, 1, 1)
+    )
+    return corners.reshape(-1, 3), np.arange(count * 3).reshape(count, 3)
+
+
+def assert_same(found, expected):
+    np.testing.assert_array_equal(found[0], expected[0])
+    np.testing.assert_allclose(found[1], expected[1], atol=1e-9)  # of a few units, in float64
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_triangles_through_the_camera_plane_are_what_single_rays_see(seed):
+    vertices, faces = soup(seed)
+    depth = vertices[faces][..., 2]
+    assert ((depth.min(axis=1) < 0) & (depth.max(axis=1) > 0)).sum() > 10
+    found = draw(vertices, faces)
+    assert len(np.unique(found[0])) > 8
+    assert_same(found, cast(vertices, faces))
+
+
+def test_working_in_small_steps_changes_nothing(monkeypatch):
+    vertices, faces = soup(7)
+    whole = draw(vertices, faces)
+    monkeypatch.setattr(raycast, "PAIRS_PER_STEP", 37)
+    assert_same(draw(vertices, faces), whole)
+    assert_same(draw(vertices, np.concatenate([faces, faces])), whole)  # of equals the first stays
+
+
+def test_a_moved_camera_sees_what_a_moved_mesh_shows():
+    vertices, faces = soup(3)
+    c2w = look(25, 70, 1.5)
+    assert_same(draw(vertices, faces, c2w), cast((vertices - c2w[:3, 3]) @ c2w[:3, :3], faces))
+
+
+def test_a_floor_below_the_camera_reaches_the_horizon_in_perspective():
+    """A huge floor at height -1 under a level camera covers all samples below the horizon, and the
+    weights reproduce the world positions.
+    """
+    vertices = np.array([[-1e3, -1, 1e3], [1e3, -1, 1e3], [0, -1, -1e6]])
+    face_index, weights = draw(vertices, [[0, 1, 2]], columns=PLACES / 20)
+    below = np.where(PLACES[:, None] > 0, 0, -1) * np.ones(32, int)
+    np.testing.assert_array_equal(face_index, below)
+    places = (weights @ vertices)[16:]
+    depth = FOCAL / PLACES[16:, None]  # weights of 1e-9 times 1e6 units
+    np.testing.assert_allclose(places[..., 2], -depth + np.zeros(32), rtol=1e-6)
+    np.testing.assert_allclose(places[..., 0], depth * PLACES / 20 / FOCAL, atol=1e-6)
+
+
+def test_what_is_nearer_than_the_near_plane_is_not_seen():
+    """One corner of the triangle is before that plane; the rest of it is visible."""
+    vertices = np.array([[-1.0, -1, -1], [1, -1, -1], [0, 1, -1]])
+    vertices *= np.array([[0.5], [2], [2]]) * raycast.NEAR
+    nearest, weights = cast(vertices, [[0, 1, 2]])
+    seen = (nearest >= 0) & (-(weights @ vertices)[..., 2] > raycast.NEAR)
+    assert 0 < seen.sum() < (nearest >= 0).sum()
+    np.testing.assert_array_equal(draw(vertices, [[0, 1, 2]])[0], np.where(seen, 0, -1))
+
+
+def test_behind_on_edge_and_degenerate_triangles_are_not_seen():
+    behind, on_edge = [[-9, -9, 1], [9, -9, 1], [0, 9, 1]], [[0, 0, -1], [0, 0, -5], [0, 9, -2]]
+    line, point = [[-1, -1, -2], [0, 0, -2], [1, 1, -2]], [[0, 0, -2]] * 3
+    for triangle in (behind, on_edge, line, point):
+        assert (draw(triangle, [[0, 1, 2]])[0] == -1).all()
+    face_index, weights = draw(np.zeros((0, 3)), np.zeros((0, 3), int))
+    assert (face_index == -1).all() and not weights.any()
+    assert draw(behind, [[0, 1, 2]], columns=PLACES[:0])[0].shape == (32, 0)
+
+
+def test_both_sides_are_seen_and_the_nearer_one_wins():
+    near, far = [[-9, -9, -2], [9, -9, -2], [0, 9, -2]], [[-9, -9, -3], [9, -9, -3], [0, 9, -3]]
+    for faces in ([[0, 1, 2], [3, 4, 5]], [[2, 1, 0], [5, 4, 3]]):
+        assert draw(near + far, faces)[0][16, 16] == 0
+        assert draw(far + near, faces)[0][16, 16] == 1
+    assert draw(near + near, [[0, 1, 2], [3, 4, 5]])[0][16, 16] == 0  # of equals the first
+
+
+def test_neighbours_leave_no_gap_on_samples_of_their_edges():
+    """A fan whose edges pass exactly through samples: its inside is covered completely."""
+    around = ((8, 0), (8, 8), (0, 8), (-8, 8), (-8, 0), (-8, -8), (0, -8), (8, -8))
+    ring = [[x, y, -FOCAL / 2] for x, y in around]
+    faces = [[0, 1 + i, 1 + (i + 1) % 8] for i in range(8)]
+    places = np.arange(-15.5, 16, 0.5)
+    face_index, weights = draw([[0, 0, -FOCAL / 2], *ring], faces, rows=places, columns=places)
+    assert (face_index >= 0).all()
+    assert weights.min() >= 0
+    np.testing.assert_allclose(weights.sum(axis=-1), 1, atol=1e-12)
+
+
+@pytest.fixture(scope="module")
+def toy():
+    pytest.importorskip("embreex")
+    return load_mesh("toy.glb")
+
+
+VIEWS = [(look(20, 30, 2.5), 50.0), (look(60, -75, 4.0), 40.0), (look(5, 100, 0.6), 90.0)]
+
+
+@pytest.mark.parametrize("view", range(len(VIEWS)))
+def test_the_toy_has_the_faces_that_embree_finds(toy, view):
+    c2w, degrees = VIEWS[view]
+    places = (np.arange(192) + 0.5) / 2 - 48
+    camera = c2w, 48 / math.tan(math.radians(degrees) / 2), places, places
+    expected, _ = raycast._embree_hits(raycast._embree_scene(toy), *camera)
+    found, _ = ZBuffer(toy.vertices, toy.faces).hits(*camera)
+    covered = (found >= 0) | (expected >= 0)
+    assert (found == expected)[covered].mean() > 0.995  # ties on edges; Embree's are float32
+
+
+def test_the_weights_give_the_places_that_embree_finds():
+    pytest.importorskip("embreex")
+    vertices, faces = soup(1)
+    camera = np.eye(4), FOCAL, PLACES, PLACES
+    scene = raycast._embree_scene(Mesh(vertices, faces))
+    expected, expected_weights = raycast._embree_hits(scene, *camera)
+    found, weights = draw(vertices, faces)
+    same = (found == expected) & (found >= 0)
+    assert same.sum() > 0.98 * (found >= 0).sum() > 200
+    # float32 on triangles seen nearly on edge
+    np.testing.assert_allclose(weights[same], expected_weights[same], atol=1e-4)

@@ -175,7 +175,7 @@ def test_a_texture_of_an_obj_that_is_no_picture_is_refused(name, content, tmp_pa
     (tmp_path / "a.mtl").write_text(f"newmtl m\nmap_Kd {name}\n")
     (tmp_path / "a.obj").write_text("mtllib a.mtl\n" + TRIANGLE)
     (tmp_path / name.strip()).write_bytes(content)
-    with pytest.raises(UserError, match=rf"{name.strip()}.* is in none of the formats PNG"):
+    with pytest.raises(UserError, match=rf"{name.strip()}.* in none of the formats PNG"):
         load_mesh(tmp_path / "a.obj")
 
 

@@ -1,4 +1,4 @@
-"""Textures hold the colours of the renders, and no gaps."""
+"""Texture coordinates give no texel to two faces; textures hold the colours of the renders."""
 
 import math
 
@@ -10,7 +10,16 @@ import trimesh
 from threestudio_gaussiandreamer.cameras import Orbit
 from threestudio_gaussiandreamer.meshes.mesh import Mesh, surface_colors
 from threestudio_gaussiandreamer.meshes.raycast import MeshCaster
-from threestudio_gaussiandreamer.surface.bake import bake, filled, in_charts, in_grid
+from threestudio_gaussiandreamer.surface.bake import (
+    SMALLEST_CELL,
+    XATLAS_FACES,
+    bake,
+    faces_that_fit,
+    filled,
+    in_charts,
+    in_grid,
+    unwrap,
+)
 from threestudio_gaussiandreamer.surface.fusion import Renders
 
 FOVY = math.radians(50)
@@ -80,3 +89,56 @@ def test_a_hidden_face_takes_the_colour_of_the_nearest_one():
     behind = np.flatnonzero(mesh.vertices[mesh.faces].mean(axis=1)[:, 0] < 0)
     colors = surface_colors(baked, behind, np.full((len(behind), 3), 1 / 3))
     assert (colors[:, 0] > 0.9).all() and (colors[:, 2] < 0.1).all()
+
+
+# ---- texture coordinates -------------------------------------------------------------------------
+
+BALL = trimesh.creation.icosphere(subdivisions=2)
+
+
+def texels_of(corners, size):
+    """Return the texels that bilinear lookup touches at many places of a triangle."""
+    weights = np.random.default_rng(0).dirichlet([0.4] * 3, 400)
+    places = np.concatenate([np.eye(3), weights]) @ corners * size - 0.5
+    first = np.floor(places + 1e-9).astype(int)
+    right, down = np.ceil(places - 1e-9).astype(int).T
+    columns, rows = first.T
+    pairs = [(x, y) for x in (columns, right) for y in (rows, down)]
+    return {texel for x, y in pairs for texel in zip(x, y, strict=True)}
+
+
+@pytest.mark.parametrize("method", [in_charts, in_grid])
+def test_faces_keep_their_corners_and_lie_in_the_texture(method):
+    found = method(BALL.vertices, BALL.faces, 128)
+    assert 0 <= found.uv.min() and found.uv.max() <= 1
+    corners = np.sort(found.rows[found.faces], axis=1)
+    np.testing.assert_array_equal(corners, np.sort(BALL.faces, axis=1))
+    again = trimesh.Trimesh(BALL.vertices[found.rows], found.faces, process=False)
+    assert again.volume == pytest.approx(BALL.volume)  # the orientation is kept too
+
+
+def test_triangles_of_the_grid_share_no_texel():
+    size = 2 * SMALLEST_CELL * 7
+    found = in_grid(BALL.vertices, BALL.faces[:90], size)
+    owners = {}
+    for face, corners in enumerate(found.uv[found.faces]):
+        for texel in texels_of(corners, size):
+            assert owners.setdefault(texel, face) == face
+    assert {0 <= x < size and 0 <= y < size for x, y in owners} == {True}
+
+
+def test_as_many_faces_fit_as_it_says():
+    size = 512
+    count = faces_that_fit(size)
+    assert count > XATLAS_FACES  # fewer are unwrapped to charts
+    faces = np.resize(BALL.faces, (count, 3))
+    uv = in_grid(BALL.vertices, faces, size).uv
+    assert uv.max() <= 1
+    legs = np.ptp(uv.reshape(count, 3, 2), axis=1) * size
+    assert legs.min() >= 2
+
+
+def test_many_faces_are_unwrapped_to_the_grid():
+    many = trimesh.creation.icosphere(subdivisions=4)
+    found = unwrap(many.vertices, many.faces, 512)
+    assert len(found.rows) == 3 * len(many.faces)  # every face for itself

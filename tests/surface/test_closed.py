@@ -52,18 +52,15 @@ def test_parts_above_the_share_stay(radius, dropped):
 
 
 @pytest.mark.parametrize("factor", [2.0**-20, 2.0**20])
-def test_simplification_is_the_same_at_any_size(factor):
+def test_simplified_meshes_stay_closed_and_keep_their_size_at_any_scale(factor):
     vertices, faces = ball()
     plain, scaled = simplified(vertices, faces, 300), simplified(factor * vertices, faces, 300)
     np.testing.assert_array_equal(scaled[0] / factor, plain[0])
     np.testing.assert_array_equal(scaled[1], plain[1])
-
-
-@pytest.mark.parametrize("count", [100, 300])
-def test_simplified_meshes_stay_closed_and_keep_their_size(count):
-    vertices, faces = simplified(*ball(), count)
-    assert len(faces) <= count and is_closed(faces)
-    assert trimesh.Trimesh(vertices, faces, process=False).volume == pytest.approx(4.12, rel=0.08)
+    for vertices, faces in (plain, simplified(*ball(), 100)):
+        assert len(faces) <= 300 and is_closed(faces)
+        found = trimesh.Trimesh(vertices, faces, process=False)
+        assert found.volume == pytest.approx(4.12, rel=0.08)
 
 
 def test_a_mesh_of_few_faces_is_left_as_it_is():
@@ -73,14 +70,11 @@ def test_a_mesh_of_few_faces_is_left_as_it_is():
     np.testing.assert_allclose(np.sort(again[0], axis=0), np.sort(vertices, axis=0))
 
 
-def test_more_parts_than_so_few_faces_can_close_are_refused():
+def test_what_cant_be_closed_is_refused():
     parts = joined(*(ball(subdivisions=1, place=(3 * k, 0, 0)) for k in range(60)))
     with pytest.raises(UserError, match="can't be closed with 100 faces"):
         simplified(*parts, 100)
-
-
-def test_a_surface_with_a_hole_is_refused():
-    vertices, faces = ball(subdivisions=1)
+    vertices, faces = ball(subdivisions=1)  # one with a hole
     with pytest.raises(UserError, match="closed with 5000 faces"):
         simplified(vertices, faces[1:], 5000)
 
@@ -139,7 +133,7 @@ def test_a_surface_that_passes_an_edge_twice_gets_another_vertex():
     assert volume == pytest.approx(cells.sum(), rel=0.05)
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(3))
 def test_random_cells_are_closed(seed):
     cells = np.random.default_rng(seed).random((5, 5, 5)) < 0.4
     vertices, faces = cells_to_mesh(cells)

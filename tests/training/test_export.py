@@ -31,7 +31,7 @@ def test_a_run_exports_the_pruned_cloud_too_and_so_does_export(tmp_path, painted
     export = run_folder(tmp_path) / "save" / "it4-export"
     assert len(read_gaussians(export / "gaussians.ply").means) == 200
     first = read_gaussians(export / "pruned" / "gaussians.ply")
-    assert len(first.means) == len(read_spz(export / "pruned" / "gaussians.spz").means) == 90
+    assert len(first.means) == len(read_spz(export / "pruned" / "gaussians.spz")[0].means) == 90
     report = json.loads((export / "pruned" / "report.json").read_text())
     assert (
         report["options"]["eps2d"] == 0.03 and report["options"]["antialias"]

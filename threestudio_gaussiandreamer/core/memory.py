@@ -1,5 +1,4 @@
-"""Reject options and files that need too much memory, before anything is allocated: options by
-what this machine has, files by their own size, since a small one can announce gigabytes."""
+"""Reject options that need more memory than this machine has, before anything is allocated."""
 
 import os
 from functools import cache
@@ -10,7 +9,6 @@ from .errors import UserError
 from .options import Rule, is_whole, rule, shown
 
 CGROUP_LIMIT = Path("/sys/fs/cgroup/memory.max")
-FIXED_BYTES, BYTES_PER_FILE_BYTE = 24 << 20, 64  # what reading a file may take
 
 
 @cache
@@ -65,25 +63,6 @@ def count_of(things: str, low: int, bytes_each: int) -> Rule:
         require_memory(path, bytes_each * value, f"{value} {things}")
 
     return rule(check)
-
-
-def require_file_memory(needed: int, file_size: int, name: str, content: str) -> None:
-    """Check what a file announces against the memory that reading a file of its size may take.
-
-    Args:
-        needed: bytes of memory that reading it takes, intermediate results included.
-        name: the file, for the message ("SPZ file 'a.spz'").
-        content: what is announced ("3000000 Gaussians").
-
-    Raises:
-        UserError: it needs more.
-    """
-    if needed > (budget := FIXED_BYTES + BYTES_PER_FILE_BYTE * file_size):
-        raise UserError(
-            f"{name}: {content} would take {size_text(needed)} of memory, but a file of "
-            f"{file_size} bytes may take {size_text(budget)} at most: it is damaged, or made to "
-            "fill the memory."
-        )
 
 
 def size_text(count: float) -> str:

@@ -29,9 +29,9 @@ from ..core import images as picture_files
 from ..core.errors import UserError
 from ..core.files import atomic_file
 from ..core.options import shown
-from ..formats.obj import write_obj
 from ..gaussians.gaussians import Gaussians, opaque
 from ..gaussians.surface import gaussian_surface
+from ..meshes.write import write_obj
 from .results import Pictures, Result, read_result
 
 RADIUS = 2.2

@@ -3,25 +3,9 @@
 An exporter is a subclass of the host's ``Exporter``, registered as ``<format>-exporter``. A call
 returns a list of ``ExporterOutput(save_name, save_type, params)``, and the system writes each with
 its method ``save_<save_type>(name, **params)``. ``gaussiandreamer-exporter`` writes several
-formats.
-
-==============  ========================  =========================================================
-format          file                      for
-==============  ========================  =========================================================
-ply             gaussians.ply             viewers of 3D Gaussian splatting
-spz             gaussians.spz             web viewers and phones, a quarter of the PLY's size; y up
-compressed-ply  gaussians.compressed.ply  SuperSplat, PlayCanvas, a quarter of the PLY's size; -y up
-sog             gaussians.sog             PlayCanvas and SuperSplat, the smallest; -y up
-glb             gaussians.glb             KHR_gaussian_splatting: Babylon.js, PlayCanvas; y up
-usda            gaussians.usda            OpenUSD 26.03: Omniverse, Houdini; y up
-points          points.ply                programs without Gaussians: their centres; z up
-surface         model.obj                 the surface with vertex colours, which T3Bench reads
-mesh            mesh.glb, mesh.obj        a closed mesh with a texture, with its MTL and PNG
-==============  ========================  =========================================================
-
-``save_name=x.spz.glb`` has SPZ inside, the only kind that CesiumJS reads, and ``x.usdz`` makes a
-USDZ, which phones open. GLB and USDA round nothing. The full name of ``mesh`` is
-``gaussiandreamer-mesh``, since threestudio has a ``mesh-exporter`` too.
+formats: ply, spz, compressed-ply, sog, glb, usda (docs/formats.md), points, surface, which T3Bench
+reads, and gaussiandreamer-mesh (docs/mesh.md); threestudio has a ``mesh-exporter`` too.
+``save_name=x.spz.glb`` has SPZ inside, the only kind that CesiumJS reads; ``x.usdz`` makes a USDZ.
 
 ==============  ===================================================================================
 option          meaning
@@ -45,8 +29,7 @@ unlit           (mesh) ask viewers to show the texture without lighting
 faces, ...      (mesh) the options of ``surface/textured.py``
 ==============  ===================================================================================
 
-docs/formats.md has sizes and the PSNR that is lost by rounding, docs/mesh.md the PSNR between mesh
-and cloud. A surface can't represent hair, smoke and glass as Gaussians do."""
+A surface can't represent hair, smoke and glass as Gaussians do."""
 
 import functools
 import os
@@ -62,7 +45,6 @@ from ..core.methods import find_method, require_dataclass, require_method
 from ..core.options import Rule, each, in_range, one_of, rule
 from ..formats.gaussian_files import FORMATS, StoredCloud, suffix_of
 from ..formats.glb import GLB_UP
-from ..formats.ply import padded_sh
 from ..formats.spz import VERSION, VERSIONS, require_version
 from ..gaussians.axes import AXES, VIEWER_UP, WORLD_UP, rotation_between
 from ..gaussians.densify import LOG_SCALE_RANGE
@@ -94,13 +76,13 @@ def require_file_name(option: str, name: str) -> None:
     """Raise UserError unless ``name``, the value of ``option``, is a valid name of a file directly
     in the export folder.
     """
-    if not name or name != os.path.basename(name) or name in (os.curdir, os.pardir):
-        raise UserError(f"{option}: expected the name of a file, without folders, got {name!r}")
-    if "\0" in name or len(name.encode(errors="surrogateescape")) > NAME_BYTES:
-        most = f"at most {NAME_BYTES} bytes and no NUL"
-        raise UserError(f"{option}: expected {most}, got {name[:80]!r}")
-    if name.casefold() in RESERVED:
-        raise UserError(f"{option}: {name!r} is a name that a run uses itself; choose another one")
+    folders = not name or name != os.path.basename(name) or name in (os.curdir, os.pardir)
+    long = "\0" in name or len(name.encode(errors="surrogateescape")) > NAME_BYTES
+    if folders or long or name.casefold() in RESERVED:
+        expected = f"a name that a run doesn't use itself ({', '.join(RESERVED)})"
+        expected = f"at most {NAME_BYTES} bytes and no NUL" if long else expected
+        expected = "the name of a file, without folders" if folders else expected
+        raise UserError(f"{option}: expected {expected}, got {name[:80]!r}")
 
 
 SAVE_NAME = rule(require_file_name)
@@ -144,11 +126,10 @@ def read_gaussians(geometry: Any) -> Gaussians:
 
 def require_export(exporter: type) -> None:
     """Raise UserError for a class of exporters that can't be called."""
-    if not isinstance(exporter, type):
-        raise UserError(f"an exporter is a {type(exporter).__name__}; register a class")
-    # the host's only raises an error
-    if find_method(exporter, "__call__") is find_method(Exporter, "__call__"):
-        raise UserError(f"{exporter.__name__} has no __call__(), which returns the files to write")
+    own = isinstance(exporter, type) and find_method(exporter, "__call__")
+    if not own or own is find_method(Exporter, "__call__"):  # the host's only raises an error
+        name = getattr(exporter, "__name__", type(exporter).__name__)
+        raise UserError(f"{name} has no __call__(), which returns the files to write")
     require_method(exporter, "__call__")
 
 
@@ -158,12 +139,13 @@ def outputs_of(exporter: Exporter) -> list[ExporterOutput]:
     Raises:
         UserError: it returns something else than a list of ExporterOutput.
     """
-    found, name = exporter(), type(exporter).__name__
+    found = exporter()
     is_list = isinstance(found, (list, tuple))
     for entry in found if is_list else [found]:
         if not isinstance(entry, ExporterOutput):
             what = f"{'entries of type ' if is_list else ''}{type(entry).__name__}"
-            raise UserError(f"{name} returned {what}; expected a list of ExporterOutput")
+            said = f"{type(exporter).__name__} returned {what}; expected a list of ExporterOutput"
+            raise UserError(said)
     return list(found)
 
 
@@ -190,7 +172,9 @@ def stored(suffix: str, *variants: str) -> Params:
 def ply(gaussians: Gaussians, cfg: Any) -> dict[str, Any]:
     cloud = StoredCloud(gaussians).in_axes(cfg.up)
     if cfg.pad_sh_degree is not None:
-        sh = np.ascontiguousarray(padded_sh(cloud.gaussians.sh, cfg.pad_sh_degree))
+        sh = cloud.gaussians.sh
+        missing = max((cfg.pad_sh_degree + 1) ** 2 - sh.shape[1], 0)
+        sh = np.pad(sh, ((0, 0), (0, missing), (0, 0)))
         cloud = cloud._replace(gaussians=cloud.gaussians._replace(sh=sh))
     return {"stored": cloud}
 

@@ -15,22 +15,18 @@ import pickle
 import pickletools
 import zipfile
 from collections.abc import Collection, Sequence
-from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
 from numpy.lib import format as npy
 
-from ..core.errors import UserError
-from ..core.memory import require_file_memory
+from .reading import Unreadable, reading, require, require_file_memory
 
 MOST_DEFLATE_SAVES = 1032
 """Bytes that one byte of a deflate stream stands for at most (zlib's technical notes)."""
 PACKINGS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 CONVERTED_BYTES = 16
 """Memory per number that is added to the budget for callers, which make two float64 copies."""
-
-
 PICKLES = (".pkl", ".pickle")
 """Extensions of pickles, whose oldest kind has no mark at its start."""
 
@@ -51,83 +47,60 @@ def read_arrays(
             holds other Python objects in its place, or needs more memory than the budget of its
             size.
     """
-    path, where = Path(path), f"{kind} {str(path)!r}"
-    try:
-        with open(path, "rb") as file:
-            start = file.read(len(npy.MAGIC_PREFIX))
+    with reading(path, kind) as path, open(path, "rb") as file:
+        start = file.read(len(npy.MAGIC_PREFIX))
+        file.seek(0)
+        size = os.fstat(file.fileno()).st_size
+        if start == npy.MAGIC_PREFIX:
+            if _read_header(file, size)[1].hasobject:
+                return _read_pickle(file.read(), required, optional)
             file.seek(0)
-            size = os.fstat(file.fileno()).st_size
-            if start == npy.MAGIC_PREFIX:
-                if not _read_header(file, size)[1].hasobject:
-                    file.seek(0)
-                    return {required[0]: _read_array(file, size, where)}
-                return _read_pickle(file.read(), where, required, optional)
-            if start[:1] == pickle.PROTO or path.suffix.lower() in PICKLES:
-                return _read_pickle(file.read(), where, required, optional)
-            with zipfile.ZipFile(file) as archive:
-                return _read_archive(archive, where, required, optional)
-    except UserError:
-        raise
-    except Exception as error:  # zipfile, zlib, ast and tokenize each raise errors of their own
-        raise UserError(
-            f"{where} can't be read: it is no NPZ or NPY file or pickled dict, or is damaged "
-            f"({type(error).__name__}: {error})"
-        ) from error
+            return {required[0]: _read_array(file, size)}
+        if start[:1] == pickle.PROTO or path.suffix.lower() in PICKLES:
+            return _read_pickle(file.read(), required, optional)
+        with zipfile.ZipFile(file) as archive:
+            return _read_archive(archive, size, required, optional)
+
+
+def _wanted(
+    found: Collection[Any], required: Sequence[str], optional: Collection[str]
+) -> list[str]:
+    """Return the names to read, after checking that all required ones are there."""
+    missing = ", ".join(repr(name) for name in required if name not in found)
+    require(not missing, f"it has no array {missing}, only {', '.join(map(str, found)) or 'none'}")
+    return [name for name in (*required, *optional) if name in found]
 
 
 def _read_archive(
-    archive: zipfile.ZipFile, where: str, required: Sequence[str], optional: Collection[str]
+    archive: zipfile.ZipFile, size: int, required: Sequence[str], optional: Collection[str]
 ) -> dict[str, np.ndarray]:
     members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
-    if missing := [name for name in required if name not in members]:
-        raise UserError(
-            f"{where} has no array {', '.join(map(repr, missing))}, only "
-            f"{', '.join(members) or 'none'}"
-        )
-    wanted = {name: members[name] for name in (*required, *optional) if name in members}
-    _require_memory(archive, wanted, where)
-    return {name: _read_member(archive, info, where) for name, info in wanted.items()}
-
-
-def _require_memory(
-    archive: zipfile.ZipFile, wanted: dict[str, zipfile.ZipInfo], where: str
-) -> None:
-    """Check the total size in the headers before any array is unpacked."""
-    needed = 0
-    for info in wanted.values():
-        with _open_member(archive, info, where) as file:
+    names = _wanted(members, required, optional)
+    needed, arrays = 0, {}
+    for name in names:  # the sizes of all, before any is unpacked
+        info = members[name]
+        usual = info.compress_type in PACKINGS
+        usual = usual and info.file_size <= MOST_DEFLATE_SAVES * info.compress_size
+        require(usual, f"it is damaged: {info.filename!r} can't be unpacked")
+        with archive.open(info) as file:
             shape, dtype = _read_header(file, info.file_size)
         needed += math.prod(shape) * (dtype.itemsize + CONVERTED_BYTES)
-    file_size = os.fstat(archive.fp.fileno()).st_size
-    require_file_memory(needed, file_size, where, f"the arrays {', '.join(wanted)}")
+    require_file_memory(needed, size, f"the arrays {', '.join(names)}")
+    for name in names:
+        with archive.open(members[name]) as file:
+            arrays[name] = _read_array(file, members[name].file_size)
+            file.read()  # at the end, zipfile compares the checksum
+    return arrays
 
 
-def _open_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo, where: str) -> IO[bytes]:
-    too_large = info.file_size > MOST_DEFLATE_SAVES * info.compress_size
-    if info.compress_type not in PACKINGS or too_large:
-        raise UserError(f"{where} is damaged: {info.filename!r} can't be unpacked")
-    return archive.open(info)
-
-
-def _read_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo, where: str) -> np.ndarray:
-    with _open_member(archive, info, where) as file:
-        array = _read_array(file, info.file_size, where)
-        file.read()  # at the end, zipfile compares the checksum
-    return array
-
-
-def _read_array(file: IO[bytes], size: int, where: str) -> np.ndarray:
+def _read_array(file: IO[bytes], size: int) -> np.ndarray:
     """Read the array in a stream; header and data must have ``size`` bytes together."""
     shape, dtype = _read_header(file, size)
-    if dtype.hasobject:
-        raise UserError(
-            f"{where} holds Python objects as a pickle, which could run code, and isn't opened"
-        )
-    if min(shape, default=0) < 0 or file.tell() + math.prod(shape) * dtype.itemsize != size:
-        raise UserError(
-            f"{where} is damaged: an array {shape} of {dtype} is announced, but the file is of "
-            "another size"
-        )
+    said = "it holds Python objects as a pickle, which could run code, and isn't opened"
+    require(not dtype.hasobject, said)
+    whole = min(shape, default=0) >= 0
+    whole = whole and file.tell() + math.prod(shape) * dtype.itemsize == size
+    require(whole, f"it is damaged: an array {shape} of {dtype} doesn't fill it")
     file.seek(0)
     return npy.read_array(file, allow_pickle=False)
 
@@ -135,8 +108,8 @@ def _read_array(file: IO[bytes], size: int, where: str) -> np.ndarray:
 def _read_header(file: IO[bytes], size: int) -> tuple[tuple[int, ...], np.dtype]:
     version = npy.read_magic(file)
     length_bytes = 2 if version == (1, 0) else 4
-    if int.from_bytes(file.read(length_bytes), "little") > size:
-        raise ValueError("the header is longer than the file")
+    length = int.from_bytes(file.read(length_bytes), "little")
+    require(length <= size, "the header is longer than the file")
     file.seek(-length_bytes, os.SEEK_CUR)
     # version 3 differs from 2 only in Unicode names of fields, which plain arrays don't have
     read = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
@@ -178,30 +151,24 @@ class _Unpickler(pickle.Unpickler):
 
 
 def _read_pickle(
-    data: bytes, where: str, required: Sequence[str], optional: Collection[str]
+    data: bytes, required: Sequence[str], optional: Collection[str]
 ) -> dict[str, np.ndarray]:
     for opcode, argument, _ in pickletools.genops(data):  # checks the sizes that it announces
-        if opcode.name in ("PUT", "LONG_BINPUT") and int(argument) > len(data):
-            raise UserError(f"{where} is damaged: it would fill the memory")
-    content = _plain(_Unpickler(io.BytesIO(data), encoding="latin1").load(), where, len(data))
+        too_large = opcode.name in ("PUT", "LONG_BINPUT") and int(argument) > len(data)
+        require(not too_large, "it is damaged: it would fill the memory")
+    content = _plain(_Unpickler(io.BytesIO(data), encoding="latin1").load(), len(data))
     if isinstance(content, list) and len(content) == 1:  # numpy.save's array of one dict
         content = content[0]
-    if not isinstance(content, dict):
-        raise UserError(f"{where} is a pickle of something else than a dict of arrays")
-    if missing := [name for name in required if name not in content]:
-        raise UserError(
-            f"{where} has no array {', '.join(map(repr, missing))}, only "
-            f"{', '.join(map(str, content)) or 'none'}"
-        )
-    names = [name for name in (*required, *optional) if name in content]
-    arrays = {name: np.array(_plain(content[name], where, len(data))) for name in names}
+    require(isinstance(content, dict), "it is a pickle of something else than a dict of arrays")
+    names = _wanted(content, required, optional)
+    arrays = {name: np.array(_plain(content[name], len(data))) for name in names}
     for name, values in arrays.items():
-        if values.dtype.hasobject:
-            raise UserError(f"{where} holds Python objects as {name!r}; an array was expected")
+        usual = not values.dtype.hasobject
+        require(usual, f"it holds Python objects as {name!r}; an array was expected")
     return arrays
 
 
-def _plain(value: Any, where: str, size: int) -> Any:
+def _plain(value: Any, size: int) -> Any:
     """Return what an object of a pickle of ``size`` bytes stands for; other values as they are."""
     if not isinstance(value, _Object):
         return value
@@ -212,18 +179,18 @@ def _plain(value: Any, where: str, size: int) -> Any:
     if value.kind == "_frombuffer":
         return _array(*value.made_from)
     if value.kind == "Ch":
-        return _plain(state["x"], where, size)
+        return _plain(state["x"], size)
     if value.kind == "Select":
-        source, rows = (_plain(state[name], where, size) for name in ("a", "idxs"))
+        source, rows = (_plain(state[name], size) for name in ("a", "idxs"))
         return np.ravel(source)[rows].reshape(state["preferred_shape"])
     if value.kind in ("csc_matrix", "csr_matrix"):
         from scipy import sparse
 
         shape = state.get("_shape", state.get("shape"))
-        require_file_memory(3 * 8 * math.prod(shape), size, where, f"a sparse matrix {shape}")
-        parts = [_plain(state[name], where, size) for name in ("data", "indices", "indptr")]
+        require_file_memory(3 * 8 * math.prod(shape), size, f"a sparse matrix {shape}")
+        parts = [_plain(state[name], size) for name in ("data", "indices", "indptr")]
         return getattr(sparse, value.kind)(tuple(parts), shape).toarray()
-    raise UserError(f"{where} holds an object {value.kind[:60]!r}; an array was expected")
+    raise Unreadable(f"it holds an object {value.kind[:60]!r}; an array was expected")
 
 
 def _array(data: Any, kind: _Object, shape: tuple[int, ...], order: str) -> Any:

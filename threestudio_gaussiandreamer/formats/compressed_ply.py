@@ -12,24 +12,21 @@ sh          f_rest as bytes; absent at degree 0: 256 (f_rest / 8 + 0.5)
 
 Described in PlayCanvas' manual, "The Compressed PLY Format"; axes as those of a PLY."""
 
-import logging
 import os
 from collections.abc import Sequence
 from math import ceil, sqrt
 from pathlib import Path
-from typing import BinaryIO, NoReturn
 
 import numpy as np
 from jaxtyping import Float, Integer
 
-from ..core.errors import UserError
-from ..core.files import atomic_file, existing_file
+from ..core.files import atomic_file
 from ..gaussians.gaussians import Gaussians, finite
 from ..gaussians.sh import COEFFICIENTS, rgb_to_sh0, sh0_to_rgb
 from . import packing
-from .ply import BYTE_ORDERS, Element, read_header
+from .ply import header_bytes, header_of, read_header, read_rows
+from .reading import reading, require
 
-logger = logging.getLogger(__name__)
 CHUNK = 256
 """Gaussians of a chunk."""
 LIMITS = tuple(
@@ -65,8 +62,12 @@ def write_compressed_ply(
     count, coefficients = len(gaussians.means), 3 * (gaussians.sh.shape[1] - 1)
     values = _chunked_values(gaussians)
     limits = _limits(values)
+    elements = [("chunk", len(limits), [(name, "float") for name in LIMITS])]
+    elements += [("vertex", count, [(name, "uint") for name in PACKED])]
+    harmonics = [(f"f_rest_{index}", "uchar") for index in range(coefficients)]
+    elements += [("sh", count, harmonics)] if coefficients else []
     with atomic_file(path) as file:
-        file.write(_header(count, len(limits), coefficients, comments))
+        file.write(header_bytes(elements, comments))
         file.write(limits.astype("<f4").tobytes())
         file.write(_packed(gaussians, values, limits).tobytes())
         file.write(_harmonic_bytes(gaussians.sh[:, 1:]).tobytes())
@@ -74,13 +75,9 @@ def write_compressed_ply(
 
 def is_compressed_ply(path: str | os.PathLike) -> bool:
     """Return whether the file is a PLY with the elements of a compressed one."""
-    try:
-        with open(path, "rb") as file:
-            elements = {entry.name: entry for entry in read_header(file, str(path)).elements}
-    except (OSError, UserError):
-        return False
-    vertices = elements.get("vertex")
-    return "chunk" in elements and vertices is not None and _names(vertices)[:1] == PACKED[:1]
+    header = header_of(path)
+    found = {element.name: element.properties for element in header.elements} if header else {}
+    return "chunk" in found and [entry.name for entry in found.get("vertex", [])][:1] == [PACKED[0]]
 
 
 def read_compressed_ply(path: str | os.PathLike) -> Gaussians:
@@ -89,14 +86,8 @@ def read_compressed_ply(path: str | os.PathLike) -> Gaussians:
     Raises:
         UserError: there is no such file, it is no compressed PLY, or it is damaged.
     """
-    path = existing_file(path, "compressed PLY")
-    try:
-        with open(path, "rb") as file:
-            elements = _read_elements(file, path)
-    except OSError as error:
-        raise UserError(f"cannot read {str(path)!r}: {error.strerror or error}.") from error
-    with np.errstate(invalid="ignore", over="ignore"):  # limits of damaged files
-        return _decoded(elements)
+    with reading(path, "compressed PLY") as file:
+        return _decoded(_read_elements(file))
 
 
 def _decoded(elements: dict[str, np.ndarray]) -> Gaussians:
@@ -115,16 +106,6 @@ def _decoded(elements: dict[str, np.ndarray]) -> Gaussians:
 
 
 # ---- writing -------------------------------------------------------------------------------------
-
-
-def _header(count: int, chunks: int, coefficients: int, comments: Sequence[str]) -> bytes:
-    lines = ["ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in comments)]
-    lines += [f"element chunk {chunks}", *(f"property float {name}" for name in LIMITS)]
-    lines += [f"element vertex {count}", *(f"property uint {name}" for name in PACKED)]
-    if coefficients:
-        lines += [f"element sh {count}"]
-        lines += [f"property uchar f_rest_{index}" for index in range(coefficients)]
-    return ("\n".join([*lines, "end_header"]) + "\n").encode("ascii")
 
 
 def _chunked_values(gaussians: Gaussians) -> Float[np.ndarray, "C 256 3 3"]:
@@ -185,53 +166,32 @@ def _harmonic_bytes(rest: Float[np.ndarray, "N K 3"]) -> Integer[np.ndarray, "N 
 # ---- reading -------------------------------------------------------------------------------------
 
 
-def _fail(path: Path, problem: str) -> NoReturn:
-    raise UserError(f"compressed PLY {str(path)!r}: {problem}")
-
-
-def _names(element: Element) -> tuple[str, ...]:
-    return tuple(entry.name for entry in element.properties)
-
-
-def _read_elements(file: BinaryIO, path: Path) -> dict[str, np.ndarray]:
+def _read_elements(path: Path) -> dict[str, np.ndarray]:
     """Read each element as an array (rows, columns), after checking the header."""
-    header = read_header(file, str(path))
-    order = BYTE_ORDERS[header.encoding]
-    if not order:
-        _fail(path, "it is text; a binary file was expected.")
-    _check_layout(header.elements, path)
-    size = os.fstat(file.fileno()).st_size
-    found = {}
-    for element in header.elements:
-        kind = np.dtype(order + element.properties[0].type)
-        shape = element.count, len(element.properties)
-        needed = kind.itemsize * shape[0] * shape[1]
-        if needed > size - file.tell():
-            what = f"{element.count} rows of {element.name!r} are announced"
-            _fail(path, f"{what}, but the file ends before: it is truncated or damaged.")
-        found[element.name] = np.frombuffer(file.read(needed), kind).reshape(shape)
-    if more := size - file.tell():
-        logger.warning("compressed PLY %r: %d bytes follow its elements", str(path), more)
-    return found
-
-
-def _check_layout(elements: list[Element], path: Path) -> None:
-    shapes = {entry.name: (_names(entry), {p.type for p in entry.properties}) for entry in elements}
-    counts = {entry.name: entry.count for entry in elements}
-    if len(shapes) < len(elements) or not {"chunk", "vertex"} <= set(shapes) <= {
-        *("chunk", "vertex", "sh")
-    }:
-        _fail(path, f"its elements are {', '.join(shapes)[:80]}; chunk, vertex, sh were expected.")
-    known = [(names, {"f4"}) for names in (LIMITS, LIMITS[:WITHOUT_COLORS])]
-    rest = [tuple(f"f_rest_{i}" for i in range(3 * (k - 1))) for k in COEFFICIENTS[1:]]
-    fits = shapes["chunk"] in known and shapes["vertex"] == (PACKED, {"u4"})
-    if not fits or "sh" in shapes and shapes["sh"] not in [(names, {"u1"}) for names in rest]:
-        _fail(path, "its properties aren't those of the format, in the format's order.")
-    if any(entry.has_lists for entry in elements):
-        _fail(path, "it has lists, which the format hasn't.")
-    count = counts["vertex"]
-    if counts["chunk"] != ceil(count / CHUNK) or counts.get("sh", count) != count:
-        _fail(path, f"{counts['chunk']} chunks don't fit {count} Gaussians: it is damaged.")
+    with open(path, "rb") as file:
+        header = read_header(file)
+        elements = {entry.name: entry for entry in header.elements}
+        known = {(*elements,)} & {("chunk", "vertex"), ("chunk", "vertex", "sh")}
+        require(
+            bool(known) and header.encoding != "ascii", "it isn't binary, or has other elements"
+        )
+        count = elements["vertex"].count
+        rest = [tuple(f"f_rest_{i}" for i in range(3 * (k - 1))) for k in COEFFICIENTS[1:]]
+        layouts = {
+            "chunk": ((LIMITS, LIMITS[:WITHOUT_COLORS]), "f4", ceil(count / CHUNK)),
+            "vertex": ((PACKED,), "u4", count),
+            "sh": (rest, "u1", count),
+        }
+        found = {}
+        for element in header.elements:
+            layouts_known, kind, rows = layouts[element.name]
+            names = tuple(entry.name for entry in element.properties)
+            usual = all(entry.type == kind and not entry.count_type for entry in element.properties)
+            said = f"{element.name!r} has other properties than those of the format, or other rows"
+            require(usual and names in layouts_known and element.count == rows, said)
+            columns = read_rows(file, element, header.encoding).values()
+            found[element.name] = np.stack(list(columns), axis=1)
+        return found
 
 
 def _chunk_limits(chunks: Float[np.ndarray, "C L"]) -> Float[np.ndarray, "C 3 2 3"]:

@@ -7,27 +7,28 @@ Gaussian splatting and its viewers. The same axes are written by default."""
 
 import logging
 import re
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection
 from pathlib import Path
-from typing import Any, NamedTuple, Optional
+from typing import NamedTuple, Optional
 
 from ..core.errors import UserError, unknown
 from ..core.files import existing_file
 from ..gaussians.axes import AXES, VIEWER_UP, WORLD_UP, rotate, rotation_between
 from ..gaussians.gaussians import Gaussians, drawable
-from . import spz
 from .compressed_ply import is_compressed_ply, read_compressed_ply, write_compressed_ply
-from .glb import GLB_UP, load_glb, write_glb, write_spz_glb
+from .glb import GLB_UP, read_glb, write_glb, write_spz_glb
+from .packing import ANTIALIASED
 from .ply import (
-    gaussians_size,
+    gaussian_properties,
+    header_bytes,
     is_gaussian_ply,
     read_comments,
     read_gaussians,
     write_gaussians,
 )
-from .sog import SOG_UP, load_sog, write_sog
+from .sog import SOG_UP, read_sog, write_sog
 from .splat import read_ksplat, read_splat
-from .spz import SPZ_UP, load_spz, read_spz_comment, spz_arrays, spz_bytes, write_spz
+from .spz import SPZ_UP, VERSION, read_spz, spz_arrays, spz_bytes, write_spz
 from .usda import USDA_UP, read_usd, write_usda, write_usdz
 
 logger = logging.getLogger(__name__)
@@ -36,11 +37,8 @@ UP, PRUNED = "up:", "pruned to the likeness, dB:"
 """Keys of the comments in files; the second is the PSNR to the original cloud."""
 VERTICAL_AXIS = "Vertical Axis:"
 """Nerfstudio's key for the up axis."""
-ANTIALIASED = "SplatRenderMode: mip"
-"""The comment by which Brush, SuperSplat and splat-transform tag clouds trained with antialiasing.
-"""
 RENDER_MODE = re.compile(r"splatrendermode: *(\w+)|antialiased ([01])", re.IGNORECASE)
-"""That comment, or Postshot's."""
+"""``ANTIALIASED``, or Postshot's comment."""
 
 
 class StoredCloud(NamedTuple):
@@ -88,42 +86,21 @@ def _read_ply(path: Path) -> Content:
     return read_gaussians(path, allow_non_finite=True), read_comments(path)
 
 
-def _read_spz(path: Path) -> Content:
-    gaussians, antialiased = load_spz(path)
-    notes = [ANTIALIASED] if antialiased else []
-    return gaussians, read_spz_comment(path).split("; ") + notes
-
-
-def _read_sog(path: Path) -> Content:
-    gaussians, antialiased, notes = load_sog(path)
-    return gaussians, notes + ([ANTIALIASED] if antialiased else [])
-
-
-def _write_spz(path: str, gaussians: Gaussians, notes: Sequence[str], **options: Any) -> None:
-    antialiased, comment = ANTIALIASED in notes, _without_mode(notes)
-    write_spz(path, gaussians, comment=comment, antialiased=antialiased, **options)
-
-
-def _write_sog(path: str, gaussians: Gaussians, notes: Sequence[str]) -> None:
-    others = [note for note in notes if note != ANTIALIASED]
-    write_sog(path, gaussians, antialiased=ANTIALIASED in notes, notes=others)
-
-
 FORMATS = {
     ".ply": CloudFormat(VIEWER_UP, _read_ply, write_gaussians, any_up=True),
     ".compressed.ply": CloudFormat(VIEWER_UP, _read_ply, write_compressed_ply, any_up=True),
-    ".spz": CloudFormat(SPZ_UP, _read_spz, _write_spz),
-    ".sog": CloudFormat(SOG_UP, _read_sog, _write_sog),
-    ".glb": CloudFormat(GLB_UP, load_glb, write_glb),
-    ".spz.glb": CloudFormat(GLB_UP, load_glb, write_spz_glb),
-    ".gltf": CloudFormat(GLB_UP, load_glb, None),
+    ".spz": CloudFormat(SPZ_UP, read_spz, write_spz),
+    ".sog": CloudFormat(SOG_UP, read_sog, write_sog),
+    ".glb": CloudFormat(GLB_UP, read_glb, write_glb),
+    ".spz.glb": CloudFormat(GLB_UP, read_glb, write_spz_glb),
+    ".gltf": CloudFormat(GLB_UP, read_glb, None),
     ".usda": CloudFormat(USDA_UP, read_usd, write_usda),
     ".usdz": CloudFormat(USDA_UP, read_usd, write_usdz),
     ".usdc": CloudFormat(USDA_UP, read_usd, None),
     ".usd": CloudFormat(USDA_UP, read_usd, None),
-    "meta.json": CloudFormat(SOG_UP, _read_sog, None),
-    ".ksplat": CloudFormat(VIEWER_UP, lambda path: (read_ksplat(path), []), None),
-    ".splat": CloudFormat(VIEWER_UP, lambda path: (read_splat(path), []), None),
+    "meta.json": CloudFormat(SOG_UP, read_sog, None),
+    ".ksplat": CloudFormat(VIEWER_UP, read_ksplat, None),
+    ".splat": CloudFormat(VIEWER_UP, read_splat, None),
 }
 """By extension."""
 READ = tuple(FORMATS)
@@ -171,10 +148,8 @@ def require_format(name: str, option: str, formats: Collection[str] = WRITTEN) -
     suffix = suffix_of(name)
     if suffix not in formats:
         *others, last = formats
-        raise UserError(
-            f"{option}: expected the name of a {', '.join(others)} or {last} file, got {name!r}"
-            f"{conversion(name)}"
-        )
+        expected = f"expected the name of a {', '.join(others)} or {last} file"
+        raise UserError(f"{option}: {expected}, got {name!r}{conversion(name)}")
     return suffix
 
 
@@ -206,18 +181,17 @@ def read_stored(file: Path, *, up: Optional[str] = None) -> StoredCloud:
     if up is not None and up not in AXES:
         raise unknown("axis", up, AXES)
     up = up or (stated_up(notes) if known.any_up else None) or known.up
-    return StoredCloud(gaussians, up, _number(_note(notes, PRUNED)), _stated_mode(notes))
+    pruned = _note(notes, PRUNED)  # the file may be from another program
+    pruned_to = float(pruned) if re.fullmatch(r"\d{1,4}(\.\d{1,9})?", pruned) else None
+    return StoredCloud(gaussians, up, pruned_to, _stated_mode(notes))
 
 
 def stated_up(notes: list[str]) -> Optional[str]:
     """Return the up axis in a file's comments, or None if they have none that is known."""
     stated = (_note(notes, UP) or _note(notes, VERTICAL_AXIS)).lower()
     if stated and stated not in AXES:
-        logger.warning(
-            "the up axis in the file's comment %r is none of %s: it is ignored",
-            f"{UP} {stated[:40]}",
-            ", ".join(AXES),
-        )
+        said = "the up axis in the file's comment %r is none of %s: it is ignored"
+        logger.warning(said, f"{UP} {stated[:40]}", ", ".join(AXES))
     return stated if stated in AXES else None
 
 
@@ -233,20 +207,13 @@ def is_antialiased(path: Path) -> bool:
 
 def _note(notes: list[str], key: str) -> str:
     """Return the text after ``key`` in the last note that begins with it; empty if none does."""
-    return next(
-        (note.removeprefix(key).strip() for note in reversed(notes) if note.startswith(key)), ""
-    )
+    return ([""] + [note.removeprefix(key).strip() for note in notes if note.startswith(key)])[-1]
 
 
 def _stated_mode(notes: list[str]) -> bool:
     """Return whether the last note about it says that the cloud was trained with antialiasing."""
     modes = [found for note in notes if (found := RENDER_MODE.fullmatch(note.strip()))]
     return bool(modes) and "".join(filter(None, modes[-1].groups())).lower() in ("mip", "1")
-
-
-def _number(text: str) -> Optional[float]:
-    """Parse the number in a note, or return None; the file may be from another program."""
-    return float(text) if re.fullmatch(r"\d{1,4}(\.\d{1,9})?", text) else None
 
 
 # ---- writing -------------------------------------------------------------------------------------
@@ -257,7 +224,7 @@ def write_cloud(
     cloud: StoredCloud,
     suffix: Optional[str] = None,
     *,
-    spz_version: int = spz.VERSION,
+    spz_version: int = VERSION,
     spz_up: str = SPZ_UP,
 ) -> None:
     """Write a cloud: a PLY in the cloud's axes, other formats in their own.
@@ -275,41 +242,29 @@ def write_cloud(
     known = FORMATS[suffix]
     options = {"version": spz_version, "up": spz_up} if suffix == ".spz" else {}
     stored = cloud if known.any_up else cloud.in_axes(options.get("up", known.up))
-    known.write(path, stored.gaussians, _notes(stored, known), **options)
+    known.write(path, stored.gaussians, notes_of(stored, suffix), **options)
 
 
-def _notes(cloud: StoredCloud, known: CloudFormat) -> list[str]:
-    """Return what a file says about a cloud besides its Gaussians."""
+def notes_of(cloud: StoredCloud, suffix: str) -> list[str]:
+    """Return what a file of a format says about a cloud besides its Gaussians."""
     pruned = [] if cloud.pruned_to is None else [f"{PRUNED} {cloud.pruned_to:.6g}"]
-    up = [f"{UP} {cloud.up}"] if known.any_up else []
+    up = [f"{UP} {cloud.up}"] if FORMATS[suffix].any_up else []
     return [*up, *pruned, *([ANTIALIASED] if cloud.antialiased else [])]
-
-
-def ply_notes(cloud: StoredCloud) -> list[str]:
-    """Return the comments about a cloud in the header of its PLY."""
-    return _notes(cloud, FORMATS[".ply"])
-
-
-def spz_note(cloud: StoredCloud) -> str:
-    """Return the comment about a cloud in its SPZ file: the PSNR of pruning, or nothing."""
-    return _without_mode(_notes(cloud, FORMATS[".spz"]))
-
-
-def _without_mode(notes: Sequence[str]) -> str:
-    """Join notes for an SPZ, which has a flag for antialiasing."""
-    return "; ".join(note for note in notes if note != ANTIALIASED)
 
 
 def file_size(cloud: StoredCloud, suffix: str) -> int:
     """Return the size in bytes of the PLY or SPZ file that :func:`write_cloud` would write."""
     if suffix == ".spz":
-        return len(spz_bytes(cloud.in_axes(SPZ_UP).gaussians, comment=spz_note(cloud)))
-    return gaussians_size(*cloud.gaussians.sh.shape[:2], ply_notes(cloud))
+        return len(spz_bytes(cloud.in_axes(SPZ_UP).gaussians, notes_of(cloud, suffix)))
+    count, harmonics = cloud.gaussians.sh.shape[:2]
+    properties = gaussian_properties(harmonics)
+    header = header_bytes([("vertex", count, properties)], notes_of(cloud, suffix))
+    return len(header) + 4 * len(properties) * count
 
 
 def as_stored(cloud: StoredCloud, suffix: str) -> StoredCloud:
     """Return the cloud as it would be read back from a PLY or SPZ file; SPZ reorders it too."""
     if suffix == ".ply":
         return cloud
-    packed = spz_bytes(cloud.in_axes(SPZ_UP).gaussians)
-    return cloud._replace(gaussians=spz_arrays(packed), up=SPZ_UP).in_axes(cloud.up)
+    read, _ = spz_arrays(spz_bytes(cloud.in_axes(SPZ_UP).gaussians))
+    return cloud._replace(gaussians=read, up=SPZ_UP).in_axes(cloud.up)

@@ -22,12 +22,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from ..core.files import existing_file
-from ..core.memory import require_file_memory
 from ..gaussians.axes import placed, rotate
 from ..gaussians.gaussians import Gaussians, finite, joined
 from ..gaussians.sh import COEFFICIENTS, sh0_colors
-from ..meshes.gltf import Document, parse_errors, world_matrices
+from ..meshes.gltf import Document, World, world_matrices
 from ..meshes.mesh import srgb_to_linear
 from ..meshes.write import write_glb_file
 from .packing import (
@@ -39,6 +37,7 @@ from .packing import (
     to_byte,
     unit_quats,
 )
+from .reading import reading, require, require_file_memory
 from .spz import spz_arrays, spz_bytes
 
 logger = logging.getLogger(__name__)
@@ -103,33 +102,29 @@ def write_spz_glb(path: str | os.PathLike, gaussians: Gaussians, notes: Sequence
     write_glb_file(path, document, blocks)
 
 
-def read_glb(path: str | os.PathLike) -> Gaussians:
-    """Read the Gaussians of a GLB or glTF file; see :func:`load_glb`."""
-    return load_glb(path)[0]
-
-
-def load_glb(path: str | os.PathLike) -> tuple[Gaussians, list[str]]:
+def read_glb(path: str | os.PathLike) -> tuple[Gaussians, list[str]]:
     """Read the Gaussians of all nodes of the default scene, with y up, and the notes of our writer.
 
     Raises:
         UserError: there is no such file, it is damaged, holds no Gaussians, or
             Gaussians that aren't supported.
     """
-    path = existing_file(path, "GLB file")
-    with parse_errors(path):
-        document = Document(path)
+    with reading(path, "GLB file") as file:
+        document = Document(file)
         found = list(_primitives(document))
-        _require_memory(document, [primitive for primitive, _ in found])
+        counts = [document.count(item["attributes"]["POSITION"]) for item, _ in found]
+        each = [DECODED_BYTES + DECODED_BYTES_PER_HARMONIC * _harmonics(item) for item, _ in found]
+        needed = sum(a * b for a, b in zip(counts, each, strict=True))
+        require_file_memory(needed, file.stat().st_size, f"{sum(counts)} Gaussians")
         parts = [
             placed(_read_primitive(document, primitive), world, f"GLB file {str(path)!r}")
             for primitive, world in found
         ]
-        if not parts and EXTENSION not in document.json.get("extensionsUsed", []):
-            document.fail(f"no primitive has the extension {EXTENSION}: it holds no Gaussians")
-        asset = document.json["asset"]
-    extras = asset.get("extras")
-    notes = extras.get("notes") if isinstance(extras, dict) else None
-    gaussians = joined(parts)
+        known = bool(parts) or EXTENSION in document.json.get("extensionsUsed", [])
+        require(known, f"no primitive has the extension {EXTENSION}: it holds no Gaussians")
+        asset, gaussians = document.json["asset"], joined(parts)
+        extras = asset.get("extras")
+        notes = extras.get("notes") if isinstance(extras, dict) else None
     if str(asset.get("generator")).startswith(TURNED_GENERATOR):
         gaussians = rotate(gaussians, HALF_TURN)
     return gaussians, [str(note) for note in notes] if isinstance(notes, list) else []
@@ -177,7 +172,12 @@ def _document(
         "mode": POINTS,
         "extensions": {EXTENSION: SPLATTING},
     }
-    accessors = [_accessor(index, values) for index, values in enumerate(attributes.values())]
+    accessors = []
+    for index, values in enumerate(attributes.values()):
+        is_byte = values.dtype == np.uint8
+        kind = {"bufferView": index, "componentType": BYTE if is_byte else FLOAT}
+        kind |= {"count": len(values), "type": TYPES[values.shape[1]]}
+        accessors.append(kind | ({"normalized": True} if is_byte else {}))
     accessors[0] |= {"min": means.min(axis=0).tolist(), "max": means.max(axis=0).tolist()}
     return head | {
         "scenes": [{"nodes": [0]}],
@@ -188,25 +188,10 @@ def _document(
     }
 
 
-def _accessor(view: int, values: np.ndarray) -> dict[str, Any]:
-    is_byte = values.dtype == np.uint8
-    return {
-        "bufferView": view,
-        "componentType": BYTE if is_byte else FLOAT,
-        "count": len(values),
-        "type": TYPES[values.shape[1]],
-        **({"normalized": True} if is_byte else {}),
-    }
-
-
 # ---- reading -------------------------------------------------------------------------------------
 
 
-Primitive = dict[str, Any]
-World = Float[np.ndarray, "4 4"]
-
-
-def _primitives(document: Document) -> Iterator[tuple[Primitive, World]]:
+def _primitives(document: Document) -> Iterator[tuple[dict[str, Any], World]]:
     """Yield each primitive that holds Gaussians, and its node's matrix to world coordinates."""
     for node, world in world_matrices(document).items():
         entry = document.entry("nodes", node)
@@ -216,33 +201,19 @@ def _primitives(document: Document) -> Iterator[tuple[Primitive, World]]:
                     yield primitive, world
 
 
-def _require_memory(document: Document, primitives: list[Primitive]) -> None:
-    """Check the memory for the Gaussians of all primitives; one that several nodes use counts for
-    each of them.
-    """
-    counts = [document.count(item["attributes"]["POSITION"]) for item in primitives]
-    needed = sum(
-        count * (DECODED_BYTES + DECODED_BYTES_PER_HARMONIC * _harmonics(item))
-        for count, item in zip(counts, primitives, strict=True)
-    )
-    size, name = document.path.stat().st_size, f"GLB file {str(document.path)!r}"
-    require_file_memory(needed, size, name, f"{sum(counts)} Gaussians")
-
-
-def _harmonics(primitive: Primitive) -> int:
+def _harmonics(primitive: dict[str, Any]) -> int:
     """Return the number of harmonics, by the highest degree whose last coefficient is present."""
     found = [k for k in COEFFICIENTS if _semantics(k)[-1] in primitive["attributes"]]
     return max(found, default=COEFFICIENTS[0])
 
 
-def _read_primitive(document: Document, primitive: Primitive) -> Gaussians:
+def _read_primitive(document: Document, primitive: dict[str, Any]) -> Gaussians:
     extension = primitive["extensions"][EXTENSION]
     kernel = extension.get("kernel", SPLATTING["kernel"])
-    if kernel != SPLATTING["kernel"]:
-        document.fail(f"its Gaussians have the kernel {str(kernel)[:40]!r}; 'ellipse' was expected")
-    inner = extension.get("extensions", {})
-    read = _read_spz if SPZ in inner else _read_plain
-    gaussians = read(document, primitive)
+    said = f"its Gaussians have the kernel {str(kernel)[:40]!r}; 'ellipse' was expected"
+    require(kernel == SPLATTING["kernel"], said)
+    read = _read_spz if SPZ in extension.get("extensions", {}) else _read_plain
+    gaussians = read(document, primitive["attributes"], extension)
     space = extension.get("colorSpace", SPLATTING["colorSpace"])
     if is_linear(space):
         return displayed(gaussians, str(document.path))
@@ -251,40 +222,40 @@ def _read_primitive(document: Document, primitive: Primitive) -> Gaussians:
     return gaussians
 
 
-def _read_spz(document: Document, primitive: Primitive) -> Gaussians:
-    extension = primitive["extensions"][EXTENSION]
+def _read_spz(
+    document: Document, attributes: dict[str, int], extension: dict[str, Any]
+) -> Gaussians:
     view, _ = document.view(extension["extensions"][SPZ].get("bufferView"))
-    gaussians = spz_arrays(bytes(view), str(document.path))
-    count = document.count(primitive["attributes"]["POSITION"])
-    if len(gaussians.means) != count:
-        document.fail(f"its SPZ has {len(gaussians.means)} rows for {count} Gaussians")
+    gaussians, _ = spz_arrays(bytes(view))
+    count = document.count(attributes["POSITION"])
+    said = f"its SPZ has {len(gaussians.means)} rows for {count} Gaussians"
+    require(len(gaussians.means) == count, said)
     return rotate(gaussians, HALF_TURN) if "kernel" in extension else gaussians
 
 
-def _read_plain(document: Document, primitive: Primitive) -> Gaussians:
-    attributes = primitive["attributes"]
+def _read_plain(
+    document: Document, attributes: dict[str, int], extension: dict[str, Any]
+) -> Gaussians:
     count = document.count(attributes["POSITION"])
     stored = document.entry("accessors", attributes["POSITION"])
-    inner = primitive["extensions"][EXTENSION].get("extensions", {})
-    if inner and not {"bufferView", "sparse"} & stored.keys():
-        document.fail(f"its Gaussians are compressed by {list(inner)[0][:80]}, which isn't read")
+    inner = extension.get("extensions", {})
+    packed = inner and not {"bufferView", "sparse"} & stored.keys()
+    require(not packed, f"its Gaussians are compressed by {str([*inner])[:80]}, which isn't read")
 
     def rows(semantic: str, kind: str) -> np.ndarray:
-        if semantic not in attributes:
-            document.fail(f"its Gaussians lack the attribute {semantic}")
+        require(semantic in attributes, f"its Gaussians lack the attribute {semantic}")
         values = document.accessor(attributes[semantic], (kind,)).floats()
-        if len(values) != count:
-            document.fail(f"{semantic} has {len(values)} rows for {count} Gaussians")
+        said = f"{semantic} has {len(values)} rows for {count} Gaussians"
+        require(len(values) == count, said)
         return values
 
+    degree = _harmonics({"attributes": attributes})
     return Gaussians(
         means=rows("POSITION", "VEC3"),
         quats=rows(f"{EXTENSION}:ROTATION", "VEC4")[:, [3, 0, 1, 2]],
         log_scales=_log_scales(rows(f"{EXTENSION}:SCALE", "VEC3"), document),
         logit_opacities=logits(rows(f"{EXTENSION}:OPACITY", "SCALAR")[:, 0], FLOAT_OPACITY_MARGIN),
-        sh=np.stack(
-            [rows(semantic, "VEC3") for semantic in _semantics(_harmonics(primitive))], axis=1
-        ),
+        sh=np.stack([rows(semantic, "VEC3") for semantic in _semantics(degree)], axis=1),
     )
 
 
@@ -295,7 +266,5 @@ def _log_scales(scales: Float[np.ndarray, "N 3"], document: Document) -> Float[n
     if len(scales) and np.median(scales) < 0:
         logger.warning("%s: scales are read as logarithms, as drafts of 2026 had", document.path)
         return scales
-    if (scales < 0).any():
-        document.fail("some of its scales are below 0")
-    with np.errstate(divide="ignore"):
-        return np.log(scales)
+    require(not (scales < 0).any(), "some of its scales are below 0")
+    return np.log(scales)

@@ -11,6 +11,9 @@ from ..gaussians.sh import rgb_to_sh0, sh0_to_rgb
 from ..meshes.mesh import linear_to_srgb
 
 log = logging.getLogger(__name__)
+ANTIALIASED = "SplatRenderMode: mip"
+"""The comment by which Brush, SuperSplat and splat-transform tag clouds trained with antialiasing.
+"""
 OPACITY_MARGIN = 1 / 2040
 """Opacities that are read from bytes are clamped to this distance from 0 and 1, an eighth of a
 step, since their logits are infinite there.

@@ -33,25 +33,6 @@ class Producer(NamedTuple):
     note: str
     """The reason, for the table of ``docs/formats.md``."""
 
-    def axes(self, kind: str, name: str) -> Axes:
-        """Return the axes of files of a kind, ``GAUSSIANS`` or ``MESH``.
-
-        Args:
-            name: the producer's, for the message.
-
-        Raises:
-            UserError: the program doesn't write such files.
-        """
-        axes = self.gaussians if kind == GAUSSIANS else self.mesh
-        if axes is None:
-            other = MESH if kind == GAUSSIANS else GAUSSIANS
-            words = {GAUSSIANS: "Gaussians", MESH: "meshes"}
-            raise UserError(
-                f"producer: {name!r} stands for files of {words[other]}, and this one is of "
-                f"{words[kind]}; producers of {words[kind]} are {', '.join(producers_of(kind))}"
-            )
-        return axes
-
 
 CAMERA, GLTF, WORLD = Axes("-y", "-z"), Axes("+y", "+z"), Axes("+z", "+x")
 PRODUCERS = {
@@ -93,7 +74,14 @@ def producer_axes(name: str, kind: str) -> Axes:
     """
     if name not in PRODUCERS:
         raise unknown("producer", name, PRODUCERS)
-    return PRODUCERS[name].axes(kind, name)
+    axes = getattr(PRODUCERS[name], kind)
+    if axes is None:
+        here, other = ("Gaussians", "meshes") if kind == GAUSSIANS else ("meshes", "Gaussians")
+        raise UserError(
+            f"producer: {name!r} stands for files of {other}, and this one is of {here}; "
+            f"producers of {here} are {', '.join(producers_of(kind))}"
+        )
+    return axes
 
 
 def from_producer(cloud: StoredCloud, name: str, suffix: str = ".ply") -> StoredCloud:

@@ -30,29 +30,28 @@ JSON and images are checked before they are unpacked. Members are read into memo
 
 import io
 import json
-import math
 import os
 import struct
 import zipfile
-import zlib
 from collections.abc import Sequence
+from contextlib import closing
 from math import ceil, sqrt
-from types import TracebackType
-from typing import Any, NoReturn, Optional
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Integer
 
-from ..core.errors import UserError
-from ..core.files import atomic_file, existing_file
-from ..core.memory import require_file_memory
+from ..core.files import atomic_file
 from ..gaussians.axes import VIEWER_UP
 from ..gaussians.gaussians import Gaussians, finite
 from ..gaussians.sh import COEFFICIENTS
 from . import packing
+from .packing import ANTIALIASED
+from .reading import reading, require, require_file_memory
 
 SOG_UP = VIEWER_UP
-ANTIALIASED = "antialiased"
+ANTIALIASED_MODEL = "antialiased"
 MAX_PALETTE = 65536
 MAX_DISTANCES = 3e8
 """Limit of the distances that an iteration of k-means computes, entries times Gaussians; at the
@@ -69,17 +68,7 @@ DECODED_BYTES, DECODED_BYTES_PER_HARMONIC = 200, 24
 """Bytes of memory that reading takes per Gaussian, and per harmonic of it, with a safety margin."""
 BYTES_PER_PIXEL = 24
 """Memory for a pixel of an image while it is decoded."""
-FORMATS = {b"RIFF": "WEBP", b"\x89PNG": "PNG"}
-"""Of images, by their first bytes."""
 PACKINGS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-DAMAGED = (
-    zipfile.BadZipFile,
-    zlib.error,
-    struct.error,
-    NotImplementedError,
-    RuntimeError,
-    EOFError,
-)
 ROUNDS = 12
 """Iterations; later ones hardly reduce the error."""
 SHORT_WORK = 10**7
@@ -88,19 +77,12 @@ BLOCK = 2048
 """Vectors whose distances to all entries are computed at once."""
 
 
-def write_sog(
-    path: str | os.PathLike,
-    gaussians: Gaussians,
-    *,
-    antialiased: bool = False,
-    notes: Sequence[str] = (),
-) -> None:
+def write_sog(path: str | os.PathLike, gaussians: Gaussians, notes: Sequence[str] = ()) -> None:
     """Write an SOG file atomically, without Gaussians that can't be drawn.
 
     Args:
         gaussians: with -y up.
-        antialiased: whether they were trained with antialiasing.
-        notes: ASCII lines, which other readers ignore.
+        notes: ASCII lines, which other readers ignore; ``packing.ANTIALIASED`` sets the model.
 
     Raises:
         UserError: harmonics above degree 3, or the file can't be written.
@@ -108,38 +90,47 @@ def write_sog(
     gaussians = finite(gaussians, str(path))
     gaussians = gaussians.rows(packing.morton_order(gaussians.means))
     images, meta = _encoded(gaussians)
-    meta |= {"model": ANTIALIASED} if antialiased else {}
-    meta |= {"notes": list(notes)} if notes else {}
+    others = [note for note in notes if note != ANTIALIASED]
+    meta |= {"model": ANTIALIASED_MODEL} if ANTIALIASED in notes else {}
+    meta |= {"notes": others} if others else {}
     with atomic_file(path) as file, zipfile.ZipFile(file, "w") as archive:
         for name, pixels in images.items():
             archive.writestr(zipfile.ZipInfo(name, MEMBER_DATE), _webp(pixels))
         archive.writestr(zipfile.ZipInfo("meta.json", MEMBER_DATE), json.dumps(meta))
 
 
-def load_sog(path: str | os.PathLike) -> tuple[Gaussians, bool, list[str]]:
-    """Read an SOG file, or by its ``meta.json`` one without an archive.
-
-    Returns:
-        the Gaussians, whether they were trained with antialiasing, and the notes of our writer.
+def read_sog(path: str | os.PathLike) -> tuple[Gaussians, list[str]]:
+    """Read an SOG file, or by its ``meta.json`` one without an archive; also the notes.
 
     Raises:
         UserError: there is no such file, it is no SOG of version 1 or 2, it is damaged, or it
             would take more memory than the budget of its size.
     """
-    with SogArchive(path) as archive:
+    with reading(path, "SOG file") as file, closing(_Archive(file)) as archive:
         low, high = (archive.rows("means", index).astype(np.uint16) for index in (0, 1))
+        least, most = (archive.floats("means", key, 3) for key in ("mins", "maxs"))
+        logs = least + (most - least) * ((low | high << 8)[:, :3] / 65535)
         quats, sh0 = archive.rows("quats"), archive.rows("sh0")
+        largest = quats[:, 3].astype(np.int64) - FIRST_TAG
+        require((largest >= 0).all(), "a quaternion names no largest component: it is damaged")
         colors = archive.values("sh0", sh0, 4)
+        sh = colors[:, None, :3]
+        if archive.bands:
+            entries, pixels = archive.palette(), archive.rows("shN", 1).astype(np.int64)
+            sh = np.empty((archive.count, 1 + entries.shape[1], 3), np.float32)
+            sh[:, 0] = colors[:, :3]
+            sh[:, 1:] = archive.values("shN", entries[pixels[:, 0] | pixels[:, 1] << 8], 1)
+        logits = colors[:, 3] if archive.version == 1 else packing.logits_of_bytes(sh0[:, 3])
         gaussians = Gaussians(
-            means=_positions((low | high << 8)[:, :3], *archive.bounds()),
-            quats=_quats(quats, archive),
+            means=(np.sign(logs) * np.expm1(np.abs(logs))).astype(np.float32),
+            quats=packing.with_largest(largest, (quats[:, :3] / 255 - 0.5) * sqrt(2)),
             log_scales=archive.values("scales", archive.rows("scales")[:, :3]),
-            logit_opacities=(
-                colors[:, 3] if archive.version == 1 else packing.logits_of_bytes(sh0[:, 3])
-            ),
-            sh=_harmonics(colors[:, :3], archive),
+            logit_opacities=logits,
+            sh=sh,
         )
-        return gaussians, archive.meta.get("model") == ANTIALIASED, archive.notes()
+        notes = archive.meta.get("notes")
+        notes = [note for note in notes if isinstance(note, str)] if type(notes) is list else []
+        return gaussians, notes + [ANTIALIASED] * (archive.meta.get("model") == ANTIALIASED_MODEL)
 
 
 # ---- writing -------------------------------------------------------------------------------------
@@ -248,65 +239,40 @@ def _webp(pixels: Integer[np.ndarray, "H W 4"]) -> bytes:
 # ---- the archive ---------------------------------------------------------------------------------
 
 
-class SogArchive:
-    """An open SOG file, or the ``meta.json`` of an unpacked one.
+class _Archive:
+    """An open SOG file, or the ``meta.json`` of an unpacked one; version and memory are checked."""
 
-    Raises:
-        UserError: there is no such file, it is no SOG of version 1 or 2, it is damaged, or it
-            announces more than the memory budget of its size.
-    """
-
-    def __init__(self, path: str | os.PathLike) -> None:
-        self.path = existing_file(path, "SOG file")
-        self._zip: Optional[zipfile.ZipFile] = None
-        unpacked = self.path.suffix.lower() == ".json"
-        beside = self.path.parent.iterdir() if unpacked else ()
-        files = [self.path, *(file for file in beside if file.suffix in (".webp", ".png"))]
+    def __init__(self, path: Path) -> None:
+        self.path, unpacked = path, path.suffix.lower() == ".json"
+        beside = path.parent.iterdir() if unpacked else ()
+        files = [path, *(file for file in beside if file.suffix in (".webp", ".png"))]
         self.size = sum(file.stat().st_size for file in files)
-        try:
-            self._zip = None if unpacked else zipfile.ZipFile(self.path)
-        except (*DAMAGED, OSError, ValueError) as error:
-            self.fail(f"it isn't a zip archive, or damaged ({error})")
+        self._zip = None if unpacked else zipfile.ZipFile(path)
         names = self._zip.namelist() if self._zip else []
         found = [name for name in names if name.split("/")[-1] == "meta.json"]
         # a folder that was packed by hand is in the names of its files
         self._folder = min(found, key=len, default="meta.json").removesuffix("meta.json")
-        self.meta = self._read_meta()
-        self.version: int = self.meta.get("version", 1)
-        shape = self._section("means").get("shape") if self.version == 1 else None
+        data = self._member(path.name if unpacked else "meta.json", MAX_META_BYTES)
+        self.meta: dict[str, Any] = json.loads(data.decode("utf-8"))
+        self.version = self.meta.get("version", 1)
+        said = f"it is of version {str(self.version)[:20]}; version 1 or 2 was expected"
+        require(self.version in VERSIONS, said)
+        shape = self.meta["means"].get("shape") if self.version == 1 else None
         counted = {"count": shape[0]} if isinstance(shape, list) and shape else self.meta
-        self.count: int = self._number(counted, "count")
-        harmonics = COEFFICIENTS[self._bands()]
-        needed = self.count * (DECODED_BYTES + DECODED_BYTES_PER_HARMONIC * harmonics)
-        self._require_memory(needed, f"{self.count} Gaussians")
+        self.count, self.bands = self._number(counted, "count"), 0
+        if self.meta.get("shN") is not None and self.version == 1:
+            width = _image_size(self._image("shN", 0))[0]
+            self.bands = [PALETTE_COLUMNS * (k - 1) for k in COEFFICIENTS].index(width or -1)
+        elif self.meta.get("shN") is not None:
+            self.bands = self._number(self.meta["shN"], "bands")
+        said = f"harmonics of degree {self.bands}: 0 to 3 were expected"
+        require(self.bands < len(COEFFICIENTS), said)
+        each = DECODED_BYTES + DECODED_BYTES_PER_HARMONIC * COEFFICIENTS[self.bands]
+        require_file_memory(self.count * each, self.size, f"{self.count} Gaussians")
 
-    def __enter__(self) -> "SogArchive":
-        return self
-
-    def __exit__(
-        self,
-        kind: Optional[type[BaseException]],
-        error: Optional[BaseException],
-        trace: Optional[TracebackType],
-    ) -> None:
+    def close(self) -> None:
         if self._zip is not None:
             self._zip.close()
-
-    def fail(self, problem: str) -> NoReturn:
-        """Raise UserError about this file."""
-        raise UserError(f"SOG file {str(self.path)!r}: {problem}")
-
-    # ---- the JSON --------------------------------------------------------------------------------
-
-    def notes(self) -> list[str]:
-        """Return the lines that our writer adds; empty in files of other programs."""
-        notes = self.meta.get("notes", [])
-        return [note for note in notes if isinstance(note, str)] if isinstance(notes, list) else []
-
-    def bounds(self) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
-        """Return the smallest and the largest logarithm of the positions, for each axis."""
-        means = self._section("means")
-        return self._floats(means, "mins", 3), self._floats(means, "maxs", 3)
 
     def values(
         self, section: str, pixels: Integer[np.ndarray, "*N C"], channels: int = 3
@@ -314,202 +280,89 @@ class SogArchive:
         """Return what the bytes of an image stand for: entries of a codebook, in version 1 steps
         between ``mins`` and ``maxs`` of each of the section's ``channels`` (1: of all).
         """
-        about = self._section(section)
         if self.version == 1:
-            low, high = (self._floats(about, key, channels) for key in ("mins", "maxs"))
+            low, high = (self.floats(section, key, channels) for key in ("mins", "maxs"))
             book = np.linspace(low, high, CODEBOOK)
         else:
-            book = self._floats(about, "codebook", CODEBOOK)[:, None]
+            book = self.floats(section, "codebook", CODEBOOK)[:, None]
         book = book.astype(np.float32)
         if book.shape[1] == 1:  # indices by a second axis take memory
             return book[:, 0][pixels]
         return book[pixels, np.arange(pixels.shape[-1]) % book.shape[1]]
 
-    def _read_meta(self) -> dict[str, Any]:
-        try:
-            name = "meta.json" if self._zip else self.path.name
-            meta = json.loads(self._member(name, MAX_META_BYTES).decode("utf-8"))
-        except (ValueError, RecursionError) as error:
-            if isinstance(error, UserError):
-                raise
-            self.fail(f"its meta.json isn't valid JSON ({str(error)[:100]})")
-        version = meta.get("version", 1) if isinstance(meta, dict) else None
-        if version not in VERSIONS:
-            self.fail(f"it is of version {str(version)[:20]}; version 1 or 2 was expected")
-        return meta
-
-    def _section(self, name: str) -> dict[str, Any]:
-        section = self.meta.get(name)
-        if not isinstance(section, dict):
-            self.fail(f"its meta.json has no section {name!r}")
-        return section
-
     def _number(self, section: dict[str, Any], key: str) -> int:
         value = section.get(key)
-        if type(value) is not int or value < 0:
-            self.fail(f"{key} should be 0 or more, not {str(value)[:40]}")
+        usual = type(value) is int and value >= 0
+        require(usual, f"{key} should be 0 or more, not {str(value)[:40]}")
         return value
 
-    def _floats(self, section: dict[str, Any], key: str, count: int) -> Float[np.ndarray, " C"]:
-        values = section.get(key)
-        values = [values] if count == 1 and not isinstance(values, list) else values
-        usual = isinstance(values, list) and len(values) == count
-        if not usual or not all(type(value) in (int, float) for value in values):
-            self.fail(f"{key} should be {count} numbers, not {str(values)[:80]}")
-        numbers = np.array([min(max(value, -1e38), 1e38) for value in values], np.float64)
-        if not np.isfinite(numbers).all():
-            self.fail(f"{key} holds NaN")
+    def floats(self, section: str, key: str, count: int) -> Float[np.ndarray, " C"]:
+        """Return ``count`` numbers of the JSON."""
+        numbers = np.atleast_1d(np.array(self.meta[section][key], np.float64)).clip(-1e38, 1e38)
+        usual = numbers.shape == (count,) and np.isfinite(numbers).all()
+        require(usual, f"{key} of {section} should be {count} numbers")
         return numbers
-
-    def _bands(self) -> int:
-        """Return the degree of the harmonics."""
-        if self.meta.get("shN") is None:
-            return 0
-        if self.version == 1:
-            width = self._image_size(*self._image("shN", 0))[0]
-            known = {PALETTE_COLUMNS * (K - 1): K for K in COEFFICIENTS[1:]}
-            if width not in known:
-                self.fail(f"a palette of {width} pixels in width isn't of degree 1 to 3")
-            return COEFFICIENTS.index(known[width])
-        bands = self._number(self._section("shN"), "bands")
-        if bands not in range(len(COEFFICIENTS)):
-            self.fail(f"harmonics of degree {bands} are announced: 0 to 3 were expected")
-        return bands
-
-    # ---- images ----------------------------------------------------------------------------------
 
     def rows(self, section: str, index: int = 0) -> Integer[np.ndarray, "N 4"]:
         """Return the pixels of an image, one for each Gaussian."""
-        pixels = self._pixels(section, index)
-        height, width = pixels.shape[:2]
-        if height * width < self.count:
-            size = f"{width} x {height} pixels"
-            self.fail(f"{section} has {size}, too few for {self.count} Gaussians")
-        return pixels.reshape(-1, 4)[: self.count]
+        pixels = self._pixels(section, index).reshape(-1, 4)
+        said = f"{section} has {len(pixels)} pixels, too few for {self.count} Gaussians"
+        require(len(pixels) >= self.count, said)
+        return pixels[: self.count]
 
-    def palette(self) -> Optional[Integer[np.ndarray, "P K 3"]]:
-        """Return the entries of the palette of harmonics, K for each; None without any."""
-        if not (bands := self._bands()):
-            return None
-        coefficients, pixels = COEFFICIENTS[bands] - 1, self._pixels("shN", 0)
+    def palette(self) -> Integer[np.ndarray, "P K 3"]:
+        """Return the entries of the palette of harmonics, K for each."""
+        coefficients, pixels = COEFFICIENTS[self.bands] - 1, self._pixels("shN", 0)
         height, width = pixels.shape[:2]
         count = height * PALETTE_COLUMNS
         if self.version != 1:
-            count = self._number(self._section("shN"), "count")
-        if width != PALETTE_COLUMNS * coefficients or height * PALETTE_COLUMNS < count:
-            size = f"{width} x {height} pixels"
-            self.fail(f"the palette of {count} entries of degree {bands} can't have {size}")
+            count = self._number(self.meta["shN"], "count")
+        fits = width == PALETTE_COLUMNS * coefficients and height * PALETTE_COLUMNS >= count
+        require(fits, f"the palette of {count} entries can't have {width} x {height} pixels")
         return pixels[..., :3].reshape(-1, coefficients, 3)[:count]
 
-    def _image(self, section: str, index: int) -> tuple[bytes, str]:
-        """Return the content of an image, and its name."""
-        files = self._section(section).get("files")
-        if not isinstance(files, list) or len(files) <= index or not isinstance(files[index], str):
-            self.fail(f"its meta.json names no image {index} of {section!r}")
-        return self._member(files[index], self.size), files[index]
+    def _image(self, section: str, index: int) -> bytes:
+        return self._member(self.meta[section]["files"][index], self.size)
 
     def _pixels(self, section: str, index: int) -> Integer[np.ndarray, "H W 4"]:
-        data, name = self._image(section, index)
-        width, height = self._image_size(data, name)
-        self._require_memory(BYTES_PER_PIXEL * width * height, f"{width} x {height} pixels")
-        return self._decoded(data, (width, height), name)
-
-    def _image_size(self, data: bytes, name: str) -> tuple[int, int]:
-        """Return width and height in the header of a lossless WebP, or of a PNG."""
-        kind, at = data[12:16], 20
-        if FORMATS.get(data[:4]) == "PNG" and kind == b"IHDR" and len(data) >= 24:
-            return struct.unpack_from(">II", data, 16)
-        if data[:4] != b"RIFF" or data[8:12] != b"WEBP" or len(data) < 30:
-            self.fail(f"{name[:40]!r} isn't a WebP or PNG image")
-        if kind == b"VP8X":
-            canvas = data[at + 4 : at + 7], data[at + 7 : at + 10]
-            width, height = (int.from_bytes(value, "little") + 1 for value in canvas)
-            return width, height
-        if kind != b"VP8L":
-            self.fail(f"{name[:40]!r} isn't a lossless WebP image, so its numbers are lost")
-        bits = int.from_bytes(data[at + 1 : at + 5], "little")
-        return (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
-
-    def _decoded(
-        self, data: bytes, size: tuple[int, int], name: str
-    ) -> Integer[np.ndarray, "H W 4"]:
         from PIL import Image
 
-        try:
-            with Image.open(io.BytesIO(data), formats=[FORMATS[data[:4]]]) as image:
-                if image.size != size or getattr(image, "n_frames", 1) != 1:
-                    self.fail(f"{name[:40]!r} is of another size than its header says")
-                return np.asarray(image.convert("RGBA"))
-        except UserError:
-            raise
-        except Exception as error:  # Pillow raises errors of many types for damaged images
-            self.fail(f"{name[:40]!r} can't be decoded ({type(error).__name__}: {error})")
-
-    # ---- members of the archive ------------------------------------------------------------------
+        data = self._image(section, index)
+        width, height = _image_size(data)
+        require_file_memory(
+            BYTES_PER_PIXEL * width * height, self.size, f"{width} x {height} pixels"
+        )
+        with Image.open(io.BytesIO(data), formats=["WEBP", "PNG"]) as image:
+            same = image.size == (width, height)
+            require(same, f"an image of {section} is of another size than its header says")
+            return np.asarray(image.convert("RGBA"))
 
     def _member(self, name: str, most: int) -> bytes:
-        """Return the content of a member, at most ``most`` bytes."""
+        """Return the content of a member, or of a file beside ``meta.json``, at most ``most``."""
         if self._zip is None:
-            return self._beside(name, most)
-        try:
-            info = self._zip.getinfo(self._folder + name)
-        except KeyError:
-            self.fail(f"it has no {name[:40]!r}")
-        if info.compress_type not in PACKINGS or info.flag_bits & 1:
-            self.fail(f"{name[:40]!r} is encrypted, or packed by an unknown method")
-        if info.file_size > most:
-            self.fail(f"{name[:40]!r} has {info.file_size} bytes; at most {most} were expected")
-        try:
-            return self._zip.read(info)  # compares the checksum too
-        except (*DAMAGED, OSError, ValueError) as error:
-            self.fail(f"{name[:40]!r} can't be unpacked ({error})")
-
-    def _beside(self, name: str, most: int) -> bytes:
-        """Return the content of a file in the folder of ``meta.json``."""
-        try:
-            with self.path.with_name(name).open("rb") as file:
+            with self.path.with_name(name).open("rb") as file:  # refuses names with folders
                 data = file.read(most + 1)
-        except (OSError, ValueError) as error:  # a name with a folder in it is a ValueError
-            self.fail(f"{name[:40]!r}, which should lie beside it, can't be read ({error})")
-        if len(data) > most:
-            self.fail(f"{name[:40]!r} has more than the {most} bytes that were expected")
-        return data
-
-    def _require_memory(self, needed: float, content: str) -> None:
-        needed = math.ceil(needed)
-        require_file_memory(needed, self.size, f"SOG file {str(self.path)!r}", content)
+            require(len(data) <= most, f"{name!r} has more than {most} bytes")
+            return data
+        info = self._zip.getinfo(self._folder + name)
+        usual = info.compress_type in PACKINGS and info.file_size <= most
+        require(usual, f"{name[:40]!r} has more than {most} bytes, or is packed in another way")
+        return self._zip.read(info)  # compares the checksum too
 
 
-# ---- reading -------------------------------------------------------------------------------------
-
-
-def _positions(
-    steps: Integer[np.ndarray, "N 3"], low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"]
-) -> Float[np.ndarray, "N 3"]:
-    logs = low + (high - low) * (steps / 65535)
-    return (np.sign(logs) * np.expm1(np.abs(logs))).astype(np.float32)
-
-
-def _quats(rows: Integer[np.ndarray, "N 4"], archive: SogArchive) -> Float[np.ndarray, "N 4"]:
-    largest = rows[:, 3].astype(np.int64) - FIRST_TAG
-    if (largest < 0).any():
-        archive.fail("a quaternion's index of its largest component isn't 0 to 3: it is damaged")
-    return packing.with_largest(largest, (rows[:, :3] / 255 - 0.5) * sqrt(2))
-
-
-def _harmonics(
-    constant: Float[np.ndarray, "N 3"], archive: SogArchive
-) -> Float[np.ndarray, "N K 3"]:
-    if (entries := archive.palette()) is None:
-        return constant[:, None]
-    pixels = archive.rows("shN", 1).astype(np.int64)
-    labels = pixels[:, 0] | pixels[:, 1] << 8
-    if len(labels) and labels.max() >= len(entries):
-        archive.fail(f"a Gaussian has entry {labels.max()} of a palette of {len(entries)}")
-    sh = np.empty((len(constant), 1 + entries.shape[1], 3), np.float32)
-    sh[:, 0] = constant
-    sh[:, 1:] = archive.values("shN", entries[labels], 1)
-    return sh
+def _image_size(data: bytes) -> tuple[int, int]:
+    """Return width and height in the header of a PNG, or of a lossless WebP."""
+    if data[:4] == b"\x89PNG":
+        return struct.unpack_from(">II", data, 16)
+    usual = data[:4] == b"RIFF" and data[8:12] == b"WEBP"
+    require(usual, "one of its images isn't a WebP or PNG image")
+    if data[12:16] == b"VP8X":
+        width, height = (int.from_bytes(data[at : at + 3], "little") + 1 for at in (24, 27))
+        return width, height
+    lossless = data[12:16] == b"VP8L"
+    require(lossless, "one of its images isn't a lossless WebP image, so its numbers are lost")
+    bits = int.from_bytes(data[21:25], "little")
+    return (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
 
 
 # ---- codebooks -----------------------------------------------------------------------------------

@@ -12,16 +12,14 @@ band channel by channel. Numbers are float32 at level 0. At levels 1 and 2 they 
 positions are steps from the centre of the Gaussian's bucket, and at level 2 harmonics are bytes."""
 
 import os
-from typing import NoReturn
 
 import numpy as np
 from jaxtyping import Float
 
-from ..core.errors import UserError
-from ..core.files import existing_file
 from ..gaussians.gaussians import Gaussians
 from ..gaussians.sh import C0, COEFFICIENTS, rgb_to_sh0
 from .packing import logits_of_bytes
+from .reading import reading, require
 
 RECORD = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
 HEADER = np.dtype(
@@ -50,70 +48,62 @@ ROUNDED_TO_0 = 2.0**-25
 """The largest scale that is 0 as float16."""
 
 
-def read_splat(path: str | os.PathLike) -> Gaussians:
-    """Read a ``.splat`` file; rows with values that aren't finite are kept.
+def read_splat(path: str | os.PathLike) -> tuple[Gaussians, list[str]]:
+    """Read a ``.splat`` file, which has no notes; rows with values that aren't finite are kept.
 
     Raises:
         UserError: there is no such file, it is empty, or its size isn't a multiple of 32 bytes.
     """
-    path = existing_file(path, ".splat file")
-    size = path.stat().st_size
-    if size == 0 or size % RECORD.itemsize:
-        raise UserError(
-            f".splat file {str(path)!r}: its size should be a multiple of {RECORD.itemsize} bytes, "
-            f"one record a Gaussian, not {size}: it is truncated or of another format"
+    with reading(path, ".splat file") as file:
+        size = file.stat().st_size
+        said = f"its size should be a multiple of {RECORD.itemsize} bytes, one record a Gaussian"
+        usual = size > 0 and size % RECORD.itemsize == 0
+        require(usual, f"{said}, not {size}: it is truncated or of another format")
+        rows = np.fromfile(file, RECORD)
+        colors = (rows["rgba"][:, :3] / np.float32(255) - np.float32(0.5)) / np.float32(C0)
+        gaussians = Gaussians(
+            means=rows["mean"].astype(np.float32),
+            quats=(rows["quat"].astype(np.float32) - 128) / 128,
+            log_scales=np.log(rows["scale"]).astype(np.float32),
+            logit_opacities=logits_of_bytes(rows["rgba"][:, 3]),
+            sh=colors[:, None],
         )
-    rows = np.fromfile(path, RECORD)
-    colors = (rows["rgba"][:, :3] / np.float32(255) - np.float32(0.5)) / np.float32(C0)
-    with np.errstate(divide="ignore", invalid="ignore"):  # of scales that are 0 or negative
-        log_scales = np.log(rows["scale"])
-    return Gaussians(
-        means=rows["mean"].astype(np.float32),
-        quats=(rows["quat"].astype(np.float32) - 128) / 128,
-        log_scales=log_scales.astype(np.float32),
-        logit_opacities=logits_of_bytes(rows["rgba"][:, 3]),
-        sh=colors[:, None],
-    )
+        return gaussians, []
 
 
-def read_ksplat(path: str | os.PathLike) -> Gaussians:
-    """Read a ``.ksplat`` file; rows with values that aren't finite are kept.
+def read_ksplat(path: str | os.PathLike) -> tuple[Gaussians, list[str]]:
+    """Read a ``.ksplat`` file, which has no notes; rows with values that aren't finite are kept.
 
     Raises:
         UserError: there is no such file, or it is damaged or of another version.
     """
-    return _File(path).gaussians()
+    with reading(path, ".ksplat file") as file:
+        return _File(np.fromfile(file, np.uint8)).gaussians(), []
 
 
 class _File:
     """The bytes of a file, which are read at places that are checked."""
 
-    def __init__(self, path: str | os.PathLike) -> None:
-        self.path = existing_file(path, ".ksplat file")
-        self.data = np.fromfile(self.path, np.uint8)
+    def __init__(self, data: np.ndarray) -> None:
+        self.data = data
         self.header = self.rows(HEADER, 0, 1)[0]
         version, self.level = (self.header["major"], self.header["minor"]), self.header["level"]
-        if version[0] != 0 or version[1] < 1 or self.level not in range(len(NUMBERS)):
-            self.fail(
-                "version 0.1 and level 0, 1 or 2 were expected, not version "
-                f"{version[0]}.{version[1]} and level {self.level}"
-            )
-
-    def fail(self, problem: str) -> NoReturn:
-        raise UserError(f".ksplat file {str(self.path)!r}: {problem}")
+        usual = version[0] == 0 and version[1] >= 1 and self.level in range(len(NUMBERS))
+        said = f"not version {version[0]}.{version[1]} and level {self.level}"
+        require(usual, f"version 0.1 and level 0, 1 or 2 were expected, {said}")
 
     def rows(self, kind: np.dtype, at: int, count: int) -> np.ndarray:
         """Return ``count`` values of a type from the byte ``at`` on."""
-        if (end := at + count * kind.itemsize) > len(self.data):
-            self.fail(f"it ends after {len(self.data)} bytes instead of {end}: it is damaged")
+        end = at + count * kind.itemsize
+        require(end <= len(self.data), f"it ends after {len(self.data)} bytes instead of {end}")
         return self.data[at:end].view(kind)
 
     def gaussians(self) -> Gaussians:
         """Return the Gaussians of all sections."""
         sections = self.rows(SECTION, HEADER.itemsize, int(self.header["sections"]))
-        if len(sections) and sections["degree"].max() > MAX_DEGREE:
-            self.fail(f"harmonics of degree {sections['degree'].max()}; expected 0 to {MAX_DEGREE}")
-        coefficients = COEFFICIENTS[sections["degree"].max(initial=0)]
+        degree = sections["degree"].max(initial=0)
+        require(degree <= MAX_DEGREE, f"harmonics of degree {degree}; expected 0 to {MAX_DEGREE}")
+        coefficients = COEFFICIENTS[degree]
         at, found = HEADER.itemsize + sections.nbytes, []
         for section in sections:
             values = {name: section[name].item() for name in SECTION.names}
@@ -132,8 +122,7 @@ class _File:
             means = rows["mean"] if self.level == 0 else self.positions(rows["mean"], values, at)
             found.append(self.cloud(rows, means, coefficients))
             at += buckets + values["room"] * record.itemsize
-        if not found:
-            self.fail("it has no Gaussians")
+        require(bool(found), "it has no Gaussians")
         return Gaussians(*(np.concatenate(values) for values in zip(*found, strict=True)))
 
     def positions(
@@ -144,8 +133,8 @@ class _File:
         centers = self.rows(np.dtype("<f4"), at + partly.nbytes, 3 * section["buckets"])
         held = section["full"] * section["bucket"] + int(partly.sum(dtype=np.int64))
         usual = section["full"] + section["partial"] == section["buckets"]
-        if section["stride"] != 3 * centers.itemsize or not usual or held != len(steps):
-            self.fail(f"its buckets hold {held} of the {len(steps)} Gaussians: it is damaged")
+        usual = usual and section["stride"] == 3 * centers.itemsize and held == len(steps)
+        require(usual, f"its buckets hold {held} of the {len(steps)} Gaussians: it is damaged")
         sizes = np.concatenate([np.full(section["full"], section["bucket"], np.int64), partly])
         far = section["steps"] or STEPS
         offsets = (steps.astype(np.float64) - far) * (section["block"] / 2 / far)
@@ -169,12 +158,10 @@ class _File:
                 band = values[:, 3 * (start - 1) : 3 * (end - 1)].reshape(len(rows), 3, -1)
                 sh[:, start:end] = band.swapaxes(1, 2)
         scales = rows["scale"].astype(np.float32)
-        with np.errstate(divide="ignore", invalid="ignore"):  # of scales that are negative
-            log_scales = np.log(np.where(scales == 0, np.float32(ROUNDED_TO_0), scales))
         return Gaussians(
             means=means.astype(np.float32),
             quats=rows["quat"].astype(np.float32),
-            log_scales=log_scales,
+            log_scales=np.log(np.where(scales == 0, np.float32(ROUNDED_TO_0), scales)),
             logit_opacities=logits_of_bytes(rows["rgba"][:, 3]),
             sh=sh,
         )

@@ -35,65 +35,51 @@ import struct
 import zlib
 from collections.abc import Sequence
 from math import ceil, log, log2, sqrt
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Integer
 
 from ..core.errors import UserError
-from ..core.files import atomic_file, existing_file
-from ..core.memory import require_file_memory
+from ..core.files import atomic_file
 from ..gaussians.axes import rotate
 from ..gaussians.gaussians import Gaussians, finite, usable
 from . import packing
+from .packing import ANTIALIASED
+from .reading import reading, require, require_file_memory
 
 logger = logging.getLogger(__name__)
-HEADER, TABLE_OFFSET, ENTRY = (
-    struct.Struct("<4sIIBBBB"),
-    struct.Struct("<I12x"),
-    struct.Struct("<QQ"),
-)
-MAGIC = b"NGSP"
-VERSIONS = (3, 4)
-"""Versions that can be written."""
-GZIP_VERSIONS, ZSTD_VERSION = (1, 2, 3), 4
-MAX_STORED_DEGREE = 4
-ANTIALIASED, HAS_EXTENSIONS = 1, 2
+HEADER, TABLE_OFFSET = struct.Struct("<4sIIBBBB"), struct.Struct("<I12x")
+ENTRY, RECORD = struct.Struct("<QQ"), struct.Struct("<II")
+"""Of the table: packed and unpacked size; of an extension: type and length."""
+MAGIC, MAX_STORED_DEGREE, ZSTD_VERSION = b"NGSP", 4, 4
+VERSIONS, VERSION = (3, 4), 3
+"""Versions that can be written, and the one that is by default."""
+IS_ANTIALIASED, HAS_EXTENSIONS = 1, 2
 """Bits of the header's flags."""
-RECORD = struct.Struct("<II")
-"""Type and length of an extension, which its content follows."""
 COORDINATES = 0xADBE0003
 """Type of SPZ_ADOBE_coordinate_system, the record of the axes."""
 SYSTEMS = ("", *"LDB RDB LUB RUB LDF RDF LUF RUF LFD RFD LFU RFU LBD RBD LBU RBU".split())
 """Directions of x, y and z by the number in that record: left, right, down, up, back, front."""
-OWN_SYSTEM = "RUB"
-MAX_EXTENSION_BYTES = 1 << 16
-MOST_DEFLATE_SAVES = 1032
-"""Bytes that one byte of a deflate stream stands for at most (zlib's technical notes)."""
-MIN_WINDOW = 8 << 20
-"""Bytes of a Zstandard window that every decoder accepts (RFC 8878, section 3.1.1.1.2)."""
-ZSTD_LEVEL = 19
-DECODED_BYTES, DECODED_BYTES_PER_HARMONIC = 180, 9
-"""Bytes of memory that reading takes per Gaussian, and per harmonic of it, with a safety margin."""
-VERSION = 3
-"""The version that is written by default."""
-SPZ_UP = "y"
+OWN_SYSTEM, SPZ_UP = "RUB", "y"
+DIRECTIONS = dict(zip("RUBLDF", np.concatenate([np.eye(3), -np.eye(3)]), strict=True))
+"""Right, up, back and their opposites, in the file's usual axes."""
 SYSTEM_OF = {SPZ_UP: OWN_SYSTEM, "-y": "RDF"}
 """Axes that can be written, by the axis that is up."""
-STEPS_PER_SIZE = 32
+MAX_EXTENSION_BYTES, ZSTD_LEVEL = 1 << 16, 19
+MIN_WINDOW = 8 << 20
+"""Bytes of a Zstandard window that every decoder accepts (RFC 8878, section 3.1.1.1.2)."""
+DECODED_BYTES, DECODED_BYTES_PER_HARMONIC = 180, 9
+"""Bytes of memory that reading takes per Gaussian, and per harmonic of it, with a safety margin."""
+MIN_STEPS_PER_SIZE, STEPS_PER_SIZE = 2, 32
 """Resolution of positions: steps per median size of the Gaussians. More steps hardly improve the
 PSNR (reports/answered.md).
 """
-MIN_STEPS_PER_SIZE = 2
 INLIER_QUANTILE, OUTLIER_FACTOR = 0.99, 256
-"""If the range of the farthest position would leave fewer than ``MIN_STEPS_PER_SIZE`` steps per
-median size, positions beyond ``OUTLIER_FACTOR`` times the ``INLIER_QUANTILE`` quantile of distances
-are clipped.
+"""If the range of the farthest position would leave fewer than ``MIN_STEPS_PER_SIZE`` steps,
+positions beyond ``OUTLIER_FACTOR`` times the ``INLIER_QUANTILE`` quantile of distances are clipped.
 """
-COLOR_SCALE = 0.15
-DIRECTIONS = dict(zip("RUBLDF", np.concatenate([np.eye(3), -np.eye(3)]), strict=True))
-"""Right, up, back and their opposites, in the file's usual axes."""
-MAX_FIXED = 2**23 - 1
+MAX_FIXED, COLOR_SCALE = 2**23 - 1, 0.15
 COLOR_REACH = 0.5 / COLOR_SCALE
 """Largest absolute value of a stored constant harmonic: colours from -0.44 to 1.44."""
 MIN_LOG_SCALE, MAX_LOG_SCALE = -10.0, 255 / 16 - 10
@@ -119,19 +105,13 @@ class SpzHeader(NamedTuple):
         position, rotation = 6 if self.version == 1 else 9, 3 if self.version < 3 else 4
         return [position, 1, 3, 3, rotation, 3 * ((self.degree + 1) ** 2 - 1)]
 
-    @property
-    def antialiased(self) -> bool:
-        """Whether the Gaussians were trained with antialiasing."""
-        return bool(self.flags & ANTIALIASED)
-
 
 def write_spz(
     path: str | os.PathLike,
     gaussians: Gaussians,
+    notes: Sequence[str] = (),
     *,
-    comment: str = "",
     version: int = VERSION,
-    antialiased: bool = False,
     up: str = SPZ_UP,
 ) -> None:
     """Write :func:`spz_bytes` atomically.
@@ -143,27 +123,16 @@ def write_spz(
         UserError: the file can't be written.
     """
     gaussians = finite(gaussians, str(path))
-    options = {"comment": comment, "version": version, "antialiased": antialiased, "up": up}
-    data = spz_bytes(gaussians, **options)
+    data = spz_bytes(gaussians, notes, version=version, up=up)
     if clipped := int(out_of_range(gaussians).sum()):
-        logger.warning(
-            "%s: %d of %d Gaussians are farther away or larger than SPZ can hold: clipped to its "
-            "range",
-            path,
-            clipped,
-            len(gaussians.means),
-        )
+        said = "%s: %d of %d Gaussians are farther away or larger than SPZ can hold: clipped to its"
+        logger.warning(f"{said} range", path, clipped, len(gaussians.means))
     with atomic_file(path) as file:
         file.write(data)
 
 
 def spz_bytes(
-    gaussians: Gaussians,
-    *,
-    comment: str = "",
-    version: int = VERSION,
-    antialiased: bool = False,
-    up: str = SPZ_UP,
+    gaussians: Gaussians, notes: Sequence[str] = (), *, version: int = VERSION, up: str = SPZ_UP
 ) -> bytes:
     """Encode Gaussians as an SPZ file.
 
@@ -172,10 +141,9 @@ def spz_bytes(
 
     Args:
         gaussians: in the axes right, up, back, or with another axis ``up``.
-        comment: ASCII text for the gzip header, which other readers ignore; version 4 has no place
-            for it.
+        notes: ASCII texts for the gzip header, which other readers ignore; version 4 has no place
+            for them. ``packing.ANTIALIASED`` sets the header's flag.
         version: 3 or 4.
-        antialiased: whether the Gaussians were trained with antialiasing.
         up: a key of ``SYSTEM_OF``, which version 4 records; version 3 can only have the default.
 
     Raises:
@@ -196,10 +164,13 @@ def spz_bytes(
         _smallest_three(gaussians.quats),
         _harmonic_bytes(gaussians.sh[:, 1:]),
     ]
-    flags, degree = ANTIALIASED if antialiased else 0, gaussians.sh_degree
+    flags, degree = IS_ANTIALIASED if ANTIALIASED in notes else 0, gaussians.sh_degree
     header = SpzHeader(MAGIC, version, len(gaussians.means), degree, fractional, flags, 0)
     packed = [np.ascontiguousarray(block).tobytes() for block in blocks]
-    return pack(header, packed, comment, SYSTEM_OF[up])
+    if version == ZSTD_VERSION:
+        return _zstd(header, packed, SYSTEM_OF[up])
+    comment = "; ".join(note for note in notes if note != ANTIALIASED)
+    return _gzip(HEADER.pack(*header) + b"".join(packed), comment)
 
 
 def position_step(gaussians: Gaussians) -> float:
@@ -214,51 +185,52 @@ def out_of_range(gaussians: Gaussians) -> Bool[np.ndarray, " N"]:
     return far | (gaussians.log_scales > MAX_LOG_SCALE + 1 / 32).any(axis=1)
 
 
-def read_spz(path: str | os.PathLike) -> Gaussians:
-    """Read the Gaussians of an SPZ file of version 1 to 4, in its axes: right, up, back.
+def read_spz(path: str | os.PathLike) -> tuple[Gaussians, list[str]]:
+    """Read the Gaussians of an SPZ file of version 1 to 4, in its axes: right, up, back; and its
+    notes.
 
     Raises:
         UserError: there is no such file, it is no SPZ file of these versions, or it is damaged.
     """
-    return load_spz(path)[0]
+    with reading(path, "SPZ file") as file:
+        data = file.read_bytes()
+        gaussians, antialiased = spz_arrays(data)
+    has_comment_alone = data[:2] == b"\x1f\x8b" and data[3:4] == b"\x10"
+    comment = data[10:4096].partition(b"\0")[0].decode("latin-1") if has_comment_alone else ""
+    return gaussians, comment.split("; ") + [ANTIALIASED] * antialiased
 
 
-def load_spz(path: str | os.PathLike) -> tuple[Gaussians, bool]:
-    """Read an SPZ file as :func:`read_spz`; also return whether it was trained antialiased."""
-    path = existing_file(path, "SPZ file")
-    try:
-        header, blocks, system = unpack(path.read_bytes(), str(path))
-    except OSError as error:
-        raise UserError(f"cannot read {str(path)!r}: {error.strerror or error}.") from error
-    return _decoded(header, blocks, system), header.antialiased
+def spz_arrays(packed: bytes) -> tuple[Gaussians, bool]:
+    """Decode the bytes of an SPZ file; also return whether it was trained antialiased.
 
-
-def spz_arrays(packed: bytes, name: str = "") -> Gaussians:
-    """Decode the bytes of an SPZ file; ``name`` is for messages. See :func:`read_spz`."""
-    return _decoded(*unpack(packed, name))
-
-
-def _decoded(header: SpzHeader, blocks: list[Integer[np.ndarray, "N B"]], system: str) -> Gaussians:
-    positions, alphas, colors, scales, rotations, harmonics = blocks
+    Raises:
+        Exception: it is damaged; callers of files from outside use :func:`reading`.
+    """
+    unpack = _unpack_zstd if packed[:4] == MAGIC else _unpack_gzip
+    header, data, extensions = unpack(packed)
+    view, ends = np.frombuffer(data, "u1"), header.count * np.cumsum([0, *header.blocks])
+    positions, alphas, colors, scales, rotations, harmonics = (
+        view[start:end].reshape(header.count, width)
+        for start, end, width in zip(ends, ends[1:], header.blocks, strict=False)
+    )
     read_quats = _from_first_three if header.version < 3 else _from_smallest_three
+    sh = np.empty((header.count, 1 + harmonics.shape[1] // 3, 3), np.float32)
+    sh[:, 0] = (colors / np.float32(255) - np.float32(0.5)) / np.float32(COLOR_SCALE)
+    sh[:, 1:] = harmonics.reshape(header.count, -1, 3) if harmonics.size else 0
+    sh[:, 1:] -= 128  # in place, since harmonics are most of the memory
+    sh[:, 1:] /= 128
     gaussians = Gaussians(
         means=_positions(positions, header),
         quats=read_quats(rotations),
         log_scales=scales / np.float32(16) + np.float32(MIN_LOG_SCALE),
         logit_opacities=packing.logits_of_bytes(alphas[:, 0]),
-        sh=_harmonics(colors, harmonics),
+        sh=sh,
     )
-    if system == OWN_SYSTEM:
-        return gaussians
-    return rotate(gaussians, np.stack([DIRECTIONS[letter] for letter in system], axis=1))
-
-
-def read_spz_comment(path: str | os.PathLike) -> str:
-    """Read the comment that :func:`spz_bytes` writes; empty if there is none."""
-    with open(path, "rb") as file:
-        head = file.read(4096)
-    has_comment_alone = head[:2] == b"\x1f\x8b" and head[3:4] == b"\x10"
-    return head[10:].partition(b"\0")[0].decode("latin-1") if has_comment_alone else ""
+    system = _system(extensions) if header.flags & HAS_EXTENSIONS else OWN_SYSTEM
+    if system != OWN_SYSTEM:
+        turned = np.stack([DIRECTIONS[letter] for letter in system], axis=1)
+        gaussians = rotate(gaussians, turned)
+    return gaussians, bool(header.flags & IS_ANTIALIASED)
 
 
 # ---- the attributes as SPZ stores them -----------------------------------------------------------
@@ -322,18 +294,6 @@ def _from_first_three(block: Integer[np.ndarray, "N 3"]) -> Float[np.ndarray, "N
     return np.concatenate([w, xyz], axis=1).astype(np.float32)
 
 
-def _harmonics(
-    colors: Integer[np.ndarray, "N 3"], rest: Integer[np.ndarray, "N R"]
-) -> Float[np.ndarray, "N K 3"]:
-    """Decode the harmonics; in place, since they are most of the memory."""
-    sh = np.empty((len(colors), 1 + rest.shape[1] // 3, 3), np.float32)
-    sh[:, 0] = (colors / np.float32(255) - np.float32(0.5)) / np.float32(COLOR_SCALE)
-    sh[:, 1:] = rest.reshape(len(rest), -1, 3) if rest.size else 0
-    sh[:, 1:] -= 128
-    sh[:, 1:] /= 128
-    return sh
-
-
 def _harmonic_bytes(rest: Float[np.ndarray, "N K 3"]) -> Integer[np.ndarray, "N K 3"]:
     """Encode harmonics with zero at 128, rounded to the step of each degree, which compresses
     better.
@@ -346,19 +306,66 @@ def _harmonic_bytes(rest: Float[np.ndarray, "N K 3"]) -> Integer[np.ndarray, "N 
 # ---- containers ----------------------------------------------------------------------------------
 
 
-def pack(
-    header: SpzHeader, blocks: Sequence[bytes], comment: str = "", system: str = OWN_SYSTEM
-) -> bytes:
-    """Pack the blocks of a file of version 3 or 4.
+def require_version(version: int) -> None:
+    """Raise UserError if files of this version can't be packed here."""
+    if version not in VERSIONS:
+        raise UserError(f"SPZ files of version {version} aren't written: choose 3 or 4")
+    if version == ZSTD_VERSION:
+        _zstandard()
 
-    Args:
-        comment: ASCII text for the gzip header, which other readers ignore; version 4 has no place
-            for it.
-        system: the axes, one of ``SYSTEMS``, which version 4 records; version 3 has no others than
-            the default.
+
+def _check(header: SpzHeader, versions: Sequence[int], size: int) -> None:
+    known = header.magic == MAGIC and header.version in versions
+    require(known, "it isn't an SPZ file of version 1 to 4")
+    degree = f"harmonics of degree {header.degree} are announced: 0 to 4 were expected"
+    require(header.degree <= MAX_STORED_DEGREE, degree)
+    each = DECODED_BYTES + DECODED_BYTES_PER_HARMONIC * (header.degree + 1) ** 2
+    require_file_memory(each * header.count, size, f"{header.count} Gaussians")
+
+
+def _system(extensions: bytes) -> str:
+    """Return the axes that the extensions record; warn about other extensions."""
+    system, at = OWN_SYSTEM, 0
+    while at + RECORD.size <= len(extensions):
+        kind, length = RECORD.unpack_from(extensions, at)
+        content = extensions[at + RECORD.size :][:length]
+        at += RECORD.size + length
+        number = int.from_bytes(content, "little")
+        if kind != COORDINATES:
+            logger.warning("an SPZ file has vendor extension %#x, which is ignored", kind)
+            continue
+        usual = length == 4 and 0 < number < len(SYSTEMS)
+        require(usual, f"its record of the axes has the number {number}: 1 to 16 were expected")
+        system = SYSTEMS[number]
+    return system
+
+
+def _gzip(data: bytes, comment: str) -> bytes:
+    """Compress to one gzip member (RFC 1952) without a time stamp, to make files reproducible."""
+    deflate = zlib.compressobj(9, zlib.DEFLATED, -zlib.MAX_WBITS)
+    note = comment.encode("ascii") + b"\0" if comment else b""
+    head = struct.pack("<4BIBB", 0x1F, 0x8B, 8, 16 if comment else 0, 0, 2, 255)
+    checksum = struct.pack("<II", zlib.crc32(data), len(data) & 0xFFFFFFFF)
+    return head + note + deflate.compress(data) + deflate.flush() + checksum
+
+
+def _unpack_gzip(packed: bytes) -> tuple[SpzHeader, bytes, bytes]:
+    """Return header, blocks and extensions of versions 1 to 3; unpack no more than the header's
+    counts require.
     """
-    if header.version != ZSTD_VERSION:
-        return _gzip(HEADER.pack(*header) + b"".join(blocks), comment)
+    stream = zlib.decompressobj(16 + zlib.MAX_WBITS)
+    header = SpzHeader._make(HEADER.unpack(stream.decompress(packed, HEADER.size)))
+    _check(header, (1, 2, 3), len(packed))
+    size = header.count * sum(header.blocks)
+    data = stream.decompress(stream.unconsumed_tail, size) if size else b""
+    extensions = rest = stream.decompress(stream.unconsumed_tail, MAX_EXTENSION_BYTES)
+    while not stream.eof and rest:  # read on to the checksum at the end
+        rest = stream.decompress(stream.unconsumed_tail, MAX_EXTENSION_BYTES)
+    require(len(data) == size and stream.eof, "it is truncated")
+    return header, data, extensions
+
+
+def _zstd(header: SpzHeader, blocks: Sequence[bytes], system: str) -> bytes:
     compressor = _zstandard().ZstdCompressor(level=ZSTD_LEVEL, write_checksum=True)
     filled = [block for block in blocks if block]
     packed = [compressor.compress(block) for block in filled]
@@ -370,158 +377,28 @@ def pack(
     return b"".join([head, TABLE_OFFSET.pack(offset), record, table, *packed])
 
 
-def unpack(packed: bytes, name: str) -> tuple[SpzHeader, list[Integer[np.ndarray, "N B"]], str]:
-    """Unpack header and blocks, and no more than the header's counts require; also return the
-    axes, one of ``SYSTEMS``.
-
-    Args:
-        name: the file, for messages.
-
-    Raises:
-        UserError: no SPZ file of version 1 to 4, damaged, or more memory than the file's budget.
-    """
-    try:
-        unpack_version = _unpack_zstd if packed[:4] == MAGIC else _unpack_gzip
-        header, blocks, extensions = unpack_version(packed, name)
-    except (zlib.error, struct.error) as error:
-        fail(name, f"it isn't an SPZ file, or damaged ({error}).")
-    system = _system(extensions, name) if header.flags & HAS_EXTENSIONS else OWN_SYSTEM
-    shapes = [(header.count, size) for size in header.blocks]
-    arrays = [np.frombuffer(data, "u1") for data in blocks]
-    blocks = [array.reshape(shape) for array, shape in zip(arrays, shapes, strict=True)]
-    return header, blocks, system
-
-
-def _system(extensions: bytes, name: str) -> str:
-    """Return the axes that the extensions record; warn about other extensions."""
-    system, at = OWN_SYSTEM, 0
-    while at + RECORD.size <= len(extensions):
-        kind, length = RECORD.unpack_from(extensions, at)
-        content = extensions[at + RECORD.size :][:length]
-        at += RECORD.size + length
-        number = int.from_bytes(content, "little")
-        if kind != COORDINATES:
-            logger.warning("SPZ file %r has vendor extension %#x, which is ignored", name, kind)
-        elif length == 4 and 0 < number < len(SYSTEMS):
-            system = SYSTEMS[number]
-        else:
-            fail(name, f"its record of the axes has the number {number}: 1 to 16 were expected.")
-    return system
-
-
-def require_version(version: int) -> None:
-    """Raise UserError if files of this version can't be packed here."""
-    if version not in VERSIONS:
-        raise UserError(f"SPZ files of version {version} aren't written: choose 3 or 4")
-    if version == ZSTD_VERSION:
-        _zstandard()
-
-
-def fail(name: str, problem: str) -> NoReturn:
-    """Raise UserError about a file."""
-    raise UserError(f"SPZ file {name!r}: {problem}")
-
-
-def _check_header(header: SpzHeader, versions: tuple[int, ...], size: int, name: str) -> None:
-    if header.magic != MAGIC or header.version not in versions:
-        fail(name, "it isn't an SPZ file of version 1 to 4.")
-    if header.degree > MAX_STORED_DEGREE:
-        fail(name, f"harmonics of degree {header.degree} are announced: 0 to 4 were expected.")
-    each = DECODED_BYTES + DECODED_BYTES_PER_HARMONIC * (header.degree + 1) ** 2
-    what = f"{header.count} Gaussians"
-    require_file_memory(each * header.count, size, f"SPZ file {name!r}", what)
-
-
-# ---- versions 1 to 3 -----------------------------------------------------------------------------
-
-
-def _unpack_gzip(packed: bytes, name: str) -> tuple[SpzHeader, list[memoryview], bytes]:
-    stream = zlib.decompressobj(16 + zlib.MAX_WBITS)
-    header = SpzHeader._make(HEADER.unpack(stream.decompress(packed, HEADER.size)))
-    sizes = [size * header.count for size in header.blocks]
-    if header.degree <= MAX_STORED_DEGREE and sum(sizes) > MOST_DEFLATE_SAVES * len(packed):
-        what = f"{header.count} Gaussians are announced"
-        fail(name, f"{what}, but {len(packed)} bytes can't hold them.")
-    _check_header(header, GZIP_VERSIONS, len(packed), name)
-    data = stream.decompress(stream.unconsumed_tail, sum(sizes)) if sum(sizes) else b""
-    extensions = rest = stream.decompress(stream.unconsumed_tail, MAX_EXTENSION_BYTES)
-    while not stream.eof and rest:  # read on to the checksum at the end
-        rest = stream.decompress(stream.unconsumed_tail, MAX_EXTENSION_BYTES)
-    if len(data) < sum(sizes):
-        _fail_truncated(name, header, sum(sizes), len(data))
-    if not stream.eof:
-        fail(name, "its checksum at the end is missing: it is truncated.")
-    view, ends = memoryview(data), np.cumsum(sizes)
-    blocks = [view[end - size : end] for end, size in zip(ends, sizes, strict=True)]
-    return header, blocks, extensions
-
-
-def _fail_truncated(name: str, header: SpzHeader, size: int, found: int) -> NoReturn:
-    fail(
-        name,
-        f"{header.count} Gaussians need {size} bytes, but {found} are there: it is truncated or "
-        "damaged.",
-    )
-
-
-def _gzip(data: bytes, comment: str) -> bytes:
-    """Compress to one gzip member (RFC 1952) without a time stamp, to make files reproducible."""
-    deflate = zlib.compressobj(9, zlib.DEFLATED, -zlib.MAX_WBITS)
-    note = comment.encode("ascii") + b"\0" if comment else b""
-    head = struct.pack("<4BIBB", 0x1F, 0x8B, 8, 16 if comment else 0, 0, 2, 255)
-    return (
-        head
-        + note
-        + deflate.compress(data)
-        + deflate.flush()
-        + struct.pack("<II", zlib.crc32(data), len(data) & 0xFFFFFFFF)
-    )
-
-
-# ---- version 4 -----------------------------------------------------------------------------------
-
-
-def _unpack_zstd(packed: bytes, name: str) -> tuple[SpzHeader, list[bytes], bytes]:
+def _unpack_zstd(packed: bytes) -> tuple[SpzHeader, bytes, bytes]:
     header = SpzHeader._make(HEADER.unpack_from(packed))
-    _check_header(header, (ZSTD_VERSION,), len(packed), name)
-    sizes = [size * header.count for size in header.blocks]
-    frames = _frames(packed, header, [size for size in sizes if size], name)
-    blocks = (_unpack_frame(*frame, name) for frame in frames)
+    _check(header, (ZSTD_VERSION,), len(packed))
+    sizes = [size * header.count for size in header.blocks if size * header.count]
     (table,) = TABLE_OFFSET.unpack_from(packed, HEADER.size)
-    extensions = packed[HEADER.size + TABLE_OFFSET.size : table][:MAX_EXTENSION_BYTES]
-    return header, [next(blocks) if size else b"" for size in sizes], extensions
-
-
-def _frames(
-    packed: bytes, header: SpzHeader, sizes: list[int], name: str
-) -> list[tuple[bytes, int]]:
-    """Return each packed block with its unpacked size, which must be one of ``sizes``."""
-    (table,) = TABLE_OFFSET.unpack_from(packed, HEADER.size)
-    at = table + ENTRY.size * header.streams
-    if header.streams != len(sizes) or table < HEADER.size + TABLE_OFFSET.size or at > len(packed):
-        fail(name, f"its table of {header.streams} blocks is damaged: {len(sizes)} were expected.")
-    frames = []
-    for index, size in enumerate(sizes):
-        length, announced = ENTRY.unpack_from(packed, table + ENTRY.size * index)
-        if announced != size or at + length > len(packed):
-            _fail_truncated(name, header, size, min(announced, len(packed)))
-        frames.append((packed[at : at + length], size))
+    start, at = HEADER.size + TABLE_OFFSET.size, table + ENTRY.size * header.streams
+    require(header.streams == len(sizes) and table >= start, "its table of blocks is damaged")
+    entries = [ENTRY.unpack_from(packed, table + ENTRY.size * i) for i in range(len(sizes))]
+    whole = at + sum(length for length, _ in entries) == len(packed)
+    require(whole and [size for _, size in entries] == sizes, "it is truncated or damaged")
+    blocks = []
+    for length, size in entries:
+        blocks.append(_unpack_frame(packed[at : at + length], size))
         at += length
-    if at != len(packed):
-        fail(name, f"{len(packed) - at} bytes follow its last block: it is damaged.")
-    return frames
+    return header, b"".join(blocks), packed[start:table][:MAX_EXTENSION_BYTES]
 
 
-def _unpack_frame(frame: bytes, size: int, name: str) -> bytes:
-    zstd = _zstandard()
-    reader = zstd.ZstdDecompressor(max_window_size=max(MIN_WINDOW, size))
-    try:
-        # reads on past ``size`` to the checksum; the frame's own size is not believed
-        data = reader.stream_reader(io.BytesIO(frame)).read(size + 1)
-    except zstd.ZstdError as error:
-        fail(name, f"a block of it is damaged ({error}).")
-    if len(data) != size:
-        fail(name, f"a block of it has another size than {size} bytes: it is damaged.")
+def _unpack_frame(frame: bytes, size: int) -> bytes:
+    reader = _zstandard().ZstdDecompressor(max_window_size=max(MIN_WINDOW, size))
+    # reads on past ``size`` to the checksum; the frame's own size is not believed
+    data = reader.stream_reader(io.BytesIO(frame)).read(size + 1)
+    require(len(data) == size, "a block of it is of another size than announced: it is damaged")
     return data
 
 

@@ -10,27 +10,26 @@ or require any other unknown extension. Lines, lights, normals and animations ar
 Accessors, scenes and materials are decoded here, since trimesh ignores or misreads most of these
 features, and pygltflib only parses the JSON.
 
-Everything that the JSON says is checked where it is used, so that a damaged file is one message."""
+What reads a document runs inside :func:`~threestudio_gaussiandreamer.formats.reading.reading`,
+which makes one message of all that a damaged file raises."""
 
 import base64
-import binascii
 import json
 import logging
 import math
 import struct
 import urllib.parse
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple, NoReturn, Optional
 
 import numpy as np
 from jaxtyping import Float, Integer, UInt8
 
-from ..core.errors import UserError
 from ..core.quaternions import rotation_rows
+from ..formats.reading import reading, require
 from .mesh import CLAMP, MIRROR, REPEAT, Mesh, Tile, linear_to_srgb, unit_rgb
-from .side_files import Budget, SideFiles, decode_texture, fail
+from .side_files import Budget, SideFiles, decode_texture
 
 POINTS, LINES, TRIANGLES, STRIP, FAN = 0, (1, 2, 3), 4, 5, 6
 LARGEST_UV = 2.0**20
@@ -42,7 +41,6 @@ NEAREST = 9728
 UNREAD_IMAGES = ("KHR_texture_basisu", "MSFT_texture_dds")
 UNSET_FACTOR = [0.4, 0.4, 0.4]
 """trimesh's default for materials without a colour; ignored, since it would darken the texture."""
-MALFORMED = (KeyError, IndexError, TypeError, AttributeError, ValueError, OverflowError)
 
 World = Float[np.ndarray, "4 4"]
 
@@ -98,7 +96,7 @@ class Document:
         path: a ``.glb`` or ``.gltf`` file.
 
     Raises:
-        UserError: the file isn't glTF 2.0, is damaged, or requires an unsupported extension.
+        Unreadable: the file isn't glTF 2.0, is damaged, or requires an unsupported extension.
     """
 
     def __init__(self, path: Path) -> None:
@@ -106,71 +104,39 @@ class Document:
         self.side_files = SideFiles(path, self.budget)
         data = path.read_bytes()
         is_glb = data[:4] == b"glTF"
-        if path.suffix.lower() == ".glb" and not is_glb and data.lstrip()[:1] != b"{":
-            self.fail(f"it isn't a GLB file, which begins with glTF, but with {data[:20]!r}")
-        text, self._chunk = _glb_chunks(data, path) if is_glb else (data, None)
-        self.json = _parsed(text, path)
+        usual = is_glb or path.suffix.lower() != ".glb" or data.lstrip()[:1] == b"{"
+        require(usual, f"it isn't a GLB file, which begins with glTF, but with {data[:20]!r}")
+        text, self._chunk = _glb_chunks(data) if is_glb else (data, None)
+        self.json = json.loads(text.decode("utf-8"), parse_constant=_no_constant)
         self._buffers: dict[int, memoryview] = {}
-        self._check_version()
-        self._check_extensions()
-
-    def fail(self, problem: str) -> NoReturn:
-        """Raise UserError with the reason why the file can't be read."""
-        fail(self.path, problem)
+        version = str(self.json["asset"]["version"])
+        said = f"it is glTF of version {version[:20]}; version 2 was expected"
+        require(version.startswith("2."), said)
+        for name in self.json.get("extensionsRequired", []):
+            require(
+                name in READ_EXTENSIONS | HARMLESS_EXTENSIONS,
+                f"it requires the glTF extension {str(name)[:80]!r}, which isn't read here: export "
+                "it without that (Draco and meshopt compression off, PNG or JPEG textures)",
+            )
 
     def entry(self, kind: str, index: Any) -> dict[str, Any]:
         """Return the object with this index in the list ``kind`` ("nodes", "meshes", ...)."""
         entries = self.json.get(kind, [])
-        if not isinstance(entries, list) or type(index) is not int:
-            self.fail(f"its JSON isn't that of a glTF file: {kind} {str(index)[:40]!r}")
-        if not 0 <= index < len(entries) or not isinstance(entries[index], dict):
-            self.fail(f"it names number {index} of {len(entries)} {kind}")
+        known = type(index) is int and 0 <= index < len(entries)
+        require(known, f"it names number {str(index)[:40]} of {len(entries)} {kind}")
         return entries[index]
 
-    def numbers(self, values: Any, count: int, what: str) -> Float[np.ndarray, " count"]:
-        """Convert a list of the JSON to float64.
-
-        Raises:
-            UserError: it isn't a list of ``count`` numbers; ``what`` names it in the message.
-        """
-        usual = isinstance(values, (list, tuple)) and len(values) == count
-        if not usual or not all(type(value) in (int, float) for value in values):
-            self.fail(f"{what} should be {count} numbers, not {str(values)[:80]}")
-        try:
-            return np.array([float(value) for value in values])
-        except OverflowError:
-            self.fail(f"{what} has a number beyond floating point")
+    def numbers(self, values: Any, count: int) -> Float[np.ndarray, " count"]:
+        """Convert a list of the JSON, which must have ``count`` numbers, to float64."""
+        require(len(values) == count, f"{count} numbers were expected, not {str(values)[:80]}")
+        return np.array([float(value) for value in values])
 
     def size(self, entry: dict[str, Any], key: str, default: Optional[int] = None) -> int:
-        """Return a count or an offset of an entry.
-
-        Raises:
-            UserError: it is missing and has no default, or is no integer of 0 or more.
-        """
+        """Return a count or an offset of an entry, an integer of 0 or more."""
         value = entry.get(key, default)
-        if type(value) is not int or value < 0:
-            self.fail(f"{key} should be 0 or more, not {str(value)[:40]}")
+        usual = type(value) is int and value >= 0
+        require(usual, f"{key} should be 0 or more, not {str(value)[:40]}")
         return value
-
-    # -- extensions --------------------------------------------------------------------------------
-
-    def _check_version(self) -> None:
-        asset = self.json.get("asset", {})
-        version = asset.get("version") if isinstance(asset, dict) else None
-        if not str(version).startswith("2."):
-            self.fail(f"it is glTF of version {str(version)[:20]}; version 2 was expected")
-
-    def _check_extensions(self) -> None:
-        required = self.json.get("extensionsRequired", [])
-        if not isinstance(required, list):
-            self.fail("its JSON isn't that of a glTF file: extensionsRequired")
-        for name in required:
-            if name not in READ_EXTENSIONS | HARMLESS_EXTENSIONS:
-                self.fail(
-                    f"it requires the glTF extension {str(name)[:80]!r}, which isn't read here: "
-                    "export it without that (Draco and meshopt compression off, PNG or JPEG "
-                    "textures)"
-                )
 
     # -- binary data -------------------------------------------------------------------------------
 
@@ -179,8 +145,7 @@ class Document:
         view = self.entry("bufferViews", index)
         content = self._buffer(view.get("buffer"))
         start, length = self.size(view, "byteOffset", 0), self.size(view, "byteLength")
-        if start + length > len(content):
-            self.fail(f"buffer view {index} ends after its buffer")
+        require(start + length <= len(content), f"buffer view {index} ends after its buffer")
         return content[start : start + length], self.size(view, "byteStride", 0)
 
     def accessor(self, index: Any, kinds: tuple[str, ...]) -> Numbers:
@@ -191,14 +156,21 @@ class Document:
         """
         entry = self.entry("accessors", index)
         kind, component = entry.get("type"), entry.get("componentType")
-        if kind not in kinds or component not in COMPONENTS:
-            self.fail(
-                f"accessor {index} is {str(kind)[:20]} of component type {str(component)[:20]}; "
-                f"{' or '.join(kinds)} was expected"
-            )
+        said = f"accessor {index} is {str(kind)[:20]} of component type {str(component)[:20]}"
+        usual = kind in kinds and component in COMPONENTS
+        require(usual, f"{said}; {' or '.join(kinds)} was expected")
         shape = self.size(entry, "count"), WIDTHS[kind]
         dtype = np.dtype(COMPONENTS[component])
-        values = self._dense(entry, index, shape, dtype)
+        if "bufferView" in entry:
+            values = self._strided(entry, shape, dtype)
+        else:
+            require(
+                "sparse" in entry,
+                f"the numbers of accessor {index} aren't in the file; if they are compressed "
+                "(Draco, meshopt, SPZ), export it without that",
+            )
+            self.budget.spend(shape[0] * shape[1] * dtype.itemsize, f"accessor {index}")
+            values = np.zeros(shape, dtype)
         if "sparse" in entry:
             values = self._with_sparse(values, entry["sparse"], dtype)
         return Numbers(values, entry.get("normalized") is True)
@@ -207,47 +179,25 @@ class Document:
         """Return how many elements an accessor announces."""
         return self.size(self.entry("accessors", index), "count")
 
-    def _dense(
-        self, entry: dict[str, Any], index: Any, shape: tuple[int, int], dtype: np.dtype
-    ) -> np.ndarray:
-        if "bufferView" in entry:
-            place = entry["bufferView"], self.size(entry, "byteOffset", 0)
-            return self._strided(*place, shape, dtype)
-        if "sparse" not in entry:
-            self.fail(
-                f"the numbers of accessor {index} aren't in the file; if they are compressed "
-                "(Draco, meshopt, SPZ), export it without that"
-            )
-        self.budget.spend(shape[0] * shape[1] * dtype.itemsize, f"accessor {index}")
-        return np.zeros(shape, dtype)
-
     def _strided(
-        self, view: Any, offset: int, shape: tuple[int, int], dtype: np.dtype
+        self, entry: dict[str, Any], shape: tuple[int, int], dtype: np.dtype
     ) -> np.ndarray:
-        """Return rows of a buffer view without a copy."""
-        content, stride = self.view(view)
+        """Return rows of an entry's buffer view without a copy."""
+        content, stride = self.view(entry.get("bufferView"))
         row = shape[1] * dtype.itemsize
-        stride = stride or row
         if not shape[0]:
             return np.zeros(shape, dtype)
-        if stride < row or offset + (shape[0] - 1) * stride + row > len(content):
-            self.fail(f"an accessor reads {shape[0]} rows, which end after buffer view {view}")
-        return np.ndarray(shape, dtype, content, offset, (stride, dtype.itemsize))
+        require(stride == 0 or stride >= row, f"rows of {row} bytes can't be {stride} bytes apart")
+        place = self.size(entry, "byteOffset", 0), (stride or row, dtype.itemsize)
+        return np.ndarray(shape, dtype, content, *place)  # NumPy checks the end
 
     def _with_sparse(self, values: np.ndarray, sparse: Any, dtype: np.dtype) -> np.ndarray:
         """Return a copy in which some rows are replaced."""
-        count = self.size(sparse, "count")
-        where = sparse["indices"]
+        count, where = self.size(sparse, "count"), sparse["indices"]
         kind = COMPONENTS.get(where.get("componentType"))
-        if kind not in INDICES:
-            self.fail("the indices of a sparse accessor should be unsigned integers")
-        offset = self.size(where, "byteOffset", 0)
-        rows = self._strided(where.get("bufferView"), offset, (count, 1), np.dtype(kind))[:, 0]
-        if count and rows.max() >= len(values):
-            self.fail(f"a sparse accessor replaces row {rows.max()} of {len(values)}")
-        entry, shape = sparse["values"], (count, values.shape[1])
-        offset = self.size(entry, "byteOffset", 0)
-        replacement = self._strided(entry.get("bufferView"), offset, shape, dtype)
+        require(kind in INDICES, "the indices of a sparse accessor should be unsigned integers")
+        rows = self._strided(where, (count, 1), np.dtype(kind))[:, 0]
+        replacement = self._strided(sparse["values"], (count, values.shape[1]), dtype)
         self.budget.spend(values.nbytes, "a sparse accessor")
         values = values.copy()
         values[rows] = replacement
@@ -258,70 +208,46 @@ class Document:
             entry = self.entry("buffers", index)
             if "uri" in entry:
                 content = self.resource(entry["uri"], f"buffer {index}")
-                if content is None:
-                    self.fail(f"buffer {index} is missing")
-            elif index == 0 and self._chunk is not None:
-                content = self._chunk
             else:
-                self.fail(f"buffer {index} isn't in the file")
-            if len(content) < self.size(entry, "byteLength"):
-                self.fail(f"buffer {index} is shorter than it should be")
+                content = self._chunk if index == 0 else None
+            require(content is not None, f"buffer {index} is missing")
+            whole = len(content) >= self.size(entry, "byteLength")
+            require(whole, f"buffer {index} is shorter than it should be")
             self._buffers[index] = memoryview(content)
         return self._buffers[index]
 
-    def resource(self, uri: Any, what: str) -> Optional[bytes]:
+    def resource(self, uri: str, what: str) -> Optional[bytes]:
         """Return the content of a data URI or of a file beside this one; None where it is missing.
 
         Raises:
-            UserError: damaged, an address on the network, or not a regular file.
+            Unreadable: an address on the network, or not a regular file.
         """
-        if not isinstance(uri, str):
-            self.fail(f"the URI of {what} isn't text")
         scheme = urllib.parse.urlsplit(uri[:100]).scheme if ":" in uri[:100] else ""
         if scheme == "data":
-            return self._data_uri(uri, what)
-        if len(scheme) > 1:
-            self.fail(f"{what} is at {uri[:80]!r}; only files beside the mesh are read")
-        return self.side_files.read(urllib.parse.unquote(uri))
-
-    def _data_uri(self, uri: str, what: str) -> bytes:
-        head, _, body = uri.partition(",")
-        try:
+            head, _, body = uri.partition(",")
             if head.endswith(";base64"):
                 return base64.b64decode(urllib.parse.unquote(body), validate=True)
             return urllib.parse.unquote_to_bytes(body)
-        except (binascii.Error, ValueError) as error:
-            self.fail(f"the data URI of {what} is damaged: {error}")
+        said = f"{what} is at {uri[:80]!r}; only files beside the mesh are read"
+        require(len(scheme) <= 1, said)
+        return self.side_files.read(urllib.parse.unquote(uri))
 
 
-def _glb_chunks(data: bytes, path: Path) -> tuple[bytes, Optional[memoryview]]:
+def _glb_chunks(data: bytes) -> tuple[bytes, Optional[memoryview]]:
     """Return the JSON and the binary chunk of a GLB."""
     at, chunks = 12, []
     while at + 8 <= len(data):
         size, kind = struct.unpack_from("<I4s", data, at)
         at += 8 + size
         chunks.append((kind, memoryview(data)[at - size : at]))
-    if not chunks or chunks[0][0] != b"JSON" or at > len(data):
-        fail(path, "its chunks don't fill it")
+    usual = bool(chunks) and chunks[0][0] == b"JSON" and at <= len(data)
+    require(usual, "its chunks don't fill it: it is truncated or damaged")
     binary = chunks[1][1] if len(chunks) > 1 and chunks[1][0] == b"BIN\0" else None
     return bytes(chunks[0][1]), binary
 
 
-def _parsed(text: bytes, path: Path) -> dict[str, Any]:
-    try:
-        document = json.loads(text.decode("utf-8"), parse_constant=_no_constant)
-    except (ValueError, RecursionError) as error:
-        fail(path, f"its JSON isn't valid ({str(error)[:100]})")
-    if not isinstance(document, dict):
-        fail(path, "its JSON isn't that of a glTF file")
-    return document
-
-
 def _no_constant(name: str) -> NoReturn:
     raise ValueError(f"{name} is no JSON")
-
-
-# ---- scenes --------------------------------------------------------------------------------------
 
 
 def read_gltf(path: Path) -> list[Mesh]:
@@ -330,22 +256,8 @@ def read_gltf(path: Path) -> list[Mesh]:
     Raises:
         UserError: the file is damaged, exceeds its budget, or has content that isn't supported.
     """
-    with parse_errors(path):
-        return _Scene(Document(path)).parts()
-
-
-@contextmanager
-def parse_errors(path: Path) -> Iterator[None]:
-    """Turn the errors that the damaged glTF file ``path`` causes in the block into UserError."""
-    try:
-        with np.errstate(over="ignore", invalid="ignore"):  # dropped later
-            yield
-    except UserError:
-        raise
-    except OSError as error:
-        fail(path, error.strerror or str(error))
-    except MALFORMED as error:
-        fail(path, f"its JSON isn't that of a glTF file ({type(error).__name__}: {error})")
+    with reading(path, "mesh") as file:
+        return list(_Scene(Document(file)).parts())
 
 
 # ---- materials -----------------------------------------------------------------------------------
@@ -369,13 +281,11 @@ class Materials:
 
     def __init__(self, document: Document) -> None:
         self.document = document
-        self._surfaces: dict[int, Surface] = {}
-        self._textures: dict[int, Optional[np.ndarray]] = {}
+        self._surfaces: dict[Any, Surface] = {None: Surface()}
+        self._textures: dict[Any, Optional[np.ndarray]] = {}
 
     def surface(self, index: Any) -> Surface:
         """Return the base colour of the material of this index; None = the default material."""
-        if index is None:
-            return Surface()
         if index not in self._surfaces:
             self._surfaces[index] = self._read(self.document.entry("materials", index))
         return self._surfaces[index]
@@ -383,67 +293,49 @@ class Materials:
     def _read(self, material: dict[str, Any]) -> Surface:
         old = _extension(material, "KHR_materials_pbrSpecularGlossiness")
         model = material.get("pbrMetallicRoughness", {}) if old is None else old
-        names = ("baseColorTexture", "baseColorFactor")
-        if old is not None:
-            names = ("diffuseTexture", "diffuseFactor")
-        surface = Surface(factor=self._factor(model.get(names[1]), textured=names[0] in model))
-        info = model.get(names[0])
-        texture = None if info is None else self._image(self._texture(info))
-        if texture is None:
-            return surface
-        transform = _extension(info, "KHR_texture_transform") or {}
-        return surface._replace(
-            texture=texture,
-            tile=self._tile(self._texture(info), texture),
-            coordinates=transform.get("texCoord", info.get("texCoord", 0)),
-            transform=self._transform(transform) if transform else None,
-        )
-
-    def _factor(self, factor: Any, textured: bool) -> Optional[np.ndarray]:
-        if factor is None:
-            return None
-        rgb = self.document.numbers(factor, 4, "the colour of a material")[:3]
-        by_trimesh = "trimesh" in str(self.document.json["asset"].get("generator"))
-        if (by_trimesh and rgb.tolist() == UNSET_FACTOR) or (textured and (rgb == 1).all()):
-            return None
-        return linear_to_srgb(unit_rgb(rgb[None])[0])
-
-    def _texture(self, info: dict[str, Any]) -> dict[str, Any]:
-        return self.document.entry("textures", info.get("index"))
+        kind = "baseColor" if old is None else "diffuse"
+        info, factor = model.get(f"{kind}Texture"), model.get(f"{kind}Factor")
+        if factor is not None:
+            rgb = self.document.numbers(factor, 4)[:3]
+            by_trimesh = "trimesh" in str(self.document.json["asset"].get("generator"))
+            unset = by_trimesh and rgb.tolist() == UNSET_FACTOR
+            unset = unset or f"{kind}Texture" in model and (rgb == 1).all()
+            factor = None if unset else linear_to_srgb(unit_rgb(rgb[None])[0])
+        if info is None:
+            return Surface(factor)
+        texture = self.document.entry("textures", info.get("index"))
+        if (picture := self._image(texture)) is None:
+            return Surface(factor)
+        moved = _extension(info, "KHR_texture_transform") or {}
+        coordinates = moved.get("texCoord", info.get("texCoord", 0))
+        matrix = self._transform(moved) if moved else None
+        return Surface(factor, picture, self._tile(texture, picture), coordinates, matrix)
 
     def _image(self, texture: dict[str, Any]) -> Optional[np.ndarray]:
         """Return the picture of a texture; None, with a warning, where its file is missing."""
         source = (_extension(texture, "EXT_texture_webp") or texture).get("source")
         if source is None:
             source = texture.get("source")
-        if source is None:
-            kinds = [name for name in UNREAD_IMAGES if _extension(texture, name) is not None]
-            self.document.fail(f"a texture has no PNG, JPEG or WebP image, only {kinds or 'none'}")
+        kinds = [name for name in UNREAD_IMAGES if _extension(texture, name) is not None]
+        said = f"a texture has no PNG, JPEG or WebP image, only {kinds or 'none'}"
+        require(source is not None, said)
         if source not in self._textures:
-            self._textures[source] = self._decoded(source)
+            image = self.document.entry("images", source)
+            if "bufferView" in image:
+                data = bytes(self.document.view(image["bufferView"])[0])
+            else:
+                data = self.document.resource(image.get("uri"), f"image {source}")
+            name = str(image.get("name", source))[:80]
+            found = None if data is None else decode_texture(data, name, self.document.budget)
+            self._textures[source] = found
         return self._textures[source]
-
-    def _decoded(self, index: Any) -> Optional[np.ndarray]:
-        image = self.document.entry("images", index)
-        if "bufferView" in image:
-            data = bytes(self.document.view(image["bufferView"])[0])
-        else:
-            data = self.document.resource(image.get("uri"), f"image {index}")
-        if data is None:
-            return None
-        return decode_texture(data, str(image.get("name", index))[:80], self.document.budget)
 
     def _tile(self, texture: dict[str, Any], picture: np.ndarray) -> Tile:
         height, width = picture.shape[:2]
-        sampler = {}
-        if "sampler" in texture:
-            sampler = self.document.entry("samplers", texture["sampler"])
-        wraps = [sampler.get(key, 10497) for key in ("wrapS", "wrapT")]
-        if not all(wrap in WRAPS for wrap in wraps):
-            self.document.fail(f"a texture wraps by {str(wraps)[:60]}; {list(WRAPS)} are known")
-        return Tile(
-            0, width, height, *(WRAPS[w] for w in wraps), sampler.get("magFilter") == NEAREST
-        )
+        known = "sampler" in texture
+        sampler = self.document.entry("samplers", texture["sampler"]) if known else {}
+        wraps = [WRAPS[sampler.get(key, 10497)] for key in ("wrapS", "wrapT")]
+        return Tile(0, width, height, *wraps, sampler.get("magFilter") == NEAREST)
 
     def _transform(self, transform: dict[str, Any]) -> np.ndarray:
         """Return KHR_texture_transform as a matrix: scale, then rotate, then move.
@@ -451,9 +343,9 @@ class Materials:
         The rotation is counter-clockwise as seen in the texture, whose v grows downwards.
         """
         numbers = self.document.numbers
-        offset = numbers(transform.get("offset", [0, 0]), 2, "a texture's offset")
-        scale = numbers(transform.get("scale", [1, 1]), 2, "a texture's scale")
-        (angle,) = numbers([transform.get("rotation", 0)], 1, "a texture's rotation")
+        offset = numbers(transform.get("offset", [0, 0]), 2)
+        scale = numbers(transform.get("scale", [1, 1]), 2)
+        (angle,) = numbers([transform.get("rotation", 0)], 1)
         c, s = math.cos(angle), math.sin(angle)
         return np.column_stack([np.array([[c, s], [-s, c]]) * scale, offset])
 
@@ -462,18 +354,7 @@ def _extension(entry: dict[str, Any], name: str) -> Optional[dict[str, Any]]:
     return entry.get("extensions", {}).get(name)
 
 
-def _texture_coordinates(
-    uv: Float[np.ndarray, "V 2"], surface: Surface
-) -> Float[np.ndarray, "V 2"]:
-    """Return coordinates as ``Mesh`` has them: transformed, and v upwards."""
-    uv = np.nan_to_num(uv).clip(-LARGEST_UV, LARGEST_UV)
-    if surface.transform is not None:
-        moved = uv @ surface.transform[:, :2].T + surface.transform[:, 2]
-        uv = np.nan_to_num(moved).clip(-LARGEST_UV, LARGEST_UV).astype(np.float32)
-    return np.stack([uv[:, 0], 1 - uv[:, 1]], axis=1)
-
-
-# ---- poses ---------------------------------------------------------------------------------------
+# ---- scenes --------------------------------------------------------------------------------------
 
 
 def world_matrices(document: Document) -> dict[int, World]:
@@ -482,100 +363,37 @@ def world_matrices(document: Document) -> dict[int, World]:
     Without scenes, the nodes that are no children are the roots.
 
     Raises:
-        UserError: a node is shown twice, which would be a cycle or no tree.
+        Unreadable: a node is shown twice, which would be a cycle or no tree.
     """
+    if document.json.get("scenes"):
+        roots = document.entry("scenes", document.json.get("scene", 0)).get("nodes", [])
+    else:
+        nodes = document.json.get("nodes", [])
+        children = {child for node in nodes for child in node.get("children", [])}
+        roots = [index for index in range(len(nodes)) if index not in children]
     worlds: dict[int, World] = {}
-    waiting = [(root, np.eye(4)) for root in reversed(_roots(document))]
+    waiting = [(root, np.eye(4)) for root in reversed(roots)]
     while waiting:
         index, above = waiting.pop()
         node = document.entry("nodes", index)
-        if index in worlds:
-            document.fail(f"node {index} has two parents")
-        worlds[index] = above @ local_matrix(document, node)
+        require(index not in worlds, f"node {index} has two parents")
+        worlds[index] = above @ _local_matrix(document, node)
         waiting += [(child, worlds[index]) for child in reversed(node.get("children", []))]
     return worlds
 
 
-def _roots(document: Document) -> list[Any]:
-    if document.json.get("scenes"):
-        return document.entry("scenes", document.json.get("scene", 0)).get("nodes", [])
-    nodes = document.json.get("nodes", [])
-    children = {child for node in nodes for child in node.get("children", [])}
-    return [index for index in range(len(nodes)) if index not in children]
-
-
-def local_matrix(document: Document, node: dict[str, Any]) -> World:
+def _local_matrix(document: Document, node: dict[str, Any]) -> World:
     """Return a node's matrix to its parent: its own, or T R S."""
     if "matrix" in node:
-        return document.numbers(node["matrix"], 16, "the matrix of a node").reshape(4, 4).T
+        return document.numbers(node["matrix"], 16).reshape(4, 4).T
     matrix = np.eye(4)
-    rotation = document.numbers(node.get("rotation", [0, 0, 0, 1]), 4, "the rotation of a node")
-    scale = document.numbers(node.get("scale", [1, 1, 1]), 3, "the scale of a node")
-    matrix[:3, :3] = rotation_matrix(rotation) * scale
-    matrix[:3, 3] = document.numbers(node.get("translation", [0] * 3), 3, "the place of a node")
+    xyzw = document.numbers(node.get("rotation", [0, 0, 0, 1]), 4)
+    if xyzw.any():  # zero is the identity
+        x, y, z, w = xyzw / np.linalg.norm(xyzw)
+        matrix[:3, :3] = rotation_rows(w, x, y, z)
+    matrix[:3, :3] *= document.numbers(node.get("scale", [1, 1, 1]), 3)
+    matrix[:3, 3] = document.numbers(node.get("translation", [0] * 3), 3)
     return matrix
-
-
-def rotation_matrix(xyzw: Float[np.ndarray, "4"]) -> Float[np.ndarray, "3 3"]:
-    """Return the rotation of a quaternion; zero is the identity."""
-    if not xyzw.any():
-        return np.eye(3)
-    x, y, z, w = xyzw / np.linalg.norm(xyzw)
-    return np.array(rotation_rows(w, x, y, z))
-
-
-def skinned(
-    document: Document,
-    skin: Any,
-    attributes: dict[str, Any],
-    positions: Float[np.ndarray, "V 3"],
-    worlds: dict[int, World],
-) -> Float[np.ndarray, "V 3"]:
-    """Return the vertices of a skinned mesh in the pose of its joints.
-
-    The mesh's own node doesn't move it (glTF 2.0, 3.7.3.3); each vertex is moved by the weighted
-    mean of its joints' matrices.
-    """
-    matrices = _joint_matrices(document, document.entry("skins", skin), worlds)
-    blended, total = np.zeros((len(positions), 4, 4)), np.zeros(len(positions))
-    document.budget.spend(blended.nbytes, "a skinned mesh")
-    for joints, weights in _influences(document, attributes, len(positions)):
-        if joints.size and joints.max() >= len(matrices):
-            document.fail(f"a vertex follows joint {joints.max()} of {len(matrices)}")
-        for column in range(4):
-            blended += weights[:, column, None, None] * matrices[joints[:, column]]
-            total += weights[:, column]
-    blended /= np.where(total > 0, total, 1)[:, None, None]
-    return np.einsum("vij,vj->vi", blended[:, :3, :3], positions) + blended[:, :3, 3]
-
-
-def _joint_matrices(
-    document: Document, skin: dict[str, Any], worlds: dict[int, World]
-) -> Float[np.ndarray, "J 4 4"]:
-    joints = skin["joints"]
-    if any(joint not in worlds for joint in joints):
-        document.fail("a joint of a skin isn't in the scene")
-    matrices = np.stack([worlds[joint] for joint in joints])
-    if "inverseBindMatrices" not in skin:
-        return matrices
-    inverse = document.accessor(skin["inverseBindMatrices"], ("MAT4",)).floats()
-    if len(inverse) < len(joints):
-        document.fail(f"a skin has {len(inverse)} matrices for {len(joints)} joints")
-    return matrices @ inverse[: len(joints)].reshape(-1, 4, 4).transpose(0, 2, 1)
-
-
-def _influences(document: Document, attributes: dict[str, Any], count: int):
-    """Yield the joints (V, 4) and their weights (V, 4) of each set of attributes."""
-    sets = sum(name.startswith("JOINTS_") for name in attributes)
-    for number in range(sets):
-        joints = document.accessor(attributes[f"JOINTS_{number}"], ("VEC4",)).values
-        weights = document.accessor(attributes[f"WEIGHTS_{number}"], ("VEC4",))
-        if joints.dtype.kind != "u" or not len(joints) == len(weights.values) == count:
-            document.fail("the joints of a skinned mesh don't fit its vertices")
-        yield joints, weights.floats(normalize=True)
-
-
-# ---- scenes --------------------------------------------------------------------------------------
 
 
 class _Scene:
@@ -585,77 +403,74 @@ class _Scene:
         self.document, self.materials = document, Materials(document)
         self.worlds = world_matrices(document)
 
-    def parts(self) -> list[Mesh]:
-        found = [part for node in self.worlds for part in self._parts_of(node)]
-        return [part for part in found if part is not None]
-
-    def _parts_of(self, index: int) -> list[Optional[Mesh]]:
-        node = self.document.entry("nodes", index)
-        if "EXT_mesh_gpu_instancing" in node.get("extensions", {}):
-            self.document.fail("it has instances by EXT_mesh_gpu_instancing, which isn't read here")
-        if "mesh" not in node:
-            return []
-        mesh = self.document.entry("meshes", node["mesh"])
-        weights = node.get("weights", mesh.get("weights", []))
-        weights = self.document.numbers(weights, len(weights), "the weights of a mesh")
-        return [self._part(index, node, primitive, weights) for primitive in mesh["primitives"]]
+    def parts(self) -> Iterator[Mesh]:
+        """Yield each primitive of triangles or points."""
+        for index in self.worlds:
+            node = self.document.entry("nodes", index)
+            instanced = "EXT_mesh_gpu_instancing" in node.get("extensions", {})
+            said = "it has instances by EXT_mesh_gpu_instancing, which isn't read here"
+            require(not instanced, said)
+            if "mesh" not in node:
+                continue
+            mesh = self.document.entry("meshes", node["mesh"])
+            weights = node.get("weights", mesh.get("weights", []))
+            weights = self.document.numbers(weights, len(weights))
+            for primitive in mesh["primitives"]:  # lines are ignored
+                if "POSITION" in primitive["attributes"] and primitive.get("mode") not in LINES:
+                    yield self._part(index, node, primitive, weights)
 
     def _part(
         self, index: int, node: dict[str, Any], primitive: dict[str, Any], weights: np.ndarray
-    ) -> Optional[Mesh]:
-        """Return one primitive, transformed to the world; None for lines or without positions."""
+    ) -> Mesh:
+        """Return one primitive, transformed to the world."""
         mode, attributes = primitive.get("mode", TRIANGLES), primitive["attributes"]
-        if mode in LINES or "POSITION" not in attributes:
-            return None
         count = self.document.count(attributes["POSITION"])
         self.document.budget.spend_geometry(count, 0)
         corners = self._corners(primitive, count)
         self.document.budget.spend_geometry(0, len(corners) // (3 if mode == TRIANGLES else 1))
-        faces = self._faces(mode, corners)
+        faces = _faces(mode, corners.astype(np.int64))
         positions = self._attribute(primitive, "POSITION", ("VEC3",), count, weights)
-        world = self.worlds[index]
+        world, colors = self.worlds[index], None
         if "skin" in node:
-            vertices = skinned(self.document, node["skin"], attributes, positions, self.worlds)
+            vertices = self._skinned(node["skin"], attributes, positions)
         else:
             vertices = positions.astype(np.float64)
             if not np.array_equal(world, np.eye(4)):
                 vertices = vertices @ world[:3, :3].T + world[:3, 3]
             if np.linalg.det(world[:3, :3]) < 0:
                 faces = faces[:, ::-1]  # glTF: a mirrored node reverses the winding of its faces
-        part = Mesh(vertices, faces, vertex_colors=self._colors(primitive, count, weights))
-        return self._with_material(part, primitive, weights)
-
-    # -- faces -------------------------------------------------------------------------------------
+        if "COLOR_0" in attributes:
+            kinds = ("VEC3", "VEC4")
+            found = self._attribute(primitive, "COLOR_0", kinds, count, weights, normalize=True)
+            colors = unit_rgb(found)
+        surface = self.materials.surface(primitive.get("material"))
+        if surface.factor is not None:  # times COLOR_0
+            own = 1 if colors is None else colors
+            colors = np.broadcast_to(surface.factor * own, vertices.shape)
+        part = Mesh(vertices, faces, vertex_colors=colors)
+        if surface.texture is None or not len(faces):
+            return part
+        name = f"TEXCOORD_{surface.coordinates}"
+        if name not in attributes:
+            log.warning("%s has a texture for %s, which is missing", self.document.path, name)
+            return part
+        uv = self._attribute(primitive, name, ("VEC2",), count, weights)
+        uv = np.nan_to_num(uv).clip(-LARGEST_UV, LARGEST_UV)
+        if surface.transform is not None:
+            moved = uv @ surface.transform[:, :2].T + surface.transform[:, 2]
+            uv = np.nan_to_num(moved).clip(-LARGEST_UV, LARGEST_UV).astype(np.float32)
+        upwards = np.stack([uv[:, 0], 1 - uv[:, 1]], axis=1)
+        return part._replace(uv=upwards, texture=surface.texture, tiles=(surface.tile,))
 
     def _corners(self, primitive: dict[str, Any], count: int) -> Integer[np.ndarray, " C"]:
         """Return the vertices in the order in which faces take them."""
         if "indices" not in primitive:
             return np.arange(count)
         values = self.document.accessor(primitive["indices"], ("SCALAR",)).values[:, 0]
-        if values.dtype not in [np.dtype(kind) for kind in INDICES]:
-            self.document.fail("the indices of a mesh should be unsigned integers")
-        if len(values) and values.max() >= count:
-            self.document.fail(f"a face names vertex {values.max()} of {count}")
+        require(values.dtype.kind == "u", "the indices of a mesh should be unsigned integers")
+        known = not len(values) or values.max() < count
+        require(known, f"a face names a vertex beyond the last of {count}")
         return values
-
-    def _faces(self, mode: Any, corners: np.ndarray) -> Integer[np.ndarray, "F 3"]:
-        corners = corners.astype(np.int64)
-        first = np.arange(max(len(corners) - 2, 0))
-        if mode == TRIANGLES:
-            if len(corners) % 3:
-                self.document.fail(f"{len(corners)} corners don't make triangles")
-            return corners.reshape(-1, 3)
-        if mode == STRIP:  # every second triangle has the opposite winding
-            odd = first % 2
-            return np.stack([corners[first + i] for i in (0, 1 + odd, 2 - odd)], axis=1)
-        if mode == FAN:
-            hub = np.broadcast_to(corners[:1], first.shape) if len(first) else first
-            return np.stack([corners[first + 1], corners[first + 2], hub], axis=1)
-        if mode == POINTS:
-            return np.zeros((0, 3), np.int64)
-        self.document.fail(f"a primitive of mode {str(mode)[:20]} is unknown")
-
-    # -- attributes --------------------------------------------------------------------------------
 
     def _attribute(
         self,
@@ -668,45 +483,57 @@ class _Scene:
         normalize: bool = False,
     ) -> Float[np.ndarray, "V W"]:
         """Return an attribute of the vertices with its morph targets added (float32)."""
-        values = self._rows(primitive["attributes"][name], name, kinds, count, normalize)
+
+        def rows(index: Any) -> np.ndarray:
+            values = self.document.accessor(index, kinds).floats(normalize=normalize)
+            require(len(values) == count, f"{name} has {len(values)} rows for {count} vertices")
+            return values
+
+        values = rows(primitive["attributes"][name])
         for weight, target in zip(weights, primitive.get("targets", []), strict=False):
             if name in target and weight:
-                offsets = self._rows(target[name], name, kinds, count, normalize)
+                offsets = rows(target[name])
                 width = min(offsets.shape[1], values.shape[1])
                 values[:, :width] += np.float32(weight) * offsets[:, :width]
         return values
 
-    def _rows(
-        self, index: Any, name: str, kinds: tuple[str, ...], count: int, normalize: bool
-    ) -> np.ndarray:
-        values = self.document.accessor(index, kinds).floats(normalize=normalize)
-        if len(values) != count:
-            self.document.fail(f"{name} has {len(values)} rows for {count} vertices")
-        return values
+    def _skinned(
+        self, skin: Any, attributes: dict[str, Any], positions: Float[np.ndarray, "V 3"]
+    ) -> Float[np.ndarray, "V 3"]:
+        """Return the vertices of a skinned mesh in the pose of its joints.
 
-    def _colors(
-        self, primitive: dict[str, Any], count: int, weights: np.ndarray
-    ) -> Optional[np.ndarray]:
-        if "COLOR_0" not in primitive["attributes"]:
-            return None
-        kinds = ("VEC3", "VEC4")
-        colors = self._attribute(primitive, "COLOR_0", kinds, count, weights, normalize=True)
-        return unit_rgb(colors)
+        The mesh's own node doesn't move it (glTF 2.0, 3.7.3.3); each vertex is moved by the
+        weighted mean of its joints' matrices.
+        """
+        entry, count = self.document.entry("skins", skin), len(positions)
+        matrices = np.stack([self.worlds[joint] for joint in entry["joints"]])
+        if "inverseBindMatrices" in entry:
+            inverse = self.document.accessor(entry["inverseBindMatrices"], ("MAT4",)).floats()
+            inverse = inverse[: len(matrices)].reshape(len(matrices), 4, 4)
+            matrices = matrices @ inverse.transpose(0, 2, 1)
+        blended, total = np.zeros((count, 4, 4)), np.zeros(count)
+        self.document.budget.spend(blended.nbytes, "a skinned mesh")
+        for number in range(sum(name.startswith("JOINTS_") for name in attributes)):
+            joints = self.document.accessor(attributes[f"JOINTS_{number}"], ("VEC4",)).values
+            weights = self.document.accessor(attributes[f"WEIGHTS_{number}"], ("VEC4",))
+            fit = joints.dtype.kind == "u" and len(joints) == len(weights.values) == count
+            require(fit, "the joints of a skinned mesh don't fit its vertices")
+            for joint, weight in zip(joints.T, weights.floats(normalize=True).T, strict=True):
+                blended += weight[:, None, None] * matrices[joint]
+                total += weight
+        blended /= np.where(total > 0, total, 1)[:, None, None]
+        return np.einsum("vij,vj->vi", blended[:, :3, :3], positions) + blended[:, :3, 3]
 
-    def _with_material(self, part: Mesh, primitive: dict[str, Any], weights: np.ndarray) -> Mesh:
-        """Return the part with factor times COLOR_0 as vertex colours, and the texture."""
-        surface = self.materials.surface(primitive.get("material"))
-        if surface.factor is not None:
-            own = 1 if part.vertex_colors is None else part.vertex_colors
-            colors = np.broadcast_to(surface.factor * own, part.vertices.shape)
-            part = part._replace(vertex_colors=colors)
-        if surface.texture is None or not len(part.faces):
-            return part
-        name = f"TEXCOORD_{surface.coordinates}"
-        if name not in primitive["attributes"]:
-            log.warning("%s has a texture for %s, which is missing", self.document.path, name)
-            return part
-        uv = self._attribute(primitive, name, ("VEC2",), len(part.vertices), weights)
-        return part._replace(
-            uv=_texture_coordinates(uv, surface), texture=surface.texture, tiles=(surface.tile,)
-        )
+
+def _faces(mode: Any, corners: Integer[np.ndarray, " C"]) -> Integer[np.ndarray, "F 3"]:
+    first = np.arange(max(len(corners) - 2, 0))
+    if mode == TRIANGLES:
+        return corners.reshape(-1, 3)
+    if mode == STRIP:  # every second triangle has the opposite winding
+        odd = first % 2
+        return np.stack([corners[first + i] for i in (0, 1 + odd, 2 - odd)], axis=1)
+    if mode == FAN:
+        hub = np.broadcast_to(corners[:1], first.shape) if len(first) else first
+        return np.stack([corners[first + 1], corners[first + 2], hub], axis=1)
+    require(mode == POINTS, f"a primitive of mode {str(mode)[:20]} is unknown")
+    return np.zeros((0, 3), np.int64)

@@ -28,10 +28,11 @@ from jaxtyping import Float, Int
 
 from ..core.errors import UserError, unknown
 from ..core.files import existing_file
-from ..formats.ply import COLORS, MEANS, Lists, PlyTable, read_comments, read_faces, unit_colors
+from ..formats.ply import COLORS, MEANS, Lists, PlyTable, unit_colors
+from ..formats.reading import Unreadable, reading, require
 from .gltf import LARGEST_UV, read_gltf
 from .mesh import GREY, MAX_NON_FINITE, Mesh, face_areas, linear_to_srgb, merged, unit_rgb
-from .side_files import Budget, SideFiles, decode_image, decode_texture, fail, open_texture, utf8
+from .side_files import Budget, SideFiles, decode_image, decode_texture, open_texture, utf8
 
 GLTF_FORMATS = ("glb", "gltf")
 Z_UP_FORMATS = ("ply", "stl", "off", "xyz")
@@ -89,9 +90,21 @@ def load_mesh(
     if not scale > 0:
         raise UserError(f"the scale of a mesh must be greater than 0, not {scale}")
     rotation = pose_rotation(_extension(path), up, front)
-    mesh = merged(_surfaces(path))
-    mesh = _drop_bad_vertices(mesh, path)
-    return mesh._replace(vertices=_normalise(mesh, rotation, scale, path))
+    parts = [part for part in read_parts(path) if len(part.faces)]
+    if not parts:
+        raise UserError(
+            f"the mesh {str(path)!r} has no faces: give a triangle mesh, or a point cloud to a "
+            "point-cloud prior"
+        )
+    mesh = _drop_bad_vertices(merged(parts), path)
+    if not len(mesh.vertices):
+        raise UserError(f"no face of the mesh {str(path)!r} is usable: all have a NaN or infinity")
+    low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+    half = (high - low).max() / 2
+    centred = (mesh.vertices - (low + high) / 2) / (half or 1.0)
+    if not half > 0 or not face_areas(mesh._replace(vertices=centred)).sum() > 0:
+        raise UserError(f"the mesh {str(path)!r} has no surface: all its faces have zero area")
+    return mesh._replace(vertices=scale * centred @ rotation.T)
 
 
 def mesh_file(path: str | Path) -> Path:
@@ -117,8 +130,7 @@ def bundled_meshes() -> list[str]:
     return sorted(file.name for file in ASSETS.glob("*.glb"))
 
 
-# Reading
-# --------------------------------------------------------------------------------------------------
+# ---- reading -------------------------------------------------------------------------------------
 
 
 def read_parts(path: Path) -> list[Mesh]:
@@ -149,19 +161,7 @@ def _extension(path: Path) -> str:
     return extension
 
 
-def _surfaces(path: Path) -> list[Mesh]:
-    """Return the parts with faces."""
-    parts = [part for part in read_parts(path) if len(part.faces)]
-    if not parts:
-        raise UserError(
-            f"the mesh {str(path)!r} has no faces: give a triangle mesh, or a point cloud to a "
-            "point-cloud prior"
-        )
-    return parts
-
-
-# Cleaning and pose
-# --------------------------------------------------------------------------------------------------
+# ---- cleaning and pose ---------------------------------------------------------------------------
 
 
 def _drop_bad_vertices(mesh: Mesh, path: Path) -> Mesh:
@@ -176,29 +176,11 @@ def _drop_bad_vertices(mesh: Mesh, path: Path) -> Mesh:
         log.warning("dropped %d of %d vertices of %s that aren't finite", bad, len(finite), path)
     keep_face = finite[mesh.faces].all(axis=1)
     used, faces = np.unique(mesh.faces[keep_face], return_inverse=True)
-    rows = {name: getattr(mesh, name) for name in ("vertices", "uv", "vertex_colors")}
-    face_rows = {name: getattr(mesh, name) for name in ("face_colors", "tile_index")}
-    return mesh._replace(
-        faces=faces.reshape(-1, 3),
-        **{name: None if value is None else value[used] for name, value in rows.items()},
-        **{name: None if value is None else value[keep_face] for name, value in face_rows.items()},
-    )
-
-
-def _normalise(mesh: Mesh, rotation: np.ndarray, scale: float, path: Path) -> np.ndarray:
-    """Return the vertices centred at the origin, scaled so that half the longest side of their box
-    is ``scale``, and rotated.
-    """
-    if not len(mesh.vertices):
-        raise UserError(
-            f"no face of the mesh {str(path)!r} is usable: all touch a non-finite vertex"
-        )
-    low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
-    half = (high - low).max() / 2
-    centred = (mesh.vertices - (low + high) / 2) / (half or 1.0)
-    if not half > 0 or not face_areas(mesh._replace(vertices=centred)).sum() > 0:
-        raise UserError(f"the mesh {str(path)!r} has no surface: all its faces have zero area")
-    return scale * centred @ rotation.T
+    rows = dict.fromkeys(("vertices", "uv", "vertex_colors"), used)
+    rows |= dict.fromkeys(("face_colors", "tile_index"), keep_face)
+    found = {name: getattr(mesh, name) for name in rows}
+    kept = {name: x if x is None else x[rows[name]] for name, x in found.items()}
+    return mesh._replace(faces=faces.reshape(-1, 3), **kept)
 
 
 def pose_rotation(extension: str, up: str, front: Optional[str]) -> np.ndarray:
@@ -218,8 +200,7 @@ def pose_rotation(extension: str, up: str, front: Optional[str]) -> np.ndarray:
     return np.stack([AXES[front], np.cross(AXES[up], AXES[front]), AXES[up]])
 
 
-# PLY
-# --------------------------------------------------------------------------------------------------
+# ---- PLY -----------------------------------------------------------------------------------------
 
 
 def read_ply_mesh(path: Path) -> list[Mesh]:
@@ -228,31 +209,32 @@ def read_ply_mesh(path: Path) -> list[Mesh]:
     Raises:
         UserError: the file is damaged or exceeds its budget.
     """
-    budget, table, faces = Budget(path), PlyTable.read(path), read_faces(path)
-    if missing := [name for name in MEANS if name not in table]:
-        fail(path, f"its vertices have no {', '.join(missing)}")
-    vertices = table.doubles(MEANS)
-    corners = next((faces[name] for name in INDICES if name in faces), Lists(*np.zeros((2, 0))))
-    triangles, polygons = _triangles(corners)
-    budget.spend_geometry(len(vertices), len(triangles))
-    known = (corners.values >= 0) & (corners.values < len(vertices)) & (corners.values % 1 == 0)
-    if not known.all():
-        wrong = corners.values[~known][0]
-        fail(path, f"it is damaged: a face names vertex {wrong:g} of {len(vertices)}")
-    indices = corners.values.astype(np.int64)
-    mesh = Mesh(vertices, indices[triangles])
-    if all(name in table for name in COLORS):
-        colors = unit_colors(table[COLORS], table.stored_type(COLORS[0]), path)
-        mesh = mesh._replace(vertex_colors=_finite(colors, path))
-    elif all(name in faces for name in COLORS):
-        colors = np.stack([faces[name].values for name in COLORS], axis=1)
-        full = 255 if colors.max(initial=0) > 1 else 1
-        mesh = mesh._replace(face_colors=unit_rgb(colors[polygons] / full))
-    uv = _corner_coordinates(table, faces, corners, indices)
-    if uv is None or not len(triangles):
-        return [mesh]
-    numbers = faces[TEXTURE_NUMBER].values if TEXTURE_NUMBER in faces else np.zeros(len(polygons))
-    return _textured(mesh, triangles, indices, uv, numbers[polygons], budget)
+    with reading(path, "mesh") as path:
+        table, budget = PlyTable(path, faces=True), Budget(path)
+        require(table.has(MEANS), f"its vertices have no {', '.join(MEANS)}")
+        vertices, faces = table.doubles(MEANS), table.faces
+        found = [faces[name] for name in INDICES if name in faces]
+        corners = found[0] if found else Lists(*np.zeros((2, 0)))
+        triangles, polygons = _triangles(corners)
+        budget.spend_geometry(len(vertices), len(triangles))
+        indices = corners.values.astype(np.int64)
+        known = (indices >= 0) & (indices < len(vertices)) & (indices == corners.values)
+        said = f"it is damaged: a face names a vertex beyond the last of {len(vertices)}"
+        require(known.all(), said)
+        mesh = Mesh(vertices, indices[triangles])
+        if table.has(COLORS):
+            colors = unit_colors(table[COLORS], table.stored_type(COLORS[0]), path)
+            mesh = mesh._replace(vertex_colors=_finite(colors, path))
+        elif all(name in faces for name in COLORS):
+            colors = np.stack([faces[name].values for name in COLORS], axis=1)
+            full = 255 if colors.max(initial=0) > 1 else 1
+            mesh = mesh._replace(face_colors=unit_rgb(colors[polygons] / full))
+        uv = _corner_coordinates(table, corners, indices)
+        if uv is None or not len(triangles):
+            return [mesh]
+        numbers = np.zeros(len(corners.lengths))
+        numbers = faces[TEXTURE_NUMBER].values if TEXTURE_NUMBER in faces else numbers
+        return _textured(mesh, table, triangles, indices, uv, numbers[polygons], budget)
 
 
 def _triangles(
@@ -285,14 +267,14 @@ def _finite(colors: Float[np.ndarray, "V 3"], path: Path) -> Float[np.ndarray, "
 
 
 def _corner_coordinates(
-    table: PlyTable, faces: dict[str, Lists], corners: Lists, indices: Int[np.ndarray, " C"]
+    table: PlyTable, corners: Lists, indices: Int[np.ndarray, " C"]
 ) -> Optional[Float[np.ndarray, "C 2"]]:
     """Return the texture coordinates of all corners, or None."""
-    of_corners = faces.get(OF_CORNERS)
+    of_corners = table.faces.get(OF_CORNERS)
     if of_corners is not None and (of_corners.lengths == 2 * corners.lengths).all():
         uv = of_corners.values.reshape(-1, 2)
     else:
-        named = [names for names in COORDINATES if all(name in table for name in names)]
+        named = [names for names in COORDINATES if table.has(names)]
         if not named:
             return None
         uv = table.doubles(named[0])[indices]
@@ -301,6 +283,7 @@ def _corner_coordinates(
 
 def _textured(
     mesh: Mesh,
+    table: PlyTable,
     triangles: Int[np.ndarray, "T 3"],
     indices: Int[np.ndarray, " C"],
     uv: Float[np.ndarray, "C 2"],
@@ -310,10 +293,10 @@ def _textured(
     """Return a part for each texture: the triangles with its number, with vertices divided where
     their coordinates differ. Triangles without a texture keep their colours.
     """
-    path, files = budget.path, SideFiles(budget.path, budget)
+    path, files = table.path, SideFiles(table.path, budget)
     names = [
         comment[len(TEXTURE_FILE) :].strip()
-        for comment in read_comments(path)
+        for comment in table.comments
         if comment.lower().startswith(TEXTURE_FILE.lower())
     ]
     if not names:
@@ -347,8 +330,7 @@ def _textured(
     return parts
 
 
-# Other formats, by trimesh
-# --------------------------------------------------------------------------------------------------
+# ---- other formats, by trimesh -------------------------------------------------------------------
 
 
 def read_with_trimesh(path: Path) -> list[Mesh]:
@@ -359,12 +341,8 @@ def read_with_trimesh(path: Path) -> list[Mesh]:
         UserError: the file is damaged, exceeds its budget, or references something that isn't a
             regular file.
     """
-    try:
-        return [_require_fitting(part, path) for part in _parts(path, Budget(path))]
-    except UserError:
-        raise
-    except Exception as error:  # trimesh's readers raise exceptions of many types
-        fail(path, f"{type(error).__name__}: {error}")
+    with reading(path, "mesh") as path:
+        return _parts(path, Budget(path))
 
 
 def _parts(path: Path, budget: Budget) -> list[Mesh]:
@@ -372,9 +350,9 @@ def _parts(path: Path, budget: Budget) -> list[Mesh]:
 
     files, content = _Resolver(path, budget), path.read_bytes()
     if path.suffix.lower() == ".obj":
-        content = files.with_libraries(_checked_obj(utf8(content), path))
+        content = files.with_libraries(_checked_obj(utf8(content)))
     elif path.suffix.lower() == ".stl":
-        content = _exact_stl(content, path)
+        content = _exact_stl(content)
     scene = trimesh.load_scene(
         io.BytesIO(content),
         file_type=path.suffix.lower().lstrip("."),
@@ -390,12 +368,14 @@ def _parts(path: Path, budget: Budget) -> list[Mesh]:
         world, name = scene.graph[node]
         geometry = scene.geometry[name]
         if len(getattr(geometry, "vertices", ())):
-            part = _colored(_surface(geometry, path, budget), geometry, files)
-            parts.append(part._replace(vertices=_placed(part.vertices, world)))
+            part = _colored(_surface(geometry, budget), geometry, files)
+            if not np.array_equal(world, np.eye(4)):
+                part = part._replace(vertices=part.vertices @ world[:3, :3].T + world[:3, 3])
+            parts.append(_require_fitting(part))
     return parts
 
 
-def _checked_obj(data: bytes, path: Path) -> bytes:
+def _checked_obj(data: bytes) -> bytes:
     """Return an OBJ whose lines of vertices and faces are valid, since trimesh stops reading at the
     first text that isn't a number, and whose faces count from the first vertex.
     """
@@ -404,7 +384,7 @@ def _checked_obj(data: bytes, path: Path) -> bytes:
     if wrong := _wrong_obj_line(len(first[1].split()) if first else 3).search(text):
         number = text.count(b"\n", 0, wrong.start()) + 1
         shown = repr(wrong[0][:80].decode(errors="replace"))
-        fail(path, f"line {number} is no vertex or face: {shown}")
+        raise Unreadable(f"line {number} is no vertex or face: {shown}")
     if not RELATIVE_FACE.search(text):
         return text
     counts = {b"v": 0, b"vt": 0, b"vn": 0}
@@ -412,8 +392,7 @@ def _checked_obj(data: bytes, path: Path) -> bytes:
     def absolute(number: bytes, count: int) -> bytes:
         if not number.startswith(b"-"):
             return number
-        if int(number) < -count:
-            fail(path, f"a face names number {int(number)} of {count} vertices")
+        require(int(number) >= -count, f"a face names number {int(number)} of {count} vertices")
         return b"%d" % (count + 1 + int(number))
 
     def line(found: re.Match[bytes]) -> bytes:
@@ -445,13 +424,13 @@ def _wrong_obj_line(width: int) -> re.Pattern[bytes]:
     )
 
 
-def _exact_stl(data: bytes, path: Path) -> bytes:
+def _exact_stl(data: bytes) -> bytes:
     """Return a binary STL without what follows its last triangle, and an STL of text as it is."""
     if b"facet" in data[:1024] or b"endsolid" in data[:1024]:
         return data
     size = 84 + 50 * int.from_bytes(data[80:84], "little")
-    if len(data) < size:
-        fail(path, f"it is truncated or damaged: {size} bytes were expected, not {len(data)}")
+    said = f"it is truncated or damaged: {size} bytes were expected, not {len(data)}"
+    require(len(data) >= size, said)
     return data[:size]
 
 
@@ -491,12 +470,12 @@ def _rgb_of(rows: list[list[str]]) -> Optional[np.ndarray]:
 class _Resolver:
     """Resolver through which trimesh reads the files that a mesh references.
 
-    trimesh catches the exceptions raised here, so the first UserError is kept in ``refused``.
+    trimesh catches the exceptions raised here, so the first Unreadable is kept in ``refused``.
     """
 
     def __init__(self, path: Path, budget: Budget) -> None:
         self.budget, self.file_name = budget, path.name
-        self.refused: Optional[UserError] = None
+        self.refused: Optional[Unreadable] = None
         self._files = SideFiles(path, budget)
         self._pictures: dict[int, tuple[Any, np.ndarray]] = {}
         self._materials = b""
@@ -523,8 +502,8 @@ class _Resolver:
             content = self._files.read(name, *(name[end:] for end in ends))
             if content is not None:
                 # trimesh would read the part without a texture that can't be opened
-                open_texture(content, repr(name[:80]), self.budget)
-        except UserError as error:
+                open_texture(content, repr(name[:80]))
+        except Unreadable as error:
             self.refused = self.refused or error
             raise
         if content is None:
@@ -541,25 +520,14 @@ class _Resolver:
         return self._pictures[id(image)][1]
 
 
-def _placed(vertices: np.ndarray, world: np.ndarray) -> np.ndarray:
-    if np.array_equal(world, np.eye(4)):
-        return vertices
-    return vertices @ world[:3, :3].T + world[:3, 3]
-
-
-def _surface(geometry: Any, path: Path, budget: Budget) -> Mesh:
+def _surface(geometry: Any, budget: Budget) -> Mesh:
     """Return vertices and faces of a geometry of trimesh."""
     vertices = np.array(geometry.vertices, dtype=np.float64)
     faces = np.asarray(getattr(geometry, "faces", np.zeros((0, 3))), dtype=np.int64)
     budget.spend_geometry(len(vertices), len(faces))
-    if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.shape[1:] != (3,):
-        fail(
-            path,
-            f"it is damaged: vertices {vertices.shape} and faces {faces.shape} aren't of three "
-            "numbers",
-        )
-    if len(faces) and (faces.min() < 0 or faces.max() >= len(vertices)):
-        fail(path, f"it is damaged: a face names vertex {faces.max()} of {len(vertices)}")
+    usual = vertices.shape[1:] == faces.shape[1:] == (3,)
+    usual = usual and (not len(faces) or faces.min() >= 0 and faces.max() < len(vertices))
+    require(usual, f"it is damaged: a face names a vertex beyond the last of {len(vertices)}")
     return Mesh(vertices=vertices, faces=faces)
 
 
@@ -570,49 +538,35 @@ def _colored(part: Mesh, geometry: Any, files: _Resolver) -> Mesh:
         colors = getattr(geometry, "colors", None)
         usual = colors is not None and len(colors) == len(part.vertices)
         return part._replace(vertex_colors=unit_rgb(colors)) if usual else part
-    if visual.kind == "texture":
-        return _with_material(part, visual, files)
     if visual.kind == "vertex":
         return part._replace(vertex_colors=unit_rgb(visual.vertex_colors))
     if visual.kind == "face":
         return part._replace(face_colors=unit_rgb(visual.face_colors))
-    return part
+    return _with_material(part, visual, files) if visual.kind == "texture" else part
 
 
 def _with_material(part: Mesh, visual: Any, files: _Resolver) -> Mesh:
     """Return the part with its texture multiplied by the material's colour, or with that colour
     alone. Black with a texture is ignored, as programs write it that don't multiply.
     """
-    texture, tint = _texture(visual.material, files), _tint(visual.material)
-    if tint is not None and (texture is None or tint.any()):
-        part = part._replace(vertex_colors=np.broadcast_to(tint, part.vertices.shape))
+    material = visual.material
+    image = getattr(material, "image", getattr(material, "baseColorTexture", None))
+    # trimesh makes a grey image for an OBJ with coordinates and no material: one without a format
+    texture = None if getattr(image, "format", None) is None else files.picture(image)
+    linear = hasattr(material, "baseColorFactor")
+    tint = getattr(material, "baseColorFactor" if linear else "diffuse", None)
+    if tint is not None and tuple(np.asarray(tint)[:3]) != UNSET_COLOR:
+        tint = unit_rgb(np.asarray(tint)[None])[0]
+        tint = linear_to_srgb(tint) if linear else tint
+        if texture is None or tint.any():
+            part = part._replace(vertex_colors=np.broadcast_to(tint, part.vertices.shape))
     if texture is None or visual.uv is None:
         return part
     uv = np.nan_to_num(np.asarray(visual.uv, dtype=np.float32)[:, :2])
     return part._replace(uv=uv.clip(-LARGEST_UV, LARGEST_UV), texture=texture)
 
 
-def _texture(material: Any, files: _Resolver) -> Optional[np.ndarray]:
-    """Return the colour texture of a material, or None if it has none.
-
-    For an OBJ with coordinates but without a material trimesh creates a grey image, which is
-    recognised by its missing file format and ignored.
-    """
-    image = getattr(material, "image", getattr(material, "baseColorTexture", None))
-    return None if getattr(image, "format", None) is None else files.picture(image)
-
-
-def _tint(material: Any) -> Optional[np.ndarray]:
-    """Return the material's colour (3,) as sRGB values in [0, 1], or None if it has none."""
-    linear = hasattr(material, "baseColorFactor")
-    tint = getattr(material, "baseColorFactor" if linear else "diffuse", None)
-    if tint is None or tuple(np.asarray(tint)[:3]) == UNSET_COLOR:
-        return None
-    tint = unit_rgb(np.asarray(tint)[None])[0]
-    return linear_to_srgb(tint) if linear else tint
-
-
-def _require_fitting(part: Mesh, path: Path) -> Mesh:
+def _require_fitting(part: Mesh) -> Mesh:
     """Return the part after checking that its colours have one row per vertex or face."""
     count = {
         "uv": (len(part.vertices), 2),
@@ -620,6 +574,7 @@ def _require_fitting(part: Mesh, path: Path) -> Mesh:
         "face_colors": (len(part.faces), 3),
     }
     for name, shape in count.items():
-        if (values := getattr(part, name)) is not None and values.shape != shape:
-            fail(path, f"it is damaged: its {name} are {values.shape}, {shape} was expected")
+        found = np.shape(shape if (values := getattr(part, name)) is None else values)
+        usual = values is None or found == shape
+        require(usual, f"it is damaged: its {name} are {found}, {shape} was expected")
     return part

@@ -2,7 +2,7 @@
 it. Colours of files become float32 display values in [0, 1]."""
 
 import logging
-from typing import Any, NamedTuple, Optional
+from typing import NamedTuple, Optional
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped, UInt8
@@ -57,31 +57,45 @@ class Mesh(NamedTuple):
         )
 
 
-# Merging
-# --------------------------------------------------------------------------------------------------
+# ---- merging -------------------------------------------------------------------------------------
 
 
 def merged(parts: list[Mesh]) -> Mesh:
     """Concatenate the parts to one mesh.
 
-    Textures are concatenated to one array with a tile for each. Parts with face colours get three
-    separate vertices per face, with vertex colours.
+    Each texture is stored once, with a tile for each combination of texture, wrapping and filter.
+    Parts with face colours get three separate vertices per face, with vertex colours.
     """
     if len(parts) == 1:
         return parts[0]
     parts = [_unwelded(part) for part in parts]
     offsets = np.cumsum([0] + [len(part.vertices) for part in parts])
-    mesh = Mesh(
-        vertices=np.concatenate([part.vertices for part in parts]),
-        faces=np.concatenate(
-            [part.faces + offset for part, offset in zip(parts, offsets[:-1], strict=True)]
-        ),
+    faces = [part.faces + offset for part, offset in zip(parts, offsets, strict=False)]
+    mesh = Mesh(np.concatenate([part.vertices for part in parts]), np.concatenate(faces))
+    if any(part.has_colors for part in parts):  # those of a part with a texture multiply it
+        mesh = mesh._replace(vertex_colors=np.concatenate([_vertex_colors(part) for part in parts]))
+    pictures = {id(part.texture): part.texture for part in parts if part.texture is not None}
+    if not pictures:
+        return mesh
+    sizes = [picture.size // 3 for picture in pictures.values()]
+    starts = dict(zip(pictures, np.cumsum([0, *sizes]).tolist(), strict=False))
+    tiles: dict[Tile, int] = {}
+    numbers, coordinates = [], []
+    for part in parts:
+        number, uv = -1, np.zeros((len(part.vertices), 2), dtype=np.float32)
+        if part.texture is not None:
+            height, width = part.texture.shape[:2]
+            tile = part.tiles[0] if part.tiles else Tile(0, width, height)
+            tile = tile._replace(start=starts[id(part.texture)])
+            number, uv = tiles.setdefault(tile, len(tiles)), part.uv
+        numbers.append(number)
+        coordinates.append(uv)
+    return mesh._replace(
+        texture=np.concatenate([picture.reshape(-1, 1, 3) for picture in pictures.values()]),
+        tiles=tuple(tiles),
+        tile_index=np.repeat(numbers, [len(part.faces) for part in parts]),
+        uv=np.concatenate(coordinates),
     )
-    if any(part.has_colors for part in parts):
-        mesh = mesh._replace(vertex_colors=np.concatenate([_vertex_factor(part) for part in parts]))
-    if any(part.texture is not None for part in parts):
-        mesh = mesh._replace(**_textures(parts))
-    return mesh
 
 
 def _unwelded(part: Mesh) -> Mesh:
@@ -89,61 +103,19 @@ def _unwelded(part: Mesh) -> Mesh:
     if part.face_colors is None:
         return part
     corners = part.faces.reshape(-1)
+    faces = np.arange(len(corners)).reshape(-1, 3)
     colors = np.repeat(part.face_colors, 3, axis=0)
-    return Mesh(
-        vertices=part.vertices[corners],
-        faces=np.arange(len(corners)).reshape(-1, 3),
-        vertex_colors=colors,
-    )
+    return Mesh(part.vertices[corners], faces, vertex_colors=colors)
 
 
-def _vertex_factor(part: Mesh) -> np.ndarray:
-    """Return the vertex colours (V, 3); by default 1 for parts with a texture, which they multiply,
-    and grey for others.
-    """
-    if part.vertex_colors is not None:
-        return part.vertex_colors
-    return np.full(part.vertices.shape, GREY if part.texture is None else 1.0, dtype=np.float32)
+def _vertex_colors(mesh: Mesh) -> Float[np.ndarray, "V 3"]:
+    """Return the vertex colours; by default 1 with a texture, and grey without one."""
+    if mesh.vertex_colors is not None:
+        return mesh.vertex_colors
+    return np.full(mesh.vertices.shape, GREY if mesh.texture is None else 1.0, dtype=np.float32)
 
 
-def _textures(parts: list[Mesh]) -> dict[str, Any]:
-    """Return the fields of the merged texture: each texture is stored once, with a tile for each
-    combination of texture, wrapping and filter.
-    """
-    starts, total = {}, 0
-    for part in parts:
-        if part.texture is not None and id(part.texture) not in starts:
-            starts[id(part.texture)] = total
-            total += part.texture.size // 3
-    pictures = {id(part.texture): part.texture for part in parts if part.texture is not None}
-    texels = np.concatenate([pictures[key].reshape(-1, 1, 3) for key in starts])
-    tiles: dict[Tile, int] = {}
-    numbers = [
-        -1 if part.texture is None else tiles.setdefault(_tile(part, starts), len(tiles))
-        for part in parts
-    ]
-    return {
-        "texture": texels,
-        "tiles": tuple(tiles),
-        "tile_index": np.repeat(numbers, [len(part.faces) for part in parts]),
-        "uv": np.concatenate([_coordinates(part) for part in parts]),
-    }
-
-
-def _tile(part: Mesh, starts: dict[int, int]) -> Tile:
-    height, width = part.texture.shape[:2]
-    tile = part.tiles[0] if part.tiles else Tile(0, width, height)
-    return tile._replace(start=starts[id(part.texture)])
-
-
-def _coordinates(part: Mesh) -> np.ndarray:
-    if part.texture is None:
-        return np.zeros((len(part.vertices), 2), dtype=np.float32)
-    return part.uv
-
-
-# Colours
-# --------------------------------------------------------------------------------------------------
+# ---- colours -------------------------------------------------------------------------------------
 
 
 def unit_rgb(colors: Shaped[np.ndarray, "N C"]) -> Float[np.ndarray, "N 3"]:
@@ -193,16 +165,10 @@ def vertex_surface_colors(mesh: Mesh) -> Float[np.ndarray, "V 3"]:
     colours, that of one of them.
     """
     if not len(mesh.faces):
-        return _vertex_colors(mesh)
+        return _vertex_colors(mesh._replace(texture=None))
     corner = np.zeros(len(mesh.vertices), np.int64)
     corner[mesh.faces.ravel()] = np.arange(mesh.faces.size)  # any corner of any face at this vertex
     return surface_colors(mesh, corner // 3, np.eye(3)[corner % 3])
-
-
-def _vertex_colors(mesh: Mesh) -> np.ndarray:
-    if mesh.vertex_colors is not None:
-        return mesh.vertex_colors
-    return np.full(mesh.vertices.shape, GREY, np.float32)
 
 
 def _flat_colors(mesh: Mesh, face_index: np.ndarray, weights: np.ndarray) -> np.ndarray:
@@ -239,16 +205,15 @@ def _looked_up(texels: np.ndarray, uv: np.ndarray, tile: Tile) -> np.ndarray:
     fx, fy = (x - x0)[:, None], (y - y0)[:, None]
     columns = [_neighbour(x0, i, tile.width, tile.wrap_u) for i in (0, 1)]
     rows = [tile.start + _neighbour(y0, i, tile.height, tile.wrap_v) * tile.width for i in (0, 1)]
+
+    def texel(index: np.ndarray) -> Float[np.ndarray, "M 3"]:
+        values = texels[index].astype(np.float32)
+        return values / 255 if texels.dtype == np.uint8 else values
+
     upper, lower = (
-        (1 - fx) * _texel(texels, row + columns[0]) + fx * _texel(texels, row + columns[1])
-        for row in rows
+        (1 - fx) * texel(row + columns[0]) + fx * texel(row + columns[1]) for row in rows
     )
     return (1 - fy) * upper + fy * lower
-
-
-def _texel(texels: np.ndarray, index: np.ndarray) -> Float[np.ndarray, "M 3"]:
-    values = texels[index].astype(np.float32)
-    return values / 255 if texels.dtype == np.uint8 else values
 
 
 def _wrapped(coordinate: np.ndarray, wrap: int) -> np.ndarray:
@@ -269,8 +234,7 @@ def _neighbour(first: np.ndarray, offset: int, size: int, wrap: int) -> np.ndarr
     return index % size if wrap == REPEAT else index.clip(0, size - 1)
 
 
-# Surface
-# --------------------------------------------------------------------------------------------------
+# ---- surface -------------------------------------------------------------------------------------
 
 
 def sample_surface(

@@ -18,10 +18,9 @@ import functools
 import logging
 import math
 import os
-from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -100,19 +99,10 @@ class MeshCaster:
             for image, camera in zip(images, cameras, strict=True)
             for fill in self._bands(image, *camera, supersample)
         ]
-        if bands:
-            with ThreadPoolExecutor(min(len(bands), os.cpu_count() or 1)) as pool:
-                drawn = pool.map(lambda fill: fill(), bands)
-                list(
-                    tqdm(
-                        drawn,
-                        progress,
-                        len(bands),
-                        unit="band",
-                        disable=None if progress else True,
-                        leave=False,
-                    )
-                )
+        hidden = None if progress else True  # None: shown in terminals
+        with ThreadPoolExecutor(min(len(bands) or 1, os.cpu_count() or 1)) as pool:
+            drawn = pool.map(lambda fill: fill(), bands)
+            list(tqdm(drawn, progress, len(bands), unit="band", disable=hidden, leave=False))
         return images
 
     def visible(
@@ -144,14 +134,15 @@ class MeshCaster:
 
         def fill(start: int, end: int) -> None:
             colors = self._cast(c2w, focal, _samples(start, end, supersample) - height / 2, columns)
-            image[start:end, left:right] = colors.reshape(
-                end - start, supersample, right - left, supersample, 4
-            ).mean(axis=(1, 3))
+            shape = end - start, supersample, right - left, supersample, 4
+            image[start:end, left:right] = colors.reshape(shape).mean(axis=(1, 3))
 
-        return [
-            functools.partial(fill, start, end)
-            for start, end in _row_groups(top, bottom, supersample * len(columns))
-        ]
+        if not len(columns):
+            return []
+        # at most RAYS_PER_CAST rays at once, or one row, to bound the memory
+        size = max(1, RAYS_PER_CAST // (supersample * len(columns)))
+        starts = range(top, bottom, size)
+        return [functools.partial(fill, start, min(start + size, bottom)) for start in starts]
 
     def _bounds(
         self, c2w: np.ndarray, focal: float, height: int, width: int
@@ -199,16 +190,6 @@ def _require_size(height: int, width: int, supersample: int) -> None:
 def _samples(start: int, end: int, supersample: int) -> Float[np.ndarray, " S"]:
     """Return the coordinates of a regular grid of samples in the pixels start ... end - 1."""
     return start + (np.arange((end - start) * supersample) + 0.5) / supersample
-
-
-def _row_groups(top: int, bottom: int, rays_per_row: int) -> list[tuple[int, int]]:
-    """Split pixel rows into groups (start, end) of at most RAYS_PER_CAST rays, or of one row, to
-    bound the memory.
-    """
-    if not rays_per_row:
-        return []
-    size = max(1, RAYS_PER_CAST // rays_per_row)
-    return [(start, min(start + size, bottom)) for start in range(top, bottom, size)]
 
 
 # Type of ray casters: (c2w (4, 4), focal, rows (H,), columns (W,)) -> index of the nearest face
@@ -267,7 +248,7 @@ class TargetCache:
 
     def __init__(self, caster: MeshCaster, supersample: int, capacity: int) -> None:
         self.caster, self.supersample, self.capacity = caster, supersample, capacity
-        self._pictures: OrderedDict[tuple, Tensor] = OrderedDict()
+        self._pictures: dict[tuple, Tensor] = {}  # the least recently used first
         self._planned: dict[tuple, tuple[np.ndarray, float]] = {}
 
     def plan(
@@ -303,11 +284,14 @@ class TargetCache:
             images = self.caster.render_views(
                 missing.values(), height, width, supersample=self.supersample
             )
-            found |= {
-                key: _planes(np.round(image * 255).astype(np.uint8)).to(c2w.device)
-                for key, image in zip(missing, images, strict=True)
-            }
-        self._remember(found)
+            for key, image in zip(missing, images, strict=True):
+                planes = np.moveaxis(np.round(image * 255).astype(np.uint8), -1, 0)
+                found[key] = torch.from_numpy(np.ascontiguousarray(planes)).to(c2w.device)
+        for key, picture in found.items():
+            self._pictures.pop(key, None)
+            self._pictures[key] = picture
+        for key in list(self._pictures)[: max(len(self._pictures) - self.capacity, 0)]:
+            del self._pictures[key]
         return [found[key] for key in keys]
 
     def __len__(self) -> int:
@@ -322,17 +306,6 @@ class TargetCache:
         room = max(0, PIXELS_PER_CAST // (height * width) - len(missing))
         beside = [key for key in self._planned if key[2:] == (height, width)][:room]
         return {key: self._planned.pop(key) for key in beside}
-
-    def _remember(self, pictures: dict[tuple, Tensor]) -> None:
-        for key, picture in pictures.items():
-            self._pictures[key] = picture
-            self._pictures.move_to_end(key)
-        while len(self._pictures) > self.capacity:
-            self._pictures.popitem(last=False)
-
-
-def _planes(image: UInt8[np.ndarray, "H W 4"]) -> UInt8[Tensor, "4 H W"]:
-    return torch.from_numpy(np.ascontiguousarray(np.moveaxis(image, -1, 0)))
 
 
 def _cameras(
@@ -350,22 +323,6 @@ def _key(camera: tuple[np.ndarray, float], height: int, width: int) -> tuple:
 # ---- the z-buffer --------------------------------------------------------------------------------
 
 
-class Triangles(NamedTuple):
-    """The triangles of a mesh that may be visible in one image."""
-
-    face_index: Int[np.ndarray, " T"]
-    edges: Float[np.ndarray, "T 3 3"]
-    """The edge function opposite each corner, as a vector whose dot product with the ray is >= 0
-    inside; world units squared.
-    """
-    volume: Float[np.ndarray, " T"]
-    """|det(a, b, c)|: the sum of the edge functions is volume / depth."""
-    box: Int[np.ndarray, "T 4"]
-    """The samples in the triangle's box: first row, end row, first column, end column; ends are
-    exclusive.
-    """
-
-
 class ZBuffer:
     """Finds the visible faces of one triangle mesh, from both sides; thread-safe."""
 
@@ -380,7 +337,7 @@ class ZBuffer:
         columns: Float[np.ndarray, " W"],
     ) -> tuple[Int[np.ndarray, "H W"], Float[np.ndarray, "H W 3"]]:
         """Return the nearest face at each sample, -1 for none, and the weights of its three corners
-        (0 for none).
+        (0 for none); of faces at equal depth the first.
 
         Args:
             c2w: OpenGL camera to world.
@@ -388,41 +345,45 @@ class ZBuffer:
             rows, columns: ascending coordinates of the samples in pixels relative to the image's
                 centre, rows downwards.
         """
-        rays = _Rays(-rows / focal, columns / focal)
         corners = ((self.vertices - c2w[:3, 3]) @ c2w[:3, :3])[self.faces]
-        triangles = _triangles(corners, focal, rows, columns)
+        box = _boxes(corners, focal, rows, columns)
+        index = np.flatnonzero((box[:, 0] < box[:, 1]) & (box[:, 2] < box[:, 3]))
+        a, b, c = np.moveaxis(corners[index], 1, 0)
+        edges = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1)
+        volume = np.einsum("tc,tc->t", a, edges[:, 0])
+        edges *= np.sign(volume)[:, None, None]
+        seen = volume != 0  # not exactly edge-on
+        index, edges, volume = index[seen], edges[seen], np.abs(volume[seen])
+
+        def edge_functions(triangle: np.ndarray, corner: int, sample: np.ndarray) -> np.ndarray:
+            """Return the edge function opposite a corner for each pair, >= 0 inside."""
+            edge, (row, column) = edges[triangle, corner], np.divmod(sample, len(columns))
+            x, y = columns / focal, -rows / focal
+            return x[column] * edge[:, 0] + y[row] * edge[:, 1] - edge[:, 2]
+
         nearest = np.full(len(rows) * len(columns), -1)
         inverse_depth = np.zeros(len(nearest))
-        for triangle, sample in _pairs(triangles.box, len(columns)):
-            _draw(triangles, rays, triangle, sample, nearest, inverse_depth)
-        return _weights(triangles, rays, nearest)
-
-
-class _Rays(NamedTuple):
-    """The rays (x, y, -1) through the samples, in camera coordinates."""
-
-    y: Float[np.ndarray, " H"]
-    x: Float[np.ndarray, " W"]
-
-    def times(
-        self, edge: Float[np.ndarray, "P 3"], sample: Int[np.ndarray, " P"]
-    ) -> Float[np.ndarray, " P"]:
-        row, column = np.divmod(sample, len(self.x))
-        return self.x[column] * edge[:, 0] + self.y[row] * edge[:, 1] - edge[:, 2]
-
-
-def _triangles(
-    corners: Float[np.ndarray, "F 3 3"], focal: float, rows: np.ndarray, columns: np.ndarray
-) -> Triangles:
-    """Return the triangles whose box contains a sample and that aren't seen exactly edge-on."""
-    box = _boxes(corners, focal, rows, columns)
-    index = np.flatnonzero((box[:, 0] < box[:, 1]) & (box[:, 2] < box[:, 3]))
-    a, b, c = np.moveaxis(corners[index], 1, 0)
-    edges = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1)
-    volume = np.einsum("tc,tc->t", a, edges[:, 0])
-    edges *= np.sign(volume)[:, None, None]
-    seen = volume != 0
-    return Triangles(index[seen], edges[seen], np.abs(volume[seen]), box[index[seen]])
+        for triangle, sample in _pairs(box[index], len(columns)):
+            total = 0.0
+            for corner in range(3):
+                value = edge_functions(triangle, corner, sample)
+                inside = value >= 0
+                triangle, sample, total = triangle[inside], sample[inside], (total + value)[inside]
+            value = total / volume[triangle]
+            nearer = (value > inverse_depth[sample]) & (value < 1 / NEAR)
+            triangle, sample, value = triangle[nearer], sample[nearer], value[nearer]
+            np.maximum.at(inverse_depth, sample, value)
+            best = np.flatnonzero(value == inverse_depth[sample])
+            places, first = np.unique(sample[best], return_index=True)
+            nearest[places] = triangle[best[first]]
+        sample = np.flatnonzero(nearest >= 0)
+        found = [edge_functions(nearest[sample], corner, sample) for corner in range(3)]
+        values = np.stack(found, axis=1)
+        face_index, weights = np.full(len(nearest), -1), np.zeros((len(nearest), 3))
+        face_index[sample] = index[nearest[sample]]
+        weights[sample] = values / values.sum(axis=1, keepdims=True)
+        shape = len(rows), len(columns)
+        return face_index.reshape(shape), weights.reshape(*shape, 3)
 
 
 def _boxes(
@@ -433,20 +394,15 @@ def _boxes(
     """
     points = _in_front(corners)
     with np.errstate(invalid="ignore"):  # NaN marks a missing point
-        across, down = (
-            focal * points[..., 0] / -points[..., 2],
-            focal * points[..., 1] / points[..., 2],
-        )
-    spans = [
-        (rows, np.fmin.reduce(down, 1), np.fmax.reduce(down, 1)),
-        (columns, np.fmin.reduce(across, 1), np.fmax.reduce(across, 1)),
-    ]
-    ends = [
-        (np.searchsorted(places, low - SLACK), np.searchsorted(places, high + SLACK, "right"))
-        for places, low, high in spans
-    ]
-    box = np.stack([ends[0][0], ends[0][1], ends[1][0], ends[1][1]], axis=1)
-    box[np.isnan(spans[0][1])] = 0
+        across = focal * points[..., 0] / -points[..., 2]
+        down = focal * points[..., 1] / points[..., 2]
+    ends = []
+    for places, values in ((rows, down), (columns, across)):
+        low, high = np.fmin.reduce(values, 1), np.fmax.reduce(values, 1)
+        ends.append(np.searchsorted(places, low - SLACK))
+        ends.append(np.searchsorted(places, high + SLACK, "right"))
+    box = np.stack(ends, axis=1)
+    box[np.isnan(down).all(axis=1)] = 0
     return box
 
 
@@ -480,42 +436,3 @@ def _pairs(
         triangle = np.repeat(some, np.minimum(ends[some], last) - np.maximum(starts[some], first))
         row, column = np.divmod(np.arange(first, last) - starts[triangle], across[triangle])
         yield triangle, (box[triangle, 0] + row) * width + box[triangle, 2] + column
-
-
-def _draw(
-    triangles: Triangles,
-    rays: _Rays,
-    triangle: Int[np.ndarray, " P"],
-    sample: Int[np.ndarray, " P"],
-    nearest: Int[np.ndarray, " S"],
-    inverse_depth: Float[np.ndarray, " S"],
-) -> None:
-    """Update the buffers in place with the pairs whose sample is inside the triangle and nearer
-    than before; at equal depth the first triangle is kept.
-    """
-    total = 0.0
-    for corner in range(3):
-        value = rays.times(triangles.edges[triangle, corner], sample)
-        inside = value >= 0
-        triangle, sample, total = triangle[inside], sample[inside], (total + value)[inside]
-    value = total / triangles.volume[triangle]
-    nearer = (value > inverse_depth[sample]) & (value < 1 / NEAR)
-    triangle, sample, value = triangle[nearer], sample[nearer], value[nearer]
-    np.maximum.at(inverse_depth, sample, value)
-    best = np.flatnonzero(value == inverse_depth[sample])
-    places, first = np.unique(sample[best], return_index=True)
-    nearest[places] = triangle[best[first]]
-
-
-def _weights(
-    triangles: Triangles, rays: _Rays, nearest: Int[np.ndarray, " S"]
-) -> tuple[Int[np.ndarray, "H W"], Float[np.ndarray, "H W 3"]]:
-    """Return the face indices and barycentric weights of the nearest triangles."""
-    sample = np.flatnonzero(nearest >= 0)
-    edges = triangles.edges[nearest[sample]]
-    values = np.stack([rays.times(edges[:, corner], sample) for corner in range(3)], axis=1)
-    face_index, weights = np.full(len(nearest), -1), np.zeros((len(nearest), 3))
-    face_index[sample] = triangles.face_index[nearest[sample]]
-    weights[sample] = values / values.sum(axis=1, keepdims=True)
-    shape = len(rays.y), len(rays.x)
-    return face_index.reshape(shape), weights.reshape(*shape, 3)

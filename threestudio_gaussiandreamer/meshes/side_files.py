@@ -11,19 +11,17 @@ import io
 import logging
 import os
 import stat
-import struct
 import unicodedata
 import urllib.parse
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NoReturn, Optional
+from typing import Any, Optional
 
 import numpy as np
 from jaxtyping import UInt8
 
-from ..core.errors import UserError
-from ..core.memory import BYTES_PER_FILE_BYTE
+from ..formats.reading import BYTES_PER_FILE_BYTE, Unreadable, require
 
 log = logging.getLogger(__name__)
 
@@ -36,8 +34,6 @@ BYTES_PER_VERTEX = 200
 BYTES_PER_FACE = 150
 """Peak memory while a part is decoded, merged, cleaned and transformed."""
 FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "GIF", "TGA", "TIFF")
-UNREADABLE = (OSError, ValueError, SyntaxError, EOFError, OverflowError, struct.error)
-"""Exceptions that Pillow raises for damaged files."""
 ROWS_AT_ONCE = 256
 """Rows converted at a time, which limits the peak memory to two copies of the image, not four."""
 ENCODINGS = ("latin-1", "cp1252", "cp1250", "cp1251", "gb18030", "shift_jis", "cp949", "big5")
@@ -47,22 +43,13 @@ consulted: dict[str, Optional[tuple[int, int]]] = {}
 it."""
 
 
-def fail(path: Path, problem: str) -> NoReturn:
-    """Raise UserError with the reason why ``path``, of a mesh or of Gaussians in glTF, can't be
-    read.
-    """
-    raise UserError(f"can't read {str(path)!r}: {problem}")
-
-
 class Budget:
     """The remaining memory budget of the mesh ``path``, bytes: increased by the size of every file
     that is read, reduced by decoded content.
     """
 
     def __init__(self, path: Path) -> None:
-        self.path = path
-        self.left = FIXED_BYTES
-        self.total = FIXED_BYTES
+        self.left = self.total = FIXED_BYTES
         self.add_file(path.stat().st_size)
 
     def add_file(self, size: int) -> None:
@@ -71,25 +58,16 @@ class Budget:
         self.total += BYTES_PER_FILE_BYTE * size
 
     def spend(self, size: int, what: str) -> None:
-        """Deduct ``size`` bytes; ``what`` names the content in the message.
-
-        Raises:
-            UserError: the budget is exceeded.
-        """
+        """Deduct ``size`` bytes; raise Unreadable, with ``what``, if that exceeds the budget."""
         self.left -= size
-        if self.left < 0:
-            fail(
-                self.path,
-                f"{what} is too large: textures, vertices and faces of a file of this size may "
-                f"take {self.total >> 20} MiB of memory together",
-            )
+        require(
+            self.left >= 0,
+            f"{what} is too large: textures, vertices and faces of a file of this size may take "
+            f"{self.total >> 20} MiB of memory together",
+        )
 
     def spend_geometry(self, vertices: int, faces: int) -> None:
-        """Deduct the bytes of one part of the scene.
-
-        Raises:
-            UserError: the budget is exceeded.
-        """
+        """Deduct the bytes of one part of the scene."""
         size = BYTES_PER_VERTEX * vertices + BYTES_PER_FACE * faces
         self.spend(size, f"a part with {vertices} vertices and {faces} faces")
 
@@ -143,7 +121,7 @@ class SideFiles:
         read, else one whose name differs in case, accents' form, percent-encoding or encoding.
 
         Raises:
-            UserError: it is no regular file (a FIFO would block), or can't be read.
+            Unreadable: it is no regular file (a FIFO would block), or can't be read.
         """
         for place in self._places(name, *others):
             try:
@@ -151,7 +129,8 @@ class SideFiles:
             except (FileNotFoundError, NotADirectoryError):
                 continue
             except (OSError, ValueError) as error:  # ValueError: a NUL in the name
-                fail(self.path, f"the file {name[:200]!r} that it names isn't readable: {error}")
+                said = f"the file {name[:200]!r} that it names isn't readable: {error}"
+                raise Unreadable(said) from error
         log.warning("%s names the file %r, which does not exist", self.path, name[:200])
         return None
 
@@ -188,51 +167,42 @@ def decode_texture(data: bytes, name: str, budget: Budget) -> UInt8[np.ndarray, 
         name: names the texture in messages.
 
     Raises:
-        UserError: it can't be decoded, or exceeds the budget.
+        Unreadable: it can't be decoded, or exceeds the budget.
     """
-    return decode_image(open_texture(data, name, budget), name, budget)
+    return decode_image(open_texture(data, name), name, budget)
 
 
-def open_texture(data: bytes, name: str, budget: Budget) -> Any:
-    """Open an image file with Pillow, without loading its texels.
-
-    Raises:
-        UserError: it isn't an image in one of ``FORMATS``.
-    """
-    from PIL import Image, UnidentifiedImageError
+@contextlib.contextmanager
+def _pillow_errors(name: str) -> Iterator[None]:
+    from PIL import Image
 
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # see budget.spend
-            return Image.open(io.BytesIO(data), formats=FORMATS)
-    except UnidentifiedImageError:  # Pillow's message names a Python object
-        fail(budget.path, f"the texture {name} is in none of the formats {', '.join(FORMATS)}")
-    except (*UNREADABLE, Image.DecompressionBombError) as error:
-        fail(budget.path, f"the texture {name} can't be read: {error}")
+            yield
+    except Exception as error:  # Pillow's readers raise errors of many types
+        formats = f"it is damaged, or in none of the formats {', '.join(FORMATS)}"
+        raise Unreadable(f"the texture {name} can't be read: {formats}") from error
+
+
+def open_texture(data: bytes, name: str) -> Any:
+    """Open an image file with Pillow, without loading its texels."""
+    from PIL import Image
+
+    with _pillow_errors(name):
+        return Image.open(io.BytesIO(data), formats=FORMATS)
 
 
 def decode_image(image: Any, name: str, budget: Budget) -> UInt8[np.ndarray, "H W 3"]:
-    """Decode an image that Pillow has opened but not yet loaded.
-
-    Raises:
-        UserError: its format isn't one of ``FORMATS``, it is damaged, or it exceeds the budget.
-    """
-    if image.format not in FORMATS:
-        fail(budget.path, f"the texture {name} is {image.format}, not one of {', '.join(FORMATS)}")
+    """Decode an image that Pillow has opened but not yet loaded."""
     size = f"the texture {name} of {image.width} x {image.height} texels"
     budget.spend(BYTES_PER_TEXEL * image.width * image.height, size)
-    try:
-        image.load()
-        return _rgb_rows(image)
-    except UNREADABLE as error:
-        fail(budget.path, f"the texture {name} is damaged: {error}")
-
-
-def _rgb_rows(image: Any) -> UInt8[np.ndarray, "H W 3"]:
     texels = np.empty((image.height, image.width, 3), np.uint8)
-    for top in range(0, image.height, ROWS_AT_ONCE):
-        bottom = min(top + ROWS_AT_ONCE, image.height)
-        texels[top:bottom] = _rgb(image.crop((0, top, image.width, bottom)))
+    with _pillow_errors(name):
+        image.load()
+        for top in range(0, image.height, ROWS_AT_ONCE):
+            bottom = min(top + ROWS_AT_ONCE, image.height)
+            texels[top:bottom] = _rgb(image.crop((0, top, image.width, bottom)))
     return texels
 
 

@@ -18,6 +18,7 @@ from jaxtyping import Float, Int, UInt8
 
 from ..core.errors import UserError
 from ..core.files import atomic_file
+from ..gaussians.surface import Surface
 from .mesh import Mesh
 
 UNLIT = "KHR_materials_unlit"
@@ -127,7 +128,7 @@ def write_textured_glb(
     Raises:
         UserError: a value isn't finite, or the file can't be written.
     """
-    require_finite(path, mesh)
+    _require_finite(path, mesh.vertices, mesh.uv)
     joined = welded(mesh)
     arrays = {
         "indices": mesh.faces.reshape(-1, 1).astype("<u4"),
@@ -199,7 +200,7 @@ def write_textured_obj(
     Raises:
         UserError: a value isn't finite, or a file can't be written.
     """
-    require_finite(path, mesh)
+    _require_finite(path, mesh.vertices, mesh.uv)
     texture, material = companions(path)
     with atomic_file(texture) as file:
         file.write(png_bytes(mesh.texture))
@@ -218,6 +219,20 @@ def write_textured_obj(
         np.savetxt(file, corners, fmt="f %d/%d/%d %d/%d/%d %d/%d/%d")
 
 
+def write_obj(path: str | os.PathLike, surface: Surface) -> None:
+    """Write an OBJ with colours after the positions ("v x y z r g b"), without a material, which
+    MeshLab, Blender and trimesh can read.
+
+    Raises:
+        UserError: vertices or colours aren't finite, or the file can't be written.
+    """
+    _require_finite(path, surface.vertices, surface.colors)
+    rows = np.concatenate([surface.vertices, surface.colors], axis=1)
+    with atomic_file(path) as file:
+        np.savetxt(file, rows, fmt="v %.6g %.6g %.6g %.4f %.4f %.4f")
+        np.savetxt(file, surface.faces + 1, fmt="f %d %d %d")
+
+
 # ---- both ----------------------------------------------------------------------------------------
 
 
@@ -231,9 +246,8 @@ def companions(path: str | os.PathLike) -> tuple[Path, ...]:
     return (path.with_suffix(".png"), path.with_suffix(".mtl")) if beside else ()
 
 
-def require_finite(path: str | os.PathLike, mesh: Mesh) -> None:
-    """Raise UserError unless positions and texture coordinates are finite."""
-    if not (np.isfinite(mesh.vertices).all() and np.isfinite(mesh.uv).all()):
+def _require_finite(path: str | os.PathLike, *values: Float[np.ndarray, "..."]) -> None:
+    if not all(np.isfinite(each).all() for each in values):
         raise UserError(f"{str(path)!r} isn't written: some of its vertices hold NaN or infinity")
 
 

@@ -44,6 +44,7 @@ from ..core.options import (
     rule,
     satisfies,
 )
+from ..formats.reading import reading
 from ..gaussians.point_cloud import PointCloud
 from ..host import register
 from ..meshes.mesh import Mesh
@@ -146,8 +147,8 @@ def textured(mesh: Mesh, body: Body, path: str) -> Mesh:
     Raises:
         UserError: the image is missing or damaged.
     """
-    file = existing_file(path, "texture")
-    texture = decode_texture(file.read_bytes(), repr(path), Budget(file))
+    with reading(path, "texture") as file:
+        texture = decode_texture(file.read_bytes(), repr(path), Budget(file))
     corners = np.stack([body.faces, body.face_uv], axis=-1).reshape(-1, 2)
     pairs, faces = np.unique(corners, axis=0, return_inverse=True)
     vertices, uv = mesh.vertices[pairs[:, 0]], body.uv[pairs[:, 1]]

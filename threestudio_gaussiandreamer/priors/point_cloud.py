@@ -34,7 +34,7 @@ from ..core.errors import UserError, unknown
 from ..core.files import existing_file
 from ..formats.array_files import read_arrays
 from ..formats.gaussian_files import ply_up
-from ..formats.ply import is_gaussian_ply, read_header, read_points, unit_colors
+from ..formats.ply import is_gaussian_ply, read_points, require_ply, unit_colors
 from ..formats.producers import GAUSSIANS, MESH
 from ..gaussians.axes import FRONTS
 from ..gaussians.grow import longest_side
@@ -87,8 +87,7 @@ def point_file(path: str) -> Path:
     """
     file, known = existing_file(path, "point cloud"), [f".{name}" for name in mesh_formats()]
     if file.suffix.lower() == ".ply":
-        with open(file, "rb") as opened:
-            read_header(opened, str(file))
+        require_ply(file)
     elif file.suffix.lower() not in (*READERS, *known):
         raise unknown("point cloud format", file.suffix, [*READERS, *known])
     return file

@@ -19,14 +19,13 @@ from ..exporters.files import (
     read_gaussians,
 )
 from ..formats.gaussian_files import StoredCloud, write_cloud
-from ..formats.obj import write_obj
 from ..formats.ply import write_points
 from ..formats.spz import VERSION
 from ..gaussians.point_cloud import PointCloud
 from ..gaussians.surface import Surface
 from ..host import ExporterOutput, find, warn
 from ..meshes.mesh import Mesh
-from ..meshes.write import write_textured_mesh
+from ..meshes.write import write_obj, write_textured_mesh
 from ..prune import PruneOptions, prune_to_budget, write_report
 from ..view.render import RenderSettings
 from .pages import prompt_of, write_pages

@@ -20,7 +20,7 @@ import numpy as np
 
 from ..core.errors import UserError, unknown
 from ..core.files import atomic_file
-from ..formats.gaussian_files import StoredCloud, ply_notes, spz_note
+from ..formats.gaussian_files import StoredCloud, notes_of
 from ..formats.ply import NORMALS, gaussian_columns, gaussian_properties, header_bytes
 from ..formats.spz import SPZ_UP, spz_bytes
 from ..gaussians.axes import AXES, WORLD_UP, rotation_between
@@ -142,7 +142,8 @@ def _meta(clouds: Sequence[Shown], options: PageOptions, pose: Pose) -> dict[str
     """Return the facts that the page's scripts read."""
     cloud, settings = clouds[0].cloud, options.settings
     properties = gaussian_properties(cloud.gaussians.sh.shape[1])
-    header = header_bytes(properties, len(cloud.gaussians.means), ply_notes(cloud))
+    vertices = ("vertex", len(cloud.gaussians.means), properties)
+    header = header_bytes([vertices], notes_of(cloud, ".ply"))
     return {
         "title": options.title,
         "name": options.name,
@@ -174,11 +175,7 @@ def _meta(clouds: Sequence[Shown], options: PageOptions, pose: Pose) -> dict[str
 def _data_blocks(clouds: Sequence[Shown]) -> str:
     blocks = {f"cloud-{i}": packed(shown.cloud.gaussians) for i, shown in enumerate(clouds)}
     stored = clouds[0].cloud
-    blocks["spz"] = spz_bytes(
-        stored.in_axes(SPZ_UP).gaussians,
-        comment=spz_note(stored),
-        antialiased=stored.antialiased,
-    )
+    blocks["spz"] = spz_bytes(stored.in_axes(SPZ_UP).gaussians, notes_of(stored, ".spz"))
     return "\n".join(
         f'<script type="text/plain" id="{name}">{base64.b64encode(data).decode()}</script>'
         for name, data in blocks.items()

@@ -1,0 +1,70 @@
+"""Read files from anywhere: one message for every kind of damage, and a limit of the memory that a
+file may take, in proportion to its size, since a small one can announce gigabytes."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+
+from ..core.errors import UserError
+from ..core.files import existing_file
+from ..core.memory import size_text
+
+FIXED_BYTES = 24 << 20
+BYTES_PER_FILE_BYTE = 64
+
+
+class Unreadable(ValueError):
+    """What is wrong with the file that :func:`reading` has opened, without its name."""
+
+
+@contextmanager
+def reading(path: str | PathLike, kind: str) -> Iterator[Path]:
+    """Yield the existing file ``path``. Whatever a damaged one raises in the block is one error.
+
+    Args:
+        kind: what the file is, for the message ("SPZ file").
+
+    Raises:
+        UserError: there is no such file, or the block raises an error about its content.
+    """
+    path = existing_file(path, kind)
+    where = f"{kind} {str(path)!r}"
+    try:
+        with np.errstate(all="ignore"):
+            yield path
+    except UserError:
+        raise
+    except Unreadable as error:
+        raise UserError(f"{where}: {error}") from error
+    except OSError as error:
+        other = f" ({error.filename})" if error.filename not in (None, str(path)) else ""
+        raise UserError(f"cannot read {where}: {error.strerror or error}{other}") from error
+    except Exception as error:  # parsers raise errors of many types
+        reason = f"{type(error).__name__}: {error}"[:200]
+        raise UserError(
+            f"{where}: it is truncated, damaged or of another format ({reason})"
+        ) from error
+
+
+def require(fits: bool, problem: str) -> None:
+    """Raise :class:`Unreadable` unless ``fits``."""
+    if not fits:
+        raise Unreadable(problem)
+
+
+def require_file_memory(needed: int, file_size: int, content: str) -> None:
+    """Raise :class:`Unreadable` if reading takes more memory than a file of its size may.
+
+    Args:
+        needed: bytes, intermediate results included, by the file's header.
+        content: what is announced ("3000000 Gaussians").
+    """
+    budget = FIXED_BYTES + BYTES_PER_FILE_BYTE * file_size
+    require(
+        needed <= budget,
+        f"{content} would take {size_text(needed)} of memory, but a file of {file_size} bytes may "
+        f"take {size_text(budget)} at most: it is damaged, or made to fill the memory",
+    )
