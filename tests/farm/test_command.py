@@ -3,6 +3,7 @@
 import fcntl
 import os
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -47,6 +48,10 @@ def no_ray(monkeypatch):
     monkeypatch.setattr(command.driver, "connect", refuse)
 
 
+UNKNOWN = ("out/${name}", "${oc.env:NOWHERE}", "???")
+"""Folders of a configuration that aren't known before a run."""
+
+
 @pytest.mark.parametrize(
     ("text", "arguments", "message"),
     [
@@ -58,28 +63,32 @@ def no_ray(monkeypatch):
         ("a fox", ["system.prompt_processor.prompt=x"], "set by the prompt list"),
         ("a fox", ["--config", "demoo.yaml"], "unknown configuration 'demoo.yaml'"),
         ("a fox", ["--out", "prompts.txt"], "can't be written"),
+        ("a fox", ["--out", "file"], "choose another --out"),
+        ("a fox", ["--report"], "there is no farm in"),
+        ("a fox", ["--config", "root0.yaml", "--out", "out", "--report"], "there is no farm in"),
+        *(("a fox", ["--config", f"root{i}.yaml"], "isn't known here: give --out") for i in (0, 1)),
+        ("a fox", ["--config", "root2.yaml"], "isn't known here: give --out"),
+        ("a fox", ["--out", "held"], "another farm command is at work in"),
+        ("a fox", ["--workers", "0"], "--workers: expected a whole number from 1, got '0'"),
+        ("a fox", ["--gpus", "-1"], "--gpus"),
+        ("a fox", ["--time-limit", "nan"], "expected a number above 0, got 'nan'"),
+        ("a fox", ["--price", "-2"], "--price"),
+        ("a fox", ["--nothing"], "unrecognized option --nothing"),
     ],
 )
 def test_bad_input_is_refused_before_ray_starts(farm, monkeypatch, text, arguments, message):
     no_ray(monkeypatch)
+    for i, root in enumerate(UNKNOWN):
+        Path(f"root{i}.yaml").write_text(f"exp_root_dir: {root}")
+    Path("file").touch()
+    Path("held").mkdir()
+    descriptor = os.open("held", os.O_RDONLY)
+    fcntl.flock(descriptor, fcntl.LOCK_EX)
+    before = {*os.listdir(), "prompts.txt"}
     code, err = farm(text, *arguments)
+    os.close(descriptor)
     assert code == 2 and message in err and "Traceback" not in err
-    assert os.listdir() == ["prompts.txt"]
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["--workers", "0"], "--workers: expected a whole number from 1, got '0'"),
-        (["--gpus", "-1"], "--gpus"),
-        (["--time-limit", "nan"], "expected a number above 0, got 'nan'"),
-        (["--price", "-2"], "--price"),
-        (["--nothing"], "unrecognized option --nothing"),
-    ],
-)
-def test_invalid_options_are_named(farm, arguments, message):
-    code, err = farm("a fox", *arguments)
-    assert code == 2 and message in err
+    assert {*os.listdir()} == before
 
 
 @pytest.mark.parametrize(
@@ -108,32 +117,13 @@ def test_without_ray_the_extra_is_named(farm, monkeypatch):
     assert code == 2 and "pip install 'threestudio-gaussiandreamer[cluster]'" in err
 
 
-def test_a_folder_in_which_another_command_works_is_refused(farm, monkeypatch, tmp_path):
-    no_ray(monkeypatch)
-    (tmp_path / "out").mkdir()
-    descriptor = os.open(tmp_path / "out", os.O_RDONLY)
-    fcntl.flock(descriptor, fcntl.LOCK_EX)
-    code, err = farm("a fox", "--out", "out")
-    os.close(descriptor)
-    assert code == 2 and "another farm command is at work in" in err
-
-
-def test_a_file_is_no_farms_folder(farm, monkeypatch, tmp_path):
-    no_ray(monkeypatch)
-    (tmp_path / "out").touch()
-    code, err = farm("a fox", "--out", "out")
-    assert code == 2 and "can't be written" in err and "choose another --out" in err
-
-
 def test_the_report_needs_neither_ray_nor_a_finished_asset(farm, monkeypatch, tmp_path):
     no_ray(monkeypatch)
-    options = ["--report", f"exp_root_dir={tmp_path}/runs"]
-    code, err = farm("a fox", *options)
-    assert code == 2 and "there is no farm in" in err and not (tmp_path / "runs").exists()
     require_same_farm(Place(tmp_path / "runs/farm-prompts"), RECIPE)
-    code, _ = farm("a fox", *options)
-    assert code == 0
+    assert farm("a fox", "--report", f"exp_root_dir={tmp_path}/runs")[0] == 0
     assert "waiting" in (tmp_path / "runs/farm-prompts/report/table.csv").read_text()
+    monkeypatch.setattr(command, "make_assets", lambda *args: None)  # something is left to do
+    assert farm("a fox", "--out", "out") == (1, "")
 
 
 def test_the_folder_may_be_that_of_the_environment(tmp_path, monkeypatch):
@@ -141,21 +131,6 @@ def test_the_folder_may_be_that_of_the_environment(tmp_path, monkeypatch):
     (tmp_path / "a.yaml").write_text("exp_root_dir: ${oc.env:HERE}/runs")
     assert root_of([str(DEMO), str(tmp_path / "a.yaml")]) == "s3://bucket/runs"
     assert root_of([str(DEMO)]) == "outputs"
-
-
-@pytest.mark.parametrize("root", ["out/${name}", "${oc.env:NOWHERE}", "???"])
-def test_a_folder_that_is_not_known_is_asked_for(farm, monkeypatch, tmp_path, root):
-    no_ray(monkeypatch)
-    (tmp_path / "a.yaml").write_text(f"exp_root_dir: {root}")
-    code, err = farm("a fox", "--config", "a.yaml", "--report")
-    assert code == 2 and "isn't known here: give --out" in err
-    code, err = farm("a fox", "--config", "a.yaml", "--report", "--out", "out")
-    assert code == 2 and "there is no farm in" in err
-
-
-def test_the_code_is_that_of_a_finished_farm_only_if_all_is_finished(farm, monkeypatch):
-    monkeypatch.setattr(command, "make_assets", lambda *args: None)
-    assert farm("a fox", "--out", "out") == (1, "")
 
 
 def test_a_finished_farm_needs_no_ray(farm, monkeypatch, tmp_path):
@@ -181,26 +156,21 @@ def test_a_finished_farm_needs_no_ray(farm, monkeypatch, tmp_path):
 # -- configurations --------------------------------------------------------------------------------
 
 
-def test_an_error_in_a_rows_configuration_names_its_line(tmp_path):
-    path = tmp_path / "prompts.csv"
-    path.write_text("prompt,overrides\na fox,\na cat,trainer.max_steps=-3\n")
-    recipe = recipe_of(str(DEMO))
-    with pytest.raises(ValueError, match="line 3 of the prompt list: trainer.max_steps"):
-        check_recipe(recipe, read_rows(path))
-
-
-def test_an_option_of_the_farm_is_refused_in_every_row(tmp_path, monkeypatch):
-    monkeypatch.setattr("threestudio_gaussiandreamer.farm.recipe.MOST_CHECKS", 1)
-    rows = [Row("fox", "a fox"), Row("cat", "a cat", overrides=("resume=x.ckpt",), line=2)]
-    with pytest.raises(ValueError, match="line 2 of the prompt list: resume is set by the farm"):
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"overrides": ("trainer.max_steps=-3",)}, "line 3 of the prompt list: trainer.max_steps"),
+        ({"config": ("nothing.yaml",)}, "line 3 .*unknown configuration 'nothing.yaml'"),
+        # also in rows beyond those of which the whole configuration is checked
+        ({"overrides": ("resume=x.ckpt",)}, "line 3 of the prompt list: resume is set by the farm"),
+    ],
+)
+def test_an_error_in_a_rows_configuration_names_its_line(monkeypatch, options, message):
+    if "resume" in message:
+        monkeypatch.setattr("threestudio_gaussiandreamer.farm.recipe.MOST_CHECKS", 1)
+    with pytest.raises(ValueError, match=message):
+        rows = [Row("fox", "a fox"), Row("cat", "a cat", line=3, **options)]
         check_recipe(recipe_of(str(DEMO)), rows)
-
-
-def test_a_missing_configuration_of_a_row_names_its_line(tmp_path):
-    row = Row("fox", "a fox", config=("nothing.yaml",), line=4)
-    recipe = recipe_of(str(DEMO))
-    with pytest.raises(ValueError, match="line 4 .*unknown configuration 'nothing.yaml'"):
-        check_recipe(recipe, [row])
 
 
 def test_the_low_memory_configuration_is_used_where_it_is_valid():

@@ -170,18 +170,6 @@ def test_an_outcome_decides_what_becomes_of_an_asset(
     assert (tmp_path / "assets/toy0/failed.json").exists() == bool(error)
 
 
-def test_a_step_collects_all_outcomes_and_looks_after_workers_now_and_then(tmp_path):
-    bench = Bench(tmp_path, finished, workers=3)
-    bench.driver.fill()
-    bench.driver.step()
-    assert bench.driver.counts[FINISHED] == 3
-    bench.driver.step()
-    assert bench.driver.counts[FINISHED] == 6 and bench.reads == 1
-    bench.driver.look_due = 0.0
-    bench.driver.look_after_workers()
-    assert bench.reads == 2
-
-
 def test_obstacles_end_the_farm_and_leave_the_assets_to_the_next(tmp_path, monkeypatch):
     full = {"state": BLOCKED, "error": "No space left"}
     bench = Bench(tmp_path / "a", lambda job: full if job.row == ROWS[2] else finished(job))

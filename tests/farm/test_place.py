@@ -102,8 +102,20 @@ def made(place, row=FOX):
 RESULT = {"key": FOX.key, "hash": "ab", "files": ["save/it5-export/a.ply"]}
 
 
-def life_of_a_farm(url, elsewhere):
+def test_a_folder_is_a_place_too(tmp_path):
+    place = Place(str(tmp_path))
+    place.write({"a/b.txt": b"1"})
+    made(place)
+    assert place.read(["a/b.txt", "none"]) == [b"1", None] and str(place) == os.fspath(tmp_path)
+    place.publish(FOX, RESULT)
+    assert place.finished(FOX)["hash"] == "ab" and place.finished(FOX._replace(seed=1)) is None
+    assert (tmp_path / "assets/fox/ckpts/last.ckpt").exists()
+
+
+@pytest.mark.parametrize("url", ["memory://farm", "s3"])
+def test_the_life_of_a_farm_below_a_url(url, memory, request, tmp_path):
     """Train, lose the machine, go on elsewhere, fail, publish, and read the records."""
+    url, elsewhere = request.getfixturevalue("s3") if url == "s3" else url, tmp_path / "elsewhere"
     first, second = Place(url), pickle.loads(pickle.dumps(Place(url, scratch=elsewhere)))
     folder = made(first)
     first.keep_checkpoint(FOX, False)
@@ -127,14 +139,6 @@ def life_of_a_farm(url, elsewhere):
     assert first.read([module.part_of(FOX, False)]) == [None]
     write_report(first, [FOX], 1)
     assert b"fox" in first.read(["report/table.csv"])[0]
-
-
-def test_a_farm_in_memory(memory, tmp_path):
-    life_of_a_farm(memory, tmp_path / "elsewhere")
-
-
-def test_a_farm_on_s3(s3, tmp_path):
-    life_of_a_farm(s3, tmp_path / "elsewhere")
 
 
 def test_the_result_is_uploaded_last_and_a_reader_sees_no_half_asset(memory, monkeypatch):
@@ -290,18 +294,6 @@ def test_a_url_that_can_not_be_used_is_one_message(monkeypatch):
     monkeypatch.setattr("fsspec.core.url_to_fs", refuses)
     with pytest.raises(UserError, match="ftp://host/farm can't be used: Connection refused"):
         Place("ftp://host/farm")
-
-
-def test_a_folder_is_a_place_too(tmp_path):
-    place = Place(str(tmp_path))
-    place.write({"a/b.txt": b"1"})
-    made(place)
-    assert place.read(["a/b.txt", "none"]) == [b"1", None] and str(place) == os.fspath(tmp_path)
-    place.publish(FOX, RESULT)
-    assert place.finished(FOX)["hash"] == "ab" and place.finished(FOX._replace(seed=1)) is None
-    assert (tmp_path / "assets/fox/ckpts/last.ckpt").exists()
-    place.discard(FOX)
-    assert place.finished(FOX) is None
 
 
 def test_unfinished_assets_are_handed_out_with_what_their_records_say(tmp_path):

@@ -19,7 +19,6 @@ from ..formats.array_files import read_arrays
 from ..gaussians.gaussians import Gaussians
 from ..gaussians.point_cloud import PointCloud
 from ..host import get_device
-from ..prompts.view_prompts import view_directions
 from ..toybox import recognition
 from ..toybox.kinds import KINDS
 from ..toybox.views import BACKGROUND, SIZE
@@ -27,7 +26,7 @@ from ..toybox.words import attributes_in
 from ..training.initialization import gaussians_on_points
 from . import t3bench
 from .clip_similarity import Protocol, open_clip, protocol_for, score
-from .image_reward import ImageReward
+from .image_reward import SOURCES, ImageReward
 from .results import Pictures, Result, find_result, read_result
 
 Color = tuple[float, float, float]
@@ -51,6 +50,10 @@ class Metric:
     columns: ClassVar[tuple[str, ...]]
     undefined: ClassVar[str] = ""
     """Why all of them are NaN for some assets."""
+    needs: ClassVar[tuple[str, ...]] = ()
+    """The option for the folder of its models, and the commands that download these."""
+    sized: ClassVar[bool] = False
+    """Whether its pictures have the size of ``--size``."""
 
     def __init__(self, args: Namespace) -> None:
         raise NotImplementedError
@@ -72,7 +75,8 @@ shared_judge = lru_cache(maxsize=1)(recognition.load_judge)
 class Clip(Metric):
     """The paper's CLIP similarity."""
 
-    columns = ("clip",)
+    columns, sized = ("clip",), True
+    needs = ("clip", "`hf download openai/clip-vit-large-patch14 --local-dir clip`")
 
     def __init__(self, args: Namespace) -> None:
         self.clip = shared_clip(args.clip)
@@ -86,7 +90,7 @@ class Clip(Metric):
 class Directions(Metric):
     """The share of views that CLIP assigns to the prompt of another direction."""
 
-    columns = ("wrong_direction",)
+    columns, sized, needs = ("wrong_direction",), True, Clip.needs
     AZIMUTHS = {"front": (-15, 15), "side": (75, 105, -75, -105), "back": (165, -165)}
 
     def __init__(self, args: Namespace) -> None:
@@ -95,18 +99,17 @@ class Directions(Metric):
     def score(self, asset: Asset) -> dict[str, float]:
         azimuth = torch.tensor([float(a) for group in self.AZIMUTHS.values() for a in group])
         pictures = rendered(asset, self.protocol.at(azimuth), self.protocol.size)
-        texts = {d.name: d.prompt(asset.prompt) for d in view_directions()}
-        found = np.stack(
-            [self.clip.similarities(pictures, texts[name]) for name in self.AZIMUTHS], axis=1
-        ).argmax(axis=1)
+        texts = [f"{asset.prompt}, {name} view" for name in self.AZIMUTHS]  # as in training
+        found = np.stack([self.clip.similarities(pictures, text) for text in texts], axis=1)
         wanted = [i for i, group in enumerate(self.AZIMUTHS.values()) for _ in group]
-        return {"wrong_direction": float(np.mean(found != wanted))}
+        return {"wrong_direction": float(np.mean(found.argmax(axis=1) != wanted))}
 
 
 class Reward(Metric):
     """ImageReward of the views of the paper's CLIP similarity, of its first seed."""
 
-    columns = ("imagereward",)
+    columns, sized = ("imagereward",), True
+    needs = ("imagereward", *(f"`{command} --local-dir ir`" for command in SOURCES.values()))
 
     def __init__(self, args: Namespace) -> None:
         self.model, self.size = shared_image_reward(args.imagereward), args.size
@@ -121,7 +124,7 @@ class Reward(Metric):
 class Quality(Metric):
     """T3Bench's quality, of the Gaussians in place of a mesh."""
 
-    columns = ("quality",)
+    columns, needs = ("quality",), Reward.needs
 
     def __init__(self, args: Namespace) -> None:
         self.model = shared_image_reward(args.imagereward)

@@ -33,7 +33,6 @@ from ..models.bundled import NAME
 from ..training.camera_options import MAX_SIDE
 from .asset_metrics import METRICS, Asset, Metric
 from .clip_similarity import Protocol, has_own_cameras
-from .image_reward import SOURCES
 from .results import Result, find_result, read_result
 
 FILES = ("scorecard.csv", "scorecard.json")
@@ -99,36 +98,23 @@ def open_metrics(args: argparse.Namespace) -> list[Metric]:
         UserError: a name isn't known, or a file that a metric needs is missing.
     """
     names = [name.strip() for name in args.metrics.split(",") if name.strip()]
-    for name in names:
-        if name not in METRICS:
-            raise unknown("metric", name, METRICS)
     if not names:
         raise UserError(f"--metrics is empty: expected some of {', '.join(METRICS)}")
     if args.size is not None and not 1 <= args.size <= MAX_SIDE:
         raise UserError(f"--size {shown(args.size)}: expected 1 to {MAX_SIDE} pixels")
     for name in names:
-        require_models(name, args)
-    if args.size is not None and not any(has_size(name, args.clip) for name in names):
+        if name not in METRICS:
+            raise unknown("metric", name, METRICS)
+        option, *commands = METRICS[name].needs or ("judge",)
+        if not getattr(args, option):
+            after = " and ".join(commands)
+            raise UserError(f"--metrics {name} needs --{option} FOLDER, after {after}")
+    own = "clip" if has_own_cameras(args.clip) else None  # whose size the toybox's CLIP determines
+    sized = [METRICS[name] for name in names if METRICS[name].sized]
+    if args.size is not None and all(metric.needs[0] == own for metric in sized):
         raise UserError("--size has no effect on these metrics, whose pictures have their own size")
     args.size = Protocol().size if args.size is None else args.size
     return [METRICS[name](args) for name in names]
-
-
-def has_size(name: str, clip: Optional[str]) -> bool:
-    """Return whether ``--size`` is that of a metric's pictures; the toybox's CLIP has its own."""
-    return name == "imagereward" or name in ("clip", "directions") and not has_own_cameras(clip)
-
-
-def require_models(name: str, args: argparse.Namespace) -> None:
-    """Raise UserError unless the folder of models that a metric needs is given."""
-    if name in ("clip", "directions") and not args.clip:
-        raise UserError(
-            f"--metrics {name} needs --clip FOLDER, for instance after `hf download "
-            "openai/clip-vit-large-patch14 --local-dir clip`"
-        )
-    if name in ("imagereward", "quality") and not args.imagereward:
-        commands = " and ".join(f"`{line} --local-dir ir`" for line in SOURCES.values())
-        raise UserError(f"--metrics {name} needs --imagereward FOLDER, after {commands}")
 
 
 def find_results(folders: Sequence[str], failed: list[str]) -> list[Result]:

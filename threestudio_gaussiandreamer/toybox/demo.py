@@ -31,14 +31,7 @@ from ..core.files import atomic_file, json_text, output_folder
 from ..core.signals import interrupt, raised_signals
 from ..core.streams import generator
 from ..diffusion import sds
-from ..evaluation.asset_metrics import (
-    ATTRIBUTES,
-    Asset,
-    Scores,
-    prior_of,
-    rendered,
-    result_of,
-)
+from ..evaluation.asset_metrics import ATTRIBUTES, Asset, Scores, prior_of, rendered, result_of
 from ..host import find
 from ..launch.folder_lock import RunFolder, claim, claim_new
 from ..models.bundled import NAME, is_export
