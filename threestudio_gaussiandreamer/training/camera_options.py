@@ -1,6 +1,7 @@
 """The options of the data module; ``data.py`` describes them."""
 
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Any, ClassVar, List, Tuple
 
 from ..core.errors import UserError
@@ -70,73 +71,42 @@ class CameraConfig:
 
     @staticmethod
     def check(cfg: Any) -> None:
-        """Raise UserError where the lists of sizes don't fit the milestones, or nothing could hold
-        what is asked for.
-        """
+        """Raise UserError where options don't fit each other, or the pictures the memory."""
+        milestones, listed = list(cfg.resolution_milestones), False
+        if any(later <= earlier for earlier, later in pairwise([0, *milestones])):
+            raise UserError(
+                f"resolution_milestones: expected increasing steps above 0, got {milestones}"
+            )
         for name in LISTED:
-            values = getattr(cfg, name)
-            if isinstance(values, list) and len(values) not in (
-                1,
-                len(cfg.resolution_milestones) + 1,
-            ):
+            count = len(values) if is_list(values := getattr(cfg, name)) else 1
+            listed |= count > 1
+            if count not in (1, len(milestones) + 1):
                 raise UserError(
-                    f"{name}: {len(values)} entries need {len(values) - 1} "
-                    "resolution_milestones, the steps at which the next entry applies, got "
-                    f"{len(cfg.resolution_milestones)}"
+                    f"{name}: {count} entries need {count - 1} resolution_milestones, the steps at "
+                    f"which the next entry applies, got {len(milestones)}"
                 )
-        _check_milestones(cfg)
-        _check_groups(cfg)
-        _check_pool(cfg)
-        _check_memory(cfg)
-
-
-def _check_milestones(cfg: Any) -> None:
-    milestones = list(cfg.resolution_milestones)
-    if any(later <= earlier for earlier, later in zip([0, *milestones], milestones, strict=False)):
-        raise UserError(
-            f"resolution_milestones: expected increasing steps above 0, got {milestones}"
-        )
-    if milestones and not any(
-        isinstance(getattr(cfg, name), list) and len(getattr(cfg, name)) > 1
-        for name in ("height", "width", "batch_size")
-    ):
-        raise UserError(
-            f"resolution_milestones: give height, width or batch_size {len(milestones) + 1} entries"
-        )
-
-
-def _check_groups(cfg: Any) -> None:
-    """Raise UserError where the views of a batch can't be groups of ``n_view``."""
-    for size in _per_stage(cfg.batch_size, range(len(cfg.resolution_milestones) + 1)):
-        if size % cfg.n_view:
-            raise UserError(f"batch_size: expected multiples of n_view={cfg.n_view}, got {size}")
-
-
-def _check_pool(cfg: Any) -> None:
-    """Raise UserError where a fixed pool of views has options of random ones."""
-    if cfg.n_view > 1 and cfg.train_views:
-        raise UserError("train_views: a fixed pool of views has no groups: set n_view=1")
-    if cfg.progressive_until and cfg.train_views:
-        raise UserError(
-            "progressive_until: the angles of a fixed pool of views don't widen: set train_views=0"
-        )
-
-
-def _check_memory(cfg: Any) -> None:
-    """Raise UserError for pictures larger than the memory."""
-    for height, width, batch in sizes_of_stages(cfg):
-        what = f"{batch} views of {height} x {width} pixels"
-        require_memory("batch_size", TRAIN_BYTES * height * width * batch, what)
-    what = f"pictures of {cfg.eval_height} x {cfg.eval_width} pixels"
-    require_memory("eval_height", EVAL_BYTES * cfg.eval_height * cfg.eval_width, what)
+        if milestones and not listed:
+            needed = f"{len(milestones) + 1} entries"
+            raise UserError(f"resolution_milestones: give height, width or batch_size {needed}")
+        if cfg.n_view > 1 and cfg.train_views:
+            raise UserError("train_views: a fixed pool of views has no groups: set n_view=1")
+        if cfg.progressive_until and cfg.train_views:
+            raise UserError(
+                "progressive_until: the angles of a fixed pool of views don't widen: set "
+                "train_views=0"
+            )
+        for height, width, batch in sizes_of_stages(cfg):
+            if batch % cfg.n_view:
+                expected = f"expected multiples of n_view={cfg.n_view}"
+                raise UserError(f"batch_size: {expected}, got {batch}")
+            what = f"{batch} views of {height} x {width} pixels"
+            require_memory("batch_size", TRAIN_BYTES * height * width * batch, what)
+        what = f"pictures of {cfg.eval_height} x {cfg.eval_width} pixels"
+        require_memory("eval_height", EVAL_BYTES * cfg.eval_height * cfg.eval_width, what)
 
 
 def sizes_of_stages(cfg: Any) -> list[tuple[int, int, int]]:
     """Return height, width and number of the views in a step of each stage."""
     stages = range(len(cfg.resolution_milestones) + 1)
-    return list(zip(*(_per_stage(getattr(cfg, name), stages) for name in LISTED), strict=True))
-
-
-def _per_stage(given: Any, stages: range) -> list[int]:
-    values = given if isinstance(given, (list, tuple)) else [given]
-    return [values[min(i, len(values) - 1)] for i in stages]
+    sizes = [v if is_list(v) else [v] for v in (cfg.height, cfg.width, cfg.batch_size)]
+    return [tuple(values[min(i, len(values) - 1)] for values in sizes) for i in stages]

@@ -46,7 +46,7 @@ from ..cameras import Orbit, OrbitRanges
 from ..core.distributed import own_rows, require_shareable
 from ..core.streams import generator
 from ..host import Updateable, parse_structured, pl, register, register_builtin, run_seed
-from .camera_options import CameraConfig
+from .camera_options import CameraConfig, sizes_of_stages
 
 
 def make_batch(
@@ -96,14 +96,9 @@ class TrainCameras(IterableDataset, Updateable):
         self.cfg = cfg
         self.next_step: Callable[[], int] = lambda: 0
         self._views_by_size: dict[tuple[int, int], dict[str, Any]] = {}
-        sizes = [
-            v if isinstance(v, (list, tuple)) else [v]
-            for v in (cfg.height, cfg.width, cfg.batch_size)
-        ]
-        stages = max(map(len, sizes))
-        for batch_size in sizes[2]:
+        self.sizes = sizes_of_stages(cfg)
+        for _, _, batch_size in self.sizes:
             require_shareable(batch_size, "data.batch_size", together=cfg.n_view)
-        self.sizes = list(zip(*[v * stages if len(v) == 1 else v for v in sizes], strict=True))
         angles = cfg.elevation_range, cfg.azimuth_range
         self.ranges = OrbitRanges(*map(tuple, (*angles, cfg.camera_distance_range, cfg.fovy_range)))
         self.pool = None
