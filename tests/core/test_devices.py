@@ -9,8 +9,7 @@ from threestudio_gaussiandreamer.core.devices import get_device, torch_threads, 
 
 
 @pytest.mark.parametrize(
-    ("ranks", "index"),
-    [({}, 0), ({"LOCAL_RANK": "3"}, 3), ({"SLURM_LOCALID": "2"}, 2)],
+    ("ranks", "index"), [({}, 0), ({"LOCAL_RANK": "3"}, 3), ({"SLURM_LOCALID": "2"}, 2)]
 )
 def test_each_process_of_a_machine_has_its_own_gpu(monkeypatch, ranks, index):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)

@@ -5,11 +5,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from threestudio_gaussiandreamer.core.host_copies import (
-    DelayedReads,
-    HostCopy,
-    flush_reads,
-)
+from threestudio_gaussiandreamer.core.host_copies import DelayedReads, HostCopy, flush_reads
 
 
 @pytest.fixture

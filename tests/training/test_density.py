@@ -7,11 +7,7 @@ import math
 import pytest
 import torch
 
-from threestudio_gaussiandreamer.training.density import (
-    DECAY,
-    DensityControl,
-    DensityOutcome,
-)
+from threestudio_gaussiandreamer.training.density import DECAY, DensityControl, DensityOutcome
 from threestudio_gaussiandreamer.training.geometry import GaussianCloud
 
 EACH_STEP = {"start": 0, "stop": 10, "every": 1}

@@ -52,11 +52,7 @@ def models(tmp_path_factory):
             model=tiny_3d_models.shap_e(folder / "shap-e"), num_inference_steps=2, grid_size=24
         ),
         "point_e": prior(
-            checkpoint=base,
-            upsampler=upsampler,
-            clip=clip,
-            num_steps=2,
-            num_points=64,
+            checkpoint=base, upsampler=upsampler, clip=clip, num_steps=2, num_points=64
         ),
         "motion": prior(
             motion=motion(folder),

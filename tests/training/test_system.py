@@ -102,9 +102,7 @@ def test_a_run_long_enough_for_its_pool_has_the_pictures_cast_at_once(
 ):
     cast = []
     monkeypatch.setattr(
-        MeshTruth,
-        "prefetch",
-        lambda self, *views: cast.append((len(views[0]), *views[2:])),
+        MeshTruth, "prefetch", lambda self, *views: cast.append((len(views[0]), *views[2:]))
     )
     options = ["data.width=48", "data.height=48", "system.renderer.downsample=2"]
     assert (

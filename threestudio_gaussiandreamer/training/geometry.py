@@ -54,14 +54,7 @@ from ..core.errors import UserError
 from ..core.host_copies import DelayedReads
 from ..core.lazy_mapping import LazyMapping
 from ..core.methods import require_method
-from ..core.options import (
-    at_least,
-    between,
-    in_range,
-    one_of,
-    positive,
-    schedule,
-)
+from ..core.options import at_least, between, in_range, one_of, positive, schedule
 from ..gaussians import densify, sh
 from ..gaussians.densify import LOG_SCALE_RANGE, PARAMETERS, Change
 from ..gaussians.grow import SCALE_RULES

@@ -54,6 +54,8 @@ def check_backend(option: str, name: str) -> None:
         )
 
 
+DRAWING = ("near", "far", "eps2d", "antialias", "preset", "downsample", "backend")
+"""Options that `rasterize` is given."""
 OUTPUTS = ("comp_rgb", "comp_rgb_bg", "opacity", "depth", "rasterized")
 """What training reads of a renderer's outputs, whatever its options are."""
 
@@ -115,7 +117,7 @@ class SplattingRenderer(Rasterizer):
             error is differentiated by. ``depth`` and ``comp_normal`` are computed when they are
             first read.
         """
-        options, cloud, device = self.cfg, self.geometry, self.geometry.means.device
+        cloud, device = self.geometry, self.geometry.means.device
         c2w, fovy = c2w.to(device, torch.float32), fovy.to(device, torch.float32)
         with without_autocast(device.type):
             flat = FlatBackground.is_flat(self.background)
@@ -127,13 +129,7 @@ class SplattingRenderer(Rasterizer):
                 *(cloud.means, cloud.quats, cloud.scales(), opacities, colors),
                 *(viewmats, Ks, width, height),
                 background=color,
-                near=options.near,
-                far=options.far,
-                eps2d=options.eps2d,
-                antialias=options.antialias,
-                preset=options.preset,
-                downsample=options.downsample,
-                backend=options.backend,
+                **{name: getattr(self.cfg, name) for name in DRAWING},
                 absgrad=self.training and getattr(cloud, "wants_absgrad", False),
             )
             image, background = out.image, color[:, None, None] if flat else None

@@ -113,11 +113,7 @@ class CudaKernel(NamedTuple):
 
 
 def _draw(
-    batch: Batch,
-    splats: Splats,
-    totals: AsyncReadback,
-    images: Images,
-    contribution: Tensor,
+    batch: Batch, splats: Splats, totals: AsyncReadback, images: Images, contribution: Tensor
 ) -> Lists:
     """Fill the images; return the lists, which are incomplete if the capacity was too small.
 
@@ -159,11 +155,7 @@ def _report_short_memory() -> None:
 
 
 def _sums_of_rows(
-    batch: Batch,
-    splats: Splats,
-    lists: Lists,
-    totals: list[int],
-    upstream: BlendUpstream,
+    batch: Batch, splats: Splats, lists: Lists, totals: list[int], upstream: BlendUpstream
 ) -> Tensor:
     """Run `blend_backward` on all views, or on fewer at a time if memory is short; lists that are
     incomplete are made again.
