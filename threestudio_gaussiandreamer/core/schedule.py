@@ -13,7 +13,6 @@ Integer end steps count optimiser steps, those written as ``10.0`` epochs. Rando
 endless epoch, in threestudio too, so that with them a schedule in epochs stays at its first value.
 """
 
-import functools
 import logging
 import math
 from itertools import pairwise
@@ -23,6 +22,7 @@ from typing import Any, NamedTuple
 from .errors import UserError
 
 logger = logging.getLogger(__name__)
+_warned: set[tuple[str, str]] = set()
 FORMS = "a number, [v0, v1, end], [s0, v0, v1, s1] or [s0, v0, v1, s1, v2, s2, ...]"
 
 
@@ -66,19 +66,16 @@ def validate_schedule(value: Any, name: str = "the schedule", minimum: float = -
     lowest = min(schedule.values)
     if lowest < minimum:
         raise UserError(f"{name}: expected values of {minimum:g} or more, got {lowest:g}")
-    if schedule.in_epochs:
-        # once for the part and the launcher, which call the option by its name and by its path
-        _warn_of_epochs(name.rpartition(".")[2], str(value))
+    # once for the part and the launcher, which call the option by its name and by its path
+    if schedule.in_epochs and (key := (name.rpartition(".")[2], str(value))) not in _warned:
+        _warned.add(key)
+        logger.warning(
+            "%s: its end steps have decimal points and count epochs; random cameras are one "
+            "endless epoch, so that it stays at its first value: write whole numbers to count "
+            "steps",
+            name,
+        )
     return value
-
-
-@functools.cache
-def _warn_of_epochs(name: str, value: str) -> None:
-    logger.warning(
-        "%s: its end steps have decimal points and count epochs; random cameras are one endless "
-        "epoch, so that it stays at its first value: write whole numbers to count steps",
-        name,
-    )
 
 
 def parse_schedule(value: Any, name: str = "the schedule") -> Schedule:
