@@ -78,6 +78,7 @@ toybox-sheet: $(VENV)/ready-for-models       ## docs/images/toybox-world.png: 10
 charts: $(VENV)/ready-for-charts   ## docs/charts/*.png from the committed numbers beside them
 	$(ENVIRON) $(BIN)/python -m benchmarks.splatting.chart_splatting --from-csv
 	$(ENVIRON) $(BIN)/python -m benchmarks.quality.chart_runs
+	$(ENVIRON) $(BIN)/python -m benchmarks.quality.chart_needed
 	$(ENVIRON) $(BIN)/python -m benchmarks.quality.mesh --objects
 
 # the meshes to measure on: make measure-charts OBJECTS="toy.glb path/to/spot.glb path/to/duck.glb"
