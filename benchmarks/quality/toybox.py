@@ -61,7 +61,7 @@ from benchmarks.quality.toybox_jobs import (
     setup_of_samples,
 )
 from benchmarks.quality.toybox_options import CHARTS as VARIANTS
-from threestudio_gaussiandreamer.guidance.half_precision import cpu_multiplies_bfloat16
+from threestudio_gaussiandreamer.guidance.text_to_image import cpu_multiplies_bfloat16
 
 KEY = ("variant", "x", "withheld", "index", "seed", "setup", "judge")
 LOOKS = ("saturation", "at_limits", "evaluations")
@@ -127,7 +127,7 @@ def prepare() -> None:
     import torch
 
     from threestudio_gaussiandreamer import register_parts
-    from threestudio_gaussiandreamer.models.loaded import keep_loaded
+    from threestudio_gaussiandreamer.models.model_files import keep_loaded
 
     torch.set_num_threads(1)
     register_parts()

@@ -22,7 +22,7 @@ SCENE = [
     "system.geometry.prior.num_points=160", "system.geometry.prior.color_smoothing=0",
     "system.geometry.grow.num_candidates=20000", "system.geometry.grow.radius=0.05",
     "system.geometry.grow.max_points=40", "system.geometry.budget=null",
-    "system.guidance.eval_steps=2", "system.evaluation.views=2", "system.evaluation.size=16",
+    "system.evaluation.views=2", "system.evaluation.size=16",
     "system.geometry.densify.enabled=true", "system.geometry.densify.grad_threshold=2e-3",
     "system.geometry.max_gaussians=400", "trainer.enable_progress_bar=false",
     "trainer.log_every_n_steps=50", "checkpoint.save_top_k=1",

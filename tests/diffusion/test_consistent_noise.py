@@ -12,7 +12,6 @@ from threestudio_gaussiandreamer.cameras import (
     surface_points,
 )
 from threestudio_gaussiandreamer.diffusion.consistent_noise import (
-    ITEM,
     LATTICES,
     PRIMES,
     TABLE,
@@ -96,24 +95,6 @@ def test_the_background_has_noise_of_its_own_in_each_view_and_draw():
         correlation = torch.corrcoef(torch.stack([a[corner].flatten(), b[corner].flatten()]))
         assert abs(float(correlation[0, 1])) < 0.25  # three deviations of 144 numbers
     assert len(noise[0][corner].unique()) == 4 * 6 * 6
-
-
-def test_no_background_of_seven_items_is_that_of_another_one_shifted():
-    """Nor with the lattices exchanged, whose rows are half of the table apart."""
-    shifts = np.arange(-63, 64)
-    pixels = shifts[:, None] * PRIMES[0] + shifts * PRIMES[1]
-    shifted = {*(pixels % TABLE).ravel(), *((pixels + TABLE // LATTICES) % TABLE).ravel()}
-    assert not shifted & {items * ITEM % TABLE for items in range(1, 7)}
-    assert 7 * ITEM % TABLE in shifted
-
-
-def test_a_background_is_standard_normal_and_its_pixels_are_independent():
-    view = ball([0.0], 128)
-    nothing = (view[0], torch.zeros_like(view[1]), *view[2:])
-    noise = noise_of(64, table(), nothing)[0]
-    assert abs(float(noise.mean())) < 5 / 2**7 and abs(float(noise.var()) - 1) < 0.06
-    neighbours = (noise[:, :, 1:] * noise[:, :, :-1]).mean()
-    assert abs(float(neighbours)) < 0.04  # five deviations of 16,000 products
 
 
 def test_cells_are_cubes_of_each_lattice():

@@ -86,3 +86,15 @@ def test_stratified_timesteps_lie_one_in_each_range():
     ordered = draws.sort(1).values
     assert (ordered >= low).all() and (ordered <= high).all()
     assert draws.min() < 20 and draws.max() > 980 and (draws[:, 0] != draws[0, 0]).any()
+
+
+def test_every_prediction_type_is_converted_to_the_noise():
+    x, eps = torch.randn(2, 3, 5, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    abar = ABAR[torch.tensor([20, 500, 980])]
+    a, sigma = abar.sqrt()[:, None], (1 - abar).sqrt()[:, None]
+    outputs = {"epsilon": eps, "v_prediction": a * eps - sigma * x, "sample": x}
+    outputs["velocity"] = eps - x
+    assert outputs.keys() == sds.PREDICTIONS.keys()
+    for name, output in outputs.items():
+        found = sds.PREDICTIONS[name](output, a * x + sigma * eps, abar)
+        torch.testing.assert_close(found, eps, rtol=0, atol=1e-12)

@@ -9,7 +9,7 @@ from tests.helpers.tiny_guidance import (
 )
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def mesh_path(tmp_path_factory):
     """Write a ball with a nose: red in front, green behind, blue on top."""
     import trimesh
@@ -28,11 +28,11 @@ def mesh_path(tmp_path_factory):
     return str(path)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def models(tmp_path_factory):
     return make_models(tmp_path_factory.mktemp("models"))
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def prompts(models):
     return make_prompts(models)

@@ -1,83 +1,56 @@
-"""The gradient of Stable Diffusion's guidance: against float64, in closed form, and in half
-precision.
-"""
+"""The gradient of Stable Diffusion's guidance: against float64, and in half precision."""
 
 import math
-from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 import torch
 import torch.nn.functional as F
-from torch import nn
 
+from tests.helpers import tiny_guidance as tiny
 from tests.helpers.tiny_guidance import (
     BATCH,
-    PREDICTIONS,
     Recorder,
     gradient,
     guidance,
     relative,
     renders,
 )
-from threestudio_gaussiandreamer.core import streams
-from threestudio_gaussiandreamer.guidance import base, half_precision, text_to_image
+from threestudio_gaussiandreamer.guidance import base, text_to_image
 from threestudio_gaussiandreamer.guidance.base import NonFiniteScore
-from threestudio_gaussiandreamer.guidance.half_precision import (
+from threestudio_gaussiandreamer.guidance.stable_diffusion import (
     PerItemLossScale,
-    weights_type,
+    StableDiffusionGuidance,
 )
-from threestudio_gaussiandreamer.guidance.stable_diffusion import StableDiffusionGuidance
+from threestudio_gaussiandreamer.guidance.text_to_image import weights_type
 
 pytest.importorskip("diffusers")
-
-CPUINFO = Path("/proc/cpuinfo")
 
 
 # Against float64 by hand
 # --------------------------------------------------------------------------------------------------
 
 
-def reference_gradient(model, prediction, prompt_utils, rgb, *, scale, clip=None, step=0):
-    """Compute the SDS gradient at the render in float64: item by item, one forward pass per prompt,
-    with the formulas of the papers.
-    """
+def reference_gradient(model, prediction, prompt_utils, rgb, **options):
     from diffusers import AutoencoderKL, UNet2DConditionModel
 
-    unet = UNet2DConditionModel.from_pretrained(model, subfolder="unet").double().eval()
-    vae = AutoencoderKL.from_pretrained(model, subfolder="vae").double().eval()
+    unet = tiny.in_double(UNet2DConditionModel, model, "unet")
+    vae = tiny.in_double(AutoencoderKL, model, "vae")
     betas = torch.linspace(math.sqrt(0.00085), math.sqrt(0.012), 1000, dtype=torch.float64) ** 2
-    alphas = torch.cumprod(1 - betas, 0)
-    cond, uncond = prompt_utils.get_text_embeddings(**BATCH).double().chunk(2)
-    total = torch.zeros_like(rgb, dtype=torch.float64)
-    for i, image in enumerate(rgb.detach().double()):
-        draw = lambda stream, i=i: streams.generator(0, stream, step, i)  # noqa: E731
-        t = int(torch.randint(20, 981, (), generator=draw("timestep")))
-        abar = alphas[t]
-        image = image.permute(2, 0, 1)[None].requires_grad_()
-        posterior = vae.encode(
-            F.interpolate(image, (64, 64), mode="bilinear", align_corners=False) * 2 - 1
-        ).latent_dist
-        x = 0.18215 * (
-            posterior.mean + posterior.std * torch.randn(4, 8, 8, generator=draw("vae")).double()
-        )
-        eps = torch.randn(4, 8, 8, generator=draw("noise")).double()
-        z = abar.sqrt() * x + (1 - abar).sqrt() * eps
-        with torch.no_grad():
-            predicted = [
-                unet(z, t, encoder_hidden_states=text[i : i + 1]).sample for text in (cond, uncond)
-            ]
-        if prediction == "v_prediction":
-            predicted = [abar.sqrt() * v + (1 - abar).sqrt() * z for v in predicted]
-        grad = (1 - abar) * (predicted[1] + scale * (predicted[0] - predicted[1]) - eps)
-        grad = grad if clip is None else grad.clamp(-clip, clip)
-        (back,) = torch.autograd.grad(x, image, grad.detach() / len(rgb))
-        total[i] = back[0].permute(1, 2, 0)
-    return total
+    path = tiny.diffusion_path(torch.cumprod(1 - betas, 0))
+    text = prompt_utils.get_text_embeddings(**BATCH).double()
+
+    def network(z, t, row):
+        output, (a, sigma) = unet(z, t, encoder_hidden_states=text[row]).sample, path(t)
+        return a * output + sigma * z if prediction == "v_prediction" else output
+
+    def encode(image, generator):
+        image = F.interpolate(image, (64, 64), mode="bilinear", align_corners=False)
+        return 0.18215 * tiny.posterior_sample(vae, image, generator)
+
+    return tiny.reference_gradient(rgb, network, encode, path, **options)
 
 
-@pytest.mark.parametrize("size", [64, 128])
-@pytest.mark.parametrize("prediction", PREDICTIONS)
+@pytest.mark.parametrize("prediction, size", [("epsilon", 64), ("v_prediction", 128)])
 def test_the_gradient_is_that_of_a_float64_reference(models, prompts, prediction, size):
     guide = guidance(models, prediction)
     rgb = renders(size=size)
@@ -102,149 +75,6 @@ def test_clip_scale_and_step_reach_the_gradient(models, prompts):
     assert relative(gradient(guide, prompts[False], rgb)[0], expected) < 1e-5
 
 
-# In closed form
-# --------------------------------------------------------------------------------------------------
-
-
-class ExactUNet(nn.Module):
-    """The exact score of known latents with the interface of a UNet: of the first latent for
-    prompts of ones, of all for prompts of zeros.
-    """
-
-    def __init__(self, bank, std, alphas, prediction):
-        super().__init__()
-        self.bank, self.std, self.alphas, self.prediction = bank, std, alphas, prediction
-        self.config = SimpleNamespace(
-            encoder_hid_dim=None, cross_attention_dim=5, sample_size=bank.shape[-1]
-        )
-
-    def forward(self, sample, timestep, encoder_hidden_states):
-        from threestudio_gaussiandreamer.diffusion.exact_score import denoise
-
-        abar = self.alphas[timestep]
-        modes = self.bank.flatten(1).to(sample)
-        everything = torch.zeros(len(sample), len(modes), dtype=torch.float64)
-        alone = everything.masked_fill(torch.arange(len(modes)) > 0, -math.inf)
-        prior = torch.where(
-            encoder_hidden_states.mean(dim=(1, 2))[:, None] > 0.5, alone, everything
-        )
-        eps = denoise(sample.flatten(1), abar, modes, std=self.std, log_prior=prior).eps.view_as(
-            sample
-        )
-        a, sigma = (root.sqrt().to(sample)[:, None, None, None] for root in (abar, 1 - abar))
-        x0 = (sample - sigma * eps) / a
-        return SimpleNamespace(
-            sample={"epsilon": eps, "v_prediction": a * eps - sigma * x0, "sample": x0}[
-                self.prediction
-            ]
-        )
-
-
-class LinearVAE(nn.Module):
-    """Average pooling and a colour matrix with the interface of a VAE."""
-
-    def __init__(self, matrix, factor):
-        super().__init__()
-        self.matrix, self.factor, self.config = matrix, factor, SimpleNamespace(scaling_factor=0.5)
-
-    def encode(self, images):
-        mean = torch.einsum(
-            "dc,bchw->bdhw", self.matrix.to(images), F.avg_pool2d(images, self.factor)
-        )
-        return SimpleNamespace(latent_dist=SimpleNamespace(mean=mean, std=torch.zeros_like(mean)))
-
-
-def marked_prompts():
-    def get_text_embeddings(elevation, azimuth, camera_distances, view_dependent_prompting=True):
-        return torch.cat([torch.ones(len(elevation), 2, 5), torch.zeros(len(elevation), 2, 5)])
-
-    return SimpleNamespace(use_perp_neg=False, get_text_embeddings=get_text_embeddings)
-
-
-def exact_guidance(models, prediction, bank, std, **options):
-    guide = guidance(models, **options)
-    guide.prediction_type = prediction
-    guide.unet, guide.text_width = ExactUNet(bank, std, guide.alphas_cumprod, prediction), 5
-    guide.vae = LinearVAE(torch.randn(4, 3, generator=torch.Generator().manual_seed(3)), 8)
-    return guide
-
-
-def adjoint(guide, latent_gradient, size):
-    """Return the linear encoder's gradient with respect to the render: the transposed matrix,
-    spread over each pooled square.
-    """
-    matrix = guide.vae.matrix.double()
-    pixels = (
-        torch.einsum("dc,bdhw->bchw", matrix, latent_gradient)
-        * guide.vae.config.scaling_factor
-        * 2
-        / guide.vae.factor**2
-    )
-    return F.interpolate(pixels, size=(size, size), mode="nearest").permute(0, 2, 3, 1)
-
-
-@pytest.mark.parametrize("weighting", ["sds", "uniform", "fantasia3d"])
-@pytest.mark.parametrize("prediction", [*PREDICTIONS, "sample"])
-def test_the_gradient_towards_one_known_image_is_the_closed_form(models, prediction, weighting):
-    """With one mode of zero width the noise cancels: grad = w(t) a / sigma (x - x1) for
-    any noise.
-    """
-    bank = torch.randn(1, 4, 8, 8, generator=torch.Generator().manual_seed(1))
-    guide = exact_guidance(
-        models,
-        prediction,
-        bank,
-        0.0,
-        guidance_scale=1.0,
-        weighting_strategy=weighting,
-        min_step_percent=0.2,
-    )
-    rgb = renders()
-    mine, _ = gradient(guide, marked_prompts(), rgb)
-    x = guide.encode(rgb.detach().movedim(-1, 1)).double()
-    abar = guide.alphas_cumprod[guide.add_noise(x.float()).t]
-    weight = {
-        "sds": 1 - abar,
-        "uniform": torch.ones(4).double(),
-        "fantasia3d": abar.sqrt() * (1 - abar),
-    }[weighting]
-    expected = (weight * (abar / (1 - abar)).sqrt())[:, None, None, None] * (x - bank.double()) / 4
-    # float32 in z and the score; the noise, a few times larger than what is left, cancels: measured
-    # below 2e-6
-    assert relative(mine, adjoint(guide, expected, 64)) < 1e-5
-    closer = rgb.detach() - 1e-3 * mine / mine.abs().max()
-
-    def distance(image):
-        return (guide.encode(image.movedim(-1, 1)) - bank).square().sum()
-
-    assert distance(closer) < distance(rgb.detach())
-
-
-@pytest.mark.parametrize("prediction", PREDICTIONS)
-@pytest.mark.parametrize("scale", [2.0, 100.0])
-def test_guidance_between_two_mixtures_is_the_closed_form(models, prediction, scale):
-    """One image against five, of positive width; the posterior is computed here in float64."""
-    draw = torch.Generator().manual_seed(2)
-    bank, std = 0.3 * torch.randn(5, 4, 8, 8, generator=draw), 0.5
-    guide = exact_guidance(
-        models, prediction, bank, std, guidance_scale=scale, min_step_percent=0.3
-    )
-    rgb = renders()
-    mine, _ = gradient(guide, marked_prompts(), rgb)
-    noised = guide.add_noise(guide.encode(rgb.detach().movedim(-1, 1)))
-    abar = guide.alphas_cumprod[noised.t][:, None]
-    variance = abar * std**2 + 1 - abar
-    z, modes = noised.z.double().flatten(1), bank.double().flatten(1)
-    distances = (z[:, None] - abar[..., None].sqrt() * modes).square().sum(-1)
-    shares = torch.softmax(-distances / (2 * variance), dim=1)
-    assert ((shares > 0.01).sum(1) > 1).any(), "a posterior of one picture would test nothing"
-    toward = lambda mean: (1 - abar).sqrt() * (z - abar.sqrt() * mean) / variance  # noqa: E731
-    cond, uncond = toward(modes[0]), toward(shares @ modes)
-    eps = (uncond + scale * (cond - uncond)).view_as(noised.z)
-    expected = (1 - abar)[..., None, None] * (eps - noised.noise.double()) / 4
-    assert relative(mine, adjoint(guide, expected, 64)) < 1e-5
-
-
 # Half precision
 # --------------------------------------------------------------------------------------------------
 
@@ -257,7 +87,7 @@ def half(monkeypatch):
 
 @pytest.mark.parametrize("native", [False, True])
 def test_half_precision_on_a_cpu_is_bfloat16_where_it_is_native(monkeypatch, native):
-    monkeypatch.setattr(half_precision, "cpu_multiplies_bfloat16", lambda: native)
+    monkeypatch.setattr(text_to_image, "cpu_multiplies_bfloat16", lambda: native)
     cpu, gpu = torch.device("cpu"), torch.device("cuda")
     cfg = StableDiffusionGuidance.Config()
     assert (weights_type(cfg, gpu), weights_type(cfg, cpu)) == (torch.float16, torch.float32)
@@ -267,16 +97,8 @@ def test_half_precision_on_a_cpu_is_bfloat16_where_it_is_native(monkeypatch, nat
     assert weights_type(cfg, gpu) == weights_type(cfg, cpu) == torch.float32
 
 
-@pytest.mark.skipif(
-    not (hasattr(torch.cpu, "get_capabilities") and CPUINFO.exists()), reason="nothing to compare"
-)
-def test_which_cpus_multiply_bfloat16():
-    flags = set(CPUINFO.read_text().split())
-    assert half_precision.cpu_multiplies_bfloat16() == bool(flags & {"avx512_bf16", "amx_bf16"})
-
-
 def test_the_gradient_in_bfloat16_on_a_cpu(models, prompts, monkeypatch):
-    monkeypatch.setattr(half_precision, "cpu_multiplies_bfloat16", lambda: True)
+    monkeypatch.setattr(text_to_image, "cpu_multiplies_bfloat16", lambda: True)
     options = {"half_precision_on_cpu": True, "enable_channels_last_format": True}
     guide, rgb = guidance(models, guidance_scale=4.0, **options), renders()
     assert guide.unet.dtype == guide.vae.dtype == torch.bfloat16

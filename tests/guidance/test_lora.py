@@ -7,8 +7,9 @@ import torch
 
 from tests.helpers import tiny_guidance as tiny
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.guidance.lora import adapted_layers, particle_noise
 from threestudio_gaussiandreamer.guidance.stable_diffusion import StableDiffusionGuidance
+from threestudio_gaussiandreamer.guidance.variants import vsd as module
+from threestudio_gaussiandreamer.guidance.variants.vsd import adapted_layers, particle_noise
 
 pytest.importorskip("diffusers")
 
@@ -98,23 +99,20 @@ def test_the_error_is_the_guided_noise_minus_that_of_the_merged_lora(models, pro
     torch.testing.assert_close(error, expected, rtol=0, atol=1e-5)
 
 
-def test_the_lora_follows_the_gradient_of_the_mean_squared_error(models, prompts):
-    """Two samples without the camera's dropout: the gradient that Adam gets, against autograd
-    through the merged weights.
+def test_the_lora_follows_the_gradient_of_the_mean_squared_error(models, prompts, monkeypatch):
+    """Without the camera: the gradient that Adam gets, against autograd through the merged
+    weights.
     """
-    guide, particles = vsd(models, samples=2, camera_dropout=1.0)
+    monkeypatch.setattr(module, "CAMERA_DROPOUT", 1.0)
+    guide, particles = vsd(models)
     with_values(particles)
     latents, _, condition = inputs(guide, prompts)
     particles.optimizer.step = lambda: None
     numbers = learn(guide, latents, condition)
     unet = merged(guide, particles).requires_grad_(True)
-    losses = []
-    for sample in range(2):
-        noised = particle_noise(guide, latents, sample)
-        text = condition.embeddings[:4]
-        predicted = unet(noised.z, noised.t, encoder_hidden_states=text).sample
-        losses.append(torch.nn.functional.mse_loss(predicted, noised.noise))
-    loss = (losses[0] + losses[1]) / 2
+    noised, text = particle_noise(guide, latents), condition.embeddings[:4]
+    predicted = unet(noised.z, noised.t, encoder_hidden_states=text).sample
+    loss = torch.nn.functional.mse_loss(predicted, noised.noise)
     loss.backward()
     assert numbers["lora_error"] == pytest.approx(loss.item(), rel=1e-5)
     for (name, layer), down, up in zip(
@@ -144,25 +142,20 @@ def test_the_lora_learns_the_renders_and_leaves_the_unet_alone(models, prompts):
     assert not any(layer._forward_hooks for layer in guide.unet.modules())
 
 
-def test_an_evaluation_does_not_train(models, prompts):
+def test_an_evaluation_does_not_train_and_bad_items_are_not_learnt(models, prompts):
     guide, particles = vsd(models)
-    state = {name: value.clone() for name, value in particles.state().items()}
-    rgb = tiny.renders(2)
-    guide(rgb, prompts[False], guidance_eval=True, **tiny.first(2), **cameras(2))
-    assert all(torch.equal(particles.state()[name], value) for name, value in state.items())
-    guide(rgb, prompts[False], **tiny.first(2), **cameras(2))
-    assert any(not torch.equal(particles.state()[name], value) for name, value in state.items())
-
-
-def test_bad_items_are_not_learnt(models, prompts):
-    guide, particles = vsd(models)
+    before = {name: value.clone() for name, value in particles.state().items()}
+    rgb, views = tiny.renders(2), tiny.first(2) | cameras(2)
+    guide(rgb, prompts[False], guidance_eval=True, **views)
+    assert all(torch.equal(particles.state()[name], value) for name, value in before.items())
+    guide(rgb, prompts[False], **views)
+    assert any(not torch.equal(particles.state()[name], value) for name, value in before.items())
     latents, _, condition = inputs(guide, prompts)
-    poisoned = latents.clone()
-    poisoned[2] = torch.nan
+    latents[2] = torch.nan
     good = torch.tensor([True, True, False, True])
-    assert learn(guide, poisoned, condition, good)["lora_error"] > 0
+    assert learn(guide, latents, condition, good)["lora_error"] > 0
     assert all(value.isfinite().all() for value in particles.state().values())
-    assert learn(guide, poisoned, condition, ~GOOD) == {}
+    assert learn(guide, latents, condition, ~GOOD) == {}
 
 
 # State
@@ -183,22 +176,14 @@ def test_a_restored_lora_continues_bit_for_bit(models, prompts):
     assert ours.keys() == theirs.keys() == saved.keys()
     assert all(torch.equal(ours[name], theirs[name]) for name in ours)
     assert any(not torch.equal(ours[name], saved[name]) for name in ours)
+    smaller, _ = vsd(models, rank=2)
+    with pytest.raises(UserError, match="had learnt .* resume with the configuration"):
+        smaller.variant.restore(smaller, saved)
 
 
-def test_a_lora_of_another_rank_is_refused(models):
-    guide, particles = vsd(models)
-    other, _ = vsd(models, rank=2)
-    with pytest.raises(UserError, match="not the LoRA of rank 2 .* resume with the configuration"):
-        other.variant.restore(other, particles.state())
-
-
-@pytest.mark.parametrize("option", ["enable_torch_compile", "enable_sequential_cpu_offload"])
-def test_options_that_replace_the_unets_forward_pass_are_refused(models, option):
-    cfg = {
-        "pretrained_model_name_or_path": str(models["epsilon"]),
-        "variant_type": "vsd-variant",
-        option: True,
-    }
-    with pytest.raises(UserError, match=f"system.guidance.{option}: vsd-variant trains a LoRA"):
-        StableDiffusionGuidance.preflight(cfg)
-    StableDiffusionGuidance.preflight(cfg | {option: False})
+def test_options_that_replace_the_unets_forward_pass_are_refused(models):
+    cfg = {"pretrained_model_name_or_path": str(models["epsilon"]), "variant_type": "vsd-variant"}
+    StableDiffusionGuidance.preflight(cfg)
+    for option in ("enable_torch_compile", "enable_sequential_cpu_offload"):
+        with pytest.raises(UserError, match=f"system.guidance.{option}: vsd-variant trains a LoRA"):
+            StableDiffusionGuidance.preflight(cfg | {option: True})

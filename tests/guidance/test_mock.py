@@ -53,7 +53,8 @@ def test_descent_ends_in_a_disc_on_the_background():
 
 
 # the noise of cfd-variant is attached to the surface, for which it needs a renderer's depth
-VARIANTS = {name for name in names() if name.endswith("-variant")} - {"cfd-variant"}
+VARIANTS = {name for name in names() if name.endswith("-variant") and "test" not in name}
+VARIANTS -= {"cfd-variant"}
 
 
 @pytest.mark.parametrize("name", sorted(VARIANTS))
@@ -64,31 +65,21 @@ def test_it_works_with_every_variant(name):
 
 
 def test_it_takes_the_place_of_stable_diffusion():
-    overrides = [
-        "system.guidance_type=mock-guidance",
-        "system.prompt_processor.prompt=a fox",
-    ]
+    overrides = ["system.guidance_type=mock-guidance", "system.prompt_processor.prompt=a fox"]
     cfg = load_config(find_config("gaussiandreamer.yaml"), cli_args=overrides)
     check_config(cfg)
     assert cfg.system.guidance.guidance_scale > 1
     assert "view_dependent_prompting" not in cfg.system.guidance
 
 
-@pytest.mark.parametrize("prompt", ["a ball", "ein Würfel: 1/2 $5 ${x}"])
-def test_smoke_yaml_runs_every_stage_on_any_prompt(prompt, tmp_path, monkeypatch):
+def test_smoke_yaml_runs_every_stage_on_any_prompt(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    Path("prompt.txt").write_text(prompt)
+    Path("prompt.txt").write_text("ein Würfel: 1/2 $5 ${x}")
     options = ["--gpu", "cpu", "system.prompt_processor.prompt_file=prompt.txt"]
     options += ["use_timestamp=false", "tag=t"]
     assert main(["--config", "smoke.yaml", "--train", *options]) == 0
-    written = files(Path("outputs/smoke/t"))
-    assert written >= {
-        "ckpts/last.ckpt",
-        "save/prior/points.npz",
-        "save/it8-0.png",
-        "save/it8-test/1.png",
-        "save/it8-export/gaussians.ply",
-        "save/it8-export/gaussians.spz",
-        "index.html",
-    }
+    exports = {f"save/it8-export/gaussians.{suffix}" for suffix in ("ply", "spz")}
+    pictures = {"save/it8-0.png", "save/it8-test/1.png", "index.html"}
+    expected = exports | pictures | {"ckpts/last.ckpt", "save/prior/points.npz"}
+    assert files(Path("outputs/smoke/t")) >= expected
     assert main(["--config", "smoke.yaml", "--export", *options, "resume=auto"]) == 0

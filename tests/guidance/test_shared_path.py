@@ -81,21 +81,11 @@ def test_draws_are_a_function_of_step_and_item(monkeypatch):
 
 
 def test_schedules_are_evaluated_at_every_step():
-    cfg = OmegaConf.create(
-        {"max_step_percent": [500, 0.98, 0.55, 501], "grad_clip": [0, 1.5, 2.0, 1000]}
-    )
-    guidance = Stub(cfg)
-    seen = {}
-    for at in (0, 500, 501, 1000, 2000):
+    schedules = {"max_step_percent": [500, 0.98, 0.55, 501], "grad_clip": [0, 1.5, 2.0, 1000]}
+    guidance = Stub(OmegaConf.create(schedules))
+    for at, largest, clip in ((0, 980, 1.5), (500, 980, 1.75), (501, 550, 1.7505), (2000, 550, 2)):
         guidance.update_step(0, at)
-        seen[at] = (guidance.min_step, guidance.max_step, guidance.grad_clip)
-    assert seen == {
-        0: (20, 980, 1.5),
-        500: (20, 980, 1.75),
-        501: (20, 550, 1.7505),
-        1000: (20, 550, 2.0),
-        2000: (20, 550, 2.0),
-    }
+        assert (guidance.min_step, guidance.max_step, guidance.grad_clip) == (20, largest, clip)
 
 
 def test_clipping_is_elementwise_on_the_latents_gradient():
@@ -107,39 +97,28 @@ def test_clipping_is_elementwise_on_the_latents_gradient():
     assert (free.abs() > limit).any()
 
 
-@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
-def test_bad_items_are_masked_and_the_others_keep_their_gradient_bit_for_bit(value, caplog):
-    rgb = uniform(4, 4, 4, 3)
-    guidance = Stub({"grad_clip": 10.0})
+@pytest.mark.parametrize("value", [math.nan, -math.inf])
+@pytest.mark.parametrize("where", ["score", "encoder"])
+def test_bad_items_are_masked_and_the_others_keep_their_gradient_bit_for_bit(value, where):
+    rgb, guidance = uniform(4, 4, 4, 3), Stub({"grad_clip": 10.0})
     _, expected = step(guidance, rgb)
+    with torch.autocast("cpu", torch.bfloat16):  # which changes nothing
+        assert torch.equal(step(guidance, rgb)[1], expected)
 
-    def corrupt(eps, step):
-        eps = eps.clone()
-        eps[1, 0, 2, 3] = value
-        return eps
+    def corrupt(values, step=0):
+        factor = torch.ones(4, 1, 1, 1)
+        factor[1] = value
+        return values * factor
 
-    guidance.corrupt = corrupt
+    encode = guidance.encode
+    if where == "score":
+        guidance.corrupt = corrupt
+    else:
+        guidance.encode = lambda rgb, **batch: corrupt(encode(rgb))
     out, grad = step(guidance, rgb)
     assert out["bad_items"] == 1 and guidance.bad_items == 1
     assert torch.equal(grad[[0, 2, 3]], expected[[0, 2, 3]])
-    assert (
-        (grad[1] == 0).all()
-        and torch.isfinite(out["loss_sds"])
-        and torch.isfinite(out["grad_norm"])
-    )
-
-
-def test_an_encoder_that_overflows_affects_only_its_item():
-    class Overflowing(Stub):
-        def encode(self, rgb, **batch):
-            scale = torch.tensor([1.0, math.inf, 1.0]).reshape(3, 1, 1, 1)
-            return super().encode(rgb) * scale
-
-    rgb = uniform(3, 4, 4, 3)
-    _, expected = step(Stub({}), rgb)
-    out, grad = step(Overflowing({}), rgb)
-    assert out["bad_items"] == 1 and (grad[1] == 0).all()
-    assert torch.equal(grad[[0, 2]], expected[[0, 2]])
+    assert (grad[1] == 0).all() and out["loss_sds"].isfinite() and out["grad_norm"].isfinite()
 
 
 def test_ten_bad_steps_in_a_row_end_the_run_with_a_named_error():
@@ -171,38 +150,14 @@ def test_bad_steps_of_a_gpu_are_counted_when_their_numbers_arrive(monkeypatch):
         flush_reads(guidance)
 
 
-def test_autocast_changes_nothing():
-    rgb = uniform(2, 4, 4, 3)
-    _, expected = step(Stub({}), rgb)
-    with torch.autocast("cpu", torch.bfloat16):
-        _, grad = step(Stub({}), rgb)
-    assert grad.dtype == torch.float32 and torch.equal(grad, expected)
-
-
-def test_latents_can_be_given_directly():
-    guidance, latents = Stub({}), uniform(2, 4, 4, 3)
-    rgb = latents.clone().requires_grad_()
-    guidance(rgb, None, rgb_as_latents=True)["loss_sds"].backward()
-    t = sds.timesteps(2, 20, 980, seed=0, step=0)
-    weight = (1 - guidance.alphas_cumprod[t]).float().reshape(2, 1, 1, 1)
-    torch.testing.assert_close(rgb.grad, weight * latents / 2, rtol=0, atol=1e-5)
-
-
 def test_evaluation_has_what_the_hosts_saver_reads():
-    guidance = Stub({"max_items_eval": 2, "eval_steps": 3})
-    batch = {
-        "elevation": torch.zeros(3),
-        "azimuth": torch.tensor([0.0, 90, 180]),
-        "camera_distances": torch.full((3,), 2.5),
-    }
-    out = guidance(uniform(3, 8, 6, 3), None, guidance_eval=True, **batch)["eval"]
+    angles = {"elevation": torch.zeros(6), "azimuth": torch.tensor([0.0, 90, 180, -90, 0, 0])}
+    batch = angles | {"camera_distances": torch.full((6,), 2.5)}
+    out = Stub({})(uniform(6, 8, 6, 3), None, guidance_eval=True, **batch)["eval"]
     for name in ("imgs_noisy", "imgs_1step", "imgs_1orig", "imgs_final"):
-        assert out[name].shape == (2, 8, 6, 3)
-    assert out["bs"] == 2 and len(out["noise_levels"]) == 2
-    assert [text.split("\n")[1:] for text in out["texts"]] == [
-        ["e0.0", "a0.0", "c2.50"],
-        ["e0.0", "a90.0", "c2.50"],
-    ]
+        assert out[name].shape == (4, 8, 6, 3)
+    assert out["bs"] == 4 and len(out["noise_levels"]) == len(out["texts"]) == 4
+    assert out["texts"][1].split("\n")[1:] == ["e0.0", "a90.0", "c2.50"]
 
 
 @pytest.mark.parametrize(
@@ -226,11 +181,10 @@ def test_bad_options_are_named_at_once(cfg, message):
 @pytest.mark.parametrize(
     ("returned", "message"),
     [
-        (lambda z: z, r"returned only \(4, 3, 6, 5\); expected a pair"),
+        (lambda z: z, r"returned \(4, 3, 6, 5\); expected a pair"),
         (lambda z: (z[:1], None), r"returned \(1, 3, 6, 5\) and NoneType; .* shape \(4, 3, 6, 5\)"),
         (lambda z: (z, z[:, :1]), r"returned \(4, 3, 6, 5\) and \(4, 1, 6, 5\)"),
-        (lambda z: (z, z, z), r"returned \(4, 3, 6, 5\) and .*; expected a pair"),
-        (lambda z: None, "returned only None"),
+        (lambda z: None, "returned NoneType"),
     ],
 )
 def test_what_predict_returns_is_checked(monkeypatch, returned, message):
@@ -240,13 +194,7 @@ def test_what_predict_returns_is_checked(monkeypatch, returned, message):
 
 
 def test_a_scale_without_an_unconditional_prediction_is_reported_once(caplog):
-    guidance = Stub({"guidance_scale": 7.5})
+    guidance = Stub({"guidance_scale": 7.25})
     for _ in range(2):
         step(guidance, uniform(4, 6, 5, 3))
-    assert caplog.text.count("guidance_scale=7.5 has no effect: Stub.predict returns no") == 1
-
-
-def test_a_report_that_is_no_dictionary_is_named(monkeypatch):
-    monkeypatch.setattr(Stub, "report", lambda self: None)
-    with pytest.raises(UserError, match="Stub.report returned NoneType; expected a dictionary"):
-        step(Stub({"guidance_scale": 1.0}), uniform(4, 6, 5, 3))
+    assert caplog.text.count("guidance_scale=7.25 has no effect: Stub.predict returns no") == 1

@@ -47,7 +47,6 @@ def gradient(kind, folder):
     "kind, variant, named",
     [
         ("stable-diffusion-xl", "fp16", True),
-        ("stable-diffusion-3", "fp16", True),
         ("stable-diffusion-3", "bf16", True),
         ("mvdream", "fp16", False),
     ],

@@ -14,14 +14,8 @@ PARTS = ("state_dict", "guidance", "optimizer_states")
 def config(path, **system):
     """Return the configuration of three steps from random points; tests vary ``system``."""
     cfg = yaml.safe_load((Path(__file__).parents[2] / "configs" / "demo.yaml").read_text())
-    sizes = {
-        "width": 16,
-        "height": 16,
-        "eval_width": 16,
-        "eval_height": 16,
-        "n_test_views": 2,
-        "train_views": 0,
-    }
+    sizes = dict.fromkeys(("width", "height", "eval_width", "eval_height"), 16)
+    sizes |= {"n_test_views": 2, "train_views": 0}
     geometry = {
         **cfg["system"]["geometry"],
         "prior_type": "random-prior",
@@ -60,7 +54,6 @@ def diffusion(model, family="stable-diffusion"):
             "guidance_scale": 20.0,
             "max_step_percent": [2, 0.98, 0.55, 3],
             "grad_clip": [0, 1.5, 2.0, 1000],
-            "eval_steps": 2,
         },
     }
 
@@ -79,18 +72,12 @@ def flat(content, name=""):
     """Return every tensor of a part of a checkpoint by its path."""
     if isinstance(content, torch.Tensor):
         return {name: content}
-    entries = (
-        content.items()
-        if isinstance(content, dict)
-        else enumerate(content)
-        if isinstance(content, (list, tuple))
-        else ()
-    )
-    return {
-        place: tensor
-        for key, value in entries
-        for place, tensor in flat(value, f"{name}/{key}").items()
-    }
+    if isinstance(content, (list, tuple)):
+        content = dict(enumerate(content))
+    found = {}
+    for key, value in content.items() if isinstance(content, dict) else ():
+        found |= flat(value, f"{name}/{key}")
+    return found
 
 
 def assert_resumes(path, folder, *options):

@@ -18,7 +18,7 @@ from torch.nn.utils import parameters_to_vector
 from tests.helpers import tiny_guidance as tiny
 from threestudio_gaussiandreamer.diffusion import sds
 from threestudio_gaussiandreamer.diffusion.noise_table import NoiseTable
-from threestudio_gaussiandreamer.guidance.lora import particle_noise
+from threestudio_gaussiandreamer.guidance.variants import vsd
 
 VSD = threestudio.find("stable-diffusion-vsd-guidance")
 
@@ -120,9 +120,8 @@ def compare_vsd(models, prediction, dropped):
     Args:
         dropped: train the LoRA without the camera.
     """
-    variant = {"variant_type": "vsd-variant", "variant": {"camera_dropout": float(dropped)}}
     options = {"guidance_scale": 7.5, "view_dependent_prompting": False}
-    ours = tiny.guidance(models, prediction, **options, **variant)
+    ours = tiny.guidance(models, prediction, **options, variant_type="vsd-variant")
     particles = ours.variant.particles(ours)
     weights = list(particles.lora.parameters())
     for weight in weights:
@@ -131,10 +130,11 @@ def compare_vsd(models, prediction, dropped):
     x = torch.randn(2, 4, 8, 8, requires_grad=True)
     arguments = {"prompt_utils": Prompts(2), **tiny.first(2), "rgb_as_latents": True}
     arguments |= {"rgb": x.movedim(1, -1), "c2w": torch.randn(2, 4, 4)}
-    out = ours(**arguments)
+    with mock.patch.object(vsd, "CAMERA_DROPOUT", float(dropped)):
+        out = ours(**arguments)
     (own,) = grad(out["loss_sds"], x)
     theirs = GivenNetworks(options, ours, models[prediction])
-    draws = ours.add_noise(x), particle_noise(ours, x.detach(), 0)
+    draws = ours.add_noise(x), vsd.particle_noise(ours, x.detach())
     with (
         mock.patch("random.random", return_value=0.0 if dropped else 1.0),
         mock.patch("torch.randint", side_effect=[draw.t for draw in draws]),

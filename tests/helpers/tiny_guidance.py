@@ -4,6 +4,7 @@ import torch
 from torch import nn
 
 from tests.helpers import tiny_models
+from threestudio_gaussiandreamer.core import streams
 from threestudio_gaussiandreamer.guidance import stable_diffusion  # noqa: F401
 from threestudio_gaussiandreamer.host import find
 from threestudio_gaussiandreamer.prompts import prompt_processors  # noqa: F401
@@ -86,3 +87,50 @@ class Recorder(nn.Module):
     def forward(self, *args, **kwargs):
         self.calls.append((args, kwargs))
         return self.network(*args, **kwargs)
+
+
+def reference_gradient(
+    rgb, network, encode, path, *, scale, clip=None, step=0, last=980, velocity=False
+):
+    """Compute the gradient at the render in float64: item by item, one forward pass per prompt,
+    with the formulas of the papers.
+
+    Args:
+        network: returns its prediction for (z, t, row of the embeddings).
+        encode: returns the latent of an image, given the generator of its noise.
+        path: returns the factors of the latent and of the noise at t.
+        velocity: of a rectified flow, as in RFDS; else the noise, with the weight sigma^2.
+    """
+    total = torch.zeros_like(rgb, dtype=torch.float64)
+    for i, image in enumerate(rgb.detach().double()):
+        draw = lambda stream, i=i: streams.generator(0, stream, step, i)  # noqa: E731
+        t = int(torch.randint(20, last + 1, (), generator=draw("timestep")))
+        a, sigma = path(t)
+        image = image.permute(2, 0, 1)[None].requires_grad_()
+        x = encode(image, draw("vae"))
+        eps = torch.randn(x.shape[1:], generator=draw("noise")).double()
+        z = a * x + sigma * eps
+        with torch.no_grad():
+            cond, uncond = (network(z, t, slice(row, row + 1)) for row in (i, i + len(rgb)))
+        grad = uncond + scale * (cond - uncond) - (eps - x if velocity else eps)
+        grad = grad if velocity else sigma**2 * grad
+        grad = grad if clip is None else grad.clamp(-clip, clip)
+        (back,) = torch.autograd.grad(x, image, grad.detach() / len(rgb))
+        total[i] = back[0].permute(1, 2, 0)
+    return total
+
+
+def posterior_sample(vae, image, generator):
+    """Return the latent, without scale, that the VAE's posterior gives with this noise."""
+    posterior = vae.encode(image * 2 - 1).latent_dist
+    noise = torch.randn(posterior.mean.shape[1:], generator=generator).double()
+    return posterior.mean + posterior.std * noise
+
+
+def diffusion_path(alphas):
+    return lambda t: (alphas[t].sqrt(), (1 - alphas[t]).sqrt())
+
+
+def in_double(kind, folder, component):
+    """Load a network in float64."""
+    return kind.from_pretrained(folder, subfolder=component).double().eval()

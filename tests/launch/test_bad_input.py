@@ -118,7 +118,7 @@ register_parts()
         ("system.geometry.prior.scale=0", "system.geometry.prior.scale: expected a number above 0"),
         ("system.guidance.up=w", "unknown system.guidance.up 'w'"),
         ("system.guidance.front=x", "unknown system.guidance.front 'x': did you mean"),
-        ("system.guidance.scale=0", "system.guidance.scale: expected a number above 0"),
+        ("system.guidance.supersample=0", "system.guidance.supersample: expected a number"),
         ("system.renderer.radius=0", "system.renderer.radius: expected a number above 0"),
         (
             "system.material.color_activation=relu",

@@ -10,80 +10,48 @@ from threestudio_gaussiandreamer.models.bundled import CLIP, DIFFUSION, POINTS, 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     """The layout of an export, in the place of the bundled one."""
-    for name in (
-        "stable-diffusion/unet/weights",
-        "clip/weights",
-        "points.safetensors",
-        "training.json",
-    ):
+    names = ("stable-diffusion/unet/weights", "clip/weights", "points.safetensors", "training.json")
+    for name in (*names, "my notes, für später.txt"):
         path = tmp_path / "bundle" / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(name)
     bundled.write_digests(tmp_path / "bundle")
     monkeypatch.setattr(bundled, "FOLDER", tmp_path / "bundle")
+    bundled.require_intact.cache_clear()
     return tmp_path / "bundle"
 
 
-@pytest.mark.parametrize("part", [DIFFUSION, CLIP, POINTS])
-def test_the_name_and_the_folder_of_an_export_stand_for_their_parts(folder, part):
-    assert model_part("toybox", part) == model_part(str(folder), part) == str(folder / part)
-
-
-def test_other_names_are_unchanged(folder):
+def test_the_name_and_the_folder_of_an_export_stand_for_their_parts(folder):
+    for part in (DIFFUSION, CLIP, POINTS):
+        assert model_part("toybox", part) == model_part(str(folder), part) == str(folder / part)
     others = ("owner/model", "", "x" * 5000, "a\0b", str(folder / "clip"), str(folder.parent))
     assert all(model_part(name, CLIP) == name for name in others)
+    assert {"training.json", "my notes, für später.txt"} <= bundled.read_digests(folder).keys()
+    line = (folder / "SHA256SUMS").read_text().splitlines()[-1]  # as of sha256sum
+    assert line.endswith("  training.json") and len(line.split()[0]) == 64
 
 
-def test_the_list_of_digests_is_that_of_sha256sum(folder):
-    line = (folder / "SHA256SUMS").read_text().splitlines()[1]
-    assert line.endswith("  points.safetensors") and len(line.split()[0]) == 64
-    assert "training.json" in (folder / "SHA256SUMS").read_text()
-
-
-def test_a_damaged_file_is_named_with_how_to_install_it_again(folder):
-    (folder / "stable-diffusion/unet/weights").write_text("other")
-    with pytest.raises(UserError, match="unet/weights' is damaged: install.*git checkout"):
-        model_part("toybox", DIFFUSION)
-    assert model_part("toybox", CLIP)  # the other parts can be used
-
-
-def test_a_missing_file_is_named(folder):
-    (folder / "points.safetensors").unlink()
-    with pytest.raises(
-        UserError, match="points.safetensors': No such file.*install the package again"
-    ):
-        model_part("toybox", POINTS)
-
-
-@pytest.mark.parametrize("part", [CLIP, "another"])
-def test_without_the_list_or_the_part_the_package_is_to_be_installed_again(folder, part):
-    if part == CLIP:
+@pytest.mark.parametrize("is_bundled", [True, False])
+@pytest.mark.parametrize("content", [None, "other"])
+def test_a_damaged_file_is_named_with_how_to_get_it_again(folder, monkeypatch, content, is_bundled):
+    weights = folder / "stable-diffusion/unet/weights"
+    weights.write_text(content) if content else weights.unlink()
+    if not is_bundled:
+        monkeypatch.setattr(bundled, "FOLDER", folder / "elsewhere")
+    name = "toybox" if is_bundled else str(folder)
+    remedy = "install.*git checkout" if is_bundled else "write the folder again"
+    with pytest.raises(UserError, match=f"unet/weights' is missing or damaged: {remedy}"):
+        model_part(name, DIFFUSION)
+    assert model_part(name, CLIP)  # the other parts can be used
+    if not is_bundled:
+        assert model_part(name, "another")  # an export needn't have all parts
+        bundled.require_intact.cache_clear()
         (folder / "SHA256SUMS").unlink()
-    with pytest.raises(UserError, match="(SHA256SUMS|another)' is missing: install the package"):
-        model_part("toybox", part)
+        assert model_part(name, DIFFUSION)
 
 
-@pytest.mark.parametrize("content", [b"abc\n", b"\xff\x00\x80\n", b"0" * 64 + b"\n"])
-def test_a_damaged_list_of_digests_is_named(folder, content):
-    (folder / "SHA256SUMS").write_bytes(content)
-    with pytest.raises(UserError, match="SHA256SUMS' is damaged: install the package again"):
+@pytest.mark.parametrize("content", [None, b"\xff\x00\x80\n"])
+def test_without_the_list_the_package_is_to_be_installed_again(folder, content):
+    (folder / "SHA256SUMS").write_bytes(content) if content else (folder / "SHA256SUMS").unlink()
+    with pytest.raises(UserError, match="clip' is missing or damaged: install the package again"):
         model_part("toybox", CLIP)
-
-
-def test_other_files_of_a_folder_may_have_any_names(folder, monkeypatch):
-    """An export lists those that its folder had before."""
-    monkeypatch.setattr(bundled, "FOLDER", folder / "elsewhere")
-    (folder / "my notes, für später.txt").write_text("a")
-    bundled.write_digests(folder)
-    assert "my notes, für später.txt" in bundled.read_digests(folder)
-    assert model_part(str(folder), CLIP) == str(folder / CLIP)
-
-
-def test_damaged_files_of_an_export_are_named_unless_it_has_no_digests(folder, monkeypatch):
-    monkeypatch.setattr(bundled, "FOLDER", folder / "elsewhere")
-    (folder / "clip/weights").write_text("other")
-    with pytest.raises(UserError, match="clip/weights' is damaged: write the folder again"):
-        model_part(str(folder), CLIP)
-    assert model_part(str(folder), "another")  # an export needn't have all parts
-    (folder / "SHA256SUMS").unlink()
-    assert model_part(str(folder), CLIP)

@@ -33,15 +33,12 @@ def model(folder, settings):
     return folder
 
 
-def names(components):
-    return ["model_index.json", *(f"{component}/config.json" for component in components)]
-
-
 @pytest.mark.parametrize("family", families.FAMILIES, ids=lambda family: family.title)
 def test_every_family_is_taken_by_its_own_parts_alone(family, tmp_path):
     folder = model(tmp_path / "model", SETTINGS[family])
+    names = [f"{component}/config.json" for component in NAMES[family]]
     families.require_family(family, folder)
-    families.require_names(family, names(NAMES[family]))
+    families.require_names(family, names)
     by_names = families.STABLE_DIFFUSION if family == families.MULTI_VIEW else family
     for other in set(families.FAMILIES) - {family}:
         said = f"isn't {other.title}, but {family.title}.*gaussiandreamer-{family.parts}-guidance"
@@ -49,29 +46,24 @@ def test_every_family_is_taken_by_its_own_parts_alone(family, tmp_path):
             families.require_family(other, folder)
         if not {family, other} <= set(families.SAME_FILES):
             with pytest.raises(UserError, match=f"isn't {other.title}, but {by_names.title}"):
-                families.require_names(other, names(NAMES[family]))
+                families.require_names(other, names)
 
 
-@pytest.mark.parametrize(
-    "settings, said",
-    [
-        ({"_class_name": "FluxTransformer2DModel"}, "FluxTransformer2DModel, which no guidance"),
-        (SETTINGS[families.MULTI_VIEW] | {"ip_dim": 16}, "MultiViewUNetModel, which no guidance"),
-    ],
-)
-def test_models_that_no_guidance_takes(settings, said, tmp_path):
-    folder = model(tmp_path / "model", settings)
-    for family in families.FAMILIES:
-        with pytest.raises(UserError, match=f"{said} takes; those that are taken: Stable.*MVDream"):
-            families.require_family(family, folder)
+def test_models_that_no_guidance_takes(tmp_path):
+    image = SETTINGS[families.MULTI_VIEW] | {"ip_dim": 16}
+    for settings in ({"_class_name": "FluxTransformer2DModel"}, image):
+        folder = model(tmp_path / settings["_class_name"], settings)
+        said = f"{settings['_class_name']}, which no guidance takes; those that are taken: Stable"
+        with pytest.raises(UserError, match=said):
+            families.require_family(families.MULTI_VIEW, folder)
 
 
-@pytest.mark.parametrize("content", [None, "not json", "[1]"])
-def test_missing_and_damaged_settings_are_left_to_the_loader(content, tmp_path):
-    if content is not None:
-        (tmp_path / "unet").mkdir()
-        (tmp_path / "unet" / "config.json").write_text(content)
+def test_missing_and_damaged_settings_are_left_to_the_loader(tmp_path):
     families.require_family(families.STABLE_DIFFUSION, tmp_path)
+    (tmp_path / "unet").mkdir()
+    for content in ("not json", "[1]"):
+        (tmp_path / "unet" / "config.json").write_text(content)
+        families.require_family(families.STABLE_DIFFUSION, tmp_path)
     families.require_names(families.STABLE_DIFFUSION, ["README.md", "vae/config.json"])
 
 

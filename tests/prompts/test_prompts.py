@@ -45,7 +45,7 @@ def test_of_a_huge_prompt_file_only_the_beginning_is_read(tmp_path):
 @pytest.mark.parametrize(
     "options, match",
     [
-        ({"prompt_file": "prompt.txt"}, "prompt.txt' is not UTF-8 text .byte 3."),
+        ({"prompt_file": "prompt.txt"}, "prompt.txt' can't be read as UTF-8 .* position 3"),
         ({"prompt_file": "promt.txt"}, "does not exist; near names.*prompt.txt"),
         ({"prompt_file": "prompt.txt", "prompt": "a fox"}, "both prompt and prompt_file"),
     ],

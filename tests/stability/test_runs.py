@@ -41,7 +41,7 @@ from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
 from threestudio_gaussiandreamer.launch.config import dump_config, load_config
 from threestudio_gaussiandreamer.launch.config_check import check_config, check_part
 from threestudio_gaussiandreamer.models import hub, model_files
-from threestudio_gaussiandreamer.models.embedding_cache import EmbeddingCache
+from threestudio_gaussiandreamer.models.text_encoders import EmbeddingCache
 from threestudio_gaussiandreamer.priors.cache import read_cache
 from threestudio_gaussiandreamer.priors.motion import read_motions
 from threestudio_gaussiandreamer.priors.point_cloud import load_points

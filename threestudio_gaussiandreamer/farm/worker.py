@@ -23,7 +23,7 @@ from .. import __version__, register_parts
 from ..core.errors import UserError, raised_in
 from ..core.launcher import train_alone
 from ..host import pl
-from ..models.loaded import keep_loaded, load_counts
+from ..models.model_files import keep_loaded, load_counts
 from .board import Beat
 from .place import FAILED, FINISHED, STOPPED, AnotherRow, Place, Unreachable, has_files
 from .recipe import Job, Recipe, all_sources, launch_arguments

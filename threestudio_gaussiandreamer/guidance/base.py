@@ -32,8 +32,6 @@ grad_clip           clamp each element of the latent's gradient to +- this; none
 weighting_strategy  w(t): sds (1 - abar), uniform (1), fantasia3d (sqrt(abar) (1 - abar)),
                     x0 (sqrt((1 - abar) / abar): the gradient is x minus the denoised x),
                     rectified_flow (1 + sqrt((1 - abar) / abar): the error of a flow's velocity)
-max_items_eval      how many items ``guidance_eval`` shows; 0 or less = all, as in threestudio
-eval_steps          DDIM steps from the noise to ``imgs_final``
 ==================  ================================================================================
 """
 
@@ -41,7 +39,7 @@ import functools
 from abc import ABC, abstractmethod
 from collections import Counter
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Optional, Tuple
+from typing import Any, Optional, Tuple
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -63,6 +61,8 @@ from .variants.vsd import GaussianParticles
 
 __all__ = ["GUIDANCE_SCALE", "NonFiniteScore", "ScoreDistillation"]
 
+EVAL_ITEMS, EVAL_STEPS = 4, 20
+"""Most items that ``guidance_eval`` shows, and DDIM steps from the noise to ``imgs_final``."""
 MAX_BAD_STEPS = 10
 """A run ends after so many steps in a row in which the score of some item was NaN or infinite."""
 
@@ -87,10 +87,10 @@ class ScoreDistillation(BaseObject, ABC):
         variant: dict = field(default_factory=dict)
         grad_clip: Any = field(default=None, metadata=schedule(min=0))
         weighting_strategy: str = field(default="sds", metadata=one_of(sds.WEIGHTS))
-        max_items_eval: int = 4
-        eval_steps: int = field(default=20, metadata=in_range(1, 1000))
 
-        REMOVED: ClassVar[dict[str, Any]] = {
+        REMOVED = {
+            "max_items_eval": (lambda count: True, f"guidance_eval shows {EVAL_ITEMS} items"),
+            "eval_steps": (lambda steps: True, f"imgs_final takes {EVAL_STEPS} steps"),
             "reuse_steps": (1, "each step evaluates the score model"),
             "timestep_schedule": (
                 "uniform",
@@ -122,17 +122,17 @@ class ScoreDistillation(BaseObject, ABC):
     UNGUIDED_IGNORES: tuple[str, ...] = ("guidance_interval", "recon_std_rescale")
     """Options that have no effect if ``guidance_scale`` is 1."""
 
-    PARTICLES_IGNORE: tuple[str, ...] = ("rank", "lr", "samples", "camera_dropout")
+    PARTICLES_IGNORE: tuple[str, ...] = ("rank", "lr")
     """Options of ``vsd-variant`` that :meth:`particle_model` doesn't read."""
 
     LOSSES: tuple[str, ...] = ("sds",)
     """Names of the losses that a step returns, without the prefix ``loss_``."""
 
+    NO_LORA = ""
+    """Why ``vsd-variant`` can't be used."""
+
     KNOWS_TRUTH = False
     """Whether instances have an attribute ``truth``, see :mod:`.known_truth`."""
-
-    # Defined by subclasses
-    # ----------------------------------------------------------------------------------------------
 
     @abstractmethod
     def encode(self, rgb: Float[Tensor, "B 3 H W"], **batch: Any) -> Latents:
@@ -155,43 +155,39 @@ class ScoreDistillation(BaseObject, ABC):
         """
 
     def select(self, condition: Any, rows: Int[Tensor, " R"]) -> Any:
-        """Return the conditions of some items. Conditions that are None, a tensor or a list with
-        one entry per item are known; subclasses with others override this.
-
-        Raises:
-            UserError: the conditions are of another type.
+        """Return the conditions of some items; subclasses whose conditions aren't None, a tensor or
+        a list with one entry per item override this.
         """
         if condition is None:
             return None
-        if isinstance(condition, Tensor):
-            return condition[rows]
         if isinstance(condition, list):
             return [condition[row] for row in rows.tolist()]
-        raise UserError(
-            f"{type(self).__name__} has conditions of type {type(condition).__name__}: define its "
-            f"method select, which guidance_interval and {self.cfg.variant_type} need"
-        )
+        if not isinstance(condition, Tensor):
+            raise UserError(
+                f"{type(self).__name__} has conditions of type {type(condition).__name__}: define "
+                f"its method select, which guidance_interval and {self.cfg.variant_type} need"
+            )
+        return condition[rows]
 
     def particle_model(self, options: Any) -> Any:
-        """Return the model of the renders' own distribution that ``vsd-variant`` trains.
-
-        Args:
-            options: the variant's, without effect of those in ``PARTICLES_IGNORE``.
+        """Return the model of the renders' own distribution that ``vsd-variant``, whose options are
+        given, trains.
         """
-        return GaussianParticles(options.momentum)
+        return GaussianParticles()
 
     @classmethod
     def check_particle_model(cls, cfg: Any) -> None:
         """Raise UserError if ``vsd-variant`` can't be used with these options of the guidance."""
+        if cls.NO_LORA:
+            raise UserError(
+                f"vsd-variant trains a LoRA in a UNet of single views, and {cls.NO_LORA}: use "
+                "another system.guidance.variant_type"
+            )
 
     @classmethod
     def preflight(cls, cfg: Any) -> None:
-        """Check within seconds that a guidance of this configuration can be built; called before
-        any long work.
-
-        Raises:
-            UserError: a requirement, such as a model's file, is missing; the message says what to
-                do.
+        """Raise UserError if a requirement of this configuration, such as a model's file, is
+        missing; takes seconds, and is called before any long work.
         """
         cfg = parse_structured(cls.Config, cfg)
         variant_class(cfg).preflight(cls, cfg)
@@ -218,7 +214,7 @@ class ScoreDistillation(BaseObject, ABC):
 
     def configure(self) -> None:
         self.alphas_cumprod = sds.sd_alphas_cumprod()
-        self.evaluations, self._has_warned = 0, False
+        self.evaluations = 0
         self.variant = variant_class(self.cfg)(self.cfg.variant)
         self.bad_items, self.bad_steps = 0, Counter[str]()
         self.reads = DelayedReads()
@@ -301,9 +297,6 @@ class ScoreDistillation(BaseObject, ABC):
     ) -> dict[str, Any]:
         """Return the loss and what is logged, from the norm of the gradient of each item and the
         number of bad items.
-
-        Raises:
-            UserError: a part's ``report`` returned no dictionary.
         """
         out = {
             "loss_sds": loss,
@@ -314,25 +307,13 @@ class ScoreDistillation(BaseObject, ABC):
             "bad_items": bad_items,
             "evaluations": float(self.evaluations),
         }
-        for part in (self, self.variant):
-            found = part.report()
-            if not isinstance(found, dict):
-                raise UserError(
-                    f"{type(part).__name__}.report returned {type(found).__name__}; expected a "
-                    "dictionary of names and numbers, {} if there is none"
-                )
-            out |= found
-        return out
+        return out | (self.report() or {}) | (self.variant.report() or {})
 
     def _gradient(
         self, residual: Latents, abar: Float[Tensor, " B"]
     ) -> tuple[Latents, Bool[Tensor, " B"]]:
-        """Weight and clip the residual.
-
-        Returns:
-            the gradient, zero for items in which it isn't finite, and a mask of those.
-        """
-        weight = sds.WEIGHTS[self.cfg.weighting_strategy](abar)
+        """Weight and clip the residual; also return which items aren't finite, which are zero."""
+        weight = sds.WEIGHTS[self.options.weighting_strategy](abar)
         grad = sds.per_item(weight, residual) * residual
         bad = find_bad_items(grad)
         if may_have_any(bad):
@@ -341,7 +322,7 @@ class ScoreDistillation(BaseObject, ABC):
 
     def count_bad(self, bad: Bool[Tensor, " B"], what: str, advice: str) -> None:
         """Count items that aren't finite, when their number is known; warn of them, or raise
-        NonFiniteScore with the advice if there were some in ``MAX_BAD_STEPS`` steps in a row.
+        NonFiniteScore with the advice after ``MAX_BAD_STEPS`` steps in a row.
         """
         self.reads.submit(bad, functools.partial(self._note_bad, self.step, what, advice))
 
@@ -361,11 +342,7 @@ class ScoreDistillation(BaseObject, ABC):
         return self.variant.state()
 
     def restore(self, state: State) -> None:
-        """Restore what :meth:`state` returned.
-
-        Raises:
-            UserError: the tensors aren't those of this configuration.
-        """
+        """Restore what :meth:`state` returned; raise UserError for another configuration's."""
         # earlier versions kept predictions for several steps
         kept = {name: value for name, value in state.items() if not name.startswith("kept.")}
         self.variant.restore(self, kept)
@@ -384,25 +361,16 @@ class ScoreDistillation(BaseObject, ABC):
         if inside is None or inside.all():
             return self.guided_noise(z, t, condition, scale, rescale=rescale)
         eps = torch.empty_like(z)
-        for is_inside in (True, False):
-            rows = (inside == is_inside).nonzero()[:, 0]
-            if not len(rows):
-                continue
+        for rows, is_inside in ((inside.nonzero()[:, 0], True), ((~inside).nonzero()[:, 0], False)):
             some = (z[rows], t[rows], self.select(condition, rows))
-            if is_inside:
+            if is_inside and len(rows):
                 eps[rows] = self.guided_noise(*some, scale, rescale=rescale)
-            else:
+            elif len(rows):
                 eps[rows] = self.conditional(*some)
         return eps
 
     def guided_noise(
-        self,
-        z: Latents,
-        t: Timesteps,
-        condition: Any,
-        scale: float,
-        *,
-        rescale: float = 0.0,
+        self, z: Latents, t: Timesteps, condition: Any, scale: float, *, rescale: float = 0.0
     ) -> Latents:
         """Predict the noise with classifier-free guidance.
 
@@ -416,13 +384,8 @@ class ScoreDistillation(BaseObject, ABC):
                 return eps.to(z)
         cond, uncond = self._pair(self.predict(z, t, condition), z)
         if uncond is None:
+            _warn_of_no_effect(scale, type(self).__name__)
             uncond = cond
-            if not self._has_warned:
-                self._has_warned = True
-                warn(
-                    f"guidance_scale={scale:g} has no effect: {type(self).__name__}.predict "
-                    "returns no unconditional prediction"
-                )
         guided = sds.classifier_free(cond, uncond, scale)
         return sds.rescaled(guided, cond, z, self.abar_of(t), rescale) if rescale else guided
 
@@ -461,15 +424,13 @@ class ScoreDistillation(BaseObject, ABC):
                 broadcast.
         """
         entries = found if isinstance(found, (tuple, list)) else [found]
-        shapes = [entry.shape if isinstance(entry, Tensor) else type(entry) for entry in entries]
-        if entries is not found or shapes not in ([z.shape, z.shape], [z.shape, type(None)]):
-            what = " and ".join(
-                shape.__name__ if isinstance(shape, type) else str(tuple(shape)) for shape in shapes
-            )
+        shapes = [tuple(x.shape) if isinstance(x, Tensor) else type(x).__name__ for x in entries]
+        shape = tuple(z.shape)
+        if entries is not found or shapes not in ([shape, shape], [shape, "NoneType"]):
             raise UserError(
-                f"{type(self).__name__}.predict returned {'' if entries is found else 'only '}"
-                f"{what}; expected a pair, the conditional and the unconditional prediction (or "
-                f"None), of the shape {tuple(z.shape)} of the noisy latents"
+                f"{type(self).__name__}.predict returned {' and '.join(map(str, shapes))}; "
+                "expected a pair, the conditional and the unconditional prediction (or None), of "
+                f"the shape {shape} of the noisy latents"
             )
         cond, uncond = found
         return cond.to(z), None if uncond is None else uncond.to(z)
@@ -517,33 +478,32 @@ def is_guided(cfg: Any, variant: Variant | type[Variant]) -> bool:
 
 
 def variant_class(cfg: Any) -> type[Variant]:
-    """Return the class that ``variant_type`` names.
-
-    Raises:
-        UserError: it is unknown, or another kind of part.
-    """
-    found = find(cfg.variant_type) if cfg.variant_type in names() else None
-    if not _is_variant(found):
-        known = [name for name in names() if _is_variant(find(name))]
-        raise UserError(f"variant_type: {unknown('variant', cfg.variant_type, known)}")
+    """Return the class that ``variant_type`` names; raise UserError if it is none."""
+    known = {
+        name
+        for name in names()
+        if isinstance(part := find(name), type) and issubclass(part, Variant)
+    }
+    if cfg.variant_type not in known:
+        raise UserError(f"variant_type: {unknown('variant', cfg.variant_type, sorted(known))}")
+    found = find(cfg.variant_type)
     require_method(found, "residual", "guidance", "latents", "condition", "batch")
     return found
 
 
-def _is_variant(part: Any) -> bool:
-    return isinstance(part, type) and issubclass(part, Variant)
+@functools.lru_cache
+def _warn_of_no_effect(scale: float, name: str) -> None:
+    """Warn, once per process, of a scale where there is only one prediction."""
+    warn(
+        f"guidance_scale={scale:g} has no effect: {name}.predict returns no unconditional "
+        "prediction"
+    )
 
 
 def _knots(*schedules: Any) -> set[int]:
-    """Return a set that contains all steps at which the slope of a schedule changes. It also has
-    the values of the schedules, which does no harm.
-    """
+    """Return all steps at which the slope of a schedule changes, and harmless others."""
     lists = [entries for entries in schedules if not isinstance(entries, (int, float))]
     return {0, *(int(entry) for entries in lists for entry in entries)}
-
-
-# Pictures of the score model's inputs and predictions
-# --------------------------------------------------------------------------------------------------
 
 
 @torch.no_grad()
@@ -555,10 +515,10 @@ def score_pictures(
     Returns:
         pictures (B, H, W, 3) in [0, 1]: ``imgs_noisy``, the noisy latents; ``imgs_1step``,
         denoised in one step with guidance; ``imgs_1orig``, denoised in one step with the
-        conditional score only; ``imgs_final``, denoised in ``eval_steps`` steps; and ``texts``,
+        conditional score only; ``imgs_final``, denoised in ``EVAL_STEPS`` steps; and ``texts``,
         ``noise_levels`` and ``bs``, the number of items."""
-    size, most = len(noised.t), guidance.cfg.max_items_eval
-    count = size if most < 1 else min(most, size)
+    size, views = len(noised.t), getattr(guidance.cfg, "n_view", 1)
+    count = min(size, max(EVAL_ITEMS // views, 1) * views)
     batch = items_of(batch, size, slice(count))
     t, abar, _, z = (values[:count] for values in noised)
     condition = guidance.condition(prompt_utils, **batch)
@@ -571,7 +531,7 @@ def score_pictures(
             z,
             t,
             guidance.alphas_cumprod.double().to(z.device),
-            steps=guidance.cfg.eval_steps,
+            steps=EVAL_STEPS,
         ),
     }
     images = {
@@ -592,13 +552,9 @@ def _captions(levels: list[float], batch: Batch) -> list[str]:
     return ["\n".join(lines) for lines in zip(*columns, strict=True)]
 
 
-# Items that aren't finite
-# --------------------------------------------------------------------------------------------------
-
-
 def find_bad_items(grad: Float[Tensor, "B *d"]) -> Bool[Tensor, " B"]:
     """Return which items contain NaN or infinity. If the sum over all elements is finite then so
-    are the elements, so on a CPU the usual case needs a single reduction.
+    are the elements.
     """
     if not grad.is_cuda and grad.sum().isfinite():
         return torch.zeros(len(grad), dtype=torch.bool, device=grad.device)

@@ -2,8 +2,7 @@
 IF's first stage, 64 x 64.
 
 Options: those of ``guidance/text_to_image.py``; ``guidance_scale`` is 20 unless given, as in
-threestudio; ``enable_vae_slicing`` is accepted, so that configurations that save memory fit any
-model, and there is no VAE here. The UNet also predicts the variance of its reverse step, which
+threestudio. The UNet also predicts the variance of its reverse step, which
 distillation doesn't need."""
 
 from dataclasses import dataclass, field
@@ -27,7 +26,6 @@ class DeepFloydGuidance(TextToImageDistillation):
     class Config(TextToImageDistillation.Config):
         pretrained_model_name_or_path: str = DEEP_FLOYD
         guidance_scale: float = field(default=20.0, metadata=GUIDANCE_SCALE)
-        enable_vae_slicing: bool = False
 
     cfg: Config
     family = FAMILY

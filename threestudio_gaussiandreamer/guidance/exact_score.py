@@ -9,7 +9,7 @@ render's own background.
 ==================  ================================================================================
 option              meaning
 ==================  ================================================================================
-mesh                path of the mesh, or the bare name of a bundled one; scale, up, front: as in
+mesh                path of the mesh, or the bare name of a bundled one; up, front: as in
                     ``meshes.load_mesh``
 mode                ``view-exact``: the picture from this very camera (reconstruction: an upper
                     bound, not generation); ``direction-bins``: the bank views on the camera's side
@@ -21,11 +21,9 @@ space               ``pixel``: sharp, posteriors of one picture; ``latent``: poo
 image_size          height of the pictures that are compared, pixels; 0 = as rendered; the render is
                     resized to it
 latent_size         height of the latent in pixels (image_size is a multiple)
-std                 width s of each mode, in the units of the space (pixels in [-1, 1])
-bank_*              number of views, their ranges (degrees, world units) and their seed
-bank_includes_view  the bank stands for all views, so the camera's own is one of them, with the
-                    weight of any other; without it the error can't fall below that of the
-                    nearest view of the bank
+bank_*              number of views, their ranges (degrees, world units) and their seed; the bank
+                    stands for all views, so the camera's own is one of them, with the weight of
+                    any other
 supersample         rays per pixel and axis; max_cached_targets: pictures of view-exact kept in
                     memory (4 bytes a pixel)
 guidance_scale      1 = none (the default here); otherwise the unconditional mixture is the bank,
@@ -39,7 +37,7 @@ angle of view."""
 import itertools
 import math
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Optional, Tuple
+from typing import Any, Optional, Tuple
 
 import torch
 import torch.nn.functional as F
@@ -50,7 +48,7 @@ from ..cameras import OrbitRanges, camera_pool
 from ..core.errors import UserError
 from ..core.given_gradient import given_gradient
 from ..core.memory import count_of, require_memory
-from ..core.options import at_least, in_range, interval, one_of, positive, required
+from ..core.options import at_least, in_range, interval, one_of, required
 from ..diffusion import sds
 from ..diffusion.exact_score import COLOR_MATRIX, Denoised, LinearLatent, denoise
 from ..host import parse_structured, register, warn
@@ -70,9 +68,10 @@ BANK_BYTES = 16
 """Memory per pixel of the bank while it is cast, bytes."""
 MAX_MODE_BYTES = 2**31
 """Largest memory of a bank in the space of pixels; over backgrounds of pixels, of each item's."""
-OF_BANK = ("bank_views", "bank_includes_view", "bank_elevation_range", "bank_distance_range")
-OF_BANK += ("bank_fovy_range",)
+OF_BANK = ("bank_views", "bank_distance_range", "bank_fovy_range")
 """Without its seed, which series of runs set for all of them."""
+BANK_ELEVATIONS = (-10.0, 60.0)
+"""Degrees."""
 
 
 @register("exact-score-guidance")
@@ -81,20 +80,14 @@ class ExactScoreGuidance(ScoreDistillation):
     class Config(ScoreDistillation.Config):
         guidance_scale: float = field(default=1.0, metadata=GUIDANCE_SCALE)
         mesh: str = field(default="", metadata=required("give the mesh that is the truth"))
-        scale: float = field(default=1.0, metadata=positive("world units"))
         up: str = field(default="auto", metadata=one_of(("auto", *AXES)))
         front: Optional[str] = field(default=None, metadata=one_of(AXES))
         mode: str = field(default="view-exact", metadata=one_of(MODES))
         space: str = field(default="pixel", metadata=one_of(SPACES))
         image_size: int = field(default=0, metadata=in_range(0, 16_384, "pixels"))
         latent_size: int = field(default=32, metadata=in_range(1, 4096, "pixels"))
-        std: float = field(default=0.0, metadata=at_least(0))
         bank_views: int = field(default=200, metadata=count_of("views", 1, 4096))
-        bank_includes_view: bool = True
         bank_seed: int = 0
-        bank_elevation_range: Tuple[float, float] = field(
-            default=(-10.0, 60.0), metadata=interval(-90, 90, "degrees")
-        )
         bank_distance_range: Tuple[float, float] = field(
             default=(1.5, 4.0), metadata=interval(1e-6, 1e6, "world units")
         )
@@ -104,11 +97,18 @@ class ExactScoreGuidance(ScoreDistillation):
         supersample: int = field(default=2, metadata=in_range(1, 64, "rays a pixel each way"))
         max_cached_targets: int = field(default=512, metadata=at_least(1))
 
-        REMOVED: ClassVar[dict[str, Any]] = {
+        REMOVED = {
             **ScoreDistillation.Config.REMOVED,
             "latent_channels": (4, "a latent has 4"),
             "color_matrix": (True, "a latent has 4 mixed channels"),
             "temperature": (1.0, "the responsibilities are exact"),
+            "scale": (1.0, "the mesh's longest side is one world unit times two"),
+            "bank_elevation_range": (
+                lambda given: tuple(given) == BANK_ELEVATIONS,
+                "it is -10 to 60",
+            ),
+            "std": (0.0, "each mode is one picture, without width"),
+            "bank_includes_view": (True, "the bank includes the camera's own view"),
         }
 
         @staticmethod
@@ -132,18 +132,13 @@ class ExactScoreGuidance(ScoreDistillation):
     def configure(self) -> None:
         super().configure()
         cfg = self.cfg
-        mesh = MeshCaster(load_mesh(cfg.mesh, scale=cfg.scale, up=cfg.up, front=cfg.front))
-        self.truth = MeshTruth(
-            mesh,
-            cfg.supersample,
-            cfg.max_cached_targets,
-            self._picture_size if self._needs_own_view else None,
-        )
+        mesh = MeshCaster(load_mesh(cfg.mesh, up=cfg.up, front=cfg.front))
+        self.truth = MeshTruth(mesh, cfg.supersample, cfg.max_cached_targets, self._picture_size)
         self._banks: dict[tuple[int, int], Bank] = {}
         self._size: Optional[tuple[int, int]] = None
         self._perplexity = 1.0
         ranges = OrbitRanges(
-            cfg.bank_elevation_range, (-180.0, 180.0), cfg.bank_distance_range, cfg.bank_fovy_range
+            BANK_ELEVATIONS, (-180.0, 180.0), cfg.bank_distance_range, cfg.bank_fovy_range
         )
         self.bank_orbit = camera_pool(cfg.bank_views, ranges, cfg.bank_seed, "bank")
 
@@ -166,9 +161,6 @@ class ExactScoreGuidance(ScoreDistillation):
     @classmethod
     def is_text_guided(cls, cfg: Any) -> bool:
         return cfg.mode != "view-agnostic"
-
-    # Score distillation
-    # ---------------------------------------------------------------------------------------
 
     def __call__(
         self, rgb: Float[Tensor, "B H W c"], prompt_utils: Any = None, **options: Any
@@ -223,7 +215,7 @@ class ExactScoreGuidance(ScoreDistillation):
         """
         options = self.cfg
         return (
-            (options.mode, options.space, options.std) == ("view-exact", "pixel", 0)
+            (options.mode, options.space) == ("view-exact", "pixel")
             and self._picture_size(*size) == tuple(size)
             and not self.guided
             and self.grad_clip is None
@@ -249,16 +241,9 @@ class ExactScoreGuidance(ScoreDistillation):
         """Return the mixture of each item. ``encode`` must be called before, since it sets the size
         of the pictures.
         """
-        if self._size is None:
-            raise UserError(
-                "exact-score-guidance compares pictures: give it renders, not latents "
-                "(rgb_as_latents)"
-            )
         background = background_of(comp_rgb_bg, len(c2w), c2w.device)
-        own: Any = [None] * len(c2w)
-        if self._needs_own_view:
-            rgba = self.truth.pictures(c2w, fovy, *self._size)
-            own = self._latent().encode(composite(rgba, background))
+        rgba = self.truth.pictures(c2w, fovy, *self._size)
+        own = self._latent().encode(composite(rgba, background))
         members = self._members(batch, len(c2w))
         if not self.guided and not members.any():
             return [Mixture(view) for view in own]
@@ -269,7 +254,7 @@ class ExactScoreGuidance(ScoreDistillation):
     def predict(
         self, z: Latents, t: Timesteps, condition: list[Mixture]
     ) -> tuple[Latents, Optional[Latents]]:
-        abar = self.alphas_cumprod.to(t.device)[t]
+        abar = self.abar_of(t)
         by_pictures = itertools.groupby(condition, lambda mixture: id(mixture.pictures))
         groups = [list(group) for _, group in by_pictures]
         sizes = [len(group) for group in groups]
@@ -301,7 +286,7 @@ class ExactScoreGuidance(ScoreDistillation):
         """Return sqrt(abar / (1 - abar)) (x - x_1) for mixtures of one picture without width, in
         whose score the noise cancels.
         """
-        if self.cfg.std or any(mixture.pictures is not None for mixture in condition):
+        if any(mixture.pictures is not None for mixture in condition):
             return None
         _, abar = self.draw_timesteps(latents)
         self._perplexity = 1.0
@@ -321,16 +306,9 @@ class ExactScoreGuidance(ScoreDistillation):
         items with the same pictures.
         """
         modes, log_prior = modes_of(mixtures)
-        options = {"std": self.cfg.std, "distances": modes.squared_distances(z, abar)}
-        cond = denoise(z, abar, modes, log_prior=log_prior, **options)
-        return cond, denoise(z, abar, modes, **options) if self.guided else None
-
-    # Mixtures
-    # ----------------------------------------------------------------------------------------------
-
-    @property
-    def _needs_own_view(self) -> bool:
-        return self.cfg.mode == "view-exact" or self.cfg.bank_includes_view
+        distances = modes.squared_distances(z, abar)
+        cond = denoise(z, abar, modes, log_prior=log_prior, distances=distances)
+        return cond, denoise(z, abar, modes, distances=distances) if self.guided else None
 
     def _members(self, batch: dict[str, Any], count: int) -> Bool[Tensor, "B K"]:
         """Return a mask of the bank's views in the conditional mixture of each item."""
@@ -392,10 +370,8 @@ def picture_size(cfg: Any, guided: bool, height: int, width: int) -> tuple[int, 
 
 
 def pooling_factor(height: int, width: int, latent_size: int) -> int:
-    """Return how many pixels each way a latent of this height has.
-
-    Raises:
-        UserError: pictures of this size can't be pooled to it.
+    """Return how many pixels each way a latent of this height has; raise UserError if pictures of
+    this size can't be pooled to it.
     """
     factor = height // latent_size
     if factor * latent_size != height or width % max(factor, 1):

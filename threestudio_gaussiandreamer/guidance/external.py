@@ -3,7 +3,7 @@ signatures that its guidances have, and what they train themselves.
 """
 
 import inspect
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -59,11 +59,8 @@ def _loss(value: Any, what: str, rgb: Tensor) -> Float[Tensor, ""]:
     try:
         loss = torch.as_tensor(value, device=rgb.device).reshape(())
     except (TypeError, ValueError, RuntimeError) as error:
-        shape = f"shape {tuple(value.shape)}" if isinstance(value, Tensor) else ""
-        raise UserError(
-            f"{what} of {shape or f'type {type(value).__name__}'}: one number was expected, as "
-            "from .mean()"
-        ) from error
+        kind = getattr(value, "shape", None) or type(value).__name__
+        raise UserError(f"{what} of {kind}: one number was expected, as from .mean()") from error
     if loss.device.type == "cpu" and not loss.isfinite():  # on a GPU, looking would wait for it
         raise UserError(f"{what} = {loss.item()}: expected a finite number")
     return loss
@@ -72,27 +69,12 @@ def _loss(value: Any, what: str, rgb: Tensor) -> Float[Tensor, ""]:
 @contextmanager
 def own_randomness(step: int) -> Iterator[None]:
     """Seed torch's global generators with (seed, step) in this context, for guidances that draw
-    from them; restore their state afterwards.
-
-    A resumed run thus draws the same values as an uninterrupted one, and rendering validation
-    pictures doesn't change the values that training draws."""
-    generators = [torch.default_generator]
-    if torch.cuda.is_available():
-        torch.cuda.init()
-        generators.append(torch.cuda.default_generators[torch.cuda.current_device()])
-    # torch.random.fork_rng takes several times longer, and torch.manual_seed a millisecond, in
-    # which it records a stack trace for each kind of device that is missing
-    states = [generator.get_state() for generator in generators]
-    seed = derive_seed(item_seed(), "guidance", step)
-    for generator in generators:
-        generator.manual_seed(seed)
-    if torch.backends.mps.is_available():
-        torch.mps.manual_seed(seed)
-    try:
+    from them; restore their state afterwards. A resumed run thus draws the same values as an
+    uninterrupted one, and validation doesn't change those of training.
+    """
+    with torch.random.fork_rng([torch.cuda.current_device()] if torch.cuda.is_available() else []):
+        torch.manual_seed(derive_seed(item_seed(), "guidance", step))
         yield
-    finally:
-        for generator, state in zip(generators, states, strict=True):
-            generator.set_state(state)
 
 
 def trainable_parameters(guidance: Any) -> dict[str, nn.Parameter]:
@@ -102,43 +84,25 @@ def trainable_parameters(guidance: Any) -> dict[str, nn.Parameter]:
 
 
 def trainable_groups(guidance: Any, lr: float) -> list[dict[str, Any]]:
-    """Return an optimiser group with learning rate ``lr`` of the parameters that a guidance trains;
-    none for most guidances.
-    """
+    """Return an optimiser group of those parameters; none for most guidances."""
     learning = list(trainable_parameters(guidance).values())
     return [{"params": learning, "name": "guidance", "lr": lr}] if learning else []
 
 
 def learnt_weights(guidance: Any) -> dict[str, Tensor]:
     """Return the trained parameters of a guidance, for a checkpoint; of this package's guidances,
-    the state of the variant. Frozen weights aren't stored, since they are those of the published
-    model.
+    the state of the variant.
     """
     if isinstance(guidance, ScoreDistillation):
         return guidance.state()
     return {name: parameter.detach() for name, parameter in trainable_parameters(guidance).items()}
 
 
-def require_learnt(weights: Any, what: str) -> None:
-    """Check what a checkpoint has in place of the result of :func:`learnt_weights`; None is fine.
-
-    Args:
-        what: the file, for messages.
-
-    Raises:
-        UserError: it isn't a mapping of tensors.
-    """
-    weights = {} if weights is None else weights
-    values = weights.values() if isinstance(weights, Mapping) else [None]
-    if not all(isinstance(value, Tensor) for value in values):
-        raise UserError(f"{what}: its guidance isn't a mapping of tensors")
-
-
 def restore_learnt(guidance: Any, weights: dict[str, Tensor]) -> None:
     """Restore parameters that :func:`learnt_weights` returned.
 
     Raises:
-        UserError: names or shapes differ from the parameters that the guidance trains.
+        UserError: their names or shapes differ.
     """
     if isinstance(guidance, ScoreDistillation):
         guidance.restore(weights)

@@ -1,11 +1,9 @@
 """The ground truth of guidances that have one, such as a mesh.
 
 If a guidance has an attribute ``truth`` with the methods of :class:`MeshTruth` (whose ``mesh`` may
-be None), renders of the run are compared with it: the progress bar shows the PSNR, validation
-pictures include the ground truth, ``budget: auto`` goes by their error, and, if it is a mesh,
-held-out views are scored. A guidance that has computed the mean squared error of a step's renders
-to the ground truth returns it as ``error_to_truth``; where it doesn't, steps that are logged render
-the ground truth.
+be None), renders of the run are compared with it. A guidance that has computed the mean squared
+error of a step's renders to the ground truth returns it as ``error_to_truth``; where it doesn't,
+steps that are logged render the ground truth.
 """
 
 from collections.abc import Callable
@@ -36,7 +34,7 @@ class MeshTruth:
         supersample: rays per pixel and axis.
         max_cached: largest number of cached pictures, which are stored as uint8.
         prefetch_size: maps (height, width) of a render to the size of the picture that training
-            needs for it; None if training needs no pictures.
+            needs for it.
     """
 
     def __init__(
@@ -44,7 +42,7 @@ class MeshTruth:
         mesh: MeshCaster,
         supersample: int,
         max_cached: int,
-        prefetch_size: Optional[Callable[[int, int], Size]] = None,
+        prefetch_size: Callable[[int, int], Size],
     ) -> None:
         self.mesh, self._prefetch_size = mesh, prefetch_size
         self.pictures = TargetCache(mesh, supersample, max_cached)
@@ -72,9 +70,8 @@ class MeshTruth:
         """Plan to cast these views in large batches, if all fit into the cache. Called if training
         will need most of them at this size.
         """
-        if self._prefetch_size is None or len(c2w) > self.pictures.capacity:
-            return
-        self.pictures.plan(c2w, fovy, *self._prefetch_size(height, width))
+        if len(c2w) <= self.pictures.capacity:
+            self.pictures.plan(c2w, fovy, *self._prefetch_size(height, width))
 
 
 def background_of(

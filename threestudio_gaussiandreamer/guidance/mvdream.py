@@ -62,14 +62,10 @@ class MVDreamGuidance(StableDiffusionGuidance):
                     "view_contrast: this model has one prompt for all views: set it to 0"
                 )
             StableDiffusionGuidance.Config.check(cfg)
-            if cfg.max_items_eval > 0 and cfg.max_items_eval % cfg.n_view:
-                raise UserError(
-                    f"max_items_eval: expected a multiple of n_view={cfg.n_view}, or 0, got "
-                    f"{cfg.max_items_eval}"
-                )
 
     cfg: Config
     family = MULTI_VIEW
+    NO_LORA = "MVDream predicts several together"
     # without view contrast and Perp-Neg, which it doesn't have
     UNGUIDED_IGNORES = ("guidance_interval", "recon_std_rescale")
 
@@ -87,17 +83,11 @@ class MVDreamGuidance(StableDiffusionGuidance):
         self.text_width = self.unet.config.cross_attention_dim
 
     def prepare_denoiser(self, network: nn.Module) -> nn.Module:
-        return super().prepare_denoiser(attend_across_views(network, self.cfg.n_view))
+        attend_across_views(network, self.cfg.n_view)
+        return super().prepare_denoiser(network)
 
     def require_inputs(self) -> None:
         """Do nothing: the family and its settings leave no other inputs."""
-
-    @classmethod
-    def check_particle_model(cls, cfg: Any) -> None:
-        raise UserError(
-            "vsd-variant trains a LoRA on single views, and MVDream predicts several together: use "
-            "another system.guidance.variant_type"
-        )
 
     def condition(self, prompt_utils: Any, **batch: Any) -> Condition:
         """See :meth:`.ScoreDistillation.condition`.

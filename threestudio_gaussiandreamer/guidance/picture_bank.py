@@ -57,9 +57,9 @@ class Bank(NamedTuple):
 
 
 class Mixture(NamedTuple):
-    """The modes of one item's mixture distribution: the view of its camera, pictures, or both."""
+    """The modes of one item's mixture distribution: the view of its camera, and pictures."""
 
-    own: Optional[Float[Tensor, "c h w"]]
+    own: Float[Tensor, "c h w"]
     """The view of the camera, encoded; the first mode."""
     pictures: Optional[Pictures] = None
     mixing: Optional[Float[Tensor, "c l"]] = None
@@ -73,7 +73,7 @@ class Mixture(NamedTuple):
 class Modes(NamedTuple):
     """The modes of the items of a batch whose mixtures have the same pictures."""
 
-    own: Optional[Float[Tensor, "B d"]]
+    own: Float[Tensor, "B d"]
     pictures: Pictures
     mixing: Float[Tensor, "B c l"]
 
@@ -85,25 +85,20 @@ class Modes(NamedTuple):
         parts = [of_layers @ part.flatten(1).double().mT for part in _chunks(self.pictures.layers)]
         norms = torch.einsum("bcl,klm,bcm->bk", mixing, self.pictures.products, mixing)
         distances = expanded_distances(wide, abar, norms, torch.cat(parts, dim=1))
-        if self.own is None:
-            return distances
         return torch.cat([squared_distances(z, self.own[:, None], abar), distances], dim=1)
 
     def weighted_sum(self, weights: Float[Tensor, "B K"]) -> Float[Tensor, "B d"]:
-        of_pictures = weights if self.own is None else weights[:, 1:]
-        layers = weighted_sum(of_pictures, self.pictures.layers.flatten(1))
+        layers = weighted_sum(weights[:, 1:], self.pictures.layers.flatten(1))
         found = self.mixing.to(layers) @ layers.unflatten(1, (self.mixing.shape[2], -1))
-        found = found.flatten(1)
-        return found if self.own is None else weights[:, :1] * self.own + found
+        return weights[:, :1] * self.own + found.flatten(1)
 
 
 def modes_of(
     mixtures: list[Mixture],
 ) -> tuple[Any, Optional[Float[Tensor, "B K"]]]:
     """Return the modes of mixtures with the same pictures, and the logarithms of their priors."""
-    own, pictures = mixtures[0].own, mixtures[0].pictures
-    if own is not None:
-        own = torch.stack([mixture.own for mixture in mixtures]).flatten(1)
+    own = torch.stack([mixture.own for mixture in mixtures]).flatten(1)
+    pictures = mixtures[0].pictures
     if pictures is None:
         return ImageTensor(own[:, None]), None
     mixing = torch.stack([mixture.mixing for mixture in mixtures])
@@ -112,14 +107,14 @@ def modes_of(
 
 
 def mixture_of(
-    own: Optional[Float[Tensor, "c h w"]],
+    own: Float[Tensor, "c h w"],
     members: Bool[Tensor, " K"],
     background: Float[Tensor, "bh bw 3"],
     bank: Bank,
     guided: bool,
 ) -> Mixture:
-    """Return a mixture whose conditional modes are the camera's own view, if any, and the
-    ``members`` of a bank; if it is ``guided``, the whole bank is in its unconditional mixture.
+    """Return a mixture whose conditional modes are the camera's own view and the ``members`` of a
+    bank; if it is ``guided``, the whole bank is in its unconditional mixture.
 
     Args:
         background: what the bank is composited on: one colour (1, 1, 3) or pixels (H', W', 3).
@@ -136,7 +131,7 @@ def mixture_of(
         latents = [bank.latent.encode(composite(some, background[None])) for some in rgba]
         pictures = Pictures.of(torch.cat(latents))
         mixing = torch.eye(pictures.layers.shape[1], device=background.device)
-    conditional = torch.cat([torch.ones(int(own is not None), dtype=torch.bool), members])
+    conditional = torch.cat([torch.ones(1, dtype=torch.bool), members])
     log_prior = torch.where(conditional, 0.0, -torch.inf).to(background.device)
     return Mixture(own, pictures, mixing, log_prior)
 

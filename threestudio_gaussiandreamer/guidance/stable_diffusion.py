@@ -1,20 +1,13 @@
-"""Guidance ``gaussiandreamer-stable-diffusion-guidance``: score distillation in the latent space of
-Stable Diffusion.
+"""Guidances ``gaussiandreamer-stable-diffusion-guidance`` and ``...-stable-diffusion-xl-guidance``:
+score distillation in the latent space of Stable Diffusion.
 
-Takes any model in diffusers' Stable Diffusion format (1.x, 2.x; predicting noise, v or x0). Options
-in addition to those of ``guidance/text_to_image.py``:
+Takes any model in diffusers' Stable Diffusion format (1.x, 2.x; predicting noise, v or x0).
+Options: those of ``guidance/text_to_image.py``."""
 
-===================  ===============================================================================
-option               meaning
-===================  ===============================================================================
-enable_vae_slicing   encode one image at a time, and once more in the backward pass: needs the
-                     memory of a single image, and the time of a second encoding
-===================  ===============================================================================
-"""
-
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
@@ -23,10 +16,20 @@ from torch.utils.checkpoint import checkpoint
 
 from ..core.errors import UserError
 from ..host import register, register_builtin
-from ..prompts.prompt_processors import STABLE_DIFFUSION
-from .half_precision import PerItemLossScale
+from ..models.families import STABLE_DIFFUSION_XL as XL_FAMILY
+from ..models.model_files import pipeline_settings
+from ..models.text_encoders import unpack
+from ..prompts.prompt_processors import STABLE_DIFFUSION_XL
+from .base import find_bad_items, without_bad_items
 from .text_to_image import TextToImageDistillation, resized
-from .types import Latents
+from .types import Embeddings, Latents, Timesteps
+
+SIZES = 6
+"""How many numbers describe original size, cropped corner and size of a picture."""
+PEAK = 64.0
+"""Gradients are scaled so that their largest element is in [PEAK, 2 PEAK) when they enter the
+backward pass of a half-precision network: float16 has magnitudes from 6e-8 to 65504.
+"""
 
 
 @register_builtin("stable-diffusion-guidance")
@@ -34,17 +37,6 @@ from .types import Latents
 class StableDiffusionGuidance(TextToImageDistillation):
     """Score distillation of renders that the VAE has encoded."""
 
-    @dataclass
-    class Config(TextToImageDistillation.Config):
-        pretrained_model_name_or_path: str = STABLE_DIFFUSION
-        enable_vae_slicing: bool = False
-
-        REMOVED: ClassVar[dict[str, Any]] = {
-            **TextToImageDistillation.Config.REMOVED,
-            "enable_vae_tiling": (False, "images are encoded as a whole"),
-        }
-
-    cfg: Config
     components = ("unet", "vae", "scheduler")
 
     def load(self, folder: Path) -> None:
@@ -120,3 +112,88 @@ class StableDiffusionGuidance(TextToImageDistillation):
         self.count_bad(
             bad, "the VAE's gradient", "set system.guidance.half_precision_weights=false"
         )
+
+
+class PerItemLossScale:
+    """A separate loss scale for each item, for one forward and backward pass of a half-precision
+    network, whose input is passed to ``enter`` and its output to ``leave``. In the backward pass
+    the gradient of each item is multiplied by a power of two where it enters the network, and
+    divided by it in float32 where it leaves.
+
+    Args:
+        on_result: called in the backward pass with a mask, (B,) bool, of items whose gradient isn't
+            finite; those gradients are set to zero.
+    """
+
+    def __init__(self, on_result: Callable[[Bool[Tensor, " B"]], None]) -> None:
+        self.on_result = on_result
+        self.scale: Tensor = torch.ones(())
+
+    def enter(self, x: Float[Tensor, "B *d"]) -> Float[Tensor, "B *d"]:
+        if x.requires_grad:
+            x.register_hook(self._unscaled)
+        return x
+
+    def leave(self, y: Float[Tensor, "B *e"]) -> Float[Tensor, "B *e"]:
+        if y.requires_grad:
+            y.register_hook(self._scaled)
+        return y
+
+    def _scaled(self, grad: Float[Tensor, "B *e"]) -> Float[Tensor, "B *e"]:
+        peak = grad.abs().amax(dim=tuple(range(1, grad.dim())), keepdim=True)
+        self.scale = torch.where(peak > 0, PEAK / torch.exp2(peak.log2().floor()), 1.0)
+        return grad * self.scale
+
+    def _unscaled(self, grad: Float[Tensor, "B *d"]) -> Float[Tensor, "B *d"]:
+        bad = find_bad_items(grad)
+        self.on_result(bad)
+        scale = self.scale.reshape(-1, *[1] * (grad.dim() - 1))
+        return without_bad_items(grad, bad) / scale
+
+
+@register("gaussiandreamer-stable-diffusion-xl-guidance")
+class StableDiffusionXLGuidance(StableDiffusionGuidance):
+    """Its UNet is also conditioned on the pooled embedding of the prompt, and on the sizes in
+    pixels of the training picture before cropping, of the cropped corner and of the result (Podell
+    et al. 2023, section 2.2): here the size that the model sees, (0, 0), and that size again.
+
+    The published VAE overflows in float16 (``force_upcast`` in its settings): with float16 weights
+    it stays in float32, unless it is one that was mended for half precision.
+    """
+
+    @dataclass
+    class Config(StableDiffusionGuidance.Config):
+        pretrained_model_name_or_path: str = STABLE_DIFFUSION_XL
+
+    cfg: Config
+    family = XL_FAMILY
+
+    def vae_type(self, folder: Path) -> torch.dtype:
+        from diffusers import AutoencoderKL
+
+        overflows = AutoencoderKL.load_config(folder, subfolder="vae").get("force_upcast", True)
+        return torch.float32 if overflows and self.dtype == torch.float16 else self.dtype
+
+    def load(self, folder: Path) -> None:
+        if pipeline_settings(folder).get("requires_aesthetics_score"):
+            raise UserError(
+                f"{self.cfg.pretrained_model_name_or_path} is Stable Diffusion XL's refiner, which "
+                "only finishes pictures: use the base model"
+            )
+        super().load(folder)
+        config = self.unet.config
+        self.pooled_width = (
+            config.projection_class_embeddings_input_dim - SIZES * config.addition_time_embed_dim
+        )
+
+    def require_inputs(self) -> None:
+        self.require_text_to_image(self.vae.config.latent_channels, ("text_time",))
+
+    def run_network(
+        self, z: Latents, t: Timesteps, embeddings: Embeddings, **inputs: Tensor
+    ) -> Latents:
+        tokens, pooled = unpack(embeddings.to(self.dtype), self.pooled_width)
+        side = float(self.image_size)
+        sizes = z.new_tensor([side, side, 0, 0, side, side]).expand(len(z), SIZES)
+        inputs["added_cond_kwargs"] = {"text_embeds": pooled, "time_ids": sizes}
+        return self.unet(z.to(self.dtype), t, encoder_hidden_states=tokens, **inputs).sample

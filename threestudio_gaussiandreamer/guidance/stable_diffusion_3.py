@@ -49,6 +49,7 @@ class StableDiffusion3Guidance(StableDiffusionGuidance):
     cfg: Config
     components = ("transformer", "vae", "scheduler")
     family = FAMILY
+    NO_LORA = "Stable Diffusion 3 is a transformer"
 
     @property
     def denoiser(self) -> Any:
@@ -57,13 +58,6 @@ class StableDiffusion3Guidance(StableDiffusionGuidance):
     @property
     def patch_size(self) -> int:
         return self.transformer.config.patch_size
-
-    @classmethod
-    def check_particle_model(cls, cfg: Any) -> None:
-        raise UserError(
-            "vsd-variant trains a LoRA in a UNet, and Stable Diffusion 3 is a transformer: use "
-            "another system.guidance.variant_type"
-        )
 
     def set_schedule(self, folder: Path) -> None:
         """Read the shift and the number of the timesteps of the model's training."""
@@ -97,14 +91,6 @@ class StableDiffusion3Guidance(StableDiffusionGuidance):
                 f"positions up to {largest} pixels, got {size}"
             )
         return size
-
-    def require_inputs(self) -> None:
-        channels = self.transformer.config.in_channels
-        if channels != self.vae.config.latent_channels:
-            raise UserError(
-                f"{self.cfg.pretrained_model_name_or_path} needs other inputs than text "
-                f"(in_channels {channels}): use a model that makes images from text alone"
-            )
 
     def run_network(self, z: Latents, t: Timesteps, embeddings: Embeddings) -> Latents:
         abar = self._abar[t]

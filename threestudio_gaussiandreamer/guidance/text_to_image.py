@@ -25,8 +25,9 @@ enable_torch_compile                compile the network on its first use
 enable_attention_slicing            attention in slices: less memory, slower
 enable_sequential_cpu_offload       keep the network's weights in the CPU's memory: least memory,
                                     much slower
-enable_memory_efficient_attention   torch's own attention is so already; accepted for threestudio's
-                                    configurations
+enable_vae_slicing                  let the VAE, where there is one, encode one image at a time, and
+                                    once more in the backward pass: needs the memory of a single
+                                    image, and the time of a second encoding
 ==================================  ================================================================
 
 View contrast is eps_c' = eps_c + view_contrast (eps_c - eps_o), where o is the prompt of the view
@@ -58,15 +59,15 @@ from ..core.errors import UserError, unknown
 from ..core.extras import require_extra
 from ..core.options import in_range, one_of
 from ..diffusion.sds import PREDICTIONS, perp_neg
-from ..host import debug, info, parse_structured, warn
-from ..models.families import STABLE_DIFFUSION, Family
+from ..host import info, parse_structured, warn
+from ..models.families import STABLE_DIFFUSION as FAMILY
+from ..models.families import Family
 from ..models.hub import find_model
-from ..models.loaded import keep_on_cpu, loaded
-from ..models.model_files import load_network, load_settings
+from ..models.model_files import load_network, load_settings, loaded
+from ..prompts.prompt_processors import STABLE_DIFFUSION
 from .base import ScoreDistillation
-from .half_precision import HALF_TYPES, weights_type
-from .lora import LoRAParticles
 from .types import Condition, Embeddings, Latents, Timesteps, view_of_row
+from .variants.vsd import LoRAParticles
 
 USUAL_SCALES = (0, 200)
 """Guidance scales beyond these are worth a warning: above twice the paper's results saturate, and
@@ -88,6 +89,29 @@ NOT_ADAPTABLE = ("enable_torch_compile", "enable_sequential_cpu_offload")
 """Options that replace the UNet's forward pass, where ``vsd-variant`` trains a LoRA."""
 
 
+HALF_TYPES = {"float16": torch.float16, "bfloat16": torch.bfloat16}
+
+
+def weights_type(cfg: Any, device: torch.device) -> torch.dtype:
+    """Return the number type of a network's weights: on a GPU ``half_precision_type``; on a CPU
+    bfloat16, if ``half_precision_on_cpu`` is set and the CPU multiplies it; else float32.
+    """
+    if not cfg.half_precision_weights:
+        return torch.float32
+    if device.type == "cuda":
+        return HALF_TYPES[cfg.half_precision_type]
+    native = cfg.half_precision_on_cpu and cpu_multiplies_bfloat16()
+    return torch.bfloat16 if native else torch.float32
+
+
+def cpu_multiplies_bfloat16() -> bool:
+    """Return whether the CPU has instructions that multiply bfloat16 (AVX-512 BF16, AMX). Others
+    convert each number, which takes more time than float32.
+    """
+    has = getattr(torch.cpu, "get_capabilities", dict)()  # older torch doesn't report any
+    return any(has.get(name, False) for name in ("avx512_bf16", "amx_bf16"))
+
+
 class TextToImageDistillation(ScoreDistillation):
     """Score distillation from a network that is conditioned on text embeddings. Subclasses define
     how images are encoded.
@@ -95,7 +119,7 @@ class TextToImageDistillation(ScoreDistillation):
 
     @dataclass
     class Config(ScoreDistillation.Config):
-        pretrained_model_name_or_path: str = ""
+        pretrained_model_name_or_path: str = STABLE_DIFFUSION
         revision: Optional[str] = None
         view_dependent_prompting: bool = True
         view_contrast: float = field(default=0.0, metadata=in_range(0, 100))
@@ -107,11 +131,13 @@ class TextToImageDistillation(ScoreDistillation):
         enable_torch_compile: bool = False
         enable_attention_slicing: bool = False
         enable_sequential_cpu_offload: bool = False
-        enable_memory_efficient_attention: bool = False
+        enable_vae_slicing: bool = False
 
-        REMOVED: ClassVar[dict[str, Any]] = {
+        REMOVED = {
             **ScoreDistillation.Config.REMOVED,
             "view_contrast_from": (CONTRAST_FROM, f"it is {CONTRAST_FROM}"),
+            "enable_memory_efficient_attention": (lambda on: True, "torch's attention is so"),
+            "enable_vae_tiling": (False, "images are encoded as a whole"),
         }
 
         @staticmethod
@@ -125,13 +151,13 @@ class TextToImageDistillation(ScoreDistillation):
 
     cfg: Config
     components: ClassVar[tuple[str, ...]] = ("unet", "scheduler")
-    family: ClassVar[Family] = STABLE_DIFFUSION
+    family: ClassVar[Family] = FAMILY
     """The models that this guidance takes."""
     scale_width: Optional[int] = None
     """Width of the guidance scale's embedding; None if the network doesn't take the scale."""
     # guidance_interval also limits view contrast and Perp-Neg, which need no scale
     UNGUIDED_IGNORES = ("recon_std_rescale",)
-    PARTICLES_IGNORE = ("momentum",)
+    PARTICLES_IGNORE = ()
 
     # Loading
     # ----------------------------------------------------------------------------------------------
@@ -151,7 +177,7 @@ class TextToImageDistillation(ScoreDistillation):
     def configure(self) -> None:
         super().configure()
         self.dtype = weights_type(self.cfg, self.device)
-        folder = self._find(self.cfg, half=self.half)
+        folder = self._find(self.cfg, half=self.dtype != torch.float32)
         info(
             f"loading {self.cfg.pretrained_model_name_or_path} in "
             f"{str(self.dtype).removeprefix('torch.')}"
@@ -165,11 +191,6 @@ class TextToImageDistillation(ScoreDistillation):
                 f"{high} (1: none) for {self.cfg.pretrained_model_name_or_path}"
                 + ("" if self.scale_width is None else ", which takes the scale as an input")
             )
-
-    @property
-    def half(self) -> bool:
-        """Whether the networks are in half precision."""
-        return self.dtype != torch.float32
 
     def set_schedule(self, folder: Path) -> None:
         """Read the noise schedule of the model's training, float64, and the prediction type of its
@@ -205,8 +226,6 @@ class TextToImageDistillation(ScoreDistillation):
     def load(self, folder: Path) -> None:
         """Load the networks; subclasses extend this with their own."""
         self.load_denoiser(folder)
-        if self.cfg.enable_memory_efficient_attention:
-            debug("enable_memory_efficient_attention: torch's attention needs little memory")
 
     def load_denoiser(self, folder: Path) -> None:
         """Load the network that predicts the noise, and set ``text_width`` and ``scale_width``."""
@@ -219,9 +238,6 @@ class TextToImageDistillation(ScoreDistillation):
     def size_of_images(self, factor: int = 1) -> int:
         """Return height and width of the images for the model, pixels: ``image_size``, or
         ``factor`` times the latent size that the model was trained with. Warn if they differ.
-
-        Raises:
-            UserError: neither is known.
         """
         cfg, trained = self.cfg, self.denoiser.config.sample_size
         size = trained * factor if isinstance(trained, int) else None
@@ -240,12 +256,12 @@ class TextToImageDistillation(ScoreDistillation):
     def require_text_to_image(
         self, channels: int, embedding_types: tuple[Optional[str], ...] = (None, "text")
     ) -> None:
-        """Raise UserError unless the inputs of the UNet are an image of ``channels`` channels and
-        embeddings of these types only.
+        """Raise UserError unless the inputs of the network are an image of ``channels`` channels
+        and embeddings of these types only.
         """
         wanted = {"in_channels": (channels,), "class_embed_type": (None,)}
         wanted["addition_embed_type"] = embedding_types
-        given = {name: self.unet.config[name] for name in wanted}
+        given = {name: self.denoiser.config.get(name) for name in wanted}
         if other := [f"{name} {given[name]}" for name in wanted if given[name] not in wanted[name]]:
             raise UserError(
                 f"{self.cfg.pretrained_model_name_or_path} needs other inputs than text "
@@ -264,7 +280,7 @@ class TextToImageDistillation(ScoreDistillation):
         read: Callable[..., nn.Module] = load_network,
         key: tuple[Hashable, ...] = (),
     ) -> nn.Module:
-        """Load one frozen network of the model, unless this process has kept it (``loaded.py``).
+        """Load one frozen network of the model, or return a kept one (:func:`.loaded`).
 
         Args:
             prepare: moves it to its device and applies options of this part.
@@ -275,7 +291,8 @@ class TextToImageDistillation(ScoreDistillation):
         dtype = dtype or self.dtype
 
         def load() -> nn.Module:
-            network = read(network_class, folder, component, half=self.half, torch_dtype=dtype)
+            half = self.dtype != torch.float32
+            network = read(network_class, folder, component, half=half, torch_dtype=dtype)
             network.requires_grad_(False)
             is_cpu_half = (self.device.type, dtype) == ("cpu", torch.bfloat16)
             if self.cfg.enable_channels_last_format and not is_cpu_half:  # slower there
@@ -291,7 +308,11 @@ class TextToImageDistillation(ScoreDistillation):
         if self.cfg.enable_attention_slicing and hasattr(network, "set_attention_slice"):
             network.set_attention_slice(1)
         if self.cfg.enable_sequential_cpu_offload:
-            keep_on_cpu(network, self.device)
+            require_extra("diffusion", "accelerate")
+            from accelerate import cpu_offload
+
+            # the weights of each layer are copied to the device while it computes
+            cpu_offload(network, execution_device=self.device)
         else:
             network.to(self.device)
         return torch.compile(network) if self.cfg.enable_torch_compile else network
@@ -306,11 +327,6 @@ class TextToImageDistillation(ScoreDistillation):
             prompt_utils: a :class:`.view_prompts.PromptEmbeddings`, or threestudio's
                 ``PromptProcessorOutput``.
         """
-        if not hasattr(prompt_utils, "get_text_embeddings"):
-            raise UserError(
-                "this guidance needs text embeddings: set system.prompt_processor_type to the "
-                "processor of its model"
-            )
         elevation, azimuth = batch["elevation"], batch["azimuth"]
         more = (batch["camera_distances"], self.cfg.view_dependent_prompting)
         views, other = (elevation, azimuth, *more), None
@@ -353,7 +369,8 @@ class TextToImageDistillation(ScoreDistillation):
 
     @classmethod
     def check_particle_model(cls, cfg: Any) -> None:
-        if found := [name for name in NOT_ADAPTABLE if getattr(cfg, name)]:
+        super().check_particle_model(cfg)
+        if found := [name for name in NOT_ADAPTABLE if cfg[name]]:
             raise UserError(
                 f"system.guidance.{found[0]}: vsd-variant trains a LoRA in the UNet, which needs "
                 f"the plain UNet: set {found[0]}=false"
@@ -384,12 +401,7 @@ class TextToImageDistillation(ScoreDistillation):
         return perp_neg(cond, uncond, eps[2 * batch :].unflatten(0, (batch, 2)), perp), uncond
 
     def _contrasted(
-        self,
-        eps: Latents,
-        z: Latents,
-        t: Timesteps,
-        condition: Condition,
-        scale: float = 1.0,
+        self, eps: Latents, z: Latents, t: Timesteps, condition: Condition, scale: float = 1.0
     ) -> Latents:
         """Return the conditional predictions ``eps`` with view contrast, if the condition has it.
 
@@ -405,11 +417,7 @@ class TextToImageDistillation(ScoreDistillation):
         return eps.index_add(0, rows, eps[rows] - other, alpha=self.cfg.view_contrast)
 
     def noise(
-        self,
-        z: Latents,
-        t: Timesteps,
-        embeddings: Float[Tensor, "kB N F"],
-        scale: float = 1.0,
+        self, z: Latents, t: Timesteps, embeddings: Embeddings, scale: float = 1.0
     ) -> Float[Tensor, "kB c h w"]:
         """Predict the noise, float32, for each row of ``embeddings`` and the latent of its view, in
         one forward pass of the network.

@@ -6,6 +6,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from ..core.errors import UserError
+
 Batch = dict[str, Any]
 Latents = Float[Tensor, "B c h w"]
 """Clean or noisy ones, noise, predictions of it, or gradients."""
@@ -75,3 +77,12 @@ def items_of(batch: Batch, size: int, index: Any) -> Batch:
         k: v[index] if isinstance(v, Tensor) and v.dim() and len(v) == size else v
         for k, v in batch.items()
     }
+
+
+def require_resumable(state: State, names: set[str]) -> None:
+    """Raise UserError if the state in a checkpoint isn't empty and hasn't these tensors."""
+    if state and set(state) != names:
+        raise UserError(
+            f"the checkpoint's guidance had learnt {len(state)} tensors that aren't those of this "
+            "one: resume with the configuration that the run was started with"
+        )

@@ -22,7 +22,6 @@ MODULES = (
     "guidance.deep_floyd",
     "guidance.mvdream",
     "guidance.stable_diffusion_3",
-    "guidance.stable_diffusion_xl",
     "prompts.prompts",
     "prompts.prompt_processors",
     "exporters.files",

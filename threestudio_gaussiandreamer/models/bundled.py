@@ -9,7 +9,6 @@ damage before anything is loaded.
 import functools
 import hashlib
 import os
-import re
 from pathlib import Path
 
 from ..core.errors import UserError
@@ -21,8 +20,6 @@ RECORD, DIGESTS = "training.json", "SHA256SUMS"
 """The export's record of its training, which marks such a folder, and the digests of its other
 files in the format of ``sha256sum``.
 """
-LINE = re.compile(rb"([0-9a-f]{64})  (.+)")
-"""A line of the list of digests."""
 DIFFUSION, CLIP = "stable-diffusion", "clip"
 POINTS, JUDGE = "points.safetensors", "judge.safetensors"
 REINSTALL = (
@@ -44,8 +41,7 @@ def model_part(name: str, part: str) -> str:
         part: DIFFUSION, CLIP, POINTS or JUDGE.
 
     Raises:
-        UserError: a file is missing or damaged; the message says how to install it or to write it
-            again.
+        UserError: a file is missing or damaged; the message says how to get it again.
     """
     if name == NAME:
         require_intact(FOLDER, part)
@@ -71,36 +67,22 @@ def require_intact(folder: Path, part: str) -> None:
     """Compare the files of a part with their digests, once per process.
 
     Raises:
-        UserError: one is missing or differs; or the list of digests, or a bundled part in it.
+        UserError: one is missing or differs; or a bundled part isn't in the list of digests.
     """
-    digests, remedy = read_digests(folder), _remedy(folder)
-    files = [name for name in digests if name.partition("/")[0] == part]
-    for name in files:
-        path = folder / name
-        try:
-            found = digest_of(path)
-        except OSError as error:
-            reason = error.strerror or error
-            raise UserError(f"the file {str(path)!r}: {reason}; {remedy}") from error
-        if found != digests[name]:
-            raise UserError(f"the file {str(path)!r} is damaged: {remedy}")
-    if folder == FOLDER and not files:
-        missing = part if digests else DIGESTS
-        raise UserError(f"{str(folder / missing)!r} is missing: {remedy}")
+    digests = read_digests(folder)
+    names = [name for name in digests if name.partition("/")[0] == part]
+    remedy = REINSTALL if folder == FOLDER else EXPORT_AGAIN
+    for path in (folder / name for name in names or [part] * (folder == FOLDER)):
+        if not path.is_file() or digest_of(path) != digests[path.relative_to(folder).as_posix()]:
+            raise UserError(f"the file {str(path)!r} is missing or damaged: {remedy}")
 
 
 def read_digests(folder: Path) -> dict[str, str]:
-    """Return the SHA-256 of each file by its path below ``folder``; empty without a list.
-
-    Raises:
-        UserError: the list is damaged.
-    """
+    """Return the SHA-256 of each file by its path below ``folder``; empty without a list."""
     path = folder / DIGESTS
     lines = path.read_bytes().splitlines() if path.is_file() else []
-    found = [LINE.fullmatch(line) for line in lines]
-    if not all(found):
-        raise UserError(f"{str(path)!r} is damaged: {_remedy(folder)}")
-    return {os.fsdecode(line[2]): line[1].decode() for line in found}
+    found = (os.fsdecode(line).partition("  ") for line in lines)
+    return {name: digest for digest, _, name in found}
 
 
 def write_digests(folder: Path) -> None:
@@ -114,7 +96,3 @@ def write_digests(folder: Path) -> None:
 def digest_of(path: Path) -> str:
     """Return the SHA-256 of a file's content."""
     return hashlib.sha256(path.read_bytes()).hexdigest()
-
-
-def _remedy(folder: Path) -> str:
-    return REINSTALL if folder == FOLDER else EXPORT_AGAIN

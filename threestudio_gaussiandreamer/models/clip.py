@@ -17,13 +17,7 @@ from torch import Tensor
 from ..core.extras import require_extra
 from .bundled import CLIP, model_part
 from .hub import Source, locate
-from .model_files import (
-    component_files,
-    free_memory,
-    load_network,
-    load_settings,
-    require_vocabulary,
-)
+from .model_files import free_memory, load_network, load_settings, needed_files
 
 MEAN, STD = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
 """Mean and standard deviation of CLIP's training pictures per channel, used by all of OpenAI's and
@@ -43,18 +37,14 @@ def clip_source(
     """
 
     def picks(names: Collection[str]) -> list[str]:
-        needed = component_files(names, "", allow_bin=allow_bin)
-        require_vocabulary(names, "")
-        return needed
+        return needed_files(names, [""], allow_bin=allow_bin)
 
     return Source(model_part(model, CLIP), picks, option)
 
 
-def load_text_encoder(
-    folder: Path, component: str = "", *, allow_bin: Optional[bool] = None
-) -> Any:
-    """Load transformers' ``CLIPTextModelWithProjection`` in float32 and evaluation mode. The files
-    may also be those of a CLIP with both encoders.
+def load_text_encoder(folder: Path, component: str = "", *, allow_bin=None) -> Any:
+    """Load transformers' ``CLIPTextModelWithProjection``, float32, also from the files of a CLIP
+    with both encoders.
     """
     from transformers import CLIPTextModelWithProjection
 

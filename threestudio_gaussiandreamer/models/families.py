@@ -48,21 +48,21 @@ SAME_FILES = (STABLE_DIFFUSION, MULTI_VIEW)
 """Families whose models have files of the same names."""
 
 
-def require_family(family: Family, folder: Path) -> None:
+def require_family(family: Optional[Family], folder: Path) -> None:
     """Raise UserError if ``folder`` holds a model of another family, or of one that no guidance
     takes. Folders without the settings of a network pass, since their missing files are reported
-    elsewhere.
+    elsewhere; None accepts any.
     """
     settings = _network_settings(folder)
-    found = family_of(settings) if settings else family
-    if found is None:
-        known = ", ".join(each.title for each in FAMILIES)
-        raise UserError(
-            f"the model in {str(folder)!r} has a {settings.get('_class_name')}, which no guidance "
-            f"takes; those that are taken: {known}"
-        )
+    if family is None or not settings:
+        return
+    found = family_of(settings)
     if found != family:
-        raise UserError(f"the model in {str(folder)!r} isn't {family.title}, but {found}")
+        known = ", ".join(each.title for each in FAMILIES)
+        other = f"a {settings.get('_class_name')}, which no guidance takes; those that are taken: "
+        raise UserError(
+            f"the model in {str(folder)!r} isn't {family.title}, but {found or other + known}"
+        )
 
 
 def family_of(settings: dict[str, Any]) -> Optional[Family]:
@@ -79,9 +79,11 @@ def family_of(settings: dict[str, Any]) -> Optional[Family]:
     return STABLE_DIFFUSION_3 if name == "SD3Transformer2DModel" else None
 
 
-def require_names(family: Family, names: Collection[str]) -> None:
+def require_names(family: Optional[Family], names: Collection[str]) -> None:
     """Raise UserError if the file names of a model show that it is of another family."""
     components, found = {name.split("/")[0] for name in names if "/" in name}, family
+    if family is None:
+        return
     if "transformer" in components:
         found = STABLE_DIFFUSION_3 if "text_encoder_3" in components else family
     elif "unet" in components and "text_encoder_2" in components:

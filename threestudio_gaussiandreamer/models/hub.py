@@ -80,19 +80,16 @@ def find_model(
         UserError: see :func:`locate`; or the model is of another family.
     """
     name = model_part(name, DIFFUSION)
-    if family is not None:
-        require_family(family, Path(name).expanduser())
-    # '*/*' skips files outside of the components' folders: some models have a copy of all weights
-    # there, in a single file
-    download_options = "--include '*/*' --exclude '*.bin'"
+    require_family(family, Path(name).expanduser())
 
     def picks(names: Collection[str]) -> list[str]:
-        if family is not None:
-            require_names(family, names)
+        require_names(family, names)
         return needed_files(names, components, half=half)
 
-    folder = locate(Source(name, picks, OPTION, revision, download_options), download=download)
-    if family is not None and folder is not None:
+    # '*/*' skips files outside of the components' folders: some models have a copy of all weights
+    # there, in a single file
+    source = Source(name, picks, OPTION, revision, "--include '*/*' --exclude '*.bin'")
+    if folder := locate(source, download=download):
         require_family(family, folder)
     return folder
 
@@ -115,26 +112,29 @@ def locate(source: Source, *, download: bool = True) -> Optional[Path]:
             "the form owner/model."
         )
     require_extra("diffusion", "huggingface_hub")
-    if cached := cached_snapshot(source):
-        with contextlib.suppress(UserError):  # files are missing, which can be downloaded
-            source.picks(files_below(cached))
-            return cached
-    sizes = _files_on_hub(source)
-    if not download:
-        return None
-    info(f"downloading {source.name}: up to {sum(sizes.values()) / 1e9:.1f} GB, once")
-    try:  # exactly these files, except those that the cache already has
-        found = _snapshot(source, list(sizes), endpoint=os.environ.get("HF_ENDPOINT") or None)
-    except Exception as error:  # from huggingface_hub, its HTTP library, sockets or the file system
-        raise UserError(explain(source, error)) from error
-    return _checked(found, source)
-
-
-def _snapshot(source: Source, patterns: list[str], **options: Any) -> Path:
     from huggingface_hub import snapshot_download
 
-    options |= {"revision": source.revision, "allow_patterns": patterns}
-    return Path(snapshot_download(source.name, **options))
+    options = {"revision": source.revision, "endpoint": os.environ.get("HF_ENDPOINT") or None}
+    # ValueError: files are missing, which can be downloaded; OSError: no version is in the cache.
+    # The pattern matches no file, so that only ``picks`` checks for completeness.
+    with contextlib.suppress(ValueError, OSError):
+        cached = snapshot_download(
+            source.name, allow_patterns=["-"], local_files_only=True, **options
+        )
+        source.picks(files_below(Path(cached)))
+        return Path(cached)
+    try:
+        sizes = _files_on_hub(source)
+        if not download:
+            return None
+        info(f"downloading {source.name}: up to {sum(sizes.values()) / 1e9:.1f} GB, once")
+        # exactly these files, except those that the cache already has
+        found = snapshot_download(source.name, allow_patterns=list(sizes), **options)
+    except UserError:
+        raise
+    except Exception as error:  # from huggingface_hub, its HTTP library, sockets or the file system
+        raise UserError(explain(source, error)) from error
+    return _checked(Path(found), source)
 
 
 def _checked(folder: Path, source: Source) -> Path:
@@ -154,27 +154,9 @@ def _checked(folder: Path, source: Source) -> Path:
 
 def _near_folders(folder: Path) -> str:
     parent = folder.parent
-    entries = parent.iterdir() if is_folder(parent) else ()
-    names = [entry.name for entry in entries if is_folder(entry)]
+    names = [e.name for e in parent.iterdir() if is_folder(e)] if is_folder(parent) else []
     near = get_close_matches(folder.name, names, n=3, cutoff=0.5)
     return f" (near: {', '.join(str(parent / name) for name in near)})" if near else ""
-
-
-def cached_snapshot(source: Source) -> Optional[Path]:
-    """Return the cache folder of a model's newest downloaded version, complete or not; None if
-    there is none. Makes no network request.
-    """
-    from huggingface_hub.errors import HFValidationError
-
-    # The pattern matches no file, so that snapshot_download doesn't check for completeness;
-    # ``locate`` does, for the needed files only.
-    try:
-        return _snapshot(source, ["-"], local_files_only=True)
-    except HFValidationError as error:
-        message = f"{source}: there is no such folder, and it is no hub id: {error}"
-        raise UserError(message) from error
-    except OSError:
-        return None
 
 
 def _files_on_hub(source: Source) -> dict[str, int]:
@@ -188,11 +170,8 @@ def _files_on_hub(source: Source) -> dict[str, int]:
             f"set.{_how_to_get(source)}"
         )
     options = {"revision": source.revision, "timeout": TIMEOUT, "files_metadata": True}
-    try:
-        api = HfApi(endpoint=os.environ.get("HF_ENDPOINT") or None)
-        model = _with_timeout(lambda: api.model_info(source.name, **options))
-    except Exception as error:  # from huggingface_hub, its HTTP library or sockets
-        raise UserError(explain(source, error)) from error
+    api = HfApi(endpoint=os.environ.get("HF_ENDPOINT") or None)
+    model = _with_timeout(lambda: api.model_info(source.name, **options))
     sizes = {file.rfilename: file.size or 0 for file in model.siblings or ()}
     try:
         return {name: sizes[name] for name in source.picks(list(sizes))}
@@ -201,12 +180,8 @@ def _files_on_hub(source: Source) -> dict[str, int]:
 
 
 def _with_timeout(ask: Callable[[], Any]) -> Any:
-    """Call ``ask()`` in a daemon thread and return its result, or raise after ``TIMEOUT``.
-
-    The library's own timeout doesn't cover the DNS lookup, which can take a minute.
-
-    Raises:
-        TimeoutError: ``ask`` hasn't returned in time; its thread continues.
+    """Call ``ask()`` in a daemon thread and return its result, or raise TimeoutError after
+    ``TIMEOUT``: the library's own timeout doesn't cover the DNS lookup, which can take a minute.
     """
     answers: Future = Future()
 
@@ -253,14 +228,14 @@ def _how_to_get(source: Source) -> str:
     if is_folder(folder.parent):
         return f" The folder {str(folder.parent)!r} has no {folder.name!r}{_near_folders(folder)}."
     name = MOVED.get(source.name, source.name)
-    removed = f" Its publisher removed it from the hub; {name!r} is a copy."
-    moved = removed if source.name in MOVED else ""
+    moved = f" Its publisher removed it from the hub; {name!r} is a copy."
     revision = f"--revision {source.revision}" if source.revision else ""
     local = f"--local-dir models/{name.split('/')[-1]}"
     words = ["hf download", name, revision, source.download_options, local]
     command = " ".join(filter(None, words))
     return (
-        f"{moved} With a network connection: `{command}`; then set {source.option} to that folder."
+        f"{moved if source.name in MOVED else ''} With a network connection: `{command}`; then set "
+        f"{source.option} to that folder."
         " Where the hub is out of reach, HF_ENDPOINT names a mirror of it, and ModelScope has many "
         "of its models (docs/models.md). To run without any weights: --config demo.yaml."
     )

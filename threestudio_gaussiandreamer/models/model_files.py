@@ -1,4 +1,5 @@
-"""Select the needed files of a model in diffusers' or transformers' format, and load them.
+"""Select the needed files of a model in diffusers' or transformers' format, load them, and keep
+networks for processes with several runs.
 
 A model of several components has a sub-folder for each (``unet``, ``vae``, ``text_encoder``, ...).
 The files of a single network lie in the model's folder itself; its component is named "". Weights
@@ -9,7 +10,8 @@ import gc
 import hashlib
 import json
 import re
-from collections.abc import Collection, Iterable, Iterator
+from collections import Counter
+from collections.abc import Callable, Collection, Hashable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple, Optional
@@ -54,49 +56,34 @@ def needed_files(
     names: Collection[str], components: Iterable[str], *, half=False, allow_bin=None
 ) -> list[str]:
     """Return the files that are read to load these components; see :func:`component_weights`.
+    The component "" is a network with its tokenizer.
 
     Raises:
         UserError: files are missing; the message lists them for each component.
     """
     needed, problems = ["model_index.json"] if "model_index.json" in names else [], []
     for component in components:
-        try:
-            needed += component_files(names, component, half=half, allow_bin=allow_bin)
-        except UserError as error:
-            problems.append(str(error))
+        prefix, own = _own(names, component)
+        settings = WITHOUT_WEIGHTS.get(component, "config.json")
+        if settings not in own:
+            problems.append(f"{prefix}{settings} is missing")
+            continue
+        has_tokenizer = component in WITHOUT_WEIGHTS.keys() - {"scheduler"} or not component
+        if has_tokenizer and not any(vocabulary <= set(own) for vocabulary in VOCABULARIES):
+            problems.append(
+                f"the tokenizer's {prefix}tokenizer.json, or {prefix}vocab.json and "
+                f"{prefix}merges.txt, are missing"
+            )
+        needed += [prefix + name for name in own if name.endswith((".json", ".txt", ".model"))]
+        if component not in WITHOUT_WEIGHTS:
+            try:
+                found = component_weights(names, component, half=half, allow_bin=allow_bin)
+                needed += found.files
+            except UserError as error:
+                problems.append(str(error))
     if problems:
         raise UserError("; ".join(problems))
     return needed
-
-
-def component_files(
-    names: Collection[str], component: str, *, half: bool = False, allow_bin: Optional[bool] = None
-) -> list[str]:
-    """Return the files that are read to load one component.
-
-    Raises:
-        UserError: files are missing.
-    """
-    prefix, own = _own(names, component)
-    small = [prefix + name for name in own if name.endswith((".json", ".txt", ".model"))]
-    needed = WITHOUT_WEIGHTS.get(component, "config.json")
-    if needed not in own:
-        raise UserError(f"{prefix}{needed} is missing")
-    if component.startswith("tokenizer"):
-        require_vocabulary(names, component)
-    if component in WITHOUT_WEIGHTS:
-        return small
-    return small + component_weights(names, component, half=half, allow_bin=allow_bin).files
-
-
-def require_vocabulary(names: Collection[str], component: str) -> None:
-    """Raise UserError unless ``names`` has the files of a tokenizer's vocabulary."""
-    prefix, own = _own(names, component)
-    if not any(vocabulary <= set(own) for vocabulary in VOCABULARIES):
-        raise UserError(
-            f"the tokenizer's {prefix}tokenizer.json, or {prefix}vocab.json and "
-            f"{prefix}merges.txt, are missing"
-        )
 
 
 def component_weights(
@@ -121,7 +108,16 @@ def component_weights(
     pickled = [prefix + name for name in own if name in PICKLED]
     if allow_bin and pickled:
         return Weights(pickled[:1], None, False)
-    raise UserError(_missing_weights(prefix, own, allow_bin))
+    problem = f"{prefix}*.safetensors, the weights, are missing"
+    if any(name.endswith(".safetensors") for name in own):
+        problem = f"some of {prefix}*.safetensors are missing"
+    elif any(name.endswith((".bin", ".pt", ".pth", ".ckpt")) for name in own):
+        hint = ", or set allow_bin: true, which reads a .bin with PyTorch's weights_only loader"
+        problem = (
+            f"{prefix} has pickled weights only, which could run code: save it again with "
+            f"safe_serialization=True{'' if allow_bin is None else hint}"
+        )
+    raise UserError(problem)
 
 
 def _own(names: Collection[str], component: str) -> tuple[str, list[str]]:
@@ -142,19 +138,6 @@ def _complete_set(own: list[str], variant: Optional[str]) -> list[str]:
         return single[:1]
     whole = len(found) == int(found[0]["shards"])
     return sorted(match.string for match in found) if whole else []
-
-
-def _missing_weights(prefix: str, own: list[str], allow_bin: Optional[bool]) -> str:
-    """Describe what is missing, given that no set of weight files can be used."""
-    if any(name.endswith(".safetensors") for name in own):
-        return f"some of {prefix}*.safetensors are missing"
-    if any(name.endswith((".bin", ".pt", ".pth", ".ckpt")) for name in own):
-        hint = ", or set allow_bin: true, which reads a .bin with PyTorch's weights_only loader"
-        return (
-            f"{prefix} has pickled weights only, which could run code: save it again with "
-            f"safe_serialization=True{'' if allow_bin is None else hint}"
-        )
-    return f"{prefix}*.safetensors, the weights, are missing"
 
 
 def pipeline_settings(folder: Path) -> dict[str, Any]:
@@ -241,6 +224,48 @@ def loading_errors(name: str) -> Iterator[None]:
             f"{name} can't be loaded: {type(error).__name__}: {str(error).strip()[:500]}. "
             "If a file is damaged, delete it and download it again."
         ) from error
+
+
+# Networks that a process keeps
+# --------------------------------------------------------------------------------------------------
+
+
+_kept: dict[Hashable, Any] = {}
+_counts: Counter = Counter()
+_keeps = False
+
+
+def keep_loaded(keep: bool = True) -> None:
+    """Keep networks from now on, for processes with several runs; with ``keep=False`` drop those
+    that were kept. Otherwise each run loads its networks and drops them at its end.
+    """
+    global _keeps
+    _keeps = keep
+    _counts.clear()
+    if not keep:
+        _kept.clear()
+
+
+def loaded(key: tuple[Hashable, ...], load: Callable[[], Any]) -> Any:
+    """Return ``load()``, or what it returned for the same key earlier. Changes of a network (its
+    device, compilation) must happen inside ``load``.
+
+    Args:
+        key: the network's name for :func:`load_counts`, then all that ``load`` depends on: folder,
+            component, number type, device and options.
+    """
+    if key in _kept:
+        return _kept[key]
+    network = load()
+    _counts[str(key[0])] += 1
+    if _keeps:
+        _kept[key] = network
+    return network
+
+
+def load_counts() -> dict[str, int]:
+    """Return how often each network was loaded since :func:`keep_loaded`, by name."""
+    return dict(_counts)
 
 
 def free_memory() -> None:

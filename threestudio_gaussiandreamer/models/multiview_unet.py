@@ -44,6 +44,10 @@ def load_multiview_unet(
     weights = component_weights(files_below(folder), component, half=half)
     with loading_errors(f"{component} of the model in {str(folder)!r}"):
         settings = json.loads((folder / component / "config.json").read_text(encoding="utf-8"))
+        if settings.get("camera_dim") != CAMERA:
+            raise UserError(
+                f"the model's camera_dim is {settings.get('camera_dim')}; {CAMERA} is expected"
+            )
         options = unet_options(settings)
         with torch.device("meta"):
             unet = unet_class(**options)
@@ -58,15 +62,7 @@ def load_multiview_unet(
 
 
 def unet_options(settings: dict[str, Any]) -> dict[str, Any]:
-    """Convert the settings of a ``MultiViewUNetModel`` to those of diffusers' UNet.
-
-    Raises:
-        UserError: its cameras aren't matrices of 16 numbers.
-    """
-    if settings.get("camera_dim") != CAMERA:
-        raise UserError(
-            f"the model's camera_dim is {settings.get('camera_dim')}; {CAMERA} is expected"
-        )
+    """Convert the settings of a ``MultiViewUNetModel`` to those of diffusers' UNet."""
     channels = [settings["model_channels"] * factor for factor in settings["channel_mult"]]
     attends = [2**level in settings["attention_resolutions"] for level in range(len(channels))]
     kinds, width = [a * "CrossAttn" for a in attends], settings.get("num_head_channels", -1)
@@ -88,16 +84,10 @@ def unet_options(settings: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def attend_across_views(unet: nn.Module, views: int) -> nn.Module:
-    """Let every self-attention of a UNet see the tokens of ``views`` consecutive rows together."""
-    _join_attention(unet, views)
-    return unet
-
-
 @contextlib.contextmanager
 def views_attended_together(unet: nn.Module, views: int) -> Iterator[None]:
     """Do as :func:`attend_across_views` within a ``with`` block; nothing for one view."""
-    hooks = _join_attention(unet, views) if views > 1 else []
+    hooks = attend_across_views(unet, views) if views > 1 else []
     try:
         yield
     finally:
@@ -105,9 +95,9 @@ def views_attended_together(unet: nn.Module, views: int) -> Iterator[None]:
             hook.remove()
 
 
-def _join_attention(unet: nn.Module, views: int) -> list[RemovableHandle]:
-    """Register hooks that join the tokens (R, L, F) of each ``views`` consecutive rows to
-    (R / views, views L, F) before a self-attention, and part them after it.
+def attend_across_views(unet: nn.Module, views: int) -> list[RemovableHandle]:
+    """Let every self-attention of a UNet see the tokens of ``views`` consecutive rows together:
+    hooks join those (R, L, F) to (R / views, views L, F) before it, and part them after it.
     """
 
     def join(module: nn.Module, args: tuple[Any, ...]) -> tuple[Any, ...]:

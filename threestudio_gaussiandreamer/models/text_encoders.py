@@ -1,6 +1,6 @@
 """Encode texts with a model's text encoders: CLIP for Stable Diffusion, T5 for DeepFloyd IF, two or
 three encoders for Stable Diffusion XL and 3. An encoder is loaded for one call and freed; CLIP's,
-which are small, are kept where ``loaded.py`` keeps networks.
+which are small, are kept where ``model_files.py`` keeps networks.
 
 As in diffusers' pipelines, texts are padded to the model's length, and longer ones truncated with a
 warning; CLIP's tokens for Stable Diffusion XL and 3 are the states before its last layer. The
@@ -10,22 +10,25 @@ Stable Diffusion XL and 3 are conditioned on tokens and on one vector for the wh
 embedding. Both are kept in one tensor, the vector as a last token that is padded with zeros
 (:func:`pack`), so that caching, view-dependent prompts and Perp-Neg treat them alike."""
 
+import hashlib
 import json
+import os
 import textwrap
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Optional
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
+from ..core.errors import UserError
 from ..core.extras import require_extra
-from ..host import get_device, warn
-from .loaded import loaded
-from .model_files import free_memory, load_network, load_settings
+from ..core.files import atomic_file, output_folder
+from ..host import debug, get_device, warn
+from .model_files import free_memory, load_network, load_settings, loaded
 
 LENGTH = 77
 """Number of tokens that CLIP, and DeepFloyd IF with T5, were trained with."""
@@ -34,6 +37,10 @@ SHOWN = 300
 T5_LENGTH = 256
 """Number of tokens that Stable Diffusion 3's pipeline takes from T5."""
 T5_WIDTH = 4096
+CACHE_FORMAT = 1
+"""Version of the cache's content, part of the key: increase it when an encoder's output for the
+same model and text changes.
+"""
 
 
 def encode_clip(folder: Path, texts: list[str]) -> list[Float[Tensor, "N F"]]:
@@ -81,29 +88,25 @@ def encode_sdxl(folder: Path, texts: list[str]) -> list[Float[Tensor, "N F"]]:
     return list(pack(torch.cat([first, second], dim=-1), pooled))
 
 
-def encode_sd3(folder: Path, texts: list[str]) -> list[Float[Tensor, "N F"]]:
+def encode_sd3(
+    folder: Path, texts: list[str], *, use_t5: bool = True
+) -> list[Float[Tensor, "N F"]]:
     """Return the embeddings of Stable Diffusion 3, one (334, 4096) per text: the tokens of both
     CLIP encoders side by side, padded to T5's width, then T5's; and their pooled embeddings.
+
+    Args:
+        use_t5: if false, zeros take the place of T5's tokens, as in diffusers' pipeline without its
+            third encoder.
     """
-    states = t5_states(folder, texts, suffix="_3", length=T5_LENGTH, uses_mask=False)
-    return _sd3_embeddings(folder, texts, states)
-
-
-def encode_sd3_without_t5(folder: Path, texts: list[str]) -> list[Float[Tensor, "N F"]]:
-    """Return the embeddings of Stable Diffusion 3 with zeros in place of T5's tokens, as diffusers'
-    pipeline does without its third encoder.
-    """
-    settings, width = folder / "transformer" / "config.json", T5_WIDTH
-    if settings.is_file():
-        width = json.loads(settings.read_text(encoding="utf-8"))["joint_attention_dim"]
-    return _sd3_embeddings(folder, texts, torch.zeros(len(texts), T5_LENGTH, width))
-
-
-def _sd3_embeddings(
-    folder: Path, texts: list[str], states: Float[Tensor, "T L F"]
-) -> list[Float[Tensor, "N F"]]:
     from transformers import CLIPTextModelWithProjection
 
+    if use_t5:
+        states = t5_states(folder, texts, suffix="_3", length=T5_LENGTH, uses_mask=False)
+    else:
+        settings, width = folder / "transformer" / "config.json", T5_WIDTH
+        if settings.is_file():
+            width = json.loads(settings.read_text(encoding="utf-8"))["joint_attention_dim"]
+        states = torch.zeros(len(texts), T5_LENGTH, width)
     parts = [_clip(folder, suffix, texts, CLIPTextModelWithProjection) for suffix in ("", "_2")]
     tokens = torch.cat([tokens for tokens, _ in parts], dim=-1)
     tokens = F.pad(tokens, (0, states.shape[-1] - tokens.shape[-1]))
@@ -222,3 +225,70 @@ def _freed(run: Callable[[torch.device], Any]) -> Any:
         return run(torch.device("cpu"))
     finally:
         free_memory()
+
+
+# Embeddings on the disk
+# --------------------------------------------------------------------------------------------------
+
+
+def require_cache_folder(folder: Path) -> None:
+    """Raise UserError unless embeddings can be written into ``folder``, which isn't made."""
+    existing = next(path for path in (folder, *folder.absolute().parents) if os.path.lexists(path))
+    if not (existing.is_dir() and os.access(existing, os.W_OK | os.X_OK)):
+        what = "is read-only" if existing.is_dir() else "is no folder"
+        raise UserError(
+            f"the folder of text embeddings {str(folder)!r} can't be written ({str(existing)!r} "
+            f"{what}): set system.prompt_processor.cache_dir to another one, or use_cache=false"
+        )
+
+
+class EmbeddingCache:
+    """The embeddings of one model's text encoder in ``folder``, a safetensors file per text.
+
+    Args:
+        folder: contains the files; created on the first write.
+        model: ``model_files.fingerprint`` of the tokenizer and the text encoder.
+    """
+
+    def __init__(self, folder: str, model: str) -> None:
+        self.folder, self.model = Path(folder).expanduser(), model
+
+    def path(self, text: str) -> Path:
+        key = json.dumps([CACHE_FORMAT, self.model, text])
+        return self.folder / f"{hashlib.sha256(key.encode()).hexdigest()}.safetensors"
+
+    def read(self, text: str) -> Optional[Float[Tensor, "N F"]]:
+        """Return the embedding of ``text``; None if it isn't cached or its file is damaged."""
+        from safetensors import SafetensorError
+        from safetensors.torch import load
+
+        path = self.path(text)
+        try:
+            return load(path.read_bytes())["embedding"]
+        except FileNotFoundError:
+            return None
+        except (OSError, SafetensorError, KeyError, ValueError) as error:
+            debug(f"the cached text embedding {path} can't be read and is made again: {error}")
+            return None
+
+    def write(self, text: str, embedding: Float[Tensor, "N F"]) -> None:
+        """Store one embedding atomically; raise UserError if the folder can't be written."""
+        from safetensors.torch import save
+
+        output_folder(self.folder, "system.prompt_processor.cache_dir")
+        content = {"embedding": embedding.float().cpu().contiguous()}
+        with atomic_file(self.path(text)) as file:
+            file.write(save(content, metadata={"text": text}))
+
+    def embed(
+        self, texts: list[str], encode: Callable[[list[str]], list[Any]]
+    ) -> list[Float[Tensor, "N F"]]:
+        """Return the embeddings of ``texts``; those that aren't cached are encoded and stored."""
+        found = {text: self.read(text) for text in texts}
+        missing = [text for text, embedding in found.items() if embedding is None]
+        if missing:
+            require_cache_folder(self.folder)  # before the encoder is loaded
+            found |= zip(missing, encode(missing), strict=True)
+        for text in missing:
+            self.write(text, found[text])
+        return [found[text] for text in texts]

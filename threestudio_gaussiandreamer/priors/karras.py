@@ -31,7 +31,7 @@ from ..core.options import one_of, positive
 from ..gaussians.point_cloud import PointCloud
 from ..meshes.load import AXES
 from ..models.clip import load_text_encoder, load_tokenizer, text_condition
-from ..models.loaded import loaded
+from ..models.model_files import loaded
 from .base import SCALE, Prior
 
 Denoiser = Callable[[Tensor, float], Tensor]
@@ -73,7 +73,7 @@ class SampledPrior(Prior):
         """Return the prompt's features.
 
         Args:
-            name: the model's, for :func:`~threestudio_gaussiandreamer.models.loaded.loaded`.
+            name: the model's, for :func:`.model_files.loaded`.
             parts: folders of the text encoder and of the tokenizer below ``folder``.
             how: further arguments of ``load_text_encoder``.
         """

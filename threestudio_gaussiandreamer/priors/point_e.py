@@ -45,8 +45,7 @@ from ..models.bundled import NAME as BUNDLED
 from ..models.bundled import POINTS, model_part
 from ..models.clip import clip_source
 from ..models.hub import locate
-from ..models.loaded import loaded
-from ..models.model_files import free_memory
+from ..models.model_files import free_memory, loaded
 from .base import points
 from .karras import (
     Network,
@@ -312,7 +311,7 @@ UPSAMPLER = Kind(
 
 
 def kept_network(kind: Kind, path: str, device: torch.device) -> Any:
-    """Return the network of :func:`load_network` on ``device``, see ``models/loaded.py``."""
+    """Return the network of :func:`load_network` on ``device``, see ``models/model_files.py``."""
     return loaded((kind.title, path, device), lambda: load_network(kind, path).to(device))
 
 

@@ -52,8 +52,7 @@ from ..gaussians.point_cloud import PointCloud
 from ..host import info, register
 from ..meshes.mesh import linear_to_srgb
 from ..models.hub import Source, locate
-from ..models.loaded import loaded
-from ..models.model_files import free_memory, load_network, load_settings, needed_files
+from ..models.model_files import free_memory, load_network, load_settings, loaded, needed_files
 from .karras import (
     Network,
     SampledPrior,

@@ -41,18 +41,18 @@ from ..core.errors import UserError
 from ..core.extras import require_extra
 from ..core.files import existing_file, is_folder
 from ..host import BaseObject, info, parse_structured, register, register_builtin
-from ..models.embedding_cache import EmbeddingCache, require_cache_folder
 from ..models.families import STABLE_DIFFUSION_3 as SD3_FAMILY
 from ..models.families import STABLE_DIFFUSION_XL as SDXL_FAMILY
 from ..models.families import Family
 from ..models.hub import find_model
 from ..models.model_files import fingerprint, pipeline_settings
 from ..models.text_encoders import (
+    EmbeddingCache,
     encode_clip,
     encode_sd3,
-    encode_sd3_without_t5,
     encode_sdxl,
     encode_t5,
+    require_cache_folder,
 )
 from .known_words import warn_of_unknown_words
 from .prompts import given_prompt
@@ -254,7 +254,7 @@ class StableDiffusion3PromptProcessor(TextEncoderPromptProcessor):
         if self.cfg.use_t5:
             self.components = (*CLIPS, "tokenizer_3", "text_encoder_3")
         else:
-            self.components, self.encode = CLIPS, encode_sd3_without_t5
+            self.components, self.encode = CLIPS, functools.partial(encode_sd3, use_t5=False)
         super().configure()
 
 

@@ -73,10 +73,8 @@ def read_prompt(path: str) -> str:
         with open(file, "rb") as opened:
             content = opened.read(MAX_PROMPT_BYTES + 1)
         text = content.decode("utf-8-sig")
-    except OSError as error:
-        raise UserError(f"cannot read {what}: {error.strerror or error}.") from error
-    except UnicodeDecodeError as error:
-        raise UserError(f"{what} is not UTF-8 text (byte {error.start}).") from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise UserError(f"{what} can't be read as UTF-8 text: {error}") from error
     if len(content) > MAX_PROMPT_BYTES:
         raise UserError(f"{what} has more than {MAX_PROMPT_BYTES} bytes: is it the right file?")
     return text.removesuffix("\n").removesuffix("\r")

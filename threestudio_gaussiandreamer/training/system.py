@@ -44,7 +44,6 @@ from ..guidance.external import (
     call_guidance,
     learnt_weights,
     own_randomness,
-    require_learnt,
     restore_learnt,
     trainable_groups,
 )
@@ -132,7 +131,6 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         if "geometry.means" in checkpoint["state_dict"]:
             names = {name: f"geometry.{name}" for name in SHAPES}
             require_cloud(checkpoint["state_dict"], names, what)
-        require_learnt(checkpoint.get("guidance"), what)
 
     # -- start -------------------------------------------------------------------------------------
 

@@ -16,7 +16,7 @@ from torch import Tensor
 from ...core.errors import UserError
 from ...core.options import in_range, require_defaults
 from ...host import BaseObject, warn
-from ..types import Batch, Good, Latents, Residual, State
+from ..types import Batch, Good, Latents, Residual, State, require_resumable
 
 GUIDANCE_SCALE = in_range(-1e6, 1e6)
 OFF = {"recon_std_rescale": 0.0}
@@ -64,14 +64,8 @@ class Variant(BaseObject, ABC):
 
     @classmethod
     def preflight(cls, guidance: type, cfg: Any) -> None:
-        """Check, before any model is loaded, that the variant works with a guidance.
-
-        Args:
-            guidance: its class.
-            cfg: the options of the guidance.
-
-        Raises:
-            UserError: it doesn't.
+        """Raise UserError if the variant doesn't work with a guidance of this class and these
+        options; called before any model is loaded.
         """
         if cls.NEEDS_TEXT and not guidance.is_text_guided(cfg):
             raise UserError(
@@ -92,11 +86,8 @@ class Variant(BaseObject, ABC):
         """
 
     def checked(self, found: Any, latents: Latents) -> Residual:
-        """Return what :meth:`residual` returned.
-
-        Raises:
-            UserError: it isn't a pair of tensors of these shapes; others might be broadcast
-                silently.
+        """Return what :meth:`residual` returned; raise UserError if it isn't a pair of tensors of
+        these shapes, since others might be broadcast.
         """
         expected = (tuple(latents.shape), (len(latents),))
         pair = found if isinstance(found, tuple) else (found,)
@@ -126,13 +117,5 @@ class Variant(BaseObject, ABC):
         return {}
 
     def restore(self, guidance: Any, state: State) -> None:
-        """Restore what :meth:`state` returned.
-
-        Raises:
-            UserError: the tensors aren't those of this variant.
-        """
-        if state:
-            raise UserError(
-                f"the checkpoint has {len(state)} tensors of another variant of score "
-                "distillation: resume with the configuration that the run was started with"
-            )
+        """Restore what :meth:`state` returned; raise UserError for that of another variant."""
+        require_resumable(state, set())

@@ -9,7 +9,7 @@ noise is drawn in each step, as in SDS. The paper's t falls in the course of a r
 ``min_step_percent`` and ``max_step_percent`` the same schedule. There are no options."""
 
 from dataclasses import dataclass
-from typing import Any, ClassVar, Optional
+from typing import Any, Optional
 
 from jaxtyping import Float
 from torch import Tensor
@@ -29,9 +29,7 @@ class CFD(Variant):
 
     @dataclass
     class Config(Variant.Config):
-        REMOVED: ClassVar[dict[str, Any]] = {"refresh": (0, "the surface's noise never changes")}
-
-    cfg: Config
+        REMOVED = {"refresh": (0, "the surface's noise never changes")}
 
     def configure(self) -> None:
         super().configure()

