@@ -313,7 +313,7 @@ class ScoreDistillation(BaseObject, ABC):
         self, residual: Latents, abar: Float[Tensor, " B"]
     ) -> tuple[Latents, Bool[Tensor, " B"]]:
         """Weight and clip the residual; also return which items aren't finite, which are zero."""
-        weight = sds.WEIGHTS[self.options.weighting_strategy](abar)
+        weight = sds.WEIGHTS[self.cfg.weighting_strategy](abar)
         grad = sds.per_item(weight, residual) * residual
         bad = find_bad_items(grad)
         if may_have_any(bad):

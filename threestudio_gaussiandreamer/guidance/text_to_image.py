@@ -370,7 +370,7 @@ class TextToImageDistillation(ScoreDistillation):
     @classmethod
     def check_particle_model(cls, cfg: Any) -> None:
         super().check_particle_model(cfg)
-        if found := [name for name in NOT_ADAPTABLE if cfg[name]]:
+        if found := [name for name in NOT_ADAPTABLE if getattr(cfg, name)]:
             raise UserError(
                 f"system.guidance.{found[0]}: vsd-variant trains a LoRA in the UNet, which needs "
                 f"the plain UNet: set {found[0]}=false"

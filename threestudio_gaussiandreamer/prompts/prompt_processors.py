@@ -99,17 +99,8 @@ class TextEncoderPromptProcessor(BaseObject):
             "prompt_library": (PROMPT_LIBRARY, f"it is {PROMPT_LIBRARY}"),
             "view_dependent_prompt_front": (False, 'prompts are "<prompt>, front view"'),
             "spawn": (lambda value: True, "the text encoder is freed in the same process"),
-            **{
-                name: (lambda given, value=value: given == value, f"it is {value:g}")
-                for name, value in THRESHOLDS.items()
-            },
-            **{
-                f"perp_neg_f_{name}": (
-                    lambda given, value=value: tuple(given) == value,
-                    f"it is {list(value)}",
-                )
-                for name, value in PERP_NEG.items()
-            },
+            **{name: (value, f"it is {value:g}") for name, value in THRESHOLDS.items()},
+            **{f"perp_neg_f_{n}": (list(abc), f"it is {list(abc)}") for n, abc in PERP_NEG.items()},
         }
 
     cfg: Config
