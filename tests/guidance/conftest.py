@@ -1,12 +1,12 @@
 """Fixtures of the guidance tests."""
 
+import functools
+
 import numpy as np
 import pytest
 
-from tests.helpers.tiny_guidance import (
-    make_models,
-    make_prompts,
-)
+from tests.helpers import tiny_large_guidance, tiny_large_models
+from tests.helpers.tiny_guidance import make_models, make_prompts
 
 
 @pytest.fixture(scope="session")
@@ -36,3 +36,17 @@ def models(tmp_path_factory):
 @pytest.fixture(scope="session")
 def prompts(models):
     return make_prompts(models)
+
+
+@pytest.fixture(scope="session")
+def large(tmp_path_factory):
+    """Return a function that makes, once, the folder and the prompts of a kind of model."""
+
+    @functools.cache
+    def made(kind):
+        make = getattr(tiny_large_models, kind.replace("-", "_"))
+        folder = make(tmp_path_factory.mktemp("models") / kind)
+        text = "stable-diffusion" if kind == "mvdream" else kind
+        return folder, tiny_large_guidance.prompts(text, folder)
+
+    return made

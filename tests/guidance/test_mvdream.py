@@ -4,7 +4,6 @@ import pytest
 import torch
 
 from tests.helpers import tiny_large_guidance as tiny
-from tests.helpers import tiny_large_models
 from tests.helpers.tiny_guidance import Recorder, relative, renders
 from threestudio_gaussiandreamer.cameras import orbit_c2w
 from threestudio_gaussiandreamer.core.errors import UserError
@@ -14,14 +13,14 @@ pytest.importorskip("diffusers")
 KIND = "mvdream"
 
 
-@pytest.fixture(scope="module")
-def model(tmp_path_factory):
-    return tiny_large_models.mvdream(tmp_path_factory.mktemp("models") / "mvdream")
+@pytest.fixture
+def model(large):
+    return large(KIND)[0]
 
 
-@pytest.fixture(scope="module")
-def prompts(model):
-    return tiny.prompts("stable-diffusion", model)
+@pytest.fixture
+def prompts(large):
+    return large(KIND)[1]
 
 
 def ring(start=10.0, count=4, **changes):

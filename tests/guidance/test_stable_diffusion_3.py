@@ -20,14 +20,14 @@ KIND = "stable-diffusion-3"
 POOLED = 2 * tiny_large_models.POOLED
 
 
-@pytest.fixture(scope="module")
-def model(tmp_path_factory):
-    return tiny_large_models.stable_diffusion_3(tmp_path_factory.mktemp("models") / "3")
+@pytest.fixture
+def model(large):
+    return large(KIND)[0]
 
 
-@pytest.fixture(scope="module")
-def prompts(model):
-    return tiny.prompts(KIND, model)
+@pytest.fixture
+def prompts(large):
+    return large(KIND)[1]
 
 
 def sigma_of(t, shift=3.0):

@@ -27,14 +27,14 @@ KIND = "stable-diffusion-xl"
 POOLED = tiny_large_models.POOLED
 
 
-@pytest.fixture(scope="module")
-def model(tmp_path_factory):
-    return tiny_large_models.stable_diffusion_xl(tmp_path_factory.mktemp("models") / "xl")
+@pytest.fixture
+def model(large):
+    return large(KIND)[0]
 
 
-@pytest.fixture(scope="module")
-def prompts(model):
-    return tiny.prompts(KIND, model)
+@pytest.fixture
+def prompts(large):
+    return large(KIND)[1]
 
 
 def reference_gradient(model, prompt_utils, rgb, *, scale):

@@ -4,25 +4,11 @@ import pytest
 import torch
 
 from tests.helpers import tiny_large_guidance as tiny
-from tests.helpers import tiny_large_models
 from tests.helpers.tiny_guidance import renders
 from threestudio_gaussiandreamer.core.errors import UserError
 
 pytest.importorskip("diffusers")
-KINDS = {
-    "stable-diffusion-xl": tiny_large_models.stable_diffusion_xl,
-    "stable-diffusion-3": tiny_large_models.stable_diffusion_3,
-    "mvdream": tiny_large_models.mvdream,
-}
 NO_LORA = {"stable-diffusion-3": "is a transformer", "mvdream": "predicts several together"}
-
-
-@pytest.fixture(scope="module")
-def models(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("models")
-    made = {kind: make(folder / kind) for kind, make in KINDS.items()}
-    text = {kind: "stable-diffusion" if kind == "mvdream" else kind for kind in KINDS}
-    return {kind: (made[kind], tiny.prompts(text[kind], made[kind])) for kind in KINDS}
 
 
 def ring():
@@ -43,8 +29,8 @@ def ring():
         *(("stable-diffusion-xl", "csd"), ("stable-diffusion-3", "cfd"), ("mvdream", "sdi")),
     ],
 )
-def test_every_variant_gives_a_gradient(models, kind, variant):
-    folder, prompt_utils = models[kind]
+def test_every_variant_gives_a_gradient(large, kind, variant):
+    folder, prompt_utils = large(kind)
     guide = tiny.guidance(kind, folder, variant_type=f"{variant}-variant")
     plain, _ = tiny.gradient(tiny.guidance(kind, folder), prompt_utils, renders(), **ring())
     grad, out = tiny.gradient(guide, prompt_utils, renders(), **ring())
@@ -52,8 +38,8 @@ def test_every_variant_gives_a_gradient(models, kind, variant):
     assert not torch.allclose(grad, plain)
 
 
-def test_several_views_together_have_an_empty_prompt_with_their_cameras(models):
-    folder, prompt_utils = models["mvdream"]
+def test_several_views_together_have_an_empty_prompt_with_their_cameras(large):
+    folder, prompt_utils = large("mvdream")
     guide = tiny.guidance("mvdream", folder, variant_type="nfsd-variant")
     condition = guide.condition(prompt_utils, **ring())
     negative = condition.embeddings[4:]
@@ -66,9 +52,9 @@ def test_several_views_together_have_an_empty_prompt_with_their_cameras(models):
     assert torch.equal(condition.select(rows).empty, condition.empty[rows])
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_lora_is_trained_in_unets_of_single_views(models, kind):
-    folder, prompt_utils = models[kind]
+@pytest.mark.parametrize("kind", ["stable-diffusion-xl", *NO_LORA])
+def test_a_lora_is_trained_in_unets_of_single_views(large, kind):
+    folder, prompt_utils = large(kind)
     options = {"pretrained_model_name_or_path": str(folder), "variant_type": "vsd-variant"}
     if kind in NO_LORA:
         part = type(tiny.guidance(kind, folder))

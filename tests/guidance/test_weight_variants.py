@@ -2,21 +2,16 @@
 as MVDream's.
 """
 
+import shutil
 from pathlib import Path
 
 import pytest
 import torch
 
 from tests.helpers import tiny_large_guidance as tiny
-from tests.helpers import tiny_large_models
 from tests.helpers.tiny_guidance import relative, renders
 
 pytest.importorskip("diffusers")
-KINDS = {
-    "stable-diffusion-xl": tiny_large_models.stable_diffusion_xl,
-    "stable-diffusion-3": tiny_large_models.stable_diffusion_3,
-    "mvdream": tiny_large_models.mvdream,
-}
 DTYPES = {"fp16": torch.float16, "bf16": torch.bfloat16}
 
 
@@ -35,12 +30,10 @@ def store(folder: Path, variant: str, named: bool) -> Path:
     return folder
 
 
-def gradient(kind, folder):
-    text = "stable-diffusion" if kind == "mvdream" else kind
+def gradient(kind, folder, prompts):
     azimuth = torch.tensor([0.0, 90.0, 180.0, 270.0])
     batch = tiny.views(elevation=torch.full((4,), 10.0), azimuth=azimuth)
-    guide, prompt_utils = tiny.guidance(kind, folder), tiny.prompts(text, folder)
-    return tiny.gradient(guide, prompt_utils, renders(), **batch)[0]
+    return tiny.gradient(tiny.guidance(kind, folder), prompts, renders(), **batch)[0]
 
 
 @pytest.mark.parametrize(
@@ -51,8 +44,10 @@ def gradient(kind, folder):
         ("mvdream", "fp16", False),
     ],
 )
-def test_half_precision_files_are_read(kind, variant, named, tmp_path):
-    full = gradient(kind, KINDS[kind](tmp_path / "model"))
-    half = gradient(kind, store(tmp_path / "model", variant, named))
+def test_half_precision_files_are_read(large, kind, variant, named, tmp_path):
+    folder, prompts = large(kind)
+    full = gradient(kind, folder, prompts)
+    copy = Path(shutil.copytree(folder, tmp_path / "model"))
+    half = gradient(kind, store(copy, variant, named), prompts)
     # bfloat16 rounds to 4e-3, which guidance 100 magnifies
     assert 0 < relative(half, full.double()) < (0.1 if variant == "fp16" else 0.5)
