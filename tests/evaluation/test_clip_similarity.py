@@ -23,7 +23,8 @@ from threestudio_gaussiandreamer.evaluation import clip_similarity as module
 from threestudio_gaussiandreamer.evaluation import results
 from threestudio_gaussiandreamer.evaluation.clip_similarity import Protocol, main
 from threestudio_gaussiandreamer.formats.gaussian_files import StoredCloud, write_cloud
-from threestudio_gaussiandreamer.launch.experiment import main as launch
+from threestudio_gaussiandreamer.launch.config import dump_config, load_config
+from threestudio_gaussiandreamer.launch.options import find_config
 
 register_parts()
 
@@ -152,27 +153,22 @@ def test_weights_in_several_files_are_the_same_clip(clip, scored, tmp_path):
 # results
 
 
-@pytest.mark.slow
 def test_a_runs_folder_brings_its_prompt_and_background(clip, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    overrides = [
-        "data.width=16", "data.height=16", "data.eval_width=16", "data.eval_height=16",
-        "data.n_test_views=2", "data.train_views=4", "system.geometry.grow.num_candidates=200",
-        "system.evaluation.size=16", "system.evaluation.views=2", "trainer.max_steps=1",
-        "system.background.color=[0.0,0.5,1.0]", "system.prompt_processor.prompt=a {b} ${c} fox",
-        "use_timestamp=false", "tag=t", "trainer.enable_progress_bar=false",
-    ]  # fmt: skip
-    assert launch(["--config", "demo.yaml", "--train", "--gpu", "cpu", *overrides]) == 0
-    result = results.find_result("outputs/demo/t")
-    assert result.file == Path("outputs/demo/t/save/it1-export/gaussians.ply")
-    assert result.prompt == "a {b} ${c} fox" and result.background == (0.0, 0.5, 1.0)
-    (image,) = results.Pictures(results.read_result(result), result.background).render(
-        Protocol().orbit.c2w[:1], torch.tensor([1.2]), 16
-    )
+    prompt = "a {b} ${c} fox"
+    options = ["system.background.color=[0.0,0.5,1.0]", f"system.prompt_processor.prompt={prompt}"]
+    (tmp_path / "run/configs").mkdir(parents=True)
+    dump_config("run/configs/parsed.yaml", load_config(find_config("demo.yaml"), cli_args=options))
+    save(tmp_path / "run/save/it1-export/gaussians.ply", blob())
+    result = results.find_result("run")
+    assert result.file == Path("run/save/it1-export/gaussians.ply")
+    assert result.prompt == prompt and result.background == (0.0, 0.5, 1.0)
+    pictures = results.Pictures(results.read_result(result), result.background)
+    (image,) = pictures.render(Protocol().orbit.c2w[:1], torch.tensor([1.2]), 16)
     np.testing.assert_allclose(image[0, 0, 0], [0.0, 0.5, 1.0], atol=1e-6)
-    assert main(["outputs/demo/t", "--clip", clip, "--seeds", "3", "--size", "24"]) == 0
+    assert main(["run", "--clip", clip, "--seeds", "3", "--size", "24"]) == 0
     found = written("evaluation")
-    assert found["results"][0]["prompt"] == "a {b} ${c} fox" and found["std"] is None
+    assert found["results"][0]["prompt"] == prompt and found["std"] is None
 
 
 @pytest.mark.parametrize(

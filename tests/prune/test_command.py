@@ -37,12 +37,9 @@ def test_a_size_is_kept(source, tmp_path):
     assert 15_000 < (tmp_path / "out.ply").stat().st_size <= 20_000
 
 
-@pytest.mark.parametrize("budget", [("--count", "150"), ("--bytes", "12kB")])
-def test_what_pruning_to_a_count_or_size_has_lost_counts_towards_a_later_quality(
-    source, tmp_path, budget
-):
+def test_what_pruning_to_a_size_has_lost_counts_towards_a_later_quality(source, tmp_path):
     """Against the original, which the later runs don't see."""
-    run(source, tmp_path / "fewer.ply", *budget)
+    run(source, tmp_path / "fewer.ply", "--bytes", "12kB")
     lost = read_cloud(str(tmp_path / "fewer.ply")).pruned_to
     run(tmp_path / "fewer.ply", tmp_path / "again.ply", "--psnr", str(lost - 1))
     first = read_cloud(str(source))

@@ -107,11 +107,13 @@ def test_one_step_is_made_for_a_press_during_a_pause_only(panel):
     assert controls.may_go_on()
 
 
-def test_a_port_in_use_is_named(taken, tmp_path, capsys):
+@pytest.fixture(scope="module")
+def view():
+    """A view at any free port."""
     pytest.importorskip("viser")
-    write_cloud(str(tmp_path / "a.ply"), cloud(5))
-    assert main([str(tmp_path / "a.ply"), "--port", str(taken)]) == 2
-    assert f"127.0.0.1:{taken} can't be served" in capsys.readouterr().err
+    view = live.LiveView("127.0.0.1", 0, "cloud")
+    yield view
+    view.close()
 
 
 def handshake(port, **headers):
@@ -130,25 +132,21 @@ def handshake(port, **headers):
         return int(connection.recv(4096).split()[1])
 
 
-def test_only_the_servers_own_page_is_answered():
-    pytest.importorskip("viser")
-    view = live.LiveView("127.0.0.1", 0, "cloud")
+def test_only_the_servers_own_page_is_answered(view):
     port = view.server.get_port()
+    assert view.address == f"http://127.0.0.1:{port}"
     own, local = f"127.0.0.1:{port}", f"localhost:{port}"
-    try:
-        for site in (own, local, "localhost:9000", f"[::1]:{port}", f"{socket.gethostname()}:1"):
-            assert handshake(port, Host=site, Origin=f"http://{site}") == 101, site
-        assert handshake(port, Host=own) == 101  # no browser
-        for origin in ("https://evil.example", "null", f"http://127.0.0.1:{port + 1}", ""):
-            assert handshake(port, Host=own, Origin=origin) == 403, origin
-        # DNS rebinding: the name of another site leads here
-        rebound = f"evil.example:{port}"
-        assert handshake(port, Host=rebound, Origin=f"http://{rebound}") == 403
-        assert handshake(port, Host=rebound) == 403
-        assert handshake(port, Host=f"127.0.0.1.evil.example:{port}") == 403
-        assert handshake(port, Host=f"evil.example@127.0.0.1:{port}", Origin="http://a") == 403
-    finally:
-        view.close()
+    for site in (own, local, "localhost:9000", f"[::1]:{port}", f"{socket.gethostname()}:1"):
+        assert handshake(port, Host=site, Origin=f"http://{site}") == 101, site
+    assert handshake(port, Host=own) == 101  # no browser
+    for origin in ("https://evil.example", "null", f"http://127.0.0.1:{port + 1}", ""):
+        assert handshake(port, Host=own, Origin=origin) == 403, origin
+    # DNS rebinding: the name of another site leads here
+    rebound = f"evil.example:{port}"
+    assert handshake(port, Host=rebound, Origin=f"http://{rebound}") == 403
+    assert handshake(port, Host=rebound) == 403
+    assert handshake(port, Host=f"127.0.0.1.evil.example:{port}") == 403
+    assert handshake(port, Host=f"evil.example@127.0.0.1:{port}", Origin="http://a") == 403
 
 
 def test_the_name_that_is_listened_on_is_known():
@@ -167,23 +165,18 @@ def test_a_server_that_cannot_be_guarded_is_not_used(monkeypatch):
     assert stopped
 
 
-def test_updates_replace_the_cloud_and_the_cameras():
-    pytest.importorskip("viser")
-    view = live.LiveView("127.0.0.1", 0, "cloud")
-    try:
-        for count in (5, 5, 7):
-            view.show(cloud(count).gaussians, f"{count} Gaussians")
-            assert len(view._splats.centers) == count
-        for views in (2, 2, 3):
-            poses = np.tile(np.eye(4, dtype=np.float32), (views, 1, 1))
-            poses[:, 0, 3] = views
-            view.show_cameras(poses, np.full(views, 0.5, np.float32), 1.5)
-            assert [frustum.position[0] for frustum in view._frustums] == [views] * views
-            assert view._frustums[0].fov == 0.5 and view._frustums[0].aspect == 1.5
-        view.remove_cameras()
-        assert not view._frustums
-    finally:
-        view.close()
+def test_updates_replace_the_cloud_and_the_cameras(view):
+    for count in (5, 5, 7):
+        view.show(cloud(count).gaussians, f"{count} Gaussians")
+        assert len(view._splats.centers) == count
+    for views in (2, 2, 3):
+        poses = np.tile(np.eye(4, dtype=np.float32), (views, 1, 1))
+        poses[:, 0, 3] = views
+        view.show_cameras(poses, np.full(views, 0.5, np.float32), 1.5)
+        assert [frustum.position[0] for frustum in view._frustums] == [views] * views
+        assert view._frustums[0].fov == 0.5 and view._frustums[0].aspect == 1.5
+    view.remove_cameras()
+    assert not view._frustums
 
 
 def test_without_viser_the_extra_is_named(monkeypatch, port):
@@ -201,6 +194,7 @@ def test_without_viser_the_extra_is_named(monkeypatch, port):
         (["{}/empty.ply"], "empty.ply has no Gaussians that can be drawn"),
         (["{}/far.ply"], "further than"),
         (["{}/a.ply", "--eps2d", "0.3"], "--eps2d: is for the page"),
+        (["{}/a.ply", "--port", "{taken}"], "can't be served (Address already in use)"),
         (["{}/a.ply", "--port", "-1"], "127.0.0.1:-1 can't be served"),
         (["{}/a.ply", "--port", "65536"], "127.0.0.1:65536 can't be served"),
         (["{}/a.ply", "--host", "999.1.1.1"], "999.1.1.1"),
@@ -210,7 +204,7 @@ def test_without_viser_the_extra_is_named(monkeypatch, port):
         (["a" * 5000], "not a usable file name"),
     ],
 )
-def test_wrong_input_is_named_before_serving(tmp_path, capsys, port, arguments, message):
+def test_wrong_input_is_named_before_serving(tmp_path, capsys, port, taken, arguments, message):
     pytest.importorskip("viser")
     write_cloud(str(tmp_path / "a.ply"), cloud(5))
     write_cloud(str(tmp_path / "empty.ply"), cloud(0))
@@ -219,7 +213,8 @@ def test_wrong_input_is_named_before_serving(tmp_path, capsys, port, arguments, 
     write_cloud(str(tmp_path / "far.ply"), far)
     (tmp_path / "runs").mkdir()
     (tmp_path / "text.ply").write_text("hello")
-    arguments = [argument.replace("{}", str(tmp_path)) for argument in arguments]
+    arguments = [x.replace("{}", str(tmp_path)) for x in arguments]
+    arguments = [x.replace("{taken}", str(taken)) for x in arguments]
     assert main(["--port", str(port), *arguments]) == 2
     assert message in capsys.readouterr().err
 

@@ -131,9 +131,9 @@ class Quality(Metric):
 
     def score(self, asset: Asset) -> dict[str, float]:
         cloud = t3bench.normalized(asset.gaussians)
-        chunks = t3bench.quality_pictures(cloud, asset.result.antialiased)
+        chunks = t3bench.pictures(cloud, t3bench.QUALITY, asset.result.antialiased)
         found = [self.model.rewards(pictures, asset.prompt) for pictures in chunks]
-        rewards = np.concatenate(found).reshape(-1, len(t3bench.QUALITY_FOVY))
+        rewards = np.concatenate(found).reshape(-1, len(t3bench.QUALITY.fovy))
         return {"quality": t3bench.quality(rewards)}
 
 

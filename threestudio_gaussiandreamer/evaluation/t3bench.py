@@ -19,6 +19,7 @@ import os
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -35,8 +36,29 @@ from ..meshes.write import write_obj
 from .results import Pictures, Result, read_result
 
 RADIUS = 2.2
-QUALITY_FOVY = tuple(math.pi / part for part in (3.0, 4.0, 5.0, 6.0, 7.5))
-CAPTION_FOVY = math.pi / 3
+
+
+class Kind(NamedTuple):
+    """The pictures that one of T3Bench's scripts renders."""
+
+    script: str
+    subdivisions: int
+    """Of the icosphere whose vertices are the places of the cameras."""
+    radius: float
+    fovy: tuple[float, ...]
+    """Radians."""
+
+    @property
+    def names(self) -> list[str]:
+        count = 10 * 4**self.subdivisions + 2
+        if len(self.fovy) == 1:
+            return [f"{vertex:03d}.png" for vertex in range(count)]
+        return [f"{vertex:03d}_{i}.png" for vertex in range(count) for i in range(len(self.fovy))]
+
+
+QUALITY = Kind("meshrender.py", 2, RADIUS, tuple(math.pi / x for x in (3.0, 4.0, 5.0, 6.0, 7.5)))
+CAPTION = Kind("meshrender_cap.py", 0, RADIUS * RADIUS, (math.pi / 3,))
+KINDS = {"quality": QUALITY, "caption": CAPTION}
 MIN_OPACITY = 0.1
 NEAR_POLE = 0.99
 SIZE, SMOOTHINGS = 512, 3
@@ -113,53 +135,31 @@ def folder_name(prompt: str) -> str:
 
 def _write_stand_ins(folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
-    for script, kind, names in (
-        ("meshrender.py", "quality", quality_names()),
-        ("meshrender_cap.py", "caption", caption_names()),
-    ):
-        with atomic_file(folder / script, durable=False) as file:
-            file.write(STAND_IN.format(kind=kind, names=names, size=SIZE).encode())
+    for name, kind in KINDS.items():
+        with atomic_file(folder / kind.script, durable=False) as file:
+            file.write(STAND_IN.format(kind=name, names=kind.names, size=SIZE).encode())
 
 
 def _write_result(save: Path, arrays: Gaussians, antialias: bool) -> None:
-    for kind, names, pictures in (
-        ("quality", quality_names(), quality_pictures(arrays, antialias)),
-        ("caption", caption_names(), caption_pictures(arrays, antialias)),
-    ):
+    for kind in KINDS:
         folder = save / "t3bench" / kind
         folder.mkdir(parents=True, exist_ok=True)
-        images = (image for chunk in pictures for image in chunk)
-        for name, image in zip(names, images, strict=True):
+        images = (image for chunk in pictures(arrays, KINDS[kind], antialias) for image in chunk)
+        for name, image in zip(KINDS[kind].names, images, strict=True):
             picture_files.write(folder / name, (image * 255).round().astype(np.uint8))
     export = save / "it0-export"
     export.mkdir(parents=True, exist_ok=True)
     write_obj(export / "model.obj", gaussian_surface(arrays))
 
 
-def quality_pictures(
-    arrays: Gaussians, antialias: bool = False
+def pictures(
+    arrays: Gaussians, kind: Kind, antialias: bool = False
 ) -> Iterator[Float[np.ndarray, "B size size 3"]]:
-    """Render the 162 x 5 views for quality of a normalised cloud, in the order of
-    :func:`quality_names`.
-    """
-    positions = np.repeat(icosphere(2, RADIUS), len(QUALITY_FOVY), 0)
-    angles = torch.tensor(QUALITY_FOVY).repeat(len(positions) // len(QUALITY_FOVY))
-    return _pictures(arrays, positions, angles, antialias)
-
-
-def caption_pictures(
-    arrays: Gaussians, antialias: bool = False
-) -> Iterator[Float[np.ndarray, "B size size 3"]]:
-    """Render the 12 views for captions of a normalised cloud."""
-    positions = icosphere(0, RADIUS) * RADIUS
-    return _pictures(arrays, positions, torch.full((len(positions),), CAPTION_FOVY), antialias)
-
-
-def _pictures(
-    arrays: Gaussians, positions: Float[np.ndarray, "V 3"], fovy: torch.Tensor, antialias: bool
-) -> Iterator[Float[np.ndarray, "B size size 3"]]:
-    pictures = Pictures(arrays, antialias=antialias)
-    return pictures.render(towards_origin(positions), fovy, SIZE, chunk=8)
+    """Render the views of a kind of a normalised cloud, in the order of its names."""
+    positions = np.repeat(icosphere(kind.subdivisions, kind.radius), len(kind.fovy), 0)
+    angles = torch.tensor(kind.fovy).repeat(len(positions) // len(kind.fovy))
+    drawn = Pictures(arrays, antialias=antialias)
+    return drawn.render(towards_origin(positions), angles, SIZE, chunk=8)
 
 
 def quality(rewards: Float[np.ndarray, "162 5"]) -> float:
@@ -173,14 +173,6 @@ def quality(rewards: Float[np.ndarray, "162 5"]) -> float:
     for _ in range(SMOOTHINGS):
         scores = np.array([scores[[i, *near[i]]].mean() for i in range(len(scores))])
     return float(20 * scores.max() + 50)
-
-
-def quality_names() -> list[str]:
-    return [f"{vertex:03d}_{i}.png" for vertex in range(162) for i in range(len(QUALITY_FOVY))]
-
-
-def caption_names() -> list[str]:
-    return [f"{vertex:03d}.png" for vertex in range(12)]
 
 
 def icosphere(subdivisions: int, radius: float) -> Float[np.ndarray, "V 3"]:

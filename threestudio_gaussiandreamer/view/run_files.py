@@ -37,17 +37,6 @@ MAX_BYTES = 4 << 20
 """Largest configuration or file of scores that is read."""
 
 
-class PlainLoader(yaml.SafeLoader):
-    """Loads YAML without aliases, which a ``parsed.yaml`` hasn't and which can expand without
-    limit.
-    """
-
-    def compose_node(self, parent: Any, index: Any) -> Any:
-        if self.check_event(yaml.events.AliasEvent):
-            raise yaml.YAMLError("it has an alias")
-        return super().compose_node(parent, index)
-
-
 @dataclass(frozen=True)
 class RunFiles:
     """The folder of a run."""
@@ -203,7 +192,11 @@ def read_json(path: Path, kind: type[T]) -> T:
 def read_yaml(path: Path) -> dict[str, Any]:
     """Read a mapping from a YAML file; an empty one if there is none or it is damaged."""
     try:
-        content = PlainLoader(read_text(path)).get_single_data()
+        text = read_text(path)
+        # a ``parsed.yaml`` has no aliases, which can expand without limit
+        if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text)):
+            return {}
+        content = yaml.safe_load(text)
     except (ValueError, RecursionError, yaml.YAMLError):
         return {}
     return content if isinstance(content, dict) else {}
