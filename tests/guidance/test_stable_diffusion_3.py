@@ -105,7 +105,7 @@ def test_half_precision(model, prompts, monkeypatch):
     assert relative(mine, reference_gradient(model, prompts, rgb, scale=100.0)) < 0.5
 
 
-@pytest.mark.parametrize("saver", ["vae_slicing", "attention_slicing", "sequential_cpu_offload"])
+@pytest.mark.parametrize("saver", ["attention_slicing", "sequential_cpu_offload"])
 def test_memory_savers_change_nothing_but_memory(model, prompts, saver):
     if saver == "sequential_cpu_offload":
         pytest.importorskip("accelerate")

@@ -7,7 +7,7 @@ import json
 import pytest
 
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.models import families
+from threestudio_gaussiandreamer.models import hub as families
 
 UNET = {"_class_name": "UNet2DConditionModel", "in_channels": 4}
 SETTINGS = {

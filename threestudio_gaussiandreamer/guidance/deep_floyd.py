@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..host import register, register_builtin
-from ..models.families import DEEP_FLOYD as FAMILY
+from ..models.hub import DEEP_FLOYD as FAMILY
 from ..prompts.prompt_processors import DEEP_FLOYD
 from .base import GUIDANCE_SCALE
 from .text_to_image import TextToImageDistillation, resized

@@ -102,7 +102,7 @@ class ExactScoreGuidance(ScoreDistillation):
             "latent_channels": (4, "a latent has 4"),
             "color_matrix": (True, "a latent has 4 mixed channels"),
             "temperature": (1.0, "the responsibilities are exact"),
-            "scale": (1.0, "the mesh's longest side is one world unit times two"),
+            "scale": (1.0, "the mesh's longest side has 2 world units"),
             "bank_elevation_range": ([*BANK_ELEVATIONS], "it is [-10, 60]"),
             "std": (0.0, "each mode is one picture, without width"),
             "bank_includes_view": (True, "the bank includes the camera's own view"),

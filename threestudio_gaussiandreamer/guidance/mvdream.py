@@ -36,7 +36,7 @@ from ..core.errors import UserError
 from ..core.options import in_range, one_of
 from ..diffusion import sds
 from ..host import register
-from ..models.families import MULTI_VIEW
+from ..models.hub import MULTI_VIEW
 from ..models.multiview_unet import CAMERA, attend_across_views, load_multiview_unet
 from ..models.text_encoders import pack, unpack
 from .base import GUIDANCE_SCALE

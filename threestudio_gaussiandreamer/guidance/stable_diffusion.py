@@ -16,7 +16,7 @@ from torch.utils.checkpoint import checkpoint
 
 from ..core.errors import UserError
 from ..host import register, register_builtin
-from ..models.families import STABLE_DIFFUSION_XL as XL_FAMILY
+from ..models.hub import STABLE_DIFFUSION_XL as XL_FAMILY
 from ..models.model_files import pipeline_settings
 from ..models.text_encoders import unpack
 from ..prompts.prompt_processors import STABLE_DIFFUSION_XL

@@ -30,7 +30,7 @@ from ..core.errors import UserError
 from ..core.options import in_range, one_of
 from ..diffusion import rectified_flow, sds
 from ..host import register
-from ..models.families import STABLE_DIFFUSION_3 as FAMILY
+from ..models.hub import STABLE_DIFFUSION_3 as FAMILY
 from ..models.model_files import load_settings
 from ..models.text_encoders import unpack
 from ..prompts.prompt_processors import STABLE_DIFFUSION_3

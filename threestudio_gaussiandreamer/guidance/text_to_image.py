@@ -60,9 +60,8 @@ from ..core.extras import require_extra
 from ..core.options import in_range, one_of
 from ..diffusion.sds import PREDICTIONS, perp_neg
 from ..host import info, parse_structured, warn
-from ..models.families import STABLE_DIFFUSION as FAMILY
-from ..models.families import Family
-from ..models.hub import find_model
+from ..models.hub import STABLE_DIFFUSION as FAMILY
+from ..models.hub import Family, find_model
 from ..models.model_files import load_network, load_settings, loaded
 from ..prompts.prompt_processors import STABLE_DIFFUSION
 from .base import ScoreDistillation

@@ -41,10 +41,9 @@ from ..core.errors import UserError
 from ..core.extras import require_extra
 from ..core.files import existing_file, is_folder
 from ..host import BaseObject, info, parse_structured, register, register_builtin
-from ..models.families import STABLE_DIFFUSION_3 as SD3_FAMILY
-from ..models.families import STABLE_DIFFUSION_XL as SDXL_FAMILY
-from ..models.families import Family
-from ..models.hub import find_model
+from ..models.hub import STABLE_DIFFUSION_3 as SD3_FAMILY
+from ..models.hub import STABLE_DIFFUSION_XL as SDXL_FAMILY
+from ..models.hub import Family, find_model
 from ..models.model_files import fingerprint, pipeline_settings
 from ..models.text_encoders import (
     EmbeddingCache,
