@@ -309,7 +309,7 @@ def test_validation_changes_nothing(views, every, random_streams, tmp_path, monk
 
     monkeypatch.setattr(GaussianDreamerSystem, "validation_step", greedy)
     validated = ["trainer.limit_val_batches=1.0", f"trainer.val_check_interval={every}"]
-    validated += [f"data.n_val_views={views}", "system.guidance.eval_steps=2"]
+    validated += [f"data.n_val_views={views}"]
     ended = launch(tmp_path, *DENSIFYING, *EVERY_STEP, *validated)
     assert ended.code == 0, ended.err
     assert len(seen) == views * (9 // every)

@@ -24,7 +24,7 @@ STEPS = 2
 SIZES = [
     "data.width=64", "data.height=64", "data.eval_width=32", "data.eval_height=32",
     "data.n_val_views=1", "data.n_test_views=2", "system.geometry.grow.num_candidates=20000",
-    "system.guidance.eval_steps=2", f"trainer.max_steps={STEPS}",
+    f"trainer.max_steps={STEPS}",
     f"trainer.val_check_interval={STEPS}", "trainer.enable_progress_bar=false", "name=run", "tag=t",
     "use_timestamp=false", "system.geometry.budget=null",
 ]  # fmt: skip

@@ -31,17 +31,14 @@ enable_vae_slicing                  let the VAE, where there is one, encode one 
 ==================================  ================================================================
 
 View contrast is eps_c' = eps_c + view_contrast (eps_c - eps_o), where o is the prompt of the view
-from the other side of the object: "front view" for "back view", and "left side view" for "right
-side view" where the prompts tell these apart. It is the negation of a concept as in composable
-diffusion (Liu et al. 2022, arXiv:2206.01714), for models whose views of a prompt are alike;
-Perp-Neg (Armandpour et al. 2023) takes away only what is perpendicular to eps_c - eps_u. Each view
-at or above the share ``CONTRAST_FROM`` of the timesteps, which decide the view, costs one more
-evaluation. It is part of guidance, so outside of ``guidance_interval`` there is none.
+from the other side of the object. It is the negation of a concept as in composable diffusion (Liu
+et al. 2022, arXiv:2206.01714); Perp-Neg (Armandpour et al. 2023) takes away only what is
+perpendicular to eps_c - eps_u. Each view at or above the share ``CONTRAST_FROM`` of the timesteps,
+which decide the view, costs one more evaluation. Outside of ``guidance_interval`` there is none.
 
-A UNet with ``time_cond_proj_dim`` takes the guidance scale as an input (Meng et al. 2023, "On
-Distillation of Guided Diffusion Models", arXiv:2210.03142), such as that of a latent consistency
-model (Luo et al. 2023, arXiv:2310.04378), and predicts the noise with guidance in one evaluation.
-Other models predict the mean of all pictures that fit z; a consistency model predicts one of them.
+A UNet with ``time_cond_proj_dim`` takes the guidance scale as an input (Meng et al. 2023,
+arXiv:2210.03142), such as that of a latent consistency model (Luo et al. 2023, arXiv:2310.04378),
+and predicts the noise with guidance in one evaluation.
 """
 
 from collections.abc import Callable, Hashable
@@ -255,9 +252,7 @@ class TextToImageDistillation(ScoreDistillation):
     def require_text_to_image(
         self, channels: int, embedding_types: tuple[Optional[str], ...] = (None, "text")
     ) -> None:
-        """Raise UserError unless the inputs of the network are an image of ``channels`` channels
-        and embeddings of these types only.
-        """
+        """Raise UserError if the network has other inputs than an image and such embeddings."""
         wanted = {"in_channels": (channels,), "class_embed_type": (None,)}
         wanted["addition_embed_type"] = embedding_types
         given = {name: self.denoiser.config.get(name) for name in wanted}
@@ -378,9 +373,7 @@ class TextToImageDistillation(ScoreDistillation):
     def at_scale(
         self, z: Latents, t: Timesteps, condition: Condition, scale: float
     ) -> Optional[Latents]:
-        """Predict the noise with guidance in one evaluation per view, if the network takes the
-        scale; Perp-Neg and scales below 1 need the unconditional prediction.
-        """
+        """See the base class; Perp-Neg and scales below 1 need the unconditional prediction."""
         if condition.negative_weights is not None:
             return super().at_scale(z, t, condition, scale)
         if scale != 1 and (self.scale_width is None or scale < 1):
@@ -435,7 +428,7 @@ class TextToImageDistillation(ScoreDistillation):
         self, z: Latents, t: Timesteps, embeddings: Embeddings, **inputs: Tensor
     ) -> Latents:
         """Return the output of the network, of the model's prediction type, for as many rows of
-        ``embeddings`` as of latents; subclasses pass the model's further inputs.
+        ``embeddings`` as of latents.
         """
         tokens = embeddings.to(self.dtype)
         return self.unet(z.to(self.dtype), t, encoder_hidden_states=tokens, **inputs).sample

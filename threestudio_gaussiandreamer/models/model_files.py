@@ -147,11 +147,10 @@ def pipeline_settings(folder: Path) -> dict[str, Any]:
 
 
 def fingerprint(folder: Path, components: Iterable[str]) -> str:
-    """Return a digest of the content of these components, independent of the folder's name.
-
-    Files up to 1 MiB are read whole; of larger ones the size and about sixteen evenly spaced
-    samples of 64 KiB. That takes milliseconds and distinguishes differently trained weights, but
-    may not notice a single changed byte."""
+    """Return a digest of the content of these components, independent of the folder's name. Of
+    files above 1 MiB the size and about sixteen samples of 64 KiB are read: that distinguishes
+    differently trained weights, but may not notice a single changed byte.
+    """
     digest = hashlib.sha256()
     for component in sorted(components):
         for path in sorted(path for path in (folder / component).rglob("*") if path.is_file()):
@@ -202,10 +201,8 @@ def load_network(
 
 
 def load_settings(loader: Any, folder: Path, component: str = "", **options: Any) -> Any:
-    """Load a tokenizer or a scheduler with ``from_pretrained`` from local files.
-
-    Raises:
-        UserError: its files are damaged or not what the libraries expect.
+    """Load a tokenizer or a scheduler with ``from_pretrained`` from local files; raise UserError if
+    they are damaged or not what the libraries expect.
     """
     options |= {"subfolder": component, "local_files_only": True}
     with loading_errors(f"{component or loader.__name__} of the model in {str(folder)!r}"):

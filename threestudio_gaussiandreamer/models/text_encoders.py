@@ -4,11 +4,8 @@ which are small, are kept where ``model_files.py`` keeps networks.
 
 As in diffusers' pipelines, texts are padded to the model's length, and longer ones truncated with a
 warning; CLIP's tokens for Stable Diffusion XL and 3 are the states before its last layer. The
-result is float32 on the CPU, without gradients.
-
-Stable Diffusion XL and 3 are conditioned on tokens and on one vector for the whole text, the pooled
-embedding. Both are kept in one tensor, the vector as a last token that is padded with zeros
-(:func:`pack`), so that caching, view-dependent prompts and Perp-Neg treat them alike."""
+result is float32 on the CPU, without gradients. The pooled embedding of Stable Diffusion XL and 3
+is a last token that is padded with zeros (:func:`pack`)."""
 
 import hashlib
 import json
@@ -211,9 +208,7 @@ def _tokenize(tokenizer: Any, texts: list[str], length: int) -> Any:
 
 @torch.no_grad()
 def _freed(run: Callable[[torch.device], Any]) -> Any:
-    """Call ``run`` with this run's device, or with the CPU if the GPU's memory doesn't suffice;
-    free its memory afterwards.
-    """
+    """Call ``run`` with this run's device, or the CPU if the GPU's memory doesn't suffice."""
     device = get_device()
     try:
         return run(device)
