@@ -216,7 +216,7 @@ def point_plys() -> list[bytes]:
 def read_ply(read: Callable, path: Path) -> tuple[Any, oracles.PlyVertices]:
     """Return what the package and the strict reader read."""
     with messages() as said:
-        found = read(path, allow_non_finite=True)
+        found = read(path)
     truth = strictly(oracles.ply_vertices, path)
     require(not truth.leftover or said, "data after the announced end without a message")
     return found, truth

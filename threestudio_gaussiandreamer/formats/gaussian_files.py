@@ -83,7 +83,7 @@ def _read_ply(path: Path) -> Content:
     """Read a PLY of either layout."""
     if is_compressed_ply(path):
         return read_compressed_ply(path), read_comments(path)
-    return read_gaussians(path, allow_non_finite=True), read_comments(path)
+    return read_gaussians(path), read_comments(path)
 
 
 FORMATS = {

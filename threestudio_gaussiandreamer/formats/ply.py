@@ -22,11 +22,11 @@ from pathlib import Path
 from typing import BinaryIO, NamedTuple, Optional
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from ..core.errors import UserError
 from ..core.files import atomic_file
-from ..gaussians.gaussians import Gaussians, finite, usable
+from ..gaussians.gaussians import Gaussians, finite
 from ..gaussians.point_cloud import PointCloud
 from ..gaussians.sh import rgb_to_sh0, sh0_colors
 from . import packing
@@ -155,12 +155,6 @@ class PlyTable:
         """Return the number type that the header states."""
         return self._types[name]
 
-    def require_valid(self, valid: Bool[np.ndarray, " N"], what: str) -> None:
-        """Raise Unreadable unless every vertex is valid; ``what`` names the values."""
-        said = f"the {what} of {(~valid).sum()} of {len(valid)} vertices are NaN or infinite"
-        first = valid.argmin() if len(valid) else 0
-        require(valid.all(), f"{said}, first in vertex {first}")
-
 
 # --------------------------------------------------------------------------------------------------
 # writing
@@ -240,51 +234,35 @@ def write_points(path: str | os.PathLike, cloud: PointCloud) -> None:
 # reading
 
 
-def read_gaussians(path: str | os.PathLike, *, allow_non_finite: bool = False) -> Gaussians:
-    """Read Gaussians with any degree of spherical harmonics, in the file's axes.
-
-    Args:
-        path: the file.
-        allow_non_finite: also return rows that are not :func:`usable`.
+def read_gaussians(path: str | os.PathLike) -> Gaussians:
+    """Read Gaussians with any degree of spherical harmonics, in the file's axes, also those with
+    values that aren't finite.
 
     Raises:
-        UserError: there is no such file, it is no PLY of Gaussians, is damaged, or has rows that
-            are not usable.
+        UserError: there is no such file, it is no PLY of Gaussians, or it is damaged.
     """
     with reading(path, "PLY file") as file:
         table = PlyTable(file)
         _require_gaussians(table)
         scales, opacities = _filtered(table, _read_log_scales(table), table["opacity"])
         arrays = Gaussians(table[MEANS], table[QUATS], scales, opacities, _read_sh(table))
-        arrays = _without_zeros(arrays, table)
-        if not allow_non_finite:
-            table.require_valid(usable(arrays), "values")
-        return arrays
+        return _without_zeros(arrays, table)
 
 
-def read_points(path: str | os.PathLike, *, allow_non_finite: bool = False) -> PointCloud:
-    """Read coloured points.
+def read_points(path: str | os.PathLike) -> PointCloud:
+    """Read coloured points, also those with values that aren't finite.
 
     Points without colours become grey (0.5); Gaussians get the colour of the constant harmonic.
 
-    Args:
-        path: the file.
-        allow_non_finite: also return rows with NaN or infinity.
-
     Raises:
-        UserError: there is no such file, it is no PLY, has no positions, is damaged, or has values
-            that aren't finite.
+        UserError: there is no such file, it is no PLY, has no positions, or is damaged.
     """
     with reading(path, "PLY file") as file:
         table = PlyTable(file)
         missing = [name for name in MEANS if name not in table.columns]
         require(not missing, f"the points lack {', '.join(missing)}.{_format_hint(table)}")
         normals = table[NORMALS] if table.has(NORMALS) else None
-        cloud = PointCloud(points=table[MEANS], colors=_read_colors(table), normals=normals)
-        if not allow_non_finite:
-            table.require_valid(np.isfinite(cloud.points).all(axis=1), "positions")
-            table.require_valid(np.isfinite(cloud.colors).all(axis=1), "colours")
-        return cloud
+        return PointCloud(points=table[MEANS], colors=_read_colors(table), normals=normals)
 
 
 def require_ply(path: Path) -> None:

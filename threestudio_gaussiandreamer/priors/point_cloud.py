@@ -189,7 +189,7 @@ def _cloud(path: Path, points: np.ndarray, colors=None, normals=None) -> PointCl
 
 
 READERS: dict[str, Callable[[Path], PointCloud]] = {
-    ".ply": lambda path: read_points(path, allow_non_finite=True),
+    ".ply": read_points,
     ".npz": read_npz,
     ".npy": lambda path: _from_columns(path, read_arrays(path, "point cloud", ["rows"])["rows"]),
     **dict.fromkeys([".xyz", ".txt", ".pts", ".csv"], read_text),
