@@ -11,7 +11,7 @@ from tests.helpers.object_clouds import ball
 from tests.helpers.ply_files import gaussians, write_raw_gaussians
 from threestudio_gaussiandreamer import register_parts
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.formats import glb, sog, spz
+from threestudio_gaussiandreamer.formats import glb, sog
 from threestudio_gaussiandreamer.formats.gaussian_files import (
     FORMATS,
     PRUNED,
@@ -145,7 +145,7 @@ COUNT = 6000
 
 
 @pytest.mark.parametrize("degree", [0, 3])
-@pytest.mark.parametrize(("suffix", "module"), [(".sog", sog), (".glb", glb), (".spz", spz)])
+@pytest.mark.parametrize(("suffix", "module"), [(".sog", sog), (".glb", glb)])
 def test_reading_takes_no_more_than_what_is_budgeted(tmp_path, suffix, module, degree):
     path = tmp_path / f"a{suffix}"
     write_cloud(str(path), StoredCloud(ball(COUNT, degree)))

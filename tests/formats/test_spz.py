@@ -379,6 +379,13 @@ def test_a_small_file_of_many_gaussians_is_refused_before_they_are_unpacked(tmp_
     assert peak < 10 * path.stat().st_size
 
 
+@pytest.mark.parametrize("degree", [0, 3])
+def test_the_memory_that_is_budgeted_is_what_reading_takes(degree):
+    content = spz_bytes(cloud(20_000, degree))
+    announced = spz.DECODED_BYTES + spz.DECODED_BYTES_PER_HARMONIC * (degree + 1) ** 2
+    assert 0.7 * 20_000 * announced < peak_of(lambda: spz_arrays(content)) < 1.05 * 2e4 * announced
+
+
 def test_without_zstandard_version_4_is_refused_by_name(tmp_path, monkeypatch):
     path = stored(tmp_path, version_4() or b"NGSP" + bytes([4]) + bytes(40))
     monkeypatch.setitem(sys.modules, "zstandard", None)

@@ -292,11 +292,7 @@ def changed(made, path, value):
         (("accessors", 1, "count"), 10**6, "damaged"),
         (("accessors", 1, "count"), 3, "vertex beyond the last of 3"),
         (("accessors", 1, "componentType"), 1, "component type 1"),
-        (
-            ("accessors", 1),
-            {"count": 4, "type": "VEC3", "componentType": 5126},
-            "aren't in the file",
-        ),
+        (("accessors", 1), {"count": 4, "type": "VEC3", "componentType": 5126}, "aren't in the fi"),
         (("bufferViews", 0, "byteLength"), 10**12, "ends after its buffer"),
         (("samplers", 0, "wrapS"), 5, "damaged"),
         (("textures", 0), {"extensions": {"KHR_texture_basisu": {}}}, "KHR_texture_basisu"),
@@ -339,34 +335,29 @@ def refused(made, saved):
         tracemalloc.stop()
 
 
-def test_textures_count_together(saved, monkeypatch):
-    """Two images of half a megabyte in a small file: one fits, two do not."""
-    monkeypatch.setattr(budget, "FIXED_BYTES", 700_000)
-    monkeypatch.setattr(budget, "BYTES_PER_FILE_BYTE", 0)
-    flat = np.zeros((256, 256, 3), np.uint8)
-    made = textured_quad(flat)
-    assert load_mesh(saved(made)).texture.shape == (256, 256, 3)
-    made.document["meshes"][0]["primitives"].append(
-        made.document["meshes"][0]["primitives"][0]
-        | {"material": made.material(made.texture(flat))}
-    )
-    message, taken = refused(made, saved)
-    assert "the texture 1 of 256 x 256 texels is too large" in message and taken < 1 << 20
-
-
-def test_instances_count(saved, monkeypatch):
-    """2,000 nodes that show one mesh are rejected before they are created; the texture is stored
-    once.
+@pytest.mark.parametrize("many", [False, True])
+def test_textures_and_instances_count_together(many, saved, monkeypatch):
+    """A small file whose two images, or 2,000 nodes of one mesh, are refused before they are made;
+    one image, or 500 nodes, are read.
     """
-    monkeypatch.setattr(budget, "FIXED_BYTES", 1 << 20)
+    monkeypatch.setattr(budget, "FIXED_BYTES", 1 << 20 if many else 700_000)
     monkeypatch.setattr(budget, "BYTES_PER_FILE_BYTE", 0)
-    made = textured_quad(np.zeros((64, 64, 3), np.uint8))
-    made.document["nodes"] = [{"mesh": 0, "translation": [i, 0, 0]} for i in range(500)]
-    made.document["scenes"][0]["nodes"] = list(range(500))
-    assert load_mesh(saved(made)).texture.size == 64 * 64 * 3
-    made.document["nodes"] *= 4
-    made.document["scenes"][0]["nodes"] = list(range(2000))
-    assert "too large" in refused(made, saved)[0]
+    flat = np.zeros((64, 64, 3) if many else (256, 256, 3), np.uint8)
+    made = textured_quad(flat)
+    if many:
+        made.document["nodes"] = [{"mesh": 0, "translation": [i, 0, 0]} for i in range(500)]
+        made.document["scenes"][0]["nodes"] = list(range(500))
+    assert load_mesh(saved(made)).texture.size == flat.size
+    if many:
+        made.document["nodes"] *= 4
+        made.document["scenes"][0]["nodes"] = list(range(2000))
+        assert "too large" in refused(made, saved)[0]
+    else:
+        (first,) = made.document["meshes"][0]["primitives"]
+        second = first | {"material": made.material(made.texture(flat))}
+        made.document["meshes"][0]["primitives"].append(second)
+        message, taken = refused(made, saved)
+        assert "the texture 1 of 256 x 256 texels is too large" in message and taken < 1 << 20
 
 
 def test_a_large_header_is_refused_before_anything_is_allocated(saved):

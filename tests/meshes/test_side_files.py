@@ -83,41 +83,28 @@ def test_an_obj_with_coordinates_and_no_material_is_grey(head, tmp_path):
     np.testing.assert_array_equal(cloud.colors, HALF)
 
 
-@pytest.mark.parametrize(
-    "before", ["", "-s 1 1 1 ", "-clamp on -bm 0.5 ", "-o 0.0 -1 -imfchan r ", "-texres 512x512 "]
-)
-def test_options_of_a_texture_are_no_part_of_its_name(before, tmp_path, caplog):
-    (tmp_path / "a.mtl").write_text(f"newmtl m\nmap_Kd {before}my pictures/a 1.png\n")
-    (tmp_path / "a.obj").write_text("mtllib a.mtl\n" + TRIANGLE)
-    (tmp_path / "my pictures").mkdir()
-    (tmp_path / "my pictures/a 1.png").write_bytes(png(np.uint8([[0x80]])))
-    mesh = load_mesh(tmp_path / "a.obj")
-    color = surface_colors(mesh, np.array([0]), np.full((1, 3), 1 / 3))
-    np.testing.assert_allclose(color, HALF, atol=2e-3)
-    assert not caplog.text
-
-
 GREY = "map_Kd grey.png\n"
 
 
 @pytest.mark.parametrize(
     ("libraries", "materials"),
     [
-        (
-            ["mtllib other.mtl my a.mtl"],
-            {"my a": f"newmtl m\n{GREY}", "other": "newmtl x\nKd 1 0 0"},
-        ),
+        (["mtllib other.mtl my a.mtl"], {"my a": f"newmtl m\n{GREY}", "other": "newmtl x\nKd 1 0"}),
         (['mtllib "my a.mtl" other.mtl'], {"my a": f"newmtl m\n{GREY}"}),
         (["mtllib other.mtl", "mtllib a.mtl"], {"a": f"newmtl m\n{GREY}", "other": "newmtl x\n"}),
         (["# no mtllib b.mtl", "mtllib a.mtl"], {"a": f"newmtl m\n{GREY}"}),
         (["mtllib a.mtl"], {"a": f"newmtl m\nKd 0 0 0\n{GREY}"}),  # as Poly's files
         (["mtllib a.mtl"], {"a": "newmtl m\nmap_Kd -clamp on 1 on 2.png\n"}),
         (["mtllib a.mtl"], {"a": "newmtl m\nmap_Kd -o 0 -7 0 -s 1 2 -clamp off grey.png\n"}),
+        (["mtllib a.mtl"], {"a": "newmtl m\nmap_Kd -clamp on -bm 0.5 my pictures/a 1.png\n"}),
+        (["mtllib a.mtl"], {"a": "newmtl m\nmap_Kd -texres 512x512 my pictures/a 1.png\n"}),
+        (["mtllib a.mtl"], {"a": "newmtl m\nmap_Kd -imfchan r my pictures/a 1.png\n"}),
         (["mtllib a.mtl", "no usemtl"], {"a": f"newmtl its one\n{GREY}"}),
     ],
 )
 def test_the_texture_of_an_obj_is_found(libraries, materials, tmp_path):
-    for name in ("grey.png", "1 on 2.png"):
+    (tmp_path / "my pictures").mkdir()
+    for name in ("grey.png", "1 on 2.png", "my pictures/a 1.png"):
         (tmp_path / name).write_bytes(png(np.uint8([[0x80]])))
     for name, text in materials.items():
         (tmp_path / f"{name}.mtl").write_text(text)

@@ -213,19 +213,16 @@ def spz_arrays(packed: bytes) -> tuple[Gaussians, bool]:
         view[start:end].reshape(header.count, width)
         for start, end, width in zip(ends, ends[1:], header.blocks, strict=False)
     )
-    read_quats = _from_first_three if header.version < 3 else _from_smallest_three
+    means, log_scales = _positions(positions, header), scales / np.float32(16)
+    quats = (_from_first_three if header.version < 3 else _from_smallest_three)(rotations)
+    logits = packing.logits_of_bytes(alphas[:, 0])
+    # the harmonics last and in place, since they are most of the memory
     sh = np.empty((header.count, 1 + harmonics.shape[1] // 3, 3), np.float32)
     sh[:, 0] = (colors / np.float32(255) - np.float32(0.5)) / np.float32(COLOR_SCALE)
     sh[:, 1:] = harmonics.reshape(header.count, -1, 3) if harmonics.size else 0
-    sh[:, 1:] -= 128  # in place, since harmonics are most of the memory
+    sh[:, 1:] -= 128
     sh[:, 1:] /= 128
-    gaussians = Gaussians(
-        means=_positions(positions, header),
-        quats=read_quats(rotations),
-        log_scales=scales / np.float32(16) + np.float32(MIN_LOG_SCALE),
-        logit_opacities=packing.logits_of_bytes(alphas[:, 0]),
-        sh=sh,
-    )
+    gaussians = Gaussians(means, quats, log_scales + np.float32(MIN_LOG_SCALE), logits, sh)
     system = _system(extensions) if header.flags & HAS_EXTENSIONS else OWN_SYSTEM
     if system != OWN_SYSTEM:
         turned = np.stack([DIRECTIONS[letter] for letter in system], axis=1)
