@@ -60,17 +60,16 @@ def write_compressed_ply(
     gaussians = finite(gaussians, str(path))
     gaussians = gaussians.rows(packing.morton_order(gaussians.means))
     count, coefficients = len(gaussians.means), 3 * (gaussians.sh.shape[1] - 1)
-    values = _chunked_values(gaussians)
-    limits = _limits(values)
-    elements = [("chunk", len(limits), [(name, "float") for name in LIMITS])]
+    elements = [("chunk", ceil(count / CHUNK), [(name, "float") for name in LIMITS])]
     elements += [("vertex", count, [(name, "uint") for name in PACKED])]
     harmonics = [(f"f_rest_{index}", "uchar") for index in range(coefficients)]
     elements += [("sh", count, harmonics)] if coefficients else []
+    by_channel = gaussians.sh[:, 1:].transpose(0, 2, 1).reshape(count, coefficients)
+    rest = packing.to_byte(np.floor(256 * (by_channel / (2 * SH_REACH) + 0.5)))
+    limits, words = _packed(gaussians)
     with atomic_file(path) as file:
         file.write(header_bytes(elements, comments))
-        file.write(limits.astype("<f4").tobytes())
-        file.write(_packed(gaussians, values, limits).tobytes())
-        file.write(_harmonic_bytes(gaussians.sh[:, 1:]).tobytes())
+        file.writelines(array.tobytes() for array in (limits, words, rest))
 
 
 def is_compressed_ply(path: str | os.PathLike) -> bool:
@@ -87,61 +86,60 @@ def read_compressed_ply(path: str | os.PathLike) -> Gaussians:
         UserError: there is no such file, it is no compressed PLY, or it is damaged.
     """
     with reading(path, "compressed PLY") as file:
-        return _decoded(_read_elements(file))
-
-
-def _decoded(elements: dict[str, np.ndarray]) -> Gaussians:
-    packed, limits = elements["vertex"], _chunk_limits(elements["chunk"])
+        elements = _read_elements(file)
+    packed, limits = elements["vertex"], elements["chunk"].astype(np.float64)
     chunks = np.arange(len(packed)) // CHUNK
-    position, rotation, scale, color = packed.T
-    colors = _between(_bytes_of(color)[:, :3] / 255, limits[:, 2], chunks)
+    # colours without limits are in [0, 1]
+    usual = np.tile(np.repeat(np.float64([0, 1]), 3), (len(limits), 1))
+    limits = np.concatenate([limits, usual[:, : len(LIMITS) - limits.shape[1]]], axis=1)
+    limits = limits.reshape(-1, 3, 2, 3)
+
+    def between(fractions: Float[np.ndarray, "N 3"], kind: int) -> Float[np.ndarray, "N 3"]:
+        low, high = limits[chunks, kind].transpose(1, 0, 2)
+        with np.errstate(invalid="ignore", over="ignore"):  # limits of damaged files
+            return low * (1 - fractions) + high * fractions
+
+    position, rotation, scale, color = packed.astype(np.int64).T
+    rgba = (color[:, None] >> np.array([24, 16, 8, 0]) & 255).astype(np.uint8)
+    constant = rgb_to_sh0(between(rgba[:, :3] / 255, 2))[:, None].astype(np.float32)
     rest = elements.get("sh", np.empty((len(packed), 0), np.uint8))
+    # the middle of each step; 0 and 255 are the limits themselves
+    values = (rest.astype(np.float32) + np.float32(0.5)) / 256
+    values[rest == 0], values[rest == 255] = 0, 1
+    values = (values - np.float32(0.5)) * np.float32(2 * SH_REACH)
+    values = values.reshape(len(rest), 3, rest.shape[1] // 3).transpose(0, 2, 1)
+    others = (_fractions(rotation, (10, 10, 10)) - 0.5) * sqrt(2)
     return Gaussians(
-        means=_between(_fractions(position), limits[:, 0], chunks).astype(np.float32),
-        quats=_quats(rotation),
-        log_scales=_between(_fractions(scale), limits[:, 1], chunks).astype(np.float32),
-        logit_opacities=packing.logits_of_bytes(_bytes_of(color)[:, 3]),
-        sh=np.concatenate([rgb_to_sh0(colors)[:, None].astype(np.float32), _harmonics(rest)], 1),
+        means=between(_fractions(position, BITS), 0).astype(np.float32),
+        quats=packing.with_largest(rotation >> 30, others),
+        log_scales=between(_fractions(scale, BITS), 1).astype(np.float32),
+        logit_opacities=packing.logits_of_bytes(rgba[:, 3]),
+        sh=np.concatenate([constant, values], axis=1),
     )
-
-
-# ---- writing -------------------------------------------------------------------------------------
-
-
-def _chunked_values(gaussians: Gaussians) -> Float[np.ndarray, "C 256 3 3"]:
-    """Return positions, logarithms of scales and colours by chunk; the last chunk is padded with
-    copies of the last Gaussian.
-    """
-    scales = gaussians.log_scales.clip(-MAX_STORED_LOG, MAX_STORED_LOG)
-    values = np.stack([gaussians.means, scales, sh0_to_rgb(gaussians.sh[:, 0])], axis=1)
-    missing = -len(values) % CHUNK
-    values = np.pad(values, ((0, missing), (0, 0), (0, 0)), "edge") if missing else values
-    return values.astype(np.float32).reshape(-1, CHUNK, 3, 3)
-
-
-def _limits(values: Float[np.ndarray, "C 256 3 3"]) -> Float[np.ndarray, "C 3 2 3"]:
-    """Return minimum and maximum of positions, scales and colours for each chunk."""
-    return np.stack([values.min(axis=1), values.max(axis=1)], axis=2)
 
 
 def _packed(
     gaussians: Gaussians,
-    values: Float[np.ndarray, "C 256 3 3"],
-    limits: Float[np.ndarray, "C 3 2 3"],
-) -> Integer[np.ndarray, "N 4"]:
+) -> tuple[Float[np.ndarray, "C 3 2 3"], Integer[np.ndarray, "N 4"]]:
+    """Return minimum and maximum of positions, scales and colours for each chunk, the last of which
+    is filled up with copies of the last Gaussian; and the words of each Gaussian.
+    """
+    scales = gaussians.log_scales.clip(-MAX_STORED_LOG, MAX_STORED_LOG)
+    values = np.stack([gaussians.means, scales, sh0_to_rgb(gaussians.sh[:, 0])], axis=1)
+    count, missing = len(values), -len(values) % CHUNK
+    values = np.pad(values, ((0, missing), (0, 0), (0, 0)), "edge") if missing else values
+    values = values.astype(np.float32).reshape(-1, CHUNK, 3, 3)
+    limits = np.stack([values.min(axis=1), values.max(axis=1)], axis=2)
     low, size = limits[:, None, :, 0], np.ptp(limits, axis=2)[:, None]
     fractions = (values - low) / np.where(size > 0, size, 1)
-    count = len(gaussians.means)
     position, scale, color = fractions.reshape(-1, 3, 3)[:count].transpose(1, 0, 2)
     alpha = packing.opacity_bytes(gaussians.logit_opacities)
     rgba = np.concatenate([packing.to_byte(255 * color), alpha[:, None]], axis=1)
-    words = [
-        _word(position, BITS),
-        _rotation_word(gaussians.quats),
-        _word(scale, BITS),
-        rgba[:, ::-1].copy().view("<u4")[:, 0],
-    ]
-    return np.stack(words, axis=1).astype("<u4")
+    largest, others = packing.without_largest(packing.unit_quats(gaussians.quats))
+    rotation = _word(others / sqrt(2) + 0.5, (10, 10, 10)) | largest.astype(np.uint32) << 30
+    color = rgba[:, ::-1].copy().view("<u4")[:, 0]
+    words = np.stack([_word(position, BITS), rotation, _word(scale, BITS), color], axis=1)
+    return limits.astype("<f4"), words.astype("<u4")
 
 
 def _word(fractions: Float[np.ndarray, "N F"], bits: Sequence[int]) -> Integer[np.ndarray, " N"]:
@@ -151,19 +149,6 @@ def _word(fractions: Float[np.ndarray, "N F"], bits: Sequence[int]) -> Integer[n
         most = (1 << width) - 1
         word = word << width | np.rint(np.clip(fraction, 0, 1) * most).astype(np.uint32)
     return word
-
-
-def _rotation_word(quats: Float[np.ndarray, "N 4"]) -> Integer[np.ndarray, " N"]:
-    largest, others = packing.without_largest(packing.unit_quats(quats))
-    return largest.astype(np.uint32) << 30 | _word(others / sqrt(2) + 0.5, (10, 10, 10))
-
-
-def _harmonic_bytes(rest: Float[np.ndarray, "N K 3"]) -> Integer[np.ndarray, "N C"]:
-    by_channel = rest.transpose(0, 2, 1).reshape(len(rest), 3 * rest.shape[1])
-    return packing.to_byte(np.floor(256 * (by_channel / (2 * SH_REACH) + 0.5)))
-
-
-# ---- reading -------------------------------------------------------------------------------------
 
 
 def _read_elements(path: Path) -> dict[str, np.ndarray]:
@@ -194,42 +179,8 @@ def _read_elements(path: Path) -> dict[str, np.ndarray]:
         return found
 
 
-def _chunk_limits(chunks: Float[np.ndarray, "C L"]) -> Float[np.ndarray, "C 3 2 3"]:
-    """Return the limits as :func:`_limits` does; colours without limits are in [0, 1]."""
-    missing = len(LIMITS) - chunks.shape[1]
-    colors = np.tile(np.repeat(np.float64([0, 1]), 3), (len(chunks), 1))[:, :missing]
-    return np.concatenate([chunks.astype(np.float64), colors], axis=1).reshape(-1, 3, 2, 3)
-
-
-def _between(
-    fractions: Float[np.ndarray, "N 3"],
-    limits: Float[np.ndarray, "C 2 3"],
-    chunks: Integer[np.ndarray, " N"],
-) -> Float[np.ndarray, "N 3"]:
-    low, high = limits[chunks, 0], limits[chunks, 1]
-    return low * (1 - fractions) + high * fractions
-
-
-def _fractions(words: Integer[np.ndarray, " N"], bits: Sequence[int] = BITS) -> np.ndarray:
+def _fractions(words: Integer[np.ndarray, " N"], bits: Sequence[int]) -> np.ndarray:
     """Invert :func:`_word`: (N, F) in [0, 1]."""
     shifts = np.cumsum(bits[::-1])[::-1] - bits
     most = (1 << np.array(bits)) - 1
-    return (words.astype(np.int64)[:, None] >> shifts & most) / most
-
-
-def _quats(words: Integer[np.ndarray, " N"]) -> Float[np.ndarray, "N 4"]:
-    others = (_fractions(words, (10, 10, 10)) - 0.5) * sqrt(2)
-    return packing.with_largest(words.astype(np.int64) >> 30, others)
-
-
-def _bytes_of(words: Integer[np.ndarray, " N"]) -> Integer[np.ndarray, "N 4"]:
-    """Return the bytes from the highest to the lowest."""
-    return (words.astype(np.int64)[:, None] >> np.array([24, 16, 8, 0]) & 255).astype(np.uint8)
-
-
-def _harmonics(rest: Integer[np.ndarray, "N C"]) -> Float[np.ndarray, "N K 3"]:
-    """Decode f_rest to the middle of each step; 0 and 255 decode to the limits themselves."""
-    fractions = (rest.astype(np.float32) + np.float32(0.5)) / 256
-    fractions[rest == 0], fractions[rest == 255] = 0, 1
-    values = (fractions - np.float32(0.5)) * np.float32(2 * SH_REACH)
-    return values.reshape(len(rest), 3, rest.shape[1] // 3).transpose(0, 2, 1)
+    return (words[:, None] >> shifts & most) / most

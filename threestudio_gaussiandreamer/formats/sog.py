@@ -59,6 +59,7 @@ limit the palette takes one core about half a minute."""
 MEMBER_DATE = (1980, 1, 1, 0, 0, 0)
 """Constant, so that equal clouds give equal files."""
 VERSIONS = 1, 2
+MEANS = ["means_l.webp", "means_u.webp"]
 CODEBOOK = 256
 PALETTE_COLUMNS = 64
 FIRST_TAG = 252
@@ -138,27 +139,33 @@ def read_sog(path: str | os.PathLike) -> tuple[Gaussians, list[str]]:
 
 def _encoded(gaussians: Gaussians) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Return the images by file name, and what ``meta.json`` says."""
-    positions, bounds = _position_steps(gaussians.means)
+    count, means = len(gaussians.means), gaussians.means.astype(np.float64)
+    logs = np.sign(means) * np.log1p(np.abs(means))
+    low, high = (logs.min(axis=0), logs.max(axis=0)) if count else (np.zeros(3), np.zeros(3))
+    steps = np.rint((logs - low) / np.where(high > low, high - low, 1) * 65535).astype(np.uint16)
+    largest, others = packing.without_largest(packing.unit_quats(gaussians.quats))
+    tags = (FIRST_TAG + largest).astype(np.uint8)[:, None]
+    quats = np.concatenate([packing.to_byte(255 * (others / sqrt(2) + 0.5)), tags], axis=1)
     scale_book, scale_rows = scalar_codebook(gaussians.log_scales, CODEBOOK)
     color_book, color_rows = scalar_codebook(gaussians.sh[:, 0], CODEBOOK)
     alphas = packing.opacity_bytes(gaussians.logit_opacities, 255)[:, None]
     images = {
-        "means_l.webp": _image(positions & 255),
-        "means_u.webp": _image(positions >> 8),
-        "quats.webp": _image(_quat_bytes(gaussians.quats)),
+        MEANS[0]: _image(steps & 255),
+        MEANS[1]: _image(steps >> 8),
+        "quats.webp": _image(quats),
         "scales.webp": _image(scale_rows),
         "sh0.webp": _image(np.concatenate([color_rows, alphas], axis=1)),
     }
     meta = {
         "version": 2,
         "asset": {"generator": "threestudio-gaussiandreamer"},
-        "count": len(gaussians.means),
-        "means": bounds | {"files": ["means_l.webp", "means_u.webp"]},
+        "count": count,
+        "means": {"mins": low.tolist(), "maxs": high.tolist(), "files": MEANS},
         "scales": {"codebook": _numbers(scale_book), "files": ["scales.webp"]},
         "quats": {"files": ["quats.webp"]},
         "sh0": {"codebook": _numbers(color_book), "files": ["sh0.webp"]},
     }
-    if gaussians.sh.shape[1] > 1 and len(gaussians.means):
+    if gaussians.sh.shape[1] > 1 and count:
         palette_images, meta["shN"] = _palette(gaussians.sh[:, 1:])
         images |= palette_images
     return images, meta
@@ -167,22 +174,6 @@ def _encoded(gaussians: Gaussians) -> tuple[dict[str, np.ndarray], dict[str, Any
 def _numbers(book: Float[np.ndarray, " B"]) -> list[float]:
     """Round a codebook to 7 digits for the JSON, about the precision of float32."""
     return [float(f"{value:.7g}") for value in book]
-
-
-def _position_steps(
-    means: Float[np.ndarray, "N 3"],
-) -> tuple[Integer[np.ndarray, "N 3"], dict[str, list[float]]]:
-    logs = np.sign(means) * np.log1p(np.abs(means.astype(np.float64)))
-    low, high = (logs.min(axis=0), logs.max(axis=0)) if len(logs) else (np.zeros(3), np.zeros(3))
-    size = np.where(high > low, high - low, 1)
-    steps = np.rint((logs - low) / size * 65535).astype(np.uint16)
-    return steps, {"mins": low.tolist(), "maxs": high.tolist()}
-
-
-def _quat_bytes(quats: Float[np.ndarray, "N 4"]) -> Integer[np.ndarray, "N 4"]:
-    largest, others = packing.without_largest(packing.unit_quats(quats))
-    tags = (FIRST_TAG + largest).astype(np.uint8)
-    return np.concatenate([packing.to_byte(255 * (others / sqrt(2) + 0.5)), tags[:, None]], axis=1)
 
 
 def _palette(rest: Float[np.ndarray, "N K 3"]) -> tuple[dict[str, np.ndarray], dict[str, Any]]:

@@ -38,7 +38,7 @@ from math import ceil, log, log2, sqrt
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Integer
+from jaxtyping import Bool
 
 from ..core.errors import UserError
 from ..core.files import atomic_file
@@ -156,13 +156,22 @@ def spz_bytes(
         raise UserError(f"an SPZ file holds harmonics up to degree 3, not {gaussians.sh_degree}")
     gaussians = gaussians.rows(packing.morton_order(gaussians.means))
     fractional = _fractional_bits(gaussians)
+    fixed = np.rint(gaussians.means.astype(np.float64) * 2.0**fractional)
+    fixed = fixed.clip(-MAX_FIXED, MAX_FIXED).astype("<i4")
+    largest, others = packing.without_largest(packing.unit_quats(gaussians.quats)[:, [1, 2, 3, 0]])
+    sizes = np.rint(np.abs(others) * (511 * sqrt(2))).astype(np.int64).clip(0, 511)
+    fields = (sizes | (others < 0) << 9) << np.array([20, 10, 0])
+    # zero harmonics are 128; they are rounded to the step of each degree, which compresses better
+    degrees = np.sqrt(np.arange(1, gaussians.sh.shape[1])).astype(int) - 1
+    steps = 2 ** (8 - np.array(SH_BITS))[degrees][:, None]
+    rest = np.floor((np.rint(128 * gaussians.sh[:, 1:]) + 128 + steps // 2) / steps) * steps
     blocks = [
-        _fixed_point(gaussians.means, fractional),
+        fixed[..., None].view("u1")[..., :3],  # the three low bytes
         packing.opacity_bytes(gaussians.logit_opacities),
         packing.to_byte(255 * (COLOR_SCALE * gaussians.sh[:, 0] + 0.5)),
         packing.to_byte(16 * (gaussians.log_scales - MIN_LOG_SCALE)),
-        _smallest_three(gaussians.quats),
-        _harmonic_bytes(gaussians.sh[:, 1:]),
+        (largest << 30 | fields.sum(axis=1)).astype("<u4"),
+        packing.to_byte(rest),
     ]
     flags, degree = IS_ANTIALIASED if ANTIALIASED in notes else 0, gaussians.sh_degree
     header = SpzHeader(MAGIC, version, len(gaussians.means), degree, fractional, flags, 0)
@@ -213,8 +222,22 @@ def spz_arrays(packed: bytes) -> tuple[Gaussians, bool]:
         view[start:end].reshape(header.count, width)
         for start, end, width in zip(ends, ends[1:], header.blocks, strict=False)
     )
-    means, log_scales = _positions(positions, header), scales / np.float32(16)
-    quats = (_from_first_three if header.version < 3 else _from_smallest_three)(rotations)
+    if header.version == 1:
+        means = positions.view("<f2")
+    else:
+        low, middle, high = positions.reshape(-1, 3, 3).transpose(2, 0, 1).astype(np.int32)
+        fixed = low | middle << 8 | (high ^ 0x80) - 0x80 << 16
+        means = fixed * 2.0**-header.fractional_bits
+    if header.version < 3:
+        xyz = rotations / 127.5 - 1
+        w = np.sqrt(np.clip(1 - (xyz**2).sum(axis=1, keepdims=True), 0, 1))
+        quats = np.concatenate([w, xyz], axis=1).astype(np.float32)
+    else:
+        word = np.ascontiguousarray(rotations).view("<u4").astype(np.int64)
+        fields = word >> np.array([20, 10, 0]) & 1023
+        others = np.where(fields & 512, -1.0, 1.0) * (fields & 511) / (511 * sqrt(2))
+        quats = packing.with_largest(word[:, 0] >> 30, others)[:, [3, 0, 1, 2]]
+    means, log_scales = means.astype(np.float32), scales / np.float32(16)
     logits = packing.logits_of_bytes(alphas[:, 0])
     # the harmonics last and in place, since they are most of the memory
     sh = np.empty((header.count, 1 + harmonics.shape[1] // 3, 3), np.float32)
@@ -228,9 +251,6 @@ def spz_arrays(packed: bytes) -> tuple[Gaussians, bool]:
         turned = np.stack([DIRECTIONS[letter] for letter in system], axis=1)
         gaussians = rotate(gaussians, turned)
     return gaussians, bool(header.flags & IS_ANTIALIASED)
-
-
-# ---- the attributes as SPZ stores them -----------------------------------------------------------
 
 
 def _fractional_bits(gaussians: Gaussians) -> int:
@@ -252,52 +272,6 @@ def _fractional_bits(gaussians: Gaussians) -> int:
 def _room(reach: float) -> int:
     """Return how many of 23 bits can be fractional for coordinates up to ``reach``."""
     return 23 - ceil(log2(max(reach, 2.0**-40) * (1 + 1e-6)))
-
-
-def _fixed_point(
-    means: Float[np.ndarray, "N 3"], fractional_bits: int
-) -> Integer[np.ndarray, "N 9"]:
-    fixed = np.rint(means.astype(np.float64) * 2.0**fractional_bits)
-    low_bytes = fixed.clip(-MAX_FIXED, MAX_FIXED).astype("<i4")[..., None].view("u1")[..., :3]
-    return low_bytes.reshape(-1, 9)
-
-
-def _positions(block: Integer[np.ndarray, "N B"], header: SpzHeader) -> Float[np.ndarray, "N 3"]:
-    if header.version == 1:
-        return block.view("<f2").astype(np.float32)
-    low, middle, high = block.reshape(-1, 3, 3).transpose(2, 0, 1).astype(np.int32)
-    fixed = low | middle << 8 | (high ^ 0x80) - 0x80 << 16
-    return (fixed * 2.0**-header.fractional_bits).astype(np.float32)
-
-
-def _smallest_three(quats: Float[np.ndarray, "N 4"]) -> Integer[np.ndarray, " N"]:
-    largest, others = packing.without_largest(packing.unit_quats(quats)[:, [1, 2, 3, 0]])
-    fields = (
-        np.rint(np.abs(others) * (511 * sqrt(2))).astype(np.int64).clip(0, 511) | (others < 0) << 9
-    )
-    return (largest << 30 | fields[:, 0] << 20 | fields[:, 1] << 10 | fields[:, 2]).astype("<u4")
-
-
-def _from_smallest_three(block: Integer[np.ndarray, "N 4"]) -> Float[np.ndarray, "N 4"]:
-    word = np.ascontiguousarray(block).view("<u4").astype(np.int64)
-    fields = word >> np.array([20, 10, 0]) & 1023
-    others = np.where(fields & 512, -1.0, 1.0) * (fields & 511) / (511 * sqrt(2))
-    return packing.with_largest(word[:, 0] >> 30, others)[:, [3, 0, 1, 2]]
-
-
-def _from_first_three(block: Integer[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 4"]:
-    xyz = block / 127.5 - 1
-    w = np.sqrt(np.clip(1 - (xyz**2).sum(axis=1, keepdims=True), 0, 1))
-    return np.concatenate([w, xyz], axis=1).astype(np.float32)
-
-
-def _harmonic_bytes(rest: Float[np.ndarray, "N K 3"]) -> Integer[np.ndarray, "N K 3"]:
-    """Encode harmonics with zero at 128, rounded to the step of each degree, which compresses
-    better.
-    """
-    degrees = np.sqrt(np.arange(1, rest.shape[1] + 1)).astype(int) - 1
-    steps = 2 ** (8 - np.array(SH_BITS))[degrees][:, None]
-    return packing.to_byte(np.floor((np.rint(128 * rest) + 128 + steps // 2) / steps) * steps)
 
 
 # ---- containers ----------------------------------------------------------------------------------
