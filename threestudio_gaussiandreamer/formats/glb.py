@@ -27,7 +27,7 @@ from ..gaussians.gaussians import Gaussians, finite, joined
 from ..gaussians.sh import COEFFICIENTS, sh0_colors
 from ..meshes.gltf import Document, World, world_matrices
 from ..meshes.mesh import srgb_to_linear
-from ..meshes.write import write_glb_file
+from ..meshes.write import accessor, write_glb_file
 from .packing import (
     FLOAT_OPACITY_MARGIN,
     displayed,
@@ -50,8 +50,7 @@ SPLATTING = {
     "projection": "perspective",
     "sortingMethod": "cameraDistance",
 }
-FLOAT, BYTE, POINTS, ARRAY_BUFFER = 5126, 5121, 0, 34962
-TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
+POINTS, ARRAY_BUFFER = 0, 34962
 DECODED_BYTES, DECODED_BYTES_PER_HARMONIC = 300, 72
 """Upper bounds of the memory that reading takes, per Gaussian and per harmonic of a Gaussian."""
 HALF_TURN = np.diag([-1.0, 1.0, -1.0])
@@ -96,8 +95,8 @@ def write_spz_glb(path: str | os.PathLike, gaussians: Gaussians, notes: Sequence
         document["bufferViews"] = [{}]
         # CesiumJS needs the matrix even where it is the identity
         document["nodes"] = [{"mesh": 0, "matrix": np.eye(4).ravel().tolist()}]
-        for accessor in document["accessors"]:
-            del accessor["bufferView"]
+        for entry in document["accessors"]:
+            del entry["bufferView"]
     blocks = [spz_bytes(gaussians)] if len(gaussians.means) else []
     write_glb_file(path, document, blocks)
 
@@ -172,12 +171,7 @@ def _document(
         "mode": POINTS,
         "extensions": {EXTENSION: SPLATTING},
     }
-    accessors = []
-    for index, values in enumerate(attributes.values()):
-        is_byte = values.dtype == np.uint8
-        kind = {"bufferView": index, "componentType": BYTE if is_byte else FLOAT}
-        kind |= {"count": len(values), "type": TYPES[values.shape[1]]}
-        accessors.append(kind | ({"normalized": True} if is_byte else {}))
+    accessors = [accessor(index, values) for index, values in enumerate(attributes.values())]
     accessors[0] |= {"min": means.min(axis=0).tolist(), "max": means.max(axis=0).tolist()}
     return head | {
         "scenes": [{"nodes": [0]}],

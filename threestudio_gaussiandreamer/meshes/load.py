@@ -167,12 +167,7 @@ def _extension(path: Path) -> str:
 def _drop_bad_vertices(mesh: Mesh, path: Path) -> Mesh:
     """Remove faces with a vertex that isn't finite, and vertices that no face uses."""
     finite = np.isfinite(mesh.vertices).all(axis=1)
-    if (bad := int((~finite).sum())) > MAX_NON_FINITE * len(finite):
-        raise UserError(
-            f"{bad} of {len(finite)} vertices of {str(path)!r} aren't finite (at most 5 % may "
-            "be): export the mesh again"
-        )
-    if bad:
+    if bad := _few(finite, "vertices", path):
         log.warning("dropped %d of %d vertices of %s that aren't finite", bad, len(finite), path)
     keep_face = finite[mesh.faces].all(axis=1)
     used, faces = np.unique(mesh.faces[keep_face], return_inverse=True)
@@ -181,6 +176,16 @@ def _drop_bad_vertices(mesh: Mesh, path: Path) -> Mesh:
     found = {name: getattr(mesh, name) for name in rows}
     kept = {name: x if x is None else x[rows[name]] for name, x in found.items()}
     return mesh._replace(faces=faces.reshape(-1, 3), **kept)
+
+
+def _few(finite: np.ndarray, what: str, path: Path) -> int:
+    """Return how many rows aren't finite; raise UserError if they are more than few."""
+    if (bad := int((~finite).sum())) > MAX_NON_FINITE * len(finite):
+        raise UserError(
+            f"{bad} of {len(finite)} {what} of {str(path)!r} aren't finite (at most 5 % may be): "
+            "export the mesh again"
+        )
+    return bad
 
 
 def pose_rotation(extension: str, up: str, front: Optional[str]) -> np.ndarray:
@@ -254,15 +259,9 @@ def _triangles(
 def _finite(colors: Float[np.ndarray, "V 3"], path: Path) -> Float[np.ndarray, "V 3"]:
     """Return the colours with grey for those that aren't finite, if they are few."""
     finite = np.isfinite(colors).all(axis=1)
-    if (bad := int((~finite).sum())) > MAX_NON_FINITE * len(finite):
-        raise UserError(
-            f"{bad} of {len(finite)} colours of {str(path)!r} aren't finite (at most 5 % may "
-            "be): export the mesh again"
-        )
-    if bad:
-        log.warning(
-            "%d of %d colours of %s aren't finite: they become grey", bad, len(finite), path
-        )
+    if bad := _few(finite, "colours", path):
+        said = "%d of %d colours of %s aren't finite: they become grey"
+        log.warning(said, bad, len(finite), path)
     return np.where(finite[:, None], colors, np.float32(GREY))
 
 
@@ -294,18 +293,12 @@ def _textured(
     their coordinates differ. Triangles without a texture keep their colours.
     """
     path, files = table.path, SideFiles(table.path, budget)
-    names = [
-        comment[len(TEXTURE_FILE) :].strip()
-        for comment in table.comments
-        if comment.lower().startswith(TEXTURE_FILE.lower())
-    ]
+    said = [text for text in table.comments if text.lower().startswith(TEXTURE_FILE.lower())]
+    names = [text[len(TEXTURE_FILE) :].strip() for text in said]
     if not names:
-        log.warning(
-            "%s has texture coordinates but names no texture, which isn't shown: add the line "
-            "'comment %sNAME.png' to its header, or save the mesh as GLB",
-            path,
-            TEXTURE_FILE,
-        )
+        said = "%s has texture coordinates but names no texture, which isn't shown: add the line "
+        remedy = "'comment %sNAME.png' to its header, or save the mesh as GLB"
+        log.warning(said + remedy, path, TEXTURE_FILE)
     parts = []
     for number in np.unique(numbers):
         rows = numbers == number
@@ -318,15 +311,9 @@ def _textured(
         corners = triangles[rows].ravel()
         keys = np.column_stack([indices[corners], uv[corners]])
         _, kept, places = np.unique(keys, axis=0, return_index=True, return_inverse=True)
-        used = corners[kept]
-        parts.append(
-            Mesh(
-                mesh.vertices[indices[used]],
-                places.reshape(-1, 3),
-                uv=uv[used],
-                texture=decode_texture(content, repr(name[:80]), budget),
-            )
-        )
+        used, texture = corners[kept], decode_texture(content, repr(name[:80]), budget)
+        vertices, faces = mesh.vertices[indices[used]], places.reshape(-1, 3)
+        parts.append(Mesh(vertices, faces, uv=uv[used], texture=texture))
     return parts
 
 
@@ -353,12 +340,8 @@ def _parts(path: Path, budget: Budget) -> list[Mesh]:
         content = files.with_libraries(_checked_obj(utf8(content)))
     elif path.suffix.lower() == ".stl":
         content = _exact_stl(content)
-    scene = trimesh.load_scene(
-        io.BytesIO(content),
-        file_type=path.suffix.lower().lstrip("."),
-        resolver=files,
-        process=False,
-    )
+    kind = path.suffix.lower().lstrip(".")
+    scene = trimesh.load_scene(io.BytesIO(content), file_type=kind, resolver=files, process=False)
     if files.refused:
         raise files.refused
     if path.suffix.lower() == ".off":
@@ -413,15 +396,10 @@ def _wrong_obj_line(width: int) -> re.Pattern[bytes]:
     (with alpha), all must have as many: trimesh splits the numbers of all vertices into rows of the
     first one's width without checking each line."""
     vertex = b"%b{%d}" % (ENTRY, width) if width in (4, 7) else b"%b{3}(?:%b{3})?" % (ENTRY, ENTRY)
-    right = rb"v(?= )%b|vt(?= )%b{2,3}|vn(?= )%b{3}|vp .*|f(?= )(?:[ \t]+%b){3,}" % (
-        vertex,
-        ENTRY,
-        ENTRY,
-        CORNER,
-    )
-    return re.compile(
-        rb"^(?=[ \t]*[vf])(?!(?:%b)[ \t]*\r?$).*$" % right, re.MULTILINE | re.IGNORECASE
-    )
+    right = rb"v(?= )%b|vt(?= )%b{2,3}|vn(?= )%b{3}|vp .*|f(?= )(?:[ \t]+%b){3,}"
+    right %= vertex, ENTRY, ENTRY, CORNER
+    line = rb"^(?=[ \t]*[vf])(?!(?:%b)[ \t]*\r?$).*$" % right
+    return re.compile(line, re.MULTILINE | re.IGNORECASE)
 
 
 def _exact_stl(data: bytes) -> bytes:
@@ -438,19 +416,16 @@ def _add_off_colors(scene: Any, text: str, path: Path) -> None:
     """Set the colours of an OFF file's vertices, which trimesh doesn't read; log a warning for
     others, such as those of faces.
     """
-    (kind, *counts), *lines = filter(
-        None, (line.partition("#")[0].split() for line in text.splitlines())
-    )
+    words = (line.partition("#")[0].split() for line in text.splitlines())
+    (kind, *counts), *lines = filter(None, words)
     (vertices, faces, *_), *lines = [counts, *lines] if counts else lines
     rows, polygons = lines[: int(vertices)], lines[int(vertices) :][: int(faces)]
     colors = _rgb_of([row[3:] for row in rows]) if kind.upper() in ("OFF", "COFF") else None
     has_more = "C" in kind.upper() or kind.upper() == "OFF" and any(len(row) > 3 for row in rows)
     of_faces = any(len(polygon) > int(polygon[0]) + 1 for polygon in polygons)
     if of_faces or has_more and colors is None:
-        what = "faces" if of_faces else "vertices"
-        log.warning(
-            "%s: the colours of its %s aren't read; convert it to PLY to keep them", path, what
-        )
+        said = "%s: the colours of its %s aren't read; convert it to PLY to keep them"
+        log.warning(said, path, "faces" if of_faces else "vertices")
     if colors is not None:
         (geometry,) = scene.geometry.values()
         geometry.visual.vertex_colors = colors

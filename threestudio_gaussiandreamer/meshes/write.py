@@ -22,7 +22,8 @@ from ..gaussians.surface import Surface
 from .mesh import Mesh
 
 UNLIT = "KHR_materials_unlit"
-FLOAT, UNSIGNED_INT, LINEAR, CLAMP_TO_EDGE = 5126, 5125, 9729, 33071
+COMPONENTS = {"u1": 5121, "u4": 5125, "f4": 5126}
+LINEAR, CLAMP_TO_EDGE = 9729, 33071
 ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER = 34962, 34963
 ALIGNMENT = 4
 NAME_BYTES = 63
@@ -143,7 +144,7 @@ def write_textured_glb(
 def _document(arrays: Mapping[str, np.ndarray], unlit: bool, name: str) -> dict[str, Any]:
     """Return the JSON of a GLB with one mesh; the arrays and the picture are its buffer views."""
     targets = [ELEMENT_ARRAY_BUFFER] + [ARRAY_BUFFER] * (len(arrays) - 1)
-    accessors = [_accessor(view, values) for view, values in enumerate(arrays.values())]
+    accessors = [accessor(view, values) for view, values in enumerate(arrays.values())]
     accessors[1] |= {
         "min": arrays["POSITION"].min(axis=0).tolist(),
         "max": arrays["POSITION"].max(axis=0).tolist(),
@@ -177,14 +178,14 @@ def _document(arrays: Mapping[str, np.ndarray], unlit: bool, name: str) -> dict[
     }
 
 
-def _accessor(view: int, values: np.ndarray) -> dict[str, Any]:
-    kinds = {1: "SCALAR", 2: "VEC2", 3: "VEC3"}
-    component = UNSIGNED_INT if values.dtype.kind == "u" else FLOAT
+def accessor(view: int, values: np.ndarray) -> dict[str, Any]:
+    """Return the JSON of an array (N, C) that fills a buffer view; bytes stand for fractions."""
     return {
         "bufferView": view,
-        "componentType": component,
+        "componentType": COMPONENTS[values.dtype.str[1:]],
         "count": len(values),
-        "type": kinds[values.shape[1]],
+        "type": {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}[values.shape[1]],
+        **({"normalized": True} if values.dtype == np.uint8 else {}),
     }
 
 
