@@ -61,7 +61,7 @@ def test_a_texture_colours_the_body(with_tiny_anny, tmp_path):
         np.testing.assert_allclose(colors, np.tile([1, 0, 0.2], (len(colors), 1)), atol=1e-6)
     assert make(color=None)("").colors == pytest.approx(0.5)  # grey without one
     (tmp_path / "skin.png").write_bytes(b"\x89PNG broken")
-    with pytest.raises(UserError, match="texture .*skin.png.* is in none of the formats"):
+    with pytest.raises(UserError, match="texture .*skin.png.* in none of the formats"):
         make(**options)("")
     with pytest.raises(UserError, match="texture .*does not exist"):
         make(texture="nothing.png").preflight()

@@ -148,7 +148,7 @@ def textured(mesh: Mesh, body: Body, path: str) -> Mesh:
         UserError: the image is missing or damaged.
     """
     with reading(path, "texture") as file:
-        texture = decode_texture(file.read_bytes(), repr(path), Budget(file))
+        texture = decode_texture(file.read_bytes(), "of the body", Budget(file))
     corners = np.stack([body.faces, body.face_uv], axis=-1).reshape(-1, 2)
     pairs, faces = np.unique(corners, axis=0, return_inverse=True)
     vertices, uv = mesh.vertices[pairs[:, 0]], body.uv[pairs[:, 1]]
