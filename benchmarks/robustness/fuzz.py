@@ -34,6 +34,7 @@ ROOM = 3 << 30
 """Bytes of address space that a process may add to that of its libraries."""
 MODULES = {"rasteriser": "tests.fuzz.scenes", "densify and prune": "tests.fuzz.sequences"}
 """What a target's process imports before it counts as started; others import the file targets."""
+UNITS = {"rasteriser": "Gaussians, forward and backward", "densify and prune": "operations"}
 OPERATIONS = 25
 SEQUENCES_AT_ONCE = 20
 
@@ -60,16 +61,10 @@ Report = Iterator[tuple[int, dict[str, Any]]]
 def try_files(name: str, seed: int, first: int, last: int) -> Report:
     from tests.fuzz.targets import outcomes
 
-    for index, outcome in outcomes(name, range(first, last), seed):
-        failures = [outcome.detail] if outcome.kind == "failed" else []
-        yield (
-            index,
-            {
-                "inputs": {name: 1},
-                "refused": {name: int(outcome.kind == "refused")},
-                "failures": {name: failures},
-            },
-        )
+    for index, (kind, detail) in outcomes(name, range(first, last), seed):
+        failures = [detail] if kind == "failed" else []
+        refused = {name: int(kind == "refused")}
+        yield index, {"inputs": {name: 1}, "refused": refused, "failures": {name: failures}}
 
 
 def try_scenes(name: str, seed: int, first: int, last: int) -> Report:
@@ -86,24 +81,15 @@ def try_scenes(name: str, seed: int, first: int, last: int) -> Report:
     for index in range(first, last):
         scene = extreme_scene(seed * 1_000_000 + index)
         part = well_posed(scene)
+        checks = {backend: (fault_of, scene, backend) for backend in BACKENDS}
+        checks["agreement"] = (disagreement_on, part, BACKENDS)
         seconds, failures = {}, {}
-        for backend in BACKENDS:
+        for row, (check, *arguments) in checks.items():
             started = time.perf_counter()
-            failures[backend] = _faults(fault_of, scene, backend)
-            seconds[backend] = time.perf_counter() - started
-        started = time.perf_counter()
-        failures["agreement"] = _faults(disagreement_on, part, BACKENDS)
-        counts = dict.fromkeys(BACKENDS, len(scene.cloud.means)) | {
-            "agreement": len(part.cloud.means)
-        }
-        yield (
-            index,
-            {
-                "inputs": counts,
-                "failures": failures,
-                "seconds": seconds | {"agreement": time.perf_counter() - started},
-            },
-        )
+            failures[row] = _faults(check, *arguments)
+            seconds[row] = time.perf_counter() - started
+        counts = {row: len(checked.cloud.means) for row, (_, checked, _) in checks.items()}
+        yield index, {"inputs": counts, "failures": failures, "seconds": seconds}
 
 
 def _faults(check: Callable[..., str | None], *arguments: Any) -> list[str]:
@@ -122,20 +108,15 @@ def try_sequences(name: str, seed: int, first: int, last: int) -> Report:
     from tests.fuzz.sequences import CloudSequence
 
     torch.set_num_threads(1)
-    options = {
-        "deadline": None,
-        "database": None,
-        "suppress_health_check": list(hypothesis.HealthCheck),
-    }
+    settings = hypothesis.settings(
+        max_examples=SEQUENCES_AT_ONCE, stateful_step_count=OPERATIONS, deadline=None,
+        database=None, suppress_health_check=list(hypothesis.HealthCheck),
+    )  # fmt: skip
     for index in range(first, last, SEQUENCES_AT_ONCE):
         CloudSequence.steps, failures = 0, []
-        settings = hypothesis.settings(
-            max_examples=SEQUENCES_AT_ONCE, stateful_step_count=OPERATIONS, **options
-        )
+        seeded = hypothesis.seed(seed * 1_000_000 + index)(CloudSequence)
         try:
-            run_state_machine_as_test(
-                hypothesis.seed(seed * 1_000_000 + index)(CloudSequence), settings=settings
-            )
+            run_state_machine_as_test(seeded, settings=settings)
         except Exception as error:
             failures.append(f"{type(error).__name__}: {error}")
         yield index, {"inputs": {name: CloudSequence.steps}, "failures": {name: failures}}
@@ -150,12 +131,9 @@ def work(name: str, seed: int, first: int, last: int) -> None:
     importlib.import_module(MODULES.get(name, "tests.fuzz.targets"))
     report = kind_of(name)(name, seed, first, last)
     print(json.dumps({"ready": True}), file=output)
-    libraries = (
-        int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-        if Path("/proc/self/statm").exists()
-        else 0
-    )
-    if libraries:
+    if Path("/proc/self/statm").exists():
+        pages = int(Path("/proc/self/statm").read_text().split()[0])
+        libraries = pages * resource.getpagesize()
         resource.setrlimit(resource.RLIMIT_AS, (libraries + ROOM, resource.RLIM_INFINITY))
     for index, counts in report:
         print(json.dumps({"index": index, **counts}), file=output)
@@ -168,34 +146,29 @@ def kind_of(name: str) -> Callable[[str, int, int, int], Report]:
 # ---- in the main process -------------------------------------------------------------------------
 
 
+Enough = Callable[["TargetRun"], bool]
+
+
 class TargetRun:
     """One target's worker processes, one after the other, and the sums of their reports."""
 
     def __init__(self, name: str, seed: int, keep: Path) -> None:
         self.name, self.seed, self.keep = name, seed, keep
-        self.inputs: dict[str, int] = {}
-        self.refused: dict[str, int] = {}
-        self.failures: dict[str, int] = {}
-        self.seconds: dict[str, float] = {}
+        self.sums: dict[str, dict[str, Any]] = {
+            kind: {} for kind in ("inputs", "refused", "failures", "seconds")
+        }
+        self.at_once = SEQUENCES_AT_ONCE if name == "densify and prune" else 1
 
-    def run(
-        self, count: int, enough: Callable[["TargetRun"], bool], tick: Callable[[int], None]
-    ) -> None:
+    def run(self, count: int, enough: Enough, tick: Callable[[int], None]) -> None:
         """Try inputs 0 to ``count``, or until there are enough; a process that ends early is
         followed by another one.
         """
         first, started = 0, time.perf_counter()
         while first < count and not enough(self):
             first = self._watch(first, count, enough, tick)
-        self.seconds.setdefault(self.name, time.perf_counter() - started)
+        self.sums["seconds"].setdefault(self.name, time.perf_counter() - started)
 
-    def _watch(
-        self,
-        first: int,
-        count: int,
-        enough: Callable[["TargetRun"], bool],
-        tick: Callable[[int], None],
-    ) -> int:
+    def _watch(self, first: int, count: int, enough: Enough, tick: Callable[[int], None]) -> int:
         """Return the index to continue with."""
         worker = ["--worker", self.name, str(self.seed), str(first), str(count)]
         command = [sys.executable, "-m", __spec__.name, *worker]
@@ -204,25 +177,17 @@ class TargetRun:
         timeout = STARTUP
         try:
             while not enough(self):
-                line = (
-                    process.stdout.readline()
-                    if select.select([process.stdout], [], [], timeout)[0]
-                    else "hang"
-                )
-                timeout = TIMEOUT
+                ready = select.select([process.stdout], [], [], timeout)[0]
+                line, timeout = process.stdout.readline() if ready else "hang", TIMEOUT
+                if line == "" and process.wait() == 0:
+                    return count
                 if line in ("", "hang"):
-                    return (
-                        count
-                        if not line and process.wait() == 0
-                        else self._lost(first, line, process, tick)
-                    )
+                    return self._lost(first, line, process, tick)
                 report = json.loads(line)
                 if "index" in report:
                     self._add(report)
                     tick(report["index"] + 1 - first)
-                    first = report["index"] + (
-                        SEQUENCES_AT_ONCE if self.name == "densify and prune" else 1
-                    )
+                    first = report["index"] + self.at_once
             return count
         finally:
             process.kill()
@@ -239,18 +204,14 @@ class TargetRun:
         return index + 1
 
     def _add(self, report: dict[str, Any]) -> None:
-        for kind, sums in (
-            ("inputs", self.inputs),
-            ("refused", self.refused),
-            ("seconds", self.seconds),
-        ):
-            for row, value in report.get(kind, {}).items():
-                sums[row] = sums.get(row, 0) + value
         for row, failures in report["failures"].items():
-            self.failures[row] = self.failures.get(row, 0) + len(failures)
             for failure in failures:
                 print(f"{row} {report['index']}: {failure}", file=sys.stderr)
                 self._keep(report["index"], failure)
+        counts = {row: len(failures) for row, failures in report["failures"].items()}
+        for kind, sums in self.sums.items():
+            for row, value in (report | {"failures": counts}).get(kind, {}).items():
+                sums[row] = sums.get(row, 0) + value
 
     def _keep(self, index: int, failure: str) -> None:
         self.keep.mkdir(parents=True, exist_ok=True)
@@ -264,24 +225,15 @@ class TargetRun:
             )
 
     def rows(self) -> list[Row]:
-        units = {
-            "rasteriser": "Gaussians, forward and backward",
-            "densify and prune": "operations",
-        }
-        named = {
-            row: f"{self.name}: {row}" if self.name == "rasteriser" else row for row in self.inputs
-        }
+        unit = UNITS.get(self.name, "damaged files")
+        prefix = f"{self.name}: " if self.name == "rasteriser" else ""
         return [
             Row(
-                named[row],
-                units.get(self.name, "damaged files"),
-                inputs,
-                self.failures.get(row, 0),
-                self.refused.get(row, 0),
-                self.seconds[row],
+                f"{prefix}{row}", unit, inputs, self.sums["failures"].get(row, 0),
+                self.sums["refused"].get(row, 0), self.sums["seconds"][row],
             )
-            for row, inputs in self.inputs.items()
-        ]
+            for row, inputs in self.sums["inputs"].items()
+        ]  # fmt: skip
 
 
 # ---- the table -----------------------------------------------------------------------------------
@@ -294,9 +246,8 @@ def main() -> int:
     rows, names = [], options.only or [*file_targets(), "rasteriser", "densify and prune"]
     for name in names:
         target, count = TargetRun(name, options.seed, Path(options.keep)), how_many(name, options)
-        with tqdm(
-            desc=name, total=None if name == "rasteriser" else count, unit="input", disable=None
-        ) as bar:
+        total = None if name == "rasteriser" else count
+        with tqdm(desc=name, total=total, unit="input", disable=None) as bar:
             target.run(count, enough_of(name, options), bar.update)
         rows += target.rows()
         print("\n".join(map(line_of, target.rows())), flush=True)
@@ -305,32 +256,18 @@ def main() -> int:
 
 
 def parse() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--inputs", type=int, default=2500, help="damaged files of each kind")
-    parser.add_argument(
-        "--gaussians",
-        type=int,
-        default=1_000_000,
-        help="extreme Gaussians through each backend; 'agreement' has fewer",
-    )
-    parser.add_argument(
-        "--sequences",
-        type=int,
-        default=1000,
-        help=f"random sequences of at most {OPERATIONS} operations",
-    )
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument(
-        "--only", nargs="+", help="only these targets; other rows of the CSV are kept"
-    )
-    parser.add_argument(
-        "--keep",
-        default="outputs/fuzz-failures",
-        help="folder for inputs that failed",
-    )
-    parser.add_argument("--worker", nargs=4, help=argparse.SUPPRESS)
+    raw = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=raw)
+    add = parser.add_argument
+    add("--inputs", type=int, default=2500, help="damaged files of each kind")
+    extreme = "extreme Gaussians through each backend; 'agreement' has fewer"
+    add("--gaussians", type=int, default=1_000_000, help=extreme)
+    sequences = f"random sequences of at most {OPERATIONS} operations"
+    add("--sequences", type=int, default=1000, help=sequences)
+    add("--seed", type=int, default=0)
+    add("--only", nargs="+", help="only these targets; other rows of the CSV are kept")
+    add("--keep", default="outputs/fuzz-failures", help="folder for inputs that failed")
+    add("--worker", nargs=4, help=argparse.SUPPRESS)
     return parser.parse_args()
 
 
@@ -340,11 +277,11 @@ def file_targets() -> list[str]:
     return list(TARGETS)
 
 
-def enough_of(name: str, options: argparse.Namespace) -> Callable[[TargetRun], bool]:
+def enough_of(name: str, options: argparse.Namespace) -> Enough:
     """Return whether a target is done early: scenes, when every backend has had its Gaussians."""
 
     def enough(target: TargetRun) -> bool:
-        drawn = [count for row, count in target.inputs.items() if row != "agreement"]
+        drawn = [count for row, count in target.sums["inputs"].items() if row != "agreement"]
         return name == "rasteriser" and min(drawn, default=0) >= options.gaussians
 
     return enough
