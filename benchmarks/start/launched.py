@@ -8,7 +8,6 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Optional
 
@@ -17,20 +16,14 @@ MARK = "MEASURED "
 """The extension prints one line of this and a JSON object."""
 
 
-def run_with_probe(
-    probe: Path,
-    checkout: Path,
-    *overrides: str,
-    config: str = "configs/demo.yaml",
-    environment: Mapping[str, str] = {},
-) -> dict[str, Any]:
-    """Train with a checkout in an empty folder until its extension ends the run.
+def run_with_probe(probe: Path, checkout: Path, *overrides: str) -> dict[str, Any]:
+    """Train the demo with a checkout on the CPU, in an empty folder, until its extension ends the
+    run.
 
     Args:
         probe: the extension's source.
         checkout: the folder of ``launch.py``.
         overrides: further arguments, such as ``trainer.max_steps=300``.
-        environment: further variables, for the extension.
 
     Returns:
         the object that the extension printed.
@@ -38,42 +31,19 @@ def run_with_probe(
     Raises:
         RuntimeError: the run ended without it.
     """
-    done = launch_with_probe(probe, checkout, *overrides, config=config, environment=environment)
-    for line in done.stdout.splitlines():
-        if line.startswith(MARK):
-            return json.loads(line.removeprefix(MARK))
-    raise RuntimeError(f"{checkout} measured nothing:\n{done.stdout}\n{done.stderr}")
-
-
-def launch_with_probe(
-    probe: Path, checkout: Path, *overrides: str, **options: Any
-) -> subprocess.CompletedProcess[str]:
-    """Train with a checkout in an empty folder with an extension; arguments as of
-    :func:`run_with_probe`.
-    """
+    command = [sys.executable, checkout / "launch.py", "--config", checkout / "configs/demo.yaml"]
+    command += ["--train", "--gpu", "cpu", *overrides]
+    environment = os.environ | {"PYTHONPATH": str(checkout)}
     with tempfile.TemporaryDirectory() as folder:
         extension = Path(folder, "custom", "probe")
         extension.mkdir(parents=True)
         shutil.copy(probe, extension / "__init__.py")
-        return launch(checkout, folder, *overrides, **options)
-
-
-def launch(
-    checkout: Path,
-    folder: str,
-    *overrides: str,
-    config: str = "configs/demo.yaml",
-    environment: Mapping[str, str] = {},
-) -> subprocess.CompletedProcess[str]:
-    """Train with a checkout on the CPU in ``folder``; arguments as of :func:`run_with_probe`."""
-    command = [sys.executable, checkout / "launch.py", "--config", checkout / config, "--train"]
-    return subprocess.run(
-        [*map(str, command), "--gpu", "cpu", *overrides],
-        cwd=folder,
-        env=os.environ | {"PYTHONPATH": str(checkout)} | dict(environment),
-        capture_output=True,
-        text=True,
-    )
+        options: dict[str, Any] = {"capture_output": True, "text": True}
+        done = subprocess.run([*map(str, command)], cwd=folder, env=environment, **options)
+    for line in done.stdout.splitlines():
+        if line.startswith(MARK):
+            return json.loads(line.removeprefix(MARK))
+    raise RuntimeError(f"{checkout} measured nothing:\n{done.stdout}\n{done.stderr}")
 
 
 def commit_of(checkout: Path) -> str:
