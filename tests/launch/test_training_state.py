@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 import torch
 
-from tests.helpers.checkpoints import CALLBACK, whole_checkpoint
+from tests.helpers.checkpoints import whole_checkpoint
 from threestudio_gaussiandreamer.core.checkpoint_file import load_checkpoint, save_file
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.launch.training_state import check_training_state
@@ -63,53 +63,27 @@ IMPOSSIBLE = [
     (at("state_dict", 3, value=torch.zeros(1)), "3 in its state_dict is of type Tensor"),
     (at("guidance", value=[1]), "its guidance isn't a mapping of tensors"),
     (at("guidance", value=torch.zeros(3)), "its guidance isn't a mapping of tensors"),
-    (
-        at(
-            *(*FIT, "epoch_loop.automatic_optimization.optim_progress", "optimizer", "step"),
-            *("total", "completed"),
-            value={},
-        ),
-        "isn't one of Lightning's: TypeError",
-    ),
     (at("global_step", value=-1), "its global_step is -1"),
-    (at("global_step", value=10**20), "its global_step is 1000"),
     (at("global_step", value=10**400), "its global_step is an integer of 1329 bits"),
-    (at("global_step", value=True), "its global_step is True"),
     (at("global_step", value=7), "loops are at step 3, its global_step is 7"),
     (at("epoch", value=-1), "its epoch is -1"),
     (at("epoch", value="0"), "its epoch is of type str"),
-    (at("loops", value={}), "its loops have no fit_loop"),
-    (at("loops", value=[1]), "its loops have no fit_loop"),
-    (at(*FIT, value={}), "its fit_loop has no epoch_loop.automatic"),
+    (at("loops", value=[1]), "its loops aren't those of Lightning: TypeError"),
+    (at(*FIT, value={}), "its loops are at step 0"),
     (
         at(*FIT, "epoch_loop.manual_optimization.optim_step_progress", value={}),
-        "isn't one of Lightning's: KeyError",
+        "its loops aren't those of Lightning: KeyError",
     ),
-    (without(*FIT, "epoch_progress"), "its fit_loop has no epoch_progress"),
-    (at(*FIT, "epoch_progress", "total", "ready", value=-1), "total.ready is -1; expected a"),
-    (at(*FIT, "epoch_progress", "total", value="x"), "total is 'x'; expected a count"),
-    (at("optimizer_states", value=[]), "hold no optimiser"),
-    (at("optimizer_states", value=[None]), "has no state and param_groups"),
-    (at(*ADAM, "state", value={}), "has no moments"),
-    (at(*ADAM, "state", value=3), "isn't a mapping of mappings"),
-    (at(*ADAM, "param_groups", value=[3]), "isn't a list of groups"),
+    (at("optimizer_states", value=[]), "Adam can't resume .*: ValueError there is no optimiser"),
+    (at("optimizer_states", value=[None]), "Adam can't resume"),
     (at(*ADAM, "param_groups", value=[]), "Adam can't resume"),
-    (at(*ADAM, "param_groups", 0, "lr", value=math.nan), "lr of the group means is nan"),
     (at(*ADAM, "param_groups", 0, "betas", value="x"), "Adam can't resume"),
-    (at(*ADAM, "state", 0, "exp_avg", value=lambda t: t[:3]), "has the shape .3, 3.; expected"),
-    (at(*ADAM, "state", 0, "exp_avg_sq", value=NAN), "means.exp_avg_sq holds NaN"),
-    (
-        at(*ADAM, "state", 0, "exp_avg_sq", value=lambda t: t - 1),
-        "a step of Adam from its optimizer_states makes means NaN",
-    ),
+    (at(*ADAM, "state", 0, "exp_avg", value=lambda t: t[:3]), "Adam can't resume"),
+    (at(*ADAM, "state", 0, "exp_avg_sq", value=NAN), "means.* is NaN"),
+    (at(*ADAM, "state", 0, "exp_avg_sq", value=lambda t: t - 1), "means.* is NaN"),
     (without(*ADAM, "state", 0, "step"), "Adam can't resume from its optimizer_states, which may"),
-    (at("pytorch-lightning_version", value=3), "pytorch-lightning_version is of type int"),
     (at("pytorch-lightning_version", value="x"), "is 'x'; expected 2.0 or later"),
     (at("pytorch-lightning_version", value="1.9.5"), "is '1.9.5'; expected 2.0 or later"),
-    (at("callbacks", value=[]), "its callbacks is of type list"),
-    (at("callbacks", CALLBACK, value=[]), "is of type list"),
-    (at("callbacks", CALLBACK, "best_k_models", value=3), "its best_k_models is of type int"),
-    (at("lr_schedulers", value=3), "its lr_schedulers is of type int"),
 ]
 
 
@@ -128,17 +102,10 @@ def test_a_whole_checkpoint_is_accepted(tmp_path):
     later["pytorch-lightning_version"] = "10.0.1"
     read(tmp_path / "c.ckpt", later)
 
-
-def test_plain_gradient_descent_has_no_moments(tmp_path):
-    content = whole_checkpoint()
-    state = content["optimizer_states"][0]
+    plain = whole_checkpoint()
+    state = plain["optimizer_states"][0]
     optimizer = torch.optim.SGD([torch.zeros(1, requires_grad=True)], lr=0.1)
     (own,) = optimizer.state_dict()["param_groups"]
-    state["state"] = {}
-    with pytest.raises(UserError, match="has no moments"):
-        read(tmp_path / "a.ckpt", content)
-    state["param_groups"] = [
-        {**own, **{name: group[name] for name in ("params", "name")}}
-        for group in state["param_groups"]
-    ]
-    assert read(tmp_path / "b.ckpt", content, "SGD")["global_step"] == 3
+    kept = [{name: group[name] for name in ("params", "name")} for group in state["param_groups"]]
+    state |= {"state": {}, "param_groups": [own | group for group in kept]}
+    read(tmp_path / "d.ckpt", plain, "SGD")
