@@ -10,7 +10,7 @@ themselves into a .glb, and a .spz.glb holds them always, as SPZ, which CesiumJS
 
 import argparse
 import os
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Optional
@@ -154,7 +154,9 @@ def _check_options(args: argparse.Namespace, suffix: str, mesh: bool) -> None:
         require_version(args.spz_version)
     elif args.spz_version != VERSION:
         raise UserError(f"--spz-version: OUT is a {suffix} file")
-    if args.up_out and args.up_out not in _axes_of(suffix, args.spz_version, mesh):
+    turned = suffix == ".spz" and args.spz_version == ZSTD_VERSION
+    axes = SYSTEM_OF if turned else AXES if not mesh and FORMATS[suffix].any_up else ()
+    if args.up_out and args.up_out not in axes:
         raise UserError(
             f"--up-out: OUT is a {suffix} file, whose axes are fixed; it is for PLYs, and y or -y "
             "with --spz-version 4"
@@ -176,13 +178,6 @@ def _check_options(args: argparse.Namespace, suffix: str, mesh: bool) -> None:
         raise UserError("--check: OUT is a mesh; it is for files of Gaussians")
     check_options(MeshOptions, mesh_options(args, False), "--")
     require_mesh_libraries()
-
-
-def _axes_of(suffix: str, spz_version: int, mesh: bool) -> Collection[str]:
-    """Return the up axes that OUT can have."""
-    if suffix == ".spz" and spz_version == ZSTD_VERSION:
-        return SYSTEM_OF
-    return AXES if not mesh and FORMATS[suffix].any_up else ()
 
 
 def _read(source: Path, args: argparse.Namespace) -> StoredCloud:

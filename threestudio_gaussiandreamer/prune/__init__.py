@@ -1,7 +1,4 @@
-"""Prune a finished cloud to a budget: ``python -m threestudio_gaussiandreamer.prune IN OUT``.
-
-``options.py`` has the options, ``pipeline.py`` reads, prunes and reports, ``command.py`` is the
-command line."""
+"""Prune a finished cloud to a budget: ``python -m threestudio_gaussiandreamer.prune IN OUT``."""
 
 from .command import main
 from .options import PruneOptions

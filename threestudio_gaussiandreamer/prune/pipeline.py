@@ -7,7 +7,6 @@ file of the output format stores, so they include its rounding. All cameras are 
 look inwards, which suits objects but not rooms."""
 
 import bisect
-import logging
 import math
 import statistics
 import time
@@ -23,6 +22,7 @@ from ..core.devices import get_device
 from ..core.errors import UserError
 from ..core.files import atomic_file, existing_file, json_text
 from ..core.images import write as write_image
+from ..core.logs import warn
 from ..formats.gaussian_files import StoredCloud, as_stored, file_size
 from ..formats.spz import COLOR_REACH
 from ..gaussians.axes import rotation_between
@@ -40,16 +40,8 @@ from ..gaussians.views import (
     views_around,
 )
 from ..view.run_files import read_any
-from .options import (
-    PruneOptions,
-    budget_of,
-    combined_psnr,
-    error_of,
-    parse_bytes,
-    parse_count,
-)
+from .options import PruneOptions, budget_of, combined_psnr, error_of, parse_bytes, parse_count
 
-logger = logging.getLogger(__name__)
 TRAIN_VIEWS, VAL_VIEWS, TEST_VIEWS = 64, 32, 48
 TURNS = (0.0, 45.0, 60.0)
 """Azimuth of the first view of each set, degrees."""
@@ -118,11 +110,9 @@ def prune_to_budget(
     spent = _spent(stored, reached)
     met = asked.psnr is None or error_of(spent) <= error_of(asked.psnr) + 2 * LEAST_ERROR
     if not met:
-        logger.warning(
-            "the budget isn't met: as a %s file these Gaussians reach a PSNR to the original of "
-            "at most %.2f dB",
-            suffix,
-            spent,
+        warn(
+            f"the budget isn't met: as a {suffix} file these Gaussians reach a PSNR to the "
+            f"original of at most {spent:.2f} dB"
         )
     unchanged = len(after.gaussians.means) == len(stored.gaussians.means)
     if asked.psnr is not None and met:
@@ -232,9 +222,6 @@ def views_of(stored: StoredCloud, options: PruneOptions) -> list[Views]:
         )
         for count, turn in zip((TRAIN_VIEWS, VAL_VIEWS, TEST_VIEWS), TURNS, strict=True)
     ]
-
-
-# ---- the report ----------------------------------------------------------------------------------
 
 
 def write_report(
