@@ -247,7 +247,7 @@ def companions(path: str | os.PathLike) -> tuple[Path, ...]:
     return (path.with_suffix(".png"), path.with_suffix(".mtl")) if beside else ()
 
 
-def _require_finite(path: str | os.PathLike, *values: Float[np.ndarray, "..."]) -> None:
+def _require_finite(path: str | os.PathLike, *values: Any) -> None:
     if not all(np.isfinite(each).all() for each in values):
         raise UserError(f"{str(path)!r} isn't written: some of its vertices hold NaN or infinity")
 
