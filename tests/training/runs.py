@@ -70,6 +70,10 @@ class MockGuidance(BaseObject):
         }
 
 
+def length(count):
+    return f"trainer.max_steps={count}", f"trainer.val_check_interval={count}"
+
+
 def launch(folder, mesh, *options, stage="--train"):
     overrides = [f"exp_root_dir={folder}", f"system.guidance.mesh={mesh}", *SMALL, *options]
     return main(["--config", str(CONFIGS / "demo.yaml"), stage, "--gpu", "cpu", *overrides])

@@ -3,7 +3,7 @@
 import csv
 import re
 
-from tests.training.runs import PRUNE, SMALL, cloud_of, launch, mocked_config, run_folder
+from tests.training.runs import PRUNE, SMALL, cloud_of, launch, length, mocked_config, run_folder
 from threestudio_gaussiandreamer.launch.experiment import main
 
 
@@ -12,7 +12,7 @@ def test_auto_says_what_more_would_gain(tmp_path, painted_box, capsys):
     options = ["budget=auto", "min_gaussians=20"]
     options += [f"prune.{x}" for x in "start=2 stop=6 every=2 gain=5.9 likeness=1".split()]
     options = [f"system.geometry.{option}" for option in options]
-    options += [f"exp_root_dir={tmp_path}", "trainer.max_steps=6", "trainer.val_check_interval=6"]
+    options += [f"exp_root_dir={tmp_path}", *length(6)]
     config = mocked_config(tmp_path, painted_box)
     assert main(["--config", str(config), "--train", "--gpu", "cpu", *SMALL, *options]) == 0
     said = "".join(capsys.readouterr())
@@ -24,12 +24,7 @@ def test_auto_says_what_more_would_gain(tmp_path, painted_box, capsys):
 
 
 def test_a_budget_that_needs_larger_rounds_is_met_with_a_message(tmp_path, painted_box, capsys):
-    options = [
-        *PRUNE,
-        "system.geometry.budget=70",
-        "trainer.max_steps=8",
-        "trainer.val_check_interval=8",
-    ]
+    options = [*PRUNE, "system.geometry.budget=70", *length(8)]
     assert launch(tmp_path, painted_box, *options) == 0
     told = (
         r"2 rounds of pruning must reduce \d+ Gaussians to 70: each keeps 0.[56]\d "

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from tests.training.runs import launch, run_folder
+from tests.training.runs import launch, length, run_folder
 from threestudio_gaussiandreamer.core.host_copies import HostCopy
 from threestudio_gaussiandreamer.metrics import psnr
 from threestudio_gaussiandreamer.splatting.cpu import backend as cpu
@@ -83,7 +83,7 @@ def test_the_error_that_a_guidance_returns_is_logged_and_no_truth_is_rendered(
 
     monkeypatch.setattr(system.GaussianDreamerSystem, "report", compare)
     monkeypatch.delattr(system, "true_views")
-    steps = ["trainer.max_steps=2", "trainer.val_check_interval=2"]
+    steps = [*length(2)]
     assert launch(tmp_path, painted_box, *steps) == 0
     logged = [float(row["dB"]) for row in logged_rows(tmp_path) if row["dB"]]
     assert logged == pytest.approx(expected, abs=1e-4) and len(expected) == 2

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tests.helpers.painted_ball import painted_ball
-from tests.training.runs import cloud_of, launch, run_folder
+from tests.training.runs import cloud_of, launch, length, run_folder
 from threestudio_gaussiandreamer.exporters import files as mesh_exporter
 from threestudio_gaussiandreamer.formats.gaussian_files import read_cloud
 from threestudio_gaussiandreamer.formats.ply import read_gaussians
@@ -22,12 +22,7 @@ def test_a_run_exports_the_pruned_cloud_too_and_so_does_export(tmp_path, painted
         "system.prune.steps=3",
         "system.exporter.formats=[ply,spz]",
     ]
-    assert (
-        launch(
-            tmp_path, painted_box, *options, "trainer.max_steps=4", "trainer.val_check_interval=4"
-        )
-        == 0
-    )
+    assert launch(tmp_path, painted_box, *options, *length(4)) == 0
     export = run_folder(tmp_path) / "save" / "it4-export"
     assert len(read_gaussians(export / "gaussians.ply").means) == 200
     first = read_gaussians(export / "pruned" / "gaussians.ply")
@@ -51,30 +46,10 @@ def test_a_run_exports_the_pruned_cloud_too_and_so_does_export(tmp_path, painted
     )
 
 
-def test_pruned_exports_note_what_they_have_spent(tmp_path, painted_box, capsys):
-    options = [
-        "system.prune.psnr=25",
-        "system.prune.size=32",
-        "system.prune.steps=3",
-        "system.exporter.formats=[ply,spz]",
-    ]
-    assert (
-        launch(
-            tmp_path, painted_box, *options, "trainer.max_steps=2", "trainer.val_check_interval=2"
-        )
-        == 0
-    )
-    files = run_folder(tmp_path) / "save" / "it2-export" / "pruned"
-    said = capsys.readouterr().out
-    for name in ("gaussians.ply", "gaussians.spz"):
-        assert str(files / name) in said  # where everything is
-        assert read_cloud(str(files / name)).pruned_to == 25
-
-
 def test_test_validate_and_export_use_the_checkpoint_and_no_prior(tmp_path, painted_box):
     mesh = tmp_path / "box.glb"
     mesh.write_bytes(painted_box.read_bytes())
-    assert launch(tmp_path, mesh, "trainer.max_steps=3", "trainer.val_check_interval=3") == 0
+    assert launch(tmp_path, mesh, *length(3)) == 0
     save, last = run_folder(tmp_path) / "save", run_folder(tmp_path) / "ckpts" / "last.ckpt"
     trained = (save / "it3-test" / "1.png").read_bytes()
     for path in (
@@ -94,19 +69,20 @@ def test_test_validate_and_export_use_the_checkpoint_and_no_prior(tmp_path, pain
     assert np.array_equal(exported.means, means[:, [1, 2, 0]] * np.float32([1, -1, -1]))
 
 
-def test_every_format_is_exported_and_says_that_it_was_trained_antialiased(tmp_path, painted_box):
-    options = [
-        "system.renderer.antialias=true",
-        "system.exporter.formats=[ply,compressed-ply,spz,sog,glb,usda]",
-    ]
-    steps = ["trainer.max_steps=1", "trainer.val_check_interval=1"]
-    assert launch(tmp_path, painted_box, *options, *steps) == 0
-    export = run_folder(tmp_path) / "save" / "it1-export"
+def test_every_format_notes_how_it_was_trained_and_pruned(tmp_path, painted_box, capsys):
+    options = ["system.renderer.antialias=true", "system.prune.psnr=25", "system.prune.size=32"]
+    options += ["system.prune.steps=3", *length(1)]
+    formats = "system.exporter.formats=[ply,compressed-ply,spz,sog,glb,usda]"
+    assert launch(tmp_path, painted_box, *options, formats) == 0
+    export, said = run_folder(tmp_path) / "save" / "it1-export", capsys.readouterr().out
     suffixes = ["ply", "compressed.ply", "spz", "sog", "glb"]
     stored = [read_cloud(str(export / f"gaussians.{suffix}")) for suffix in suffixes]
     assert [cloud.antialiased for cloud in stored] == [True] * 5
     assert [len(cloud.gaussians.means) for cloud in stored] == [200] * 5
     assert "SplatRenderMode: mip" in (export / "gaussians.usda").read_text()
+    for name in ("gaussians.ply", "gaussians.spz"):
+        path = str(export / "pruned" / name)
+        assert path in said and read_cloud(path).pruned_to == 25
 
 
 @register("test-raising-exporter")
@@ -185,7 +161,7 @@ def test_a_mesh_is_exported_beside_the_cloud_as_the_run_draws(tmp_path, painted_
     )
     small = "{faces: 200, texture: 64, views: 8, view_size: 64, resolution: 16}"
     options = ["system.exporter.formats=[ply,mesh]", f"system.exporter.options={{mesh: {small}}}"]
-    steps = ["trainer.max_steps=1", "trainer.val_check_interval=1"]
+    steps = [*length(1)]
     drawn = ["system.renderer.antialias=true", "system.renderer.eps2d=0.2"]
     assert launch(tmp_path, painted_box, *options, *steps, *drawn) == 0
     export = run_folder(tmp_path) / "save" / "it1-export"

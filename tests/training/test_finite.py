@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from tests.training.runs import launch, run_folder
+from tests.training.runs import launch, length, run_folder
 from threestudio_gaussiandreamer.training import system
 from threestudio_gaussiandreamer.training.finite import (
     CHECK_EVERY,
@@ -72,7 +72,7 @@ def test_a_run_that_turns_non_finite_stops_and_saves_nothing_of_it(
     tmp_path, painted_box, monkeypatch, capsys, cause
 ):
     monkeypatch.setattr(system, "CHECK_EVERY", 3)
-    steps = ["trainer.max_steps=5", "trainer.val_check_interval=5"]
+    steps = [*length(5)]
     assert launch(tmp_path, painted_box, *steps, *NON_FINITE[cause]) == 2
     errors = capsys.readouterr().err
     assert errors.count("are NaN or infinite") == 1 and "step 3:" in errors
@@ -91,11 +91,7 @@ def test_a_non_finite_state_never_replaces_a_good_checkpoint(tmp_path, painted_b
             self.geometry.means.data[5, 1] = torch.nan
 
     monkeypatch.setattr(GaussianDreamerSystem, "training_step", with_nan)
-    every = [
-        "checkpoint.every_n_train_steps=1",
-        "trainer.max_steps=4",
-        "trainer.val_check_interval=4",
-    ]
+    every = ["checkpoint.every_n_train_steps=1", *length(4)]
     assert launch(tmp_path, painted_box, *every) == 2
     last = run_folder(tmp_path) / "ckpts" / "last.ckpt"
     found = torch.load(last, weights_only=True)

@@ -11,11 +11,11 @@ from PIL import Image
 
 from benchmarks.viewers.browser import chromium
 from benchmarks.viewers.devtools import open_page
-from tests.training.runs import launch, run_folder
+from tests.training.runs import launch, length, run_folder
 from threestudio_gaussiandreamer.core.images import read
 from threestudio_gaussiandreamer.training.pages import discard_turntable
 
-SHORT = ["trainer.max_steps=2", "trainer.val_check_interval=2"]
+SHORT = [*length(2)]
 
 
 def meta(path) -> dict:
@@ -56,16 +56,19 @@ def test_the_poster_has_a_transparent_background(save):
     assert poster[0, 0, 3] == 0 and poster[..., 3].max() > 60
 
 
-def test_a_run_without_ffmpeg_exports_its_cloud_all_the_same(
+def test_a_run_without_ffmpeg_or_a_page_exports_its_cloud_all_the_same(
     tmp_path, painted_box, monkeypatch, capfd
 ):
+    monkeypatch.setattr("threestudio_gaussiandreamer.view.page.MAX_GAUSSIANS", 100)
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     monkeypatch.delitem(sys.modules, "imageio.plugins.ffmpeg", raising=False)
     assert launch(tmp_path, painted_box, "system.prompt_processor.prompt=a box", *SHORT) == 0
     save = run_folder(tmp_path) / "save"
     assert (save / "it2-export" / "gaussians.ply").is_file()
     assert not list(save.glob("*.mp4"))
-    assert "pip install imageio-ffmpeg" in capfd.readouterr().err
+    said = capfd.readouterr().err
+    assert "pip install imageio-ffmpeg" in said
+    assert "no view.html is written" in said and "200 Gaussians" in said
 
 
 def test_the_turntable_is_an_animated_picture_too(save):
@@ -122,12 +125,3 @@ def test_pages_can_be_switched_off(painted_box, tmp_path):
     assert launch(tmp_path, painted_box, "system.pages=false", *SHORT) == 0
     save = run_folder(tmp_path) / "save"
     assert not [*save.rglob("*.html"), *save.rglob("poster.png"), *save.rglob("prior/*.spz")]
-
-
-def test_a_page_for_too_many_gaussians_is_skipped_with_a_warning(
-    painted_box, tmp_path, monkeypatch, capsys
-):
-    monkeypatch.setattr("threestudio_gaussiandreamer.view.page.MAX_GAUSSIANS", 100)
-    assert launch(tmp_path, painted_box, *SHORT) == 0
-    said = capsys.readouterr().err
-    assert "no view.html is written" in said and "200 Gaussians" in said

@@ -15,6 +15,7 @@ from tests.training.runs import (
     SMALL,
     cloud_of,
     launch,
+    length,
     mocked_config,
     run_folder,
     same,
@@ -57,9 +58,7 @@ def test_a_cache_folder_of_embeddings_is_checked_before_any_model_is_loaded(
 
 
 def test_training_against_a_known_truth_improves_on_held_out_views(tmp_path, painted_box, capsys):
-    assert (
-        launch(tmp_path, painted_box, "trainer.max_steps=60", "trainer.val_check_interval=60") == 0
-    )
+    assert launch(tmp_path, painted_box, *length(60)) == 0
     metrics = json.loads((run_folder(tmp_path) / "save" / "metrics.json").read_text())
     assert (
         metrics["result"]["psnr"] > metrics["prior"]["psnr"] + 1.5
@@ -183,12 +182,7 @@ def test_a_learned_background_learns_and_is_in_the_checkpoint(tmp_path, painted_
     config = mocked_config(
         tmp_path, painted_box, background={"mode": "learned", "color": [0.5, 0.5, 0.5], "lr": 0.1}
     )
-    overrides = [
-        f"exp_root_dir={tmp_path}",
-        *SMALL,
-        "trainer.max_steps=20",
-        "trainer.val_check_interval=20",
-    ]
+    overrides = [f"exp_root_dir={tmp_path}", *SMALL, *length(20)]
     assert main(["--config", str(config), "--train", "--gpu", "cpu", *overrides]) == 0
     color = torch.sigmoid(
         cloud_of(run_folder(tmp_path) / "ckpts" / "last.ckpt")["background.logit"]
