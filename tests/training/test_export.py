@@ -128,6 +128,7 @@ def test_formats_that_fail_leave_the_others(tmp_path, painted_box, capsys):
     formats = ["ply", *(f"test-{name}" for name in FAILING), "points"]
     options = [f"system.exporter.formats=[{','.join(formats)}]", "trainer.max_steps=1"]
     options += ["trainer.val_check_interval=1", "system.prune.count=100"]
+    options += ["system.prune.size=32", "system.prune.steps=3"]
     with pytest.raises(RuntimeError, match="no memory for that"):
         launch(tmp_path, painted_box, *options)
     printed, export = capsys.readouterr(), run_folder(tmp_path) / "save" / "it1-export"
