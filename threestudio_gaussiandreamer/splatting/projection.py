@@ -54,27 +54,19 @@ def project(scene: Scene, options: RasterizeOptions) -> Splats:
     width, height = scene.size
     finite = torch.stack([_finite(x) for x in (means, quats, scales, opacities)]).all(0)
     means, quats, scales, opacities = (_keep(finite, x) for x in (means, quats, scales, opacities))
-    cameras_finite = _finite(viewmats[:, :3]) & _finite(
-        Ks[:, [0, 1, 0, 1], [0, 1, 2, 2]]
-    )  # only the entries that are used
-    viewmats, Ks = (
-        _keep(cameras_finite, viewmats, torch.eye(4)),
-        _keep(cameras_finite, Ks, torch.eye(3)),
-    )
+    # only the entries that are used
+    cameras_finite = _finite(viewmats[:, :3]) & _finite(Ks[:, [0, 1, 0, 1], [0, 1, 2, 2]])
+    viewmats = _keep(cameras_finite, viewmats, torch.eye(4))
+    Ks = _keep(cameras_finite, Ks, torch.eye(3))
 
     t, axes = _to_camera(means, quats, scales, viewmats)
     with torch.no_grad():
         candidates = _to_screen(t, axes, opacities, Ks, width, height, options)
-        visible = (
-            finite
-            & colors.isfinite().all(-1)
-            & cameras_finite[:, None]
-            & _visible(*candidates, width, height, options)
-        )
+        drawable = finite & colors.isfinite().all(-1) & cameras_finite[:, None]
+        visible = drawable & _visible(*candidates, width, height, options)
     t, axes = _keep(visible, t, torch.tensor([0.0, 0.0, 1.0])), _keep(visible, axes, torch.eye(3))
-    Ks = _keep(
-        visible.any(1), Ks, torch.eye(3)
-    )  # the intrinsics of a view without visible Gaussians may overflow even with constants
+    # the intrinsics of a view without visible Gaussians may overflow even with constants
+    Ks = _keep(visible.any(1), Ks, torch.eye(3))
     splats = _to_screen(t, axes, opacities, Ks, width, height, options)
     return Splats(*(_keep(visible, x) for x in splats), visible)
 
@@ -87,9 +79,8 @@ def quats_to_rotations(quats: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batc
     that divisor, so it is detached."""
     largest = quats.detach().abs().amax(-1, keepdim=True)
     usable = largest >= SMALLEST_QUATERNION
-    q = torch.where(
-        usable, quats / torch.where(usable, largest, 1), quats.new_tensor([1.0, 0, 0, 0])
-    )
+    identity = quats.new_tensor([1.0, 0, 0, 0])
+    q = torch.where(usable, quats / torch.where(usable, largest, 1), identity)
     w, x, y, z = (q / torch.linalg.vector_norm(q, dim=-1, keepdim=True)).unbind(-1)
     return torch.stack([torch.stack(row, -1) for row in rotation_rows(w, x, y, z)], -2)
 
@@ -113,17 +104,10 @@ def _to_screen(t, axes, opacities, Ks, width, height, options) -> tuple[Tensor, 
     u0, u1 = _project_axes(t, axes, Ks, width, height)
     conics, variances, compensation = _invert_covariance(u0, u1, options.eps2d)
     depths = t[..., 2]
-    means2d = torch.stack(
-        [_focal(Ks, i) * (t[..., i] / depths) + _centre(Ks, i) for i in (0, 1)], -1
-    )
+    centres = [_focal(Ks, i) * (t[..., i] / depths) + _centre(Ks, i) for i in (0, 1)]
     opacities = opacities * compensation if options.antialias else opacities.expand_as(depths)
-    return (
-        means2d,
-        conics,
-        opacities,
-        depths,
-        _extents(variances.detach(), opacities.detach(), options.alpha_min),
-    )
+    extents = _extents(variances.detach(), opacities.detach(), options.alpha_min)
+    return torch.stack(centres, -1), conics, opacities, depths, extents
 
 
 def _project_axes(t, axes, Ks, width, height) -> tuple[Tensor, Tensor]:
@@ -136,9 +120,8 @@ def _project_axes(t, axes, Ks, width, height) -> tuple[Tensor, Tensor]:
     for i, size in ((0, width), (1, height)):
         focal, centre = _focal(Ks, i), _centre(Ks, i)
         margin = FRUSTUM_MARGIN * 0.5 * size / focal
-        slope = torch.clamp(
-            t[..., i] / z, -centre / focal - margin, (size - centre) / focal + margin
-        )
+        low, high = -centre / focal - margin, (size - centre) / focal + margin
+        slope = torch.clamp(t[..., i] / z, low, high)
         rows.append((focal / z)[..., None] * (axes[..., i, :] - slope[..., None] * axes[..., 2, :]))
     return rows[0], rows[1]
 
@@ -182,16 +165,11 @@ def _visible(means2d, conics, opacities, depths, extents, width, height, options
     least ``alpha_min``, and a box that overlaps the image.
     """
     in_range = (depths > options.near) & (depths < options.far)
-    drawable = (
-        conics.isfinite().all(-1)
-        & (conics[..., 0] > 0)
-        & (conics[..., 2] > 0)
-        & means2d.isfinite().all(-1)
-    )
-    on_screen = (
-        (means2d + extents >= 0) & (means2d - extents <= means2d.new_tensor([width, height]))
-    ).all(-1)
-    return in_range & drawable & (opacities >= options.alpha_min) & on_screen
+    finite = conics.isfinite().all(-1) & means2d.isfinite().all(-1)
+    positive = (conics[..., 0] > 0) & (conics[..., 2] > 0)
+    low, high = means2d + extents >= 0, means2d - extents <= means2d.new_tensor([width, height])
+    opaque = opacities >= options.alpha_min
+    return in_range & finite & positive & opaque & (low & high).all(-1)
 
 
 def _finite(x) -> Tensor:

@@ -30,10 +30,8 @@ def rasterize(scene: Scene, options: RasterizeOptions) -> Rasterized:
     tracked = (scene.colors, scene.background)
     splats = splats._replace(means2d=track_means2d(splats, tracked, options.absgrad))
     colors = scene.colors.expand(len(scene.viewmats), -1, -1)
-    views = [
-        render_view(splats, colors, view, *scene.size, options)
-        for view in range(len(scene.viewmats))
-    ]
+    numbers = range(len(scene.viewmats))
+    views = [render_view(splats, colors, view, *scene.size, options) for view in numbers]
     sums, contribution = (torch.stack(x) for x in zip(*views, strict=True))
     sums = sums.unflatten(1, (scene.height, scene.width))
     return compose(sums, splats, contribution, scene.background, options)
@@ -62,9 +60,8 @@ def render_view(
     ]
     sums, largest = zip(*blended, strict=True)
     contribution = splats.depths.new_zeros(splats.depths.shape[1])
-    return torch.cat(sums), contribution.index_copy(
-        0, front_to_back.ids, torch.stack(largest).amax(0)
-    )
+    largest = torch.stack(largest).amax(0)
+    return torch.cat(sums), contribution.index_copy(0, front_to_back.ids, largest)
 
 
 def sort(splats: Splats, colors: Tensor, view: int) -> Sorted:
@@ -72,13 +69,9 @@ def sort(splats: Splats, colors: Tensor, view: int) -> Sorted:
     visible = splats.visible[view].nonzero()[:, 0]
     ids = visible[splats.depths[view, visible].argsort(stable=True)]
     means2d, conics, opacities, depths = (x[view, ids] for x in splats[:4])
-    return Sorted(
-        ids,
-        means2d,
-        conics,
-        opacities,
-        torch.cat([colors[view, ids], depths[:, None], torch.ones_like(depths)[:, None]], 1),
-    )
+    depth_and_one = torch.stack([depths, torch.ones_like(depths)], 1)
+    features = torch.cat([colors[view, ids], depth_and_one], 1)
+    return Sorted(ids, means2d, conics, opacities, features)
 
 
 def blend(
@@ -111,9 +104,8 @@ def _accumulate(total: Tensor, ids: Tensor, values: Tensor) -> None:
 
 def pixel_centres(width: int, height: int, like: Tensor) -> Tensor:
     """Return x, y of the pixel centres (H*W, 2), row by row from the top."""
-    y, x = torch.meshgrid(
-        torch.arange(height).to(like) + 0.5, torch.arange(width).to(like) + 0.5, indexing="ij"
-    )
+    rows, columns = (torch.arange(size).to(like) + 0.5 for size in (height, width))
+    y, x = torch.meshgrid(rows, columns, indexing="ij")
     return torch.stack([x, y], -1).reshape(-1, 2)
 
 
@@ -126,8 +118,5 @@ def _blend_in_bounded_memory(bounded: bool, *arguments) -> tuple[Tensor, Tensor]
 
 
 def _pixels_per_chunk(splats: Sorted) -> int:
-    return max(
-        1,
-        CHUNK_BYTES
-        // (TENSORS_PER_PAIR * splats.opacities.element_size() * max(1, len(splats.ids))),
-    )
+    per_pixel = TENSORS_PER_PAIR * splats.opacities.element_size() * max(1, len(splats.ids))
+    return max(1, CHUNK_BYTES // per_pixel)

@@ -41,9 +41,8 @@ class Bounds(NamedTuple):
     # (6, S): mean x, y in pixels of the view; conic a, k, c; the largest q at which alpha >=
     # alpha_min
     shapes: Tensor
-    rectangles: (
-        Tensor  # (4, S): left, top, right, bottom in tiles of the grid, the last two exclusive
-    )
+    # (4, S): left, top, right, bottom in tiles of the grid, the last two exclusive
+    rectangles: Tensor
     first_rows: Tensor  # (S,) the row of the grid where the splat's view starts
 
 
@@ -72,11 +71,9 @@ def bound(means2d, conics, opacities, extents, views, grid: Grid, alpha_min: flo
     high = torch.minimum(((means2d + extents - 0.5) / TILE).floor() + 1, limit).clamp(min=0)
     first_rows = views * grid.rows
     shift = torch.stack([torch.zeros_like(views), first_rows])
-    levels = (
-        2 * torch.log(opacities / alpha_min)
-        if alpha_min > 0
-        else torch.full_like(opacities, torch.inf)
-    )
+    levels = torch.full_like(opacities, torch.inf)
+    if alpha_min > 0:
+        levels = 2 * torch.log(opacities / alpha_min)
     shapes = torch.cat([means2d.t(), conics.t(), levels[None] * (1 + SLACK) + SLACK])
     return Bounds(shapes, torch.cat([low.t().long() + shift, high.t().long() + shift]), first_rows)
 
@@ -100,9 +97,8 @@ def list_splats(bounds: Bounds, first: int, last: int, unfinished: Tensor, grid:
     left, top, right, bottom = bounds.rectangles[:, first:last]
     width, height = (right - left).clamp(min=0), (bottom - top).clamp(min=0)
     counts = width * height
-    boxes = torch.stack(
-        [left, top, width, counts.cumsum(0) - counts, bounds.first_rows[first:last]]
-    )
+    firsts = counts.cumsum(0) - counts
+    boxes = torch.stack([left, top, width, firsts, bounds.first_rows[first:last]])
     splats = torch.repeat_interleave(torch.arange(last - first, device=counts.device), counts)
     shapes, parts = bounds.shapes[:, first:last], splats.split(CANDIDATES_PER_TEST)
     pairs = [
@@ -125,9 +121,8 @@ def _test(
     row = torch.div(within, width, rounding_mode="floor")
     column, row = left + within - row * width, top + row
     tiles = row * grid.columns + column
-    reached = _reaches(
-        shapes.index_select(1, splats), column * TILE + 0.5, (row - first_row) * TILE + 0.5
-    )
+    corner = column * TILE + 0.5, (row - first_row) * TILE + 0.5
+    reached = _reaches(shapes.index_select(1, splats), *corner)
     kept = (reached & unfinished.index_select(0, tiles)).nonzero()[:, 0]
     return tiles[kept].int(), splats[kept].int()
 
@@ -145,10 +140,9 @@ def _reaches(shapes, left, top) -> Tensor:
     x, y = torch.clamp(torch.zeros_like(x0), x0, x1), torch.clamp(torch.zeros_like(y0), y0, y1)
     other_x = torch.clamp(k * y, x0, x1)
     other_y = torch.clamp(x * (a * k / (a * k * k + c)), y0, y1)
-    q = torch.minimum(
-        a * (other_x - k * y) ** 2 + c * y**2, a * (x - k * other_y) ** 2 + c * other_y**2
-    )
-    return q <= level
+    on_row = a * (other_x - k * y) ** 2 + c * y**2
+    on_column = a * (x - k * other_y) ** 2 + c * other_y**2
+    return torch.minimum(on_row, on_column) <= level
 
 
 def _longest_first(tiles: Tensor, counts: Tensor, splats: Tensor) -> Lists:

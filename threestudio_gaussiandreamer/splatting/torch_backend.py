@@ -193,9 +193,8 @@ def _backward(
         grads = torch.cat([splat_gradients(block, slopes), features], 1)
         columns.index_add_(1, block.splats, grads.transpose(0, 1).flatten(1))
         if absolute:
-            absolutes.index_add_(
-                1, block.splats, absolute_gradients(block, slopes).transpose(0, 1).flatten(1)
-            )
+            found = absolute_gradients(block, slopes).transpose(0, 1).flatten(1)
+            absolutes.index_add_(1, block.splats, found)
     return columns, absolutes
 
 
@@ -213,15 +212,12 @@ def _march(table: Table, transmittances: Tensor, options: RasterizeOptions) -> I
         active, depth = torch.arange(len(lists.tiles), device=lists.tiles.device), 0
         while len(active):
             size = ELEMENTS_PER_BLOCK // (SPLATS_PER_STEP * PIXELS)
-            for part, longest in zip(
-                active.split(size), lists.counts[active[::size]].tolist(), strict=True
-            ):
+            longest_of_parts = lists.counts[active[::size]].tolist()
+            for part, longest in zip(active.split(size), longest_of_parts, strict=True):
                 yield _block(table, lists, part, depth, min(longest - depth, SPLATS_PER_STEP))
             depth += SPLATS_PER_STEP
-            active = active[
-                _unfinished(transmittances[lists.tiles[active]], options)
-                & (lists.counts[active] > depth)
-            ]
+            unfinished = _unfinished(transmittances[lists.tiles[active]], options)
+            active = active[unfinished & (lists.counts[active] > depth)]
 
 
 def _lists(table: Table, transmittances: Tensor, options: RasterizeOptions) -> Iterator[Lists]:
@@ -229,16 +225,15 @@ def _lists(table: Table, transmittances: Tensor, options: RasterizeOptions) -> I
     of the first slices are kept for backward.
     """
     for i, (first, last) in enumerate(table.slices):
-        if i == len(table.lists) < KEPT_SLICES:
-            table.lists.append(
-                list_splats(
-                    table.bounds, first, last, _unfinished(transmittances, options), table.grid
-                )
-            )
         if i < len(table.lists):
             yield table.lists[i]
-        elif (unfinished := _unfinished(transmittances, options)).any():
-            yield list_splats(table.bounds, first, last, unfinished, table.grid)
+            continue
+        unfinished = _unfinished(transmittances, options)
+        if len(table.lists) == i < KEPT_SLICES or unfinished.any():
+            lists = list_splats(table.bounds, first, last, unfinished, table.grid)
+            if len(table.lists) == i < KEPT_SLICES:
+                table.lists.append(lists)
+            yield lists
 
 
 def _unfinished(transmittances: Tensor, options: RasterizeOptions) -> Tensor:
@@ -252,9 +247,8 @@ def _block(table: Table, lists: Lists, part: Tensor, depth: int, length: int) ->
     places = depth + torch.arange(length, device=part.device)
     positions = (lists.starts[part, None] + places).clamp(max=len(lists.splats) - 1)
     nothing = table.columns.shape[1] - 1
-    splats = torch.where(
-        places < lists.counts[part, None], lists.splats[positions].long(), nothing
-    ).flatten()
+    splats = lists.splats[positions].long()
+    splats = torch.where(places < lists.counts[part, None], splats, nothing).flatten()
     columns = table.columns.index_select(1, splats).view(-1, len(part), length)
     tiles = lists.tiles[part]
     middle_x, middle_y = (origin[:, None] + TILE / 2 for origin in table.grid.origins(tiles))
@@ -276,9 +270,8 @@ def _alphas(block: Block, options: RasterizeOptions) -> Tensor:
     x, y = steep * from_x, steep * block.k[:, None] * from_y
     top = block.opacity.clamp(min=FAINTEST).log()[:, None] - block.c[:, None] / 2 * from_y**2
     root = x[:, None] - y[:, :, None]
-    alphas = (
-        torch.addcmul(top[:, :, None], root, root, value=-1).exp_().clamp_(max=options.alpha_max)
-    )
+    alphas = torch.addcmul(top[:, :, None], root, root, value=-1).exp_()
+    alphas.clamp_(max=options.alpha_max)
     return threshold_(alphas, _just_below(options.alpha_min, alphas), 0.0).flatten(1, 2)
 
 
@@ -327,17 +320,8 @@ def splat_gradients(block: Block, slopes: Tensor) -> Tensor:
     slopes_dd = syy + y * (sy + sd)
     grad_x = block.a * slopes_t
     grad_y = block.c * sd - k * grad_x
-    return torch.stack(
-        [
-            grad_x,
-            grad_y,
-            -slopes_tt / 2,
-            block.a * slopes_td,
-            -slopes_dd / 2,
-            s / block.opacity.clamp(min=FAINTEST),
-        ],
-        1,
-    )
+    conics = (-slopes_tt / 2, block.a * slopes_td, -slopes_dd / 2)
+    return torch.stack([grad_x, grad_y, *conics, s / block.opacity.clamp(min=FAINTEST)], 1)
 
 
 def absolute_gradients(block: Block, slopes: Tensor) -> Tensor:
@@ -346,13 +330,8 @@ def absolute_gradients(block: Block, slopes: Tensor) -> Tensor:
     slopes = slopes.view(len(slopes), TILE, TILE, -1)
     k, c = block.k[:, None, None], block.c[:, None, None]
     along_x = block.a[:, None, None] * (from_x - k * from_y)
-    return torch.stack(
-        [
-            (slopes * along_x).abs().sum((1, 2)),
-            (slopes * (c * from_y - k * along_x)).abs().sum((1, 2)),
-        ],
-        1,
-    )
+    along = along_x, c * from_y - k * along_x
+    return torch.stack([(slopes * gradient).abs().sum((1, 2)) for gradient in along], 1)
 
 
 def product(a: Tensor, b: Tensor) -> Tensor:
@@ -375,9 +354,8 @@ def _centres(like: Tensor) -> Tensor:
 
 def _monomials(like: Tensor) -> Tensor:
     """Return 1, x, y, x^2, x y, y^2 at the pixel centres relative to the tile's: (6, PIXELS)."""
-    y, x = (
-        axis.flatten() for axis in torch.meshgrid(_centres(like), _centres(like), indexing="ij")
-    )
+    grid = torch.meshgrid(_centres(like), _centres(like), indexing="ij")
+    y, x = (axis.flatten() for axis in grid)
     return torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y])
 
 
@@ -399,9 +377,7 @@ def to_tiles(image: Tensor, grid: Grid) -> Tensor:
 
 def from_tiles(tiles: Tensor, grid: Grid, width: int, height: int) -> Tensor:
     """Invert `to_tiles`."""
-    tiles = tiles.view(grid.views, grid.rows, grid.columns, -1, TILE, TILE).permute(
-        0, 1, 4, 2, 5, 3
-    )
-    return tiles.reshape(grid.views, grid.rows * TILE, grid.columns * TILE, -1)[
-        :, :height, :width
-    ].contiguous()
+    tiles = tiles.view(grid.views, grid.rows, grid.columns, -1, TILE, TILE)
+    image = tiles.permute(0, 1, 4, 2, 5, 3)
+    image = image.reshape(grid.views, grid.rows * TILE, grid.columns * TILE, -1)
+    return image[:, :height, :width].contiguous()

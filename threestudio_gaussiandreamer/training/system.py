@@ -80,6 +80,7 @@ from .pictures import prefetch_truth, rgb_panel, save_pictures, true_views
 from .preflight import check_parts, preflight_parts
 from .renderer import require_outputs
 
+Outputs, Batch, Losses = Mapping[str, Any], dict[str, Any], dict[str, Tensor]
 GUIDANCE_LR = 1e-4
 """Learning rate of parameters that a guidance trains itself, such as the LoRA of VSD."""
 
@@ -202,9 +203,8 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
 
     def first_state(self) -> dict[str, Tensor]:
         """Run the prior; return the state of the cloud, on the CPU."""
-        prompt = self.prompt_utils or find(self.cfg.prompt_processor_type)(
-            self.cfg.prompt_processor
-        )
+        make = find(self.cfg.prompt_processor_type)
+        prompt = self.prompt_utils or make(self.cfg.prompt_processor)
         self.geometry.initialize(
             str(getattr(prompt, "prompt", "")),
             lambda prior, text: cached_cloud(prior, text, self._save_dir),
@@ -256,11 +256,7 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         self.report(out, batch, guided, losses)
 
     def optimize(
-        self,
-        optimizer: torch.optim.Optimizer,
-        out: Mapping[str, Any],
-        batch: dict[str, Any],
-        losses: dict[str, Tensor],
+        self, optimizer: torch.optim.Optimizer, out: Outputs, batch: Batch, losses: Losses
     ) -> None:
         """Reduce the gradients over the processes, and step the optimiser."""
         warn_if_invisible(out["opacity"], self.global_step)
@@ -290,9 +286,7 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
             self.step_log.write(self.trainer, {"prune/gain": outcome.needed.gain})
             info(f"step {self.global_step}: {outcome}")
 
-    def error_of(
-        self, out: Mapping[str, Any], batch: dict[str, Any], guided: dict[str, Any]
-    ) -> Optional[MeanError]:
+    def error_of(self, out: Outputs, batch: Batch, guided: dict[str, Any]) -> Optional[MeanError]:
         """Return what computes the mean squared error of renders to the ground truth; None if there
         is none.
         """
@@ -308,7 +302,7 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         self.geometry.set_learning_rates(optimizer, *now)
         self.part_rates.set(self, optimizer, *now)
 
-    def losses(self, guided: dict[str, Any], out: Mapping[str, Any]) -> dict[str, Tensor]:
+    def losses(self, guided: dict[str, Any], out: Outputs) -> Losses:
         """Return the weighted losses of the guidance and the regularisers, which see the renders
         and the cloud.
         """
@@ -318,26 +312,17 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         self.recent_losses.add(self.global_step, losses)
         return losses
 
-    def guide(
-        self, out: Mapping[str, Any], batch: dict[str, Any], **options: Any
-    ) -> dict[str, Any]:
+    def guide(self, out: Outputs, batch: Batch, **options: Any) -> dict[str, Any]:
         """Call the guidance with these renders, the whole batch, the renders' background, and the
         further outputs of the renderer that it names.
         """
         options |= {name: out[name].detach() for name in getattr(self.guidance, "renders", ())}
         options["comp_rgb_bg"] = out["comp_rgb_bg"]
         with own_randomness(self.true_global_step):
-            return call_guidance(
-                self.guidance, out["comp_rgb"], self.prompt_utils, batch, **options
-            )
+            inputs = out["comp_rgb"], self.prompt_utils, batch
+            return call_guidance(self.guidance, *inputs, **options)
 
-    def report(
-        self,
-        out: Mapping[str, Any],
-        batch: dict[str, Any],
-        guided: dict[str, Any],
-        losses: dict[str, Tensor],
-    ) -> None:
+    def report(self, out: Outputs, batch: Batch, guided: dict[str, Any], losses: Losses) -> None:
         """Log what the guidance returned, the weighted losses and their sum, the number of
         Gaussians and, if there is a ground truth, PSNR, every ``log_every_n_steps``.
         """
