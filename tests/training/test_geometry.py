@@ -179,6 +179,24 @@ def test_learning_rates_follow_their_schedules(sphere_points):
     assert len(rates) == 6
 
 
+@pytest.mark.parametrize("unit", ["world", "size"])
+def test_a_step_moves_means_in_the_unit_of_their_rate(sphere_points, unit):
+    geometry = started(sphere_points, lr_means_unit=unit)
+    for parameter in (geometry.quats, geometry.log_scales, geometry.means):
+        torch.nn.init.normal_(parameter, generator=torch.Generator().manual_seed(0))
+    before, gradient = geometry.means.detach().clone(), torch.randn(len(geometry), 3)
+    geometry.means.grad = gradient.clone()
+    with geometry.steps_by_size():
+        torch.optim.SGD([geometry.means], lr=0.5).step()
+    quats, axes = geometry.quats.detach(), torch.eye(3)
+    columns = [densify.rotate(quats, axis.expand(len(quats), 3)) for axis in axes]
+    scaled = torch.stack(columns, -1) * geometry.scales().detach()[:, None]
+    wanted = gradient[..., None]
+    if unit == "size":
+        wanted = scaled @ (scaled.transpose(1, 2) @ wanted)
+    assert torch.allclose(geometry.means, before - 0.5 * wanted[..., 0], atol=1e-4, rtol=1e-4)
+
+
 def test_densification_happens_at_its_steps_only_and_the_optimiser_follows(sphere_points):
     densify = {
         "enabled": True,

@@ -20,6 +20,8 @@ bound_colors        keep colours in [0, 1], which is all that viewers show: the 
                     clamped after each step, and the colour that a view sees as it is drawn
 lr_*                learning rate of each attribute: a number or a schedule; lr_sh_rest for the
                     bands above degree 0
+lr_means_unit       of lr_means: ``world`` units, or ``size``: standard deviations of each Gaussian
+                    along its own axes, so that a step moves large ones farther than small ones
 densify             enabled, start, stop, every (steps), grad_threshold, split_scale, min_opacity,
                     max_scale (world units); absgrad: compare the sum of the pixels' absolute
                     gradients, in which opposite signs don't cancel (AbsGS, Ye et al. 2024), with
@@ -43,6 +45,8 @@ keep_attributes     with gaussians-prior: start from all attributes of that clou
 """
 
 import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -96,6 +100,7 @@ class GaussianCloud(BaseGeometry):
         bound_colors: bool = True
         keep_attributes: bool = True
         lr_means: Any = field(default=5e-5, metadata=schedule(min=0, max=1e6))
+        lr_means_unit: str = field(default="world", metadata=one_of(("world", "size")))
         lr_scales: Any = field(default=1e-3, metadata=schedule(min=0, max=1e6))
         lr_quats: Any = field(default=1e-2, metadata=schedule(min=0, max=1e6))
         lr_opacities: Any = field(default=1e-2, metadata=schedule(min=0, max=1e6))
@@ -355,6 +360,23 @@ class GaussianCloud(BaseGeometry):
         for group in optimizer.param_groups:
             if group.get("name") in LEARNING_RATES:
                 group["lr"] = C(getattr(self.cfg, LEARNING_RATES[group["name"]]), epoch, step)
+
+    @contextmanager
+    def steps_by_size(self) -> Iterator[None]:
+        """Let a step of the optimiser see the means in the unit ``size``, if that is the unit of
+        their rate: as u with mean + R diag(scales) u, which starts at zero.
+        """
+        means = self.means
+        if self.options.lr_means_unit != "size" or means.grad is None:
+            yield
+            return
+        with torch.no_grad():
+            scales, quats, before = self.scales(), self.quats.detach().clone(), means.clone()
+            inverse = quats * quats.new_tensor([1.0, -1.0, -1.0, -1.0])
+            means.grad = scales * densify.rotate(inverse, means.grad)
+        yield
+        with torch.no_grad():
+            means.copy_(before + densify.rotate(quats, scales * (means - before)))
 
     @property
     def wants_absgrad(self) -> bool:

@@ -264,7 +264,8 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         average_gradients(p for group in optimizer.param_groups for p in group["params"])
         loss_scale = self.loss_scale.value(self.trainer)
         self.density.after_backward(out["rasterized"], batch["width"], batch["height"], loss_scale)
-        optimizer.step()
+        with self.geometry.steps_by_size():
+            optimizer.step()
         self.geometry.clamp_colors()
         if self.loss_scale.has_skipped(self.trainer, loss_scale):
             self.step_log.write(self.trainer, self.loss_scale.numbers)
