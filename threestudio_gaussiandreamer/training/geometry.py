@@ -367,7 +367,7 @@ class GaussianCloud(BaseGeometry):
         their rate: as u with mean + R diag(scales) u, which starts at zero.
         """
         means = self.means
-        if self.options.lr_means_unit != "size" or means.grad is None:
+        if self.cfg.lr_means_unit != "size" or means.grad is None:
             yield
             return
         with torch.no_grad():
