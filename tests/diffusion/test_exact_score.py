@@ -1,6 +1,5 @@
 import math
 
-import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
@@ -68,46 +67,6 @@ def test_responsibilities_are_finite_and_perplexity_counts_the_modes_that_share_
     corners = torch.eye(4, dtype=torch.float64)
     for z, t, modes in ((torch.zeros_like(corners[:1]), 500, 4), (1e3 * corners[:1], 0, 1)):
         assert math.isclose(denoise(z, ABAR[t : t + 1], corners).perplexity, modes, abs_tol=1e-12)
-
-
-@pytest.mark.parametrize("std", [0.3, 1.0])
-def test_the_denoised_is_the_posterior_mean_by_quadrature(std):
-    """K = 2, d = 1: E[x0 | z] and the responsibilities against scipy's quad, to 1e-8."""
-    from scipy.integrate import quad
-
-    centers, prior, abar = np.array([-0.8, 1.1]), np.array([0.3, 0.7]), float(ABAR[400])
-    a, variance = math.sqrt(abar), 1 - abar
-
-    def joint(x0, z, k):
-        return (
-            prior[k]
-            * math.exp(
-                -((x0 - centers[k]) ** 2) / (2 * std**2) - (z - a * x0) ** 2 / (2 * variance)
-            )
-            / std
-        )
-
-    def integral(power, z, k):
-        return quad(
-            lambda x0: x0**power * joint(x0, z, k), -15, 15, epsabs=1e-14, epsrel=1e-12, limit=400
-        )[0]
-
-    for z in (-2.0, -0.1, 0.4, 1.7):
-        integrals = [[integral(power, z, k) for k in (0, 1)] for power in (0, 1)]
-        mass, moment = np.array(integrals)
-        out = denoise(
-            torch.tensor([[z]], dtype=torch.float64),
-            ABAR[400:401],
-            torch.tensor(centers)[:, None],
-            std=std,
-            log_prior=torch.tensor(prior).log(),
-        )
-        np.testing.assert_allclose(
-            out.denoised.item(), moment.sum() / mass.sum(), rtol=0, atol=1e-8
-        )
-        np.testing.assert_allclose(
-            out.responsibilities[0].numpy(), mass / mass.sum(), rtol=0, atol=1e-8
-        )
 
 
 def test_ddim_from_noise_lands_on_an_image_of_the_bank():

@@ -61,26 +61,6 @@ def test_a_mixtures_velocity_is_its_score(sigma):
     )
 
 
-@pytest.mark.parametrize("sigma", [0.05, 0.5, 0.95])
-def test_the_expected_gradient_towards_a_gaussian_is_the_closed_form(sigma):
-    """For x0 ~ N(m, s^2) the expectation of v_hat - v over the noise is sigma (x - m) / ((1 -
-    sigma)^2 s^2 + sigma^2); it is linear in the noise, so a pair eps, -eps gives it exactly.
-    """
-    std, center, x, eps = 0.4, *randn(3, 1, 6)
-    abar = rectified_flow.abar_of_sigma(torch.tensor([sigma], dtype=torch.float64))
-    errors = []
-    for noise in (eps, -eps):
-        z = sds.add_noise(x, noise, abar)
-        on_path = rectified_flow.on_path(z, abar)[0]
-        v_hat = mixture_velocity(on_path, sigma, center, torch.ones(1).double(), std)[None]
-        error = rectified_flow.noise_of_velocity(v_hat, z, abar) - noise
-        weighted = sds.per_item(sds.WEIGHTS["rectified_flow"](abar), error) * error
-        torch.testing.assert_close(weighted, v_hat - (noise - x), rtol=1e-9, atol=1e-9)
-        errors.append(weighted)
-    expected = sigma * (x - center) / ((1 - sigma) ** 2 * std**2 + sigma**2)
-    torch.testing.assert_close(sum(errors) / 2, expected, rtol=1e-9, atol=1e-9)
-
-
 def test_the_weight_of_x0_gives_the_distance_to_the_denoised_picture():
     x, eps, guess = randn(3, 5, 7)
     abar = rectified_flow.abar_of_sigma(SIGMA)
