@@ -6,7 +6,6 @@ content. Any other exception is a crash."""
 
 import contextlib
 import io
-import json
 import logging
 import os
 import signal
@@ -16,7 +15,6 @@ import traceback
 import tracemalloc
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any, NamedTuple, Optional
 
@@ -53,8 +51,6 @@ from threestudio_gaussiandreamer.priors.motion import read_motions
 from threestudio_gaussiandreamer.priors.point_cloud import PointCloudPrior
 from threestudio_gaussiandreamer.splatting import rasterize
 from threestudio_gaussiandreamer.training.geometry import GaussianCloud
-from threestudio_gaussiandreamer.view.run_files import RunFiles
-from threestudio_gaussiandreamer.view.run_index import write_gallery
 
 ROOT = Path(__file__).parents[2]
 register_parts()
@@ -532,7 +528,7 @@ def exercise_ply_mesh(path: Path) -> None:
     strictly(oracles.ply_vertices, path)
 
 
-# ---- checkpoints, configurations, command lines, folders of runs ---------------------------------
+# ---- checkpoints, configurations, command lines --------------------------------------------------
 
 
 def checkpoints() -> list[bytes]:
@@ -649,43 +645,6 @@ def no_work() -> Iterator[None]:
         logger.setLevel(level)
 
 
-MARK = b"\n=====\n"
-SCORES = {"prior": {"step": 0, "psnr": 12.5}, "result": {"step": 7, "psnr": 31.0}}
-RUN = {
-    "configs/parsed.yaml": b"name: demo\nsystem:\n  renderer: {preset: fast, eps2d: 0.1}\n"
-    b"  prompt_processor: {prompt: 'a <b>box</b>'}\n  background: {color: [1.0, 0.5, 0.0]}\n",
-    "configs/raw.yaml": b"name: demo\ntag: ${name}\nsystem:\n  renderer: {preset: balanced}\n",
-    "save/metrics.json": json.dumps({"seconds": 3.5, **SCORES}).encode(),
-    "times.json": b'[{"stage": "train", "began": "2026-01-01", "seconds": 1.5}]',
-    "csv_logs/version_0/metrics.csv": b"dB,loss,step\n1.0,2.0,1\n2.0,1.0,2\n,3.0,3\n",
-}
-
-
-class _Tags(HTMLParser):
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.tags: set[str] = set()
-        self.feed(text)
-
-    def handle_starttag(self, tag: str, attrs: list) -> None:
-        self.tags.add(tag)
-
-
-def exercise_run_folder(path: Path) -> None:
-    """Write index and gallery of a run of these files; none may add an element to them."""
-    with tempfile.TemporaryDirectory() as folder:
-        run = Path(folder) / "run"
-        for name, content in zip(RUN, path.read_bytes().split(MARK), strict=False):
-            (run / name).parent.mkdir(parents=True, exist_ok=True)
-            (run / name).write_bytes(content)
-        (run / "configs").mkdir(parents=True, exist_ok=True)
-        (run / "configs" / "parsed.yaml").touch()
-        for page in (write_gallery(Path(folder)), run / "index.html"):
-            require(not _Tags(page.read_text()).tags & {"script", "b"}, "markup of a file is used")
-        if not RunFiles(run).config:
-            raise UserError("the configuration is damaged: it is left out")
-
-
 # ---- the table -----------------------------------------------------------------------------------
 
 
@@ -712,9 +671,6 @@ TARGETS: dict[str, Target] = {
     "configuration": Target(".yaml", configurations, exercise_configuration, TEXT, traced=False),
     "command-line": Target(
         ".txt", lambda: [text.encode() for text in COMMANDS], exercise_command, TEXT, traced=False
-    ),
-    "run-folder": Target(
-        ".txt", lambda: [MARK.join(RUN.values())], exercise_run_folder, TEXT, traced=False
     ),
     "motion": Target(".npz", motion_archives, exercise_motions, packing=ZIP),
     "points-npz": Target(".npz", point_archives, exercise_points, packing=ZIP),
