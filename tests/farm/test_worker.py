@@ -117,7 +117,7 @@ def test_a_folder_that_a_dying_process_still_holds_is_waited_for(place, monkeypa
 
 def test_a_machine_with_another_version_or_without_the_folder_is_named(place):
     with pytest.raises(UserError, match=f"has threestudio-.* {__version__}; the farm is of 9.9"):
-        Worker().hello("9.9", ".", 1)
+        Worker().hello(setting(place)._replace(version="9.9"))
     for wrong, said in (("version", "9.9"), ("start", "/nowhere")):
         outcome = Worker().make(JOB, 0, setting(place)._replace(**{wrong: said}))
         assert outcome["state"] == FAILED and said in outcome["error"]

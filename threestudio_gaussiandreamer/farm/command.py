@@ -133,7 +133,7 @@ def make_assets(args: argparse.Namespace, place: Place, recipe: Recipe, total: i
         board = ray.remote(num_cpus=0, max_restarts=-1)(Board).remote()
         session = datetime.now().isoformat()
         setting = Setting(recipe, place, board, os.getcwd(), session, args.retries)
-        workers = driver.start_workers(ray, count, gpus, args.cores)
+        workers = driver.start_workers(ray, count, gpus, setting)
         driver.Driver(ray, workers, setting, jobs, args.time_limit, total, finished).run()
     finally:
         ray.shutdown()  # which ends the workers

@@ -100,12 +100,13 @@ def plan_workers(
     return workers or fits, int(gpus > 0)
 
 
-def start_workers(ray: Any, count: int, gpus: int, cores: int) -> list[Any]:
-    """Start workers with so many GPUs and cores each, and wait until all are ready.
+def start_workers(ray: Any, count: int, gpus: int, setting: Setting) -> list[Any]:
+    """Start workers with so many GPUs each, and wait until all are ready.
 
     Raises:
         UserError: one can't start.
     """
+    cores = setting.recipe.cores
     environment = {"OMP_NUM_THREADS": str(cores), "OMP_WAIT_POLICY": "passive"}
     if not gpus:
         environment["CUDA_VISIBLE_DEVICES"] = ""
@@ -117,8 +118,8 @@ def start_workers(ray: Any, count: int, gpus: int, cores: int) -> list[Any]:
         runtime_env={"env_vars": environment},
     )(Worker)
     workers = [actor.remote() for _ in range(count)]
-    greetings = [worker.hello.remote(__version__, os.getcwd(), cores) for worker in workers]
     try:
+        greetings = [worker.hello.remote(setting) for worker in workers]
         ray.get(greetings, timeout=SECONDS_TO_ANSWER)
     except ray.exceptions.RayError as error:
         said = getattr(error, "cause", None) or (

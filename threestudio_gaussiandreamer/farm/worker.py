@@ -7,7 +7,6 @@ import contextlib
 import errno
 import gc
 import hashlib
-import json
 import os
 import signal
 import socket
@@ -22,8 +21,10 @@ from typing import Any, NamedTuple, Optional
 from .. import __version__, register_parts
 from ..core.errors import UserError, raised_in
 from ..core.launcher import train_alone
+from ..core.options import is_number
 from ..host import pl
 from ..models.model_files import keep_loaded, load_counts
+from ..view.run_files import RunFiles, section
 from .board import Beat
 from .place import FAILED, FINISHED, STOPPED, AnotherRow, Place, Unreachable, has_files
 from .recipe import Job, Recipe, all_sources, launch_arguments
@@ -40,7 +41,7 @@ SAVES_MEMORY = "saves_memory.txt"
 """Marks an asset's folder that is made with the low-memory configuration."""
 NOT_EXPORTED = (".json", ".html", ".png")
 """Reports and pages beside the exported files, which may hold times."""
-PICTURES = ("it*-export/poster.png", "it*-test/0.png", "it*.png")
+SCORES = ("psnr", "ssim", "multi_face")
 
 
 class Setting(NamedTuple):
@@ -64,7 +65,7 @@ class Worker:
 
     is_ready = False
 
-    def hello(self, version: str, start: str, cores: int) -> None:
+    def hello(self, setting: Setting) -> None:
         """Prepare this process.
 
         Raises:
@@ -73,7 +74,7 @@ class Worker:
         """
         if self.is_ready:
             return
-        host = socket.gethostname()
+        host, version, start = socket.gethostname(), setting.version, setting.start
         if version != __version__:
             raise UserError(
                 f"{host} has threestudio-gaussiandreamer {__version__}; the farm is of {version}, "
@@ -88,7 +89,7 @@ class Worker:
         train_alone()  # before Lightning is imported, which reads the variables
         import torch
 
-        torch.set_num_threads(cores)
+        torch.set_num_threads(setting.recipe.cores)
         keep_loaded()
         register_parts()
         self.is_ready = True
@@ -101,7 +102,7 @@ class Worker:
         self.number, self.setting = number, setting
         try:
             # here too, since Ray restarts a killed worker without it
-            self.hello(setting.version, setting.start, setting.recipe.cores)
+            self.hello(setting)
             return setting.place.finished(job.row) or self._make(job)
         except SystemExit as stop:
             if raised_in(stop, "ray."):  # which ends this process
@@ -258,15 +259,16 @@ def outcome_of(error: Exception) -> dict[str, Any]:
 
 def result_of(job: Job, folder: Path, run: Any) -> dict[str, Any]:
     """Return what a finished run has made, and where."""
-    geometry = run.system.geometry
-    pictures = (newest(folder, pattern) for pattern in PICTURES)
+    geometry, files = run.system.geometry, RunFiles(folder)
+    page = files.export and files.export / "view.html"
+    made = {"picture": files.picture, "page": page if page and page.is_file() else None}
+    measured = section(files.scores, "result")
     return {
         "key": job.row.key,
         "hash": digest(folder),
         "files": [path.relative_to(folder).as_posix() for path in exported(folder)],
-        "picture": next(filter(None, pictures), None),
-        "page": newest(folder, "it*-export/view.html"),
-        "scores": scores(folder),
+        **{name: path and path.relative_to(folder).as_posix() for name, path in made.items()},
+        "scores": {name: measured[name] for name in SCORES if is_number(measured.get(name))},
         "steps": run.trainer.global_step,
         "gaussians": len(geometry) if hasattr(geometry, "__len__") else 0,
         "megabytes": peak_megabytes(),
@@ -293,22 +295,6 @@ def digest(folder: Path) -> str:
         content = hashlib.sha256(path.read_bytes()).hexdigest()
         total.update(f"{path.relative_to(folder).as_posix()} {content}\n".encode())
     return total.hexdigest()
-
-
-def newest(folder: Path, pattern: str) -> Optional[str]:
-    """Return the last of the files below ``save`` with this pattern, relative to ``folder``."""
-    found = sorted(folder.glob(f"save/{pattern}"))
-    return found[-1].relative_to(folder).as_posix() if found else None
-
-
-def scores(folder: Path) -> dict[str, float]:
-    """Return the numbers that a run has measured on its result."""
-    try:
-        measured = json.loads((folder / "save" / "metrics.json").read_bytes())["result"]
-    except (OSError, ValueError, KeyError, TypeError):
-        return {}
-    names = ("psnr", "ssim", "multi_face")
-    return {name: measured[name] for name in names if isinstance(measured.get(name), (int, float))}
 
 
 def reset_peak_memory() -> None:

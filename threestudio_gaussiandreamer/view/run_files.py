@@ -116,6 +116,17 @@ class RunFiles:
         found = filter(holds_gaussians, files)
         return min(found, key=lambda file: suffix_of(file.name) != ".ply", default=None)
 
+    @property
+    def picture(self) -> Optional[Path]:
+        """The poster of the last export, else a picture of the last test views, or of a validation;
+        None if there is none.
+        """
+        poster = [self.export / "poster.png"] if self.export else []
+        views = sorted(self.save.glob("it*-test/0.png"), key=lambda path: step_of(path.parent))
+        validations = sorted(self.save.glob("it*.png"), key=step_of)
+        found = (*poster, *reversed(views), *reversed(validations))
+        return next(filter(Path.is_file, found), None)
+
     def psnr(self, key: str, step: Optional[int] = None) -> Optional[float]:
         """Return dB on held-out views; None if they aren't known.
 

@@ -285,13 +285,9 @@ def write_gallery(folder: Path) -> Path:
 
 
 def _card(run: RunFiles, folder: Path) -> dict[str, Any]:
-    """Return what the gallery shows of a run: its poster, or else a picture of its test views."""
-    poster = [run.export / "poster.png"] if run.export else []
-    views = sorted(run.save.glob("it*-test/0.png"), key=lambda path: step_of(path.parent))
-    found = [path for path in (*poster, *reversed(views)) if path.is_file()]
-    index = run.folder / NAME
+    index, picture = run.folder / NAME, run.picture
     return {
         "href": address(index if index.is_file() else run.folder, folder),
-        "picture": found and _picture(found[0], run, folder),
+        "picture": picture and _picture(picture, run, folder),
         "texts": (run.prompt, decibels(run.psnr("result")), str(run.folder.relative_to(folder))),
     }
