@@ -3,13 +3,7 @@
 import torch
 from hypothesis import HealthCheck, settings
 
-from tests.helpers.splatting_scenes import (
-    SINGLE,
-    Cloud,
-    Run,
-    assert_close,
-    run,
-)
+from tests.helpers.splatting_scenes import SINGLE, Cloud, Run, assert_close, run
 
 repeatable = settings(
     derandomize=True, deadline=None, max_examples=25, suppress_health_check=list(HealthCheck)
@@ -25,11 +19,23 @@ def draw(
     return run(cloud.to(torch.float32), *view, backend=backend, **options)
 
 
+_specified: dict[tuple, Run] = {}
+
+
+def specified(cloud: Cloud, *view, **options) -> Run:
+    """Return what the specification draws in float64, computed once for all backends."""
+    values = [*cloud, *view, *options.values()]
+    key = *options, *(x.numpy().tobytes() if isinstance(x, torch.Tensor) else x for x in values)
+    if key not in _specified:
+        _specified[key] = run(cloud, *view, backend="reference", **options)
+    return _specified[key]
+
+
 def compare(backend: str, cloud: Cloud, camera, *view, tolerance: float = SINGLE, **options) -> Run:
     """Assert that images and gradients, those of the cameras included, are within float32 rounding
     of the specification in float64; ``view`` is width, height and perhaps a background.
     """
-    truth = run(cloud, *camera, *view, camera_gradient=True, backend="reference", **options)
+    truth = specified(cloud, *camera, *view, camera_gradient=True, **options)
     ours = draw(backend, cloud, camera, *view, camera_gradient=True, **options)
     assert_close(ours, truth, tolerance, radii=options.get("alpha_min") != 0)
     return ours

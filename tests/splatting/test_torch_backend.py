@@ -134,13 +134,14 @@ def test_extreme_clouds(seed, n, antialias):
     assert all(x.isfinite().all() for x in (*single.out, *single.grads.values()))
 
 
-@pytest.mark.parametrize("preset", ["fast", "balanced", "accurate"])
-def test_float32_gradients_of_a_larger_cloud(preset):
+def test_float32_gradients_of_a_larger_cloud():
     cloud, camera = random_cloud(2000, seed=4, size=0.04), cameras(1, 48, 40)
     cloud.opacities[:50] = 0.9999
     background = torch.tensor([0.2, 0.5, 0.9])
-    truth = run(cloud, *camera, 48, 40, background, preset=preset, backend="reference")
-    ours = run(cloud.to(torch.float32), *camera, 48, 40, background, preset=preset, backend="torch")
+    truth = run(cloud, *camera, 48, 40, background, preset="accurate", backend="reference")
+    ours = run(
+        cloud.to(torch.float32), *camera, 48, 40, background, preset="accurate", backend="torch"
+    )
     assert error(ours.out.depth, truth.out.depth) < SINGLE
     for name in NAMES:
         assert trimmed_error(ours.grads[name], truth.grads[name]) < SINGLE, name

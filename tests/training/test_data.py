@@ -123,6 +123,7 @@ def test_the_views_of_a_pool_are_known_beforehand_unless_cameras_move():
         48,
         4,
     )
+    assert data.views_to_prefetch(1) is None and data.views_to_prefetch(2)
     known = {tuple(c2w) for c2w in views["c2w"].flatten(1).tolist()}
     assert {tuple(c2w) for b in batches(data, 20) for c2w in b["c2w"].flatten(1).tolist()} == known
     assert (
