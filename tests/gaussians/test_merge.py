@@ -38,29 +38,26 @@ def copies(params, times):
     return {name: value.repeat(times, *[1] * (value.dim() - 1)) for name, value in split.items()}
 
 
+def repeated(times):
+    """Return the first Gaussian several times."""
+    return {k: v[:1].repeat(times, *[1] * (v.dim() - 1)) for k, v in shell().items()}
+
+
 def picture(params):
     sh = torch.cat([params["sh0"], params["sh_rest"]], 1)
     cloud = Gaussians(*(params[name] for name in Gaussians._fields[:-1]), sh)
-    around = Gaussians(
-        shell()["means"],
-        shell()["quats"],
-        shell()["log_scales"],
-        shell()["logit_opacities"],
-        shell()["sh0"],
-    )
+    names = ("means", "quats", "log_scales", "logit_opacities", "sh0")
+    around = Gaussians(*(shell()[name] for name in names))
     return render_all(cloud, views_around(around, 6, 48))
 
 
 def test_a_merged_pair_keeps_its_peak_and_its_integral():
-    a, b, one = 0.6, 0.8, {name: value[:1] for name, value in shell().items()}
-    pair = {name: torch.cat([value, value]) for name, value in one.items()} | {
-        "logit_opacities": torch.tensor([a, b]).logit()
-    }
+    a, b, pair = 0.6, 0.8, repeated(2)
+    log_size = pair["log_scales"][0].mean()
+    pair["logit_opacities"] = torch.tensor([a, b]).logit()
     merged = merge_duplicates(pair).values
-    peak, size = (
-        merged["logit_opacities"].sigmoid().item(),
-        (merged["log_scales"].mean() - one["log_scales"].mean()).exp().item(),
-    )
+    peak = merged["logit_opacities"].sigmoid().item()
+    size = (merged["log_scales"].mean() - log_size).exp().item()
     r = torch.linspace(0, 8, 4001, dtype=torch.float64)
     g = (-0.5 * r**2).exp()
     light = torch.trapezoid((1 - (1 - a * g) * (1 - b * g)) * r, r).item()
@@ -73,12 +70,11 @@ def test_copies_in_one_place_become_one(times):
     params = shell()
     change = merge_duplicates(copies(params, times))
     assert len(change.parents) == 60 and change.is_new.all()
-    order = change.values["means"] @ torch.tensor([1.0, 10.0, 100.0])
-    for name in ("means", "logit_opacities", "sh0", "sh_rest"):
-        expected = params[name][(params["means"] @ torch.tensor([1.0, 10.0, 100.0])).argsort()]
-        torch.testing.assert_close(
-            change.values[name][order.argsort()], expected, atol=1e-4, rtol=1e-4
-        )  # float32 logits
+    key = torch.tensor([1.0, 10.0, 100.0])
+    order, wanted = ((of["means"] @ key).argsort() for of in (change.values, params))
+    for name in ("means", "logit_opacities", "sh0", "sh_rest"):  # float32 logits
+        found = change.values[name][order]
+        torch.testing.assert_close(found, params[name][wanted], atol=1e-4, rtol=1e-4)
     growth = (change.values["log_scales"] - params["log_scales"][change.parents % 60]).mean(1)
     assert (growth > 0).all() and (growth < 0.4).all()  # together they fall off more slowly
     assert psnr(picture(change.values), picture(copies(params, times))) > 40
@@ -91,9 +87,8 @@ def test_nearby_copies_are_merged_into_one_that_renders_like_both():
     both["means"] = both["means"] + 0.2 * both["log_scales"].exp().amin(1, keepdim=True) * away
     change = merge_duplicates(both)
     assert len(change.parents) == 60
-    assert (
-        psnr(picture(change.values), picture(both)) > 28
-    )  # where neighbours overlap, another one is in front
+    # where neighbours overlap, another one is in front
+    assert psnr(picture(change.values), picture(both)) > 28
 
 
 def test_other_gaussians_are_unchanged_bit_for_bit():
@@ -112,7 +107,7 @@ def test_other_gaussians_are_unchanged_bit_for_bit():
     ],
 )
 def test_another_colour_size_or_place_is_no_duplicate(name, offset):
-    params = {key: value[:1].repeat(2, *[1] * (value.dim() - 1)) for key, value in shell().items()}
+    params = repeated(2)
     assert len(merge_duplicates(params).parents) == 1
     params[name][1] += offset
     assert len(merge_duplicates(params).parents) == 2
@@ -123,28 +118,22 @@ def test_the_floor_holds_and_the_least_important_are_pruned_first():
     params["sh0"][60:90] += 0.2  # duplicates still, but dearer ones
     change = merge_duplicates(params, at_least=90)
     assert len(merge_duplicates(params, at_least=200).parents) == 120
-    assert len(change.parents) == 90 and set(change.parents[change.is_new].tolist()) == set(
-        range(30, 60)
-    )
+    assert len(change.parents) == 90
+    assert set(change.parents[change.is_new].tolist()) == set(range(30, 60))
 
 
 def test_many_copies_in_one_place_take_few_rounds(monkeypatch):
     """All have the same nearest neighbour: merging only mutual pairs would merge one or two per
     round.
     """
-    rounds = []
-    monkeypatch.setattr(
-        merging,
-        "_merged",
-        lambda *args, once=merging._merged: rounds.append(len(args[2])) or once(*args),
-    )
-    one = {name: value[:1] for name, value in shell().items()}
-    assert len(merge_duplicates(copies(one, 400)).parents) <= 4 and len(rounds) <= 20
+    rounds, found = [], merging.duplicates
+    monkeypatch.setattr(merging, "duplicates", lambda *args: rounds.append(0) or found(*args))
+    assert len(merge_duplicates(repeated(400)).parents) <= 4 and len(rounds) <= 20
 
 
 def test_a_chain_of_neighbours_does_not_become_one():
     """Each is similar to the next, but the first isn't similar to the last."""
-    one = {name: value[:1].repeat(40, *[1] * (value.dim() - 1)) for name, value in shell().items()}
+    one = repeated(40)
     one["quats"], one["log_scales"][:] = torch.tensor([[1.0, 0, 0, 0]]).repeat(40, 1), -2.0
     one["means"] = torch.arange(40)[:, None] * torch.tensor([[0.05, 0.0, 0.0]])
     assert 10 <= len(merge_duplicates(one).parents) <= 20
@@ -152,21 +141,12 @@ def test_a_chain_of_neighbours_does_not_become_one():
 
 def test_few_and_unusable_gaussians():
     params = shell(2)
-    assert len(merge_duplicates({name: value[:1] for name, value in params.items()}).parents) == 1
-    assert (
-        len(
-            merge_duplicates(
-                {name: value[:0] for name, value in params.items()}, at_least=0
-            ).parents
-        )
-        == 0
-    )
+    for count in (1, 0):
+        few = {name: value[:count] for name, value in params.items()}
+        assert len(merge_duplicates(few, at_least=0).parents) == count
     same = copies(shell(3), 2)
-    same["means"][0], same["quats"][4], same["log_scales"][2] = (
-        float("nan"),
-        float("nan"),
-        torch.tensor([-30.0, -30, 3]),
-    )
+    same["means"][0] = same["quats"][4] = float("nan")
+    same["log_scales"][2] = torch.tensor([-30.0, -30, 3])
     assert len(merge_duplicates(same).parents) == 6
 
 
@@ -184,14 +164,6 @@ def near_duplicates(count=400):
     return {name: torch.cat([value, other[name]]) for name, value in one.items()}
 
 
-def test_the_bound_without_covariances_is_never_above_the_cost():
-    shapes = merging._shapes(near_duplicates())
-    pairs = torch.arange(400)[:, None] + torch.tensor([0, 400])
-    costs, least = merging._costs(shapes, pairs), merging._least_costs(shapes, pairs)
-    assert (least <= costs).all() and (least > merging.DUPLICATE).any()
-    assert (costs <= merging.DUPLICATE).any()
-
-
 def test_pairs_in_parts_give_the_duplicates_of_all_costs_at_once(monkeypatch):
     params = near_duplicates()
     spent = torch.zeros(800, dtype=torch.float64)
@@ -207,9 +179,7 @@ def test_pairs_in_parts_give_the_duplicates_of_all_costs_at_once(monkeypatch):
 def test_a_large_gaussian_does_not_absorb_the_small_ones_near_it():
     """Their share of the weight is small, and so is the cost of each."""
     rng = torch.Generator().manual_seed(0)
-    many = {
-        name: value[:1].repeat(2000, *[1] * (value.dim() - 1)) for name, value in shell().items()
-    }
+    many = repeated(2000)
     many["means"] = torch.rand(2000, 3, generator=rng)
     many["log_scales"] = torch.full((2000, 3), -9.0)
     many["log_scales"][0] = -1.0
@@ -220,7 +190,7 @@ def test_a_large_gaussian_does_not_absorb_the_small_ones_near_it():
 
 @pytest.mark.parametrize("size", [-5.0, -7.0])
 def test_a_small_gaussian_in_a_large_one_hardly_changes_it(size):
-    pair = {name: value[:1].repeat(2, *[1] * (value.dim() - 1)) for name, value in shell().items()}
+    pair = repeated(2)
     pair["log_scales"][1] = size
     pair["logit_opacities"][:] = 3.0
     merged = merging._together(pair, torch.tensor([[0, 1]]))
@@ -230,7 +200,7 @@ def test_a_small_gaussian_in_a_large_one_hardly_changes_it(size):
 
 @pytest.mark.parametrize(("opacity", "larger"), [(0.005, 0.6), (0.0001, 1.5)])
 def test_a_small_gaussian_in_a_large_faint_one_stays_opaque(opacity, larger):
-    pair = {name: value[:1].repeat(2, *[1] * (value.dim() - 1)) for name, value in shell().items()}
+    pair = repeated(2)
     pair["log_scales"][1] += larger
     pair["logit_opacities"] = torch.tensor([0.9, opacity]).logit()
     merged = merge_duplicates(pair).values

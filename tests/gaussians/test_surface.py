@@ -17,11 +17,8 @@ def ball(count=4000, radius=0.5, scale=0.02, opacity=4.0, hollow=True):
     """Return Gaussians on, or in, a sphere, coloured by position."""
     rng = np.random.default_rng(0)
     points = rng.normal(size=(count, 3))
-    points *= (
-        radius
-        * (1 if hollow else rng.random((count, 1)) ** (1 / 3))
-        / np.linalg.norm(points, axis=1, keepdims=True)
-    )
+    share = 1 if hollow else rng.random((count, 1)) ** (1 / 3)
+    points *= radius * share / np.linalg.norm(points, axis=1, keepdims=True)
     return Gaussians(
         means=np.float32(points + CENTER),
         sh=np.float32((points.clip(-0.5, 0.5)) / 0.28209479)[:, None],
@@ -49,10 +46,8 @@ def test_surface_nets_of_a_sphere():
     np.testing.assert_allclose(np.linalg.norm(mesh.vertices, axis=1), 0.7, atol=0.01)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("resolution", [32, 64])
-def test_a_solid_ball_is_one_closed_surface(resolution):
-    surface = gaussian_surface(ball(count=8000, scale=0.04, hollow=False), resolution=resolution)
+def test_a_solid_ball_is_one_closed_surface():
+    surface = gaussian_surface(ball(count=8000, scale=0.04, hollow=False), resolution=32)
     mesh = as_mesh(surface)
     assert mesh.is_watertight and mesh.is_winding_consistent and mesh.volume > 0
     # half of the density at the middle is at the ball's own radius, blurred by the Gaussians' size
@@ -68,27 +63,23 @@ def test_the_surface_is_at_the_gaussians_for_any_overlap(count, scale):
     spread = np.hypot(scale, 1 / 64)
     away = np.abs(distances(surface) - 0.5)
     assert 0.5 * spread < np.median(away) < 1.5 * spread and away.max() < 3 * spread
-    np.testing.assert_allclose(
-        surface.colors, (surface.vertices - CENTER + 0.5).clip(0, 1), atol=0.08
-    )
+    wanted = (surface.vertices - CENTER + 0.5).clip(0, 1)
+    np.testing.assert_allclose(surface.colors, wanted, atol=0.08)
 
 
 def test_faint_gaussians_have_no_surface():
     arrays = ball()
     far = arrays._replace(means=arrays.means + 5, logit_opacities=arrays.logit_opacities - 10)
     both = Gaussians(*(np.concatenate(pair) for pair in zip(arrays, far, strict=True)))
-    np.testing.assert_array_equal(
-        gaussian_surface(both, resolution=24).vertices,
-        gaussian_surface(arrays, resolution=24).vertices,
-    )
+    found, wanted = (gaussian_surface(each, resolution=24).vertices for each in (both, arrays))
+    np.testing.assert_array_equal(found, wanted)
     assert len(gaussian_surface(far).faces) == 0
 
 
 def test_size_and_place_do_not_matter():
     arrays = ball(count=500)
-    moved = arrays._replace(
-        means=8 * arrays.means + 16, log_scales=arrays.log_scales + np.float32(np.log(8))
-    )
+    log_scales = arrays.log_scales + np.float32(np.log(8))
+    moved = arrays._replace(means=8 * arrays.means + 16, log_scales=log_scales)
     first, second = gaussian_surface(arrays, resolution=24), gaussian_surface(moved, resolution=24)
     # float32 means
     np.testing.assert_allclose(8 * first.vertices + 16, second.vertices, atol=1e-3)
@@ -108,12 +99,9 @@ def test_turned_and_flat_gaussians_lie_along_their_axes():
     # as far as exp(-1/2 (r / s)^2) is a half, with s that of the disc and a cell
     reach = np.sqrt(2 * np.log(2)) * np.hypot([0.5, 0.02], 1 / 96)
     assert np.abs(vertices[:, 1]).max() == pytest.approx(reach[0], abs=0.02)
-    assert np.abs(vertices @ [np.sqrt(0.5), 0, np.sqrt(0.5)]).max() == pytest.approx(
-        reach[0], abs=0.02
-    )
-    assert np.abs(vertices @ [np.sqrt(0.5), 0, -np.sqrt(0.5)]).max() == pytest.approx(
-        reach[1], abs=0.01
-    )
+    along, across = (np.sqrt(0.5) * np.array([1, 0, sign]) for sign in (1, -1))
+    assert np.abs(vertices @ along).max() == pytest.approx(reach[0], abs=0.02)
+    assert np.abs(vertices @ across).max() == pytest.approx(reach[1], abs=0.01)
 
 
 def test_other_programs_read_the_file(tmp_path):

@@ -8,8 +8,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from threestudio_gaussiandreamer.host import find
-from threestudio_gaussiandreamer.priors.body_pose import INDEX, LIMBS
-from threestudio_gaussiandreamer.priors.skeleton import BODY_JOINTS, PARENTS
+from threestudio_gaussiandreamer.priors.body_pose import BODY_JOINTS, INDEX, LIMBS, PARENTS
 from threestudio_gaussiandreamer.priors.smpl_fit import posed_joints
 
 OPTIONS = {
@@ -74,7 +73,7 @@ MIXAMO = (
     "RightToeBase Neck LeftShoulder RightShoulder Head LeftArm RightArm LeftForeArm RightForeArm "
     "LeftHand RightHand"
 ).split()
-"""Names of the joints of ``skeleton.JOINTS`` in Mixamo's files."""
+"""Names of the joints of ``body_pose.JOINTS`` in Mixamo's files."""
 
 
 def random_local(seed: int, degrees: float = 40) -> np.ndarray:

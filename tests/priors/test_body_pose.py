@@ -7,9 +7,12 @@ from scipy.spatial.transform import Rotation
 from tests.priors.cases import limb_angles, needs_anny, random_local, walked
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.priors.body_pose import (
+    BODY_JOINTS,
     INDEX,
+    JOINTS,
     NEEDED,
     POSES,
+    Body,
     named_pose,
     part_frame,
     pose_of_positions,
@@ -17,8 +20,6 @@ from threestudio_gaussiandreamer.priors.body_pose import (
     posed,
     swing,
 )
-from threestudio_gaussiandreamer.priors.makehuman import Body
-from threestudio_gaussiandreamer.priors.skeleton import BODY_JOINTS, JOINTS
 
 
 def direction(joints, start, end):

@@ -11,6 +11,7 @@ from tests.helpers.tiny_makehuman import HEADS, TALLER
 from tests.priors.cases import needs_anny
 from tests.priors.make_anny_vertices import CLOSE, PATH, PERSON
 from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.priors.body_pose import JOINTS
 from threestudio_gaussiandreamer.priors.makehuman import (
     Person,
     data_folder,
@@ -18,7 +19,6 @@ from threestudio_gaussiandreamer.priors.makehuman import (
     shares,
     target_weights,
 )
-from threestudio_gaussiandreamer.priors.skeleton import JOINTS
 
 AGES = {"baby": 0.0, "child": 1 / 3, "young": 2 / 3, "old": 1.0}
 

@@ -16,6 +16,7 @@ from threestudio_gaussiandreamer.meshes.mesh import Mesh
 from threestudio_gaussiandreamer.models.clip import PictureText, clip_source
 from threestudio_gaussiandreamer.priors import motion as module
 from threestudio_gaussiandreamer.priors import motion_text
+from threestudio_gaussiandreamer.priors.body_pose import facing, z_up
 from threestudio_gaussiandreamer.priors.motion import (
     MotionPrior,
     Motions,
@@ -23,7 +24,6 @@ from threestudio_gaussiandreamer.priors.motion import (
     offered_frames,
     read_motions,
 )
-from threestudio_gaussiandreamer.priors.skeleton import facing, z_up
 
 FAST = {"num_points": 500}
 VIEWS = len(module.VIEW_AZIMUTHS)

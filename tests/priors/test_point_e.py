@@ -14,8 +14,6 @@ from tests.priors.cases import Evil
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.priors import point_e as module
 from threestudio_gaussiandreamer.priors.point_e import (
-    BASE,
-    UPSAMPLER,
     BaseModel,
     PointEPrior,
     PointTransformer,
@@ -184,7 +182,7 @@ def test_units_and_axes(point_e, monkeypatch):
         return lambda x, sigma: network(x, torch.zeros(1))
 
     monkeypatch.setattr(BaseModel, "forward", fixed)
-    monkeypatch.setattr(module, "guided_denoiser", denoiser)
+    monkeypatch.setattr(module.karras, "guided_denoiser", denoiser)
     cloud = make(point_e, upsampler=None)("a fox")
     wanted = 1.6 * np.array([-0.2, 0.1, 0.3])  # (-y, x, z) of half the units
     np.testing.assert_allclose(cloud.points, np.tile(wanted, (64, 1)), atol=1e-5)
@@ -194,7 +192,7 @@ def test_units_and_axes(point_e, monkeypatch):
 
 def test_sizes_are_read_off_the_weights(tmp_path, point_e):
     torch.save(BaseModel(width=128, layers=3, features=10).state_dict(), tmp_path / "other.pt")
-    model = load_network(BASE, str(tmp_path / "other.pt"))
+    model = load_network(BaseModel, str(tmp_path / "other.pt"))
     blocks = model.backbone.resblocks
     assert (model.width, len(blocks), blocks[0].attn.heads) == (128, 3, 2)
     assert not model.training and not any(value.requires_grad for value in model.parameters())
@@ -233,11 +231,11 @@ def test_another_models_weights_are_refused(tmp_path, point_e, change, message):
     change(state)
     torch.save(state, tmp_path / "spoiled.pt")
     with pytest.raises(UserError, match=message):
-        load_network(BASE, str(tmp_path / "spoiled.pt"))
+        load_network(BaseModel, str(tmp_path / "spoiled.pt"))
     with pytest.raises(UserError, match=r"upsampler checkpoint .* give upsample_40m.pt"):
-        load_network(UPSAMPLER, point_e["checkpoint"])
+        load_network(Upsampler, point_e["checkpoint"])
     with pytest.raises(UserError, match=r"base checkpoint .* give base_40m_textvec.pt"):
-        load_network(BASE, point_e["upsampler"])
+        load_network(BaseModel, point_e["upsampler"])
 
 
 def test_a_checkpoint_cannot_run_code(tmp_path, point_e, no_code):

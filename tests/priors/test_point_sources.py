@@ -147,10 +147,10 @@ def test_few_bad_rows_are_dropped_also_when_normalized(tmp_path):
     [
         ("a.fox", b"x", "unknown point cloud format '.fox'"),
         ("a.xyz", b"1 2\n3 4\n", "rows of x y z"),
-        ("a.xyz", b"1 2 3\n4 5 fox\n", "not readable"),
+        ("a.xyz", b"1 2 3\n4 5 fox\n", "truncated, damaged or of another format"),
         ("a.npz", b"PK\3\4 broken", "truncated, damaged"),
-        ("a.npy", b"\x93NUMPY broken", "longer than the file"),
-        ("a.glb", b"glTF broken", "truncated or damaged"),
+        ("a.npy", b"\x93NUMPY broken", "the header is longer"),
+        ("a.glb", b"glTF broken", "it is truncated or damaged"),
         ("a.ply", b"plyx", "not a PLY"),
         ("a.npz", {"xyz": POINTS}, "has no array"),
         ("a.npz", {"points": POINTS[:, :2]}, "has shape"),

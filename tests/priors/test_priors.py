@@ -148,10 +148,13 @@ ZEROS = np.zeros((5, 3))
         (PointCloud(ZEROS[:0], ZEROS[:0]), "no points"),
         (PointCloud(ZEROS, ZEROS[:4]), r"points \(5, 3\), colours \(4, 3\)"),
         (PointCloud(ZEROS, ZEROS, ZEROS[:4]), r"normals \(4, 3\); expected \(P, 3\)"),
-        (cloud_with(faces=[[0, 1, 9999]]), "faces of the points 0 to 9999"),
-        (cloud_with(faces=[[-1, 0, 1]]), "faces of the points -1 to 1"),
+        (
+            cloud_with(faces=[[0, 1, 9999]]),
+            r"faces \(1, 3\) of type int64; expected integers \(F, 3\) from 0 to 199",
+        ),
+        (cloud_with(faces=[[-1, 0, 1]]), "faces .* from 0 to 199"),
         (cloud_with(faces=[[0, 1]]), r"faces \(1, 2\) of type int64; expected integers"),
-        (cloud_with(faces=[[0, 1], [0, 1, 2]]), "faces that are no array"),
+        (cloud_with(faces=[[0, 1], [0, 1, 2]]), "something else than arrays"),
         (cloud_with(faces=np.zeros((2, 3), np.float32)), r"faces \(2, 3\) of type float32"),
     ],
 )

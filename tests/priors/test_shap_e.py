@@ -4,9 +4,7 @@ checkpoint; and the files of models in folders, the hub's cache and on the hub.
 
 import gc
 import pickle
-import shutil
 import sys
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -21,7 +19,6 @@ from threestudio_gaussiandreamer.models.clip import (
     load_tokenizer,
     text_condition,
 )
-from threestudio_gaussiandreamer.models.hub import locate
 from threestudio_gaussiandreamer.priors import shap_e as module
 from threestudio_gaussiandreamer.priors.point_e import PointTransformer
 from threestudio_gaussiandreamer.priors.shap_e import (
@@ -327,95 +324,12 @@ def test_a_bin_is_read_when_allowed_and_runs_no_code(copy, folder, no_code):
         make(copy, allow_bin=True)("a fox")
 
 
-def test_half_precision_files_are_taken_where_there_are_no_others(copy, folder):
-    from diffusers import PriorTransformer
-
-    prior = PriorTransformer.from_pretrained(copy / "prior").half()
-    prior.save_pretrained(copy / "prior", variant="fp16")
-    weights_of(copy, "prior").unlink()
-    half, full = sampled(copy), sampled(folder)
-    assert half.dtype == torch.float32
-    assert 0 < (half - full).abs().max() < 0.05  # rounded weights, float32 arithmetic
-
-
-def test_weights_that_are_missing_or_damaged_are_no_noise(copy):
-    from safetensors.torch import load_file, save_file
-
-    weights = weights_of(copy, "prior")
-    state = load_file(weights)
-    del state["proj_in.weight"]
-    save_file(state, weights, metadata={"format": "pt"})
-    with pytest.raises(UserError, match="proj_in.weight"):
-        make(copy)("a fox")
-    weights.write_bytes(b"\0" * 100)
-    with pytest.raises(UserError, match="prior of the model .* can't be loaded"):
-        make(copy)("a fox")
-
-
-@pytest.fixture
-def hub(tmp_path, monkeypatch):
-    """Return the library's empty cache; it assumes that the hub is reachable."""
-    from huggingface_hub import constants
-
-    monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path / "hub"))
-    monkeypatch.setenv("HF_HUB_OFFLINE", "0")
-    monkeypatch.setattr(constants, "HF_HUB_OFFLINE", False)
-    return tmp_path / "hub"
-
-
-def test_offline(hub, folder, monkeypatch):
-    from huggingface_hub import constants
-
-    monkeypatch.setattr(constants, "HF_HUB_OFFLINE", True)
-    with pytest.raises(UserError, match="hf download openai/shap-e.*folder"):
-        ShapEPrior({}).preflight()
-    repository = hub / "models--openai--shap-e"
-    shutil.copytree(folder, repository / "snapshots" / ("0" * 40))
-    (repository / "refs").mkdir()
-    (repository / "refs" / "main").write_text("0" * 40)
-    np.testing.assert_array_equal(ShapEPrior(FAST)("a fox").points, make(folder)("a fox").points)
-
-
-def test_what_the_hub_refuses_names_the_option(hub, monkeypatch):
-    import huggingface_hub
-
-    def refuse(self, *args, **kwargs):
-        raise TimeoutError("timed out")
-
-    monkeypatch.setattr(huggingface_hub.HfApi, "model_info", refuse)
-    command = (
-        "hf download some/model --revision refs/pr/11 --include '\\*/\\*' --exclude "
-        "'renderer/\\*' --local-dir models/model"
-    )
-    wanted = f"reached .timed out.*`{command}`; then set system.geometry.prior.model"
-    with pytest.raises(UserError, match=wanted):
-        ShapEPrior({"model": "some/model", "revision": "refs/pr/11"}).preflight()
-
-
-def test_only_needed_files_are_downloaded_and_none_by_preflight(hub, folder, monkeypatch):
-    import huggingface_hub
-
+def test_which_files_are_needed(folder, monkeypatch):
+    """Those of the hub's repository that the pipeline of another model has are not."""
     names = [path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()]
-    files = [SimpleNamespace(rfilename=name, size=1) for name in [*names, "renderer/old.bin"]]
-    listing, fetched = SimpleNamespace(siblings=files), []
-    monkeypatch.setattr(huggingface_hub.HfApi, "model_info", lambda self, *args, **kwargs: listing)
-    make("some/model").preflight()
-    assert not hub.exists()
-
-    def download(model, **options):
-        if options.get("local_files_only"):
-            raise FileNotFoundError
-        fetched.extend(options["allow_patterns"])
-        return str(folder)
-
-    monkeypatch.setattr(huggingface_hub, "snapshot_download", download)
-    assert locate(make("some/model")._source()) == folder
-    needed = {"prior/diffusion_pytorch_model.safetensors", "tokenizer/tokenizer_config.json"}
-    assert needed <= set(fetched)
-    assert not any(name.startswith(("renderer", "vocabulary")) for name in fetched)
-
-
-def test_without_diffusers_the_extra_is_named(folder, monkeypatch):
+    picked = make("some/model")._source().picks([*names, "renderer/old.bin"])
+    assert weights_of(folder, "prior").relative_to(folder).as_posix() in picked
+    assert "tokenizer/tokenizer_config.json" in picked and "renderer/old.bin" not in picked
     monkeypatch.setitem(sys.modules, "diffusers", None)
     with pytest.raises(UserError, match=r"pip install 'threestudio-gaussiandreamer\[diffusion\]'"):
         make(folder)("a fox")

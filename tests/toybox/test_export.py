@@ -3,7 +3,6 @@ any model.
 """
 
 import json
-import re
 import shutil
 
 import numpy as np
@@ -18,7 +17,7 @@ from threestudio_gaussiandreamer.models.bundled import DIGESTS, digest_of, read_
 from threestudio_gaussiandreamer.models.clip import PictureText, clip_source
 from threestudio_gaussiandreamer.priors.point_e import PointEPrior
 from threestudio_gaussiandreamer.prompts import prompt_processors  # noqa: F401
-from threestudio_gaussiandreamer.toybox import loop, models, warm_start
+from threestudio_gaussiandreamer.toybox import models, warm_start
 from threestudio_gaussiandreamer.toybox.export import main
 from threestudio_gaussiandreamer.toybox.loop import averaged_weights, is_trained
 from threestudio_gaussiandreamer.toybox.tokens import open_tokenizer, token_ids
@@ -77,21 +76,10 @@ def test_the_guidance_sees_what_the_training_saw(guidance, prompts, unet_stage):
     abar = unet_stage.alphas_cumprod[t].float().reshape(-1, 1, 1, 1)
     expected = abar.sqrt() * v + (1 - abar).sqrt() * z
     assert torch.allclose(guidance.noise(z, t, tokens), expected, **HALF)
-
-
-def test_latents_of_the_guidance_have_the_training_scale(guidance, unet_stage):
     images = torch.rand(2, 3, 128, 128, generator=torch.Generator().manual_seed(0))
     mean = guidance.vae.encode(images * 2 - 1).latent_dist.mean * guidance.vae.config.scaling_factor
     expected = unet_stage.vae.encode(images * 2 - 1).latent_dist.mean * unet_stage.scale
     assert torch.allclose(mean, expected, **HALF)
-
-
-def test_the_guidance_gives_a_gradient(guidance, prompts):
-    rgb = torch.rand(2, 128, 128, 3, requires_grad=True)
-    angles = torch.tensor([10.0, 100.0])
-    views = {"elevation": angles, "azimuth": angles, "camera_distances": angles}
-    guidance(rgb, prompts, **views)["loss_sds"].backward()
-    assert rgb.grad.isfinite().all() and rgb.grad.abs().sum() > 0
 
 
 def test_clip_compares_pictures_with_texts(exported):
@@ -108,19 +96,16 @@ def test_the_point_e_prior_loads_the_points_model(exported, trained):
     assert cloud.points.shape == (50, 3) and np.isfinite(cloud.points).all()
     stage = STAGES["points"](options(trained))
     assert torch.allclose(
-        prior._condition(PROMPT, torch.device("cpu")),
+        prior.condition("Point-E", exported / "clip", PROMPT),
         stage.condition(token_ids(stage.tokenizer, [PROMPT])),
         **HALF,
     )
 
 
-def test_the_record_lists_what_was_tested(exported):
+def test_the_record_and_digests_of_all_files_are_written(exported):
     record = json.loads((exported / "training.json").read_text())
     assert set(record) == set(STAGES)
     assert record["clip"]["images"] == 8 and record["unet"]["steps"] == 1
-
-
-def test_digests_of_all_files_are_written(exported):
     digests = read_digests(exported)
     assert {"points.safetensors", "clip/model.safetensors", "training.json"} < set(digests)
     assert all(digest_of(exported / name) == digest for name, digest in digests.items())
@@ -150,24 +135,6 @@ def test_a_training_continues_from_the_weights(exported, trained, tmp_path):
         run.run(before + 4)
 
 
-@pytest.mark.parametrize("images, seconds", [(10**9, 1e6), (0, 0.0)])
-def test_a_continued_training_logs_its_own_rate(
-    exported, tmp_path, monkeypatch, capsys, images, seconds
-):
-    """Pictures and seconds of the training that it started from don't count."""
-    weights = tmp_path / "weights"
-    shutil.copytree(exported, weights)
-    record = json.loads((exported / "training.json").read_text())
-    last = {"images": images, "seconds": seconds, "loss": 0.5}
-    record["judge"] |= {"images": 10**9, "last": last}
-    (weights / "training.json").write_text(json.dumps(record))
-    warm_start.start_from(weights, options(tmp_path), {"judge": STAGES["judge"]})
-    monkeypatch.setattr(loop, "LOG_EVERY", 1)
-    training(tmp_path, "judge").run(10**9 + 8)
-    rates = re.findall(r"judge  1000000\d+/\d+  ([\d.]+)/s", capsys.readouterr().out)
-    assert rates and all(float(rate) < 1e5 for rate in rates)
-
-
 def test_weights_of_another_size_are_refused(exported, tmp_path, monkeypatch):
     monkeypatch.setattr(models, "VISION_LAYERS", 2)
     monkeypatch.setattr(models, "FEATURES", 64)
@@ -175,23 +142,15 @@ def test_weights_of_another_size_are_refused(exported, tmp_path, monkeypatch):
         warm_start.start_from(exported, options(tmp_path), STAGES)
 
 
-def test_no_weights_are_reported(tmp_path):
-    with pytest.raises(UserError, match="training.json"):
-        warm_start.start_from(tmp_path, options(tmp_path), STAGES)
-
-
-def test_an_untrained_folder_is_reported(tmp_path, capsys):
+def test_an_untrained_folder_and_a_target_that_can_not_be_made_are_messages(tmp_path, capsys):
     assert main([str(tmp_path / "nothing"), str(tmp_path / "models")]) == 2
     assert "train the stage 'clip' first" in capsys.readouterr().err
-
-
-def test_a_target_that_can_not_be_made_is_one_message(tmp_path, capsys):
     (tmp_path / "file").touch()
     assert main([str(tmp_path), str(tmp_path / "file" / "models")]) == 2
     assert "TARGET: the folder" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("size", [100, 3000, 8000])
+@pytest.mark.parametrize("size", [100, 8000])
 def test_a_full_disk_is_one_message_and_the_export_can_be_repeated(trained, tmp_path, capsys, size):
     """It fails in different files: weights, vocabulary, configuration."""
     target = tmp_path / "models"
@@ -206,9 +165,9 @@ def test_a_full_disk_is_one_message_and_the_export_can_be_repeated(trained, tmp_
     )
 
 
-@pytest.mark.parametrize("size", [500, 3000, 20000])
+@pytest.mark.parametrize("size", [3000, 20000])
 def test_a_full_disk_at_the_start_from_weights_is_mended_by_a_second_call(exported, tmp_path, size):
-    """It fails in the configuration of the tokenizer, in its vocabulary, and in a checkpoint."""
+    """It fails in the vocabulary, and in a checkpoint."""
     start = exported, options(tmp_path), {"text": STAGES["text"]}
     with largest_file(size), pytest.raises(UserError, match="cannot write"):
         warm_start.start_from(*start)
@@ -216,8 +175,10 @@ def test_a_full_disk_at_the_start_from_weights_is_mended_by_a_second_call(export
     assert is_trained(tmp_path, "text") and open_tokenizer(tmp_path)
 
 
-@pytest.mark.parametrize("content", [b"{", b"[]", b'{"text": 3}', b"\xff"])
-def test_a_damaged_record_of_weights_is_named(tmp_path, content):
-    (tmp_path / "training.json").write_bytes(content)
-    with pytest.raises(UserError, match="training.json' is damaged"):
-        warm_start.start_from(tmp_path, options(tmp_path / "run"), STAGES)
+def test_a_missing_or_damaged_record_of_weights_is_named(tmp_path):
+    for content in (None, b"{", b"[]", b'{"text": 3}', b"\xff"):
+        if content is not None:
+            (tmp_path / "training.json").write_bytes(content)
+        problem = "does not exist" if content is None else "training.json' is damaged"
+        with pytest.raises(UserError, match=problem):
+            warm_start.start_from(tmp_path, options(tmp_path / "run"), STAGES)

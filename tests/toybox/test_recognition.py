@@ -58,27 +58,17 @@ def test_colours_may_be_exchanged_where_nobody_can_tell(pattern, right):
     assert not recognition.recognized(sure(plain), wanted)["colors"]
 
 
-def test_the_two_colours_of_a_pattern_differ():
-    """Where each colour alone is most probably red, the second is the next most probable one."""
-    found = sure(FOX)
-    red, white = (LABELS["second"].index(name) for name in ("red", "white"))
-    found["second"][:, red], found["second"][:, white] = 0.6, 0.4
-    assert recognition.most_probable_pattern(found) == ("striped", "red", "white")
-
-
-def test_a_pattern_has_a_second_colour_and_plain_objects_have_none():
-    found = sure(FOX)
-    none, white = (LABELS["second"].index(name) for name in ("none", "white"))
-    found["second"][:, none], found["second"][:, white] = 0.5, 0.3
-    assert recognition.most_probable_pattern(found) == ("striped", "red", "white")
+def test_colours_and_pattern_are_a_combination_that_objects_have():
+    """Where each alone is most probably red or "none", the second is the next most probable."""
+    red, white, none = (LABELS["second"].index(name) for name in ("red", "white", "none"))
+    for other in (red, none):
+        found = sure(FOX)
+        found["second"][:, other], found["second"][:, white] = 0.6, 0.4
+        assert recognition.most_probable_pattern(found) == ("striped", "red", "white")
     striped, plain = (LABELS["pattern"].index(name) for name in ("striped", "plain"))
     found["pattern"][:, striped], found["pattern"][:, plain] = 0.2, 0.8
     assert recognition.most_probable_pattern(found) == ("plain", "red", "none")
-
-
-def test_an_uncertain_second_colour_does_not_make_an_object_plain():
-    """Half of the probability says "none", the other half is spread over two colours."""
-    found = sure(FOX)
+    # half of the probability says "none", the other half is spread over two colours
     for name, values in {
         "pattern": {"striped": 0.6, "plain": 0.4},
         "second": {"none": 0.5, "white": 0.3, "pink": 0.2},
@@ -93,31 +83,20 @@ def test_faces_on_all_sides():
     assert math.isnan(recognition.multi_face(sure(mug), mug))
 
 
-def test_an_exported_judge_is_loaded(tmp_path):
+def test_an_exported_judge_is_loaded_and_other_files_are_named(tmp_path, monkeypatch):
     torch.manual_seed(0)
-    judge = models.Judge()
-    export.write_weights(tmp_path / "judge.safetensors", judge.state_dict())
-    loaded = recognition.load_judge(tmp_path / "judge.safetensors")
-    pictures = torch.rand(2, 3, 128, 128)
-    for name, values in recognition.probabilities(judge, pictures).items():
-        torch.testing.assert_close(
-            recognition.probabilities(loaded, pictures)[name], values, atol=1e-2, rtol=0
-        )
-
-
-def test_the_message_about_a_judge_of_another_size_is_one_line(tmp_path, monkeypatch):
-    path = tmp_path / "judge.safetensors"
-    export.write_weights(path, models.Judge().state_dict())
+    judge, path = models.Judge(), tmp_path / "judge.safetensors"
+    with pytest.raises(UserError, match="there is no judge"):
+        recognition.load_judge(path)
+    export.write_weights(path, judge.state_dict())
+    loaded, pictures = recognition.load_judge(path), torch.rand(2, 3, 128, 128)
+    found, wanted = (recognition.probabilities(each, pictures) for each in (loaded, judge))
+    for name, values in wanted.items():
+        torch.testing.assert_close(found[name], values, atol=1e-2, rtol=0)
     monkeypatch.setattr(models.Judge, "CHANNELS", (8, 8, 8, 8))
-    with pytest.raises(UserError, match="judge") as caught:
-        recognition.load_judge(path)
-    assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize("content", [None, b"", b"\x08\0\0\0\0\0\0\0{}      "])
-def test_a_missing_or_foreign_judge_is_named(tmp_path, content):
-    path = tmp_path / "judge.safetensors"
-    if content is not None:
-        path.write_bytes(content)
-    with pytest.raises(UserError, match="judge"):
-        recognition.load_judge(path)
+    for content in (None, b"", b"\x08\0\0\0\0\0\0\0{}      "):
+        if content is not None:
+            path.write_bytes(content)
+        with pytest.raises(UserError, match="judge") as caught:
+            recognition.load_judge(path)
+        assert "\n" not in str(caught.value)

@@ -1,9 +1,7 @@
 """Every stage of the toybox's training learns, resumes exactly, and reports errors."""
 
-import contextlib
 import itertools
 import signal
-import sys
 
 import numpy as np
 import pytest
@@ -14,7 +12,7 @@ from threestudio_gaussiandreamer.core.checkpoint_file import load_file
 from threestudio_gaussiandreamer.core.devices import torch_threads
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.launch.folder_lock import claim
-from threestudio_gaussiandreamer.toybox import judge_stage, loop, points_stage, train, unet_stage
+from threestudio_gaussiandreamer.toybox import judge_stage, loop, train
 from threestudio_gaussiandreamer.toybox.loop import averaged_weights
 from threestudio_gaussiandreamer.toybox.train import STAGES, main, render_shards
 
@@ -40,9 +38,11 @@ def stop_after(run: loop.Training, steps: int) -> None:
 @pytest.mark.parametrize("name", STAGES)
 def test_resuming_gives_what_an_uninterrupted_training_gives(folder, name, tmp_path):
     whole, parts = copied(folder, tmp_path / "whole"), copied(folder, tmp_path / "parts")
+    torch.seed()  # random weights are a function of the seed, whatever the process drew before
     uninterrupted = training(whole, name)
     uninterrupted.run(uninterrupted.progress.images + 8)
     for step in (1, 2):
+        torch.seed()
         run = training(parts, name)
         stop_after(run, step)
         run.run(uninterrupted.progress.images)
@@ -51,14 +51,9 @@ def test_resuming_gives_what_an_uninterrupted_training_gives(folder, name, tmp_p
         assert torch.equal(value, weights(run)[key]), key
     losses = [[row["loss"] for row in r.progress.history] for r in (uninterrupted, run)]
     assert losses[0] == losses[1]
-
-
-@pytest.mark.parametrize("name", STAGES)
-def test_a_stage_learns_one_batch(folder, name, tmp_path):
-    run = training(copied(folder, tmp_path / "run"), name)
-    batch = next(run.stage.batches(0))
-    losses = []
-    for _ in range(12):
+    run.target = 10**9  # not yet decaying
+    batch, losses = next(run.stage.batches(0)), []
+    for _ in range(12):  # it learns one batch
         run.progress.step = 1  # the same learning rate each time
         losses.append(float(run.train_step(batch)["loss"]))
     assert losses[-1] < 0.97 * losses[0]
@@ -69,11 +64,14 @@ def test_a_stage_is_measured_on_withheld_objects(folder, name):
     stage = STAGES[name](options(folder))
     numbers = stage.evaluate(stage.model.eval())
     assert numbers and all(np.isfinite(value) for value in numbers.values())
+    if name == "judge":  # on both sorts of pictures
+        cast, gaussians = stage.held_out
+        assert torch.equal(cast.labels, gaussians.labels)
+        assert not torch.equal(cast.images, gaussians.images)
 
 
-@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
-def test_a_stop_signal_saves_and_stops(folder, tmp_path, name):
-    number = getattr(signal, name)
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
+def test_a_stop_signal_saves_and_stops(folder, tmp_path, number):
     run = training(copied(folder, tmp_path / "run"), "judge")
     step, earlier = run.train_step, signal.getsignal(number)
 
@@ -88,12 +86,11 @@ def test_a_stop_signal_saves_and_stops(folder, tmp_path, name):
     assert signal.getsignal(number) == earlier
 
 
-@pytest.mark.parametrize(("name", "code"), [("SIGINT", 130), ("SIGTERM", 143), ("SIGHUP", 129)])
-def test_after_a_stop_signal_no_other_stage_begins(tmp_path, monkeypatch, capsys, name, code):
+def test_after_a_stop_signal_no_other_stage_begins(tmp_path, monkeypatch, capsys):
     begun = []
 
     class Stopped:
-        progress, signum = loop.Progress(), getattr(signal, name)
+        progress, signum = loop.Progress(), signal.SIGHUP
 
         def __init__(self, stage):
             begun.append(stage)
@@ -103,7 +100,7 @@ def test_after_a_stop_signal_no_other_stage_begins(tmp_path, monkeypatch, capsys
 
     monkeypatch.setattr(train, "Training", Stopped)
     monkeypatch.setattr(train, "STAGES", {"clip": lambda options: "a", "unet": lambda options: "b"})
-    assert main([str(tmp_path), "--stages", "clip", "unet"]) == code
+    assert main([str(tmp_path), "--stages", "clip", "unet"]) == 129
     assert begun == ["a"] and capsys.readouterr().err == "stopped\n"
 
 
@@ -112,30 +109,6 @@ def test_a_stage_is_trained_by_one_process_at_a_time(tmp_path, capsys):
     assert main([str(tmp_path), "--stages", "judge"]) == 2 and not (tmp_path / "judge.pt").exists()
     assert "another process trains the stage 'judge'" in capsys.readouterr().err
     claimed.release()
-
-
-def test_a_full_device_as_standard_output_stops_no_training(folder, tmp_path, monkeypatch, capfd):
-    place = copied(folder, tmp_path / "run")
-    monkeypatch.setattr(train, "options_of", lambda args: options(place))
-    monkeypatch.setattr(judge_stage.JudgeStage, "evaluate", lambda self, model: {})
-    with open("/dev/full", "w") as full:
-        monkeypatch.setattr(sys, "stdout", full)
-        assert main([str(place), "--stages", "judge", "--images", "4"]) == 0
-        monkeypatch.undo()
-        with contextlib.suppress(OSError):
-            full.flush()
-    assert load_file(place / "judge.pt")["images"] == 4
-
-
-@pytest.mark.parametrize("name", STAGES)
-def test_random_weights_are_a_function_of_the_seed(folder, name):
-    found = []
-    for seed in (0, 0, 1):
-        torch.seed()  # whatever the process drew before
-        stage = STAGES[name](options(folder, seed=seed))
-        found.append(torch.cat([value.flatten() for value in stage.model.parameters()]))
-    assert torch.equal(found[0], found[1])
-    assert not torch.equal(found[0], found[2])
 
 
 def test_a_gradient_that_is_not_finite_stops_before_it_is_saved(folder, tmp_path):
@@ -167,9 +140,6 @@ def test_a_time_limit_ends_a_stage_and_lowers_the_rate_before(folder, tmp_path):
     run.train_step = step
     run.run(seconds=1e6)
     assert len(rates) == 10 and rates[0] == 1 and 0 < rates[9] < rates[8] < 1
-
-
-def test_curves_are_written(folder):
     rows = (folder / "clip.csv").read_text().splitlines()
     assert rows[0].startswith("images,seconds,loss") and len(rows) == 3
 
@@ -177,14 +147,12 @@ def test_curves_are_written(folder):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
+        ([], "FOLDER: the folder"),
         (["--stages", "unett"], "did you mean 'unet'"),
         (["--images", "0"], "--images 0: expected 1 or more"),
         (["--pool", "-3"], "--pool -3: expected 1 or more"),
         (["--device", "cuda"], "sees no GPU"),
         (["--device", "cpuu"], "unknown device 'cpuu': did you mean 'cpu'"),
-        (["--only", "attentions"], "--stages, e.g. unet"),
-        (["--rate", "0"], "--rate 0.0: expected more than 0"),
-        (["--rate", "nan"], "--rate nan: expected more than 0"),
         (["--minutes", "0"], "--minutes 0.0: expected more than 0"),
         (["--minutes", "nan"], "--minutes nan: expected more than 0"),
         (["--seed", "1000"], "--seed 1000: expected 0 to 999"),
@@ -193,14 +161,9 @@ def test_curves_are_written(folder):
     ],
 )
 def test_bad_options_are_one_message(tmp_path, capsys, arguments, message):
-    assert main([str(tmp_path), *arguments]) == 2
-    assert message in capsys.readouterr().err
-
-
-def test_a_folder_that_can_not_be_made_is_one_message(tmp_path, capsys):
     (tmp_path / "file").touch()
-    assert main([str(tmp_path / "file" / "run")]) == 2
-    assert "FOLDER: the folder" in capsys.readouterr().err
+    assert main([str(tmp_path / "file" / "run"), *arguments]) == 2
+    assert message in capsys.readouterr().err
 
 
 @pytest.mark.slow  # starts processes
@@ -235,34 +198,6 @@ def test_the_judge_has_data_of_its_own(tmp_path):
     paths = [part.shards.path(0) for part in (data.first, data.second)]
     assert paths == [casts.path(0), splats.path(0)]
     assert torch.equal(data[judge_stage.CAST_EVERY].images, data.first[1].images)
-
-
-def test_the_judge_is_measured_on_both_sorts_of_pictures(folder):
-    cast, gaussians = STAGES["judge"](options(folder)).held_out
-    assert torch.equal(cast.labels, gaussians.labels)
-    assert not torch.equal(cast.images, gaussians.images)
-
-
-# Formulas -----------------------------------------------------------------------------------
-
-
-def test_the_weight_of_v_is_truncated():
-    abar = torch.tensor([0.01, 0.5, 0.99], dtype=torch.float64)
-    expected = torch.tensor([1, 1, 0.06], dtype=torch.float64)
-    assert torch.allclose(unet_stage.truncated_weight(abar), expected)
-
-
-def test_latents_are_scaled_to_unit_variance():
-    generator = torch.Generator().manual_seed(0)
-    mean = 3 * torch.randn(50, 4, 16, 16, generator=generator)
-    moments = torch.stack([mean, torch.full_like(mean, 4.0)])
-    assert unet_stage.latent_scale(moments) == pytest.approx(1 / 5, rel=0.01)
-
-
-def test_points_go_to_point_es_units():
-    front = torch.tensor([[[0.8, 0, 0, 1.0, 0, 0]]])
-    expected = torch.tensor([0, -1.0, 0, 1, -1, -1])  # Point-E's front is -y
-    assert torch.allclose(points_stage.network_units(front)[0, :, 0], expected, atol=1e-6)
 
 
 @pytest.mark.parametrize(

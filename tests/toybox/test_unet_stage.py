@@ -1,4 +1,4 @@
-"""The training of the U-Net: its measurement, and training a part of it."""
+"""The training of the U-Net: its batches and its measurement; formulas of stages."""
 
 import collections
 import dataclasses
@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 import torch
 
-from tests.toybox.helpers import copied, options, training
-from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.toybox import tokens, views, warm_start, words
-from threestudio_gaussiandreamer.toybox.loop import averaged_weights
+from tests.toybox.helpers import options
+from threestudio_gaussiandreamer.toybox import points_stage, tokens, unet_stage, views, words
+from threestudio_gaussiandreamer.toybox.clip_stage import NAMED_QUADRANT
 from threestudio_gaussiandreamer.toybox.train import STAGES
 
 pytestmark = pytest.mark.usefixtures("small_world")
@@ -56,28 +55,19 @@ def test_joined_prompts_have_the_same_words_and_the_directions_of_their_pictures
     assert sorts["direction"] > 140 and sorts["empty"] > 5 and sorts["plain"] > 0
 
 
-def test_only_named_parameters_are_trained(folder, tmp_path):
-    place = copied(folder, tmp_path / "run")
-    training(place, "unet").run(4)
-    before = averaged_weights(place, "unet")
-    run = training(place, "unet", only="attentions")
-    run.run(run.progress.images + 4)
-    after = averaged_weights(place, "unet")
-    changed = {key for key in before if not torch.equal(before[key], after[key])}
-    assert changed and all("attentions" in key for key in changed)
-    with pytest.raises(UserError, match="--only 'attention_layers'.*down_blocks"):
-        training(place, "unet", only="attention_layers")
+def test_formulas():
+    abar = torch.tensor([0.01, 0.5, 0.99], dtype=torch.float64)
+    expected = torch.tensor([1, 1, 0.06], dtype=torch.float64)
+    assert torch.allclose(unet_stage.truncated_weight(abar), expected)
+    mean = 3 * torch.randn(50, 4, 16, 16, generator=torch.Generator().manual_seed(0))
+    moments = torch.stack([mean, torch.full_like(mean, 4.0)])
+    assert unet_stage.latent_scale(moments) == pytest.approx(1 / 5, rel=0.01)
+    front = torch.tensor([[[0.8, 0, 0, 1.0, 0, 0]]])
+    expected = torch.tensor([0, -1.0, 0, 1, -1, -1])  # Point-E's front is -y
+    assert torch.allclose(points_stage.network_units(front)[0, :, 0], expected, atol=1e-6)
 
 
-def test_the_rate_is_that_of_the_option(folder, tmp_path):
-    run = training(copied(folder, tmp_path / "run"), "unet", rate=3e-3)
-    run.progress.step = 1000
-    run.train_step(next(run.stage.batches(0)))
-    assert run.optimizer.param_groups[0]["lr"] == pytest.approx(3e-3)
-
-
-def test_a_part_of_one_network_is_trained_on_from_weights(exported, tmp_path):
-    warm_start.start_from(exported, options(tmp_path, only="attentions"), STAGES)
-    run = training(tmp_path, "unet", only="attentions")
-    free = {name for name, value in run.model.named_parameters() if value.requires_grad}
-    assert free and all("attentions" in name for name in free)
+def test_prompts_that_name_a_quadrant():
+    named = ("a fox, left side view", "right side view of a fox", "backside view of a fox")
+    assert all(NAMED_QUADRANT.search(text) for text in (*named, "a fox, front view"))
+    assert not any(map(NAMED_QUADRANT.search, ("a fox, side view", "a fox, overhead view", "a")))

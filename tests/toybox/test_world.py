@@ -23,28 +23,17 @@ def mesh_of(attributes, seed=0):
     return world.object_mesh(attributes, np.random.default_rng(seed))
 
 
-def test_the_world_is_as_large_as_it_should_be(drawn):
-    assert len(KINDS) >= 16
-    assert len(world.COLORS) == 12 and len(world.PATTERNS) == 5
+def test_objects_are_functions_of_seed_and_index(drawn):
+    assert len(KINDS) >= 16 and len(world.COLORS) == 12 and len(world.PATTERNS) == 5
     assert {a.kind for a in drawn} == set(KINDS) == set(words.NOUNS) == set(words.PARTS)
     assert {a.pattern for a in drawn} == set(world.PATTERNS)
-    assert {a.accessory for a in drawn} == {None, *ACCESSORIES}
-    assert any(a.part for a in drawn)
-
-
-def test_an_object_is_a_function_of_seed_and_index(drawn):
+    assert {a.accessory for a in drawn} == {None, *ACCESSORIES} and any(a.part for a in drawn)
     assert drawn[7] == world.draw_attributes(0, 7)
     assert [world.draw_attributes(1, index) for index in range(20)] != drawn[:20]
-
-
-def test_colors_of_one_object_differ(drawn):
     for a in drawn:
         named = [c for c in (a.color, a.second, a.part, a.accessory_color) if c]
         assert len(set(named)) == len(named)
         assert (a.second is None) == (a.pattern == "plain")
-
-
-def test_withheld_combinations_are_never_drawn(drawn):
     assert not any(world.withheld(a) for a in drawn)
     assert all(world.withheld(world.draw_attributes(0, i, held_out=True)) for i in range(20))
     # every kind, colour and pattern is learnt from other objects
@@ -52,52 +41,36 @@ def test_withheld_combinations_are_never_drawn(drawn):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_every_kind_has_a_mesh_inside_the_sphere(kind):
+def test_every_kind_has_a_mesh_inside_the_sphere_with_patterns_on_all_sides(kind):
     for accessory in (None, *ACCESSORIES):
         color = "red" if accessory else None
         mesh = mesh_of(world.Attributes(kind, "blue", "dotted", "white", None, accessory, color))
-        distance = np.linalg.norm(mesh.vertices, axis=1)
-        assert distance.max() == pytest.approx(world.RADIUS)
+        assert np.linalg.norm(mesh.vertices, axis=1).max() == pytest.approx(world.RADIUS)
         assert np.isfinite(mesh.uv).all() and (0 <= mesh.uv).all() and (mesh.uv <= 1).all()
-        assert (world.PART_SHADE * 0.69 < mesh.vertex_colors).all() and (
-            mesh.vertex_colors <= 1
-        ).all()
-
-
-@pytest.mark.parametrize("kind", ["fox", "house", "robot"])
-def test_an_accessory_shows_in_its_color(kind):
-    for name in ACCESSORIES:
-        attributes = world.Attributes(kind, "blue", accessory=name, accessory_color="lime")
-        share = share_of(attributes, "lime")
-        assert share > 0.01, name
-        assert share_of(attributes._replace(accessory=None, accessory_color=None), "lime") == 0
-
-
-@pytest.mark.parametrize("pattern", world.PATTERNS[1:])
-def test_a_pattern_shows_both_colors(pattern):
-    attributes = world.Attributes("mug", "blue", pattern, "yellow")
-    for color in ("blue", "yellow"):
-        assert share_of(attributes, color) > 0.1
-
-
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("pattern", world.PATTERNS[1:])
-def test_a_pattern_covers_the_object_on_all_sides(kind, pattern):
-    points = points_of(world.Attributes(kind, "blue", pattern, "yellow"))
-    yellow = hue_matches(points[:, 3:], "yellow")
-    around = np.degrees(np.arctan2(points[:, 1], points[:, 0]))
-    for side in range(4):
-        inside = np.abs((around - 90 * side + 180) % 360 - 180) < 45
-        assert yellow[inside].sum() > 0.05 * inside.sum()
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_no_surface_has_more_periods_than_the_texture(kind):
-    attributes = world.Attributes(kind, "blue", "dotted", "yellow")
+        assert world.PART_SHADE * 0.69 < mesh.vertex_colors.min() <= mesh.vertex_colors.max() <= 1
+    for pattern in world.PATTERNS[1:]:
+        points = points_of(world.Attributes(kind, "blue", pattern, "yellow"))
+        yellow = hue_matches(points[:, 3:], "yellow")
+        around = np.degrees(np.arctan2(points[:, 1], points[:, 0]))
+        for side in range(4):
+            inside = np.abs((around - 90 * side + 180) % 360 - 180) < 45
+            assert yellow[inside].sum() > 0.05 * inside.sum()
+    # no surface has more periods than the texture
     share = world.SIZE / (world.SIZE + world.CELL)
     for seed in range(20):
-        u, v = mesh_of(attributes, seed).uv.T
+        u, v = mesh_of(world.Attributes(kind, "blue", "dotted", "yellow"), seed).uv.T
         assert u[u < share].max() < share * (1 - 1 / world.SIZE) and v.max() < 1 - 1 / world.SIZE
+
+
+def test_accessories_and_patterns_show_in_their_colors():
+    for kind in ("fox", "house", "robot"):
+        for name in ACCESSORIES:
+            attributes = world.Attributes(kind, "blue", accessory=name, accessory_color="lime")
+            assert share_of(attributes, "lime") > 0.01, name
+            assert share_of(world.Attributes(kind, "blue"), "lime") == 0
+    for pattern in world.PATTERNS[1:]:
+        mug = world.Attributes("mug", "blue", pattern, "yellow")
+        assert share_of(mug, "blue") > 0.1 and share_of(mug, "yellow") > 0.1
 
 
 def test_a_part_without_a_color_has_the_pattern_but_is_darker():
@@ -111,19 +84,13 @@ def test_a_part_without_a_color_has_the_pattern_but_is_darker():
     assert not hue_matches(sail(part="red")[:, 3:], "yellow").any()
 
 
-def test_two_tone_has_the_second_color_above():
+def test_two_tone_has_the_second_color_above_and_the_front_is_plus_x():
     points = points_of(world.Attributes("penguin", "blue", "two-tone", "yellow"))
-    heights = {
-        name: points[hue_matches(points[:, 3:], name), 2].mean() for name in ("blue", "yellow")
-    }
-    assert heights["yellow"] > heights["blue"] + 0.2
-
-
-def test_the_front_is_plus_x():
+    blue, yellow = (points[hue_matches(points[:, 3:], name), 2] for name in ("blue", "yellow"))
+    assert yellow.mean() > blue.mean() + 0.2
     points = points_of(world.Attributes("duck", "blue"))
     beak = points[hue_matches(points[:, 3:], "orange")]
-    top = beak[beak[:, 2] > 0]  # without the feet
-    assert (top[:, :3] @ AXES["+x"]).min() > 0.1
+    assert (beak[beak[:, 2] > 0, :3] @ AXES["+x"]).min() > 0.1  # without the feet
 
 
 def points_of(attributes):
@@ -152,22 +119,38 @@ def test_prompts_name_what_there_is(drawn):
         text = words.describe(a, rng)
         assert any(noun in text for noun in words.NOUNS[a.kind])
         for color in (a.color, a.second, a.part, a.accessory_color):
-            assert color is None or any(
-                word in text for word in (color, *words.COLOR_WORDS.get(color, ()))
-            )
+            names = (color, *words.COLOR_WORDS.get(color, ()))
+            assert color is None or any(word in text for word in names)
         if a.accessory:
             assert any(word in text for word in words.ACCESSORY_WORDS[a.accessory])
         assert " a o" not in f" {text}" and " a e" not in f" {text}"
-
-
-def test_one_prompt_in_ten_is_empty_and_most_name_the_direction(drawn):
-    rng = np.random.default_rng(0)
+    for index in range(500):  # every written prompt is read back
+        attributes = world.draw_attributes(5, index)
+        text = words.describe(attributes, np.random.default_rng(index))
+        assert words.attributes_in(text) == attributes, text
     texts = [words.prompt_of(a, 10, 5 * i, rng) for i, a in enumerate(drawn) for _ in range(5)]
     assert np.mean([text == "" for text in texts]) == pytest.approx(0.1, abs=0.02)
     assert np.mean(["view" in text for text in texts]) == pytest.approx(0.7, abs=0.04)
 
 
-@pytest.mark.parametrize("elevation", [-10.0, 30.0, 59.9, 60.1, 80.0])
+@pytest.mark.parametrize(
+    ("prompt", "attributes"),
+    [
+        (
+            "A Red FOX, with a green scarf!",
+            world.Attributes("fox", "red", accessory="scarf", accessory_color="green"),
+        ),
+        ("a shiny light green lorry from above", world.Attributes("truck", "lime")),
+        ("a blue teddy bear and a horse", world.Attributes("bear", "blue")),
+        ("a carrot coloured blue car", world.Attributes("car", "blue")),
+        *((prompt, None) for prompt in ("", "a fox", "something red", "狐狸", "a " * 2000)),
+    ],
+)
+def test_other_prompts_are_read(prompt, attributes):
+    assert words.attributes_in(prompt) == attributes
+
+
+@pytest.mark.parametrize("elevation", [-10.0, 59.9, 60.1])
 def test_directions_are_those_of_the_prompt_processors(elevation):
     directions = view_directions(left_and_right=True)
     for azimuth in np.arange(-180.0, 180.0, 7.5):
@@ -194,13 +177,11 @@ def test_every_word_is_one_token(tokenizer, drawn):
     rng = np.random.default_rng(0)
     texts = [words.prompt_of(a, 10, 90, rng) for a in drawn]
     assert max(len(tokenizer(text).input_ids) for text in texts) <= LENGTH
-
-
-@pytest.mark.parametrize("text", ["", "a wombat", "Ein Fuchs, über 火 🦊", "x" * 4096, "\x00\t\n"])
-def test_any_text_can_be_tokenized(tokenizer, text):
-    ids = tokenizer(text, padding="max_length", truncation=True, max_length=LENGTH).input_ids
-    assert len(ids) == LENGTH and max(ids) < len(tokenizer)
-    assert ids[0] == len(tokenizer) - 2 and len(tokenizer) - 1 in ids
+    whole = {"padding": "max_length", "truncation": True, "max_length": LENGTH}
+    for text in ("", "a wombat", "Ein Fuchs, über 火 🦊", "x" * 4096, "\x00\t\n"):
+        ids = tokenizer(text, **whole).input_ids
+        assert len(ids) == LENGTH and max(ids) < len(tokenizer)
+        assert ids[0] == len(tokenizer) - 2 and len(tokenizer) - 1 in ids
 
 
 # Pictures -----------------------------------------------------------------------------------
@@ -216,26 +197,15 @@ def test_a_shard_is_a_function_of_seed_and_index(shards):
     for first, second in zip(shard, again, strict=True):
         assert np.array_equal(first, second)
     assert not np.array_equal(shard.rgba, shards.make(1).rgba)
-    assert [path.name for path in shards.folder.iterdir()] == [
-        f"train-world{world.VERSION}-0-6x4-00000.npz"
-    ]
-
-
-def test_a_shard_can_be_read_without_its_pictures(shards):
-    light, whole = shards.get_light(0), shards.get(0)
+    name = f"train-world{world.VERSION}-0-6x4-00000.npz"
+    assert [path.name for path in shards.folder.iterdir()] == [name]
+    light = shards.get_light(0)
     assert light.rgba.size == 0
-    assert all(np.array_equal(a, b) for a, b in zip(light[1:], whole[1:], strict=True))
-
-
-def test_a_shard_has_labels_of_its_objects(shards):
-    shard = shards.get(0)
+    assert all(np.array_equal(a, b) for a, b in zip(light[1:], shard[1:], strict=True))
     for row in range(24):
         attributes = views.attributes_of(shard.labels[row])
         assert attributes == world.draw_attributes(0, row // 4)
         assert np.array_equal(shard.labels[row], views.label_row(attributes, shard.azimuth[row]))
-
-
-def test_quadrants_are_centred_on_front_left_back_and_right():
     attributes = world.Attributes("fox", "red")
     names = views.LABELS["quadrant"]
     for azimuth, name in ((0, "front"), (44, "front"), (46, "left"), (180, "back"), (-90, "right")):
@@ -248,11 +218,7 @@ def test_objects_fill_the_picture_and_are_not_cut(shards):
         assert not picture[[0, -1]].any() and not picture[:, [0, -1]].any()
     extents = [max(np.ptp(np.nonzero(picture)[axis]) for axis in (0, 1)) for picture in alpha]
     assert np.median(extents) > 0.6 * views.SIZE
-
-
-def test_the_size_in_the_picture_varies_by_at_most_fifteen_percent():
-    near, far = views.DISTANCE
-    assert far / near <= 1.15
+    assert views.DISTANCE[1] / views.DISTANCE[0] <= 1.15
 
 
 def test_backgrounds_are_fixed_but_for_the_asked_share(shards):
@@ -285,9 +251,6 @@ def test_the_sheet_shows_every_object_with_its_prompt():
     texts = sheet[views.SIZE : cell, : 10 * views.SIZE]
     assert all((part < 128).any() for part in np.split(texts, 10, axis=1))
     assert (sheet[cell:, 2 * views.SIZE :] == 255).all()
-
-
-def test_texts_below_pictures_are_whole():
     pictures = torch.ones(2, 3, 64, 64)
     all_texts = ((), ("a", "b"), ("a", "word " * 60))
     heights = [len(contact_sheet(pictures, texts, columns=2)) for texts in all_texts]

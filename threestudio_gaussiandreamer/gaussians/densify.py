@@ -70,9 +70,7 @@ def screen_gradients(
     ``means2d_grad`` is the gradient of a loss that is averaged over the batch and multiplied by
     ``loss_scale`` (that of automatic mixed precision); both are undone here. Non-finite gradients
     count as zero."""
-    half = torch.tensor(
-        [0.5 * width, 0.5 * height], dtype=means2d_grad.dtype, device=means2d_grad.device
-    )
+    half = means2d_grad.new_tensor([0.5 * width, 0.5 * height])
     norms = (means2d_grad * half).norm(dim=-1) * (len(means2d_grad) / loss_scale)
     return torch.where(norms.isfinite(), norms, torch.zeros_like(norms))
 
@@ -89,9 +87,8 @@ def densify_and_prune(
     """
     faint = torch.sigmoid(params["logit_opacities"].detach()) < rules.min_opacity
     above_threshold = (stats.gradient > rules.grad_threshold) & ~faint
-    above_threshold &= _affordable(
-        above_threshold, stats.gradient, rules.max_gaussians - int((~faint).sum())
-    )
+    room = rules.max_gaussians - int((~faint).sum())
+    above_threshold &= _affordable(above_threshold, stats.gradient, room)
     large = params["log_scales"].exp().amax(-1) > rules.split_scale
     selected = {"clone": above_threshold & ~large, "split": above_threshold & large}
     change = clone_and_split(params, **selected, rng=rng)
@@ -108,11 +105,8 @@ def _affordable(
     """
     if int(above_threshold.sum()) <= room:
         return above_threshold
-    order = torch.argsort(
-        torch.where(above_threshold, gradient, torch.full_like(gradient, -1.0)),
-        descending=True,
-        stable=True,
-    )
+    ranked = torch.where(above_threshold, gradient, torch.full_like(gradient, -1.0))
+    order = torch.argsort(ranked, descending=True, stable=True)
     chosen = torch.zeros_like(above_threshold)
     chosen[order[: max(room, 0)]] = True
     return chosen
@@ -132,10 +126,8 @@ def clone_and_split(
     is_new = torch.arange(len(parents), device=clone.device) >= len(stay)
     values = {name: value.detach()[parents].clone() for name, value in params.items()}
     children = slice(len(stay) + len(clones), None)
-    offsets = (
-        torch.randn(2 * len(splits), 3, generator=rng).to(clone.device)
-        * values["log_scales"][children].clamp(*LOG_SCALE_RANGE).exp()
-    )
+    scales = values["log_scales"][children].clamp(*LOG_SCALE_RANGE).exp()
+    offsets = torch.randn(2 * len(splits), 3, generator=rng).to(clone.device) * scales
     values["means"][children] += rotate(values["quats"][children], offsets)
     values["log_scales"][children] -= torch.log(torch.tensor(SPLIT_SHRINK))
     return Change(parents, is_new, values)
@@ -153,32 +145,26 @@ def keep(
     rank = rank[torch.argsort(wanted[rank].int(), descending=True, stable=True)]
     left, floor = int(wanted.sum()), min(rules.min_gaussians, len(wanted))
     if left < floor:
-        logger.warning(
-            "only %d of %d Gaussians would be left: the %d that contribute most stay "
-            "(min_gaussians)",
-            left,
-            len(wanted),
-            floor,
-        )
+        few = "only %d of %d Gaussians would be left: the %d that contribute most stay (%s)"
+        logger.warning(few, left, len(wanted), floor, "min_gaussians")
     count = min(max(left, floor), rules.max_gaussians)
     rows = rank[:count].sort().values
-    return Change(
-        change.parents[rows],
-        change.is_new[rows],
-        {name: value[rows] for name, value in change.values.items()},
-    )
+    values = {name: value[rows] for name, value in change.values.items()}
+    return Change(change.parents[rows], change.is_new[rows], values)
 
 
 def prune_to(params: Mapping[str, Tensor], scores: Float[Tensor, " N"], count: int) -> Change:
     """Keep the ``count`` Gaussians with the highest scores, in their order."""
-    rows = torch.arange(len(scores), device=scores.device)
-    everything = Change(
-        rows,
-        torch.zeros_like(rows, dtype=torch.bool),
-        {name: value.detach().clone() for name, value in params.items()},
-    )
-    rules = Rules(max_gaussians=count, min_gaussians=min(count, len(rows)))
+    everything = unchanged(params)
+    rules = Rules(max_gaussians=count, min_gaussians=min(count, len(scores)))
     return keep(everything, torch.ones_like(everything.is_new), scores, rules)
+
+
+def unchanged(params: Mapping[str, Tensor]) -> Change:
+    """Return the change of a cloud into a copy of itself."""
+    rows = torch.arange(len(params["means"]), device=params["means"].device)
+    values = {name: value.detach().clone() for name, value in params.items()}
+    return Change(rows, torch.zeros_like(rows, dtype=torch.bool), values)
 
 
 def rotate(quats: Float[Tensor, "N 4"], vectors: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
@@ -199,21 +185,12 @@ def update_optimizer(
     """
     replaced = {id(old[name]): new[name] for name in new}
     for group in optimizer.param_groups:
-        group["params"] = [
-            _moved(optimizer, param, replaced[id(param)], change)
-            if id(param) in replaced
-            else param
-            for param in group["params"]
-        ]
-
-
-def _moved(
-    optimizer: torch.optim.Optimizer, old: nn.Parameter, new: nn.Parameter, change: Change
-) -> nn.Parameter:
-    state = optimizer.state.pop(old, None)
-    if state is not None:
-        optimizer.state[new] = {key: _rows(value, old, change) for key, value in state.items()}
-    return new
+        for param in group["params"]:
+            if id(param) in replaced and param in optimizer.state:
+                state = optimizer.state.pop(param)
+                moved = {key: _rows(value, param, change) for key, value in state.items()}
+                optimizer.state[replaced[id(param)]] = moved
+        group["params"] = [replaced.get(id(param), param) for param in group["params"]]
 
 
 def _rows(value: object, old: nn.Parameter, change: Change) -> object:

@@ -12,7 +12,6 @@ from typing import Optional
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from ..core.errors import UserError, unknown
 from .neighbours import NeighbourSearch
 from .point_cloud import PointCloud
 
@@ -47,7 +46,7 @@ def grow(
     """Return ``cloud`` followed by the points grown around it (Algorithm 1, stages 1 and 2).
 
     Args:
-        cloud: (P, 3) points in any unit, with colours.
+        cloud: (P, 3) finite points in any unit, P >= 1, with colours.
         num_candidates: points drawn uniformly in the bounding box.
         radius: distance below which a candidate is kept, as a share of the longest side of the
             bounding box without isolated points (the paper's "normalized" 0.01).
@@ -56,25 +55,24 @@ def grow(
         clamp: keep the grown colours in [0, 1]; the released code lets them reach 1.2.
         max_points: largest number of grown points.
         generator: the only source of randomness.
-
-    Raises:
-        UserError: an option out of range, or a cloud that is empty or not finite.
     """
-    _check_options(num_candidates, radius, color_range, max_points)
-    points = _checked(cloud.points)
+    points = np.asarray(cloud.points, np.float64)
     first, group, _ = distinct(points)  # trees are slow with many copies of one point
     search = NeighbourSearch(points[first])
     # One isolated point far away would stretch the box, and the radius with it.
     typical = points[~_isolated(search)[group]]
     reach = radius * (longest_side(typical) or 1.0)  # a single point has no size: one world unit
     candidates = generator.uniform(*growing_box(typical, reach), size=(num_candidates, 3))
-    kept, nearest = _within_reach(search, candidates, reach)
-    nearest = first[nearest]
+    distances, nearest = search.nearest(candidates, reach)
+    kept = np.flatnonzero(distances < reach)
+    found = "growing: %d of %d candidates lie within %.4g of %d points"
+    logger.info(found, len(kept), num_candidates, reach, len(first))
     # Candidates are independent, so the first ones are a uniform choice among those kept.
-    kept, nearest = kept[:max_points], nearest[:max_points]
-    colors = perturbed_colors(
-        cloud.colors[nearest], color_range=color_range, clamp=clamp, generator=generator
-    )
+    kept = kept[:max_points]
+    nearest = first[nearest[kept]]
+    colors = cloud.colors[nearest]
+    colors = colors + generator.uniform(*color_range, size=colors.shape)
+    colors = (colors.clip(0.0, 1.0) if clamp else colors).astype(np.float32)
     normals = None if cloud.normals is None else cloud.normals[nearest]
     return cloud.followed_by(PointCloud(candidates[kept], colors, normals))
 
@@ -95,18 +93,6 @@ def growing_box(
     return low - padding, high + padding
 
 
-def perturbed_colors(
-    colors: Float[np.ndarray, "R 3"],
-    *,
-    color_range: tuple[float, float],
-    clamp: bool,
-    generator: np.random.Generator,
-) -> Float[np.ndarray, "R 3"]:
-    """Return ``colors`` plus uniform noise per channel."""
-    noisy = colors + generator.uniform(*color_range, size=colors.shape)
-    return (noisy.clip(0.0, 1.0) if clamp else noisy).astype(np.float32)
-
-
 def nearest_distance_scales(
     points: Float[np.ndarray, "P 3"], rule: str = "nearest"
 ) -> Float[np.ndarray, " P"]:
@@ -118,83 +104,23 @@ def nearest_distance_scales(
     99th percentile, and fewer than four distinct points get a fraction of their bounding radius.
 
     Args:
-        points: (P, 3) in any unit, which is the unit of the result.
+        points: (P, 3) in any unit, which is the unit of the result; finite, P >= 1.
         rule: "nearest", the distance to the nearest other point (the paper), or "rms3", the root of
             the mean of the squared distances to the nearest three (the released code).
-
-    Raises:
-        UserError: an unknown rule, or a cloud that is empty or not finite.
     """
-    if rule not in SCALE_RULES:
-        raise unknown("rule of the first scales", rule, SCALE_RULES)
-    points = _checked(points)
+    points = np.asarray(points, np.float64)  # in float32 squares of tiny distances underflow
     first, group, copies = distinct(points)
     if len(first) < 4:
-        return _as_float32(np.full(len(points), _few_points_scale(points)))
-    search = NeighbourSearch(points[first])
-    distances = _bounded(_neighbour_distances(search, SCALE_RULES[rule]))
-    distances[copies > 1] = np.median(distances)
-    return _as_float32(distances[group])
-
-
-def _check_options(
-    num_candidates: int, radius: float, color_range: tuple[float, float], max_points: Optional[int]
-) -> None:
-    if num_candidates < 0:
-        raise UserError(f"num_candidates is {num_candidates}: give 0 (no growing) or more.")
-    if not (np.isfinite(radius) and radius > 0):
-        raise UserError(
-            f"the growing radius is {radius}: give a positive share of the longest side of the "
-            "bounding box, as 0.01."
-        )
-    if len(color_range) != 2 or not (
-        np.isfinite(color_range).all() and color_range[0] <= color_range[1]
-    ):
-        raise UserError(
-            f"color_range is {tuple(color_range)}: give (low, high) with low <= high, as (0.0, "
-            "0.2)."
-        )
-    if max_points is not None and max_points < 0:
-        raise UserError(
-            f"max_points is {max_points}: give the most points to grow, 0 or more, or null for "
-            "no limit."
-        )
-
-
-def _checked(points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P 3"]:
-    """Check the points and convert them to float64, in which squares of tiny distances don't
-    underflow.
-    """
-    points = np.asarray(points, np.float64)
-    if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0:
-        raise UserError(
-            f"a cloud of shape {points.shape} has no points to start from: (P, 3) with P >= 1 "
-            "was expected."
-        )
-    if not np.isfinite(points).all():
-        raise UserError(
-            f"{(~np.isfinite(points).all(axis=1)).sum()} of {len(points)} points are NaN or "
-            "infinite."
-        )
-    return points
-
-
-def _within_reach(
-    search: NeighbourSearch, candidates: Float[np.ndarray, "Q 3"], reach: float
-) -> tuple[Int[np.ndarray, " R"], Int[np.ndarray, " R"]]:
-    """Return indices of the candidates nearer than ``reach`` to a point, and of the point nearest
-    to each of them.
-    """
-    distances, nearest = search.nearest(candidates, reach)
-    kept = np.flatnonzero(distances < reach)
-    logger.info(
-        "growing: %d of %d candidates lie within %.4g of %d points",
-        len(kept),
-        len(candidates),
-        reach,
-        len(search.order),
-    )
-    return kept, nearest[kept]
+        middle = (points.min(axis=0) + points.max(axis=0)) / 2
+        radius = np.linalg.norm(points - middle, axis=1).max() or 1.0  # in one place: the unit
+        scales = np.full(len(points), FEW_POINTS_FRACTION * radius)
+    else:
+        search = NeighbourSearch(points[first])
+        distances = _bounded(_neighbour_distances(search, SCALE_RULES[rule]))
+        distances[copies > 1] = np.median(distances)
+        scales = distances[group]
+    limits = np.finfo(np.float32)
+    return scales.clip(limits.tiny, limits.max).astype(np.float32)
 
 
 def distinct(
@@ -239,28 +165,11 @@ def _bounded(distances: Float[np.ndarray, " D"]) -> Float[np.ndarray, " D"]:
     """
     cap = _isolation_cap(distances)
     if count := int((distances > cap).sum()):
-        logger.warning(
-            "%d of %d points are isolated: the first size of their Gaussians is capped at %.4g",
-            count,
-            len(distances),
-            cap,
-        )
+        capped = "%d of %d points are isolated: the first size of their Gaussians is capped at %.4g"
+        logger.warning(capped, count, len(distances), cap)
     return distances.clip(FLOOR_FRACTION * np.median(distances), cap)
 
 
 def _isolation_cap(distances: Float[np.ndarray, " D"]) -> float:
     # "lower": in a small cloud the percentile must not be the isolated point's own distance.
     return ISOLATED_FACTOR * float(np.quantile(distances, 0.99, method="lower"))
-
-
-def _as_float32(distances: Float[np.ndarray, " P"]) -> Float[np.ndarray, " P"]:
-    """Return the distances as float32, still positive and finite."""
-    limits = np.finfo(np.float32)
-    return distances.clip(limits.tiny, limits.max).astype(np.float32)
-
-
-def _few_points_scale(points: Float[np.ndarray, "P 3"]) -> float:
-    bounding_radius = np.linalg.norm(
-        points - (points.min(axis=0) + points.max(axis=0)) / 2, axis=1
-    ).max()
-    return FEW_POINTS_FRACTION * (bounding_radius or 1.0)  # all in one place: the world's unit

@@ -25,7 +25,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..splatting.projection import quats_to_rotations
-from .densify import Change
+from .densify import Change, unchanged
 from .neighbours import NeighbourSearch
 from .sh import C0
 
@@ -70,18 +70,11 @@ def merge_duplicates(params: Mapping[str, Tensor], *, at_least: int = 1) -> Chan
             and sh_rest).
         at_least: the number of Gaussians is not reduced below this.
     """
-    rows = torch.arange(len(params["means"]), device=params["means"].device)
-    change = Change(
-        rows,
-        torch.zeros_like(rows, dtype=torch.bool),
-        {name: value.detach().clone() for name, value in params.items()},
-    )
-    spent = torch.zeros(len(rows), dtype=torch.float64)
+    change = unchanged(params)
+    spent = torch.zeros(len(change.parents), dtype=torch.float64)
     while True:
-        pairs, costs = (
-            values[: max(len(change.parents) - at_least, 0)]
-            for values in duplicates(change.values, spent)
-        )
+        most = max(len(change.parents) - at_least, 0)
+        pairs, costs = (values[:most] for values in duplicates(change.values, spent))
         if not len(pairs):
             return change
         change, spent = _merged(change, spent, pairs, costs)
@@ -240,15 +233,10 @@ def _merged(
     for name, merged in _together(values, pairs).items():
         values[name][pairs[:, 0].to(device)] = merged.to(values[name])
     spent[pairs[:, 0]] = costs
-    is_new, stay = (
-        change.is_new.clone(),
-        torch.ones(len(change.parents), dtype=torch.bool, device=device),
-    )
+    is_new, stay = change.is_new.clone(), torch.ones_like(change.is_new)
     is_new[pairs[:, 0].to(device)], stay[pairs[:, 1].to(device)] = True, False
-    left = Change(
-        change.parents[stay], is_new[stay], {name: value[stay] for name, value in values.items()}
-    )
-    return left, spent[stay.cpu()]
+    left = {name: value[stay] for name, value in values.items()}
+    return Change(change.parents[stay], is_new[stay], left), spent[stay.cpu()]
 
 
 def _together(params: Mapping[str, Tensor], pairs: Int[Tensor, "P 2"]) -> dict[str, Tensor]:
@@ -269,16 +257,12 @@ def _together(params: Mapping[str, Tensor], pairs: Int[Tensor, "P 2"]) -> dict[s
     opacities = summed - product
     # The composited alpha of the pair, 1 - (1 - a g)(1 - b g), falls off more slowly than g: scale
     # the covariance so that its integral over the plane is the same.
-    variances, axes = torch.linalg.eigh(
-        covariances * ((summed - 0.5 * product) / opacities)[:, None, None]
-    )
+    growth = (summed - 0.5 * product) / opacities
+    variances, axes = torch.linalg.eigh(covariances * growth[:, None, None])
     axes = axes * torch.linalg.det(axes).sign()[:, None, None]
     x, y, z, w = torch.from_numpy(Rotation.from_matrix(axes.numpy()).as_quat()).unbind(1)
-    mixed = {
-        "means": means,
-        "log_scales": 0.5 * variances.log(),
-        "quats": torch.stack([w, x, y, z], 1),
-    }
+    quats = torch.stack([w, x, y, z], 1)
+    mixed = {"means": means, "log_scales": 0.5 * variances.log(), "quats": quats}
     mixed["logit_opacities"] = opacities.clamp(1e-6, 1 - 1e-6).logit()
     for name in params:
         if name not in mixed:

@@ -92,15 +92,9 @@ class Recovery:
         steps = math.ceil(self.steps * min(1.0, MOST / len(cloud.means)))
         for tried in range(self.first_scale, len(LR_SCALES)):
             self.first_scale = max(0, tried - 1)
-            recovered = recover(
-                cloud,
-                self.train_views,
-                self.train_images,
-                steps,
-                self.seed + round_number,
-                self.sh_reach,
-                LR_SCALES[tried],
-            )
+            targets = self.train_views, self.train_images
+            seed, scale = self.seed + round_number, LR_SCALES[tried]
+            recovered = recover(cloud, *targets, steps, seed, self.sh_reach, scale)
             if (now := self.quality(recovered)) >= reached:
                 best, reached = recovered, now
                 break
@@ -138,14 +132,11 @@ def recover(
     leaves = cloud.map(lambda values: values.detach().clone().requires_grad_())
     rates = {name: lr_scale * rate for name, rate in LEARNING_RATES.items()}
     rates["means"] *= bounds(cloud)[1]
-    groups = [
-        {"params": [leaf], "lr": rates[name]}
-        for name, leaf in zip(Gaussians._fields, leaves, strict=True)
-    ]
+    groups = [{"params": [leaf], "name": name} for name, leaf in leaves._asdict().items()]
     adam = torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-15)
     for step, rows in enumerate(_batches(len(images), steps, seed)):
-        for group, name in zip(adam.param_groups, Gaussians._fields, strict=True):
-            group["lr"] = rates[name] * (1 - step / steps)
+        for group in adam.param_groups:
+            group["lr"] = rates[group["name"]] * (1 - step / steps)
         image, _ = draw(leaves, views, rows)
         ((image - images[rows]) ** 2).mean().backward()
         adam.step()

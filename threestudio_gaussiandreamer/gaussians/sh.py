@@ -102,20 +102,11 @@ def sh_basis(dirs: Float[Tensor, "*batch 3"], degree: int) -> list[Float[Tensor,
         basis += [-c1 * y, c1 * z, -c1 * x]
     if degree >= 2:
         c2, c20 = sqrt(15 / (4 * pi)), sqrt(5 / (16 * pi))
-        basis += [
-            c2 * x * y,
-            -c2 * y * z,
-            c20 * (3 * z * z - 1),
-            -c2 * x * z,
-            0.5 * c2 * (x * x - y * y),
-        ]
+        basis += [c2 * x * y, -c2 * y * z, c20 * (3 * z * z - 1)]
+        basis += [-c2 * x * z, 0.5 * c2 * (x * x - y * y)]
     if degree >= 3:
-        c33, c32, c31, c30 = (
-            sqrt(35 / (32 * pi)),
-            sqrt(105 / (4 * pi)),
-            sqrt(21 / (32 * pi)),
-            sqrt(7 / (16 * pi)),
-        )
+        c33, c32 = sqrt(35 / (32 * pi)), sqrt(105 / (4 * pi))
+        c31, c30 = sqrt(21 / (32 * pi)), sqrt(7 / (16 * pi))
         basis += [
             -c33 * y * (3 * x * x - y * y),
             c32 * x * y * z,

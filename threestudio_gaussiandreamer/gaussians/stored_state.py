@@ -41,33 +41,21 @@ def require_cloud(
             values are NaN or infinite.
     """
     found = {name: state[stored] for name, stored in names.items() if stored in state}
-    count = len(found["means"]) if _has_rows(found.get("means")) else 0
-    if not count:
+    means = found.get("means")
+    if not isinstance(means, Tensor) or not means.dim() or not len(means):
         raise UserError(f"{what} holds no Gaussian in {names['means']}")
     for name, value in found.items():
-        _require_rows(value, (count, *SHAPES[name]), f"{what}: {names[name]}")
+        where, wanted = f"{what}: {names[name]}", (len(means), *SHAPES[name])
+        shape = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
+        sides = tuple(-1 if side < 0 else found for found, side in zip(shape, wanted, strict=False))
+        if len(shape) != len(wanted) or sides != wanted:
+            expected = ", ".join("K" if side < 0 else str(side) for side in wanted)
+            raise UserError(f"{where} has the shape {shape}; expected ({expected})")
+        if not value.is_floating_point() or value.layout != torch.strided:
+            raise UserError(f"{where} is of the type {value.dtype}; expected floating point")
         bad = 0 if allow_non_finite else int((~value.isfinite()).sum())
         if bad:
-            raise UserError(f"{what}: {names[name]} holds {bad} numbers that are NaN or infinite")
+            raise UserError(f"{where} holds {bad} numbers that are NaN or infinite")
     bands = 1 + found["sh_rest"].shape[1] if "sh_rest" in found else 1
     if isqrt(bands) ** 2 != bands:
         raise UserError(f"{what}: {bands} harmonics are no whole degree: expected 1, 4, 9 or 16")
-
-
-def _has_rows(value: Any) -> bool:
-    return isinstance(value, Tensor) and value.dim() > 0
-
-
-def _require_rows(value: Any, shape: tuple[int, ...], what: str) -> None:
-    found = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
-    if not isinstance(value, Tensor) or not _fits(value.shape, shape):
-        expected = ", ".join("K" if side < 0 else str(side) for side in shape)
-        raise UserError(f"{what} has the shape {found}; expected ({expected})")
-    if not value.is_floating_point() or value.layout != torch.strided:
-        raise UserError(f"{what} is of the type {value.dtype}; expected floating point")
-
-
-def _fits(shape: torch.Size, expected: tuple[int, ...]) -> bool:
-    return len(shape) == len(expected) and all(
-        side == wanted or wanted < 0 for side, wanted in zip(shape, expected, strict=True)
-    )

@@ -103,18 +103,15 @@ def _summed(
     shape: tuple[int, ...],
 ) -> tuple[Float[np.ndarray, "X Y Z"], Float[np.ndarray, "X Y Z 3"]]:
     """Sum opacity, and opacity times colour, at the nodes of a grid."""
-    widened = covariances + cell**2 * np.eye(3)
+    widened, ones = covariances + cell**2 * np.eye(3), np.ones((len(gaussians.means), 1))
     in_cells = _InCells(
         places=(gaussians.means - origin) / cell,
         precisions=np.moveaxis(np.linalg.inv(widened / cell**2), 0, -1),
         opacities=1 / (1 + np.exp(-gaussians.logit_opacities.astype(np.float64))),
-        weights=np.concatenate(
-            [np.ones((len(gaussians.means), 1)), sh0_colors(gaussians.sh[:, 0])], axis=1
-        ),
+        weights=np.concatenate([ones, sh0_colors(gaussians.sh[:, 0])], axis=1),
     )
-    half_sides = np.ceil(REACH * np.sqrt(widened[:, range(3), range(3)].max(axis=1)) / cell).astype(
-        int
-    )
+    widest = np.sqrt(widened[:, range(3), range(3)].max(axis=1))
+    half_sides = np.ceil(REACH * widest / cell).astype(int)
     sums = np.zeros((*shape, 4))
     for half_side in np.unique(half_sides[half_sides <= SMALL]):
         _add_many(sums, in_cells, np.flatnonzero(half_sides == half_side), int(half_side))
@@ -144,20 +141,17 @@ def _add_many(
 ) -> None:
     """Add Gaussians with the same extent in cells, up to ``NODES_AT_ONCE`` nodes at a time."""
     shape = np.array(sums.shape[:3])
-    offsets = np.stack(
-        np.meshgrid(*[np.arange(-half_side, half_side + 1)] * 3, indexing="ij"), axis=-1
-    ).reshape(-1, 3)
+    sides = np.meshgrid(*[np.arange(-half_side, half_side + 1)] * 3, indexing="ij")
+    offsets = np.stack(sides, axis=-1).reshape(-1, 3)
     flat = sums.reshape(-1, 4)
     for chunk in np.array_split(rows, -(-len(rows) * len(offsets) // NODES_AT_ONCE)):
         nodes = np.round(gaussians.places[chunk]).astype(int)[:, None] + offsets
         away = np.moveaxis((nodes - gaussians.places[chunk, None]).astype(np.float32), -1, 0)
-        opacity = gaussians.opacities[chunk, None] * _falloff(
-            away, gaussians.precisions[:, :, chunk, None]
-        )
+        falloff = _falloff(away, gaussians.precisions[:, :, chunk, None])
+        opacity = gaussians.opacities[chunk, None] * falloff
         opacity *= ((nodes >= 0) & (nodes < shape)).all(axis=-1)
-        index = np.ravel_multi_index(
-            tuple(np.moveaxis(nodes, -1, 0)), tuple(shape), mode="clip"
-        ).ravel()
+        places = tuple(np.moveaxis(nodes, -1, 0))
+        index = np.ravel_multi_index(places, tuple(shape), mode="clip").ravel()
         for channel in range(4):
             added = opacity * gaussians.weights[chunk, channel, None]
             flat[:, channel] += np.bincount(index, added.ravel(), minlength=len(flat))
@@ -189,13 +183,10 @@ def _falloff(away: Sequence[np.ndarray], precision: Float[np.ndarray, "3 3 *k"])
 
 
 def covariance_matrices(gaussians: Gaussians) -> Float[np.ndarray, "N 3 3"]:
-    w, x, y, z = (
-        gaussians.quats / np.maximum(np.linalg.norm(gaussians.quats, axis=1, keepdims=True), 1e-12)
-    ).T.astype(np.float64)
-    scaled = (
-        np.moveaxis(np.array(rotation_rows(w, x, y, z)), -1, 0)
-        * np.exp(gaussians.log_scales.astype(np.float64))[:, None]
-    )
+    lengths = np.linalg.norm(gaussians.quats, axis=1, keepdims=True)
+    unit = (gaussians.quats / np.maximum(lengths, 1e-12)).T.astype(np.float64)
+    axes = np.moveaxis(np.array(rotation_rows(*unit)), -1, 0)
+    scaled = axes * np.exp(gaussians.log_scales.astype(np.float64))[:, None]
     return scaled @ scaled.transpose(0, 2, 1)
 
 
@@ -237,9 +228,8 @@ def _quads(
     along = np.moveaxis(inside, (axis, u, v), (0, 1, 2))[:, 1:-1, 1:-1]
     cells = np.moveaxis(number, (axis, u, v), (0, 1, 2))
     a, b, c = np.nonzero(along[:-1] != along[1:])
-    ring = np.stack(
-        [cells[a, b, c], cells[a, b + 1, c], cells[a, b + 1, c + 1], cells[a, b, c + 1]], axis=1
-    )
+    around = ((b, c), (b + 1, c), (b + 1, c + 1), (b, c + 1))
+    ring = np.stack([cells[a, i, j] for i, j in around], axis=1)
     backwards = ~along[a, b, c]  # the far end is inside, so outside lies towards -axis
     ring[backwards] = ring[backwards, ::-1]
     return ring

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..cameras import Orbit, intrinsics, to_opencv
+from ..cameras import intrinsics, orbit_c2w, to_opencv
 from ..core.errors import UserError
 from ..core.streams import generator
 from ..metrics import MAX_PSNR, psnr
@@ -115,7 +115,11 @@ def views_around(
     """
     centre, radius = ball or bounds(cloud)
     require_renderable(cloud, radius)
-    c2w = _spiral(count, radius, turn, sines, distances).to(centre)
+    index = torch.arange(count)
+    elevation = torch.rad2deg(torch.asin(torch.linspace(*sines, count)))
+    distance = radius / math.sin(FOVY / 2) * torch.tensor(distances)[index % len(distances)]
+    azimuth = (turn + index * 137.50776) % 360.0
+    c2w = orbit_c2w(elevation, azimuth, distance).to(centre)
     if to_z_up is not None:
         c2w[:, :3] = to_z_up.T.to(c2w) @ c2w[:, :3]
     c2w[:, :3, 3] += centre
@@ -135,21 +139,6 @@ def require_renderable(cloud: Gaussians, radius: float) -> None:
             f"float32 can't render: the largest scale is "
             f"{float(cloud.log_scales.amax().exp()):g}; rescale them or remove the largest"
         )
-
-
-def _spiral(
-    count: int,
-    radius: float,
-    turn: float,
-    sines: tuple[float, float],
-    distances: tuple[float, ...],
-) -> Float[Tensor, "V 4 4"]:
-    """Return camera-to-world matrices of views that show a ball around the origin."""
-    index = torch.arange(count)
-    elevation = torch.rad2deg(torch.asin(torch.linspace(*sines, count)))
-    distance = radius / math.sin(FOVY / 2) * torch.tensor(distances)[index % len(distances)]
-    azimuth = (turn + index * 137.50776) % 360.0
-    return Orbit(elevation, azimuth, distance, torch.full((count,), FOVY)).c2w
 
 
 def draw(

@@ -50,11 +50,10 @@ from ..host import register
 from ..meshes.mesh import Mesh
 from ..meshes.side_files import Budget, decode_texture
 from .base import COLOR, SCALE, Prior, points
-from .body_pose import POSES, named_pose, posed
-from .makehuman import Body, Person, data_folder, load_body
+from .body_pose import POSES, Body, named_pose, posed, world_mesh
+from .makehuman import Person, data_folder, load_body
 from .mesh import centred, colored_cloud
 from .pose_files import SUFFIXES, TO_BODY, read_pose
-from .skeleton import world_mesh
 
 GENDERS = {"male": 0.0, "neutral": 0.5, "female": 1.0}
 AGES = {"baby": 0.0, "child": 1 / 3, "young": 2 / 3, "old": 1.0}

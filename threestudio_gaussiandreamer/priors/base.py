@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar, Optional
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from ..core.errors import UserError
@@ -199,10 +199,9 @@ def validated(cloud: PointCloud, name: str) -> PointCloud:
     try:
         points, colors = _as_array(cloud.points), _as_array(cloud.colors)
         normals = None if cloud.normals is None else _as_array(cloud.normals)
+        faces = None if cloud.faces is None else _as_array(cloud.faces, None)
     except (TypeError, ValueError, RuntimeError) as error:
-        raise UserError(
-            f"{name} gave something else than arrays of points, colours and normals: {error}"
-        ) from error
+        raise UserError(f"{name} gave something else than arrays: {error}") from error
     given = {"points": points, "colours": colors, "normals": normals}
     shapes = {kind: values.shape for kind, values in given.items() if values is not None}
     if points.ndim != 2 or set(shapes.values()) != {(len(points), 3)}:
@@ -210,42 +209,35 @@ def validated(cloud: PointCloud, name: str) -> PointCloud:
         raise UserError(f"{name} gave {shapes}; expected (P, 3) for all")
     if not len(points):
         raise UserError(f"{name} gave no points: its source is empty")
-    if cloud.faces is not None:
-        cloud = cloud._replace(faces=_valid_faces(cloud.faces, len(points), name))
+    if faces is not None:
+        faces = faces if faces.size else np.zeros((0, 3), np.int64)
+        whole = faces.ndim == 2 and faces.shape[1] == 3 and faces.dtype.kind in "iu"
+        if not whole or not ((faces >= 0) & (faces < len(points))).all():
+            raise UserError(
+                f"{name} gave faces {faces.shape} of type {faces.dtype}; expected integers (F, 3) "
+                f"from 0 to {len(points) - 1}"
+            )
     finite = np.isfinite(points).all(axis=1) & np.isfinite(colors).all(axis=1)
-    if bad := int((~finite).sum()):
-        report_non_finite(bad, len(points), name)
     outside = (colors[finite] < -0.25) | (colors[finite] > 2)  # a model's may be slightly outside
-    if outside.any(axis=1).mean() > 0.5:
+    if finite.any() and outside.any(axis=1).mean() > 0.5:
         low, high = colors[finite].min(), colors[finite].max()
         raise UserError(f"{name} gave colours from {low:g} to {high:g}; expected [0, 1]")
-    normals = None if normals is None else np.nan_to_num(normals)
-    cloud = cloud._replace(points=points, colors=colors.clip(0.0, 1.0), normals=normals)
-    return without_rows(cloud, finite)
+    cloud = PointCloud(points, colors.clip(0.0, 1.0), normals=normals, faces=faces)
+    if normals is not None:
+        cloud = cloud._replace(normals=np.nan_to_num(normals))
+    if finite.all():
+        return cloud
+    report_non_finite(int((~finite).sum()), len(points), name)
+    if faces is not None:  # those all of whose corners are kept
+        faces = (np.cumsum(finite) - 1)[faces[finite[faces].all(axis=1)]]
+    rows = (None if values is None else values[finite] for values in cloud[:3])
+    return PointCloud(*rows, faces=faces)
 
 
-def _as_array(values: Any) -> Float[np.ndarray, "..."]:
+def _as_array(values: Any, dtype: Any = np.float32) -> Float[np.ndarray, "..."]:
     if isinstance(values, Tensor):
-        values = values.detach().float().cpu()
-    return np.asarray(values, np.float32)
-
-
-def _valid_faces(faces: Any, count: int, name: str) -> Int[np.ndarray, "F 3"]:
-    """Return faces as an array of rows of points; raise UserError if they aren't such."""
-    try:
-        found = np.asarray(faces.detach().cpu() if isinstance(faces, Tensor) else faces)
-    except ValueError as error:  # rows of different lengths
-        raise UserError(f"{name} gave faces that are no array of integers: {error}") from error
-    found = found if found.size else np.zeros((0, 3), np.int64)
-    if found.ndim != 2 or found.shape[1] != 3 or found.dtype.kind not in "iu":
-        raise UserError(
-            f"{name} gave faces {found.shape} of type {found.dtype}; expected integers (F, 3)"
-        )
-    if len(found) and not 0 <= found.min() <= found.max() < count:
-        raise UserError(
-            f"{name} gave faces of the points {found.min()} to {found.max()}; it has {count}"
-        )
-    return found
+        values = values.detach().float().cpu() if dtype else values.detach().cpu()
+    return np.asarray(values, dtype)
 
 
 def report_non_finite(bad: int, count: int, name: str) -> None:
@@ -256,17 +248,6 @@ def report_non_finite(bad: int, count: int, name: str) -> None:
             "check the source"
         )
     logger.warning("%s: dropped %d of %d points that are NaN or infinite", name, bad, count)
-
-
-def without_rows(cloud: PointCloud, keep: Bool[np.ndarray, " P"]) -> PointCloud:
-    """Return the kept points, and the faces all of whose corners are kept."""
-    if keep.all():
-        return cloud
-    faces = cloud.faces
-    if faces is not None:
-        faces = (np.cumsum(keep) - 1)[faces[keep[faces].all(axis=1)]]
-    normals = None if cloud.normals is None else cloud.normals[keep]
-    return PointCloud(cloud.points[keep], cloud.colors[keep], normals=normals, faces=faces)
 
 
 def ground_layer(cloud: PointCloud, cfg: Any, generator: np.random.Generator) -> PointCloud:

@@ -1,16 +1,31 @@
-"""Pose a body: by rotations of SMPL's joints relative to a T-pose, or so that its limbs point as
-those of given joint positions.
+"""Bodies, whose joints are those of SMPL: their axes, and their poses by rotations of the joints
+relative to a T-pose, or so that their limbs point as those of given joint positions.
 
+Bodies have y up and look along +z, the left side at +x, as SMPL, HumanML3D and MakeHuman have them.
 A pose is the rotation of every joint's part of the body from the rest pose, (22, 3, 3), in the
 body's axes. Skinning is linear (linear blend skinning)."""
 
+from typing import NamedTuple
+
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from ..core.errors import UserError
-from .makehuman import Body
-from .skeleton import BODY_JOINTS, JOINTS, PARENTS
+from ..meshes.mesh import Mesh
 
+JOINTS = (
+    "pelvis, left hip, right hip, lower spine, left knee, right knee, middle spine, left "
+    "ankle, right ankle, upper spine, left foot,"
+    " right foot, neck, left collar, right collar, head, left shoulder, right shoulder, left "
+    "elbow, right elbow, left wrist, right wrist,"
+    " left hand, right hand"
+).split(", ")
+BODY_JOINTS = 22
+"""The first joints of SMPL, SMPL-H and SMPL-X, and all of HumanML3D."""
+PARENTS = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19)
+"""Of the first ``BODY_JOINTS`` joints; every joint comes after its parent."""
+LEFT, RIGHT = (1, 16), (2, 17)
+"""Hip and shoulder of each side."""
 SIDES = ("left", "right")
 INDEX = {name: number for number, name in enumerate(JOINTS[:BODY_JOINTS])}
 CHAINS = ("hip", "knee", "ankle", "foot"), ("shoulder", "elbow", "wrist")
@@ -46,6 +61,20 @@ POSES: dict[str, dict[str, Degrees]] = {
     },
 }  # fmt: skip
 """Rotations of joints from a T-pose, degrees: about z first, then y, then x, the parent's axes."""
+
+
+class Body(NamedTuple):
+    """A body at rest: y up, looking along +z, arms lowered by 45 degrees; metres."""
+
+    vertices: Float[np.ndarray, "V 3"]
+    faces: Int[np.ndarray, "F 3"]
+    uv: Float[np.ndarray, "T 2"]
+    """v upwards."""
+    face_uv: Int[np.ndarray, "F 3"]
+    """Rows of ``uv`` at the corners of each face."""
+    joints: Float[np.ndarray, "22 3"]
+    weights: Float[np.ndarray, "V 22"]
+    """By how much each vertex moves with each joint; rows sum to 1."""
 
 
 def posed(body: Body, pose: Float[np.ndarray, "22 3 3"]) -> Body:
@@ -167,3 +196,37 @@ def swing(
 
 def _unit(vector: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
     return vector / max(float(np.linalg.norm(vector)), 1e-12)
+
+
+def z_up(points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
+    """Rotate points from y up, front +z, to z up, front +x."""
+    return points[:, [2, 0, 1]]
+
+
+def facing(joints: Float[np.ndarray, "K 3"]) -> Float[np.ndarray, "3 3"]:
+    """Return the rotation about the world's z axis after which a body with these joints (y up)
+    faces +x.
+
+    The front is horizontal and perpendicular to the sum of the vectors from the left to the right
+    hip and shoulder. If that sum is vertical or zero, the body isn't rotated."""
+    joints = z_up(joints)
+    across = (joints[list(RIGHT)] - joints[list(LEFT)]).sum(axis=0)
+    forward = np.cross([0.0, 0.0, 1.0], across)[:2]
+    length = np.linalg.norm(forward)
+    if length < 1e-6:
+        return np.eye(3)
+    x, y = forward / length
+    return np.array([[x, y, 0.0], [-y, x, 0.0], [0.0, 0.0, 1.0]])
+
+
+def world_mesh(mesh: Mesh, joints: Float[np.ndarray, "K 3"], scale: float) -> Mesh:
+    """Return a body with z up that faces +x, its box centred, and ``scale`` as half the longest
+    side.
+
+    Args:
+        mesh: y up, any unit.
+        joints: the body's, in the mesh's axes.
+    """
+    vertices = z_up(mesh.vertices) @ facing(joints).T
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    return mesh._replace(vertices=scale * (vertices - (low + high) / 2) / ((high - low).max() / 2))

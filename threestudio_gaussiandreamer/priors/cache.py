@@ -1,12 +1,13 @@
 """Cache the output of the prior in the run's folder, from which a restarted run reads it."""
 
+import contextlib
 import hashlib
-import itertools
 import json
 import math
 import os
 import sys
 from collections.abc import Iterator, Mapping
+from itertools import islice
 from pathlib import Path
 from typing import Any, Optional
 
@@ -82,20 +83,16 @@ def _files(options: Any) -> Iterator[tuple[str, int, int]]:
     """Yield name, size and time of change of the files that options name, or that are below the
     folders that they name.
     """
-    if isinstance(options, dict):
-        options = list(options.values())
-    if isinstance(options, (list, tuple)):
-        for value in options:
+    values = options.values() if isinstance(options, dict) else options
+    for value in values:
+        if isinstance(value, (dict, list, tuple)):
             yield from _files(value)
-    elif isinstance(options, (str, Path)) and options:
-        try:
-            path = Path(options).expanduser()
-            inside = sorted(itertools.islice(path.rglob("*"), MAX_FILES)) if path.is_dir() else []
-            for file in (path, *inside):
-                if file.is_file():
+        elif isinstance(value, (str, Path)) and value:
+            with contextlib.suppress(OSError, ValueError, RuntimeError):  # no usable name
+                path = Path(value).expanduser()
+                inside = sorted(islice(path.rglob("*"), MAX_FILES)) if path.is_dir() else []
+                for file in filter(Path.is_file, (path, *inside)):
                     yield file.name, file.stat().st_size, file.stat().st_mtime_ns
-        except (OSError, ValueError, RuntimeError):  # no usable name, or not to be read
-            return
 
 
 def _code(kind: type) -> Iterator[tuple[str, str]]:
@@ -107,20 +104,16 @@ def _code(kind: type) -> Iterator[tuple[str, str]]:
     for file in map(Path, filter(None, found)):
         is_foreign = OURS not in file.parents and (file.parent / "__init__.py").is_file()
         for source in sorted(file.parent.rglob("*.py")) if is_foreign else [file]:
-            try:
+            with contextlib.suppress(OSError):  # not to be read
                 yield source.name, hashlib.sha256(source.read_bytes()).hexdigest()
-            except OSError:  # not to be read
-                continue
 
 
 def read_cache(path: Path, key: str) -> Optional[PointCloud]:
     """Return the cached cloud; None if there is none, its key or a file beside the mesh differs, or
     the file is damaged.
     """
-    if not path.is_file():
-        return None
     names = ["key", "beside", "points", "colors"]
-    try:
+    try:  # a missing file is a UserError too
         data = read_arrays(path, "cache", names, ["normals", "faces"])
         beside = json.loads(str(data.pop("beside")))
     except (UserError, ValueError):
@@ -158,10 +151,9 @@ def turntable(cloud: PointCloud, *, views: int, size: int) -> UInt8[np.ndarray, 
     scales = np.float32(SIZE / radius) * nearest_distance_scales(points, "rms3")
     scales = torch.from_numpy(scales)[:, None].expand(-1, 3)
     quats = torch.tensor([1.0, 0.0, 0.0, 0.0]).expand(len(means), 4)
-    azimuths = torch.arange(views) * (360.0 / views)
-    distance = torch.full_like(azimuths, MARGIN / math.sin(FOVY / 2))
-    c2w = orbit_c2w(torch.full_like(azimuths, ELEVATION), azimuths, distance)
-    viewmats, Ks = to_opencv(c2w, torch.full_like(azimuths, FOVY), size, size)
+    azimuths, ones = torch.arange(views) * (360.0 / views), torch.ones(views)
+    c2w = orbit_c2w(ELEVATION * ones, azimuths, MARGIN / math.sin(FOVY / 2) * ones)
+    viewmats, Ks = to_opencv(c2w, FOVY * ones, size, size)
     colors = torch.from_numpy(np.asarray(cloud.colors, np.float32))
     inputs = (means, quats, scales, torch.full((len(means),), 0.95), colors)
     white, cameras = torch.ones(3), zip(viewmats.split(1), Ks.split(1), strict=True)

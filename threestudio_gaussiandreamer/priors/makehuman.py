@@ -19,7 +19,7 @@ from jaxtyping import Float, Int
 
 from ..core.errors import UserError
 from ..core.extras import missing_extra
-from .skeleton import BODY_JOINTS, JOINTS
+from .body_pose import BODY_JOINTS, JOINTS, Body
 
 DATA = "data/mpfb2"
 METRES = 0.1
@@ -60,20 +60,6 @@ class Person(NamedTuple):
     height: float = 0.5
     proportions: float = 0.5
     """0 ideal, 1 uncommon."""
-
-
-class Body(NamedTuple):
-    """A body at rest: y up, looking along +z, arms lowered by 45 degrees; metres."""
-
-    vertices: Float[np.ndarray, "V 3"]
-    faces: Int[np.ndarray, "F 3"]
-    uv: Float[np.ndarray, "T 2"]
-    """v upwards."""
-    face_uv: Int[np.ndarray, "F 3"]
-    """Rows of ``uv`` at the corners of each face."""
-    joints: Float[np.ndarray, "22 3"]
-    weights: Float[np.ndarray, "V 22"]
-    """By how much each vertex moves with each joint; rows sum to 1."""
 
 
 Groups = dict[str, Int[np.ndarray, "F 4 2"]]

@@ -47,6 +47,7 @@ from ..core.extras import require_extra
 from ..core.files import existing_file
 from ..core.options import at_least, is_whole, positive, satisfies
 from ..formats.array_files import read_arrays
+from ..formats.reading import reading, require
 from ..gaussians.point_cloud import PointCloud
 from ..host import info, register, warn
 from ..meshes.load import load_mesh
@@ -55,10 +56,10 @@ from ..meshes.raycast import MeshCaster, over_background
 from ..models.clip import clip_source, picture_similarities
 from ..models.hub import locate
 from .base import COLOR, SCALE, Prior, points
+from .body_pose import JOINTS, world_mesh
 from .mesh import centred, colored_cloud, face_normals
 from .motion_text import reduced_prompt
 from .pose_files import require_frame
-from .skeleton import JOINTS, world_mesh
 from .smpl_fit import fit_bodies, load_body_model, posed_vertices
 
 VIEW_AZIMUTHS = (-40.0, 0.0, 40.0)
@@ -92,27 +93,24 @@ def read_motions(path: str) -> Motions:
         UserError: missing, pickled, of another layout, without frames, or not finite; the message
             says what to do.
     """
-    file = existing_file(path, "motion file")
-    arrays = read_arrays(file, "motion file", ["motion"], ["text", "lengths"])
-    positions = _sample_frame_joint(arrays["motion"], path)
-    samples, frames = positions.shape[:2]
-    lengths = arrays.get("lengths", np.full(samples, frames))
-    whole = lengths.shape == (samples,) and lengths.dtype.kind in "iu"
-    if not whole or not ((lengths >= 1) & (lengths <= frames)).all():
-        raise UserError(
-            f"motion file {path!r}: lengths must be {samples} whole numbers from 1 to "
-            f"{frames}, got {lengths.tolist()}"
+    with reading(path, "motion file") as file:
+        arrays = read_arrays(file, "motion file", ["motion"], ["text", "lengths"])
+        positions = _sample_frame_joint(arrays["motion"])
+        samples, frames = positions.shape[:2]
+        lengths = arrays.get("lengths", np.full(samples, frames))
+        whole = lengths.shape == (samples,) and lengths.dtype.kind in "iu"
+        require(
+            whole and ((lengths >= 1) & (lengths <= frames)).all(),
+            f"lengths must be {samples} whole numbers from 1 to {frames}, got {lengths.tolist()}",
         )
+        for sample, length in zip(positions, lengths, strict=True):
+            finite = np.isfinite(sample[:length]).all()
+            require(finite, "it has positions that are NaN or infinite: make it again")
     texts = None if "text" not in arrays else [str(text) for text in np.atleast_1d(arrays["text"])]
-    for sample, length in zip(positions, lengths, strict=True):
-        if not np.isfinite(sample[:length]).all():
-            raise UserError(
-                f"motion file {path!r} has positions that are NaN or infinite: make it again"
-            )
     return Motions(positions, texts, lengths.tolist())
 
 
-def _sample_frame_joint(motion: np.ndarray, path: str) -> Float[np.ndarray, "S F J 3"]:
+def _sample_frame_joint(motion: np.ndarray) -> Float[np.ndarray, "S F J 3"]:
     """Convert any of the layouts to (samples, frames, joints, 3)."""
     ordered, shape = np.zeros(0), motion.shape
     if len(shape) == 4 and shape[1] in JOINT_COUNTS and shape[2] == 3:
@@ -121,12 +119,12 @@ def _sample_frame_joint(motion: np.ndarray, path: str) -> Float[np.ndarray, "S F
         ordered = motion.transpose(2, 0, 1)[None]
     elif len(shape) == 3 and shape[1] in JOINT_COUNTS and shape[2] == 3:
         ordered = motion[None]
-    if motion.dtype.kind not in "fiu" or not ordered.size:
-        raise UserError(
-            f"motion file {path!r} holds an array {shape} of {motion.dtype}: numbers (samples, 22 "
-            "or 24 joints, 3, frames) were expected (6 for a joint are rotations: MDM's HumanML3D "
-            "models give positions)"
-        )
+    require(
+        motion.dtype.kind in "fiu" and ordered.size > 0,
+        f"it holds an array {shape} of {motion.dtype}: (samples, 22 or 24 joints, 3, frames) "
+        "numbers were expected (6 for a joint are rotations; MDM's HumanML3D models give "
+        "positions)",
+    )
     return np.ascontiguousarray(ordered, np.float64)
 
 
@@ -255,18 +253,13 @@ def offered_frames(motions: Motions, sample: Optional[int], frame: Any) -> list[
     """
     count = len(motions.lengths)
     if sample is not None and sample >= count:
-        raise UserError(
-            f"sample: the file has {count} motions, numbered from 0; there is no {sample}"
-        )
+        raise UserError(f"sample: the file has {count} motions, from 0; there is no {sample}")
     if frame != "clip":
         require_frame(frame, motions.lengths[sample or 0], f"motion {sample or 0}")
         return [(sample or 0, frame)]
     samples = range(count) if sample is None else [sample]
-    return [
-        (s, int(f))
-        for s in samples
-        for f in np.unique(np.linspace(0, motions.lengths[s] - 1, NUM_FRAMES).round())
-    ]
+    frames = {s: np.linspace(0, motions.lengths[s] - 1, NUM_FRAMES).round() for s in samples}
+    return [(s, int(f)) for s in samples for f in np.unique(frames[s])]
 
 
 def report_residuals(residuals: Float[np.ndarray, "K"], name: str, limit: float) -> None:
@@ -279,9 +272,9 @@ def report_residuals(residuals: Float[np.ndarray, "K"], name: str, limit: float)
     found = f"{residuals.mean():.1f} mm mean, {residuals[worst]:.1f} mm at the {JOINTS[worst]}"
     if residuals.mean() > limit:
         raise UserError(
-            f"SMPL does not fit {name}: its joints are off by {found} (max_residual_mm is "
-            f"{limit:g}): are the positions in metres, y up and"
-            " in SMPL's order? Choose another frame or raise max_residual_mm"
+            f"SMPL does not fit {name}: its joints are off by {found}: are the positions in "
+            "metres, y up and in SMPL's order? Choose another frame or raise max_residual_mm "
+            f"({limit:g})"
         )
     info(f"SMPL fitted to {name}: {found}")
 
@@ -290,9 +283,8 @@ def body_pictures(mesh: Mesh) -> Float[np.ndarray, "V H W 3"]:
     """Render the body in shaded grey on white, from the front and from both sides of the front."""
     vertices = mesh.vertices / np.abs(mesh.vertices).max()
     caster = MeshCaster(shaded(Mesh(vertices, mesh.faces)))
-    ones = torch.ones(len(VIEW_AZIMUTHS))
-    azimuths, at = torch.tensor(VIEW_AZIMUTHS), (VIEW_ELEVATION * ones, VIEW_DISTANCE * ones)
-    views = orbit_c2w(at[0], azimuths, at[1]).numpy()
+    azimuths, ones = torch.tensor(VIEW_AZIMUTHS), torch.ones(len(VIEW_AZIMUTHS))
+    views = orbit_c2w(VIEW_ELEVATION * ones, azimuths, VIEW_DISTANCE * ones).numpy()
     pictures = caster.render_views([(c2w, VIEW_FOVY) for c2w in views], PICTURE_SIZE, PICTURE_SIZE)
     return over_background(pictures, np.ones(3, np.float32))
 

@@ -30,12 +30,13 @@ from typing import Any, Optional
 import numpy as np
 from jaxtyping import Float
 
-from ..core.errors import UserError, unknown
+from ..core.errors import unknown
 from ..core.files import existing_file
 from ..formats.array_files import read_arrays
 from ..formats.gaussian_files import ply_up
 from ..formats.ply import is_gaussian_ply, read_points, require_ply, unit_colors
 from ..formats.producers import GAUSSIANS, MESH
+from ..formats.reading import reading, require
 from ..gaussians.axes import FRONTS
 from ..gaussians.grow import longest_side
 from ..gaussians.point_cloud import PointCloud
@@ -104,14 +105,10 @@ def load_points(path: Path) -> PointCloud:
     """Read the points of a file in its own axes; the extension determines the format.
 
     Raises:
-        UserError: the extension is unknown, or the file can't be read or has no points.
+        UserError: the file can't be read or has no points.
     """
-    try:
+    with reading(path, "point cloud"):
         return READERS.get(path.suffix.lower(), read_mesh_points)(path)
-    except UserError:
-        raise
-    except (OSError, ValueError, KeyError, MemoryError) as error:
-        raise UserError(f"point cloud {str(path)!r} is not readable: {error}") from error
 
 
 def rotated(cloud: PointCloud, rotation: Float[np.ndarray, "3 3"]) -> PointCloud:
@@ -156,8 +153,7 @@ def read_text(path: Path) -> PointCloud:
 def read_mesh_points(path: Path) -> PointCloud:
     """Return the vertices and points of a mesh file, transformed by its scene graph."""
     parts = [part for part in read_parts(path) if len(part.vertices)]
-    if not parts:
-        raise UserError(f"point cloud {str(path)!r} is empty: it has no vertices")
+    require(bool(parts), "it is empty: it has no vertices")
     colored = any(part.has_colors for part in parts)
     colors = np.concatenate([vertex_surface_colors(part) for part in parts]) if colored else None
     return _cloud(path, np.concatenate([part.vertices for part in parts]), colors)
@@ -165,9 +161,9 @@ def read_mesh_points(path: Path) -> PointCloud:
 
 def _from_columns(path: Path, rows: np.ndarray) -> PointCloud:
     """Interpret columns as x y z, x y z r g b, or x y z intensity r g b (PTS)."""
-    if rows.ndim != 2 or rows.shape[1] not in (3, 6, 7):
-        expected = "rows of x y z or x y z r g b were expected"
-        raise UserError(f"point cloud {str(path)!r} has shape {rows.shape}: {expected}")
+    expected = "rows of x y z or x y z r g b were expected"
+    fits = rows.ndim == 2 and rows.shape[1] in (3, 6, 7)
+    require(fits, f"it has shape {rows.shape}: {expected}")
     return _cloud(path, rows[:, :3], rows[:, -3:] if rows.shape[1] > 3 else None)
 
 
@@ -177,11 +173,9 @@ def _cloud(path: Path, points: np.ndarray, colors=None, normals=None) -> PointCl
         logger.warning("%s has no colours: grey is used", path)
         colors = np.full(np.shape(points), GREY, np.float32)
     for name, values in (("points", points), ("colors", colors), ("normals", normals)):
-        if values is not None and np.shape(values) != (len(points), 3):
-            raise UserError(
-                f"point cloud {str(path)!r}: {name} has shape {np.shape(values)}, "
-                f"({len(points)}, 3) was expected"
-            )
+        shape, expected = np.shape(values), f"({len(points)}, 3) was expected"
+        fits = values is None or shape == (len(points), 3)
+        require(fits, f"{name} has shape {shape}: {expected}")
     # float64, since float32 would round points far from the origin before they are centred
     colors = unit_colors(np.asarray(colors).astype(np.float32), np.asarray(colors).dtype, path)
     normals = None if normals is None else np.asarray(normals, np.float32)

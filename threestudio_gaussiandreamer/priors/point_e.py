@@ -27,7 +27,7 @@ has 64 channels in every published model."""
 
 import math
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, NamedTuple, Optional
+from typing import Any, ClassVar, Optional
 
 import numpy as np
 import torch
@@ -46,17 +46,9 @@ from ..models.bundled import POINTS, model_part
 from ..models.clip import clip_source
 from ..models.hub import locate
 from ..models.model_files import free_memory, loaded
+from . import karras
 from .base import points
-from .karras import (
-    Network,
-    SampledPrior,
-    cosine_alphas_cumprod,
-    guided_denoiser,
-    karras_sigmas,
-    linear_alphas_cumprod,
-    sample_heun,
-    torch_generator,
-)
+from .karras import SampledPrior
 from .weights import load_exactly, read_state_dict
 
 UPSAMPLED = 3072
@@ -99,21 +91,22 @@ class PointEPrior(SampledPrior):
     cfg: Config
 
     def preflight(self) -> None:
-        existing_file(model_part(self.cfg.checkpoint, POINTS), BASE.title, (BUNDLED,))
+        existing_file(model_part(self.cfg.checkpoint, POINTS), BaseModel.title, (BUNDLED,))
         if self.cfg.upsampler:
-            existing_file(self.cfg.upsampler, UPSAMPLER.title)
+            existing_file(self.cfg.upsampler, Upsampler.title)
         require_extra("diffusion", "transformers")
         locate(clip_source(self.cfg.clip), download=False)
 
     def generate(self, prompt: str, generator: np.random.Generator) -> PointCloud:
         self.preflight()
-        cfg, rng = self.cfg, torch_generator(generator)
+        cfg, rng = self.cfg, karras.torch_generator(generator)
         info(f"Point-E: {cfg.prompt or prompt!r} on {self.device}")
         condition = self.condition("Point-E", locate(clip_source(cfg.clip)), prompt)
         points = self._coarse_points(condition, rng)
         if cfg.upsampler:
-            network = kept_network(UPSAMPLER, cfg.upsampler, self.device)
-            denoise = guided_denoiser(mean_of(network, points), linear_alphas_cumprod())
+            network = kept_network(Upsampler, cfg.upsampler, self.device)
+            levels = karras.linear_alphas_cumprod()
+            denoise = karras.guided_denoiser(mean_of(network, points), levels)
             points = torch.cat([points, self._sampled(denoise, UPSAMPLED, 1, rng)], dim=-1)
         free_memory()
         rows = points[0].T.cpu().numpy()
@@ -124,7 +117,7 @@ class PointEPrior(SampledPrior):
         self, condition: Float[Tensor, "1 D"], rng: torch.Generator
     ) -> Float[Tensor, "1 6 N"]:
         cfg, path = self.cfg, model_part(self.cfg.checkpoint, POINTS)
-        network = kept_network(BASE, path, self.device)
+        network = kept_network(BaseModel, path, self.device)
         given, expected = condition.shape[-1], network.clip_embed.in_features
         if given != expected:
             raise UserError(
@@ -132,7 +125,8 @@ class PointEPrior(SampledPrior):
                 f"with {expected}: use ViT-L/14"
             )
         predict = mean_of(network, self.with_unconditional(condition))
-        denoise = guided_denoiser(predict, cosine_alphas_cumprod(), scale=cfg.guidance_scale)
+        levels = karras.cosine_alphas_cumprod()
+        denoise = karras.guided_denoiser(predict, levels, scale=cfg.guidance_scale)
         return self._sampled(denoise, cfg.num_points, 0, rng)
 
     def _sampled(
@@ -144,14 +138,14 @@ class PointEPrior(SampledPrior):
             stage: 0 for the base model, 1 for the upsampler.
         """
         noise = torch.randn(1, CHANNELS, count, generator=rng).to(self.device)
-        sigmas = karras_sigmas(self.cfg.num_steps, SIGMA_MAX[stage])
+        sigmas = karras.karras_sigmas(self.cfg.num_steps, SIGMA_MAX[stage])
         title = ("Point-E", "Point-E upsampler")[stage]
         options = {"churn": CHURN[stage], "generator": rng, "progress": title}
-        sample = sample_heun(denoise, noise, sigmas, **options)
+        sample = karras.sample_heun(denoise, noise, sigmas, **options)
         return (sample - BIASES.to(self.device)) / SCALES.to(self.device)
 
 
-def mean_of(network: nn.Module, condition: Tensor) -> Network:
+def mean_of(network: nn.Module, condition: Tensor) -> karras.Network:
     """Return a network under a condition, restricted to the mean, the first half of its output
     channels. The second half is the variance.
     """
@@ -215,6 +209,12 @@ class PointTransformer(nn.Module):
     part of the result.
     """
 
+    title: ClassVar[str]
+    file: ClassVar[str]
+    """The published one."""
+    projection: ClassVar[str]
+    """Name of a weight that only this network has, with as many columns as features of CLIP."""
+
     def __init__(self, width: int, layers: int, heads: Optional[int] = None) -> None:
         super().__init__()
         self.width = width
@@ -239,6 +239,9 @@ class PointTransformer(nn.Module):
 class BaseModel(PointTransformer):
     """From noise to coarse points, given the text's features (``base40M-textvec``)."""
 
+    title, file = "Point-E base checkpoint", "base_40m_textvec.pt"
+    projection = "clip_embed.weight"
+
     def __init__(
         self, width: int = 512, layers: int = 12, features: int = 768, heads: Optional[int] = None
     ) -> None:
@@ -254,6 +257,9 @@ class BaseModel(PointTransformer):
 
 class Upsampler(PointTransformer):
     """From noise to further points, given the coarse ones (``upsample``)."""
+
+    title, file = "Point-E upsampler checkpoint", "upsample_40m.pt"
+    projection = "clip_embed.1.weight"
 
     def __init__(
         self, width: int = 512, layers: int = 12, features: int = 1024, heads: Optional[int] = None
@@ -292,30 +298,12 @@ def timestep_embedding(timesteps: Real[Tensor, " B"], width: int) -> Float[Tenso
 # Loading ------------------------------------------------------------------------------------------
 
 
-class Kind(NamedTuple):
-    """One of the published networks."""
-
-    network: type
-    title: str
-    file: str
-    projection: str
-    """Name of a weight that only this network has. It projects CLIP's features, so its number of
-    columns is their number.
-    """
-
-
-BASE = Kind(BaseModel, "Point-E base checkpoint", "base_40m_textvec.pt", "clip_embed.weight")
-UPSAMPLER = Kind(
-    Upsampler, "Point-E upsampler checkpoint", "upsample_40m.pt", "clip_embed.1.weight"
-)
-
-
-def kept_network(kind: Kind, path: str, device: torch.device) -> Any:
+def kept_network(kind: type[PointTransformer], path: str, device: torch.device) -> Any:
     """Return the network of :func:`load_network` on ``device``, see ``models/model_files.py``."""
     return loaded((kind.title, path, device), lambda: load_network(kind, path).to(device))
 
 
-def load_network(kind: Kind, path: str) -> Any:
+def load_network(kind: type[PointTransformer], path: str) -> Any:
     """Load a network of this kind in evaluation mode. Its sizes are read from the weights' shapes.
 
     Raises:
@@ -329,6 +317,6 @@ def load_network(kind: Kind, path: str) -> Any:
             f"{kind.title} {path!r} holds another model: give {kind.file} or a finetuned one "
             "of its format"
         )
-    network = kind.network(width, layers, projection.shape[1])
+    network = kind(width, layers, projection.shape[1])
     load_exactly(network, state, f"{kind.title} {path!r}")
     return network.eval().requires_grad_(False)

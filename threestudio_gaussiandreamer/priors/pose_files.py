@@ -22,11 +22,9 @@ import numpy as np
 from jaxtyping import Float
 
 from ..core.errors import UserError, unknown
-from ..core.files import existing_file
 from ..formats.array_files import read_arrays
-from .body_pose import NEEDED, SIDES, pose_of_positions, pose_of_rotations
-from .makehuman import Body
-from .skeleton import BODY_JOINTS
+from ..formats.reading import reading, require
+from .body_pose import BODY_JOINTS, NEEDED, SIDES, Body, pose_of_positions, pose_of_rotations
 
 TO_BODY = {
     "y": np.eye(3),
@@ -77,17 +75,16 @@ def read_pose(
         UserError: the file is missing, of another format, damaged, not finite, or has no such
             frame.
     """
-    file = existing_file(path, "pose file")
-    suffix = file.suffix.lower()
-    if suffix not in SUFFIXES:
-        raise unknown(f"format of the pose file {path!r}:", suffix, SUFFIXES)
-    if suffix == ".bvh":
-        pose, stated = pose_of_positions(body, read_bvh(file, frame)), BODY_UP
-    else:
-        local, stated = read_axis_angles(file, frame)
-        pose = pose_of_rotations(body, local)
-    if not np.isfinite(pose).all():
-        raise UserError(f"pose file {path!r} has rotations in frame {frame} that are too large")
+    with reading(path, "pose file") as file:
+        suffix = file.suffix.lower()
+        if suffix not in SUFFIXES:
+            raise unknown(f"format of the pose file {path!r}:", suffix, SUFFIXES)
+        if suffix == ".bvh":
+            pose, stated = pose_of_positions(body, read_bvh(file, frame)), BODY_UP
+        else:
+            local, stated = read_axis_angles(file, frame)
+            pose = pose_of_rotations(body, local)
+        require(np.isfinite(pose).all(), f"it has rotations in frame {frame} that are too large")
     return TO_BODY[stated if up == "auto" else up] @ pose
 
 
@@ -99,20 +96,17 @@ def read_axis_angles(path: Path, frame: int) -> tuple[Float[np.ndarray, "22 3 3"
     names = ("poses", "global_orient", "body_pose", *FRAME_RATES)
     arrays = read_arrays(path, "pose file", required, names)
     angles = _angles(arrays)
-    if angles is None:
-        given = ", ".join(f"{name} {a.shape} of {a.dtype}" for name, a in arrays.items())
-        raise UserError(
-            f"pose file {str(path)!r} has {given or 'neither poses nor body_pose'}: axis-angle "
-            "rotations were expected, (frames, 3 x joints) or (frames, joints, 3) of "
-            f"{', '.join(map(str, JOINT_COUNTS))} joints in poses, or in global_orient and "
-            "body_pose; matrices aren't read"
-        )
+    given = ", ".join(f"{name} {a.shape} of {a.dtype}" for name, a in arrays.items())
+    require(
+        angles is not None,
+        f"it has {given or 'neither poses nor body_pose'}: axis-angle rotations were expected, "
+        f"(frames, 3 x joints) or (frames, joints, 3) of {', '.join(map(str, JOINT_COUNTS))} "
+        "joints in poses, or in global_orient and body_pose; matrices aren't read",
+    )
     require_frame(frame, len(angles), f"pose file {str(path)!r}")
     chosen = np.asarray(angles[frame, : 3 * BODY_JOINTS], np.float64).reshape(-1, 3)
-    if not np.isfinite(chosen).all():
-        raise UserError(
-            f"pose file {str(path)!r} has rotations that are NaN or infinite in frame {frame}"
-        )
+    finite = np.isfinite(chosen).all()
+    require(finite, f"it has rotations that are NaN or infinite in frame {frame}")
     up = AMASS_UP if any(name in arrays for name in FRAME_RATES) else BODY_UP
     return Rotation.from_rotvec(chosen).as_matrix(), up
 
@@ -160,22 +154,25 @@ def read_bvh(path: Path, frame: int) -> dict[str, Float[np.ndarray, "3"]]:
     """Return the positions of the known joints in one frame of a BVH, in the file's unit and axes.
 
     Raises:
-        UserError: the file is damaged, has no such frame, numbers that aren't finite, or lacks
-            joints that a pose needs.
+        Unreadable: it is damaged, or lacks joints that a pose needs.
+        UserError: it has no such frame.
     """
     hierarchy, _, motion = path.read_text(encoding="utf-8", errors="replace").partition("MOTION")
-    joints = _hierarchy(hierarchy, path)
-    names = joint_names([joint.name for joint in joints], path)
-    values = _frame_values(motion, sum(len(joint.channels) for joint in joints), frame, path)
+    joints = _hierarchy(hierarchy)
+    names = joint_names([joint.name for joint in joints])
+    rows = [line for line in motion.splitlines() if line.strip()]
+    rows = [line for line in rows if not line.lstrip().startswith("Frame")]
+    require_frame(frame, len(rows), f"BVH file {str(path)!r}")
+    values = _numbers(rows[frame].split(), sum(len(joint.channels) for joint in joints))
     positions = _positions(joints, values)
     return {name: positions[number] for name, number in names.items()}
 
 
-def joint_names(names: list[str], path: Path) -> dict[str, int]:
-    """Return the index of the file's joint for each joint of ``skeleton.py`` that it has.
+def joint_names(names: list[str]) -> dict[str, int]:
+    """Return the index of the file's joint for each joint of ``body_pose.py`` that it has.
 
     Raises:
-        UserError: a joint of ``NEEDED`` is missing.
+        Unreadable: a joint of ``NEEDED`` is missing.
     """
     known = {}
     for number, name in enumerate(names):
@@ -187,12 +184,13 @@ def joint_names(names: list[str], path: Path) -> dict[str, int]:
         number = next((known[side, part] for part in parts if (side, part) in known), None)
         if number is not None and number not in found.values():
             found[name] = number
-    if missing := [name for name in NEEDED if name not in found]:
-        raise UserError(
-            f"BVH file {str(path)!r} has no joint that is known as the {', the '.join(missing)}: "
-            f"its joints are {', '.join(filter(None, names[:40]))}. Rename them, for example to "
-            "LeftUpLeg, LeftLeg, LeftArm, LeftForeArm"
-        )
+    missing = [name for name in NEEDED if name not in found]
+    require(
+        not missing,
+        f"it has no joint that is known as the {', the '.join(missing)}: its joints are "
+        f"{', '.join(filter(None, names[:40]))}. Rename them, for example to LeftUpLeg, LeftLeg, "
+        "LeftArm, LeftForeArm",
+    )
     return found
 
 
@@ -211,7 +209,7 @@ def split_name(name: str) -> tuple[str, str]:
     return side, re.sub(r"(?<=[a-z])0+(?=\d)", "", "".join(words))
 
 
-def _hierarchy(text: str, path: Path) -> list[Joint]:
+def _hierarchy(text: str) -> list[Joint]:
     """Return the joints in the order of their channels; parents come first."""
     joints: list[Joint] = []
     above: list[Optional[int]] = []
@@ -227,38 +225,25 @@ def _hierarchy(text: str, path: Path) -> list[Joint]:
         elif kind == "}" and above:
             current = above.pop()
         elif kind == "OFFSET" and joints:
-            joints[-1].offset = _numbers(words, 3, path)
+            joints[-1].offset = _numbers(words, 3)
         elif kind == "CHANNELS" and joints:
             joints[-1].channels = words[1:]
-            if len(set(words[1:]) & set(CHANNELS)) < len(words[1:]):
-                raise UserError(
-                    f"BVH file {str(path)!r} is damaged: channels {' '.join(words[1:])}; expected "
-                    f"different ones of {', '.join(CHANNELS)}"
-                )
-    if not joints or above:
-        what = "is cut off" if joints else "has no joints"
-        raise UserError(f"BVH file {str(path)!r} is damaged: its hierarchy {what}")
+            expected = f"expected different ones of {', '.join(CHANNELS)}"
+            fits = len(set(words[1:]) & set(CHANNELS)) == len(words[1:])
+            require(fits, f"it has channels {' '.join(words[1:])}; {expected}")
+    require(bool(joints), "its hierarchy has no joints")
+    require(not above, "its hierarchy is cut off")
     return joints
 
 
-def _frame_values(text: str, count: int, frame: int, path: Path) -> Float[np.ndarray, " C"]:
-    """Return the values of all channels in one frame."""
-    lines = [line for line in text.splitlines() if line.strip()]
-    rows = [line for line in lines if not line.lstrip().startswith("Frame")]
-    require_frame(frame, len(rows), f"BVH file {str(path)!r}")
-    return _numbers(rows[frame].split(), count, path)
-
-
-def _numbers(words: list[str], count: int, path: Path) -> Float[np.ndarray, " N"]:
+def _numbers(words: list[str], count: int) -> Float[np.ndarray, " N"]:
     try:
         values = np.array(words, np.float64)
     except ValueError:
         values = np.array([np.nan])
-    if len(values) != count or not (np.abs(values) < LARGEST).all():
-        raise UserError(
-            f"BVH file {str(path)!r} is damaged: {count} finite numbers were expected in the line "
-            f"{' '.join(words)[:80]!r}"
-        )
+    fits = len(values) == count and (np.abs(values) < LARGEST).all()
+    line = " ".join(words)[:80]
+    require(fits, f"{count} finite numbers were expected in the line {line!r}")
     return values
 
 

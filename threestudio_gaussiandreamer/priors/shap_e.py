@@ -53,14 +53,8 @@ from ..host import info, register
 from ..meshes.mesh import linear_to_srgb
 from ..models.hub import Source, locate
 from ..models.model_files import free_memory, load_network, load_settings, loaded, needed_files
-from .karras import (
-    Network,
-    SampledPrior,
-    guided_denoiser,
-    karras_sigmas,
-    sample_heun,
-    torch_generator,
-)
+from . import karras
+from .karras import SampledPrior
 from .weights import load_exactly, read_state_dict
 
 COMPONENTS = ("tokenizer", "text_encoder", "prior", "scheduler", "shap_e_renderer")
@@ -108,7 +102,7 @@ class ShapEPrior(SampledPrior):
         self.preflight()
         folder = locate(self._source())
         info(f"Shap-E: {self.cfg.prompt or prompt!r} on {self.device}")
-        latents = self._sample(folder, prompt, torch_generator(generator))
+        latents = self._sample(folder, prompt, karras.torch_generator(generator))
         renderer = self._part(folder, "shap_e_renderer")
         cloud = decoded(renderer, latents, colors=self.cfg.colors, grid_size=self.cfg.grid_size)
         free_memory()
@@ -137,9 +131,9 @@ class ShapEPrior(SampledPrior):
         half = cfg.half_precision and noise.device.type == "cuda"
         network = prior_network(prior, self.with_unconditional(condition), half=half)
         options = {"scale": cfg.guidance_scale, "prediction": prediction}
-        denoise = guided_denoiser(network, alphas_cumprod, **options)
-        sigmas = karras_sigmas(cfg.num_inference_steps, SIGMA_MAX)
-        return sample_heun(denoise, noise, sigmas, generator=rng, progress="Shap-E")
+        denoise = karras.guided_denoiser(network, alphas_cumprod, **options)
+        sigmas = karras.karras_sigmas(cfg.num_inference_steps, SIGMA_MAX)
+        return karras.sample_heun(denoise, noise, sigmas, generator=rng, progress="Shap-E")
 
     def _part(self, folder: Path, part: str) -> Any:
         """Return one network, always in float32: in half precision the renderer's encoding of
@@ -177,7 +171,7 @@ def read_schedule(folder: Path) -> tuple[Float[np.ndarray, "T"], str]:
     return scheduler.alphas_cumprod.double().numpy(), prediction
 
 
-def prior_network(prior: Any, conditions: Float[Tensor, "N D"], *, half: bool) -> Network:
+def prior_network(prior: Any, conditions: Float[Tensor, "N D"], *, half: bool) -> karras.Network:
     """Wrap diffusers' network with its conditions, one for each item."""
 
     def predict(z: Tensor, timesteps: Tensor) -> Tensor:

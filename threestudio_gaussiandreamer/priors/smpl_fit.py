@@ -22,11 +22,10 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..core.devices import torch_threads
-from ..core.errors import UserError
 from ..core.extras import require_extra
-from ..core.files import existing_file
 from ..formats.array_files import read_arrays
-from .skeleton import BODY_JOINTS
+from ..formats.reading import reading, require
+from .body_pose import BODY_JOINTS
 
 FIELDS = ("v_template", "shapedirs", "posedirs", "J_regressor", "weights", "kintree_table", "f")
 """Arrays of a body model's file that are used."""
@@ -85,8 +84,9 @@ def load_body_model(path: str, *, num_shape: int = 10) -> BodyModel:
         UserError: missing, or not a body model; the message says what to do.
     """
     kind = "body model (the NPZ or PKL of SMPL, SMPL-H or SMPL-X)"
-    arrays = read_arrays(existing_file(path, kind), kind, FIELDS)
-    _check(arrays, path)
+    with reading(path, kind) as file:
+        arrays = read_arrays(file, kind, FIELDS)
+        _check(arrays)
     vertices, joints = len(arrays["v_template"]), len(arrays["J_regressor"])
     parents = torch.from_numpy(arrays["kintree_table"][0].astype(np.int64))
     parents[0] = -1
@@ -223,8 +223,8 @@ def _minimise(body: tuple[Tensor, ...], loss: Callable[[], Tensor], iterations: 
         tensor.requires_grad_(False)
 
 
-def _check(arrays: dict[str, np.ndarray], path: str) -> None:
-    """Raise UserError unless the arrays are those of a body with SMPL's 22 joints or more, of
+def _check(arrays: dict[str, np.ndarray]) -> None:
+    """Raise Unreadable unless the arrays are those of a body with SMPL's 22 joints or more, of
     finite numbers, whose faces name vertices and whose joints hang on earlier ones.
     """
     vertices, joints = len(arrays["v_template"]), len(arrays["J_regressor"])
@@ -245,13 +245,13 @@ def _check(arrays: dict[str, np.ndarray], path: str) -> None:
         and ((parents[0, 1:] >= 0) & (parents[0, 1:] < np.arange(1, joints))).all()
         and ((faces >= 0) & (faces < vertices)).all()
     )
-    if not sound:
-        shapes = ", ".join(f"{name} {arrays[name].shape}" for name in FIELDS)
-        problem = "is damaged" if fits else f"has other arrays ({shapes})"
-        raise UserError(
-            f"body model {path!r} {problem}: finite numbers that fit each other, of {BODY_JOINTS} "
-            "joints or more, were expected; get it again"
-        )
+    shapes = ", ".join(f"{name} {arrays[name].shape}" for name in FIELDS)
+    problem = "it is damaged" if fits else f"it has other arrays ({shapes})"
+    require(
+        sound,
+        f"{problem}: finite numbers that fit each other, of {BODY_JOINTS} joints or more, were "
+        "expected; get it again",
+    )
 
 
 def _tensor(values: np.ndarray) -> Tensor:

@@ -5,8 +5,6 @@ names must match those of the network exactly.
 import pickle
 import zipfile
 from collections.abc import Mapping
-from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -33,7 +31,13 @@ def read_state_dict(path: str, kind: str) -> dict[str, Tensor]:
     if zipfile.is_zipfile(file):
         require_plain_archive(file)
     try:
-        content = _read(file)
+        if file.suffix == ".safetensors":
+            from safetensors.torch import load_file
+
+            content = load_file(file)
+        else:  # zip files are memory-mapped, so that unused tensors (optimiser state) aren't read
+            mapped = zipfile.is_zipfile(file)
+            content = torch.load(file, map_location="cpu", weights_only=True, mmap=mapped)
     except Exception as error:  # torch raises various exceptions for damaged pickles
         problem = f"can't be read: {type(error).__name__}"
         if isinstance(error, pickle.UnpicklingError):
@@ -50,16 +54,6 @@ def read_state_dict(path: str, kind: str) -> dict[str, Tensor]:
             f"{WRAPPER!r}, was expected"
         )
     return dict(state)
-
-
-def _read(file: Path) -> Any:
-    """Read safetensors or a pickle."""
-    if file.suffix == ".safetensors":
-        from safetensors.torch import load_file
-
-        return load_file(file)
-    # zip files are memory-mapped, so that unused tensors (optimiser state) aren't read
-    return torch.load(file, map_location="cpu", weights_only=True, mmap=zipfile.is_zipfile(file))
 
 
 def load_exactly(module: nn.Module, state: Mapping[str, Tensor], what: str) -> None:

@@ -18,8 +18,7 @@ from ..cameras import Orbit
 from ..core.streams import numpy_generator
 from . import models
 from .loop import Stage, StepData, is_trained, normal
-from .splat_shards import render_gaussians
-from .views import DISTANCE, FOVY_DEG, Shard, with_backgrounds
+from .views import DISTANCE, FOVY_DEG, Shard, render_gaussians, with_backgrounds
 
 RANDOM_BACKGROUNDS = 0.15
 SPLAT_SHARE = 0.2

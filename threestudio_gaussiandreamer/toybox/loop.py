@@ -145,10 +145,6 @@ class Options:
     shard_objects: int = 256
     precision: str = "float32"
     """Either "float32", or "bfloat16" for autocast on GPUs and on CPUs that multiply it."""
-    only: str = ""
-    """Substring of the names of the parameters to train; the others stay fixed."""
-    rate: Optional[float] = None
-    """Learning rate; None for the default of each stage."""
     batch: Optional[int] = None
     """Batch size; None for the default of each stage."""
     workers: int = 0
@@ -173,7 +169,6 @@ class Stage(ABC):
         self.options = options
         self.device = torch.device(options.device)
         self.batch = options.batch or self.batch_size
-        self.rate = options.rate or self.learning_rate
         self.constants: dict[str, float] = {}
         """Constants that are needed to use the trained network; stored in the checkpoint."""
         self.shards = options.shards
@@ -236,7 +231,7 @@ class Training:
         self.path = checkpoint_path(stage.options.folder, stage.name)
         self.ema = AveragedModel(self.model, multi_avg_fn=_average, use_buffers=False)
         self.optimizer = torch.optim.AdamW(
-            self.model.parameters(), lr=stage.rate, betas=(0.9, 0.99), weight_decay=0.01
+            self.model.parameters(), lr=stage.learning_rate, betas=(0.9, 0.99), weight_decay=0.01
         )
         self.progress = Progress()
         self.measured: dict[str, float] = {}
@@ -292,7 +287,7 @@ class Training:
         progress, device = self.progress, self.stage.device.type
         factor = rate_factor(progress.step, self.done)
         for group in self.optimizer.param_groups:
-            group["lr"] = self.stage.rate * factor
+            group["lr"] = self.stage.learning_rate * factor
         mixed = self.stage.options.precision == "bfloat16"
         with torch.autocast(device, dtype=torch.bfloat16, enabled=mixed):
             loss, metrics = self.stage.loss(self.model, batch)
@@ -349,24 +344,12 @@ class Training:
 
     @torch.no_grad()
     def _freeze(self) -> None:
-        """Freeze parameters at their averages: those with which dependent networks were trained,
-        and those that the option ``only`` leaves out.
-
-        Raises:
-            UserError: that leaves none.
-        """
-        prefixes, only = self.stage.frozen(), self.stage.options.only
+        """Freeze parameters with which dependent networks were trained, at their averages."""
         averages = dict(self.ema.module.named_parameters())
         for name, parameter in self.model.named_parameters():
-            if name.startswith(prefixes) or only not in name:
+            if name.startswith(self.stage.frozen()):
                 parameter.copy_(averages[name])
                 parameter.requires_grad_(False)
-        if not any(parameter.requires_grad for parameter in self.model.parameters()):
-            groups = sorted({name.partition(".")[0] for name in averages})
-            raise UserError(
-                f"--only {only!r}: {self.stage.name!r} has no such parameters to train; the parts "
-                f"of the network are {', '.join(groups)}"
-            )
 
     def _log(self, metrics: list[dict[str, Tensor]], seconds: float) -> None:
         """Print and keep the means of these steps' metrics."""

@@ -47,12 +47,9 @@ def write_tokenizer(folder: Path, words: Sequence[str]) -> None:
         SETTINGS: special | {"model_max_length": LENGTH} | named,
     }
     for name, content in contents.items():
-        json_file = isinstance(content, dict)
-        text = (
-            json.dumps(content, ensure_ascii=False, indent=0)
-            if json_file
-            else "\n".join([*content, ""])
-        )
+        text = "\n".join([*content, ""])
+        if isinstance(content, dict):
+            text = json.dumps(content, ensure_ascii=False, indent=0)
         with atomic_file(folder / name) as file:
             file.write(text.encode())
 
@@ -67,15 +64,6 @@ def copy_tokenizer(source: Path, folder: Path) -> None:
     for path in sorted(source.iterdir(), key=lambda path: path.name == SETTINGS):
         with atomic_file(folder / path.name) as file:
             file.write(path.read_bytes())
-
-
-def words_of(folder: Path) -> list[str]:
-    """Return the list of words beside a tokenizer.
-
-    Raises:
-        UserError: there is none.
-    """
-    return existing_file(folder / WORDS, "list of words").read_text(encoding="utf-8").split()
 
 
 def word_merges(words: Sequence[str]) -> list[tuple[str, str]]:
@@ -129,18 +117,13 @@ def open_tokenizer(folder: Path) -> Any:
     place = Path(folder) / "tokenizer"
     if not (place / SETTINGS).is_file():
         write_tokenizer(place, words.vocabulary())
-    if missing := missing_words(words_of(place)):
+    known = existing_file(place / WORDS, "list of words").read_text(encoding="utf-8").split()
+    if missing := sorted(set(words.vocabulary()) - set(known)):
         raise UserError(
-            f"the tokenizer {str(place)!r} doesn't know {', '.join(missing)}: export the training "
-            "(python -m threestudio_gaussiandreamer.toybox.export), and continue it in another "
-            "folder with --from-weights"
+            f"the tokenizer {str(place)!r}, of an earlier version, doesn't know "
+            f"{', '.join(missing)}: train in another folder"
         )
     return CLIPTokenizer.from_pretrained(str(place))
-
-
-def missing_words(known: Sequence[str]) -> list[str]:
-    """Return the words of the toybox that aren't in ``known``, sorted."""
-    return sorted(set(words.vocabulary()) - set(known))
 
 
 def token_ids(tokenizer: Any, texts: Sequence[str]) -> Int[Tensor, "B 32"]:

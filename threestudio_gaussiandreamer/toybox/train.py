@@ -55,8 +55,6 @@ def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
     bfloat16 = "bfloat16: autocast, on a GPU or a CPU that multiplies it"
     add("--precision", choices=["float32", "bfloat16"], default="float32", help=bfloat16)
     add("--batch", type=int, help="pictures of one step; default: the stage's own")
-    add("--rate", type=float, help="learning rate; default: the stage's own")
-    add("--only", default="", help="train parameters with this in their names; others stay fixed")
     add("--pool", type=int, default=40, help="shards of 1024 pictures, visited cyclically")
     workers = "processes that render all shards first and make the batches afterwards"
     add("--workers", type=int, default=0, help=workers)
@@ -72,8 +70,6 @@ def options_of(args: argparse.Namespace) -> Options:
     for name in args.stages:
         if name not in STAGES:
             raise unknown("stage", name, STAGES)
-    if args.only and len(args.stages) != 1:
-        raise UserError(f"--only {args.only}: give the stage that it is for as --stages, e.g. unet")
     for name, least in {"images": 1, "batch": 1, "pool": 1, "workers": 0}.items():
         value = getattr(args, name)
         if value is not None and value < least:
@@ -83,10 +79,8 @@ def options_of(args: argparse.Namespace) -> Options:
             f"--seed {shown(args.seed)}: expected 0 to {SEED_OFFSET - 1}; larger seeds are of the "
             "objects that the judge learns from"
         )
-    for name in ("rate", "minutes"):
-        value = getattr(args, name)
-        if value is not None and not value > 0:
-            raise UserError(f"--{name} {value}: expected more than 0")
+    if not args.minutes > 0:
+        raise UserError(f"--minutes {args.minutes}: expected more than 0")
     if args.device.startswith("cuda") and not torch.cuda.is_available():
         raise UserError(f"--device {args.device}: PyTorch sees no GPU here; give cpu")
     devices = ["cpu", "cuda", *(f"cuda:{i}" for i in range(torch.cuda.device_count()))]

@@ -6,6 +6,7 @@ shards can be used with different backgrounds.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -15,11 +16,12 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int, UInt8
 
-from ..cameras import Orbit, orbit_c2w
+from ..cameras import Orbit, orbit_c2w, to_opencv
 from ..core.files import atomic_file, remove_abandoned
 from ..core.streams import numpy_generator
 from ..meshes.mesh import Mesh, sample_surface, surface_colors
 from ..meshes.raycast import MeshCaster
+from ..splatting import rasterize
 from .kinds import ACCESSORIES, KINDS
 from .world import COLORS, PATTERNS, VERSION, Attributes, draw_attributes, object_mesh
 
@@ -214,6 +216,22 @@ def with_backgrounds(
     # with the channels in front, the arithmetic runs along whole rows of pixels
     channels = torch.from_numpy(rgba.transpose(0, 3, 1, 2)).float().contiguous().div_(255)
     return channels[:, :3] + (1 - channels[:, 3:]) * torch.from_numpy(background)
+
+
+def render_gaussians(
+    gaussians: Sequence[np.ndarray], orbit: Orbit, *, eps2d: float
+) -> Float[np.ndarray, "N s s 4"]:
+    """Render Gaussians from these cameras; return premultiplied RGBA in [0, 1].
+
+    Args:
+        gaussians: means, quaternions, scales, opacities and colours, as ``rasterize`` takes them.
+        eps2d: dilation, square pixels.
+    """
+    viewmats, Ks = to_opencv(orbit.c2w, orbit.fovy, SIZE, SIZE)
+    gaussians = [torch.from_numpy(np.float32(values)) for values in gaussians]
+    drawn = rasterize(*gaussians, viewmats, Ks, SIZE, SIZE, preset="fast", eps2d=eps2d)
+    alpha = drawn.alpha.reshape(*drawn.image.shape[:-1], 1)
+    return torch.cat([drawn.image, alpha], dim=-1).clamp(0, 1).numpy()
 
 
 def row_batch(
