@@ -50,3 +50,9 @@ def large(tmp_path_factory):
         return folder, tiny_large_guidance.prompts(text, folder)
 
     return made
+
+
+@pytest.fixture
+def model(large, request):
+    """Return the folder of the model that the test's module names, ``KIND``."""
+    return large(request.module.KIND)[0]

@@ -14,11 +14,6 @@ KIND = "mvdream"
 
 
 @pytest.fixture
-def model(large):
-    return large(KIND)[0]
-
-
-@pytest.fixture
 def prompts(large):
     return large(KIND)[1]
 

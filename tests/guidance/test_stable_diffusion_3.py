@@ -21,11 +21,6 @@ POOLED = 2 * tiny_large_models.POOLED
 
 
 @pytest.fixture
-def model(large):
-    return large(KIND)[0]
-
-
-@pytest.fixture
 def prompts(large):
     return large(KIND)[1]
 

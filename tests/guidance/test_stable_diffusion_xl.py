@@ -28,11 +28,6 @@ POOLED = tiny_large_models.POOLED
 
 
 @pytest.fixture
-def model(large):
-    return large(KIND)[0]
-
-
-@pytest.fixture
 def prompts(large):
     return large(KIND)[1]
 
