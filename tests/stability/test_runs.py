@@ -642,7 +642,7 @@ ALIKE = "x" * 4095, "🦊" * 999, "a_.._.._x", "two_lines", "a?b", "a*b", "con",
 
 
 @row("A5", "Prompt as path / YAML")
-@pytest.mark.parametrize("source", ["command line", "prompt file"])
+@pytest.mark.parametrize("source", [*slow("command line"), "prompt file"])
 def test_a_prompt_stays_text_and_its_folder_below_the_root(source, tmp_path, measured):
     """The prompt is stored verbatim, also after parsed.yaml was read back; a folder of its name can
     be created. Different prompts have different ones, also those that share their first 64 bytes,
