@@ -51,6 +51,7 @@ def device(monkeypatch):
     return exchange
 
 
+@pytest.mark.slow
 class TestCudaKernels(KernelContract):
     @pytest.fixture
     def backend(self):
