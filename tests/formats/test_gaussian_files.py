@@ -78,9 +78,8 @@ def test_gaussians_that_cant_be_drawn_are_left_out(tmp_path):
 
 
 def test_mistakes(tmp_path):
-    with pytest.raises(
-        UserError, match=r"OUT: expected the name of a .ply, .* or .usdz file, got 'a.obj'"
-    ):
+    said = r"OUT: expected the name of a .ply, .* or .usdz file, got 'a.obj'"
+    with pytest.raises(UserError, match=said):
         write_cloud("a.obj", StoredCloud(cloud()))
     write_cloud(str(tmp_path / "a.ply"), StoredCloud(cloud()))
     with pytest.raises(UserError, match="unknown axis 'w'"):

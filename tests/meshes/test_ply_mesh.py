@@ -63,23 +63,15 @@ def colors_at_corners(path):
 
 @pytest.mark.parametrize("binary", [True, False])
 @pytest.mark.parametrize("faces", [TRIANGLES, MIXED, [[0, 1, 2, 3]]])
-@pytest.mark.parametrize("names", [("s", "t"), ("u", "v"), ("texture_u", "texture_v")])
-def test_texture_coordinates_of_vertices(tmp_path, binary, faces, names):
-    path = ply(tmp_path, faces=faces, columns=of_vertices(names), comments=TEXTURE, binary=binary)
-    np.testing.assert_array_equal(colors_at_corners(path), EXPECTED)
-    assert len(read_parts(path)[0].faces) == {1: 2, 2: 2 + (faces is MIXED)}[len(faces)]
-
-
-@pytest.mark.parametrize("binary", [True, False])
-@pytest.mark.parametrize("faces", [TRIANGLES, MIXED, [[0, 1, 2, 3]]])
-def test_texture_coordinates_of_corners(tmp_path, binary, faces):
+def test_texture_coordinates_of_vertices_and_corners(tmp_path, binary, faces):
+    for names in (("s", "t"), ("u", "v"), ("texture_u", "texture_v")):
+        columns = of_vertices(names)
+        path = ply(tmp_path, faces=faces, columns=columns, comments=TEXTURE, binary=binary)
+        np.testing.assert_array_equal(colors_at_corners(path), EXPECTED)
+        assert len(read_parts(path)[0].faces) == {1: 2, 2: 2 + (faces is MIXED)}[len(faces)]
     path = ply(tmp_path, faces=faces, corners=UV, comments=TEXTURE, binary=binary)
     np.testing.assert_array_equal(colors_at_corners(path), EXPECTED)
     assert len(read_parts(path)[0].vertices) == 4
-
-
-@pytest.mark.parametrize("binary", [True, False])
-def test_a_mesh_of_one_face(tmp_path, binary):
     path = ply(tmp_path, faces=[[0, 1, 2]], corners=UV, comments=TEXTURE, binary=binary)
     mesh = load_mesh(path)
     assert mesh.faces.shape == (1, 3) and mesh.texture is not None
