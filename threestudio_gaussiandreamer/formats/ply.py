@@ -244,8 +244,7 @@ def read_gaussians(path: str | os.PathLike) -> Gaussians:
     with reading(path, "PLY file") as file:
         table = PlyTable(file)
         _require_gaussians(table)
-        scales, opacities = _filtered(table, _read_log_scales(table), table["opacity"])
-        arrays = Gaussians(table[MEANS], table[QUATS], scales, opacities, _read_sh(table))
+        arrays = Gaussians(table[MEANS], table[QUATS], *_read_sizes(table), _read_sh(table))
         return _without_zeros(arrays, table)
 
 
@@ -305,30 +304,27 @@ def _require_gaussians(table: PlyTable) -> None:
         logger.warning("%s: unknown properties are left out: %s%s", table.path, names, more)
 
 
-def _read_log_scales(table: PlyTable) -> Float[np.ndarray, "N 3"]:
-    """Read the logarithms of the scales; the third one of 2D Gaussians is ``FLAT_LOG_SCALE``."""
-    names = [name for name in LOG_SCALES if name in table.columns]
-    scales = table[tuple(names)]
-    if scales.shape[1] == 3 and not (len(scales) and (scales[:, 2] == -np.inf).all()):
-        return scales
-    logger.warning("%s: 2D Gaussians, without a third scale: read as flat ones", table.path)
-    return np.pad(scales[:, :2], ((0, 0), (0, 1)), constant_values=FLAT_LOG_SCALE)
+def _read_sizes(table: PlyTable) -> tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, " N"]]:
+    """Read the logarithms of the scales, of which the third one of 2D Gaussians is
+    ``FLAT_LOG_SCALE``, and the logits of the opacities.
 
-
-def _filtered(
-    table: PlyTable, log_scales: Float[np.ndarray, "N 3"], logits: Float[np.ndarray, " N"]
-) -> tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, " N"]]:
-    """Apply Mip-Splatting's 3D filter: the variances grow by its square, and opacities shrink by
+    Mip-Splatting's 3D filter is applied: the variances grow by its square, and opacities shrink by
     the ratio of the volumes.
     """
+    scales, logits = (
+        table[tuple(name for name in LOG_SCALES if table.has([name]))],
+        table["opacity"],
+    )
+    if scales.shape[1] < 3 or (len(scales) and (scales[:, 2] == -np.inf).all()):
+        logger.warning("%s: 2D Gaussians, without a third scale: read as flat ones", table.path)
+        third = ((0, 0), (0, 1))
+        scales = np.pad(scales[:, :2], third, constant_values=FLAT_LOG_SCALE)
     if FILTER not in table.columns:
-        return log_scales, logits
+        return scales, logits
     logger.warning("%s: its 3D filter is applied to scales and opacities", table.path)
-    with np.errstate(divide="ignore", invalid="ignore"):  # filters that are 0 or NaN
-        filters = np.log(table[FILTER].astype(np.float64))[:, None]
-        larger = np.logaddexp(2 * log_scales, 2 * filters) / 2
-        ratios = np.exp((log_scales - larger).sum(axis=1))
-    opacities = packing.opacities(logits) * ratios
+    filters = np.log(table[FILTER].astype(np.float64))[:, None]
+    larger = np.logaddexp(2 * scales, 2 * filters) / 2
+    opacities = packing.opacities(logits) * np.exp((scales - larger).sum(axis=1))
     return larger.astype(np.float32), packing.logits(opacities, packing.FLOAT_OPACITY_MARGIN)
 
 
@@ -341,20 +337,17 @@ def _without_zeros(arrays: Gaussians, table: PlyTable) -> Gaussians:
     empty &= (arrays.sh[:, 0] == 0).all(axis=1)
     if not empty.any():
         return arrays
-    logger.warning(
-        "%s: %d of %d rows hold nothing but zeros: left out", table.path, empty.sum(), len(empty)
-    )
+    said = "%s: %d of %d rows hold nothing but zeros: left out"
+    logger.warning(said, table.path, empty.sum(), len(empty))
     return arrays.rows(~empty)
 
 
 def _format_hint(table: PlyTable) -> str:
     """Return a hint for the message if the properties are those of another kind of PLY."""
     if COMPRESSED in table.columns:
-        return (
-            " It is a compressed PLY: convert it by `python -m threestudio_gaussiandreamer.convert "
-            "in.compressed.ply out.ply`."
-        )
-    if set(MEANS) <= set(table.columns) and not {*SH_CONSTANT, "opacity"} & set(table.columns):
+        command = "python -m threestudio_gaussiandreamer.convert in.compressed.ply out.ply"
+        return f" It is a compressed PLY: convert it by `{command}`."
+    if table.has(MEANS) and not {*SH_CONSTANT, "opacity"} & set(table.columns):
         return " It holds plain points: read it as a point cloud."
     return ""
 
