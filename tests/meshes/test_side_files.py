@@ -89,7 +89,7 @@ GREY = "map_Kd grey.png\n"
 @pytest.mark.parametrize(
     ("libraries", "materials"),
     [
-        (["mtllib other.mtl my a.mtl"], {"my a": f"newmtl m\n{GREY}", "other": "newmtl x\nKd 1 0"}),
+        (["mtllib other.mtl my a.mtl"], {"my a": f"newmtl m\n{GREY}", "other": "newmtl x\n"}),
         (['mtllib "my a.mtl" other.mtl'], {"my a": f"newmtl m\n{GREY}"}),
         (["mtllib other.mtl", "mtllib a.mtl"], {"a": f"newmtl m\n{GREY}", "other": "newmtl x\n"}),
         (["# no mtllib b.mtl", "mtllib a.mtl"], {"a": f"newmtl m\n{GREY}"}),

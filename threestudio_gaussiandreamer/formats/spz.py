@@ -222,22 +222,8 @@ def spz_arrays(packed: bytes) -> tuple[Gaussians, bool]:
         view[start:end].reshape(header.count, width)
         for start, end, width in zip(ends, ends[1:], header.blocks, strict=False)
     )
-    if header.version == 1:
-        means = positions.view("<f2")
-    else:
-        low, middle, high = positions.reshape(-1, 3, 3).transpose(2, 0, 1).astype(np.int32)
-        fixed = low | middle << 8 | (high ^ 0x80) - 0x80 << 16
-        means = fixed * 2.0**-header.fractional_bits
-    if header.version < 3:
-        xyz = rotations / 127.5 - 1
-        w = np.sqrt(np.clip(1 - (xyz**2).sum(axis=1, keepdims=True), 0, 1))
-        quats = np.concatenate([w, xyz], axis=1).astype(np.float32)
-    else:
-        word = np.ascontiguousarray(rotations).view("<u4").astype(np.int64)
-        fields = word >> np.array([20, 10, 0]) & 1023
-        others = np.where(fields & 512, -1.0, 1.0) * (fields & 511) / (511 * sqrt(2))
-        quats = packing.with_largest(word[:, 0] >> 30, others)[:, [3, 0, 1, 2]]
-    means, log_scales = means.astype(np.float32), scales / np.float32(16)
+    means, quats = _means(positions, header), _quats(rotations, header)
+    log_scales = scales / np.float32(16)
     logits = packing.logits_of_bytes(alphas[:, 0])
     # the harmonics last and in place, since they are most of the memory
     sh = np.empty((header.count, 1 + harmonics.shape[1] // 3, 3), np.float32)
@@ -251,6 +237,25 @@ def spz_arrays(packed: bytes) -> tuple[Gaussians, bool]:
         turned = np.stack([DIRECTIONS[letter] for letter in system], axis=1)
         gaussians = rotate(gaussians, turned)
     return gaussians, bool(header.flags & IS_ANTIALIASED)
+
+
+def _means(block: Integer[np.ndarray, "N B"], header: SpzHeader) -> Float[np.ndarray, "N 3"]:
+    if header.version == 1:
+        return block.view("<f2").astype(np.float32)
+    low, middle, high = block.reshape(-1, 3, 3).transpose(2, 0, 1).astype(np.int32)
+    fixed = low | middle << 8 | (high ^ 0x80) - 0x80 << 16
+    return (fixed * 2.0**-header.fractional_bits).astype(np.float32)
+
+
+def _quats(block: Integer[np.ndarray, "N B"], header: SpzHeader) -> Float[np.ndarray, "N 4"]:
+    if header.version < 3:
+        xyz = block / 127.5 - 1
+        w = np.sqrt(np.clip(1 - (xyz**2).sum(axis=1, keepdims=True), 0, 1))
+        return np.concatenate([w, xyz], axis=1).astype(np.float32)
+    word = np.ascontiguousarray(block).view("<u4").astype(np.int64)
+    fields = word >> np.array([20, 10, 0]) & 1023
+    others = np.where(fields & 512, -1.0, 1.0) * (fields & 511) / (511 * sqrt(2))
+    return packing.with_largest(word[:, 0] >> 30, others)[:, [3, 0, 1, 2]]
 
 
 def _fractional_bits(gaussians: Gaussians) -> int:
