@@ -38,7 +38,7 @@ from math import ceil, log, log2, sqrt
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float, Integer
 
 from ..core.errors import UserError
 from ..core.files import atomic_file
