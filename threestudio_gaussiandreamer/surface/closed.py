@@ -49,17 +49,13 @@ def simplified(vertices: Vertices, faces: Faces, count: int) -> tuple[Vertices, 
     for aggressiveness in AGGRESSIVENESS:
         target = count
         for _ in range(ATTEMPTS):
-            # separate the surfaces that simplification made touch
-            positions, index = joined(*_fewer(vertices, faces, target, aggressiveness))
-            kept = without_folds(index)
-            found = separated(positions, kept) if len(kept) else None
-            closed = found is not None and is_closed(joined(*found)[1])
-            if not closed or len(found[1]) <= count:
+            found = _closed_again(*_fewer(vertices, faces, target, aggressiveness))
+            if found is None or len(found[1]) <= count:
                 break
             target -= len(found[1]) - count  # splitting edges has added faces
             if target < 4:  # of a tetrahedron, the smallest closed mesh
                 break
-        if closed and 0 < len(found[1]) <= count:
+        if found is not None and 0 < len(found[1]) <= count:
             return found
     raise UserError(
         f"faces: the surface can't be closed with {count} faces; allow more, or extract it with "
@@ -75,9 +71,19 @@ def _fewer(vertices: Vertices, faces: Faces, count: int, agg: int) -> tuple[Vert
     # its thresholds are for meshes of about this size; a power of two leaves all digits
     extent = float(np.ptp(vertices, axis=0).max())
     scale = 2.0 ** -round(math.log2(extent / 2)) if extent > 0 else 1.0
-    scaled, faces = (vertices * scale).astype(np.float32), faces.astype(np.int32)
-    found, faces = fast_simplification.simplify(scaled, faces, target_count=count, agg=agg)
+    scaled = (vertices * scale).astype(np.float32)
+    found, faces = fast_simplification.simplify(
+        scaled, faces.astype(np.int32), target_count=count, agg=agg
+    )
     return found / scale, faces
+
+
+def _closed_again(vertices: Vertices, faces: Faces) -> tuple[Vertices, Faces] | None:
+    """Separate surfaces that simplification made touch; None if the mesh can't be closed."""
+    positions, index = joined(vertices, faces)
+    kept = without_folds(index)
+    found = separated(positions, kept) if len(kept) else None
+    return found if found is not None and is_closed(joined(*found)[1]) else None
 
 
 def joined(vertices: Vertices, faces: Faces) -> tuple[Vertices, Faces]:

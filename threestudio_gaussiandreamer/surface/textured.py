@@ -117,11 +117,7 @@ def mesh_from_gaussians(
     views = views_around(cloud, count, size, sines=SINES, distances=(DISTANCE,))
     eps2d = EPS2D if options.eps2d is None else options.eps2d
     renders = render(cloud, views._replace(eps2d=eps2d, antialias=bool(options.antialias)), fusion)
-    if fusion is None:
-        surface = gaussian_surface(gaussians, resolution=options.resolution)
-        vertices, faces = surface.vertices, surface.faces
-    else:
-        vertices, faces = _level_set(fusion)
+    vertices, faces = _extracted(gaussians, fusion, options)
     least = options.min_component
     vertices, faces, specks = without_small_parts(vertices, faces, least)
     if not len(faces):
@@ -143,8 +139,13 @@ def _no_surface(gaussians: Gaussians) -> UserError:
     )
 
 
-def _level_set(fusion: DepthFusion) -> tuple[Vertices, Faces]:
+def _extracted(
+    gaussians: Gaussians, fusion: Optional[DepthFusion], options: MeshOptions
+) -> tuple[Vertices, Faces]:
     """Return the closed surface with all its parts, normals outwards; empty where there is none."""
+    if fusion is None:
+        surface = gaussian_surface(gaussians, resolution=options.resolution)
+        return surface.vertices, surface.faces
     from skimage.measure import marching_cubes
 
     distances = fusion.field()
