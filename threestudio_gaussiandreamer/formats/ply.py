@@ -112,10 +112,12 @@ class PlyTable:
         with open(path, "rb") as file:
             header = read_header(file)
             self.comments = header.comments
+            once = [element.name for element in header.elements].count("vertex") == 1
             for element in header.elements:
                 if element.name == "vertex":
-                    known = found is None and not element.has_lists
-                    require(known, "its vertices have lists, or are there twice; neither is read")
+                    readable = once and not element.has_lists
+                    said = "its vertices have lists, or are there twice; neither is read"
+                    require(readable, said)
                     found = read_rows(file, element, header.encoding)
                     self._types = {x.name: np.dtype(x.type) for x in element.properties}
                     rest = _remaining(file)
