@@ -3,7 +3,7 @@ time, and only the process that created it and still holds the lock removes it.
 
 The lock is the operating system's lock of the folder, which ends with the process. The file
 ``.lock`` names the host, the process and its command; on file systems without such locks, and on
-Windows, it is itself the lock."""
+Windows, it is itself the lock, by the library ``filelock``."""
 
 import contextlib
 import errno
@@ -13,7 +13,7 @@ import shutil
 import socket
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from itertools import count
 from pathlib import Path
 from typing import NamedTuple, Optional
@@ -36,19 +36,9 @@ LOCK_FILE = ".lock"
 class Lock(NamedTuple):
     """A lock on a folder."""
 
-    descriptor: int
-    """Of the folder, or of the lock file."""
-    file: Path
+    release: Callable[[], None]
     by_file: bool = False
-    """Whether the file is the lock."""
-
-    def release(self) -> None:
-        if fcntl is None:  # Windows, where no open file is removed
-            os.close(self.descriptor)
-        with contextlib.suppress(OSError):
-            self.file.unlink()
-        if fcntl is not None:
-            os.close(self.descriptor)
+    """Whether the file in the folder is the lock."""
 
 
 class RunFolder:
@@ -74,27 +64,14 @@ class RunFolder:
             return
         with contextlib.suppress(OSError):  # not empty: another run has put something there
             if self.lock is not None:
-                self._remove()
+                if self.lock.by_file:  # Windows removes no open file
+                    self.release()
+                shutil.rmtree(self.path, ignore_errors=True)
             for folder in (self.path, *self.path.parents):
                 if folder == self.first_made.parent:
                     break
                 if folder.exists():
                     folder.rmdir()
-
-    def _remove(self) -> None:
-        """Remove the folder. If a file is its lock it is renamed first, since other runs could lock
-        it as soon as that file is removed.
-        """
-        doomed = self.path
-        if self.lock.by_file:
-            doomed = self.path.with_name(f".{self.path.name}-{os.getpid()}")
-            if fcntl is None:
-                self.release()
-            self.path.rename(doomed)
-            if self.lock is not None:
-                os.close(self.lock.descriptor)
-            self.lock = None  # the file is gone; one of this name is another run's
-        shutil.rmtree(doomed, ignore_errors=True)
 
     def release(self) -> None:
         """Release the lock. The operating system's lock also ends with the process."""
@@ -149,7 +126,7 @@ def claim(
             continue
         except FolderInUse as error:
             raise FolderInUse(
-                f"{busy} in {path}{holder(path)}: wait until it ends{advice}{error}"
+                f"{busy} in {path}{_holder(path)}: wait until it ends{advice}{error}"
             ) from error
 
 
@@ -303,17 +280,14 @@ class FolderInUse(UserError):
     """Raised if another process has locked the folder."""
 
 
-def holder(folder: Path) -> str:
-    """Return, in brackets, which other process has locked a folder; "" if that isn't known."""
-    try:
+def _holder(folder: Path) -> str:
+    """Return, in brackets, which process has locked a folder; "" if that isn't known."""
+    with contextlib.suppress(OSError):
         text = (folder / LOCK_FILE).read_text(encoding="utf-8", errors="replace")
-    except OSError:
-        return ""
-    host, process, command = [*text.split(" ", 2), "", "", ""][:3]
-    ours = (host, process) == (socket.gethostname(), str(os.getpid()))
-    if ours or not process.isdecimal() or (fcntl is not None and _has_ended(text)):
-        return ""
-    return f" (process {process} on {host}: {command})"
+        host, process, command = [*text.split(" ", 2), "", "", ""][:3]
+        if process.isdecimal() and command:
+            return f" (process {process} on {host}: {command})"
+    return ""
 
 
 def _lock(path: Path) -> Lock:
@@ -325,111 +299,52 @@ def _lock(path: Path) -> Lock:
         UserError: it can't be opened, or no lock file can be written.
     """
     file = path / LOCK_FILE
+    if fcntl is None:
+        return _lock_by_file(file)
     try:
-        descriptor = os.open(path, os.O_RDONLY) if fcntl is not None else None
+        descriptor = os.open(path, os.O_RDONLY)
     except PermissionError as error:
         raise unwritable(path, error) from error
-    if descriptor is None:
-        return _lock_by_file(file)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         if not os.path.samestat(os.fstat(descriptor), os.stat(path)):
             raise FileNotFoundError(errno.ENOENT, "replaced by another folder", str(path))
-    except (BlockingIOError, FileNotFoundError) as error:
+    except OSError as error:
         os.close(descriptor)
         if isinstance(error, FileNotFoundError):
             raise
-        raise FolderInUse("") from error
-    except OSError:  # a file system without locks
-        os.close(descriptor)
-        return _lock_by_file(file)
+        if isinstance(error, BlockingIOError):
+            raise FolderInUse("") from error
+        return _lock_by_file(file)  # a file system without locks
     with contextlib.suppress(OSError):  # it is only for messages
-        file.write_text(_owner(), encoding="utf-8")
-    return Lock(descriptor, file)
+        owner = f"{socket.gethostname()} {os.getpid()} {shlex.join(sys.argv)[:500]}"
+        file.write_text(owner, encoding="utf-8")
 
+    def release() -> None:
+        with contextlib.suppress(OSError):
+            file.unlink()
+        os.close(descriptor)
 
-def _owner() -> str:
-    """Return the content of a lock file: host, process and command."""
-    return f"{socket.gethostname()} {os.getpid()} {shlex.join(sys.argv)[:500]}"
-
-
-# -- lock files ------------------------------------------------------------------------------------
+    return Lock(release)
 
 
 def _lock_by_file(file: Path) -> Lock:
-    """Create the lock file, with ``O_EXCL``, so that exactly one process succeeds. The file of a
-    process of this machine that has ended is replaced.
+    """Create the lock file, which exactly one process can.
 
     Raises:
         FolderInUse: another process has created it, and may still run.
         FileNotFoundError: the folder was removed.
         UserError: the file can't be created.
     """
-    while True:
-        try:
-            return Lock(_create(file, _owner()), file, by_file=True)
-        except FileExistsError:
-            _remove_stale(file)
-        except FileNotFoundError:
-            raise
-        except OSError as error:
-            raise unwritable(file.parent, error) from error
+    from filelock import SoftFileLock, Timeout
 
-
-def _create(file: Path, content: str) -> int:
-    """Create a file that must not exist and return its descriptor; it is removed if the content
-    can't be written. Windows removes and renames no open file, so it stays open.
-    """
-    descriptor = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL)
+    lock = SoftFileLock(file, timeout=0)
     try:
-        os.write(descriptor, content.encode())
-        return descriptor
-    except OSError:  # the disk is full
-        os.close(descriptor)
-        file.unlink(missing_ok=True)
+        lock.acquire()
+    except Timeout as error:
+        raise FolderInUse(f". If none is, here or on another machine, remove {file}") from error
+    except FileNotFoundError:
         raise
-
-
-def _remove_stale(file: Path) -> None:
-    """Remove the lock file of a process that has ended.
-
-    The file is renamed first, in which only one of several processes succeeds. If it isn't the file
-    that was read, since another process has taken the lock in between, it is put back.
-
-    Raises:
-        FolderInUse: its process may still run.
-    """
-    renamed = file.with_name(f"{LOCK_FILE}-{os.getpid()}")
-    try:
-        found = file.read_bytes()
-        ended = _has_ended(found.decode(errors="replace"))
-        if ended:
-            file.rename(renamed)
-    except FileNotFoundError:  # released, or removed by another process
-        return
-    except OSError:  # unreadable, a folder, or a file that is open on Windows
-        ended = False
-    if not ended:
-        raise FolderInUse(f". If none is, here or on another machine, remove {file}")
-    if renamed.read_bytes() != found:
-        with contextlib.suppress(OSError):
-            os.link(renamed, file)
-    renamed.unlink()
-
-
-def _has_ended(owner: str) -> bool:
-    """Return whether the owner in a lock file is a process of this machine that has ended; True on
-    Windows, where the file of a process that runs can't be renamed.
-    """
-    if fcntl is None:
-        return True
-    host, process = [*owner.split(" ", 2), ""][:2]
-    if host != socket.gethostname() or not process.isdecimal():
-        return False
-    try:
-        os.kill(int(process), 0)
-    except ProcessLookupError:
-        return True
-    except (OSError, OverflowError):  # it is another user's, or no process number
-        pass
-    return False
+    except OSError as error:
+        raise unwritable(file.parent, error) from error
+    return Lock(lock.release, by_file=True)

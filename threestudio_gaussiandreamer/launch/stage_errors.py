@@ -12,7 +12,6 @@ from ..core.errors import UserError, raised_in
 from ..host import pl, warn
 from .config_check import MisconfigurationException
 from .ddp import is_lost_process
-from .folder_lock import holder
 
 # errors of the file system that end a run with a message instead of a traceback
 WRITE_ERRORS = (
@@ -110,7 +109,7 @@ def write_errors(folder: Path) -> Iterator[None]:
             raise
         raise UserError(
             f"{error.filename} has been removed or replaced while it was needed: another command "
-            f"works in {folder}{holder(folder)}; run this one again when that has ended"
+            f"works in {folder}; run this one again when that has ended"
         ) from error
     except OSError as error:
         if not _is_write_error(error):
