@@ -692,7 +692,13 @@ _KNOWN: dict[str, list[bytes]] = {}
 
 
 def seeds(name: str) -> list[bytes]:
-    return _KNOWN.setdefault(name, TARGETS[name].seeds())
+    """Return the valid files; the first one is read once, which imports what it needs, before
+    memory is measured.
+    """
+    if name not in _KNOWN:
+        _KNOWN[name] = TARGETS[name].seeds()
+        outcome_of(TARGETS[name]._replace(traced=False), _KNOWN[name][0])
+    return _KNOWN[name]
 
 
 def mutant(name: str, seed: int, index: int) -> bytes:

@@ -51,6 +51,7 @@ def test_files_are_read_correctly_or_refused(name):
 
 @pytest.mark.parametrize("path", CORPUS, ids=lambda path: f"{path.parent.name}-{path.stem}")
 def test_a_file_of_an_earlier_defect_is_refused(path):
+    assert seeds(path.parent.name)
     outcome = outcome_of(TARGETS[path.parent.name], path.read_bytes())
     assert outcome.kind == "refused", outcome
 
