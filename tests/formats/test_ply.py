@@ -320,7 +320,7 @@ class TestDamage:
             (header("binary_middle_endian"), "binary_middle_endian"),
             (header().replace("format ascii 1.0\n", ""), "format None"),
             (header().replace("format ascii 1.0\n", "format ascii 1.0\n" * 2), "unknown line"),
-            (header(count=1, before="element vertex 1\nproperty float x"), "truncated or damaged"),
+            (header(count=1, before="element vertex 1\nproperty float x"), "are there twice"),
             (header(count=1, properties=["float x", "uchar z"]) + "2 256\n", "range of its type"),
             (header(count=1, before=FACE) + "3 0 1\n2 1 2 3\n", "a list is longer than the file"),
             (header(count=1, before=FACE) + "3 0 1 2 9\n2 1 2 3\n", "'face' holds other numbers"),
