@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch.utils.checkpoint import checkpoint
 
-from tests.helpers.splatting_draws import BACKGROUND, compare, draw, repeatable
+from tests.helpers.splatting_draws import BACKGROUND, compare, draw, repeatable, specified
 from tests.helpers.splatting_scenes import (
     NAMES,
     NO_CUTOFFS,
@@ -26,7 +26,6 @@ from tests.helpers.splatting_scenes import (
     random_cloud,
     rasterize,
     require_backward_twice_adds_up,
-    run,
     trimmed_error,
 )
 
@@ -108,7 +107,7 @@ class KernelContract:
         places.
         """
         cloud, camera = random_cloud(8000, seed=5, size=0.02), cameras(2, 160, 144)
-        truth = run(cloud, *camera, 160, 144, BACKGROUND, backend="torch")
+        truth = specified(cloud, *camera, 160, 144, BACKGROUND, backend="torch")
         ours = draw(backend, cloud, camera, 160, 144, BACKGROUND)
         for name in ("image", "alpha", "depth"):
             pictures = (getattr(drawn.out, name).flatten(0, 2) for drawn in (ours, truth))
@@ -170,7 +169,7 @@ class KernelContract:
         cloud = random_cloud(n, seed, size=size, stretch=stretch)
         camera = cameras(1 + seed % 3, width, height)
         ours = draw(backend, cloud, camera, width, height)
-        truth = run(cloud, *camera, width, height, backend="reference")
+        truth = specified(cloud, *camera, width, height)
         assert (ours.out.image - truth.out.image).abs().max() < 2 / 1024
         largest = max((g.abs().max() for g in truth.grads.values() if g.numel()), default=0)
         for name in NAMES:

@@ -23,11 +23,14 @@ _specified: dict[tuple, Run] = {}
 
 
 def specified(cloud: Cloud, *view, **options) -> Run:
-    """Return what the specification draws in float64, computed once for all backends."""
+    """Return what the specification, or the ``backend`` of the options, draws in float64; computed
+    once for all kernels.
+    """
+    options = {"backend": "reference"} | options
     values = [*cloud, *view, *options.values()]
     key = *options, *(x.numpy().tobytes() if isinstance(x, torch.Tensor) else x for x in values)
     if key not in _specified:
-        _specified[key] = run(cloud, *view, backend="reference", **options)
+        _specified[key] = run(cloud, *view, **options)
     return _specified[key]
 
 
