@@ -7,8 +7,7 @@ import pytest
 from threestudio_gaussiandreamer import register_parts
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.launch.config import load_config
-from threestudio_gaussiandreamer.launch.config_check import check_config
-from threestudio_gaussiandreamer.launch.section_checks import check_shared_views
+from threestudio_gaussiandreamer.launch.config_check import check_config, check_shared_views
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 PERP_NEG = "system.prompt_processor.use_perp_neg=true"

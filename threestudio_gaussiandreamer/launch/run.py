@@ -29,12 +29,11 @@ from .callbacks import (
     Stopped,
 )
 from .checkpoints import AtomicCheckpointIO
-from .config_check import build, plain
+from .config_check import build, check_shared_views, plain
 from .ddp import environment_plugins, planned_processes, trainer_options
 from .folder_lock import RunFolder, claim, claim_new, require_writable
 from .live_viewer import LiveViewer, ViewerConfig
 from .run_folder import PARSED, SIZES, changes_since, renumber, resume_command
-from .section_checks import check_shared_views
 from .stage_errors import lightning_errors, write_errors
 from .training_state import check_training_state
 
