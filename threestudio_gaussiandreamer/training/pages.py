@@ -38,8 +38,7 @@ TURNTABLE_FRAMES, TURNTABLE_SIZE, TURNTABLE_SECONDS = 40, 256, 4.0
 
 def save_first_cloud(system: Any) -> None:
     """Keep the cloud that training starts with, so that pages can show it beside the result."""
-    can_save = system._save_dir is not None and _is_cloud(system.geometry)
-    if can_save and system.cfg.pages and system.trainer.is_global_zero:
+    if _is_cloud(system.geometry) and system.cfg.pages and system.trainer.is_global_zero:
         first = StoredCloud(read_gaussians(system.geometry))
         write_cloud(system.get_save_path(FIRST_CLOUD), first, ".spz")
 

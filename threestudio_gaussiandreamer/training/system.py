@@ -229,7 +229,7 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         self.require_finite()
         if problem := self.density.schedule_problem(self.global_step, self.trainer.max_steps):
             warn(problem)
-        if self.global_step == 0:
+        if self.global_step == 0 and self._save_dir is not None:
             save_first_cloud(self)
         if self.measurements:
             if self.global_step == 0:

@@ -58,7 +58,7 @@ def import_lightning() -> None:
             sys.meta_path.insert(0, Submodules)
             late(METRICS, __version__=metadata.version(METRICS), _logger=logging.getLogger(METRICS))
             # no module is compiled, and no function leaves a graph, before the compiler has run
-            sys.modules["torch"]._dynamo = late(
+            vars(sys.modules["torch"])["_dynamo"] = late(
                 COMPILER,
                 OptimizedModule=type("OptimizedModule", (), {}),
                 disable=lambda function=None, *_, **__: function or (lambda f: f),

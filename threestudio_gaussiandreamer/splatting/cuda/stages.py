@@ -21,7 +21,7 @@ SPLAT, ROW = 16, 12  # floats
 NOWHERE = 2**31 - 1  # the tile of an intersection that isn't used
 CAMERA_SUMS, CAMERA_THREADS = 12, 384
 
-Argument = Union[Tensor, ctypes.Structure, ctypes._SimpleCData]
+Argument = Union[Tensor, ctypes.Structure, ctypes.c_int, ctypes.c_int64]
 
 
 class AsyncReadback(Protocol):
