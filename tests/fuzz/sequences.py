@@ -97,13 +97,9 @@ class CloudSequence(RuleBasedStateMachine):
         options = {"grad_threshold": threshold, "split_scale": split, "every": 1}
         self._round(densify=options | {"min_opacity": faint, "max_scale": huge})
 
-    @rule(
-        budget=st.sampled_from([64, 65, 80, 400]),
-        keep=st.floats(0.01, 0.99),
-        score=st.sampled_from(["contribution", "opacity", "random"]),
-    )
-    def prune(self, budget: int, keep: float, score: str) -> None:
-        self._round(budget=budget, prune={"keep": keep, "score": score})
+    @rule(budget=st.sampled_from([64, 65, 80, 400]), keep=st.floats(0.01, 0.99))
+    def prune(self, budget: int, keep: float) -> None:
+        self._round(budget=budget, prune={"keep": keep})
 
     @rule(keep=st.floats(0.01, 0.99), gain=st.floats(0.01, 5.9), error=st.floats(0, 1e30))
     def prune_as_far_as_it_pays(self, keep: float, gain: float, error: float) -> None:

@@ -106,32 +106,14 @@ def test_the_lowest_scores_are_pruned_first(sampled):
     assert torch.equal(geometry.means, expected)
 
 
-@pytest.mark.parametrize("name", importance.SCORES)
-def test_each_score_ranks_by_what_it_says(name):
-    contribution, removal = (
-        torch.tensor([0.1, 0.2, 0.3]),
-        torch.tensor([4.0, 0.25, 0.36]),
-    )  # roots: 2, 0.5, 0.6
-    logits = torch.tensor([3.0, 1.0, 2.0])
-    stats = importance.VisibilityStats(contribution, removal)
-    scores = [
-        importance.importance_by(name, logits, stats, generator(0, "s", step)) for step in (0, 0, 1)
-    ]
-    expected = {
-        "opacity": logits,
-        "contribution": contribution,
-        "removal": torch.tensor([0.2, 0.1, 0.18]),
-        "random": scores[1],
-    }
-    assert torch.allclose(scores[0], expected[name])
-    assert torch.equal(scores[0], scores[2]) == (name != "random")
+def test_importance_is_the_root_of_the_removal_error_times_the_contribution():
+    stats = importance.VisibilityStats(torch.tensor([0.1, 0.2]), torch.tensor([4.0, 0.25]))
+    assert torch.allclose(importance.importance(stats), torch.tensor([0.2, 0.1]))
 
 
 def test_without_samples_the_contribution_ranks():
     stats = importance.VisibilityStats(torch.tensor([0.1, 0.3, 0.2]), torch.zeros(3))
-    assert importance.importance_by(
-        "removal", torch.zeros(3), stats, generator(0, "s")
-    ).argsort().tolist() == [0, 2, 1]
+    assert importance.importance(stats).argsort().tolist() == [0, 2, 1]
 
 
 def drawn(geometry, opacities, preset="accurate"):

@@ -9,7 +9,7 @@ removed ones. Two quantities are collected between rounds:
 - the *removal error*, the squared change of the views if that Gaussian alone were removed, which is
   also small in front of a background of the same colour: :func:`removal_error`.
 
-The score ``removal`` is the square root of the removal error times the contribution. Each term
+Importance is the square root of the removal error times the contribution. Each term
 alone ranks some redundant Gaussians high; their product does not.
 
 How many Gaussians a scene needs follows from the removal error too: it is the squared error that a
@@ -30,8 +30,6 @@ from ..core.given_gradient import given_gradient
 from ..core.host_copies import to_device
 from .densify import Change, prune_to
 
-SCORES = ("removal", "contribution", "opacity", "random")
-"""Scores by which Gaussians can be ranked; the last two are baselines for comparison."""
 SAMPLES = 12
 """Approximate number of samples of the removal error per round; each costs a backward pass."""
 SLOPE, POWER = 0.12, 3
@@ -61,15 +59,9 @@ class AddedBackground(NamedTuple):
     """May be negative."""
 
 
-def importance_by(
-    name: str, logit_opacities: Float[Tensor, " N"], stats: VisibilityStats, rng: torch.Generator
-) -> Float[Tensor, " N"]:
-    """Return the importance of each Gaussian by one of ``SCORES``; the lowest are pruned first."""
-    if name == "opacity":
-        return logit_opacities.detach()
-    if name == "random":
-        return torch.rand(len(stats.contribution), generator=rng).to(stats.contribution.device)
-    if name == "contribution" or not stats.removal.any():  # no step has sampled the removal error
+def importance(stats: VisibilityStats) -> Float[Tensor, " N"]:
+    """Return the importance of each Gaussian; the lowest are pruned first."""
+    if not stats.removal.any():  # no step has sampled the removal error
         return stats.contribution
     return stats.removal.sqrt() * stats.contribution
 

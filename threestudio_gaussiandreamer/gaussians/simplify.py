@@ -4,7 +4,7 @@ recover after each round by fitting images of the original.
 A large cloud is first pruned at once to the fewest Gaussians with the same images, by the
 contribution of each, which rendering the images to be kept has given, and then by importance. Then
 duplicates are merged (``merge.py``). Then each round computes the importance in the training views
-(the score ``removal`` of ``importance.py``), keeps the best 80 %, and fits them to images of the
+(``importance.py``), keeps the best 80 %, and fits them to images of the
 original (``recover.py``). Pruning many more at once gives worse results than training with the
 smaller number from the start."""
 
@@ -20,7 +20,7 @@ from torch import Tensor
 from ..core.errors import UserError
 from ..core.streams import generator
 from .gaussians import Gaussians
-from .importance import VisibilityStats, importance_by, removal_error, smallest_count
+from .importance import VisibilityStats, importance, removal_error, smallest_count
 from .merge import merge_duplicates
 from .recover import Recovery, Round
 from .views import Views, draw, row_batches
@@ -73,8 +73,7 @@ def view_importance(cloud: Gaussians, views: Views, seed: int = 0) -> Float[Tens
         image, contributed = draw(cloud, views, rows, opacities)
         contribution = torch.maximum(contribution, contributed.amax(0))
         removal = removal + removal_error(image, opacities, rng)
-    stats = VisibilityStats(contribution, removal)
-    return importance_by("removal", cloud.logit_opacities, stats, rng)
+    return importance(VisibilityStats(contribution, removal))
 
 
 def simplify(

@@ -289,13 +289,10 @@ class DensityControl(DensityRule):
 
     def samples_removal(self, step: int) -> bool:
         """Return whether a sample of the removal error is due after ``step`` finished steps."""
-        cfg = self.cloud.cfg.prune
-        budget = self.cloud.cfg.budget
-        if budget is None or (cfg.score != "removal" and budget != AUTO):
+        cfg = self.cloud.cfg
+        if cfg.budget is None or not self.pruning_at(step) or len(self.cloud) <= min_count(cfg):
             return False
-        if not self.pruning_at(step) or len(self.cloud) <= min_count(self.cloud.cfg):
-            return False
-        return step % max(1, round(cfg.every / importance.SAMPLES)) == 0
+        return step % max(1, round(cfg.prune.every / importance.SAMPLES)) == 0
 
     def after_backward(
         self, out: Rasterized, width: int, height: int, loss_scale: float = 1.0
@@ -394,8 +391,7 @@ class DensityControl(DensityRule):
         values = cloud.parameters_by_name() if first is None else first.values
         rows = slice(None) if first is None else first.parents
         stats = importance.VisibilityStats(cloud.contribution[rows], cloud.removal[rows])
-        rng = generator(run_seed(), "prune", step)
-        scores = importance.importance_by(cfg.score, values["logit_opacities"], stats, rng)
+        scores = importance.importance(stats)
         share = self.kept_share(len(scores), step)
         count, needed = importance.next_count(len(scores), share, min_count(self.cloud.cfg)), None
         if self.cloud.cfg.budget == AUTO:

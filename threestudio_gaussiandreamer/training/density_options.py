@@ -8,8 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 from ..core.errors import UserError
-from ..core.options import at_least, between, in_range, is_whole, one_of, positive, shown
-from ..gaussians import importance
+from ..core.options import at_least, between, in_range, is_whole, positive, shown
 
 AUTO = "auto"
 
@@ -38,10 +37,12 @@ class PruneConfig:
     stop: int = field(default=900, metadata=at_least(0))
     every: int = field(default=50, metadata=at_least(1))
     keep: float = field(default=0.8, metadata=between(0, 1))
-    score: str = field(default="removal", metadata=one_of(importance.SCORES))
     gain: float = field(default=0.5, metadata=between(0, 6, "dB"))
     likeness: float = field(default=40.0, metadata=at_least(0, "dB"))
-    REMOVED: ClassVar[dict[str, Any]] = {"quality": (0.1, "budget=auto goes by prune.gain")}
+    REMOVED: ClassVar[dict[str, Any]] = {
+        "quality": (0.1, "budget=auto goes by prune.gain"),
+        "score": ("removal", "the removal error ranks Gaussians"),
+    }
 
     @staticmethod
     def check(cfg: Any) -> None:

@@ -32,9 +32,8 @@ budget              how many Gaussians a run ends with: a number, null or none (
                     start are merged (``merge.py``)
 prune               how the budget is met (``importance.py``): start, stop, every (steps), keep (the
                     share that a round keeps; less only where there are too few rounds for a budget
-                    that is a number), score (removal, contribution; opacity, random: to compare
-                    with), gain (dB, of ``auto``), likeness (dB, of ``auto`` where no truth is
-                    known: the error of the renders is taken to be that of this PSNR)
+                    that is a number), gain (dB, of ``auto``), likeness (dB, of ``auto`` where no
+                    truth is known: the error of the renders is taken to be that of this PSNR)
 max_gaussians       largest count: those with the least importance are dropped (of untrained points:
                     a uniform choice); min_gaussians: the least count that pruning leaves
 density_type,       the rule that changes the number of Gaussians, and its options; densify, budget
