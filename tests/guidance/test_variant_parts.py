@@ -6,7 +6,6 @@ import math
 
 import pytest
 import torch
-from omegaconf import OmegaConf
 
 from tests.guidance.exact_score_cases import guidance
 from tests.helpers import tiny_guidance as tiny
@@ -191,30 +190,6 @@ def test_a_variant_with_the_old_name_of_the_method_is_told_and_works(caplog):
     assert "Named.error is called residual now" in caplog.text
     residual, _ = Named({}).residual(None, latents(), None, {})
     assert torch.equal(residual, 0.25 * latents())
-
-
-@pytest.mark.parametrize(
-    ("options", "level", "said"),
-    [
-        ({"reuse_steps": 1, "timestep_steps": 0}, "INFO", "reuse_steps is no option any more: ea"),
-        ({"reuse_steps": 4}, "WARNING", "reuse_steps is no option any more: each step evaluates"),
-        ({"timestep_schedule": "linear"}, "WARNING", "give both the same schedule"),
-        ({"variant_type": "cfd-variant", "variant": {"refresh": 3}}, "WARNING", "variant.refresh"),
-        ({"variant_type": "ism-variant", "variant": {"stride": 0.2}}, "INFO", "variant.stride"),
-    ],
-)
-def test_options_of_earlier_versions_are_left_out_with_a_line(
-    mesh_path, caplog, options, level, said
-):
-    caplog.set_level("INFO")
-    kept = {"mesh": mesh_path} | {k: v for k, v in options.items() if k == "variant_type"}
-    values = OmegaConf.create({"mesh": mesh_path, **options})
-    check_part("system.guidance", "exact-score-guidance", values)
-    assert {key: value for key, value in values.items() if value != {}} == kept
-    lines = [line for line in caplog.records if "no option any more" in line.message]
-    assert {line.levelname for line in lines} == {level}
-    assert any(said in line.message for line in lines)
-    ExactScoreGuidance.preflight({"mesh": mesh_path, **options})
 
 
 # What limits the cost of variants, and what is refused
