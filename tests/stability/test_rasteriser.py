@@ -230,7 +230,7 @@ def needle_gradients(**options) -> list[dict[str, torch.Tensor]]:
 
 
 @row("A1", "Needle, disc, scale 1e-8..1e4")
-@pytest.mark.parametrize("backend", backends_of("reference"))
+@pytest.mark.parametrize("backend", backends_of("reference", "torch"))
 def test_needles_and_discs(backend, measured):
     """The reference uses scales and quaternions rounded to float32; a pixel may fall on the other
     side of alpha_min.
@@ -471,7 +471,7 @@ def test_float32_gradients_with_the_cutoffs_on(backend, preset, measured):
 
 
 @row("A1", "Determinism of reductions")
-@pytest.mark.parametrize("backend", THREADED)
+@pytest.mark.parametrize("backend", backends_of("torch", without=("reference", "cuda")))
 def test_the_same_bits_for_any_number_of_threads(backend, measured):
     """Forward, backward and an optimiser step, 100 times (10 in plain torch); ten runs with 1, 2, 4
     and 8 threads.

@@ -267,7 +267,8 @@ def over_the_edge(tmp_path_factory) -> Ended:
 
 
 @row("A4", "Resume mid-schedule")
-@pytest.mark.parametrize("step", [5, *slow(4, 6)])
+@pytest.mark.slow
+@pytest.mark.parametrize("step", [4, 5, 6])
 def test_resumed_at_the_edge_of_every_schedule(step, over_the_edge, tmp_path, measured):
     """Timesteps, clip, resolution, learning rate and weight all jump from step 5 to step 6, like
     the paper's from 500 to 501.
