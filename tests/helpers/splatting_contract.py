@@ -88,6 +88,7 @@ class KernelContract:
         gradients = ours.grads["opacities"]
         assert gradients[::4].abs().min() > 1e-3 * gradients.abs().max() and gradients[5] == 0
 
+    @pytest.mark.slow  # for the specification; the fast tests have each of these alone
     def test_a_few_thousand_gaussians(self, backend):
         """More than a chunk per tile, early termination, capped alphas; gradients of everything."""
         cloud = random_cloud(3000, seed=4, size=0.06)

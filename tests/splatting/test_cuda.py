@@ -26,6 +26,7 @@ from threestudio_gaussiandreamer.splatting.cuda import backend as cuda
 from threestudio_gaussiandreamer.splatting.cuda import driver as cuda_driver
 from threestudio_gaussiandreamer.splatting.cuda import memory as cuda_memory
 
+SLOW = pytest.mark.slow
 pytestmark = pytest.mark.skipif(unavailable() is not None, reason=str(unavailable()))
 
 
@@ -51,7 +52,7 @@ def device(monkeypatch):
     return exchange
 
 
-@pytest.mark.slow
+@SLOW
 class TestCudaKernels(KernelContract):
     @pytest.fixture
     def backend(self):
@@ -80,17 +81,20 @@ def opaque_cloud() -> Cloud:
     return cloud._replace(opacities=torch.full_like(cloud.opacities, 0.99))
 
 
-CLOUDS = {"thin": None, "opaque": opaque_cloud()}
+each_cloud = pytest.mark.parametrize(
+    "cloud",
+    [pytest.param(None, id="thin"), pytest.param(opaque_cloud(), id="opaque", marks=SLOW)],
+)
 
 
-@pytest.mark.parametrize("cloud", CLOUDS.values(), ids=CLOUDS)
+@each_cloud
 def test_the_order_of_the_threads_changes_no_bit(device, cloud):
     """Detects a missing barrier, and sums in the order of arrival."""
     one, *others = (scene(device, cloud, order=order) for order in (*ORDERS, "forward"))
     assert all(same(one, other) for other in others)
 
 
-@pytest.mark.parametrize("cloud", CLOUDS.values(), ids=CLOUDS)
+@each_cloud
 def test_nothing_is_read_before_it_is_written(device, monkeypatch, cloud):
     """Torch fills allocations with NaN, the emulation shared memory."""
     plain = scene(device, cloud)

@@ -9,9 +9,7 @@ from hypothesis import strategies as st
 
 from tests.helpers.splatting_scenes import (
     EXTREMES,
-    NAMES,
     NO_CUTOFFS,
-    SINGLE,
     Cloud,
     cameras,
     error,
@@ -22,8 +20,6 @@ from tests.helpers.splatting_scenes import (
     rasterize,
     require_backward_twice_adds_up,
     run,
-    stacks_on_one_pixel,
-    trimmed_error,
 )
 from threestudio_gaussiandreamer.core.devices import torch_threads
 from threestudio_gaussiandreamer.splatting import tiles, torch_backend
@@ -134,32 +130,6 @@ def test_extreme_clouds(seed, n, antialias):
     assert all(x.isfinite().all() for x in (*single.out, *single.grads.values()))
 
 
-def test_float32_gradients_of_a_larger_cloud():
-    cloud, camera = random_cloud(2000, seed=4, size=0.04), cameras(1, 48, 40)
-    cloud.opacities[:50] = 0.9999
-    background = torch.tensor([0.2, 0.5, 0.9])
-    truth = run(cloud, *camera, 48, 40, background, preset="accurate", backend="reference")
-    ours = run(
-        cloud.to(torch.float32), *camera, 48, 40, background, preset="accurate", backend="torch"
-    )
-    assert error(ours.out.depth, truth.out.depth) < SINGLE
-    for name in NAMES:
-        assert trimmed_error(ours.grads[name], truth.grads[name]) < SINGLE, name
-
-
-def test_ten_thousand_gaussians_on_one_pixel():
-    """Float32 gradients of a deep stack: T is never divided by (1 - alpha) along the list, so
-    errors do not accumulate (bar: 1e-4).
-    """
-    camera = front_camera(3, 3, 4.0)
-    for stack in stacks_on_one_pixel():
-        truth = run(stack, *camera, 3, 3, backend="reference")
-        ours = run(stack.to(torch.float32), *camera, 3, 3, backend="torch")
-        assert error(ours.out.image, truth.out.image) < 1e-5
-        for name in ("scales", "opacities", "colors", "means"):
-            assert trimmed_error(ours.grads[name], truth.grads[name]) < 1e-4, name
-
-
 def test_a_pixel_behind_an_alpha_of_one_has_finite_gradients():
     """1 / (1 - alpha) is infinite there; what is behind is invisible, so its share is zero."""
     cloud = Cloud(*(x.repeat(3, *[1] * (x.dim() - 1)) for x in one_gaussian(opacity=1.0))).to(
@@ -216,17 +186,13 @@ def test_blocks_and_saved_tensors_are_bounded(monkeypatch):
     assert sum(saved) < 400_000
 
 
-@pytest.mark.parametrize("width, height", [(96, 80), (8, 8)])
-def test_the_number_of_threads_changes_no_bit(width, height):
-    """Also with a single tile, whose matrix products the threads would otherwise share."""
-    cloud, camera = (
-        random_cloud(3000, seed=10, size=0.05).to(torch.float32),
-        cameras(2 if width > 8 else 1, width, height),
-    )
+def test_the_number_of_threads_changes_no_bit_of_a_single_tile():
+    """Whose matrix products the threads would otherwise share."""
+    cloud, camera = random_cloud(3000, seed=10, size=0.05).to(torch.float32), cameras(1, 8, 8)
     results = []
     for count in (1, 2, 3):
         with torch_threads(count):
-            results.append(run(cloud, *camera, width, height, backend="torch"))
+            results.append(run(cloud, *camera, 8, 8, backend="torch"))
     for other in results[1:]:
         assert all(torch.equal(a, b) for a, b in zip(results[0].out, other.out, strict=True))
         assert all(torch.equal(grad, other.grads[name]) for name, grad in results[0].grads.items())
