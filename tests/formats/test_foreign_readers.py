@@ -2,14 +2,13 @@
 
 PlayCanvas' splat-transform and Babylon.js (npm: @playcanvas/splat-transform, @babylonjs/core and
 @babylonjs/loaders in the folder node_modules that the environment variable VIEWER_NODE_MODULES
-names), and from PyPI gaussforge, gsply, pygltflib and Pillow; each is skipped where it isn't
-installed. OpenUSD's parser reads USDA in ``test_usda.py``."""
+names), and from PyPI gaussforge and pygltflib; each is skipped where it isn't installed. OpenUSD's
+parser reads USDA in ``test_usda.py``.
+"""
 
-import io
 import os
 import shutil
 import subprocess
-import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -123,59 +122,6 @@ def test_gaussforge_reads_what_we_write(tmp_path, name, degree):
     assert_close(in_order_of(ours, theirs), theirs, opacities=2e-3, sh=0.02)
 
 
-# ---- gsply ---------------------------------------------------------------------------------------
-
-
-def some(degree, count=50):
-    rng = np.random.default_rng(0)
-    shapes = [(3,), (4,), (3,), (), ((degree + 1) ** 2, 3)]
-    gaussians = Gaussians(
-        *(rng.normal(size=(count, *shape)).astype(np.float32) for shape in shapes)
-    )
-    gaussians.sh[:, 1:] *= 0.2
-    gaussians.logit_opacities[:3] = [87, 12, -30]
-    return gaussians._replace(log_scales=gaussians.log_scales - 4)
-
-
-def by_gsply(path):
-    gsply = pytest.importorskip("gsply", reason="gsply isn't installed")
-    data = gsply.read_spz(path) if path.suffix == ".spz" else gsply.plyread(path)
-    sh = data.sh0[:, None]
-    if data.shN is not None:
-        sh = np.concatenate([sh, data.shN.reshape(len(sh), -1, 3)], axis=1)
-    return Gaussians(data.means, data.quats, data.scales, data.opacities.reshape(-1), sh)
-
-
-@pytest.mark.parametrize("degree", [0, 3])
-def test_a_ply_holds_what_was_written(tmp_path, degree):
-    stored = StoredCloud(some(degree)).in_axes("-y")
-    write_cloud(str(tmp_path / "a.ply"), stored)
-    for ours, theirs in zip(stored.gaussians, by_gsply(tmp_path / "a.ply"), strict=True):
-        np.testing.assert_array_equal(ours, theirs)
-
-
-@pytest.mark.parametrize("degree", [0, 3])
-def test_an_spz_file_is_read_as_we_read_it(tmp_path, degree):
-    write_cloud(str(tmp_path / "a.spz"), StoredCloud(some(degree)))
-    ours, theirs = read_cloud(str(tmp_path / "a.spz")).gaussians, by_gsply(tmp_path / "a.spz")
-    for name in ("means", "quats", "log_scales", "sh"):
-        np.testing.assert_allclose(getattr(ours, name), getattr(theirs, name), atol=1e-6)
-    opacities = [1 / (1 + np.exp(-values.logit_opacities)) for values in (ours, theirs)]
-    np.testing.assert_allclose(*opacities, atol=1 / 2000)  # the byte 0 is a logit of choice
-    assert theirs.logit_opacities.max() < 6  # and 255 would be one too
-
-
-def test_its_compressed_ply_is_read(tmp_path):
-    gsply = pytest.importorskip("gsply", reason="gsply isn't installed")
-    means, quats, log_scales, logits, sh = some(0)
-    data = gsply.GSData(means, log_scales, quats, logits, sh[:, 0], np.zeros((50, 0, 3)))
-    gsply.plywrite(tmp_path / "a.compressed.ply", data, compressed=True)
-    read = read_cloud(str(tmp_path / "a.compressed.ply")).gaussians
-    order = [np.abs(means - mean).sum(1).argmin() for mean in read.means]
-    np.testing.assert_allclose(read.means, means[order], atol=5e-3)
-    np.testing.assert_allclose(read.log_scales, log_scales[order], atol=5e-3)
-
-
 # ---- parsers of the containers -------------------------------------------------------------------
 
 
@@ -201,16 +147,3 @@ def test_pygltflib_reads_what_we_write(tmp_path):
     xyzw = rows("KHR_gaussian_splatting:ROTATION", 4)
     expected = cloud.quats / np.linalg.norm(cloud.quats, axis=1, keepdims=True)
     np.testing.assert_allclose(xyzw[:, [3, 0, 1, 2]], expected, atol=1e-6)
-
-
-def test_pillow_reads_the_images_as_lossless_webp(tmp_path):
-    from PIL import Image
-
-    with zipfile.ZipFile(write(tmp_path / "a.sog", ball(300, 1))) as archive:
-        assert archive.testzip() is None
-        for name in archive.namelist():
-            if name.endswith(".webp"):
-                data = archive.read(name)
-                assert data[12:16] == b"VP8L"
-                with Image.open(io.BytesIO(data)) as image:
-                    assert image.format == "WEBP" and image.width % 4 == 0

@@ -2,7 +2,6 @@
 
 import struct
 import time
-import tracemalloc
 
 import numpy as np
 import pytest
@@ -51,24 +50,7 @@ class TestGaussians:
             ply.write_points(tmp_path / "b.ply", bad)
         assert not (tmp_path / "b.ply").exists()
 
-    def test_the_layout_is_the_one_of_the_viewers(self, tmp_path):
-        arrays = gaussians(2, degree=1)
-        ply.write_gaussians(tmp_path / "a.ply", arrays)
-        head, data = (tmp_path / "a.ply").read_bytes().split(b"end_header\n")
-        lines = head.decode().splitlines()
-        names = [line.split()[-1] for line in lines if line.startswith("property float ")]
-        rest = [f"f_rest_{i}" for i in range(9)]
-        first = [*"xyz", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
-        assert names == [*first, *rest, "opacity", *ply.LOG_SCALES, *ply.QUATS]
-        assert head.startswith(b"ply\nformat binary_little_endian 1.0\nelement vertex 2\n")
-        row = np.array(struct.unpack(f"<{len(names)}f", data[: 4 * len(names)]), np.float32)
-        harmonics = row[names.index("f_rest_0") :][:9]  # red's three, green's, blue's
-        np.testing.assert_array_equal(harmonics, arrays.sh[0, 1:].T.ravel())
-        np.testing.assert_array_equal(row[-4:], arrays.quats[0])
-        assert len(data) == 2 * 4 * len(names)
-
-    @pytest.mark.parametrize("order", ["<", ">"])
-    def test_any_order_of_properties_and_bytes_and_extra_ones(self, tmp_path, order):
+    def test_doubles_in_any_order_and_extra_ones(self, tmp_path):
         expected = gaussians(7, degree=1)
         names = [*ply.GAUSSIAN, *(f"f_rest_{i}" for i in range(9)), "segment"]
         columns = dict(zip(ply.MEANS, expected.means.T, strict=True))
@@ -78,22 +60,13 @@ class TestGaussians:
         columns |= {f"rot_{i}": expected.quats[:, i] for i in range(4)}
         columns |= {f"f_rest_{i}": expected.sh[:, 1 + i % 3, i // 3] for i in range(9)}
         names = list(rng().permutation(names))
-        rows = np.zeros(7, [(name, order + "f8") for name in names])
+        rows = np.zeros(7, [(name, ">f8") for name in names])
         for name in names:
             rows[name] = columns[name]
-        encoding = "binary_little_endian" if order == "<" else "binary_big_endian"
-        head = header(encoding, 7, [f"double {name}" for name in names]).encode()
+        head = header("binary_big_endian", 7, [f"double {name}" for name in names]).encode()
         path = saved(tmp_path, head + rows.tobytes())
         assert_same(ply.read_gaussians(path), expected)
         assert ply.is_gaussian_ply(path)
-
-    def test_text(self, tmp_path):
-        expected = gaussians(3)
-        means, quats, scales, logits, sh = expected
-        rows = np.concatenate([means, sh[:, 0], logits[:, None], scales, quats], axis=1)
-        text = "\n".join(" ".join(repr(float(value)) for value in row) for row in rows)
-        head = header("ascii", 3, [f"float {name}" for name in ply.GAUSSIAN])
-        assert_same(ply.read_gaussians(saved(tmp_path, head + text)), expected)
 
     def test_what_is_not_known_is_named(self, tmp_path, caplog):
         ply.write_gaussians(tmp_path / "a.ply", gaussians())
@@ -297,17 +270,6 @@ class TestDamage:
         caplog.clear()
         ply.read_points(saved(tmp_path, header(encoding, 3).encode() + data + b"\n\n"))
         assert not [record for record in caplog.records if "follow" in record.message]
-
-    @pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian"])
-    @pytest.mark.parametrize("count", [3, 10**12, 10**18])
-    def test_a_wrong_count_allocates_nothing(self, tmp_path, encoding, count):
-        data = b"1 2 3\n4 5 6\n" if encoding == "ascii" else bytes(24)
-        path = saved(tmp_path, header(encoding, count).encode() + data)
-        tracemalloc.start()
-        with pytest.raises(UserError, match="file.ply.*(truncated|announced)"):
-            ply.read_points(path)
-        assert tracemalloc.get_traced_memory()[1] < 4 << 20  # the header's limit, and change
-        tracemalloc.stop()
 
     @pytest.mark.parametrize(
         "content, problem",

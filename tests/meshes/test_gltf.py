@@ -306,20 +306,6 @@ def test_damage_is_one_message(path, value, message, saved):
         read_gltf(saved(changed(textured_quad(FOUR, sampler=NEAREST), path, value)))
 
 
-@pytest.mark.parametrize(
-    ("content", "said"),
-    [
-        (b"<!doctype html>", "is a web page, not the file itself"),
-        (b"broken", "isn't a GLB file, which begins with glTF"),
-        (b"", "isn't a GLB file, which begins with glTF"),
-    ],
-)
-def test_a_glb_of_something_else_is_named_as_such(tmp_path, content, said):
-    (tmp_path / "a.glb").write_bytes(content)
-    with pytest.raises(UserError, match=said):
-        load_mesh(tmp_path / "a.glb")
-
-
 # ---- one memory budget for everything in a file --------------------------------------------------
 
 

@@ -7,8 +7,6 @@ from threestudio_gaussiandreamer.meshes.load import load_mesh
 from threestudio_gaussiandreamer.meshes.mesh import (
     Mesh,
     SurfaceDistance,
-    face_areas,
-    sample_surface,
     surface_colors,
 )
 
@@ -33,23 +31,6 @@ def test_texels_are_bilinear_and_repeat():
         np.testing.assert_allclose(
             surface_colors(mesh, np.array([0]), np.full((1, 3), 1 / 3))[0], color, atol=1e-6
         )
-
-
-def test_samples_are_uniform_over_the_area_and_ignore_empty_faces():
-    from scipy import stats
-
-    vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 3, 0]], float)
-    mesh = Mesh(vertices, np.array([[0, 1, 2], [1, 1, 2], [1, 3, 2]]))
-    points, faces, weights = sample_surface(mesh, 20000, np.random.default_rng(0))
-    areas = face_areas(mesh)
-    np.testing.assert_allclose(areas, [0.5, 0, 1.5], atol=1e-12)
-    assert not (faces == 1).any()
-    assert stats.binomtest(int((faces == 0).sum()), 20000, 0.25).pvalue > 0.01
-    first = points[faces == 0]
-    assert (
-        stats.kstest(1 - (1 - first[:, 0]) ** 2, "uniform").pvalue > 0.01
-    )  # the marginal of a uniform right triangle
-    np.testing.assert_allclose(weights.sum(axis=1), 1, atol=1e-12)
 
 
 def test_surface_distances_of_a_sphere(tmp_path):
