@@ -50,21 +50,10 @@ def test_one_of_the_default_prompts_is_withheld_from_training():
     assert [withheld(attributes_in(prompt)) for prompt in demo.PROMPTS] == [False, False, True]
 
 
-def test_prompts_become_a_sheet_and_a_table(exported, tmp_path, capsys, in_process):
-    assert demo.main(arguments(exported, tmp_path, PROMPT, "a zebra: 1=2")) == 0
-    (folder,) = tmp_path.iterdir()
-    lines = (folder / "table.md").read_text().splitlines()
-    assert len(lines) == 2 + 2 * 3 and PROMPT in lines[2] and lines[3].split("|")[-2].strip()
-    assert lines[6].split("|")[3:8] == ["  "] * 5  # no known kind: nothing is recognised
-    assert Image.open(folder / "sheet.png").width == 9 * 128
-    assert str(folder / "sheet.png") in capsys.readouterr().out
-    assert demo.main(arguments(exported, tmp_path, PROMPT)) == 0  # a finished one isn't continued
-    assert len(list(tmp_path.iterdir())) == 2
-
-
-def test_an_interrupted_demo_continues(exported, tmp_path, monkeypatch, in_process):
-    words = arguments(exported, tmp_path, PROMPT, "a blue mug")
-    launch = demo.launch
+def test_an_interrupted_demo_continues_and_ends_with_a_sheet_and_a_table(
+    exported, tmp_path, monkeypatch, capsys, in_process
+):
+    words, launch = arguments(exported, tmp_path, PROMPT, "a zebra: 1=2"), demo.launch
 
     def stopped(options):
         launch(options)
@@ -79,9 +68,15 @@ def test_an_interrupted_demo_continues(exported, tmp_path, monkeypatch, in_proce
     monkeypatch.setattr(demo, "launch", launch)
     assert demo.main(words) == 0
     (folder,) = tmp_path.iterdir()
-    assert len(in_process) == 2 and (folder / "sheet.png").is_file()
-    record = read_json(folder / "runs" / "prompt2_a_blue_mug.json", dict)
+    assert len(in_process) == 2 and str(folder / "sheet.png") in capsys.readouterr().out
+    record = read_json(folder / "runs" / "prompt2_a_zebra_1_2.json", dict)
     assert record["finished"] and record["seconds"] >= 0.5  # with those before the interruption
+    lines = (folder / "table.md").read_text().splitlines()
+    assert len(lines) == 2 + 2 * 3 and PROMPT in lines[2] and lines[3].split("|")[-2].strip()
+    assert lines[6].split("|")[3:8] == ["  "] * 5  # no known kind: nothing is recognised
+    assert Image.open(folder / "sheet.png").width == 9 * 128
+    monkeypatch.setattr(demo, "launch", interrupted)
+    assert demo.main(words) == 130 and len(list(tmp_path.iterdir())) == 2  # not the finished one
 
 
 def test_an_error_of_a_run_ends_the_demo(exported, tmp_path, in_process):

@@ -132,7 +132,8 @@ def test_a_training_continues_from_the_weights(exported, trained, tmp_path):
         assert run.progress.history == ([record[name]["last"]] if record[name]["last"] else [])
         before = run.progress.images
         assert before == training(trained, name).progress.images
-        run.run(before + 4)
+        if name in ("unet", "judge"):
+            run.run(before + 4)
 
 
 def test_weights_of_another_size_are_refused(exported, tmp_path, monkeypatch):
@@ -150,27 +151,22 @@ def test_an_untrained_folder_and_a_target_that_can_not_be_made_are_messages(tmp_
     assert "TARGET: the folder" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("size", [100, 8000])
-def test_a_full_disk_is_one_message_and_the_export_can_be_repeated(trained, tmp_path, capsys, size):
-    """It fails in different files: weights, vocabulary, configuration."""
+def test_a_full_disk_is_one_message_and_the_export_can_be_repeated(trained, tmp_path, capsys):
     target = tmp_path / "models"
-    with largest_file(size):
-        assert main([str(trained), str(target)]) == 2
-    assert "cannot write" in capsys.readouterr().err
+    for size in (100, 8000):  # in weights or vocabulary, and in a configuration
+        with largest_file(size):
+            assert main([str(trained), str(target)]) == 2
+        assert "cannot write" in capsys.readouterr().err
     assert main([str(trained), str(target)]) == 0
-    assert sorted(read_digests(target)) == sorted(
-        path.relative_to(target).as_posix()
-        for path in target.rglob("*")
-        if path.is_file() and path.name != DIGESTS
-    )
+    files = {path.relative_to(target).as_posix() for path in target.rglob("*") if path.is_file()}
+    assert set(read_digests(target)) == files - {DIGESTS}
 
 
-@pytest.mark.parametrize("size", [3000, 20000])
-def test_a_full_disk_at_the_start_from_weights_is_mended_by_a_second_call(exported, tmp_path, size):
-    """It fails in the vocabulary, and in a checkpoint."""
+def test_a_full_disk_at_the_start_from_weights_is_mended_by_a_second_call(exported, tmp_path):
     start = exported, options(tmp_path), {"text": STAGES["text"]}
-    with largest_file(size), pytest.raises(UserError, match="cannot write"):
-        warm_start.start_from(*start)
+    for size in (3000, 20000):  # in the vocabulary, and in a checkpoint
+        with largest_file(size), pytest.raises(UserError, match="cannot write"):
+            warm_start.start_from(*start)
     warm_start.start_from(*start)
     assert is_trained(tmp_path, "text") and open_tokenizer(tmp_path)
 

@@ -25,37 +25,31 @@ def sure(attributes, sides=None):
     }
 
 
-def test_all_attributes_are_recognised_from_the_right_sides():
-    assert all(recognition.recognized(sure(FOX), FOX).values())
-    assert recognition.multi_face(sure(FOX), FOX) == 0.0
-
-
 @pytest.mark.parametrize(
     ("change", "missed"),
     [
-        ({"kind": "bear"}, "kind"),
-        ({"color": "black"}, "colors"),
-        ({"second": "black"}, "colors"),
-        ({"pattern": "dotted"}, "pattern"),
-        ({"accessory": None, "accessory_color": None}, "accessory"),
-        ({"accessory_color": "green"}, "accessory"),
-        ({"part": "green"}, "accessory"),
+        ({}, []),
+        ({"kind": "bear"}, ["kind"]),
+        ({"color": "black"}, ["colors"]),
+        ({"second": "black"}, ["colors"]),
+        ({"pattern": "dotted"}, ["pattern"]),
+        ({"accessory": None, "accessory_color": None}, ["accessory"]),
+        ({"accessory_color": "green"}, ["accessory"]),
+        ({"part": "green"}, ["accessory"]),
     ],
 )
 def test_one_wrong_attribute_is_missed_alone(change, missed):
     found = recognition.recognized(sure(FOX._replace(**change)), FOX)
-    assert [name for name, right in found.items() if not right] == [missed]
+    assert [name for name, right in found.items() if not right] == missed
 
 
-@pytest.mark.parametrize(
-    ("pattern", "right"), [("striped", True), ("checkered", True), ("dotted", False)]
-)
-def test_colours_may_be_exchanged_where_nobody_can_tell(pattern, right):
-    wanted = FOX._replace(pattern=pattern)
-    exchanged = wanted._replace(color=wanted.second, second=wanted.color)
-    assert recognition.recognized(sure(exchanged), wanted)["colors"] is right
-    plain = wanted._replace(pattern="plain", second=None)
-    assert not recognition.recognized(sure(plain), wanted)["colors"]
+def test_colours_may_be_exchanged_where_nobody_can_tell():
+    for pattern, right in (("striped", True), ("checkered", True), ("dotted", False)):
+        wanted = FOX._replace(pattern=pattern)
+        exchanged = wanted._replace(color=wanted.second, second=wanted.color)
+        assert recognition.recognized(sure(exchanged), wanted)["colors"] is right
+        plain = wanted._replace(pattern="plain", second=None)
+        assert not recognition.recognized(sure(plain), wanted)["colors"]
 
 
 def test_colours_and_pattern_are_a_combination_that_objects_have():
@@ -78,6 +72,7 @@ def test_colours_and_pattern_are_a_combination_that_objects_have():
 
 
 def test_faces_on_all_sides():
+    assert recognition.multi_face(sure(FOX), FOX) == 0.0
     assert recognition.multi_face(sure(FOX, sides=[0] * 8), FOX) == 0.75
     mug = Attributes("mug", "red")
     assert math.isnan(recognition.multi_face(sure(mug), mug))

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from tests.toybox.helpers import copied, options, training
-from threestudio_gaussiandreamer.core.checkpoint_file import load_file
+from threestudio_gaussiandreamer.core.checkpoint_file import load_file, save_file
 from threestudio_gaussiandreamer.core.devices import torch_threads
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.launch.folder_lock import claim
@@ -167,18 +167,13 @@ def test_bad_options_are_one_message(tmp_path, capsys, arguments, message):
 
 
 @pytest.mark.slow  # starts processes
-def test_workers_render_the_same_shards_as_a_training(tmp_path):
-    there = loop.Options(folder=tmp_path, pool=2, shard_objects=1)
-    sorts = there.shards, *judge_stage.judge_shards(there)
+def test_worker_processes_make_the_same_shards_and_batches(folder, tmp_path):
+    place = loop.Options(folder=tmp_path, pool=2, shard_objects=1)
+    sorts = place.shards, *judge_stage.judge_shards(place)
     render_shards(sorts, count=2, workers=1)
-    paths = {one.path(index) for one in sorts for index in (0, 1)}
-    assert set(there.shards.folder.iterdir()) == paths
+    assert set(place.shards.folder.iterdir()) == {one.path(i) for one in sorts for i in (0, 1)}
     for one in sorts:
         assert np.array_equal(one.get(1).rgba, one.make(1).rgba)
-
-
-@pytest.mark.slow  # starts processes
-def test_worker_processes_make_the_same_batches(folder):
     here, there = (STAGES["judge"](options(folder, workers=workers)) for workers in (0, 1))
     pairs = zip(here.batches(3), there.batches(3), strict=True)
     with torch_threads(1):  # as in the worker processes; sums are rounded otherwise
@@ -217,3 +212,28 @@ def test_networks_that_others_depend_on_are_frozen(folder, tmp_path, name, user,
     assert all(torch.equal(before[key], after[key]) for key in before if key.startswith(prefix))
     assert any(not torch.equal(before[key], after[key]) for key in before if key.startswith(free))
     training(place, user)  # which would be refused if its text encoder or its latents had changed
+
+
+def test_damaged_and_other_files_and_a_full_disk_are_messages(folder, tmp_path, monkeypatch):
+    run = training(copied(folder, tmp_path / "run"), "judge")
+    run.run(4)
+    before = run.path.read_bytes()
+
+    def full(*_, **__):
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("os.replace", full)
+        with pytest.raises(UserError, match="No space left"):
+            run.run(8)
+    assert run.path.read_bytes() == before
+    damaged = bytearray(before)
+    damaged[len(damaged) // 2] ^= 255
+    run.path.write_bytes(damaged)
+    with pytest.raises(UserError, match="judge.pt"):
+        training(tmp_path / "run", "judge")
+    save_file(run.path, {"a": torch.zeros(1)})
+    with pytest.raises(UserError, match="judge.pt isn't a checkpoint of this stage"):
+        training(tmp_path / "run", "judge")
+    with pytest.raises(UserError, match="train the stage 'text' first"):
+        training(tmp_path, "unet")
