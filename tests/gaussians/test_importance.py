@@ -60,38 +60,31 @@ def rounds(geometry, steps):
 
 EVERY_STEP = {"start": 0, "stop": 100, "every": 1}
 ONE_ROUND = {"start": 0, "stop": 1, "every": 1}
-
-
-def test_the_budget_is_reached_round_by_round_and_then_holds():
-    assert rounds(cloud(100, budget=50, prune=EVERY_STEP), 6) == [80, 64, 51, 50, 50, 50]
-
-
-def test_a_budget_is_met_with_few_rounds():
-    """Each round removes an equal, larger fraction."""
-    assert rounds(cloud(100, budget=10, prune={"start": 0, "stop": 3, "every": 1}), 4) == [
-        46,
-        21,
-        10,
-        10,
-    ]
-
-
-def test_without_a_budget_nothing_is_pruned():
-    assert rounds(cloud(100, prune=EVERY_STEP), 3) == [100, 100, 100]
+LATE = EVERY_STEP | {"start": 99}
+GROWING = EVERY_STEP | {"enabled": True, "grad_threshold": 0.0, "min_opacity": 0.0}
 
 
 @pytest.mark.parametrize(
-    ("given", "taken"),
-    [("none", None), ("None", None), (None, None), (5e3, 5000), ("5e3", 5000), ("Auto", "auto")],
+    ("count", "options", "counts"),
+    [
+        (100, {"budget": 50, "prune": EVERY_STEP}, [80, 64, 51, 50, 50, 50]),
+        (100, {"budget": 10, "prune": ONE_ROUND | {"stop": 3}}, [46, 21, 10, 10]),  # few rounds
+        (100, {"prune": EVERY_STEP}, [100] * 3),
+        (10, {"budget": 50, "prune": EVERY_STEP}, [10] * 3),
+        # growth stays within what the budget leaves
+        (100, {"budget": 50, "prune": EVERY_STEP, "densify": GROWING}, [80, 64, 51, 50, 50, 50]),
+        (40, {"budget": 50, "prune": LATE, "densify": GROWING}, [50] * 3),
+    ],
+)
+def test_the_budget_is_reached_round_by_round_and_then_holds(count, options, counts):
+    assert rounds(cloud(count, **options), len(counts)) == counts
+
+
+@pytest.mark.parametrize(
+    ("given", "taken"), [("none", None), ("None", None), ("5e3", 5000), ("Auto", "auto")]
 )
 def test_a_budget_may_have_a_unit(given, taken):
     assert GaussianCloud({"budget": given}).cfg.budget == taken
-
-
-def test_a_budget_above_the_count_changes_nothing():
-    geometry = cloud(10, budget=50, prune=EVERY_STEP)
-    before = geometry.means.detach().clone()
-    assert rounds(geometry, 3) == [10, 10, 10] and torch.equal(geometry.means, before)
 
 
 @pytest.mark.parametrize("sampled", [False, True])
@@ -106,33 +99,13 @@ def test_the_lowest_scores_are_pruned_first(sampled):
     assert torch.equal(geometry.means, expected)
 
 
-def test_importance_is_the_root_of_the_removal_error_times_the_contribution():
-    stats = importance.VisibilityStats(torch.tensor([0.1, 0.2]), torch.tensor([4.0, 0.25]))
-    assert torch.allclose(importance.importance(stats), torch.tensor([0.2, 0.1]))
-
-
-def test_without_samples_the_contribution_ranks():
-    stats = importance.VisibilityStats(torch.tensor([0.1, 0.3, 0.2]), torch.zeros(3))
-    assert importance.importance(stats).argsort().tolist() == [0, 2, 1]
-
-
-def drawn(geometry, opacities, preset="accurate"):
-    c2w = orbit_c2w(
-        torch.tensor([20.0, -10.0]), torch.tensor([30.0, 200.0]), torch.tensor([2.0, 2.0])
-    )
-    viewmats, Ks = to_opencv(c2w, torch.tensor([0.8, 0.8]), 32, 32)
+def drawn(geometry, opacities):
+    elevation, azimuth = torch.tensor([20.0, -10.0]), torch.tensor([30.0, 200.0])
+    c2w = orbit_c2w(elevation, azimuth, torch.tensor([2.0, 2.0]))
+    camera = to_opencv(c2w, torch.tensor([0.8, 0.8]), 32, 32)
     shape = geometry.means.double(), geometry.quats.double(), geometry.scales().double()
-    return rasterize(
-        *shape,
-        opacities,
-        geometry.colors(c2w[:, :3, 3]).double(),
-        viewmats,
-        Ks,
-        32,
-        32,
-        backend="torch",
-        alpha_min=0.0,
-    ).image
+    colors, exact = geometry.colors(c2w[:, :3, 3]).double(), {"backend": "torch", "alpha_min": 0.0}
+    return rasterize(*shape, opacities, colors, *camera, 32, 32, **exact).image
 
 
 @pytest.mark.slow
@@ -202,26 +175,16 @@ def test_sampling_leaves_the_gradients_of_the_loss_alone(backend):
         DensityControl(geometry).before_backward(pictures(out, opacities), 60)
         assert geometry.removal.any() == (budget is not None)
         (out.image**2).sum().backward()
-        left.append(
-            [
-                out.means2d.grad,
-                out.means2d.absgrad,
-                *(p.grad for p in geometry.parameters() if p.numel()),
-            ]
-        )
+        gradients = (p.grad for p in geometry.parameters() if p.numel())
+        left.append([out.means2d.grad, out.means2d.absgrad, *gradients])
     assert all(torch.equal(plain, sampled) for plain, sampled in zip(*left, strict=True))
 
 
-@pytest.mark.parametrize(
-    ("step", "due"), [(48, False), (51, False), (52, True), (848, True), (849, False), (852, False)]
-)
-def test_samples_are_taken_where_a_round_will_ask_for_them(step, due):
-    assert (
-        DensityControl(
-            cloud(10, budget=5, prune={"start": 100, "stop": 900, "every": 50})
-        ).samples_removal(step)
-        == due
-    )
+def test_samples_are_taken_where_a_round_will_ask_for_them():
+    schedule = {"start": 100, "stop": 900, "every": 50}
+    control = DensityControl(cloud(10, budget=5, prune=schedule))
+    due = [step for step in (48, 51, 52, 848, 849, 852) if control.samples_removal(step)]
+    assert due == [52, 848]
 
 
 def test_a_gaussian_over_its_own_colour_has_no_removal_error():
@@ -243,35 +206,11 @@ def test_a_gaussian_over_its_own_colour_has_no_removal_error():
     assert removal[0] < 1e-3 * removal[2]
 
 
-DENSIFY_EVERY_STEP = {
-    "enabled": True,
-    "start": 0,
-    "stop": 100,
-    "every": 1,
-    "grad_threshold": 0.0,
-    "min_opacity": 0.0,
-}
-
-
-def test_growth_stays_within_what_the_budget_leaves():
-    geometry = cloud(100, budget=50, prune=EVERY_STEP, densify=DENSIFY_EVERY_STEP)
-    assert rounds(geometry, 6) == [80, 64, 51, 50, 50, 50]
-
-
-def test_a_budget_gives_room_to_grow_up_to_it():
-    late = EVERY_STEP | {"start": 99}
-    assert max(rounds(cloud(40, budget=50, prune=late, densify=DENSIFY_EVERY_STEP), 3)) == 50
-
-
 def test_pruning_after_densifying_keeps_track_of_rows():
     geometry = cloud(10)
     params = geometry.parameters_by_name()
-    first = densify_and_prune(
-        params,
-        Statistics(torch.ones(10), geometry.contribution),
-        Rules(min_opacity=0.0),
-        generator(0, "s"),
-    )
+    stats = Statistics(torch.ones(10), geometry.contribution)
+    first = densify_and_prune(params, stats, Rules(min_opacity=0.0), generator(0, "s"))
     both = importance.keep_highest(first.values, geometry.contribution[first.parents], 7, first)
     assert len(both.parents) == len(both.is_new) == 7
     untouched = ~both.is_new
@@ -296,12 +235,7 @@ def test_bisection_finds_the_smallest_count_that_holds(needed):
 
 @pytest.mark.parametrize(
     ("saved", "count"),
-    [
-        (0.0, 80),  # a whole round costs nothing
-        (0.5, 80),
-        (0.95, 95),
-        (1.5, 100),  # it costs more than it may
-    ],
+    [(0.0, 80), (0.5, 80), (0.95, 95), (1.5, 100)],
 )
 def test_a_round_of_auto_drops_fewer_the_more_it_costs(saved, count):
     """``saved``: the cost of a whole round, in units of that where rounds end."""

@@ -18,12 +18,9 @@ from threestudio_gaussiandreamer.gaussians.simplify import (
 from threestudio_gaussiandreamer.gaussians.views import views_around
 
 
-@pytest.mark.parametrize(
-    ("here", "count", "rounds"),
-    [(100, 100, 0), (10, 20, 0), (10000, 6400, 2), (10000, 1500, 9), (2, 1, 1), (600, 1, 24)],
-)
-def test_how_many_rounds_it_takes(here, count, rounds):
-    assert rounds_to(count, here) == rounds
+def test_how_many_rounds_it_takes():
+    cases = ((100, 100, 0), (10, 20, 0), (10000, 6400, 2), (10000, 1500, 9), (600, 1, 24))
+    assert all(rounds_to(count, here) == rounds for here, count, rounds in cases)
 
 
 def test_hidden_gaussians_are_removed_first():
@@ -31,9 +28,8 @@ def test_hidden_gaussians_are_removed_first():
     views = views_around(cloud, 16, 48)
     kept = keep_best(cloud, view_importance(cloud, views), 400)
     outside = kept.means.norm(dim=1) > 0.9
-    assert (
-        outside.double().mean() > 0.9
-    )  # two thirds of all; a few inner ones are seen through gaps
+    # two thirds of all; a few inner ones are seen through gaps
+    assert outside.double().mean() > 0.9
 
 
 def recovery(cloud, size):
@@ -43,9 +39,8 @@ def recovery(cloud, size):
 
 
 def test_any_quality_ends_the_search():
-    apart = ball(12)._replace(
-        logit_opacities=torch.full((12,), 6.0), log_scales=torch.full((12, 3), -3.0)
-    )
+    opaque, small = torch.full((12,), 6.0), torch.full((12, 3), -3.0)
+    apart = ball(12)._replace(logit_opacities=opaque, log_scales=small)
     for psnr, count in ((1.0, 1), (99.0, 12)):
         assert len(simplify(apart, Budget(psnr=psnr), recovery(apart, 48)).means) == count
 
@@ -63,11 +58,8 @@ def test_a_gain_ends_the_search_where_more_would_pay():
 @pytest.mark.parametrize(("before", "after", "met"), [(50, 40, False), (60, 54, True)])
 def test_a_gain_counts_the_error_of_the_input(before, after, met):
     """A fifth fewer, a third of a doubling, may lose a sixth of a dB of 40 dB to the truth."""
-    rounds = (
-        Round(keep_best(ball(), torch.arange(600.0), 500), before),
-        Round(keep_best(ball(), torch.arange(600.0), 400), after),
-    )
-    assert Budget(gain=0.5).met_by(rounds[1], rounds[0]) == met
+    some, fewer = (keep_best(ball(), torch.arange(600.0), count) for count in (500, 400))
+    assert Budget(gain=0.5).met_by(Round(fewer, after), Round(some, before)) == met
 
 
 def test_a_round_that_failed_is_not_tried_again(monkeypatch):
@@ -94,35 +86,26 @@ def test_grey_gaussians_are_not_lost_before_grey():
 
 
 def test_a_large_cloud_loses_its_hidden_gaussians_without_a_recovery(monkeypatch):
-    """Rounds would drop a fifth of all first; here fewer are left before the first recovery."""
-    fitted, original = [], recover.recover
+    """Rounds would drop a fifth of all first; here fewer are left before the first recovery, and
+    before the first ranking, which takes a backward pass.
+    """
+    fitted, ranked, original = [], [], recover.recover
 
     def counted(cloud, *rest):
         fitted.append(len(cloud.means))
         return original(cloud, *rest)
 
-    monkeypatch.setattr(recover, "recover", counted)
-    monkeypatch.setattr(simplifying, "LARGE", 450)
-    monkeypatch.setattr(simplifying, "LOSSLESS", 30.0)
-    cloud = ball()
-    kept = recovery(cloud, 48)
-    assert len(simplify(cloud, Budget(count=200), kept).means) == 200
-    assert fitted and max(fitted) < simplifying.KEEP * len(cloud.means)
-
-
-def test_a_large_cloud_is_ranked_when_few_are_left(monkeypatch):
-    """Its contribution, which rendering it has given, takes no backward pass of all Gaussians."""
-    monkeypatch.setattr(simplifying, "LARGE", 450)
-    monkeypatch.setattr(simplifying, "LOSSLESS", 30.0)
-    ranked = []
-
     def rank(cloud, views, seed):
         ranked.append(len(cloud.means))
         return view_importance(cloud, views, seed)
 
+    monkeypatch.setattr(recover, "recover", counted)
+    monkeypatch.setattr(simplifying, "LARGE", 450)
+    monkeypatch.setattr(simplifying, "LOSSLESS", 30.0)
     cloud = ball()
-    simplify(cloud, Budget(count=200), recovery(cloud, 48), rank=rank)
-    assert ranked and max(ranked) < len(cloud.means)
+    found = simplify(cloud, Budget(count=200), recovery(cloud, 48), rank=rank)
+    assert len(found.means) == 200 and ranked and max(ranked) < len(cloud.means)
+    assert fitted and max(fitted) < simplifying.KEEP * len(cloud.means)
 
 
 def test_a_large_cloud_that_no_view_shows_is_a_named_error(monkeypatch):
