@@ -115,9 +115,8 @@ def test_mean_and_spread_are_over_the_seeds(scored):
     found = written(out)
     each = np.array([result["per_seed"] for result in found["results"]])
     np.testing.assert_allclose(found["per_seed"], each.mean(axis=0))
-    assert found["mean"] == pytest.approx(each.mean()) and found["std"] == pytest.approx(
-        each.mean(axis=0).std(ddof=1)
-    )
+    spread = pytest.approx(each.mean(axis=0).std(ddof=1))
+    assert found["mean"] == pytest.approx(each.mean()) and found["std"] == spread
     assert found["std"] > 0 and found["protocol"]["views"] == 120
     assert f"{found['mean']:.2f} +- {found['std']:.2f} over 3 seeds" in said
     from PIL import Image
@@ -278,10 +277,7 @@ raise SystemExit(main({arguments!r}))
         (["{ply}", "--clip", "x", "--prompt", "a", "--size", "0"], "--size"),
         (["{ply}", "--clip", "x", "--prompt", "a", "--fovy", "180"], "--fovy"),
         (["{ply}", "--clip", "toybox", "--prompt", "a", "--fovy", "60"], "--fovy has no effect"),
-        (
-            ["{ply}", "--clip", "x", "--prompt", "a", "--size", "100000"],
-            "--size 100000: expected 1",
-        ),
+        (["{ply}", "--clip", "x", "--prompt", "a", "--size", "100000"], "100000: expected 1"),
         (["{ply}", "--clip", "x", "--prompt", "a\udcff"], "isn't valid UTF-8 text"),
         (["{ply}", "--clip", "x", "--prompt", "a", "--output", "{ply}/o"], "can't be made"),
         (["{ply}", "--prompt", "a", "--t3bench", "{ply}/o"], "can't be made"),
@@ -290,10 +286,7 @@ raise SystemExit(main({arguments!r}))
         (["{ply}", "--prompt", "", "--t3bench", "{folder}"], "empty"),
         (["{ply}", "--prompt", 300 * "x", "--t3bench", "{folder}"], "more than 240 bytes"),
         (["{ply}", "{ply}", "--prompt", "a", "--t3bench", "{folder}"], "would replace each other"),
-        (
-            ["{ply}", "--prompt", "a", "--t3bench", "{folder}", "--t3bench-method", "../x"],
-            "--t3bench-method",
-        ),
+        (["{ply}", "--prompt", "a", "--t3bench", "x", "--t3bench-method", "../x"], "bench-method"),
     ],
 )
 def test_mistakes_are_one_message(arguments, said, plys, tmp_path, capsys):

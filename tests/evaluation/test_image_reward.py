@@ -43,14 +43,8 @@ def without(part):
         (without("mlp.layers.7"), "Missing key.*head.7.weight.*head.7.bias"),
         (without("crossattention"), "Missing key.*text.encoder.layer.0.crossattention"),
         (tiny.state_dict() | {"mlp.layers.9.bias": torch.zeros(1)}, "Unexpected key.*head.9.bias"),
-        (
-            tiny.state_dict() | {"mlp.layers.7.bias": torch.zeros(2)},
-            "size mismatch for head.7.bias",
-        ),
-        (
-            tiny.state_dict() | {"blip.visual_encoder.pos_embed": torch.zeros(3)},
-            "no tensors, or misshapen ones",
-        ),
+        (tiny.state_dict() | {"mlp.layers.7.bias": torch.zeros(2)}, "size mismatch for head.7.bia"),
+        (tiny.state_dict() | {"blip.visual_encoder.pos_embed": torch.zeros(3)}, "misshapen ones"),
     ],
 )
 def test_other_files_are_refused(tmp_path, state, said):

@@ -16,10 +16,6 @@ from threestudio_gaussiandreamer.evaluation.clip_similarity import main
 register_parts()
 
 
-# --------------------------------------------------------------------------------------------------
-# T3Bench
-
-
 def t3bench_pose(v):
     """Return the camera that T3Bench describes: towards the centre, the image's top towards +z, or
     +y near the poles.
@@ -38,12 +34,10 @@ def test_the_cameras_are_t3benchs(subdivisions, count):
     positions = t3bench.icosphere(subdivisions, t3bench.RADIUS)
     assert len(positions) == count
     np.testing.assert_allclose(np.linalg.norm(positions, axis=1), 2.2)
-    assert (np.abs(positions[:, 2]) > 2.19).sum() == (
-        2 if subdivisions else 0
-    )  # the poles, where +z can't be up
-    np.testing.assert_allclose(
-        t3bench.towards_origin(positions).numpy(), [t3bench_pose(v) for v in positions], atol=2e-6
-    )  # float32
+    # the poles, where +z can't be up
+    assert (np.abs(positions[:, 2]) > 2.19).sum() == (2 if subdivisions else 0)
+    found = t3bench.towards_origin(positions).numpy()  # float32
+    np.testing.assert_allclose(found, [t3bench_pose(v) for v in positions], atol=2e-6)
 
 
 def test_the_object_is_centred_and_scaled_without_what_is_invisible():
@@ -54,9 +48,8 @@ def test_the_object_is_centred_and_scaled_without_what_is_invisible():
     np.testing.assert_allclose(visible.mean(axis=0), 0, atol=1e-5)
     assert np.abs(visible).max() == pytest.approx(1)
     scale = (visible[1] - visible[2])[0] / (arrays.means[2] - arrays.means[3])[0]
-    np.testing.assert_allclose(
-        np.exp(found.log_scales), scale * np.exp(arrays.log_scales), rtol=1e-4
-    )
+    wanted = scale * np.exp(arrays.log_scales)
+    np.testing.assert_allclose(np.exp(found.log_scales), wanted, rtol=1e-4)
 
 
 @pytest.mark.slow
@@ -73,9 +66,8 @@ def test_t3benchs_scripts_find_their_pictures(plys, tmp_path, monkeypatch):
     assert len(meshes) == 1
     mesh = trimesh.load(meshes[0])  # as T3Bench's renderer does
     assert isinstance(mesh, trimesh.Trimesh) and len(mesh.faces) > 100
-    np.testing.assert_allclose(
-        mesh.visual.vertex_colors[:, :3].mean(axis=0) / 255, [0.9, 0.1, 0.1], atol=0.01
-    )
+    color = mesh.visual.vertex_colors[:, :3].mean(axis=0) / 255
+    np.testing.assert_allclose(color, [0.9, 0.1, 0.1], atol=0.01)
     assert not (root / "render").exists()  # T3Bench's own, which draws the mesh
     missing = Path("outputs_mesh_t3/FALSE_PATH")
     for script, count in (("meshrender.py", 162 * 5), ("meshrender_cap.py", 12)):
@@ -102,7 +94,5 @@ def test_t3benchs_scripts_find_their_pictures(plys, tmp_path, monkeypatch):
 def brightness(folder, pattern="*.png"):
     from PIL import Image
 
-    return [
-        float(np.asarray(Image.open(path).convert("RGB")).mean())
-        for path in sorted(folder.glob(pattern))
-    ]
+    pictures = (Image.open(path).convert("RGB") for path in sorted(folder.glob(pattern)))
+    return [float(np.asarray(picture).mean()) for picture in pictures]

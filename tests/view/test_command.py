@@ -59,7 +59,7 @@ def test_a_cloud_of_a_run_is_drawn_as_the_run_has_drawn_it(run_folder):
     assert meta(other / "gaussians.html")["clouds"][0]["quality"] == ""
 
 
-@pytest.mark.parametrize("damage", ["a: &x [1]\nb: *x", "- 1", "system: 3", "a: [", "\xff"])
+@pytest.mark.parametrize("damage", ["a: &x [1]\nb: *x", "system: 3", "\xff"])
 def test_a_damaged_configuration_leaves_the_defaults(run_folder, damage):
     (run_folder / "configs" / "parsed.yaml").write_text(damage, encoding="latin-1")
     export = run_folder / "save" / "it7-export" / "gaussians.spz"

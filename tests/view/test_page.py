@@ -71,14 +71,10 @@ class Controls(HTMLParser):
         assert self.open.pop()[0] == tag
 
 
-def test_without_javascript_there_is_no_control():
+def test_no_control_without_javascript_no_request_and_no_foreign_script():
     text = page(Shown(cloud(3), "result"), options())
     assert Controls(text).shown == []
     assert len(Controls(text.replace("<footer hidden>", "<footer>")).shown) == 6
-
-
-def test_the_policy_forbids_requests_and_foreign_scripts():
-    text = page(Shown(cloud(3), "result"), options())
     policy = html.unescape(re.search(r'Content-Security-Policy" content="([^"]*)"', text)[1])
     assert policy.startswith("default-src 'none'; script-src 'sha256-")
     assert "http" not in policy and "unsafe" not in policy
@@ -157,8 +153,5 @@ def test_a_coarse_cloud_is_a_fraction_of_the_size_and_hardly_moves():
     assert np.abs(rounded.means - gaussians.means).max() <= side / COARSE_MEANS
     assert rounded.sh.shape == (4000, 1, 3)
     assert len(packed(rounded)) < 0.4 * len(packed(gaussians._replace(sh=gaussians.sh[:, :1])))
-
-
-def test_a_single_point_can_be_made_coarse():
     point = cloud(1).gaussians
     assert np.allclose(coarse(point).means, point.means)
