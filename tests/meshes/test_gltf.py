@@ -294,6 +294,7 @@ def changed(made, path, value):
         (("accessors", 1, "componentType"), 1, "component type 1"),
         (("accessors", 1), {"count": 4, "type": "VEC3", "componentType": 5126}, "aren't in the fi"),
         (("bufferViews", 0, "byteLength"), 10**12, "ends after its buffer"),
+        (("bufferViews", 2), {"buffer": 0, "byteLength": 0}, "ends after its buffer view"),
         (("samplers", 0, "wrapS"), 5, "damaged"),
         (("textures", 0), {"extensions": {"KHR_texture_basisu": {}}}, "KHR_texture_basisu"),
         (("images", 0), {"uri": "https://example.org/a.png"}, "only files beside the mesh"),
@@ -304,6 +305,13 @@ def changed(made, path, value):
 def test_damage_is_one_message(path, value, message, saved):
     with pytest.raises(UserError, match=message):
         read_gltf(saved(changed(textured_quad(FOUR, sampler=NEAREST), path, value)))
+
+
+def test_the_end_of_an_accessor_is_found_where_64_bits_overflow(saved):
+    made = changed(textured_quad(FOUR), ("bufferViews", 3, "byteStride"), 16)
+    made.document["accessors"][2] |= {"count": 2**60, "byteOffset": 16}
+    with pytest.raises(UserError, match="ends after its buffer view"):
+        read_gltf(saved(made))
 
 
 # ---- one memory budget for everything in a file --------------------------------------------------

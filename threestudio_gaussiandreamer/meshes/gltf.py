@@ -188,8 +188,10 @@ class Document:
         if not shape[0]:
             return np.zeros(shape, dtype)
         require(stride == 0 or stride >= row, f"rows of {row} bytes can't be {stride} bytes apart")
-        place = self.size(entry, "byteOffset", 0), (stride or row, dtype.itemsize)
-        return np.ndarray(shape, dtype, content, *place)  # NumPy checks the end
+        start, stride = self.size(entry, "byteOffset", 0), stride or row
+        end = start + (shape[0] - 1) * stride + row  # NumPy doesn't check it where it overflows
+        require(end <= len(content), "an accessor ends after its buffer view: it is damaged")
+        return np.ndarray(shape, dtype, content, start, (stride, dtype.itemsize))
 
     def _with_sparse(self, values: np.ndarray, sparse: Any, dtype: np.dtype) -> np.ndarray:
         """Return a copy in which some rows are replaced."""
