@@ -24,14 +24,7 @@ SMALL = [
 
 DENSIFY = [
     f"system.geometry.densify.{option}"
-    for option in (
-        "enabled=true",
-        "start=2",
-        "stop=8",
-        "every=2",
-        "grad_threshold=1e-4",
-        "min_opacity=0.01",
-    )
+    for option in "enabled=true start=2 stop=8 every=2 grad_threshold=1e-4 min_opacity=0.01".split()
 ]
 PRUNE = [
     "system.geometry.budget=130",
@@ -50,24 +43,11 @@ class MockGuidance(BaseObject):
 
     Config = _Config
 
-    def __call__(
-        self,
-        rgb,
-        prompt_utils,
-        elevation,
-        azimuth,
-        camera_distances,
-        rgb_as_latents=False,
-        guidance_eval=False,
-        **kwargs,
-    ):
+    def __call__(self, rgb, prompt_utils, elevation, azimuth, camera_distances, **kwargs):
         target = torch.tensor(list(self.cfg.color)).expand_as(rgb)
-        return {
-            "loss_sds": 0.5 * ((rgb - target) ** 2).sum() / len(rgb),
-            "grad_norm": (rgb - target).norm().detach(),
-            "min_step": 20,
-            "max_step": 980,
-        }
+        loss = 0.5 * ((rgb - target) ** 2).sum() / len(rgb)
+        norm = (rgb - target).norm().detach()
+        return {"loss_sds": loss, "grad_norm": norm, "min_step": 20, "max_step": 980}
 
 
 def length(count):

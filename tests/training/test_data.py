@@ -11,17 +11,9 @@ from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.training.camera_options import CameraConfig
 from threestudio_gaussiandreamer.training.data import GaussianDreamerDataModule
 
-KEYS = {
-    "c2w": (4, 4, 4),
-    "mvp_mtx": (4, 4, 4),
-    "proj_mtx": (4, 4, 4),
-    "camera_positions": (4, 3),
-    "light_positions": (4, 3),
-    "elevation": (4,),
-    "azimuth": (4,),
-    "camera_distances": (4,),
-    "fovy": (4,),
-}
+KEYS = dict.fromkeys(("elevation", "azimuth", "camera_distances", "fovy"), (4,))
+KEYS |= dict.fromkeys(("camera_positions", "light_positions"), (4, 3))
+KEYS |= dict.fromkeys(("c2w", "mvp_mtx", "proj_mtx"), (4, 4, 4))
 
 
 def module(**cfg):
@@ -59,11 +51,8 @@ def test_rays_are_there_when_asked_for():
     assert batch["rays_o"].shape == batch["rays_d"].shape == (4, 32, 48, 3)
     assert torch.allclose(batch["rays_d"].norm(dim=-1), torch.ones(4, 32, 48), atol=1e-6)
     (plain,) = batches(module(rays=True, rays_d_normalize=False), 1)
-    assert torch.allclose(
-        (plain["rays_d"] @ -plain["c2w"][:, None, :3, 2:3])[..., 0],
-        torch.ones(4, 32, 48),
-        atol=1e-5,
-    )
+    depths = (plain["rays_d"] @ -plain["c2w"][:, None, :3, 2:3])[..., 0]
+    assert torch.allclose(depths, torch.ones(4, 32, 48), atol=1e-5)
 
 
 def test_groups_of_views_share_all_but_their_evenly_spaced_azimuths():
@@ -74,9 +63,8 @@ def test_groups_of_views_share_all_but_their_evenly_spaced_azimuths():
         azimuth = batch["azimuth"].reshape(2, 4)
         assert azimuth.min() >= -180 and azimuth.max() < 180
         turns = (azimuth - azimuth[:, :1]) % 360
-        torch.testing.assert_close(
-            turns, torch.tensor([[0.0, 90, 180, 270]] * 2), rtol=0, atol=1e-4
-        )
+        spaced = torch.tensor([[0.0, 90, 180, 270]] * 2)
+        torch.testing.assert_close(turns, spaced, rtol=0, atol=1e-4)
         assert ((azimuth[:, 0] >= 150) & (azimuth[:, 0] <= 180)).all()
         assert batch["elevation"][0] != batch["elevation"][4]
 
@@ -86,18 +74,13 @@ def test_validation_and_test_batches_hold_one_view_and_its_index():
     val, test = list(data.val_dataloader()), list(data.test_dataloader())
     assert [b["azimuth"].item() for b in val] == [0, 90, 180, 270]
     assert [b["azimuth"].item() for b in test] == pytest.approx([0, 72, 144, 216, 288])
-    assert (
-        val[2]["index"].tolist() == [2]
-        and val[2]["c2w"].shape == (1, 4, 4)
-        and val[2]["height"] == 20
-    )
+    assert val[2]["index"].tolist() == [2] and val[2]["height"] == 20
+    assert val[2]["c2w"].shape == (1, 4, 4)
 
 
 def test_a_stream_that_starts_at_step_3_continues_the_one_that_never_stopped():
-    whole, rest = (
-        batches(module(camera_perturb=0.1, up_perturb=0.1), 5),
-        batches(module(camera_perturb=0.1, up_perturb=0.1), 2, start=3),
-    )
+    moving = {"camera_perturb": 0.1, "up_perturb": 0.1}
+    whole, rest = batches(module(**moving), 5), batches(module(**moving), 2, start=3)
     for a, b in zip(whole[3:], rest, strict=True):
         assert torch.equal(a["c2w"], b["c2w"]) and torch.equal(a["fovy"], b["fovy"])
 
@@ -117,29 +100,21 @@ def test_a_pool_repeats_its_cameras_and_still_covers_the_circle():
 def test_the_views_of_a_pool_are_known_beforehand_unless_cameras_move():
     data = module(train_views=8)
     views = data.pool_views()
-    assert (len(views["fovy"]), views["height"], views["width"], views["batch_size"]) == (
-        8,
-        32,
-        48,
-        4,
-    )
+    assert len(views["fovy"]) == 8
+    assert [views[name] for name in ("height", "width", "batch_size")] == [32, 48, 4]
     assert data.views_to_prefetch(1) is None and data.views_to_prefetch(2)
     known = {tuple(c2w) for c2w in views["c2w"].flatten(1).tolist()}
     assert {tuple(c2w) for b in batches(data, 20) for c2w in b["c2w"].flatten(1).tolist()} == known
-    assert (
-        module().pool_views() is None and module(train_views=8, up_perturb=0.1).pool_views() is None
-    )
+    assert module().pool_views() is None
+    assert module(train_views=8, up_perturb=0.1).pool_views() is None
     assert module(train_views=8, height=[16, 32], resolution_milestones=[3]).pool_views() is None
 
 
 def test_progressive_views_widen_from_the_evaluation_view():
-    first, last = (
-        batches(module(progressive_until=100), 1)[0],
-        batches(module(progressive_until=100), 1, start=100)[0],
-    )
-    assert first["azimuth"].abs().max() == 0 and torch.allclose(
-        first["elevation"], torch.tensor(15.0), atol=1e-4
-    )
+    data = module(progressive_until=100)
+    (first,), (last,) = batches(data, 1), batches(data, 1, start=100)
+    assert first["azimuth"].abs().max() == 0
+    assert torch.allclose(first["elevation"], torch.tensor(15.0), atol=1e-4)
     assert last["azimuth"].abs().max() > 90
 
 

@@ -40,6 +40,8 @@ def models(tmp_path_factory):
     folder = tmp_path_factory.mktemp("models")
     base, upsampler = tiny_3d_models.point_e(folder / "point-e")
     clip = tiny_3d_models.clip(folder / "clip")
+    shap_e = tiny_3d_models.shap_e(folder / "shap-e")
+    body = tiny_3d_models.body_model(folder / "body.npz")
     return {
         "epsilon": guided_by(tiny_models.stable_diffusion(folder / "epsilon")),
         "deep_floyd": guided_by(tiny_models.deep_floyd(folder / "if")),
@@ -48,25 +50,12 @@ def models(tmp_path_factory):
         | {"system.guidance.image_size": 64},
         "sdxl": guided_by(tiny_large_models.stable_diffusion_xl(folder / "sdxl")),
         "mvdream": guided_by(tiny_large_models.mvdream(folder / "mvdream")),
-        "shap_e": prior(
-            model=tiny_3d_models.shap_e(folder / "shap-e"), num_inference_steps=2, grid_size=24
-        ),
-        "point_e": prior(
-            checkpoint=base, upsampler=upsampler, clip=clip, num_steps=2, num_points=64
-        ),
-        "motion": prior(
-            motion=motion(folder),
-            body_model=tiny_3d_models.body_model(folder / "body.npz"),
-            clip=clip,
-        )
-        | prior(num_points=400),
-        "candidates": prior(
-            candidates=f"[{bodies(folder)}]",
-            motion="''",
-            body_model="''",
-            clip=clip,
-            num_points=400,
-        ),
+        "shap_e": prior(model=shap_e, num_inference_steps=2, grid_size=24),
+        "point_e": prior(checkpoint=base, upsampler=upsampler, num_steps=2, num_points=64)
+        | prior(clip=clip),
+        "motion": prior(motion=motion(folder), body_model=body, clip=clip, num_points=400),
+        "candidates": prior(candidates=f"[{bodies(folder)}]", motion="''", body_model="''")
+        | prior(clip=clip, num_points=400),
         "anny": prior(num_points=400, pose="walking"),
     }
 
@@ -81,12 +70,8 @@ def motion(folder):
     """
     frames = np.repeat(tiny_3d_models.JOINTS[None, :22, :, None], 4, axis=3)
     frames[0, 20, 1] += np.linspace(0, 0.1, 4)
-    np.savez(
-        folder / "results.npz",
-        motion=frames,
-        text=np.array(["Someone waves"]),
-        lengths=np.array([4]),
-    )
+    texts, lengths = np.array(["Someone waves"]), np.array([4])
+    np.savez(folder / "results.npz", motion=frames, text=texts, lengths=lengths)
     return folder / "results.npz"
 
 
@@ -165,33 +150,28 @@ def rows(path):
 
 
 RUNS = {
-    "paper": (["gaussiandreamer.yaml"], ["shap_e", "epsilon"]),
-    "official": (["gaussiandreamer-official.yaml"], ["shap_e", "epsilon"]),
-    "if": (["gaussiandreamer.yaml", "gaussiandreamer-if.yaml"], ["shap_e", "deep_floyd"]),
-    "pointe": (["gaussiandreamer.yaml", "gaussiandreamer-pointe.yaml"], ["point_e", "epsilon"]),
-    "avatar": (["gaussiandreamer.yaml", "gaussiandreamer-avatar.yaml"], ["anny", "epsilon"]),
-    "avatar of smpl": (
-        ["gaussiandreamer.yaml", "gaussiandreamer-avatar-smpl.yaml"],
-        ["motion", "epsilon"],
-    ),
-    "avatar of candidates": (
-        ["gaussiandreamer.yaml", "gaussiandreamer-avatar-smpl.yaml"],
-        ["candidates", "epsilon"],
-    ),
-    "ground": (["gaussiandreamer.yaml", "gaussiandreamer-ground.yaml"], ["shap_e", "epsilon"]),
-    "sdxl": (["gaussiandreamer.yaml", "gaussiandreamer-sdxl.yaml"], ["shap_e", "sdxl"]),
-    "sd3": (["gaussiandreamer.yaml", "gaussiandreamer-sd3.yaml"], ["shap_e", "sd3"]),
-    "mvdream": (["gaussiandreamer.yaml", "gaussiandreamer-mvdream.yaml"], ["shap_e", "mvdream"]),
-    "mvdream, lowmem": (
-        ["gaussiandreamer.yaml", "gaussiandreamer-mvdream.yaml", "gaussiandreamer-lowmem.yaml"],
-        ["shap_e", "mvdream"],
-    ),
-    "lowmem": (["gaussiandreamer.yaml", "gaussiandreamer-lowmem.yaml"], ["shap_e", "epsilon"]),
-    "without pruning": (
-        ["gaussiandreamer.yaml", "gaussiandreamer-paper.yaml"],
-        ["shap_e", "epsilon"],
-    ),
+    "paper": ("", "shap_e epsilon"),
+    "official": ("", "shap_e epsilon"),
+    "if": ("-if", "shap_e deep_floyd"),
+    "pointe": ("-pointe", "point_e epsilon"),
+    "avatar": ("-avatar", "anny epsilon"),
+    "avatar of smpl": ("-avatar-smpl", "motion epsilon"),
+    "avatar of candidates": ("-avatar-smpl", "candidates epsilon"),
+    "ground": ("-ground", "shap_e epsilon"),
+    "sdxl": ("-sdxl", "shap_e sdxl"),
+    "sd3": ("-sd3", "shap_e sd3"),
+    "mvdream": ("-mvdream", "shap_e mvdream"),
+    "mvdream, lowmem": ("-mvdream -lowmem", "shap_e mvdream"),
+    "lowmem": ("-lowmem", "shap_e epsilon"),
+    "without pruning": ("-paper", "shap_e epsilon"),
 }
+"""Suffixes of the configurations that are added to gaussiandreamer.yaml, and models."""
+
+
+def configs_of(name):
+    if name == "official":
+        return ["gaussiandreamer-official.yaml"]
+    return ["gaussiandreamer.yaml", *(f"gaussiandreamer{x}.yaml" for x in RUNS[name][0].split())]
 
 
 def require_module(name):
@@ -199,26 +179,25 @@ def require_module(name):
         pytest.skip(f"{name} isn't installed")
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", RUNS)
 def test_a_configuration_trains(name, models, seen, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    configs, used = RUNS[name]
+    used = RUNS[name][1].split()
     if "avatar" in name:
         require_module("anny" if "anny" in used else "smplx")
-    folder = train(configs, {key: value for part in used for key, value in models[part].items()})
+    options = {key: value for part in used for key, value in models[part].items()}
+    folder = train(configs_of(name), options)
     # four views with and without the prompt, in one forward pass a step; what validation draws has
     # one view
     assert [call for call in seen if call[0] == 4] == [(4, 8)] * STEPS
     ground = 20000 if name == "ground" else 0
     assert_trained(folder, 2e-4 if name == "official" else 5e-5, ground)
     if name == "ground":
-        points = trained(folder)[1]
-        assert (points[-20000:, 2] == points[-1, 2]).all() and points[
-            :-20000, 2
-        ].min() == pytest.approx(points[-1, 2])
+        heights = trained(folder)[1][:, 2]
+        assert (heights[-20000:] == heights[-1]).all()
+        assert heights[:-20000].min() == pytest.approx(heights[-1])
 
 
 def test_every_configuration_for_models_is_trained():
     shipped = {path.name for path in CONFIGS.glob("gaussiandreamer*.yaml")}
-    assert shipped == {name for configs, _ in RUNS.values() for name in configs}
+    assert shipped == {name for run in RUNS for name in configs_of(run)}

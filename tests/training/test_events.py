@@ -61,18 +61,11 @@ def test_a_number_that_is_monitored_is_waited_for(trainer, monkeypatch):
     assert trainer.callback_metrics == {"loss": torch.tensor(1.0)}
 
 
-def test_a_run_logs_each_number_once_at_the_steps_of_the_learning_rates(tmp_path, painted_box):
-    steps = ["trainer.max_steps=4", "trainer.log_every_n_steps=2", "trainer.val_check_interval=4"]
-    assert launch(tmp_path, painted_box, *steps) == 0
-    rows = logged_rows(tmp_path)
-    for name in ("loss", "dB", "gaussians", "train/loss_sds", "train/grad_norm", "lr-Adam/means"):
-        assert [row["step"] for row in rows if row[name]] == ["1", "3"], name
-
-
 @pytest.mark.skipif(cpu.unavailable() is not None, reason=str(cpu.unavailable()))
-def test_the_error_that_a_guidance_returns_is_logged_and_no_truth_is_rendered(
+def test_a_run_logs_each_number_once_and_the_error_that_its_guidance_returns(
     tmp_path, painted_box, monkeypatch
 ):
+    """At the steps of the learning rates; no truth is rendered for it."""
     expected = []
     render, report = system.true_views, system.GaussianDreamerSystem.report
 
@@ -83,12 +76,10 @@ def test_the_error_that_a_guidance_returns_is_logged_and_no_truth_is_rendered(
 
     monkeypatch.setattr(system.GaussianDreamerSystem, "report", compare)
     monkeypatch.delattr(system, "true_views")
-    steps = [*length(2)]
-    assert launch(tmp_path, painted_box, *steps) == 0
-    logged = [float(row["dB"]) for row in logged_rows(tmp_path) if row["dB"]]
-    assert logged == pytest.approx(expected, abs=1e-4) and len(expected) == 2
-
-
-def logged_rows(folder):
-    with open(run_folder(folder) / "csv_logs" / "version_0" / "metrics.csv") as file:
-        return list(csv.DictReader(file))
+    assert launch(tmp_path, painted_box, *length(4), "trainer.log_every_n_steps=2") == 0
+    with open(run_folder(tmp_path) / "csv_logs" / "version_0" / "metrics.csv") as file:
+        rows = list(csv.DictReader(file))
+    for name in ("loss", "dB", "gaussians", "train/loss_sds", "train/grad_norm", "lr-Adam/means"):
+        assert [row["step"] for row in rows if row[name]] == ["1", "3"], name
+    logged = [float(row["dB"]) for row in rows if row["dB"]]
+    assert logged == pytest.approx(expected[1::2], abs=1e-4) and len(expected) == 4

@@ -11,78 +11,44 @@ from tests.training.runs import cloud_of, launch, length, run_folder
 from threestudio_gaussiandreamer.exporters import files as mesh_exporter
 from threestudio_gaussiandreamer.formats.gaussian_files import read_cloud
 from threestudio_gaussiandreamer.formats.ply import read_gaussians
-from threestudio_gaussiandreamer.formats.spz import read_spz
 from threestudio_gaussiandreamer.host import Exporter, ExporterOutput, register
 
 
-def test_a_run_exports_the_pruned_cloud_too_and_so_does_export(tmp_path, painted_box):
-    options = [
-        "system.prune.count=90",
-        "system.prune.size=32",
-        "system.prune.steps=3",
-        "system.exporter.formats=[ply,spz]",
-    ]
-    assert launch(tmp_path, painted_box, *options, *length(4)) == 0
-    export = run_folder(tmp_path) / "save" / "it4-export"
-    assert len(read_gaussians(export / "gaussians.ply").means) == 200
-    first = read_gaussians(export / "pruned" / "gaussians.ply")
-    assert len(first.means) == len(read_spz(export / "pruned" / "gaussians.spz")[0].means) == 90
-    report = json.loads((export / "pruned" / "report.json").read_text())
-    assert (
-        report["options"]["eps2d"] == 0.03 and report["options"]["antialias"]
-    )  # as the demo draws
-    assert (
-        report["after"]["gaussians"] == 90 and (export / "pruned" / "report.png").stat().st_size > 0
-    )
-    shutil.rmtree(export)
-    resume = [
-        f"resume={run_folder(tmp_path) / 'ckpts' / 'last.ckpt'}",
-        "system.exporter.save_video=false",
-    ]
-    assert launch(tmp_path, painted_box, *options, *resume, stage="--export") == 0
-    (again,) = run_folder(tmp_path).parent.glob("*/save/it4-export/pruned/gaussians.ply")
-    assert all(
-        a.tobytes() == b.tobytes() for a, b in zip(read_gaussians(again), first, strict=True)
-    )
-
-
-def test_test_validate_and_export_use_the_checkpoint_and_no_prior(tmp_path, painted_box):
+def test_every_format_notes_how_it_was_trained_and_pruned_and_later_stages_read_no_prior(
+    tmp_path, painted_box, capsys
+):
     mesh = tmp_path / "box.glb"
     mesh.write_bytes(painted_box.read_bytes())
-    assert launch(tmp_path, mesh, *length(3)) == 0
-    save, last = run_folder(tmp_path) / "save", run_folder(tmp_path) / "ckpts" / "last.ckpt"
-    trained = (save / "it3-test" / "1.png").read_bytes()
-    for path in (
-        *save.glob("it3-test/*"),
-        *save.glob("it3-export/*"),
-        save / "it3-0.png",
-        save / "it3-test.mp4",
-    ):
-        path.unlink()
-    mesh.unlink()  # neither prior nor target is needed any more
-    for stage in ("--test", "--validate", "--export"):
-        assert launch(tmp_path, mesh, f"resume={last}", stage=stage) == 0
-    assert (save / "it3-test" / "1.png").read_bytes() == trained
-    assert (save / "it3-0.png").is_file()
-    exported = read_gaussians(save / "it3-export" / "gaussians.ply")
-    means = cloud_of(last)["geometry.means"].numpy()
-    assert np.array_equal(exported.means, means[:, [1, 2, 0]] * np.float32([1, -1, -1]))
-
-
-def test_every_format_notes_how_it_was_trained_and_pruned(tmp_path, painted_box, capsys):
     options = ["system.renderer.antialias=true", "system.prune.psnr=25", "system.prune.size=32"]
-    options += ["system.prune.steps=3", *length(1)]
-    formats = "system.exporter.formats=[ply,compressed-ply,spz,sog,glb,usda]"
-    assert launch(tmp_path, painted_box, *options, formats) == 0
-    export, said = run_folder(tmp_path) / "save" / "it1-export", capsys.readouterr().out
+    options += ["system.prune.steps=3", "system.exporter.save_video=false", *length(3)]
+    options += ["system.exporter.formats=[ply,compressed-ply,spz,sog,glb,usda]"]
+    assert launch(tmp_path, mesh, *options) == 0
+    save, said = run_folder(tmp_path) / "save", capsys.readouterr().out
+    export, last = save / "it3-export", run_folder(tmp_path) / "ckpts" / "last.ckpt"
     suffixes = ["ply", "compressed.ply", "spz", "sog", "glb"]
     stored = [read_cloud(str(export / f"gaussians.{suffix}")) for suffix in suffixes]
     assert [cloud.antialiased for cloud in stored] == [True] * 5
     assert [len(cloud.gaussians.means) for cloud in stored] == [200] * 5
     assert "SplatRenderMode: mip" in (export / "gaussians.usda").read_text()
-    for name in ("gaussians.ply", "gaussians.spz"):
-        path = str(export / "pruned" / name)
-        assert path in said and read_cloud(path).pruned_to == 25
+    pruned = [export / "pruned" / f"gaussians.{suffix}" for suffix in ("ply", "spz")]
+    report = json.loads((export / "pruned" / "report.json").read_text())
+    for path in pruned:
+        cloud = read_cloud(str(path))
+        assert str(path) in said and cloud.pruned_to == 25
+        assert len(cloud.gaussians.means) == report["after"]["gaussians"] < 200
+    # as the demo draws
+    assert report["options"]["eps2d"] == 0.03 and report["options"]["antialias"]
+    assert (export / "pruned" / "report.png").stat().st_size > 0
+    kept = [save / "it3-test" / "1.png", export / "gaussians.ply", *pruned]
+    before = [path.read_bytes() for path in kept]
+    for path in (*kept, save / "it3-0.png"):
+        path.unlink()
+    mesh.unlink()  # neither prior nor target is needed any more
+    for stage in ("--test", "--validate", "--export"):
+        assert launch(tmp_path, mesh, *options, f"resume={last}", stage=stage) == 0
+    assert [path.read_bytes() for path in kept] == before and (save / "it3-0.png").is_file()
+    means = cloud_of(last)["geometry.means"].numpy()[:, [1, 2, 0]] * np.float32([1, -1, -1])
+    assert np.array_equal(read_gaussians(export / "gaussians.ply").means, means)
 
 
 @register("test-raising-exporter")
@@ -141,6 +107,7 @@ def test_formats_that_fail_leave_the_others(tmp_path, painted_box, capsys):
     assert "test-unbuildable failed: RuntimeError: not installed" in said
     assert "save_name 'Gaussians.ply': another file of the export" in said
     assert "params of numbers.json" in said and "save_json takes (filename: str, payload" in said
+    assert len(read_gaussians(export / "pruned" / "gaussians.ply").means) == 100
     wanted = {"gaussians.ply", "points.ply"}
     for folder in (export, export / "pruned"):
         assert {path.name for path in folder.iterdir()} >= wanted
@@ -148,7 +115,7 @@ def test_formats_that_fail_leave_the_others(tmp_path, painted_box, capsys):
     last = run_folder(tmp_path) / "ckpts" / "last.ckpt"
     shutil.rmtree(export)
     with pytest.raises(RuntimeError, match="no memory for that"):
-        launch(tmp_path, painted_box, *options, f"resume={last}", stage="--export")
+        launch(tmp_path, painted_box, options[0], f"resume={last}", stage="--export")
     assert {path.name for path in export.iterdir()} >= wanted
 
 

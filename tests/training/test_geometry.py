@@ -81,13 +81,10 @@ def test_the_object_grows_first_and_the_ground_is_added_then():
     itself.
     """
     prior = {"num_points": 400, "size": 0.7}
-    grow = {"num_candidates": 20_000, "radius": 0.04}
-    options = {"prior_type": "random-prior", "grow": grow}
+    options = {"prior_type": "random-prior", "grow": {"num_candidates": 20_000, "radius": 0.04}}
+    ground = {"ground": True, "ground_points": 100, "ground_size": 3.0}
     alone, with_ground = (
-        GaussianCloud(options | {"prior": prior}),
-        GaussianCloud(
-            options | {"prior": prior | {"ground": True, "ground_points": 100, "ground_size": 3.0}}
-        ),
+        GaussianCloud({**options, "prior": prior | more}) for more in ({}, ground)
     )
     for geometry in (alone, with_ground):
         geometry.initialize("a fox")
@@ -96,10 +93,6 @@ def test_the_object_grows_first_and_the_ground_is_added_then():
     assert torch.equal(with_ground.sh0[:-100], alone.sh0)
     bottom = alone.means[:400, 2].min()
     assert torch.equal(with_ground.means[-100:, 2], bottom.expand(100))
-
-
-def test_the_cap_holds_at_the_start(sphere_points):
-    assert len(started(sphere_points, max_gaussians=123)) == 123
 
 
 def test_the_cloud_takes_its_size_from_the_checkpoint_and_never_asks_the_prior(
@@ -121,9 +114,8 @@ def test_a_checkpoint_from_before_the_removal_error_loads(sphere_points):
     del state["removal"]
     other = GaussianCloud({})
     other.load_state_dict(state)
-    assert torch.equal(other.means, geometry.means) and torch.equal(
-        other.removal, torch.zeros(len(geometry))
-    )
+    assert torch.equal(other.means, geometry.means)
+    assert torch.equal(other.removal, torch.zeros(len(geometry)))
 
 
 def test_spherical_harmonics_are_padded_and_cut(sphere_points):
@@ -131,13 +123,7 @@ def test_spherical_harmonics_are_padded_and_cut(sphere_points):
     assert third.sh.shape == (400, 16, 3) and third.sh_rest.abs().sum() == 0
     third.sh_rest.data.normal_()
     first = GaussianCloud({"sh_degree": 1})
-    first.set_arrays(
-        **{
-            k: getattr(third, k).detach()
-            for k in ("means", "log_scales", "quats", "logit_opacities")
-        },
-        sh=third.sh.detach(),
-    )
+    first.set_arrays(**Gaussians.of(third).map(torch.Tensor.detach)._asdict())
     assert torch.equal(first.sh, third.sh[:, :4])
     assert third.colors(torch.randn(2, 3)).shape == (2, 400, 3)
 
@@ -171,12 +157,8 @@ def test_learning_rates_follow_their_schedules(sphere_points):
     optimizer = torch.optim.Adam(geometry.parameter_groups())
     geometry.set_learning_rates(optimizer, 0, 50)
     rates = {group["name"]: group["lr"] for group in optimizer.param_groups}
-    assert (
-        rates["means"] == pytest.approx(1.5e-4)
-        and rates["sh_rest"] == 0.5
-        and rates["log_scales"] == 1e-3
-    )
-    assert len(rates) == 6
+    assert rates["means"] == pytest.approx(1.5e-4) and rates["sh_rest"] == 0.5
+    assert rates["log_scales"] == 1e-3 and len(rates) == 6
 
 
 @pytest.mark.parametrize("unit", ["world", "size"])
@@ -198,14 +180,8 @@ def test_a_step_moves_means_in_the_unit_of_their_rate(sphere_points, unit):
 
 
 def test_densification_happens_at_its_steps_only_and_the_optimiser_follows(sphere_points):
-    densify = {
-        "enabled": True,
-        "start": 4,
-        "stop": 9,
-        "every": 4,
-        "min_opacity": 0.01,
-        "grad_threshold": 1.0,
-    }
+    densify = {"enabled": True, "start": 4, "stop": 9, "every": 4, "grad_threshold": 1.0}
+    densify["min_opacity"] = 0.01
     geometry = started(sphere_points, densify=densify)
     optimizer = torch.optim.Adam(geometry.parameter_groups())
     sizes = []
@@ -223,45 +199,18 @@ def test_densification_happens_at_its_steps_only_and_the_optimiser_follows(spher
 
 @pytest.mark.parametrize("absgrad", [False, True])
 def test_the_rasteriser_collects_absolute_gradients_where_they_decide(sphere_points, absgrad):
-    geometry = started(
-        sphere_points, densify={"enabled": True, "absgrad": absgrad}, init_opacity=0.5
-    )
-    background = find("gaussiandreamer-background")({"mode": "fixed", "color": [1.0, 1.0, 1.0]})
-    renderer = find("gaussiandreamer-splatting")(
-        {}, geometry=geometry, material=None, background=background
-    )
-    out = renderer(
-        orbit_c2w(torch.zeros(2), torch.tensor([0.0, 90.0]), torch.full((2,), 2.5)),
-        torch.full((2,), 0.8),
-        40,
-        24,
-    )
+    densify = {"enabled": True, "absgrad": absgrad}
+    geometry = started(sphere_points, densify=densify, init_opacity=0.5)
+    parts = {"geometry": geometry, "material": None}
+    parts["background"] = find("gaussiandreamer-background")({"color": [1.0, 1.0, 1.0]})
+    c2w = orbit_c2w(torch.zeros(2), torch.tensor([0.0, 90.0]), torch.full((2,), 2.5))
+    out = find("gaussiandreamer-splatting")({}, **parts)(c2w, torch.full((2,), 0.8), 40, 24)
     (out["comp_rgb"] ** 2).mean().backward()
     DensityControl(geometry).after_backward(out["rasterized"], 40, 24)
     means2d = out["rasterized"].means2d
     assert hasattr(means2d, "absgrad") == absgrad
     expected = screen_gradients(means2d.absgrad if absgrad else means2d.grad, 40, 24).sum(0)
     assert torch.equal(geometry.gradient_sum, expected) and expected.max() > 0
-
-
-def test_a_trained_cloud_above_the_cap_keeps_what_contributes(sphere_points, tmp_path):
-    """All attributes of the best are kept bit for bit; every fourth is faint and is removed."""
-    trained = started(sphere_points, init_opacity=0.9)
-    trained.logit_opacities.data[::4] = -5.0
-    write_cloud(str(tmp_path / "a.ply"), StoredCloud(Gaussians.of(trained).arrays()))
-    geometry = GaussianCloud(
-        {
-            "prior_type": "gaussians-prior",
-            "prior": {"path": str(tmp_path / "a.ply")},
-            "max_gaussians": 300,
-        }
-    )
-    assert len(geometry.initialize("anything").points) == 400
-    bright = torch.arange(400) % 4 != 0
-    assert all(
-        torch.equal(getattr(geometry, name), getattr(trained, name)[bright])
-        for name in ("means", "log_scales", "quats", "logit_opacities", "sh0")
-    )
 
 
 @pytest.mark.parametrize("degree, told", [(0, True), (2, False)])
@@ -276,6 +225,8 @@ def test_colours_by_direction_that_are_dropped_are_told(
     geometry.initialize("anything")
     assert (f"system.geometry.sh_degree={degree} drops the bands" in caplog.text) == told
     assert geometry.sh_rest.shape[1] == (degree + 1) ** 2 - 1
+    for name in ("means", "log_scales", "quats", "logit_opacities", "sh0"):
+        assert torch.equal(getattr(geometry, name), getattr(trained, name)), name
 
 
 @pytest.mark.parametrize(

@@ -38,21 +38,14 @@ def torus(count: int, seed: int) -> Gaussians:
     normals = torch.stack([u.cos() * v.cos(), u.sin() * v.cos(), v.sin()], 1)
     ring = torch.stack([u.cos(), u.sin(), torch.zeros(count)], 1)
     size = 0.5 * math.sqrt(4 * math.pi**2 * 0.7 * 0.3 / count)
-    log_scales = torch.tensor([size, size, 0.2 * size]).log() + 0.3 * torch.randn(
-        count, 3, generator=rng
-    )
+    noise = 0.3 * torch.randn(count, 3, generator=rng)
+    log_scales = torch.tensor([size, size, 0.2 * size]).log() + noise
     # half a turn around the bisector takes +z to the normal
-    quats = torch.cat(
-        [
-            torch.zeros(count, 1),
-            torch.nn.functional.normalize(normals + torch.tensor([0, 0, 1.0]), dim=1),
-        ],
-        1,
-    )
+    bisectors = torch.nn.functional.normalize(normals + torch.tensor([0, 0, 1.0]), dim=1)
+    quats = torch.cat([torch.zeros(count, 1), bisectors], 1)
     opacities = 0.6 + 0.35 * torch.rand(count, generator=rng)
-    return Gaussians(
-        0.7 * ring + 0.3 * normals, quats, log_scales, opacities.logit(), colored(count, rng)
-    )
+    means = 0.7 * ring + 0.3 * normals
+    return Gaussians(means, quats, log_scales, opacities.logit(), colored(count, rng))
 
 
 def colored(count: int, rng: torch.Generator) -> Float[Tensor, "N 1 3"]:
@@ -62,9 +55,8 @@ def colored(count: int, rng: torch.Generator) -> Float[Tensor, "N 1 3"]:
 def floaters(count: int, seed: int) -> Gaussians:
     """Return Gaussians like those of the torus, uniformly in a box without cameras."""
     rng = torch.Generator().manual_seed(1000 + seed)
-    return torus(count, seed + 1)._replace(
-        means=1.6 * torch.rand(count, 3, generator=rng) - 0.8, sh=colored(count, rng)
-    )
+    means = 1.6 * torch.rand(count, 3, generator=rng) - 0.8
+    return torus(count, seed + 1)._replace(means=means, sh=colored(count, rng))
 
 
 def mixed(clouds: list[Gaussians], seed: int) -> Gaussians:
@@ -80,12 +72,8 @@ def with_copies_and_floaters(true: Gaussians, seed: int) -> Gaussians:
     """
     rng = torch.Generator().manual_seed(seed)
     thinnest = true.log_scales.exp().amin(1, keepdim=True)
-    moved = [
-        true._replace(
-            means=true.means + 0.3 * thinnest * torch.randn(true.means.shape, generator=rng)
-        )
-        for _ in range(2)
-    ]
+    shifts = (0.3 * thinnest * torch.randn(true.means.shape, generator=rng) for _ in range(2))
+    moved = [true._replace(means=true.means + shift) for shift in shifts]
     return mixed([true, *moved, floaters(len(true.means), seed)], seed)
 
 
@@ -94,9 +82,8 @@ def with_shares_and_faint_floaters(true: Gaussians, seed: int) -> Gaussians:
     0.01.
     """
     shared = 1 - (1 - true.logit_opacities.sigmoid()) ** (1 / 3)
-    faint = floaters(len(true.means), seed)._replace(
-        logit_opacities=torch.full((len(true.means),), 0.01).logit()
-    )
+    faint = floaters(len(true.means), seed)
+    faint = faint._replace(logit_opacities=torch.full((len(true.means),), 0.01).logit())
     return mixed([true._replace(logit_opacities=shared.logit())] * 3 + [faint], seed)
 
 
@@ -156,10 +143,8 @@ def test_auto_finds_the_true_number_with_visible_floaters_and_copies():
 def test_prune_finds_the_true_number_with_shared_opacity_and_faint_floaters():
     true = torus(M, 0)
     start = with_shares_and_faint_floaters(true, 0)
-    views = [
-        views_around(true, count, SIZE, turn=turn)
-        for count, turn in ((48, 0.0), (32, 45.0), (16, 60.0))
-    ]
+    turns = ((48, 0.0), (32, 45.0), (16, 60.0))
+    views = [views_around(true, count, SIZE, turn=turn) for count, turn in turns]
     found = simplify(start, Budget(psnr=40.0), Recovery(start, *views[:2], steps=40))
     assert len(found.means) <= 1.2 * M
     # on other views than those that decide, which are two standard errors on the safe side: 40.1 to

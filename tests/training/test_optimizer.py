@@ -21,10 +21,8 @@ def checkpoint(folder):
 @pytest.fixture
 def train(tmp_path, painted_box):
     """Return a function that trains towards (0.9, 0.2, 0.1) on a learned background of the host."""
-    background = {"learned": True}
-    config = mocked_config(
-        tmp_path, painted_box, background_type="solid-color-background", background=background
-    )
+    background = {"background_type": "solid-color-background", "background": {"learned": True}}
+    config = mocked_config(tmp_path, painted_box, **background)
 
     def trained(folder, *options):
         overrides = [f"exp_root_dir={folder}", *SMALL, *options]
@@ -48,13 +46,21 @@ def test_the_colour_of_another_background_is_learned_and_resumed(train, tmp_path
     assert rates["background.parameters"] == pytest.approx(0.0425)  # that of step 3
 
 
-def test_parameters_without_a_rate_are_refused_before_the_prior(train, tmp_path, capsys):
+def test_parameters_need_a_rate_and_changed_arguments_hold_in_a_resumed_run(
+    train, tmp_path, capsys
+):
     assert train(tmp_path, "system.geometry.prior.path=missing.glb") == 2
     said = capsys.readouterr().err
     assert "SolidColorBackground has parameters without" in said and "params.background.lr" in said
-    rate = "system.optimizer.params.background.lr=0"
-    assert train(tmp_path, rate, "trainer.max_steps=1") == 0
+    options = ["system.optimizer.params.background.lr=0", "system.optimizer.name=AdamW"]
+    decay = "system.optimizer.args.weight_decay"
+    assert train(tmp_path, *options, f"{decay}=0.01", "trainer.max_steps=1") == 0
     assert (checkpoint(tmp_path)["state_dict"][COLOR] == 1).all()
+    last = run_folder(tmp_path) / "ckpts" / "last.ckpt"
+    changed = [f"{decay}=0.5", "system.optimizer.args.betas=[0.5,0.9]", f"resume={last}"]
+    assert train(tmp_path, *options, *changed, "trainer.max_steps=2") == 0
+    for group in checkpoint(tmp_path)["optimizer_states"][0]["param_groups"]:
+        assert group["weight_decay"] == 0.5 and list(group["betas"]) == [0.5, 0.9]
 
 
 @pytest.mark.parametrize(
@@ -81,18 +87,6 @@ def test_a_rate_without_parameters_is_refused(tmp_path, painted_box, capsys, par
 def test_wrong_rates_are_named(params, message):
     with pytest.raises(UserError, match=message):
         check_optimizer({"name": "Adam", "params": params})
-
-
-def test_changed_arguments_hold_in_a_resumed_run(tmp_path, painted_box):
-    adamw, decay = "system.optimizer.name=AdamW", "system.optimizer.args.weight_decay"
-    options = [adamw, f"{decay}=0.01", "trainer.max_steps=1"]
-    assert launch(tmp_path, painted_box, *options) == 0
-    last = run_folder(tmp_path) / "ckpts" / "last.ckpt"
-    changed = [f"{decay}=0.5", "system.optimizer.args.betas=[0.5,0.9]"]
-    resumed = [adamw, *changed, "trainer.max_steps=2", f"resume={last}"]
-    assert launch(tmp_path, painted_box, *resumed) == 0
-    for group in checkpoint(tmp_path)["optimizer_states"][0]["param_groups"]:
-        assert group["weight_decay"] == 0.5 and list(group["betas"]) == [0.5, 0.9]
 
 
 @pytest.mark.parametrize("name", ["SGD", "Adafactor", "ASGD"])
@@ -129,10 +123,9 @@ def test_a_parameter_of_an_own_geometry_is_not_left_untrained(
     assert launch(tmp_path, painted_box, "system.geometry.prior.path=missing.glb") == 2
     assert "has the parameter bright without a learning rate" in capsys.readouterr().err
     groups = GaussianCloud.parameter_groups
-    own = [{"name": "bright", "lr": 0.1}]
-    monkeypatch.setattr(
-        GaussianCloud,
-        "parameter_groups",
-        lambda self: groups(self) + [{"params": [self.bright]} | group for group in own],
-    )
+
+    def with_own(self):
+        return [*groups(self), {"name": "bright", "lr": 0.1, "params": [self.bright]}]
+
+    monkeypatch.setattr(GaussianCloud, "parameter_groups", with_own)
     assert launch(tmp_path, painted_box, "trainer.max_steps=1") == 0

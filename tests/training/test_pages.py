@@ -119,9 +119,3 @@ def test_export_writes_the_page_again_and_keeps_the_pictures_of_the_test(save, p
     assert launch(save.parents[2], painted_box, *resume, stage="--export") == 0
     assert pictures and sorted((save / "it2-test").glob("*.png")) == pictures
     assert [shown["label"] for shown in meta(page)["clouds"]] == ["result", "prior"]
-
-
-def test_pages_can_be_switched_off(painted_box, tmp_path):
-    assert launch(tmp_path, painted_box, "system.pages=false", *SHORT) == 0
-    save = run_folder(tmp_path) / "save"
-    assert not [*save.rglob("*.html"), *save.rglob("poster.png"), *save.rglob("prior/*.spz")]

@@ -29,58 +29,45 @@ from threestudio_gaussiandreamer.training import system as system_module
 from threestudio_gaussiandreamer.training.system import GaussianDreamerSystem
 
 
-@pytest.fixture
-def no_models(monkeypatch):
-    """Make loading prompt processor and guidance a failure."""
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["system.geometry.prior.path=${system.guidance.mesh}s"], "does not exist"),
+        (
+            [
+                "system.prompt_processor_type=gaussiandreamer-stable-diffusion-prompt-processor",
+                f"system.prompt_processor.cache_dir={__file__}/cache",
+            ],
+            "cache_dir",
+        ),
+    ],
+)
+def test_files_and_folders_are_checked_before_any_model_is_loaded(
+    tmp_path, painted_box, capsys, monkeypatch, options, said
+):
     monkeypatch.setattr(
         GaussianDreamerSystem, "prepare_guidance", lambda self: pytest.fail("a model was loaded")
     )
-
-
-def test_a_missing_prior_file_is_found_before_any_model_is_loaded(
-    tmp_path, painted_box, capsys, no_models
-):
-    path = "system.geometry.prior.path=${system.guidance.mesh}s"
-    assert launch(tmp_path, painted_box, path) == 2
-    assert "does not exist" in capsys.readouterr().err
-
-
-def test_a_cache_folder_of_embeddings_is_checked_before_any_model_is_loaded(
-    tmp_path, painted_box, capsys, no_models
-):
-    (tmp_path / "file").write_text("")
-    options = [
-        "system.prompt_processor_type=gaussiandreamer-stable-diffusion-prompt-processor",
-        f"system.prompt_processor.cache_dir={tmp_path}/file/cache",
-    ]
     assert launch(tmp_path, painted_box, *options) == 2
-    assert "cache_dir" in capsys.readouterr().err
+    assert said in capsys.readouterr().err
 
 
 def test_training_against_a_known_truth_improves_on_held_out_views(tmp_path, painted_box, capsys):
     assert launch(tmp_path, painted_box, *length(60)) == 0
     metrics = json.loads((run_folder(tmp_path) / "save" / "metrics.json").read_text())
-    assert (
-        metrics["result"]["psnr"] > metrics["prior"]["psnr"] + 1.5
-    )  # 60 steps at 24 pixels give about 4 dB
+    # 60 steps at 24 pixels give about 4 dB
+    assert metrics["result"]["psnr"] > metrics["prior"]["psnr"] + 1.5
     assert metrics["result"]["step"] == 60 and metrics["result"]["gaussians"] == 200
     (exported,) = (run_folder(tmp_path) / "save").glob("it60-export/gaussians.ply")
     colors = sh0_to_rgb(read_gaussians(exported).sh[:, 0])
-    assert (
-        colors.min() > -1e-6 and colors.max() < 1 + 1e-6 and metrics["result"]["out_of_gamut"] == 0
-    )
+    assert colors.min() > -1e-6 and colors.max() < 1 + 1e-6
+    assert metrics["result"]["out_of_gamut"] == 0
     printed = capsys.readouterr().out
-    assert (
-        "compare.png" in printed
-        and "test.mp4" in printed
-        and ".ply" in printed
-        and "multi-face" in printed
-        and "sides look alike" in printed
-    )
-    rows = list(
-        csv.DictReader(open(run_folder(tmp_path) / "csv_logs" / "version_0" / "metrics.csv"))
-    )
-    assert {"loss", "gaussians", "dB", "train/loss_sds", "train/grad_norm"} <= set(rows[0])
+    for said in ("compare.png", "test.mp4", ".ply", "multi-face", "sides look alike"):
+        assert said in printed
+    logged = run_folder(tmp_path) / "csv_logs" / "version_0" / "metrics.csv"
+    (header, *_) = csv.reader(open(logged))
+    assert {"loss", "gaussians", "dB", "train/loss_sds", "train/grad_norm"} <= set(header)
     events = tensorboard_events(run_folder(tmp_path))
     logged = [(event.step, round(event.value, 3)) for event in events.Scalars("held_out/psnr")]
     assert logged == [(0, metrics["prior"]["psnr"]), (60, metrics["result"]["psnr"])]
@@ -95,7 +82,7 @@ def tensorboard_events(folder):
     return EventAccumulator(str(folder / "tb_logs" / "version_0")).Reload()
 
 
-def test_a_run_long_enough_for_its_pool_has_the_pictures_cast_at_once(
+def test_a_long_run_has_the_pictures_of_its_pool_cast_at_once_and_pages_can_be_switched_off(
     tmp_path, painted_box, monkeypatch
 ):
     cast = []
@@ -103,42 +90,27 @@ def test_a_run_long_enough_for_its_pool_has_the_pictures_cast_at_once(
         MeshTruth, "prefetch", lambda self, *views: cast.append((len(views[0]), *views[2:]))
     )
     options = ["data.width=48", "data.height=48", "system.renderer.downsample=2"]
-    assert (
-        launch(
-            tmp_path,
-            painted_box,
-            *options,
-            "trainer.max_steps=3",
-            "system.exporter.save_video=false",
-        )
-        == 0
-    )
+    options += ["trainer.max_steps=3", "system.exporter.save_video=false", "system.pages=false"]
+    assert launch(tmp_path, painted_box, *options) == 0
     assert cast == [(12, 24, 24)]
+    save = run_folder(tmp_path) / "save"
+    assert not [*save.rglob("*.html"), *save.rglob("poster.png"), *save.rglob("prior/*.spz")]
 
 
 def test_looking_at_pictures_is_no_training_time(tmp_path, painted_box, monkeypatch):
     clock = np.zeros(2)
     monkeypatch.setattr(evaluate, "_now", clock.copy)
+
+    def taking(hours, body):
+        return lambda *args: (clock.__iadd__(hours), body(*args))[1]
+
     for owner, name, hours in (
         (GaussianDreamerSystem, "training_step", 1),
         (system_module, "save_pictures", 100),
     ):
-        body = getattr(owner, name)
-        monkeypatch.setattr(
-            owner,
-            name,
-            lambda *args, body=body, hours=hours: (clock.__iadd__(hours), body(*args))[1],
-        )
-    assert (
-        launch(
-            tmp_path,
-            painted_box,
-            "trainer.max_steps=2",
-            "trainer.val_check_interval=1",
-            "system.exporter.save_video=false",
-        )
-        == 0
-    )
+        monkeypatch.setattr(owner, name, taking(hours, getattr(owner, name)))
+    options = ["trainer.max_steps=2", "trainer.val_check_interval=1"]
+    assert launch(tmp_path, painted_box, *options, "system.exporter.save_video=false") == 0
     assert json.loads((run_folder(tmp_path) / "save" / "metrics.json").read_text())["seconds"] == 2
 
 
@@ -178,14 +150,10 @@ def test_a_stopped_and_resumed_run_equals_the_run_that_never_stopped(
 
 
 def test_a_learned_background_learns_and_is_in_the_checkpoint(tmp_path, painted_box):
-    config = mocked_config(
-        tmp_path, painted_box, background={"mode": "learned", "color": [0.5, 0.5, 0.5], "lr": 0.1}
-    )
+    background = {"mode": "learned", "color": [0.5, 0.5, 0.5], "lr": 0.1}
+    config = mocked_config(tmp_path, painted_box, background=background)
     overrides = [f"exp_root_dir={tmp_path}", *SMALL, *length(20)]
     assert main(["--config", str(config), "--train", "--gpu", "cpu", *overrides]) == 0
-    color = torch.sigmoid(
-        cloud_of(run_folder(tmp_path) / "ckpts" / "last.ckpt")["background.logit"]
-    )
-    assert (
-        color[0] > 0.7 and color[1] < 0.35 and color[2] < 0.3
-    )  # on its way from grey to the mock's (0.9, 0.2, 0.1)
+    logit = cloud_of(run_folder(tmp_path) / "ckpts" / "last.ckpt")["background.logit"]
+    color = torch.sigmoid(logit)  # on its way from grey to the mock's (0.9, 0.2, 0.1)
+    assert color[0] > 0.7 and color[1] < 0.35 and color[2] < 0.3
