@@ -23,13 +23,6 @@ UNIFORM = np.sqrt(1 / 12)
 """Standard deviation of numbers that are uniform in [0, 1]."""
 
 
-class Evil:
-    """Runs code when it is unpickled; the fixture ``no_code`` notices."""
-
-    def __reduce__(self):
-        return (exec, ("import os; os.environ['EVIL'] = '1'",))
-
-
 def rng(seed=0):
     return np.random.default_rng(seed)
 

@@ -1,6 +1,5 @@
 """Fixtures of the prior tests: one tiny model of each kind, written once."""
 
-import os
 import shutil
 import sys
 
@@ -16,14 +15,6 @@ from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
 from threestudio_gaussiandreamer.gaussians.point_cloud import PointCloud
 from threestudio_gaussiandreamer.priors.makehuman import Person, load_body
 from threestudio_gaussiandreamer.priors.smpl_fit import load_body_model
-
-
-@pytest.fixture
-def no_code(monkeypatch):
-    """Fail if a file of the test has run code (``cases.Evil``)."""
-    monkeypatch.delenv("EVIL", raising=False)
-    yield
-    assert "EVIL" not in os.environ
 
 
 @pytest.fixture(scope="session")

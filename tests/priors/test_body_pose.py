@@ -117,8 +117,8 @@ def test_a_real_body_keeps_its_bones_and_stands_upright(name, real_body):
     feet = [INDEX[f"{side} {part}"] for side in ("left", "right") for part in ("ankle", "foot")]
     assert real_body.weights[top, JOINTS.index("head")] > 0.9
     assert real_body.weights[low, feet].sum() > 0.9
-    upper_arms = [
+    before, after = (
         np.linalg.norm(joints[INDEX["left elbow"]] - joints[INDEX["left shoulder"]])
         for joints in (real_body.joints, found.joints)
-    ]
-    assert upper_arms[0] == pytest.approx(upper_arms[1])
+    )
+    assert before == pytest.approx(after)

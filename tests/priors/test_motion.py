@@ -8,12 +8,10 @@ import pytest
 import torch
 import trimesh
 
-from tests.helpers import tiny_3d_models as tiny
 from tests.helpers.prior_contract import PriorContract, assert_valid
-from tests.priors.cases import UNIFORM, Evil, joints_of, walk
+from tests.priors.cases import UNIFORM, joints_of, walk
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.meshes.mesh import Mesh
-from threestudio_gaussiandreamer.models.clip import PictureText, clip_source
 from threestudio_gaussiandreamer.priors import motion as module
 from threestudio_gaussiandreamer.priors import motion_text
 from threestudio_gaussiandreamer.priors.body_pose import facing, z_up
@@ -67,7 +65,7 @@ def test_the_motion_of_a_prompt(prompt, motion, monkeypatch, capsys):
 # Files of motions ---------------------------------------------------------------------------------
 
 
-def test_layouts_of_motions(motion_file, body, tmp_path, no_code):
+def test_layouts_of_motions(motion_file, body, tmp_path):
     motions = read_motions(str(motion_file))
     assert motions.positions.shape == (2, 6, 22, 3) and motions.lengths == [6, 4]
     assert motions.texts == ["Someone kicks"] * 2
@@ -88,11 +86,6 @@ def test_layouts_of_motions(motion_file, body, tmp_path, no_code):
     padded[..., 3:] = np.nan
     np.savez(tmp_path / "motion.npz", motion=padded, lengths=np.array([3]))
     assert read_motions(str(tmp_path / "motion.npz")).lengths == [3]
-    np.save(tmp_path / "evil.npy", np.array({"motion": Evil()}, dtype=object))
-    np.savez(tmp_path / "evil.npz", motion=np.array(Evil(), dtype=object))
-    for name in ("evil.npy", "evil.npz"):
-        with pytest.raises(UserError, match="pickle|holds an object 'exec'"):
-            read_motions(str(tmp_path / name))
 
 
 ZEROS = np.zeros((1, 22, 3, 5))
@@ -137,7 +130,7 @@ def asked(monkeypatch):
         return np.arange(len(pictures), dtype=float)
 
     monkeypatch.setattr(module, "picture_similarities", scores)
-    monkeypatch.setattr(module, "NUM_FRAMES", 3)
+    monkeypatch.setattr(module, "NUM_FRAMES", 2)
     return texts
 
 
@@ -160,26 +153,11 @@ def test_clip_chooses_the_frame_by_the_motions_text(options, asked, monkeypatch)
     chosen = MotionPrior(options)("Iron man kicks with his left leg")
     same = MotionPrior(options | {"sample": 1, "frame": 3})("Iron man kicks with his left leg")
     np.testing.assert_array_equal(chosen.points, same.points)
-    MotionPrior(options | {"motion_text": "Someone bows"})("Iron man")
+    MotionPrior(options | {"sample": 1, "motion_text": "Someone bows"})("Iron man")
     assert not warned
-    MotionPrior(options)("Spiderman")
+    MotionPrior(options | {"sample": 1})("Spiderman")
     assert asked == ["Someone kicks with the left leg", "Someone bows", "Spiderman"]
     assert "motion_text" in warned[0]
-
-
-def test_similarities_are_those_of_transformers(clip):
-    from transformers import CLIPModel, CLIPTokenizer
-
-    pictures = np.random.default_rng(0).random((3, tiny.IMAGE_SIZE, tiny.IMAGE_SIZE, 3), np.float32)
-    model, tokenizer = CLIPModel.from_pretrained(clip), CLIPTokenizer.from_pretrained(clip)
-    pixels = (pictures - [0.48145466, 0.4578275, 0.40821073]) / [0.26862954, 0.26130258, 0.27577711]
-    pixels = torch.from_numpy(pixels).float().permute(0, 3, 1, 2)
-    with torch.no_grad():
-        output = model(**tokenizer("a fox", return_tensors="pt"), pixel_values=pixels)
-    compared = PictureText(clip_source(clip), torch.device("cpu"))
-    scores = compared.similarities(pictures, "a fox", batch=2)
-    wanted = (output.logits_per_text[0] / model.logit_scale.exp()).detach().numpy()
-    np.testing.assert_allclose(scores, wanted, atol=1e-5)
 
 
 def test_candidates_are_chosen_for_the_prompt(tmp_path, clip, asked):

@@ -148,10 +148,7 @@ ZEROS = np.zeros((5, 3))
         (PointCloud(ZEROS[:0], ZEROS[:0]), "no points"),
         (PointCloud(ZEROS, ZEROS[:4]), r"points \(5, 3\), colours \(4, 3\)"),
         (PointCloud(ZEROS, ZEROS, ZEROS[:4]), r"normals \(4, 3\); expected \(P, 3\)"),
-        (
-            cloud_with(faces=[[0, 1, 9999]]),
-            r"faces \(1, 3\) of type int64; expected integers \(F, 3\) from 0 to 199",
-        ),
+        (cloud_with(faces=[[0, 1, 9999]]), r"faces \(1, 3\) of type int64; expected integers"),
         (cloud_with(faces=[[-1, 0, 1]]), "faces .* from 0 to 199"),
         (cloud_with(faces=[[0, 1]]), r"faces \(1, 2\) of type int64; expected integers"),
         (cloud_with(faces=[[0, 1], [0, 1, 2]]), "something else than arrays"),
@@ -197,14 +194,6 @@ def test_surface_samples(assets):
     along = np.abs((cloud.normals * cloud.points).sum(1))
     np.testing.assert_allclose(along, (on_side * half).max(1), atol=1e-5)
     np.testing.assert_allclose(cloud.colors, cloud.points + 0.5, atol=0.02)  # the ramp, in bytes
-
-
-def test_faces_without_area_get_no_samples(tmp_path):
-    vertices = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0], [0.5, 0, 0.2], [0, 0, 1]]
-    faces = [[0, 1, 4], [0, 1, 2], [3, 1, 2]] + [[0, 0, 5]] * 30  # an edge to (0, 0, 1)
-    trimesh.Trimesh(vertices, faces, process=False).export(tmp_path / "mesh.ply")
-    prior = find("mesh-prior")({"path": str(tmp_path / "mesh.ply"), "num_points": 3000})
-    assert prior("").points[:, 2].max() < -0.5  # the edge would reach up to +0.5
 
 
 def test_smoothed_colours(assets):
