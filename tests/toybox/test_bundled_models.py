@@ -33,11 +33,6 @@ def test_the_files_are_complete_and_small():
     assert sum(path.stat().st_size for path in files) <= LARGEST
 
 
-def test_a_few_steps_with_them(tmp_path):
-    pytest.importorskip("diffusers")
-    assert run(NAME, tmp_path, PROMPT) == 0
-
-
 @pytest.mark.slow
 def test_a_whole_run_is_recognised_by_the_judge(tmp_path):
     """With the draft's options, which take fewer views for the same steps."""

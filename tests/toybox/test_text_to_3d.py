@@ -36,13 +36,6 @@ def run(exported, folder, prompt, *options):
     return launch(["--config", str(CONFIGS / "toybox.yaml"), "--train", "--gpu", "cpu", *overrides])
 
 
-@pytest.fixture(scope="module")
-def finished(exported, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("runs")
-    assert run(exported, folder, PROMPT) == 0
-    return folder
-
-
 def test_cameras_and_background_are_those_of_the_training():
     cfg = yaml.safe_load((CONFIGS / "toybox.yaml").read_text())
     data, low, high = cfg["data"], *views.DISTANCE
@@ -53,30 +46,28 @@ def test_cameras_and_background_are_those_of_the_training():
     assert data["eval_camera_distance"] == pytest.approx((low + high) / 2)
 
 
-def test_a_prompt_becomes_a_cloud_and_its_pages(finished):
-    save = finished / "toybox/t/save"
+def test_a_prompt_becomes_a_cloud_and_its_pages_and_is_scored(exported, tmp_path, capsys):
+    """With unknown words, which are named, and with the models of one folder."""
+    assert run(exported, tmp_path, "a red fox with a skarf 狐狸 🦊") == 0
+    assert "wasn't trained on" in (errors := capsys.readouterr().err)
+    assert "'skarf' (near: scarf)" in errors and "'狐狸'" in errors
+    save = tmp_path / "toybox/t/save"
     names = {path.name for path in save.glob("it2-export/*")}
     assert {"gaussians.ply", "gaussians.spz", "points.ply", "view.html"} <= names
     assert (save / "prior/points.npz").is_file()
-
-
-def test_finished_runs_are_scored_with_the_models_of_one_folder(finished, exported, tmp_path):
-    models = ["--judge", str(exported), "--clip", str(exported)]
-    arguments = ["--metrics", "judge,janus,clip,directions", "--output", str(tmp_path)]
-    assert evaluate([str(finished), *arguments, *models]) == 0
-    with open(tmp_path / "scorecard.csv", newline="") as file:
+    arguments = ["--metrics", "judge,janus,clip,directions", "--output", str(tmp_path / "scores")]
+    arguments += ["--judge", str(exported), "--clip", str(exported)]
+    assert evaluate([str(tmp_path / "toybox"), *arguments]) == 0
+    with open(tmp_path / "scores" / "scorecard.csv", newline="") as file:
         (row,) = csv.DictReader(file)
     assert row["kind"] in ("0.0", "1.0") and 0 <= float(row["multi_face"]) <= 1
-    content = json.loads((tmp_path / "scorecard.json").read_text())
+    content = json.loads((tmp_path / "scores" / "scorecard.json").read_text())
     assert -100 <= content["clip"]["mean"]["mean"] <= 100
 
 
-def test_any_text_is_a_prompt(exported, tmp_path, capsys):
+def test_a_long_text_is_a_prompt(exported, tmp_path, capsys):
     quick = ("trainer.max_steps=1", "system.pages=false")
-    assert run(exported, tmp_path, "a red fox with a skarf 狐狸 🦊", *quick) == 0
-    assert "wasn't trained on" in (errors := capsys.readouterr().err)
-    assert "'skarf' (near: scarf)" in errors and "'狐狸'" in errors
-    assert run(exported, tmp_path / "long", "a red fox " * 400, *quick) == 0  # of known words
+    assert run(exported, tmp_path, "a red fox " * 400, *quick) == 0  # of known words
     assert "wasn't trained on" not in (errors := capsys.readouterr().err)
     assert "the text encoder takes 32: what comes last has no effect" in errors
 
