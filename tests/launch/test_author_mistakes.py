@@ -203,11 +203,6 @@ MISTAKES = {
         ["system.exporter.formats=[own]"],
         "Ownexporter returned NoneType; expected a list of ExporterOutput",
     ),
-    "renderer: forgot super().configure": (
-        PART.format("renderer", "training.renderer", "SplattingRenderer") + FORGOTTEN,
-        ["system.renderer_type=own-renderer"],
-        "Ownrenderer.configure must call super().configure",
-    ),
     "geometry: forgot super().configure": (
         PART.format("geometry", "training.geometry", "GaussianCloud") + FORGOTTEN,
         ["system.geometry_type=own-geometry"],
@@ -217,26 +212,6 @@ MISTAKES = {
         PART.format("guidance", "guidance.mock", "MockGuidance") + FORGOTTEN,
         ["system.guidance_type=own-guidance"],
         "Ownguidance.configure must call super().configure",
-    ),
-    "background: forgot super().configure": (
-        PART.format("background", "training.background", "FlatBackground") + FORGOTTEN,
-        ["system.background_type=own-background"],
-        "Ownbackground.configure must call super().configure",
-    ),
-    "density rule: misspelt name": (
-        DENSITY + "    pass",
-        ["system.geometry.density_type=own-densty"],
-        "system.geometry.density_type: unknown part 'own-densty': did you mean 'own-density'",
-    ),
-    "density rule: misspelt option": (
-        DENSITY + "    pass",
-        [OWN_DENSITY, "system.geometry.density.evry=5"],
-        "unknown key 'system.geometry.density.evry'",
-    ),
-    "density rule: a part of another kind": (
-        DENSITY + "    pass",
-        ["system.geometry.density_type=mesh-prior"],
-        "choose from gaussiandreamer-density, own-density",
     ),
     "density rule: no base class": (
         DENSITY.replace("Own(DensityRule)", "Own(BaseObject)") + "    pass",

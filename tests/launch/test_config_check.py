@@ -1,23 +1,28 @@
 """Misspelt keys and broken extensions are named."""
 
-import copy
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import pytest
-import yaml
 
-from tests.helpers import tiny_parts
 from tests.launch.config_cases import load
 from threestudio_gaussiandreamer import register_parts
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.core.methods import require_dataclass
 from threestudio_gaussiandreamer.host import BaseBackground, BaseObject, register
 from threestudio_gaussiandreamer.launch.config import load_config
-from threestudio_gaussiandreamer.launch.config_check import check_config, check_part
+from threestudio_gaussiandreamer.launch.config_check import (
+    check_config,
+    check_part,
+    check_shared_views,
+)
 from threestudio_gaussiandreamer.launch.extensions import load_extensions
 from threestudio_gaussiandreamer.launch.part_kinds import check_kind, find_part
+
+register_parts()
+CONFIGS = Path(__file__).parents[2] / "configs"
+DEMO = CONFIGS / "demo.yaml"
 
 
 @register("optionless-part")
@@ -48,16 +53,6 @@ class TablePart(BaseObject):
 # -- the check -------------------------------------------------------------------------------------
 
 
-def keys_of(node: dict, prefix: str = "") -> list[str]:
-    inner = [
-        key
-        for name, value in node.items()
-        if isinstance(value, dict)
-        for key in keys_of(value, f"{prefix}{name}.")
-    ]
-    return [prefix + name for name in node] + inner
-
-
 @pytest.mark.parametrize(
     ("weights", "message"),
     [
@@ -75,95 +70,50 @@ def test_a_dictionary_of_a_part_is_checked_by_its_default(weights, message):
     check_part("part", "table-part", {"weights": valid, "free": {"anything": "x"}})
 
 
-# without references, so that only the misspelling is wrong
-PLAIN = yaml.safe_load(
-    tiny_parts.CONFIG.replace("${trainer.max_steps}", "6").replace(
-        "${rmspace:${system.prompt_processor.prompt},_}", "x"
-    )
-)
-
-
-@pytest.mark.parametrize("key", keys_of(PLAIN))
-def test_every_misspelt_key_is_rejected_with_the_right_one(folder, key):
-    content = copy.deepcopy(PLAIN)
-    section, _, leaf = key.rpartition(".")
-    parent = content
-    for name in filter(None, section.split(".")):
-        parent = parent[name]
-    misspelt = leaf[:-1]
-    parent[misspelt] = parent.pop(leaf)
-    Path("misspelt.yaml").write_text(yaml.safe_dump(content))
-    wrong, right = (f"{section}.{name}" if section else name for name in (misspelt, leaf))
-    with pytest.raises(UserError, match=f"unknown key {wrong!r}.*{right!r}"):
-        check_config(load_config("misspelt.yaml"))
-
-
-@pytest.mark.parametrize("strategy", ["deepspeed", "DeepSpeed_stage_2"])
-def test_a_strategy_whose_package_is_missing_is_refused(folder, monkeypatch, strategy):
+def test_a_strategy_whose_package_is_missing_is_refused(folder, monkeypatch):
     from lightning.pytorch.strategies import deepspeed
 
     monkeypatch.setattr(deepspeed, "_DEEPSPEED_AVAILABLE", False)
-    with pytest.raises(UserError, match="trainer.strategy: .*you must have DeepSpeed installed"):
-        check_config(load(f"trainer.strategy={strategy}"))
+    for strategy in ("deepspeed", "DeepSpeed_stage_2"):
+        with pytest.raises(
+            UserError, match="trainer.strategy: .*you must have DeepSpeed installed"
+        ):
+            check_config(load(f"trainer.strategy={strategy}"))
 
 
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        (
-            "system.geometry.sise=3",
-            "unknown key 'system.geometry.sise': did you mean 'system.geometry.size'?",
-        ),
-        (
-            "system.geometry.prior.cuont=3",
-            "unknown key 'system.geometry.prior.cuont': did you mean "
-            "'system.geometry.prior.count'?",
-        ),
         ("system.geometry.size=big", "system.geometry.size: expected a whole number, got 'big'"),
-        (
-            "system.geometry.prior.count=0",
-            "system.geometry.prior.count: expected at least 1, got 0",
-        ),
-        (
-            "system.geometry.prior_type=tiny-piror",
-            "system.geometry.prior_type: unknown part 'tiny-piror': did you mean 'tiny-prior'",
-        ),
+        ("system.geometry.prior.count=0", "prior.count: expected at least 1, got 0"),
         ("system.geometry_type=tiny-geomerty", "system.geometry_type: unknown part"),
-        (
-            "system_type=tiny-sistem",
-            "system_type: unknown part 'tiny-sistem': did you mean 'tiny-system'",
-        ),
+        ("system_type=tiny-sistem", "unknown part 'tiny-sistem': did you mean 'tiny-system'"),
         ("data_type=", "data_type"),
         ("system.geometry_type=[a,b]", "system.geometry_type is ['a', 'b']; expected the name"),
         ("data.veiws=3", "unknown key 'data.veiws'"),
         ("system.geometry=3", "system.geometry"),
-        (
-            "system.loss.sds=1",
-            "unknown key 'system.loss.sds': weights of losses are called lambda_<loss>",
-        ),
+        ("system.loss.sds=1", "weights of losses are called lambda_<loss>"),
         ("system.loss.lambda_sparsty=1", "did you mean 'system.loss.lambda_sparsity'"),
         ("system.loss.lambda_fit=[1,2]", "system.loss.lambda_fit has 2 elements"),
         ("system.loggers.wadb.enable=true", "unknown key 'system.loggers.wadb'"),
         ("system.loggers.wandb.enabled=true", "unknown key 'system.loggers.wandb.enabled'"),
-        ("trainer.max_step=3", "unknown key 'trainer.max_step': did you mean 'trainer.max_steps'"),
         ("trainer.max_steps=many", "trainer.max_steps is 'many' (str); expected one of: int"),
         ("trainer.max_steps=2.5", "trainer.max_steps is 2.5 (float)"),
         ("trainer.precision=17", "trainer: Precision 17 is invalid"),
-        (
-            "trainer.limit_train_batches=2",
-            "trainer.limit_train_batches: views are drawn without end",
-        ),
+        ("trainer.limit_train_batches=2", "limit_train_batches: views are drawn without end"),
         ("trainer.limit_train_batches=0", "set trainer.max_steps for a short run, got 0"),
-        (
-            "trainer.limit_train_batches=1",
-            "trainer.limit_train_batches: views are drawn without end",
-        ),
+        ("trainer.limit_train_batches=1", "limit_train_batches: views are drawn without end"),
         ("trainer.overfit_batches=2", "trainer.overfit_batches: views are drawn without end"),
         ("trainer.accelerator=cpu", "trainer.accelerator is set by --gpu"),
         ("trainer.logger=false", "trainer.logger is set by the launcher"),
         ("checkpoint.every_n_steps=3", "unknown key 'checkpoint.every_n_steps'"),
         ("checkpoint.every_n_epochs=1", "checkpoint: Combination of parameters"),
         ("checkpoint.dirpath=x", "checkpoint.dirpath is set by exp_root_dir"),
+        ("viewer.prot=80", "viewer.prot"),
+        ("viewer.port=0", "viewer.port"),
+        ("viewer.port=http", "viewer.port"),
+        ("viewer.updates_per_second=0", "viewer.updates_per_second"),
+        ("viewer=on", "viewer"),
     ],
 )
 def test_a_mistake_is_named_by_its_path(folder, override, message):
@@ -225,6 +175,7 @@ def test_extensions_of_both_kinds_are_loaded_and_others_left_out(folder):
             "import os\nimport nothing_of_this_name\n",
             r"custom/broken.py:2: ModuleNotFoundError: No module named 'nothing_of_this_name'",
         ),
+        ("x = '\0'", "null bytes"),
         ("x = 1\ny = (\n", r"custom/broken.py:2: '\(' was never closed"),
         ("def f():\n    raise KeyError('a')\n\nf()\n", r"custom/broken.py:2: KeyError: 'a'"),
         (
@@ -243,8 +194,8 @@ def test_a_broken_extension_is_an_error_with_file_line_and_cause(folder, source,
         load_extensions()
 
 
-@pytest.mark.parametrize("name", ["logging", "torch", "yaml"])
-def test_an_extension_with_the_name_of_a_module_is_refused(folder, name):
+def test_an_extension_with_the_name_of_a_module_is_refused(folder):
+    name = "logging"
     (folder / "custom" / name).mkdir(parents=True)
     (folder / "custom" / name / "__init__.py").write_text("")
     with pytest.raises(UserError, match=f"custom/{name} has the name of a module"):
@@ -260,41 +211,35 @@ def test_another_part_forgets_the_options_that_only_the_earlier_one_has():
     """Another prior or guidance needs one override: options of the new part are kept, misspelt ones
     are still errors.
     """
-    register_parts()
-    demo = Path(__file__).parents[2] / "configs" / "demo.yaml"
     cfg = load_config(
-        demo, cli_args=["system.geometry.prior_type=random-prior", "system.geometry.prior.size=0.5"]
+        DEMO, cli_args=["system.geometry.prior_type=random-prior", "system.geometry.prior.size=0.5"]
     )
     assert dict(cfg.system.geometry.prior) == {"num_points": 16000, "size": 0.5}
     check_config(cfg)
     wrong = load_config(
-        demo, cli_args=["system.geometry.prior_type=random-prior", "system.geometry.prior.sise=0.5"]
+        DEMO, cli_args=["system.geometry.prior_type=random-prior", "system.geometry.prior.sise=0.5"]
     )
     with pytest.raises(UserError, match="system.geometry.prior.size"):
         check_config(wrong)
-    same = load_config(demo, cli_args=["system.geometry.prior_type=mesh-prior"])
+    same = load_config(DEMO, cli_args=["system.geometry.prior_type=mesh-prior"])
     assert "path" in same.system.geometry.prior
 
 
 def test_another_guidance_forgets_the_weights_of_losses_that_it_does_not_return():
-    register_parts()
-    demo = Path(__file__).parents[2] / "configs" / "demo.yaml"
     path = "system.geometry.prior.path=toy.glb"
     overrides = ["system.guidance_type=foo-guidance", "system.loss.lambda_foo=1", path]
-    cfg = load_config(demo, cli_args=[*overrides, "system.loss.lambda_tv=2"])
+    cfg = load_config(DEMO, cli_args=[*overrides, "system.loss.lambda_tv=2"])
     assert dict(cfg.system.loss) == {"lambda_foo": 1, "lambda_tv": 2}
     check_config(cfg)
     with pytest.raises(UserError, match="give its weight, for instance system.loss.lambda_foo=1"):
-        check_config(load_config(demo, cli_args=[overrides[0], path]))
+        check_config(load_config(DEMO, cli_args=[overrides[0], path]))
 
 
-@pytest.mark.parametrize("value", ["0", "0.0", "null"])
-def test_a_weight_of_0_or_null_removes_that_of_an_earlier_file(value):
-    register_parts()
-    demo = Path(__file__).parents[2] / "configs" / "demo.yaml"
-    check_config(load_config(demo, cli_args=[f"system.loss.lambda_other={value}"]))
+def test_a_weight_of_0_or_null_removes_that_of_an_earlier_file():
+    for value in ("0", "0.0", "null"):
+        check_config(load_config(DEMO, cli_args=[f"system.loss.lambda_other={value}"]))
     with pytest.raises(UserError, match="leave it out: system.loss.lambda_other=0"):
-        check_config(load_config(demo, cli_args=["system.loss.lambda_other=1"]))
+        check_config(load_config(DEMO, cli_args=["system.loss.lambda_other=1"]))
 
 
 class Undecorated(BaseObject):
@@ -372,3 +317,75 @@ def test_a_background_without_forward_is_refused():
 
     with pytest.raises(UserError, match=r"background_type: Unfinished has no forward\(dirs, ...\)"):
         check_kind("system.background_type", "unfinished", Unfinished)
+
+
+# -- options of different sections -----------------------------------------------------------------
+
+PERP_NEG = "system.prompt_processor.use_perp_neg=true"
+LATENT = "system.guidance.space=latent"
+
+
+def check(names, *overrides):
+    paths = [CONFIGS / f"{name}.yaml" for name in names]
+    given = ["system.prompt_processor.prompt=a fox"] if "demo" not in names else []
+    check_config(load_config(*paths, cli_args=[*given, *overrides]))
+
+
+MVDREAM = ("gaussiandreamer", "gaussiandreamer-mvdream")
+WRONG = [
+    (MVDREAM, ["data.n_view=2"], "data.n_view: the guidance sees 4 views"),
+    (MVDREAM, [PERP_NEG], "this guidance has one prompt for all"),
+    (
+        ("gaussiandreamer",),
+        [PERP_NEG, "system.guidance.view_dependent_prompting=false"],
+        "set system.guidance.view_dependent_prompting=true",
+    ),
+    (("toybox",), [PERP_NEG], "or system.guidance.view_contrast=0"),
+    (
+        ("gaussiandreamer",),
+        ["system.prompt_processor_type=plain-prompt-processor", "system.prompt_processor={}"],
+        "needs a prompt processor that encodes text",
+    ),
+    (("demo",), (LATENT, "data.height=250"), "pictures of 250x256 can't be pooled"),
+    (("demo",), (LATENT, "data.width=[256,250]", "data.resolution_milestones=[9]"), "256x250"),
+    (("demo",), (LATENT, "system.renderer.downsample=2", "data.height=280"), "of 140x128"),
+    (("demo",), (LATENT, "system.guidance.image_size=64", "data.width=252"), "of 64x63"),
+    (("demo",), ("system.guidance.mode=view-agnostic", "data.height=4096"), "needs .* GiB"),
+]
+
+
+@pytest.mark.parametrize(("names", "overrides", "message"), WRONG)
+def test_contradictions_are_named(names, overrides, message):
+    with pytest.raises(UserError, match=message):
+        check(names, *overrides)
+
+
+@pytest.mark.parametrize(
+    ("names", "overrides"),
+    [
+        (("toybox",), [PERP_NEG, "system.guidance.view_contrast=0"]),
+        (("demo",), [LATENT, "data.height=512", "system.renderer.downsample=2"]),
+        (("demo",), ["data.height=250"]),
+        (MVDREAM, []),
+    ],
+)
+def test_valid_combinations_pass(names, overrides):
+    check(names, *overrides)
+
+
+@pytest.mark.parametrize(
+    ("batch", "processes", "message"),
+    [
+        ("4", 3, "data.batch_size is 4, no multiple of the 3 processes"),
+        ("[8,2]", 4, "data.batch_size is 2, fewer than the 4 processes"),
+    ],
+)
+def test_processes_that_cant_share_the_views_are_found_before_they_start(batch, processes, message):
+    overrides = [f"data.batch_size={batch}", f"trainer.devices={processes}"]
+    if "[" in batch:
+        overrides.append("data.resolution_milestones=[9]")
+    cfg = load_config(DEMO, cli_args=overrides)
+    with pytest.raises(UserError, match=message):
+        check_shared_views(cfg)
+    cfg.n_gpus = 2
+    check_shared_views(cfg)

@@ -205,12 +205,15 @@ def test_a_deleted_working_folder_is_one_message(folder, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "is_folder"),
-    [("ckpts", False), ("save", False), ("ckpts/last.ckpt", True), ("cmd.txt", True)],
+    ("name", "make"),
+    [
+        *(("ckpts", Path.touch), ("save", Path.touch), ("ckpts/last.ckpt", Path.mkdir)),
+        *(("cmd.txt", Path.mkdir), ("cmd.txt", os.mkfifo)),  # writing to it would wait for a reader
+    ],
 )
-def test_a_path_that_blocks_a_result_is_found_before_the_work(folder, name, is_folder):
+def test_a_path_that_blocks_a_result_is_found_before_the_work(folder, name, make):
     (folder / name).parent.mkdir(parents=True)
-    (folder / name).mkdir() if is_folder else (folder / name).touch()
+    make(folder / name)
     with pytest.raises(UserError, match=f"{name} is "):
         require_writable(folder)
 

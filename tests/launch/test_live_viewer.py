@@ -7,12 +7,8 @@ import numpy as np
 import pytest
 
 from tests.helpers.tiny_runs import assert_same_training
-from tests.launch.bad_input_cases import DEMO
 from tests.view.clouds import cloud
-from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.launch import live_viewer
-from threestudio_gaussiandreamer.launch.config import load_config
-from threestudio_gaussiandreamer.launch.config_check import check_config
 from threestudio_gaussiandreamer.launch.live_viewer import LiveViewer, ViewerConfig
 
 
@@ -155,18 +151,3 @@ def test_cameras_that_are_switched_off_are_not_sent(viewer):
     made.controls.cameras.value = False
     assert made._show_if_due(trainer, system, {})
     assert not made.view.cameras
-
-
-@pytest.mark.parametrize(
-    ("override", "message"),
-    [
-        ("viewer.prot=80", "viewer.prot"),
-        ("viewer.port=0", "viewer.port"),
-        ("viewer.port=http", "viewer.port"),
-        ("viewer.updates_per_second=0", "viewer.updates_per_second"),
-        ("viewer=on", "viewer"),
-    ],
-)
-def test_wrong_options_are_named(override, message, tmp_path):
-    with pytest.raises(UserError, match=message):
-        check_config(load_config(DEMO, cli_args=[override]))

@@ -23,6 +23,7 @@ def test_a_demo_run_imports_nothing_heavy_that_it_does_not_use():
     assert not UNUSED & modules
 
 
+@pytest.mark.slow
 def test_the_commands_for_files_import_no_lightning():
     """It takes three times as long as what they use."""
     rooms = ("convert", "prune", "view")

@@ -55,14 +55,15 @@ MEANS, ADAM = ("state_dict", "geometry.means"), ("optimizer_states", 0)
 FIT = ("loops", "fit_loop")
 NAN = lambda tensor: tensor * math.nan  # noqa: E731
 IMPOSSIBLE = [
+    (at("state_dict", value=[1]), "its state_dict is of type list"),
+    (at("global_step", value=None), "its global_step is of type NoneType"),
+    (at("loops", value={"x": 1}), "its loops aren't those of Lightning: KeyError"),
     (empty_cloud, "holds no Gaussian"),
     (at(*MEANS, value=NAN), "geometry.means holds 30 numbers that are NaN"),
     (at(*MEANS, value=torch.Tensor.long), "is of the type torch.int64"),
     (at(*MEANS, value=[1.0]), "in its state_dict is of type list"),
     (at("state_dict", "geometry.quats", value=lambda t: t[:4]), "has the shape .4, 4.; expected"),
     (at("state_dict", 3, value=torch.zeros(1)), "3 in its state_dict is of type Tensor"),
-    (at("guidance", value=[1]), "its guidance isn't a mapping of tensors"),
-    (at("guidance", value=torch.zeros(3)), "its guidance isn't a mapping of tensors"),
     (at("global_step", value=-1), "its global_step is -1"),
     (at("global_step", value=10**400), "its global_step is an integer of 1329 bits"),
     (at("global_step", value=7), "loops are at step 3, its global_step is 7"),

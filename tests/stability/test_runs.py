@@ -23,7 +23,7 @@ import torch
 from omegaconf import OmegaConf, open_dict
 
 import threestudio_gaussiandreamer
-from tests.launch import test_shipped_configs as test_configs
+from tests.helpers import accepted_keys
 from tests.promises.commands import full_disk
 from tests.stability.backends import slow
 from tests.stability.rows import row
@@ -591,7 +591,7 @@ def test_every_key_misspelt_by_one_letter_is_refused_with_the_right_one(measured
 def test_every_option_of_every_part_misspelt_is_refused_with_the_right_one(measured):
     """Also options that no shipped file uses, nested groups included."""
     tried, failed = 0, []
-    for place, config in test_configs.config_classes().items():
+    for place, config in accepted_keys.config_classes().items():
         name, _, group = place.partition(".")
         words = {field.name for field in fields(config)}
         for word in words:
@@ -608,7 +608,7 @@ def test_every_option_of_every_part_misspelt_is_refused_with_the_right_one(measu
 @pytest.mark.slow
 @row("A5", "Wrong config keys")
 def test_every_accepted_key_is_read(measured):
-    read, classes = test_configs.names_that_are_read(), test_configs.config_classes()
+    read, classes = accepted_keys.names_that_are_read(), accepted_keys.config_classes()
     keys = [field.name for cls in classes.values() for field in fields(cls)]
     unread = sum(key not in read for key in keys)
     measured(unread, f"of {len(keys)} keys", what="never read", at_most=0)
