@@ -70,13 +70,6 @@ def test_files_of_other_programs_have_the_axes_of_their_format(tmp_path, caplog)
     assert [read_cloud(str(tmp_path / name)).up for name in ("a.spz", "a.glb")] == ["y", "y"]
 
 
-def test_gaussians_that_cant_be_drawn_are_left_out(tmp_path):
-    arrays = cloud()
-    arrays.means[3, 0], arrays.quats[7, 1] = np.nan, np.inf
-    write_raw_gaussians(tmp_path / "a.ply", arrays)
-    assert len(read_cloud(str(tmp_path / "a.ply")).gaussians.means) == 58
-
-
 def test_mistakes(tmp_path):
     said = r"OUT: expected the name of a .ply, .* or .usdz file, got 'a.obj'"
     with pytest.raises(UserError, match=said):

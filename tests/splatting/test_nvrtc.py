@@ -87,13 +87,6 @@ def test_every_kernel_compiles_without_spills(architecture):
     assert seen == set(cuda_driver.UNITS)
 
 
-@needs_nvrtc
-def test_a_mistake_in_the_text_is_shown(monkeypatch):
-    monkeypatch.setattr(nvrtc, "source", lambda unit: "__global__ void f() { undeclared = 1; }")
-    with pytest.raises(UserError, match="(?s)blend.cu for sm_80.*undeclared"):
-        nvrtc.compile_unit("blend", "sm_80")
-
-
 @pytest.mark.parametrize(
     "capability, target",
     [

@@ -11,6 +11,7 @@ import torch
 from scipy.spatial import cKDTree
 
 from tests.stability import scenes
+from tests.stability.backends import slow
 from tests.stability.rows import row
 from tests.stability.small_runs import DEMO, Ended, differences, launch
 from threestudio_gaussiandreamer.cameras import orbit_c2w
@@ -31,11 +32,7 @@ from threestudio_gaussiandreamer.training.density import DensityControl
 from threestudio_gaussiandreamer.training.geometry import STATISTICS, GaussianCloud
 
 NO_LIMITS = {"min_opacity": 0.0, "max_scale": 1e9}
-
-
 EVERY_STEP = {"enabled": True, "start": 1, "stop": 10_000, "every": 1}
-
-
 each_gradient = pytest.mark.parametrize("absgrad", [False, True], ids=["gradient", "absgrad"])
 EACH_STEP = {"start": 0, "stop": 10_000, "every": 1}
 
@@ -109,22 +106,6 @@ def test_threshold_zero_fills_the_cap_and_no_more(limit, absgrad, measured):
     counts = Training(started(**{limit: 500}, densify=growing, prune=EACH_STEP)).run(12)
     measured(max(counts), "Gaussians, cap 500", at_most=500)
     measured(min(counts[2:]), "Gaussians, once it is full", at_least=500)
-
-
-@row("A3", "Explosion")
-@pytest.mark.parametrize("cap", [64, 123, 199])
-def test_above_the_cap_the_smallest_contributions_are_removed_first(cap, measured):
-    """A cloud larger than the cap, ranked by the contributions of one step; no Gaussian is
-    selected.
-    """
-    geometry = started(max_gaussians=cap, densify=EVERY_STEP | NO_LIMITS | {"grad_threshold": 1e9})
-    training = Training(geometry)
-    training.observe()
-    best = geometry.contribution.topk(cap).indices.sort().values
-    expected = geometry.means.detach()[best]
-    DensityControl(geometry).after_step(training.optimizer, 1)
-    assert torch.equal(geometry.means, expected)
-    measured(abs(len(geometry) - cap), "off the cap", at_most=0)
 
 
 @row("A3", "Explosion")
@@ -308,7 +289,7 @@ def spelt(ids: torch.Tensor, parameter: torch.Tensor) -> torch.Tensor:
 
 
 @row("A3", "Optimiser state mismatch")
-@pytest.mark.parametrize("first_seed", range(0, 100, 20))
+@pytest.mark.parametrize("first_seed", [0, *slow(20, 40, 60, 80)])
 def test_moments_follow_their_gaussian(first_seed, measured):
     """Random rounds of cloning, splitting, dropping, capping and pruning to a budget; in a third of
     the sequences before any step.

@@ -228,7 +228,6 @@ SOURCES = {
     "rows of text": lambda folder, points, colors, _: write_text(folder / "a.xyz", points, colors),
 }
 
-
 COLOURED = [source for source in SOURCES if source != "mesh without colours"]
 
 
@@ -325,18 +324,6 @@ def test_neither_unit_nor_place_matters(unit, kind, tmp_path, measured):
         assert torch.allclose(other.means[:n], usual.means[:n], atol=1e-4)
         quality = psnr(picture(other, usual), picture(usual)).min()
         measured(quality, "dB", what="PSNR after normalisation", at_least=50.0)
-
-
-@row("A2", "Units and pose")
-@pytest.mark.parametrize("unit", [1e-3, 1.0, 1e3])
-@pytest.mark.parametrize("shift", [0.0, 1e4])
-def test_growing_does_not_depend_on_the_unit(unit, shift, measured):
-    usual, other = (
-        len(grow(colored(sphere())._replace(points=points), **GROWING, generator=rng()).points)
-        for points in (sphere(), sphere() * unit + shift)
-    )
-    off = abs((other - 1000) / (usual - 1000) - 1) * 100
-    measured(off, "%", what="deviation of the accepted share", at_most=1.0)
 
 
 @row("A2", "Flat, needle, point bbox")
