@@ -7,10 +7,8 @@ from pathlib import Path
 
 import pytest
 
-import threestudio_gaussiandreamer
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.launch import experiment
-from threestudio_gaussiandreamer.launch.experiment import main
 from threestudio_gaussiandreamer.launch.options import (
     announce_device,
     choose_gpu,
@@ -160,27 +158,3 @@ def test_gpus_that_are_not_there(monkeypatch, caplog):
     ):
         announce_device("0")
     assert announce_device("cpu") == announce_device(None) == 0
-
-
-def test_the_version_is_the_packages(capsys):
-    assert main(["--version"]) == 0
-    assert capsys.readouterr().out.strip() == threestudio_gaussiandreamer.__version__
-
-
-def test_parts_are_listed_by_kind_with_those_in_custom(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    Path("custom").mkdir()
-    Path("custom/listed.py").write_text(
-        "from threestudio_gaussiandreamer.host import Exporter, register\n"
-        "register('listed-exporter')(type('Listed', (Exporter,), {}))\n"
-    )
-    assert main(["--list-parts"]) == 0
-    kinds, kind = {}, ""
-    for line in capsys.readouterr().out.splitlines():
-        kind = kind if line.startswith(" ") else line
-        kinds.setdefault(kind, []).append(line.strip())
-    assert {"mock-guidance", "exact-score-guidance"} <= {*kinds["guidance"]}
-    assert {"listed-exporter", "ply-exporter"} <= {*kinds["exporter"]}
-    assert "tv-regulariser" in kinds["regulariser"]
-    Path("custom/broken.py").write_text("1 / 0")
-    assert main(["--list-parts"]) == 2 and "custom/broken.py" in capsys.readouterr().err

@@ -17,7 +17,7 @@ from tests.helpers import tiny_parts
 from tests.helpers.tiny_runs import assert_same_training, files, only_run
 from threestudio_gaussiandreamer.core.checkpoint_file import load_file
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.launch import callbacks, checkpoints, experiment
+from threestudio_gaussiandreamer.launch import callbacks, checkpoints
 from threestudio_gaussiandreamer.launch.config import load_config
 from threestudio_gaussiandreamer.launch.experiment import main
 
@@ -147,23 +147,6 @@ def test_a_closed_terminal_leaves_a_checkpoint(launch, monkeypatch):
     os.close(terminal)
     assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 129
     assert load_file(only_run() / "ckpts/last.ckpt")["global_step"] > 0
-
-
-@pytest.mark.parametrize("translated", [RecursionError, UserError, None])
-def test_a_signal_during_imports_ends_them_even_if_its_exception_is_caught(
-    launch, monkeypatch, translated
-):
-    def importing(*arguments):
-        try:
-            os.kill(os.getpid(), signal.SIGTERM)
-        except BaseException as error:
-            if translated:
-                raise translated("while importing") from error
-        return 0
-
-    monkeypatch.setattr(experiment, "run", importing)
-    code, _, err = launch("--train")
-    assert code == 143 and err == "stopped\n"
 
 
 def test_a_checkpoint_is_written_about_every_minute(launch, monkeypatch):
