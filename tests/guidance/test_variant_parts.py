@@ -18,6 +18,7 @@ from threestudio_gaussiandreamer.guidance.stable_diffusion import StableDiffusio
 from threestudio_gaussiandreamer.guidance.variants import Variant
 from threestudio_gaussiandreamer.host import find, names, register
 from threestudio_gaussiandreamer.launch.config_check import check_part
+from threestudio_gaussiandreamer.prompts.prompts import PlainPrompt
 
 VARIANTS = [
     name for name in names() if name.endswith("-variant") and issubclass(find(name), Variant)
@@ -110,6 +111,8 @@ def test_the_conditions_of_a_diffusion_model_are_selected_by_view(models, prompt
     """The noise of two of four views, selected, is that of all four at these views."""
     pytest.importorskip("diffusers")
     guide = tiny.guidance(models, guidance_scale=7.5)
+    with pytest.raises(UserError, match="needs text embeddings: set system.prompt_processor_type"):
+        guide.condition(PlainPrompt("a fox"), **tiny.BATCH)
     for perp_neg in (False, True):
         condition = guide.condition(prompts[perp_neg], **tiny.BATCH)
         z = torch.randn(4, 4, 8, 8, generator=torch.Generator().manual_seed(0))

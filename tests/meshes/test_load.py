@@ -1,5 +1,7 @@
 """Meshes of all formats: their pose, their colours, and files that are refused."""
 
+import contextlib
+import os
 import time
 
 import numpy as np
@@ -332,6 +334,26 @@ def test_the_bundled_toy_is_found_by_its_name_and_faces_the_front(tmp_path, monk
     assert tail.sum() > 100  # its pale tip is on the left
     saved(box(), tmp_path / "toy.glb")
     assert len(load_mesh("toy.glb").faces) == 12  # a file of that name comes first
+
+
+def test_what_prevents_reading_is_named(tmp_path, monkeypatch):
+    """A package of trimesh's that isn't installed, too little memory, a refused side file."""
+
+    def load(*args, resolver, **options):
+        with contextlib.suppress(OSError, ValueError):  # as trimesh's readers
+            resolver.get("fifo.png")
+        raise error
+
+    monkeypatch.setattr(trimesh, "load_scene", load)
+    path = saved(box(), tmp_path / "a.off")
+    for error in (ImportError("No module named 'collada'"), MemoryError("collada")):
+        expected = MemoryError if type(error) is MemoryError else UserError
+        with pytest.raises(expected, match="collada") as caught:
+            load_mesh(path)
+        assert "damaged" not in str(caught.value)
+    os.mkfifo(tmp_path / "fifo.png")
+    with pytest.raises(UserError, match="fifo.png.* regular file"):
+        load_mesh(path)
 
 
 @pytest.mark.parametrize("name", ["toyy.glb", "to.glb", "Toy.glb", "nowhere/toy.glb"])

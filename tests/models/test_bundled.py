@@ -50,8 +50,15 @@ def test_a_damaged_file_is_named_with_how_to_get_it_again(folder, monkeypatch, c
         assert model_part(name, DIFFUSION)
 
 
-@pytest.mark.parametrize("content", [None, b"\xff\x00\x80\n"])
-def test_without_the_list_the_package_is_to_be_installed_again(folder, content):
-    (folder / "SHA256SUMS").write_bytes(content) if content else (folder / "SHA256SUMS").unlink()
-    with pytest.raises(UserError, match="clip' is missing or damaged: install the package again"):
-        model_part("toybox", CLIP)
+@pytest.mark.parametrize("part", [CLIP, POINTS])
+@pytest.mark.parametrize("content", [None, b"", b"a\n", b"\xff\x00\x80\n", b"0" * 64 + b"\n"])
+def test_without_the_list_or_with_a_damaged_one_nothing_is_used(folder, monkeypatch, content, part):
+    digests = folder / "SHA256SUMS"
+    digests.unlink() if content is None else digests.write_bytes(content)
+    said = f"{'SHA256SUMS' if content else part}' is (missing or )?damaged: "
+    with pytest.raises(UserError, match=f"{said}install the package again"):
+        model_part("toybox", part)
+    if content is not None:
+        monkeypatch.setattr(bundled, "FOLDER", folder / "elsewhere")
+        with pytest.raises(UserError, match=f"{said}write the folder again"):
+            model_part(str(folder), part)

@@ -240,7 +240,7 @@ def test_half_precision_downloads_the_small_files(online):
         ("people/gated", "gated: accept .* https://huggingface.co/people/gated .*hf auth login"),
         ("missing/model", "not on the hub, or is private.*hf download missing/model"),
         ("stabilityai/stable-diffusion-2-1-base", "'sd2-community/stable-diff.*' is a copy"),
-        ("a/b.git", "could not be reached|not on the hub"),
+        ("a/b.git", "no such folder, and it is no hub id"),
     ],
 )
 def test_what_the_hub_does_not_give_is_explained(online, name, said):

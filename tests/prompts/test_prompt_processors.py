@@ -225,7 +225,7 @@ def test_a_crash_while_writing_leaves_no_broken_entry(tmp_path, monkeypatch, siz
 def test_a_cache_folder_is_checked_before_the_encoder_is_loaded(fox, tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
     preflight = StableDiffusionPromptProcessor.preflight
-    for folder in ("file", "file/cache"):
+    for folder in ("file", "file/cache", "new/" + "x" * 300, "a/" * 3000, "a\0b"):
         with pytest.raises(UserError, match="cache_dir"):
             preflight({"cache_dir": folder})
         preflight({"cache_dir": folder, "use_cache": False})
@@ -284,9 +284,9 @@ def test_the_prompt_library(fox, tmp_path):
             fox(prompt="lib:corgi")
         with pytest.raises(UserError, match="no texts .*near: a bald eagle"):
             fox(prompt="lib:bald_eagel")
-    for content in ('{"a": 1}', "[", "[3]", "3"):
+    for content in ('{"a": 1}', '{"a": "a fox"}', "[", "[3]", "3"):
         file.write_text(content)
-        with pytest.raises(UserError, match="no JSON list of texts"):
+        with pytest.raises(UserError, match="must be a list of texts"):
             fox(prompt="lib:fox")
 
 

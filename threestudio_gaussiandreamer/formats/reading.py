@@ -28,15 +28,18 @@ def reading(path: str | PathLike, kind: str) -> Iterator[Path]:
         kind: what the file is, for the message ("SPZ file").
 
     Raises:
-        UserError: there is no such file, or the block raises an error about its content.
+        UserError: there is no such file, or the block raises an error about its content, or a
+            package that reads it is missing.
     """
     path = existing_file(path, kind)
     where = f"{kind} {str(path)!r}"
     try:
         with np.errstate(all="ignore"):
             yield path
-    except UserError:
+    except (UserError, MemoryError):
         raise
+    except ImportError as error:  # of a package that reads the format
+        raise UserError(f"cannot read {where}: {error}") from error
     except Unreadable as error:
         raise UserError(f"{where}: {error}") from error
     except OSError as error:

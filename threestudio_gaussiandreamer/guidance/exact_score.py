@@ -238,6 +238,8 @@ class ExactScoreGuidance(ScoreDistillation):
         """Return the mixture of each item. ``encode`` must be called before, since it sets the size
         of the pictures.
         """
+        if self._size is None:
+            raise UserError("exact-score-guidance takes renders, not latents (rgb_as_latents)")
         background = background_of(comp_rgb_bg, len(c2w), c2w.device)
         rgba = self.truth.pictures(c2w, fovy, *self._size)
         own = self._latent().encode(composite(rgba, background))

@@ -321,6 +321,11 @@ class TextToImageDistillation(ScoreDistillation):
             prompt_utils: a :class:`.view_prompts.PromptEmbeddings`, or threestudio's
                 ``PromptProcessorOutput``.
         """
+        if not hasattr(prompt_utils, "get_text_embeddings"):
+            raise UserError(
+                "this guidance needs text embeddings: set system.prompt_processor_type to the "
+                "processor of its model"
+            )
         elevation, azimuth = batch["elevation"], batch["azimuth"]
         more = (batch["camera_distances"], self.cfg.view_dependent_prompting)
         views, other = (elevation, azimuth, *more), None

@@ -341,9 +341,12 @@ def _parts(path: Path, budget: Budget) -> list[Mesh]:
     elif path.suffix.lower() == ".stl":
         content = _exact_stl(content)
     kind = path.suffix.lower().lstrip(".")
-    scene = trimesh.load_scene(io.BytesIO(content), file_type=kind, resolver=files, process=False)
-    if files.refused:
-        raise files.refused
+    try:
+        options = {"file_type": kind, "resolver": files, "process": False}
+        scene = trimesh.load_scene(io.BytesIO(content), **options)
+    finally:  # what was refused is the reason of what trimesh raises
+        if files.refused:
+            raise files.refused
     if path.suffix.lower() == ".off":
         _add_off_colors(scene, content.decode("utf-8-sig", errors="replace"), path)
     parts = []

@@ -6,9 +6,11 @@ option for a diffusion model takes the sub-folder ``stable-diffusion``, that for
 damage before anything is loaded.
 """
 
+import contextlib
 import functools
 import hashlib
 import os
+import re
 from pathlib import Path
 
 from ..core.errors import UserError
@@ -20,6 +22,7 @@ RECORD, DIGESTS = "training.json", "SHA256SUMS"
 """The export's record of its training, which marks such a folder, and the digests of its other
 files in the format of ``sha256sum``.
 """
+LINE = re.compile(rb"([0-9a-f]{64})  (.+)")
 DIFFUSION, CLIP = "stable-diffusion", "clip"
 POINTS, JUDGE = "points.safetensors", "judge.safetensors"
 REINSTALL = (
@@ -67,22 +70,33 @@ def require_intact(folder: Path, part: str) -> None:
     """Compare the files of a part with their digests, once per process.
 
     Raises:
-        UserError: one is missing or differs; or a bundled part isn't in the list of digests.
+        UserError: one is missing or differs; or the part isn't in the list of digests.
     """
     digests = read_digests(folder)
     names = [name for name in digests if name.partition("/")[0] == part]
-    remedy = REINSTALL if folder == FOLDER else EXPORT_AGAIN
-    for path in (folder / name for name in names or [part] * (folder == FOLDER)):
-        if not path.is_file() or digest_of(path) != digests[path.relative_to(folder).as_posix()]:
-            raise UserError(f"the file {str(path)!r} is missing or damaged: {remedy}")
+    is_needed = folder == FOLDER or (folder / part).exists()  # an export needn't have all parts
+    for name in names or [part] * is_needed:
+        with contextlib.suppress(OSError):
+            if digest_of(folder / name) == digests.get(name):
+                continue
+        path = str(folder / name)
+        raise UserError(f"the file {path!r} is missing or damaged: {_remedy(folder)}")
 
 
 def read_digests(folder: Path) -> dict[str, str]:
-    """Return the SHA-256 of each file by its path below ``folder``; empty without a list."""
+    """Return the SHA-256 of each file by its path below ``folder``; empty without a list.
+
+    Raises:
+        UserError: the list is damaged.
+    """
     path = folder / DIGESTS
-    lines = path.read_bytes().splitlines() if path.is_file() else []
-    found = (os.fsdecode(line).partition("  ") for line in lines)
-    return {name: digest for digest, _, name in found}
+    try:
+        found = [LINE.fullmatch(line) for line in path.read_bytes().splitlines()]
+        return {os.fsdecode(line[2]): line[1].decode() for line in found}
+    except FileNotFoundError:
+        return {}
+    except (OSError, TypeError) as error:  # TypeError: a line of another form
+        raise UserError(f"{str(path)!r} is damaged: {_remedy(folder)}") from error
 
 
 def write_digests(folder: Path) -> None:
@@ -96,3 +110,7 @@ def write_digests(folder: Path) -> None:
 def digest_of(path: Path) -> str:
     """Return the SHA-256 of a file's content."""
     return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def _remedy(folder: Path) -> str:
+    return REINSTALL if folder == FOLDER else EXPORT_AGAIN

@@ -206,7 +206,13 @@ def locate(source: Source, *, download: bool = True) -> Optional[Path]:
         )
     require_extra("diffusion", "huggingface_hub")
     from huggingface_hub import snapshot_download
+    from huggingface_hub.utils import HFValidationError, validate_repo_id
 
+    try:
+        validate_repo_id(source.name)
+    except HFValidationError as error:
+        said = f"{source}: there is no such folder, and it is no hub id: {error}"
+        raise UserError(said) from error
     options = {"revision": source.revision, "endpoint": os.environ.get("HF_ENDPOINT") or None}
     # ValueError: files are missing, which can be downloaded; OSError: no version is in the cache.
     # The pattern matches no file, so that only ``picks`` checks for completeness.

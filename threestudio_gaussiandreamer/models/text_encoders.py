@@ -7,6 +7,7 @@ warning; CLIP's tokens for Stable Diffusion XL and 3 are the states before its l
 result is float32 on the CPU, without gradients. The pooled embedding of Stable Diffusion XL and 3
 is a last token that is padded with zeros (:func:`pack`)."""
 
+import contextlib
 import hashlib
 import json
 import os
@@ -229,11 +230,19 @@ def _freed(run: Callable[[torch.device], Any]) -> Any:
 def require_cache_folder(folder: Path) -> None:
     """Raise UserError unless embeddings can be written into ``folder``, which isn't made."""
     existing = next(path for path in (folder, *folder.absolute().parents) if os.path.lexists(path))
-    if not (existing.is_dir() and os.access(existing, os.W_OK | os.X_OK)):
-        what = "is read-only" if existing.is_dir() else "is no folder"
+    what = "is read-only" if existing.is_dir() else "is no folder"
+    try:
+        for path in (folder.absolute(), *folder.parts):  # are the names valid?
+            with contextlib.suppress(FileNotFoundError, NotADirectoryError):
+                (existing / path).lstat()
+        is_usable = existing.is_dir() and os.access(existing, os.W_OK | os.X_OK)
+    except (OSError, ValueError) as error:  # too long; NUL
+        is_usable, what = False, f"can't have it: {getattr(error, 'strerror', error)}"
+    if not is_usable:
         raise UserError(
-            f"the folder of text embeddings {str(folder)!r} can't be written ({str(existing)!r} "
-            f"{what}): set system.prompt_processor.cache_dir to another one, or use_cache=false"
+            f"the folder of text embeddings {str(folder)[:200]!r} can't be written "
+            f"({str(existing)!r} {what}): set system.prompt_processor.cache_dir to another "
+            "one, or use_cache=false"
         )
 
 

@@ -266,12 +266,14 @@ def resolve_prompt(prompt: str) -> str:
     try:
         content = json.loads(file.read_text(encoding="utf-8"))
         lists = content.values() if isinstance(content, dict) else [content]
+        if not all(isinstance(texts, list) for texts in lists):
+            raise TypeError("another value was found")
         texts = list(dict.fromkeys(text for texts in lists for text in texts))
         keywords = prompt[4:].lower().split("_")
         matches = [text for text in texts if all(keyword in text.lower() for keyword in keywords)]
     except (OSError, ValueError, TypeError, AttributeError) as error:
         raise UserError(
-            f"the prompt library {str(file)!r} is no JSON list of texts, nor an object of such "
+            f"the prompt library {str(file)!r} must be a list of texts, or an object of such "
             f"lists: {error}"
         ) from error
     if len(matches) == 1:
