@@ -131,6 +131,7 @@ def asked(monkeypatch):
 
     monkeypatch.setattr(module, "picture_similarities", scores)
     monkeypatch.setattr(module, "NUM_FRAMES", 2)
+    monkeypatch.setattr(module, "FINE", 60)
     return texts
 
 

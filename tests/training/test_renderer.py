@@ -76,26 +76,18 @@ def test_depth_and_normals_are_computed_when_they_are_read():
 
 
 @pytest.mark.parametrize(
-    ("colors", "message"),
+    ("background", "message"),
     [
-        (torch.zeros(3), r"returned colours \(3,\).*; expected \(2, 4, 5, 3\)"),
-        (None, r"returned NoneType; expected a tensor of colours \(2, 4, 5, 3\)"),
+        (lambda dirs: torch.zeros(3), r"returned colours \(3,\).*; expected \(2, 4, 5, 3\)"),
+        (lambda dirs: None, r"returned NoneType; expected a tensor of colours \(2, 4, 5, 3\)"),
+        (lambda dirs: dirs / 0, "function returned colours that aren't finite"),
     ],
 )
-def test_a_background_of_another_shape_or_type_is_named(colors, message):
+def test_a_background_of_another_shape_or_type_or_not_finite_is_named(background, message):
     out = SimpleNamespace(image=torch.zeros(2, 4, 5, 3), alpha=torch.zeros(2, 4, 5, 1))
-    renderer = SimpleNamespace(background=lambda dirs: colors)
     c2w, fovy = torch.eye(4).expand(2, 4, 4), torch.ones(2)
     with pytest.raises(UserError, match=message):
-        SplattingRenderer._composite(renderer, out, c2w, fovy, {})
-
-
-def test_a_background_that_is_not_finite_is_named():
-    out = SimpleNamespace(image=torch.zeros(2, 4, 5, 3), alpha=torch.zeros(2, 4, 5, 1))
-    renderer = SimpleNamespace(background=lambda dirs: dirs / 0)
-    c2w, fovy = torch.eye(4).expand(2, 4, 4), torch.ones(2)
-    with pytest.raises(UserError, match="function returned colours that aren't finite"):
-        SplattingRenderer._composite(renderer, out, c2w, fovy, {})
+        SplattingRenderer._composite(SimpleNamespace(background=background), out, c2w, fovy, {})
 
 
 def test_a_renderer_that_drops_outputs_is_named():
