@@ -1,6 +1,8 @@
 """Rules declared at the fields of a ``Config``, and the function that checks them."""
 
 from dataclasses import dataclass, field
+from enum import Enum
+from pathlib import Path
 from typing import Any, List, Optional, Tuple
 
 import pytest
@@ -112,6 +114,25 @@ def test_values_become_plain_and_typed_and_the_rest_keeps_its_default():
     assert parse_structured(Options, {"free": [2**63 - 1, 3.4e38]}).free[0] == 2**63 - 1
     text = "\\\\${a} # :[]"
     assert parse_structured(Options, {"text": text}).text == text
+
+
+class Side(Enum):
+    LEFT = 1
+
+
+@dataclass
+class Typed:
+    folder: Path = Path()
+    side: Optional[Side] = None
+    shares: dict[str, float] = field(default_factory=dict)
+
+
+def test_paths_members_of_enums_and_values_of_dictionaries_are_converted():
+    cfg = parse_structured(Typed, {"folder": "a/b", "side": "LEFT", "shares": {"x": "2"}}, "p.")
+    assert cfg == Typed(Path("a/b"), Side.LEFT, {"x": 2.0})
+    for values, message in ({"side": "LEFY"}, "LEFT"), ({"shares": {"x": "y"}}, "p.shares.x"):
+        with pytest.raises(UserError, match=message):
+            parse_structured(Typed, values, "p.")
 
 
 def test_a_message_that_gives_the_whole_path_keeps_it():

@@ -13,6 +13,8 @@ import string
 import types
 import typing
 from collections.abc import Callable, Collection, Mapping, MutableMapping, Sequence
+from enum import Enum
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Optional
 
@@ -264,6 +266,15 @@ def _converted(path: str, value: Any, annotation: Any) -> Any:
         return _filled(annotation, value, f"{path}.")
     if kind is dict:
         require_mapping(path, value)
+        if len(inner) == 2:
+            return {key: _converted(f"{path}.{key}", v, inner[1]) for key, v in value.items()}
+    if isinstance(kind, type) and isinstance(value, str):
+        if issubclass(kind, Enum):
+            if value not in kind.__members__:
+                raise unknown(path, value, kind.__members__)
+            return kind[value]
+        if issubclass(kind, Path):
+            return Path(value)
     return value
 
 

@@ -101,6 +101,11 @@ def run_farm(args: argparse.Namespace) -> int:
         recipe = Recipe(tuple(map(read_config, args.config)), overrides, True, args.cores)
         recipe = check_recipe(recipe, read_rows(args.prompts))
         require_same_farm(place, recipe, before_ray=True)
+        if {"ledger", "ledger.jsonl"} & set(place.names("")):
+            raise UserError(
+                f"{place} has the ledger of an earlier version, which this one doesn't read: "
+                "choose another --out"
+            )
         lock = claim(place.folder, "another farm command is at work", ", or choose another --out")
         try:
             make_assets(args, place, recipe, total)

@@ -82,17 +82,33 @@ if _threestudio_is_importable():
         def cfg(self, parsed: Any) -> None:
             """Ignore what threestudio has parsed."""
 
-    def _checked(host: type) -> type:
+    class CheckedSystem(Checked):
+        """Does with plain options what threestudio's systems do with OmegaConf's."""
+
+        def C(self, value: Any) -> float:
+            return C(value, self.true_current_epoch, self.true_global_step)
+
+        def configure_optimizers(self) -> Any:
+            options = self._options
+            given = {name: getattr(options, name) for name in ("optimizer", "scheduler")}
+            read = {name: OmegaConf.create(value) for name, value in given.items() if value}
+            self.__dict__["_options"] = dataclasses.replace(options, **read)
+            try:
+                return super().configure_optimizers()
+            finally:
+                self.__dict__["_options"] = options
+
+    def _checked(host: type, kind: type = Checked) -> type:
         """Derive a class with checked options from a base class of threestudio."""
-        return type(host.__name__, (Checked, host), {"HOST": host})
+        return type(host.__name__, (kind, host), {"HOST": host})
 
     BaseBackground = _checked(backgrounds.BaseBackground)
     BaseGeometry = _checked(geometries.BaseGeometry)
-    BaseLift3DSystem = _checked(systems.BaseLift3DSystem)
+    BaseLift3DSystem = _checked(systems.BaseLift3DSystem, CheckedSystem)
     BaseMaterial = _checked(materials.BaseMaterial)
     BaseModule = _checked(parts.BaseModule)
     BaseObject = _checked(parts.BaseObject)
-    BaseSystem = _checked(systems.BaseSystem)
+    BaseSystem = _checked(systems.BaseSystem, CheckedSystem)
     Exporter = _checked(exporters.Exporter)
     Rasterizer = _checked(renderers.Rasterizer)
 

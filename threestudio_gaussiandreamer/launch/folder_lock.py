@@ -66,7 +66,8 @@ class RunFolder:
             if self.lock is not None:
                 if self.lock.by_file:  # Windows removes no open file
                     self.release()
-                shutil.rmtree(self.path, ignore_errors=True)
+                unused = self.path.rename(self.path.with_name(f".{self.path.name}-{os.getpid()}"))
+                shutil.rmtree(unused, ignore_errors=True)
             for folder in (self.path, *self.path.parents):
                 if folder == self.first_made.parent:
                     break

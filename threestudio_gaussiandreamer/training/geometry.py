@@ -58,13 +58,14 @@ from ..core.host_copies import DelayedReads
 from ..core.lazy_mapping import LazyMapping
 from ..core.methods import require_method
 from ..core.options import at_least, between, in_range, one_of, positive, schedule
+from ..core.schedule import parse_schedule
 from ..gaussians import densify, sh
 from ..gaussians.densify import LOG_SCALE_RANGE, PARAMETERS, Change
 from ..gaussians.grow import SCALE_RULES
 from ..gaussians.merge import merge_duplicates
 from ..gaussians.point_cloud import PointCloud
 from ..gaussians.stored_state import SHAPES, require_cloud
-from ..host import BaseGeometry, C, find, register
+from ..host import BaseGeometry, C, find, register, warn
 from .density_options import DensifyConfig, PruneConfig, as_budget, check_budget, min_count
 from .initialization import GrowConfig, gaussians_on_points, grow_points, most_visible
 
@@ -118,6 +119,11 @@ class GaussianCloud(BaseGeometry):
 
         @staticmethod
         def check(cfg: Any) -> None:
+            if cfg.lr_means_unit == "size" and max(parse_schedule(cfg.lr_means).values) < 1e-3:
+                warn(
+                    "lr_means is less than 0.001 standard deviations of a Gaussian: for a rate in "
+                    "world units set lr_means_unit=world"
+                )
             if cfg.max_gaussians < cfg.min_gaussians:
                 raise UserError(
                     f"max_gaussians: expected min_gaussians ({cfg.min_gaussians}) or more, got "

@@ -111,10 +111,10 @@ class RunFiles:
 
     @property
     def cloud(self) -> Optional[Path]:
-        """The file of the exported Gaussians, a PLY if there is one; None if there is none."""
-        files = sorted(self.export.glob("*.*")) if self.export else []
-        found = filter(holds_gaussians, files)
-        return min(found, key=lambda file: suffix_of(file.name) != ".ply", default=None)
+        """The last exported file of Gaussians, a PLY if there is one; None if there is none."""
+        found = filter(holds_gaussians, sorted(self.save.glob("it*-export/*.*")))
+        rank = lambda file: (step_of(file.parent), suffix_of(file.name) == ".ply")  # noqa: E731
+        return max(found, key=rank, default=None)
 
     @property
     def picture(self) -> Optional[Path]:

@@ -2,9 +2,11 @@
 take 4.5 of 7 CPU seconds of a start. Their source runs at the first use of anything but the few
 names that Lightning and torch's optimisers need."""
 
+import functools
 import importlib
 import logging
 import sys
+import threading
 from importlib import metadata
 from importlib.machinery import ModuleSpec
 from importlib.util import find_spec, module_from_spec
@@ -12,6 +14,7 @@ from types import ModuleType, SimpleNamespace
 from typing import Any, Optional
 
 METRICS, COMPILER = "torchmetrics", "torch._dynamo"
+LOCK = threading.RLock()
 EARLY = {"Metric": "metric", "MetricCollection": "collections", "": "utilities"}
 """Names of torchmetrics that Lightning uses, and the modules that define them."""
 
@@ -30,8 +33,41 @@ class Late(ModuleType):
 
 
 def run(package: Any) -> None:
-    package.__class__ = ModuleType
-    package.__spec__.loader.exec_module(package)
+    """Run a package's source, once; other threads wait for it."""
+    with LOCK:
+        if type(package) is not Late:
+            return
+        package.__class__ = ModuleType
+        try:
+            package.__spec__.loader.exec_module(package)
+        except BaseException:
+            sys.modules.pop(package.__name__, None)
+            raise
+
+
+def compiler() -> Any:
+    """Return torch's compiler; None as long as it hasn't run."""
+    found = sys.modules.get(COMPILER)
+    return None if type(found) is Late else found
+
+
+class Compiled(type):
+    """Of a class that stands for the compiler's class of compiled modules."""
+
+    def __instancecheck__(cls, module: Any) -> bool:
+        return compiler() is not None and isinstance(module, compiler().OptimizedModule)
+
+
+def disable(function: Any = None, *args: Any, **options: Any) -> Any:
+    """Return a function that the compiler leaves as it is, once it has run."""
+    if function is None:
+        return functools.partial(disable, **options)
+
+    @functools.cache
+    def disabled(found: Any) -> Any:
+        return function if found is None else found.disable(function, *args, **options)
+
+    return functools.wraps(function)(lambda *a, **named: disabled(compiler())(*a, **named))
 
 
 class Submodules:
@@ -57,18 +93,20 @@ def import_lightning() -> None:
         if not {"lightning", METRICS, COMPILER} & sys.modules.keys():
             sys.meta_path.insert(0, Submodules)
             late(METRICS, __version__=metadata.version(METRICS), _logger=logging.getLogger(METRICS))
-            # no module is compiled, and no function leaves a graph, before the compiler has run
             vars(sys.modules["torch"])["_dynamo"] = late(
                 COMPILER,
-                OptimizedModule=type("OptimizedModule", (), {}),
-                disable=lambda function=None, *_, **__: function or (lambda f: f),
+                OptimizedModule=Compiled("OptimizedModule", (), {}),
+                disable=disable,
                 graph_break=lambda *_, **__: None,
             )
         importlib.import_module("lightning.pytorch")
     except Exception:
-        vars(sys.modules["torch"]).pop("_dynamo", None)
+        packages = ["lightning.", f"{METRICS}."]
+        if compiler() is None:  # once it has run, it can't be imported again
+            vars(sys.modules["torch"]).pop("_dynamo", None)
+            packages.append(f"{COMPILER}.")
         for name in [*sys.modules]:
-            if f"{name}.".startswith(("lightning.", f"{METRICS}.", f"{COMPILER}.")):
+            if f"{name}.".startswith(tuple(packages)):
                 del sys.modules[name]
         importlib.import_module("lightning.pytorch")
 
