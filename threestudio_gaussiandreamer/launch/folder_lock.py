@@ -64,9 +64,10 @@ class RunFolder:
             return
         with contextlib.suppress(OSError):  # not empty: another run has put something there
             if self.lock is not None:
+                unused = self.path
                 if self.lock.by_file:  # Windows removes no open file
                     self.release()
-                unused = self.path.rename(self.path.with_name(f".{self.path.name}-{os.getpid()}"))
+                    unused = unused.rename(unused.with_name(f".{unused.name}-{os.getpid()}"))
                 shutil.rmtree(unused, ignore_errors=True)
             for folder in (self.path, *self.path.parents):
                 if folder == self.first_made.parent:

@@ -12,6 +12,7 @@ ray. Faces that no render shows take the colour of the nearest face that is show
 all faces take the mean of their surroundings."""
 
 import math
+import time
 import os
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
@@ -83,6 +84,8 @@ def in_charts(vertices: Vertices, faces: Faces, size: int) -> Unwrapped:
     options.resolution, options.padding, options.bilinear = size, PADDING, True
     atlas.generate(pack_options=options)
     rows, index, uv = atlas[0]
+    # the destructor waits for ever for a thread of xatlas's that isn't yet asleep when it is called
+    time.sleep(0.05)
     return Unwrapped(rows.astype(np.int64), index.astype(np.int64), uv.astype(np.float64))
 
 
