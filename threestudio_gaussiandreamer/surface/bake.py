@@ -12,8 +12,8 @@ ray. Faces that no render shows take the colour of the nearest face that is show
 all faces take the mean of their surroundings."""
 
 import math
-import time
 import os
+import time
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
