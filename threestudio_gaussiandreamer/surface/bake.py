@@ -32,9 +32,7 @@ XATLAS_FACES = 5000
 PADDING = 2
 """Texels between charts."""
 GAP = 3.5
-"""Texels of a cell's side that aren't a triangle's: colours are interpolated within one texel, and
-so the triangles of a cell share none.
-"""
+"""Texels of a cell's side that aren't a triangle's, so that interpolation mixes no triangles."""
 SMALLEST_CELL = 6
 """Texels of the side of the smallest cell."""
 MIN_ALPHA = 128
@@ -84,8 +82,7 @@ def in_charts(vertices: Vertices, faces: Faces, size: int) -> Unwrapped:
     options.resolution, options.padding, options.bilinear = size, PADDING, True
     atlas.generate(pack_options=options)
     rows, index, uv = atlas[0]
-    # the destructor waits for ever for a thread of xatlas's that isn't yet asleep when it is called
-    time.sleep(0.05)
+    time.sleep(0.05)  # the destructor would wait for ever for a thread that isn't asleep yet
     return Unwrapped(rows.astype(np.int64), index.astype(np.int64), uv.astype(np.float64))
 
 
