@@ -1,1 +1,1 @@
-"""Exporters: write the trained cloud to files."""
+"""Exporters: which files a trained cloud is written to, and how."""

@@ -9,7 +9,7 @@ removed ones. Two quantities are collected between rounds:
 - the *removal error*, the squared change of the views if that Gaussian alone were removed, which is
   also small in front of a background of the same colour: :func:`removal_error`.
 
-Importance is the square root of the removal error times the contribution. Each term
+Importance is the contribution times the square root of the removal error. Each term
 alone ranks some redundant Gaussians high; their product does not.
 
 How many Gaussians a scene needs follows from the removal error too: it is the squared error that a

@@ -1,4 +1,4 @@
-"""Imports of every module that registers a part, in the order of the rings."""
+"""Imports the modules that register parts, or that import those which do."""
 
 from importlib import import_module
 

@@ -2,9 +2,9 @@
 
 A variant turns the predictions of a score model into the residual e of the latents x =
 encode(render); all else is the same for each: the gradient is w(t) e, clipped, without items that
-aren't finite (``guidance/base.py``). The notation is that of ``sds.py``, and of classifier-free
-guidance: eps_c and eps_u are the conditional and the unconditional prediction, eps_hat = eps_u +
-guidance_scale (eps_c - eps_u)."""
+aren't finite (``guidance/base.py``). The notation is that of ``diffusion/sds.py``, and of
+classifier-free guidance: eps_c and eps_u are the conditional and the unconditional prediction,
+eps_hat = eps_u + guidance_scale (eps_c - eps_u)."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Collection
