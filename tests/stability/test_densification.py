@@ -89,7 +89,7 @@ SCHEDULES = [f"system.geometry.{key}" for key in (
     "prior.num_points=180", "init_opacity=0.3", "budget=100", "densify.enabled=true",
     "densify.start=30", "densify.stop=95", "densify.every=10", "densify.grad_threshold=1e-4",
     "densify.min_opacity=0.4", "densify.absgrad=true", "prune.start=15", "prune.stop=95",
-    "prune.every=15", "prune.keep=0.8",
+    "prune.every=15", "prune.keep=0.8", "lr_means_unit=world", "lr_means=8e-4",
 )]  # fmt: skip
 
 
