@@ -347,12 +347,11 @@ def trained(folder, steps, size, *options) -> Ended:
     ended = launch(
         folder,
         *(f"system.geometry.lr_{name}=[0,{a},{b},{steps}]" for name, (a, b) in RATES.items()),
-        "system.geometry.lr_means_unit=world",
         *(f"data.{side}={size}" for side in ("width", "height")),
         *(f"system.evaluation.{option}" for option in ("size=48", "views=8", "supersample=2")),
         "data.train_views=40", f"trainer.max_steps={steps}", "trainer.log_every_n_steps=50",
         f"system.guidance.max_step_percent=[{middle},0.98,0.55,{middle + 1}]",
-        *options,
+        "system.geometry.lr_means_unit=world", *options,
     )  # fmt: skip
     assert ended.code == 0, ended.err
     return ended
