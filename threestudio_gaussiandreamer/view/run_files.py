@@ -112,9 +112,9 @@ class RunFiles:
     @property
     def cloud(self) -> Optional[Path]:
         """The last exported file of Gaussians, a PLY if there is one; None if there is none."""
-        found = filter(holds_gaussians, sorted(self.save.glob("it*-export/*.*")))
         rank = lambda file: (step_of(file.parent), suffix_of(file.name) == ".ply")  # noqa: E731
-        return max(found, key=rank, default=None)
+        files = sorted(sorted(self.save.glob("it*-export/*.*")), key=rank, reverse=True)
+        return next(filter(holds_gaussians, files), None)
 
     @property
     def picture(self) -> Optional[Path]:
