@@ -11,15 +11,14 @@ import pytest
 import torch
 
 from threestudio_gaussiandreamer import cameras
-from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.meshes import raycast
 from threestudio_gaussiandreamer.meshes.load import load_mesh
 from threestudio_gaussiandreamer.meshes.mesh import Mesh
 from threestudio_gaussiandreamer.meshes.raycast import (
     MeshCaster,
     TargetCache,
-    ZBuffer,
     over_background,
+    zbuffer_hits,
 )
 
 trimesh = pytest.importorskip("trimesh")
@@ -63,14 +62,10 @@ def sphere(radius=1.0, subdivisions=5):
 
 
 @both
-@pytest.mark.parametrize(
-    ("distance", "fovy", "size"), [(2.0, 70.0, (96, 96)), (3.0, 40.0, (80, 120))]
-)
-def test_the_silhouette_of_a_sphere(distance, fovy, size):
+def test_the_silhouette_of_a_sphere(distance=3.0, fovy=40.0, height=80, width=120):
     """In perspective a sphere of radius r at distance d subtends the angle asin(r / d): a disc of
     radius f tan of it.
     """
-    height, width = size
     image = MeshCaster(sphere(0.8)).render(
         look(20, 30, distance), math.radians(fovy), height, width, supersample=4
     )
@@ -138,11 +133,8 @@ def test_cameras_inside_beside_and_away():
     beside = look(0, 0, 3)
     beside[1, 3] += 50
     assert caster.render(beside, 1.0, 8, 8).max() == 0
-    with pytest.raises(UserError, match="at least 1"):
-        caster.render(look(0, 0, 3), 0.7, 0, 8)
 
 
-@both
 @pytest.mark.parametrize("terminal", [True, False])
 def test_many_views_are_the_single_views(terminal, capfd, monkeypatch):
     """With a progress bar in terminals, where it has a name."""
@@ -171,7 +163,7 @@ def test_the_cache_returns_the_pictures_and_casts_each_once(monkeypatch):
     cache = TargetCache(caster, 2, capacity=8)
     c2w, fovy = orbit_tensors(0, 90, 0)
     first = cache(c2w, fovy, 10, 12)
-    assert first.dtype == torch.uint8 and len(cache) == 2
+    assert first.dtype == torch.uint8 and len(cache._pictures) == 2
     expected = caster.render(c2w[1].numpy(), float(fovy[1]), 10, 12, 2)
     np.testing.assert_allclose(first[1] / 255.0, expected, atol=0.5 / 255 + 1e-6)
     monkeypatch.setattr(caster, "render", lambda *args, **kwargs: pytest.fail("cast again"))
@@ -183,14 +175,13 @@ def test_the_cache_is_bounded_and_drops_the_oldest_use():
     cache = TargetCache(caster, 1, capacity=3)
     for azimuth in (0, 10, 20, 0, 30):
         cache(*orbit_tensors(azimuth), 4, 4)
-    kept = {np.frombuffer(key[0], dtype=np.float32).tobytes() for key in cache._pictures}
-    assert len(cache) == 3
+    kept = {key[0] for key in cache._pictures}
     assert kept == {orbit_tensors(a)[0][0].numpy().tobytes() for a in (20, 0, 30)}
     larger = cache(*orbit_tensors(1, 2, 3, 4, 5), 4, 4)  # a batch larger than the cache
     assert larger.shape == (5, 4, 4, 4)
     cache(*orbit_tensors(5), 4, 4)
     cache(*orbit_tensors(5), 8, 4)
-    assert len(cache) == 3
+    assert len(cache._pictures) == 3
 
 
 def test_a_missing_embree_is_reported_once(caster_name, caplog):
@@ -210,9 +201,8 @@ PLACES = np.arange(-16, 16) + 0.5
 
 def draw(vertices, faces, c2w=None, rows=PLACES, columns=PLACES):
     """Return the hits of a camera, by default at the origin along -z."""
-    return ZBuffer(np.array(vertices, dtype=float), np.array(faces)).hits(
-        np.eye(4) if c2w is None else c2w, FOCAL, rows, columns
-    )
+    mesh = np.array(vertices, dtype=float), np.array(faces)
+    return zbuffer_hits(*mesh, np.eye(4) if c2w is None else c2w, FOCAL, rows, columns)
 
 
 def cast(vertices, faces, rows=PLACES, columns=PLACES):
@@ -261,14 +251,6 @@ def test_triangles_through_the_camera_plane_are_what_single_rays_see(seed):
     assert_same(found, cast(vertices, faces))
 
 
-def test_working_in_small_steps_changes_nothing(monkeypatch):
-    vertices, faces = soup(7)
-    whole = draw(vertices, faces)
-    monkeypatch.setattr(raycast, "PAIRS_PER_STEP", 37)
-    assert_same(draw(vertices, faces), whole)
-    assert_same(draw(vertices, np.concatenate([faces, faces])), whole)  # of equals the first stays
-
-
 def test_what_is_nearer_than_the_near_plane_is_not_seen():
     """One corner of the triangle is before that plane; the rest of it is visible."""
     vertices = np.array([[-1.0, -1, -1], [1, -1, -1], [0, 1, -1]])
@@ -309,21 +291,12 @@ def test_neighbours_leave_no_gap_on_samples_of_their_edges():
     np.testing.assert_allclose(weights.sum(axis=-1), 1, atol=1e-12)
 
 
-@pytest.fixture(scope="module")
-def toy():
+def test_the_toy_has_the_faces_that_embree_finds():
     pytest.importorskip("embreex")
-    return load_mesh("toy.glb")
-
-
-VIEWS = [(look(20, 30, 2.5), 50.0), (look(60, -75, 4.0), 40.0), (look(5, 100, 0.6), 90.0)]
-
-
-@pytest.mark.parametrize("view", range(len(VIEWS)))
-def test_the_toy_has_the_faces_that_embree_finds(toy, view):
-    c2w, degrees = VIEWS[view]
-    places = (np.arange(192) + 0.5) / 2 - 48
-    camera = c2w, 48 / math.tan(math.radians(degrees) / 2), places, places
-    expected, _ = raycast._embree_hits(raycast._embree_scene(toy), *camera)
-    found, _ = ZBuffer(toy.vertices, toy.faces).hits(*camera)
-    covered = (found >= 0) | (expected >= 0)
-    assert (found == expected)[covered].mean() > 0.995  # ties on edges; Embree's are float32
+    toy, places = load_mesh("toy.glb"), (np.arange(192) + 0.5) / 2 - 48
+    for view, degrees in (((20, 30, 2.5), 50), ((60, -75, 4.0), 40), ((5, 100, 0.6), 90)):
+        camera = look(*view), 48 / math.tan(math.radians(degrees) / 2), places, places
+        expected, _ = raycast._fastest_hits(toy)(*camera)
+        found, _ = zbuffer_hits(toy.vertices, toy.faces, *camera)
+        covered = (found >= 0) | (expected >= 0)
+        assert (found == expected)[covered].mean() > 0.995  # ties on edges; Embree's are float32

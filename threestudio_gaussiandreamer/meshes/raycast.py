@@ -4,21 +4,19 @@ Colours are unlit, and faces are visible from both sides. Cameras are the host's
 see ``cameras.py``): the ray through pixel (i, j) of an H x W image has the camera
 direction ``((j + 0.5 - W/2)/f, -(i + 0.5 - H/2)/f, -1)`` with ``f = H / (2 tan(fovy/2))``.
 
-Where embree isn't installed, a z-buffer in NumPy finds the triangle that is visible at each sample.
-Triangles are rasterised in homogeneous coordinates, without a division by depth (Olano and Greer
-1997, "Triangle Scan Conversion using 2D Homogeneous Coordinates"). With corners a, b, c in camera
-coordinates and the ray d = (x, y, -1), the three edge functions d . (b x c), d . (c x a),
-d . (a x b) all have the sign of det(a, b, c) exactly if the ray hits the triangle in front of the
-camera. They are proportional to the barycentric weights, and their sum over the determinant is
-1 / depth. Hence the interpolation is perspective-correct, triangles that cross the camera's plane
-need no clipping, and adjacent triangles leave no gap, since their edge functions of the common edge
-differ in sign only."""
+Where embree isn't installed, a z-buffer in NumPy finds the visible triangles, in homogeneous
+coordinates (Olano and Greer 1997, "Triangle Scan Conversion using 2D Homogeneous Coordinates").
+With corners a, b, c in camera coordinates and the ray d = (x, y, -1), the edge functions
+d . (b x c), d . (c x a), d . (a x b) all have the sign of det(a, b, c) exactly if the ray hits the
+triangle in front of the camera. They are proportional to the barycentric weights, and their sum
+over the determinant is 1 / depth. So triangles that cross the camera's plane need no clipping, and
+adjacent ones leave no gap."""
 
 import functools
 import logging
 import math
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -27,7 +25,6 @@ import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
-from ..core.errors import UserError
 from .mesh import Mesh, surface_colors
 
 RAYS_PER_CAST = 2**15
@@ -35,8 +32,6 @@ PIXELS_PER_CAST = 2**20
 """Pixels of pictures that :class:`TargetCache` casts together."""
 log = logging.getLogger(__name__)
 NEAR = 1e-6
-PAIRS_PER_STEP = 2**17
-"""(triangle, sample) pairs that are tested at once, to bound the memory and use the CPU's cache."""
 SLACK = 1e-6
 """Margin around a triangle's box in pixels, so that its rounding errors don't exclude samples that
 the edge functions would include.
@@ -66,7 +61,6 @@ class MeshCaster:
             fovy: vertical field of view in radians, in (0, pi).
             supersample: each pixel is the mean of a regular supersample x supersample grid.
         """
-        _require_size(height, width, supersample)
         image = np.zeros((height, width, 4), dtype=np.float32)
         for fill in self._bands(image, c2w, fovy, supersample):
             fill()
@@ -90,7 +84,6 @@ class MeshCaster:
         """
         from tqdm import tqdm
 
-        _require_size(height, width, supersample)
         cameras = list(cameras)
         images = np.zeros((len(cameras), height, width, 4), dtype=np.float32)
         # one task per band of rows instead of per picture, so that one picture uses all cores too
@@ -179,34 +172,28 @@ def over_background(
     return rgba[..., :3] + (1 - rgba[..., 3:]) * background
 
 
-def _require_size(height: int, width: int, supersample: int) -> None:
-    if height < 1 or width < 1 or supersample < 1:
-        raise UserError(
-            f"a picture needs a size and supersample of at least 1, not {height}x{width} and "
-            f"{supersample}"
-        )
-
-
 def _samples(start: int, end: int, supersample: int) -> Float[np.ndarray, " S"]:
     """Return the coordinates of a regular grid of samples in the pixels start ... end - 1."""
     return start + (np.arange((end - start) * supersample) + 0.5) / supersample
 
 
-# Type of ray casters: (c2w (4, 4), focal, rows (H,), columns (W,)) -> index of the nearest face
-# (H, W), -1 for none, and barycentric weights (H, W, 3). Rows and columns are the coordinates of
-# the samples in pixels relative to the image's centre, rows downwards.
 Hits = Callable[
     [np.ndarray, float, np.ndarray, np.ndarray],
     tuple[Int[np.ndarray, "H W"], Float[np.ndarray, "H W 3"]],
 ]
+"""As :func:`zbuffer_hits` of one mesh: from c2w, focal, rows and columns."""
 
 
 def _fastest_hits(mesh: Mesh) -> Hits:
     try:
-        return functools.partial(_embree_hits, _embree_scene(mesh))
+        from embreex.mesh_construction import TriangleMesh
+        from embreex.rtcore_scene import EmbreeScene
     except ImportError as error:
         _report_slow_caster(str(error))
-        return ZBuffer(mesh.vertices, mesh.faces).hits
+        return functools.partial(zbuffer_hits, mesh.vertices.astype(np.float64), mesh.faces)
+    scene = EmbreeScene()
+    TriangleMesh(scene, mesh.vertices.astype(np.float32), mesh.faces.astype(np.int32))
+    return functools.partial(_embree_hits, scene)
 
 
 @functools.cache
@@ -218,17 +205,8 @@ def _report_slow_caster(reason: str) -> None:
     )
 
 
-def _embree_scene(mesh: Mesh):
-    from embreex.mesh_construction import TriangleMesh
-    from embreex.rtcore_scene import EmbreeScene
-
-    scene = EmbreeScene()
-    TriangleMesh(scene, mesh.vertices.astype(np.float32), mesh.faces.astype(np.int32))
-    return scene
-
-
 def _embree_hits(
-    scene, c2w: np.ndarray, focal: float, rows: np.ndarray, columns: np.ndarray
+    scene: Any, c2w: np.ndarray, focal: float, rows: np.ndarray, columns: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     x, y = (columns / focal)[:, None] * c2w[:3, 0], (-rows / focal)[:, None, None] * c2w[:3, 1]
     directions = (x + y - c2w[:3, 2]).astype(np.float32).reshape(-1, 3)
@@ -264,10 +242,7 @@ class TargetCache:
     def __call__(
         self, c2w: Float[Tensor, "B 4 4"], fovy: Float[Tensor, " B"], height: int, width: int
     ) -> UInt8[Tensor, "B H W 4"]:
-        """Return premultiplied colour and coverage for each camera, on the cameras' device.
-
-        In memory each channel is a plane, since compositing moves the channels to the front.
-        """
+        """Return premultiplied colour and coverage for each camera, on the cameras' device."""
         return torch.stack(self.planes(c2w, fovy, height, width)).movedim(1, -1)
 
     def planes(
@@ -293,9 +268,6 @@ class TargetCache:
         for key in list(self._pictures)[: max(len(self._pictures) - self.capacity, 0)]:
             del self._pictures[key]
         return [found[key] for key in keys]
-
-    def __len__(self) -> int:
-        return len(self._pictures)
 
     def _take_planned(
         self, missing: Mapping[tuple, Any], height: int, width: int
@@ -323,116 +295,59 @@ def _key(camera: tuple[np.ndarray, float], height: int, width: int) -> tuple:
 # ---- the z-buffer --------------------------------------------------------------------------------
 
 
-class ZBuffer:
-    """Finds the visible faces of one triangle mesh, from both sides; thread-safe."""
+def zbuffer_hits(
+    vertices: Float[np.ndarray, "V 3"],
+    faces: Int[np.ndarray, "F 3"],
+    c2w: Float[np.ndarray, "4 4"],
+    focal: float,
+    rows: Float[np.ndarray, " H"],
+    columns: Float[np.ndarray, " W"],
+) -> tuple[Int[np.ndarray, "H W"], Float[np.ndarray, "H W 3"]]:
+    """Return the nearest face at each sample, -1 for none, and the weights of its three corners (0
+    for none); of faces at equal depth the first. Faces are visible from both sides.
 
-    def __init__(self, vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> None:
-        self.vertices, self.faces = vertices.astype(np.float64), faces
-
-    def hits(
-        self,
-        c2w: Float[np.ndarray, "4 4"],
-        focal: float,
-        rows: Float[np.ndarray, " H"],
-        columns: Float[np.ndarray, " W"],
-    ) -> tuple[Int[np.ndarray, "H W"], Float[np.ndarray, "H W 3"]]:
-        """Return the nearest face at each sample, -1 for none, and the weights of its three corners
-        (0 for none); of faces at equal depth the first.
-
-        Args:
-            c2w: OpenGL camera to world.
-            focal: focal length, pixels.
-            rows, columns: ascending coordinates of the samples in pixels relative to the image's
-                centre, rows downwards.
-        """
-        corners = ((self.vertices - c2w[:3, 3]) @ c2w[:3, :3])[self.faces]
-        box = _boxes(corners, focal, rows, columns)
-        index = np.flatnonzero((box[:, 0] < box[:, 1]) & (box[:, 2] < box[:, 3]))
-        a, b, c = np.moveaxis(corners[index], 1, 0)
-        edges = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1)
-        volume = np.einsum("tc,tc->t", a, edges[:, 0])
-        edges *= np.sign(volume)[:, None, None]
-        seen = volume != 0  # not exactly edge-on
-        index, edges, volume = index[seen], edges[seen], np.abs(volume[seen])
-
-        def edge_functions(triangle: np.ndarray, corner: int, sample: np.ndarray) -> np.ndarray:
-            """Return the edge function opposite a corner for each pair, >= 0 inside."""
-            edge, (row, column) = edges[triangle, corner], np.divmod(sample, len(columns))
-            x, y = columns / focal, -rows / focal
-            return x[column] * edge[:, 0] + y[row] * edge[:, 1] - edge[:, 2]
-
-        nearest = np.full(len(rows) * len(columns), -1)
-        inverse_depth = np.zeros(len(nearest))
-        for triangle, sample in _pairs(box[index], len(columns)):
-            total = 0.0
-            for corner in range(3):
-                value = edge_functions(triangle, corner, sample)
-                inside = value >= 0
-                triangle, sample, total = triangle[inside], sample[inside], (total + value)[inside]
-            value = total / volume[triangle]
-            nearer = (value > inverse_depth[sample]) & (value < 1 / NEAR)
-            triangle, sample, value = triangle[nearer], sample[nearer], value[nearer]
-            np.maximum.at(inverse_depth, sample, value)
-            best = np.flatnonzero(value == inverse_depth[sample])
-            places, first = np.unique(sample[best], return_index=True)
-            nearest[places] = triangle[best[first]]
-        sample = np.flatnonzero(nearest >= 0)
-        found = [edge_functions(nearest[sample], corner, sample) for corner in range(3)]
-        values = np.stack(found, axis=1)
-        face_index, weights = np.full(len(nearest), -1), np.zeros((len(nearest), 3))
-        face_index[sample] = index[nearest[sample]]
-        weights[sample] = values / values.sum(axis=1, keepdims=True)
-        shape = len(rows), len(columns)
-        return face_index.reshape(shape), weights.reshape(*shape, 3)
+    Args:
+        c2w: OpenGL camera to world.
+        focal: focal length, pixels.
+        rows, columns: ascending coordinates of the samples in pixels relative to the image's
+            centre, rows downwards.
+    """
+    corners = ((vertices - c2w[:3, 3]) @ c2w[:3, :3])[faces]
+    a, b, c = np.moveaxis(corners, 1, 0)
+    edges = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1)
+    volume = np.einsum("tc,tc->t", a, edges[:, 0])
+    edges = (edges * np.sign(volume)[:, None, None])[..., None, None]
+    box = _boxes(corners, focal, rows, columns)
+    seen = (volume != 0) & (box[:, 0] < box[:, 1]) & (box[:, 2] < box[:, 3])  # not edge-on
+    x, y = columns / focal, -rows[:, None] / focal
+    nearest = np.full((len(rows), len(columns)), -1)
+    inverse_depth, weights = np.zeros(nearest.shape), np.zeros((*nearest.shape, 3))
+    for face in np.flatnonzero(seen):
+        top, bottom, left, right = box[face]
+        part, (p, q, r) = np.s_[top:bottom, left:right], edges[face].swapaxes(0, 1)
+        values = x[left:right] * p + y[top:bottom] * q - r  # edge functions, >= 0 inside
+        total = values.sum(axis=0)
+        value = total / abs(volume[face])
+        nearer = (values >= 0).all(axis=0) & (value > inverse_depth[part]) & (value < 1 / NEAR)
+        nearest[part][nearer], inverse_depth[part][nearer] = face, value[nearer]
+        weights[part][nearer] = (values[:, nearer] / total[nearer]).T
+    return nearest, weights
 
 
 def _boxes(
     corners: Float[np.ndarray, "F 3 3"], focal: float, rows: np.ndarray, columns: np.ndarray
 ) -> Int[np.ndarray, "F 4"]:
-    """Return the box of samples around each triangle (first row, end, first column, end), empty for
-    triangles behind the camera.
+    """Return the box of samples around each triangle (first row, end, first column, end): empty for
+    those behind the near plane, the whole picture for those that cross it.
     """
-    points = _in_front(corners)
-    with np.errstate(invalid="ignore"):  # NaN marks a missing point
-        across = focal * points[..., 0] / -points[..., 2]
-        down = focal * points[..., 1] / points[..., 2]
+    near = -corners[..., 2] >= NEAR
+    depth = np.where(near, -corners[..., 2], 1)
     ends = []
-    for places, values in ((rows, down), (columns, across)):
-        low, high = np.fmin.reduce(values, 1), np.fmax.reduce(values, 1)
-        ends.append(np.searchsorted(places, low - SLACK))
-        ends.append(np.searchsorted(places, high + SLACK, "right"))
+    for places, values in ((rows, -corners[..., 1]), (columns, corners[..., 0])):
+        values = focal * values / depth
+        ends.append(np.searchsorted(places, values.min(axis=1) - SLACK))
+        ends.append(np.searchsorted(places, values.max(axis=1) + SLACK, "right"))
     box = np.stack(ends, axis=1)
-    box[np.isnan(down).all(axis=1)] = 0
+    box[~near.all(axis=1)] = 0, len(rows), 0, len(columns)
+    box[~near.any(axis=1)] = 0
     return box
-
-
-def _in_front(corners: Float[np.ndarray, "F 3 3"]) -> Float[np.ndarray, "F P 3"]:
-    """Clip triangles at the near plane: return their corners, NaN for those on the camera's side of
-    it, and the points where edges cross it, NaN for edges that don't.
-    """
-    behind = -corners[..., 2] < NEAR
-    if not behind.any():
-        return corners
-    following, depth = np.roll(corners, -1, axis=1), -corners[..., 2] - NEAR
-    with np.errstate(invalid="ignore", divide="ignore"):
-        along = depth / (depth - np.roll(depth, -1, axis=1))
-    along[behind == np.roll(behind, -1, axis=1)] = np.nan
-    crossings = corners + along[..., None] * (following - corners)
-    return np.concatenate([np.where(behind[..., None], np.nan, corners), crossings], axis=1)
-
-
-def _pairs(
-    box: Int[np.ndarray, "T 4"], width: int
-) -> Iterator[tuple[Int[np.ndarray, " P"], Int[np.ndarray, " P"]]]:
-    """Yield all pairs (triangle, sample) with the sample in the triangle's box, in the order of the
-    triangles, up to ``PAIRS_PER_STEP`` at a time.
-    """
-    across = box[:, 3] - box[:, 2]
-    ends = np.cumsum((box[:, 1] - box[:, 0]) * across)
-    starts = np.concatenate([[0], ends[:-1]])
-    for first in range(0, ends[-1] if len(ends) else 0, PAIRS_PER_STEP):
-        last = min(first + PAIRS_PER_STEP, ends[-1])
-        some = np.arange(np.searchsorted(ends, first, "right"), np.searchsorted(starts, last))
-        triangle = np.repeat(some, np.minimum(ends[some], last) - np.maximum(starts[some], first))
-        row, column = np.divmod(np.arange(first, last) - starts[triangle], across[triangle])
-        yield triangle, (box[triangle, 0] + row) * width + box[triangle, 2] + column
