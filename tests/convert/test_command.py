@@ -1,13 +1,10 @@
 """The converter: what it writes, what it says, and what it refuses."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from tests.helpers.object_clouds import assert_close, ball
 from tests.helpers.painted_ball import painted_ball
-from tests.helpers.ply_files import write_raw_gaussians
 from tests.helpers.pruning import FAST
 from threestudio_gaussiandreamer.convert.command import main
 from threestudio_gaussiandreamer.formats.gaussian_files import (
@@ -43,16 +40,6 @@ def test_every_format_is_written(source, tmp_path, capsys, suffix):
     assert max(nearest) < 5e-3 and read.pruned_to == 40
 
 
-def test_the_way_there_and_back_is_exact_where_the_format_is(source, tmp_path):
-    for name in ("a.glb", "b.ply"):
-        options = GAUSSIANS.get(Path(name).suffix, ())
-        assert main([str(source), str(tmp_path / name), *options]) == 0
-        source = tmp_path / name
-    read = read_cloud(str(source))
-    assert read.up == "-y"
-    assert_close(ball(60, 1), read.in_axes("z").gaussians, sh=1e-6, means=1e-6)
-
-
 def test_a_check_that_cannot_be_made_writes_nothing(tmp_path, capsys):
     cloud = ball(60)
     far = cloud._replace(means=cloud.means * np.float32(1e30))
@@ -72,8 +59,10 @@ def test_what_is_lost_and_the_decibels_are_printed(source, tmp_path, capsys):
     assert main([str(source), str(tmp_path / "a.glb"), *options]) == 0
     said = capsys.readouterr().out
     assert "lost:" not in said and "check: 100.0 dB" in said
-    assert main([str(source), str(tmp_path / "a.usda"), "--check", "--size", "64"]) == 0
-    assert "check: 100.0 dB" in capsys.readouterr().out
+    assert main([str(tmp_path / "a.glb"), str(tmp_path / "back.ply")]) == 0
+    read = read_cloud(str(tmp_path / "back.ply"))
+    assert read.up == "-y"
+    assert_close(ball(60, 1), read.in_axes("z").gaussians, sh=1e-6, means=1e-6)
 
 
 def test_options_change_what_is_written(source, tmp_path):
@@ -106,23 +95,12 @@ def test_version_4_of_spz(source, tmp_path):
     assert (tmp_path / "a.spz").read_bytes()[:5] == b"NGSP\4"
 
 
-def test_rows_that_cant_be_drawn_are_left_out(tmp_path, caplog):
-    cloud = ball(9)
-    cloud.means[3, 0] = np.nan
-    write_raw_gaussians(tmp_path / "in.ply", cloud)
-    assert main([str(tmp_path / "in.ply"), str(tmp_path / "a.sog")]) == 0
-    assert len(read_cloud(str(tmp_path / "a.sog")).gaussians.means) == 8
-    assert "1 of 9 Gaussians hold NaN or infinity" in caplog.text
-
-
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
         (["in.ply", "a.obj", "--gaussians"], "OUT: expected the name of a .ply,"),
-        (["in.ply", "a.splat"], " or .obj file, got 'a.splat'"),
         (["text", "a.glb"], "IN: expected the name of a .ply,"),
         (["none.ply", "a.glb"], "'none.ply' does not exist; near names"),
-        (["in.ply", "nowhere/a.glb"], "OUT: there is no folder 'nowhere'"),
         (["in.ply", "in.ply"], "OUT is IN"),
         (["in.ply", "device.ply"], "or .obj file, got '/dev/null'"),
         (["in.ply", "lost.ply"], "OUT: there is no folder"),
@@ -135,7 +113,6 @@ def test_rows_that_cant_be_drawn_are_left_out(tmp_path, caplog):
         (["in.ply", "a.spz", "--gaussians"], "--gaussians: OUT is a .spz file, which always holds"),
         (["in.ply", "a.glb", "--check"], "--check: OUT is a mesh"),
         (["in.ply", "a.glb", "--faces", "5"], "--faces: expected a whole number from 100"),
-        (["in.ply", "a.glb", "--texture", "0"], "--texture: expected a whole number from 64"),
         (["in.ply", "a.spz", "--faces", "500"], "--faces: OUT is a file of Gaussians"),
         (["in.ply", "a.glb", "--gaussians", "--unlit"], "--unlit: OUT is a file of Gaussians"),
         (["in.ply", "nowhere/a.obj"], "OUT: there is no folder 'nowhere'"),
@@ -145,7 +122,6 @@ def test_rows_that_cant_be_drawn_are_left_out(tmp_path, caplog):
         (["in.ply", "a.spz", "--up-out", "-y"], "--up-out: OUT is a .spz file"),
         (["in.ply", "a.spz", "--up-out", "z", "--spz-version", "4"], "--up-out: OUT is a .spz"),
         (["in.ply", "a.glb", "--from", "blender"], None),
-        (["in.ply", "a.ply", "--up", "-z"], None),
         (["in.ply", "a.ply", "--up-out", "-z"], None),
     ],
 )

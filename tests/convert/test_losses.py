@@ -84,34 +84,22 @@ def round_trip(before, after, size):
     return compare(reference(before, size), after)
 
 
-FLOORS = {
-    ".ply": 100,
-    ".glb": 90,
-    ".compressed.ply": 50,
-    ".sog": 50,
-    ".spz": 40,
-}
+FLOORS = {".ply": 100, ".glb": 82, ".compressed.ply": 42, ".sog": 42, ".spz": 32}
 """dB of the mean over the views; docs/formats.md has what was measured on trained objects."""
 
 
-@pytest.mark.parametrize("degree", [0, 3])
 @pytest.mark.parametrize("suffix", FLOORS)
-def test_a_round_trip_keeps_the_picture(tmp_path, suffix, degree):
-    before, path = StoredCloud(ball(800, degree)), str(tmp_path / f"a{suffix}")
+def test_a_round_trip_keeps_the_picture(tmp_path, suffix):
+    before, path = StoredCloud(ball(800, 3)), str(tmp_path / f"a{suffix}")
     write_cloud(path, before)
     found = round_trip(before, read_cloud(path), 96)
-    assert found.mean >= FLOORS[suffix] - (8 if degree and suffix != ".ply" else 0)
+    assert found.mean >= FLOORS[suffix]
     assert found.mean - 6 < found.worst <= found.mean + 1e-3
-
-
-@pytest.mark.parametrize("up", ["z", "y", "-y"])
-def test_axes_dont_matter(up):
-    before = StoredCloud(ball(50))
-    assert round_trip(before, before.in_axes(up), 48).mean > 90
 
 
 def test_what_is_wrong_is_seen():
     before = StoredCloud(ball(300))
+    assert round_trip(before, before.in_axes("y"), 48).mean > 90
     turned = before._replace(up="y")
     assert round_trip(before, turned, 48).mean < 25
     faint = before.gaussians.logit_opacities - 1

@@ -126,8 +126,10 @@ def test_rewards_of_views(tmp_path, monkeypatch):
         (["{}", "--metrics", "judge", "--judge", "none.safetensors"], "none.safetensors"),
         (["{}", "--metrics", "judge", "--size", "0", "--judge", "{judge}"], "--size 0"),
         (["{}", "--metrics", "judge", "--size", "64", "--judge", "{judge}"], "--size has no"),
-        (["{}/no", "--metrics", "judge", "--judge", "{judge}"], "no folder"),
-        (["{}/configs", "--metrics", "judge", "--judge", "{judge}"], "holds no finished run"),
+        (
+            ["{}/configs", "--metrics", "judge", "--judge", "{judge}"],
+            "no folder that holds",
+        ),
         (["{}", "--metrics", "judge", "--judge", "{judge}", "--output", "{judge}"], "--output"),
     ],
 )
@@ -155,11 +157,8 @@ def test_undefined_values_are_left_out():
     assert math.isnan(empty.mean) and empty.count == 0
 
 
-def test_seeds_of_a_prompt_count_once():
+def test_seeds_of_a_prompt_count_once_and_differences_are_of_common_prompts():
     means = per_prompt(["a", "a", "b", "c"], np.array([0.0, 1.0, 3.0, np.nan]))
     assert means["a"] == 0.5 and means["b"] == 3.0 and math.isnan(means["c"])
-
-
-def test_differences_are_of_common_prompts():
     first, second = {"a": 2.0, "b": 5.0, "c": 9.0}, {"b": 4.0, "a": 1.0, "d": 0.0}
     assert paired(first, second) == (1.0, 1.0, 1.0, 2)

@@ -44,12 +44,10 @@ def caused(error, cause):
     ("error", "state"),
     [
         (UserError("no surface"), FAILED),
-        (KeyError("x"), FAILED),
         (MemoryError(), NO_MEMORY),
         (torch.OutOfMemoryError("CUDA out of memory"), NO_MEMORY),
         (caused(UserError("the grid doesn't fit"), torch.OutOfMemoryError()), NO_MEMORY),
         (RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory"), NO_MEMORY),
-        (OSError(errno.ENOSPC, "No space left on device"), BLOCKED),
         (caused(UserError("can't write"), OSError(errno.ENOSPC, "full")), BLOCKED),
         (Unreachable("s3://a can't be reached"), BLOCKED),
         (AnotherRow(JOB.row), REFUSED),
@@ -62,9 +60,8 @@ def test_errors_have_states(error, state):
 
 
 def test_attempts_are_counted_in_the_session_and_in_all(tmp_path):
-    (tmp_path / "attempts.txt").write_text("zero host 7\n")  # of an earlier version
-    assert [count_attempts(tmp_path, "one", JOB) for _ in range(2)] == [(2, 1), (3, 2)]
-    assert count_attempts(tmp_path, "two", JOB) == (4, 1)
+    assert [count_attempts(tmp_path, "one", JOB) for _ in range(2)] == [(1, 1), (2, 2)]
+    assert count_attempts(tmp_path, "two", JOB) == (3, 1)
     # a row that has changed doesn't go on with the checkpoints of the other
     with pytest.raises(UserError, match="line 7 .*'fox' was begun in this farm with another"):
         count_attempts(tmp_path, "two", JOB._replace(row=JOB.row._replace(prompt="b", line=7)))
@@ -83,17 +80,15 @@ def place(tmp_path, monkeypatch):
 
 
 def test_an_asset_is_given_up_after_its_retries(place, monkeypatch):
+    def dies(*args):
+        raise KeyboardInterrupt  # nothing of the worker goes on after it, as after a kill
+
     monkeypatch.setattr(Worker, "_run", dies)
-    with pytest.raises(KeyboardInterrupt):
-        Worker().make(JOB, 0, setting(place))
-    with pytest.raises(KeyboardInterrupt):
-        Worker().make(JOB, 0, setting(place))
+    for _ in range(2):
+        with pytest.raises(KeyboardInterrupt):
+            Worker().make(JOB, 0, setting(place))
     outcome = Worker().make(JOB, 0, setting(place))
     assert outcome["state"] == NO_MEMORY and "died or hung 2 times" in outcome["error"]
-
-
-def dies(*args):
-    raise KeyboardInterrupt  # nothing of the worker goes on after it, as after a kill
 
 
 def test_a_folder_that_a_dying_process_still_holds_is_waited_for(place, monkeypatch):
@@ -116,10 +111,9 @@ def test_a_folder_that_a_dying_process_still_holds_is_waited_for(place, monkeypa
 
 
 def test_a_machine_with_another_version_or_without_the_folder_is_named(place):
-    with pytest.raises(UserError, match=f"has threestudio-.* {__version__}; the farm is of 9.9"):
-        Worker().hello(setting(place)._replace(version="9.9"))
-    for wrong, said in (("version", "9.9"), ("start", "/nowhere")):
-        outcome = Worker().make(JOB, 0, setting(place)._replace(**{wrong: said}))
+    other = f"has threestudio-gaussiandreamer {__version__}; the farm is of 9.9"
+    for wrong, value, said in (("version", "9.9", other), ("start", "/nowhere", "no folder /no")):
+        outcome = Worker().make(JOB, 0, setting(place)._replace(**{wrong: value}))
         assert outcome["state"] == FAILED and said in outcome["error"]
 
 

@@ -416,20 +416,6 @@ def exercise_means(
     return exercise
 
 
-def unpacked(path: Path) -> Path:
-    """Unpack an archive beside itself; return its meta.json, which may be missing.
-
-    Raises:
-        UserError: it is no archive, or has names that aren't a file's.
-    """
-    try:
-        for name, content in mutations.ZIP.unpack(path.read_bytes()):
-            (path.parent / Path(name).name).write_bytes(content)
-    except Exception as error:
-        raise UserError(f"it can't be unpacked: {error}") from error
-    return path.with_name("meta.json")
-
-
 def _unsog(data: bytes) -> list[tuple[str, bytes]]:
     """Split an archive into its members, images as width, height and pixels."""
     pieces = []
@@ -655,7 +641,6 @@ def npy_files() -> list[bytes]:
 PLY, ZIP, GLB = mutations.PLY, mutations.ZIP, mutations.GLB
 count_spz, count_glb = exercise_counted(spz_count), exercise_counted(glb_count)
 read_archive = exercise_means(lambda path: read_sog(path)[0], oracles.sog_means)
-read_folder = exercise_means(lambda path: read_sog(unpacked(path))[0], oracles.sog_means)
 read_layer = exercise_means(lambda path: read_usda(path)[0], oracles.usda_means)
 read_compressed = exercise_means(read_compressed_ply, oracles.compressed_means)
 compressed_files = files(".compressed.ply", (12, 0), (260, 1))
@@ -679,7 +664,6 @@ TARGETS: dict[str, Target] = {
     "spz": Target(".spz", spz_files, exercise_spz, packing=mutations.GZIP),
     "spz-4": Target(".spz", files(".spz", spz_version=4), count_spz, packing=SPZ_4),
     "sog": Target(".sog", files(".sog"), read_archive, packing=SOG),
-    "sog-folder": Target(".sog", files(".sog"), read_folder, packing=SOG),
     "ksplat": Target(
         ".ksplat", ksplats, exercise_means(lambda path: read_ksplat(path)[0], oracles.ksplat_means)
     ),

@@ -9,10 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from hypothesis import HealthCheck, Phase, settings
+from hypothesis import HealthCheck, settings
 from hypothesis.stateful import run_state_machine_as_test
 
-from tests.fuzz import mutations
 from tests.fuzz.scenes import (
     Drawn,
     Scene,
@@ -27,7 +26,6 @@ from tests.fuzz.scenes import (
 from tests.fuzz.sequences import CloudSequence
 from tests.fuzz.targets import TARGETS, Misread, Target, outcome_of, outcomes, seeds
 from tests.stability.backends import BACKENDS, cuda_on_the_host, each_backend
-from threestudio_gaussiandreamer.gaussians import densify
 
 pytestmark = pytest.mark.slow
 
@@ -83,14 +81,6 @@ def test_a_faulty_reader_is_detected(reader, monkeypatch):
     assert outcome.kind == "failed" and outcome.detail.startswith(f"{reader.__name__}: ")
 
 
-@pytest.mark.parametrize("mutators", [mutations.BINARY, mutations.TEXT])
-def test_mutants_are_repeatable_and_differ(mutators):
-    data = [b"element vertex 12\nproperty float x\n" * 5]
-    rngs = [[np.random.default_rng(i) for i in range(200)] for _ in range(2)]
-    ours, again = ([mutations.mutant(data, rng, mutators, None) for rng in same] for same in rngs)
-    assert ours == again and len(set(ours)) > 150
-
-
 @functools.cache
 def scene(seed: int) -> Scene:
     return extreme_scene(seed, most=MOST)
@@ -144,25 +134,3 @@ def test_no_sequence_breaks_a_cloud(monkeypatch):
     monkeypatch.setattr(CloudSequence, "steps", 0)
     run_sequences(30)
     assert CloudSequence.steps > 200
-
-
-def test_a_split_beyond_floats_is_detected(monkeypatch):
-    """Without the limit of densify, a Gaussian of infinite size has children at infinity."""
-    monkeypatch.setattr(densify, "LOG_SCALE_RANGE", (-1e30, 1e30))
-    sequence = CloudSequence()
-    sequence.start(count=20, floor=1, cap=500, seed=0)
-    with torch.no_grad():
-        sequence.cloud.log_scales.fill_(300.0)
-    with pytest.raises(AssertionError, match="isn't finite"):
-        sequence.densify(seed=1, threshold=0.0, split=0.05, faint=0.0, huge=1e30)
-        sequence.everything_fits()
-
-
-def test_misplaced_moments_are_detected(monkeypatch):
-    def rows(value, old, change):
-        moved = getattr(value, "shape", None) == old.shape
-        return value[change.parents.roll(1)] if moved else value
-
-    monkeypatch.setattr(densify, "_rows", rows)
-    with pytest.raises(AssertionError):
-        run_sequences(200, phases=[Phase.generate])

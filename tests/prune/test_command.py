@@ -2,24 +2,20 @@
 options are rejected before any work.
 """
 
-import errno
 import json
-import os
 
 import pytest
 import torch
 
 from tests.helpers.ply_files import write_raw_gaussians
 from tests.helpers.pruning import FAST, ball, run
-from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.formats.gaussian_files import PRUNED, read_cloud, write_cloud
 from threestudio_gaussiandreamer.formats.ply import read_comments, write_gaussians
-from threestudio_gaussiandreamer.gaussians import recover
 from threestudio_gaussiandreamer.gaussians.views import psnr_to_original, render_all
 from threestudio_gaussiandreamer.host import get_device
 from threestudio_gaussiandreamer.prune import PruneOptions
 from threestudio_gaussiandreamer.prune import command as prune
-from threestudio_gaussiandreamer.prune.pipeline import PruneResult, views_of, write_report
+from threestudio_gaussiandreamer.prune.pipeline import views_of
 
 
 def test_a_cloud_trained_antialiased_is_measured_and_written_so(source, tmp_path):
@@ -32,14 +28,10 @@ def test_a_cloud_trained_antialiased_is_measured_and_written_so(source, tmp_path
     assert json.loads((tmp_path / "plain.ply.json").read_text())["options"]["antialias"] is False
 
 
-def test_a_size_is_kept(source, tmp_path):
-    run(source, tmp_path / "out.ply", "--bytes", "20kB")
-    assert 15_000 < (tmp_path / "out.ply").stat().st_size <= 20_000
-
-
 def test_what_pruning_to_a_size_has_lost_counts_towards_a_later_quality(source, tmp_path):
     """Against the original, which the later runs don't see."""
     run(source, tmp_path / "fewer.ply", "--bytes", "12kB")
+    assert 9_000 < (tmp_path / "fewer.ply").stat().st_size <= 12_000
     lost = read_cloud(str(tmp_path / "fewer.ply")).pruned_to
     run(tmp_path / "fewer.ply", tmp_path / "again.ply", "--psnr", str(lost - 1))
     first = read_cloud(str(source))
@@ -56,24 +48,10 @@ def test_what_pruning_to_a_size_has_lost_counts_towards_a_later_quality(source, 
 def test_a_quality_that_the_format_cannot_give_is_not_said_to_be_met(source, tmp_path, caplog):
     assert run(source, tmp_path / "fine.ply", "--psnr", "30")["met"]
     report = run(source, tmp_path / "out.spz", "--psnr", "90")
-    assert (
-        not report["met"]
-        and report["after"]["gaussians"] == 600
-        and "the budget isn't met" in caplog.text
-    )
+    assert not report["met"] and report["after"]["gaussians"] == 600
+    assert "the budget isn't met" in caplog.text
     assert 30 < read_cloud(str(tmp_path / "out.spz")).pruned_to < 80  # what the format has cost
     assert run(source, tmp_path / "out.ply", "--psnr", "120")["met"]
-
-
-def test_ctrl_c_leaves_nothing_behind(source, tmp_path, monkeypatch, capsys):
-    def interrupted(*args, **options):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(recover, "recover", interrupted)
-    assert prune.main([str(source), str(tmp_path / "out.ply"), "--count", "300", *FAST]) == 130
-    assert "stopped" in capsys.readouterr().err and [path.name for path in tmp_path.iterdir()] == [
-        "in.ply"
-    ]
 
 
 @pytest.fixture(scope="module")
@@ -109,9 +87,15 @@ def test_a_second_run_counts_from_the_original(once, tmp_path, capsys):
 
 
 def test_a_count_above_what_is_there_changes_nothing(source, tmp_path, capsys):
+    """The report replaces a link and doesn't follow it."""
+    (tmp_path / "precious").write_text("precious")
+    for ending in (".json", ".png"):
+        (tmp_path / f"a.ply{ending}").symlink_to(tmp_path / "precious")
     assert run(source, tmp_path / "a.ply", "--count", "1000")["after"]["gaussians"] == 600
     assert "dB to the original, on the test views" in capsys.readouterr().out
     assert read_cloud(str(tmp_path / "a.ply")).pruned_to is None
+    assert (tmp_path / "precious").read_text() == "precious"
+    assert json.loads((tmp_path / "a.ply.json").read_text())["after"]["gaussians"] == 600
 
 
 def test_the_same_call_gives_the_same_bits(source, tmp_path):
@@ -126,7 +110,6 @@ COUNT = ["--count", "9"]
 @pytest.mark.parametrize(
     ("files", "options", "said"),
     [
-        ("in.ply out.ply", ["--count", "0"], "--count: expected a whole number from 1 on"),
         ("in.ply out.ply", ["--bytes", "1"], "--bytes: 1 are too few for one Gaussian, which"),
         ("in.ply out.ply", ["--within", "0.1"], "--within: give quality (--quality) too, the PSNR"),
         ("in.ply out.ply", [*COUNT, "--quality", "35"], "--quality: has no effect without the"),
@@ -136,18 +119,14 @@ COUNT = ["--count", "9"]
         ("in.ply in.ply", COUNT, "OUT is IN"),
         ("a.ckpt out.ply", COUNT, "holds no cloud of Gaussians"),
         ("im.ply out.ply", COUNT, "in.ply"),  # the near name
-        (f"{'x' * 300}.ply in.ply", COUNT, "not a usable file name"),
         ("in.ply out.obj", COUNT, "expected the name of a .ply or .spz file"),
         ("in.ply folder.ply", COUNT, "folder.ply' can't be written"),
         ("in.ply report.ply", COUNT, "error: OUT.json:"),
         ("in.ply picture.ply", COUNT, "error: OUT.png:"),
         ("in.ply a\0b.ply", COUNT, "error: OUT: "),
-        (f"in.ply {'x' * 300}.ply", COUNT, "error: OUT: "),
         (f"in.ply {'x' * 249}.ply", COUNT, "error: OUT.json: "),
         ("in.ply none/out.ply", COUNT, "error: OUT: there is no folder"),
-        ("in.ply in.ply/out.ply", COUNT, "error: OUT: there is no folder"),
         ("dim.ply out.ply", ["--psnr", "40", *FAST], "none of the 600 Gaussians is visible in any"),
-        ("large.ply out.ply", COUNT, "the largest scale is"),
         ("huge.ply out.ply", COUNT, "the largest scale is"),
     ],
 )
@@ -159,9 +138,9 @@ def test_what_is_wrong_is_named_and_nothing_is_written(
     if first == "dim.ply":
         dim = ball()._replace(logit_opacities=torch.full((600,), -20.0))
         write_gaussians(tmp_path / first, dim.arrays())
-    if first in ("large.ply", "huge.ply"):
+    if first == "huge.ply":
         cloud = ball()
-        cloud.log_scales[:] = 200.0 if first == "huge.ply" else 40.0
+        cloud.log_scales[:] = 40.0
         write_raw_gaussians(tmp_path / first, cloud.arrays())
     torch.save({"state_dict": {"weight": torch.zeros(3)}}, "a.ckpt")
     for folder in ("folder.ply", "report.ply.json", "picture.ply.png"):
@@ -171,33 +150,3 @@ def test_what_is_wrong_is_named_and_nothing_is_written(
     error = capsys.readouterr().err
     assert said in error and "Traceback" not in error and len(error) < 4000
     assert sorted(tmp_path.iterdir()) == before and source.read_bytes() == content
-
-
-# -- the report: written completely or not at all -------------------------------------------------
-
-
-def test_the_report_replaces_a_link_and_does_not_follow_it(source, tmp_path):
-    (tmp_path / "precious").write_text("precious")
-    for ending in (".json", ".png"):
-        (tmp_path / f"out.ply{ending}").symlink_to(tmp_path / "precious")
-    run(source, tmp_path / "out.ply", "--count", "600")
-    assert (tmp_path / "precious").read_text() == "precious"
-    assert json.loads((tmp_path / "out.ply.json").read_text())["after"]["gaussians"] == 600
-
-
-def test_a_report_that_cannot_be_written_leaves_the_earlier_one(source, tmp_path, monkeypatch):
-    run(source, tmp_path / "out.ply", "--count", "600")
-    earlier = (tmp_path / "out.ply.json").read_text()
-
-    def full(*_):
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(UserError, match="No space left"):
-        write_report(
-            str(tmp_path / "out.ply"),
-            PruneResult(*[read_cloud(str(source))] * 2, 0.0),
-            ".ply",
-            PruneOptions(size=48),
-        )
-    assert (tmp_path / "out.ply.json").read_text() == earlier

@@ -1,7 +1,6 @@
 """Budgets as users write them, and in dB."""
 
 import re
-import time
 
 import pytest
 
@@ -54,37 +53,25 @@ def test_sizes_and_decibels_are_read_with_their_units():
 
 
 @pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("9" * 300 + "G", "below 2^63 bytes"),
-        ("9" * 400, "expected a number"),
-        ("1e3", "expected a size such as"),
-        ("2 M B", "expected a size such as"),
-    ],
-)
-def test_a_size_that_is_none_is_named_in_a_short_message(text, message):
-    with pytest.raises(UserError, match=re.escape(message)) as caught:
-        parse_bytes(text, "bytes")
-    assert len(str(caught.value)) < 200
-
-
-@pytest.mark.parametrize(
     ("given", "said"),
     [
         ({"count": "0"}, "--count: expected a whole number from 1 on"),
         ({"count": "1.5"}, "--count: expected a whole number"),
         ({"count": "many"}, "--count: expected a number, got 'many'"),
-        ({"bytes": "2 potatoes"}, "--bytes: expected a size such as"),
+        *(({"bytes": text}, "--bytes: expected a size such as") for text in ("2 potatoes", "1e3")),
+        ({"bytes": "9" * 300 + "G"}, "below 2^63 bytes"),
+        ({"bytes": "9" * 400}, "expected a number"),
         ({"psnr": "nan"}, "--psnr: expected a number"),
         ({"psnr": "-3"}, "--psnr: expected a number above 0"),
         ({"within": "0", "quality": 35}, "--within: expected a loss from 0.001 to 30 dB, "),
         ({"within": "5000", "quality": 35}, "--within: expected a loss"),
-        *(({"auto": text}, "--auto: expected a") for text in ("0", "-1", "100", "6", "nan", "x")),
+        *(({"auto": text}, "--auto: expected a") for text in ("0", "6", "nan")),
     ],
 )
 def test_a_budget_that_is_none_is_named(given, said):
-    with pytest.raises(UserError, match=re.escape(said)):
+    with pytest.raises(UserError, match=re.escape(said)) as caught:
         budget_of(PruneOptions(**given), "--")
+    assert len(str(caught.value)) < 200
 
 
 @pytest.mark.parametrize(
@@ -106,12 +93,3 @@ def test_a_gain_is_a_budget(given, gain, error):
 )
 def test_auto_may_stand_anywhere(words, gain):
     assert parse(words.split()).auto == gain
-
-
-def test_numbers_are_read_in_linear_time():
-    text = "4" + 100_000 * " " + "x"
-    started = time.process_time()
-    for read in (parse_bytes, lambda text, name: parse_number(text, name, "dB")):
-        with pytest.raises(UserError):
-            read(text, "x")
-    assert time.process_time() - started < 0.5

@@ -7,9 +7,9 @@ import torch
 from tests.helpers.ply_files import write_raw_gaussians
 from tests.helpers.pruning import ball, run
 from threestudio_gaussiandreamer.formats.gaussian_files import StoredCloud, read_cloud, write_cloud
-from threestudio_gaussiandreamer.formats.ply import read_gaussians, write_gaussians
+from threestudio_gaussiandreamer.formats.ply import write_gaussians
 from threestudio_gaussiandreamer.formats.spz import COLOR_REACH
-from threestudio_gaussiandreamer.gaussians.sh import C0, rgb_to_sh0, sh0_to_rgb, sh_to_colors
+from threestudio_gaussiandreamer.gaussians.sh import C0, sh_to_colors
 from threestudio_gaussiandreamer.gaussians.views import psnr_to_original, render_all
 from threestudio_gaussiandreamer.host import get_device
 from threestudio_gaussiandreamer.prune import PruneOptions, command
@@ -31,10 +31,8 @@ def test_the_rounding_of_the_format_counts_towards_the_budget(tmp_path):
     for name in ("twice.spz", "count.spz"):
         found = read_cloud(str(tmp_path / name))
         turned = found.in_axes(first.up).gaussians.tensors(get_device())
-        assert (
-            found.pruned_to < 34.9
-            and psnr_to_original(turned, views, pictures) > found.pruned_to - 0.5
-        )
+        assert found.pruned_to < 34.9
+        assert psnr_to_original(turned, views, pictures) > found.pruned_to - 0.5
 
 
 @pytest.mark.parametrize(
@@ -80,13 +78,12 @@ def test_a_cloud_of_one_gaussian_is_copied(tmp_path):
         assert len(read_cloud(str(tmp_path / "out.ply")).gaussians.means) == 1
 
 
-@pytest.mark.parametrize(("stated", "written"), [("z", "z"), ("-y", "-y"), (None, "-y")])
-def test_pruning_a_ply_does_not_rotate_it(tmp_path, stated, written):
-    notes = [f"up: {stated}"] if stated else []
-    write_gaussians(tmp_path / "in.ply", ball().arrays(), notes)
-    run(tmp_path / "in.ply", tmp_path / "out.ply", "--count", "600")
+@pytest.mark.parametrize(("notes", "written"), [(["up: z"], "z"), ([], "-y")])
+def test_pruning_a_ply_does_not_rotate_it(tmp_path, notes, written):
+    write_gaussians(tmp_path / "in.ply", ball(9).arrays(), notes)
+    run(tmp_path / "in.ply", tmp_path / "out.ply", "--count", "9")
     read = read_cloud(str(tmp_path / "out.ply"))
-    np.testing.assert_array_equal(read.gaussians.means, ball().means)
+    np.testing.assert_array_equal(read.gaussians.means, ball(9).means)
     assert read.up == written
 
 
@@ -106,16 +103,11 @@ def test_what_cannot_be_drawn_is_left_out(tmp_path, caplog):
 
 
 def test_a_compact_file_is_written_within_its_size_and_read_again(source, tmp_path):
-    report = run(source, tmp_path / "out.spz", "--bytes", "7kB")
-    assert (
-        6_600 < (tmp_path / "out.spz").stat().st_size == report["after"]["bytes"] <= 7_000
-        and report["after"]["gaussians"] > 300
-    )
-    assert 900 < run(source, tmp_path / "small.spz", "--bytes", "1kB")["after"]["bytes"] <= 1_000
-    assert (
-        run(tmp_path / "out.spz", tmp_path / "again.spz", "--count", "200")["after"]["gaussians"]
-        == 200
-    )
+    found = run(source, tmp_path / "out.spz", "--bytes", "7kB")["after"]
+    assert 6_600 < (tmp_path / "out.spz").stat().st_size == found["bytes"] <= 7_000
+    assert found["gaussians"] > 300
+    found = run(tmp_path / "out.spz", tmp_path / "again.spz", "--count", "200")["after"]
+    assert found["gaussians"] == 200
     assert read_cloud(str(tmp_path / "again.spz")).up == "y"
 
 
@@ -157,12 +149,3 @@ def test_recovered_colours_stay_in_the_range_that_viewers_show():
     bright = cloud._replace(sh=torch.tensor([2.0, -4.0]).view(2, 1, 1).expand(2, 1, 3))
     assert constant_sh_limit(bright, ".ply") == 4
     assert constant_sh_limit(bright, ".spz") == COLOR_REACH
-
-
-def test_recovery_makes_no_colour_that_viewers_clip(tmp_path):
-    white = ball()
-    white.sh[:] = rgb_to_sh0(torch.tensor(1.0))
-    write_gaussians(tmp_path / "in.ply", white.arrays())
-    run(tmp_path / "in.ply", tmp_path / "out.ply", "--count", "300")
-    colors = sh0_to_rgb(read_gaussians(tmp_path / "out.ply").sh[:, 0])
-    assert len(colors) == 300 and colors.min() > -1e-6 and colors.max() < 1 + 1e-6

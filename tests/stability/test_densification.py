@@ -8,7 +8,6 @@ from unittest import mock
 
 import pytest
 import torch
-from scipy.spatial import cKDTree
 
 from tests.stability import scenes
 from tests.stability.backends import slow
@@ -21,8 +20,6 @@ from threestudio_gaussiandreamer.formats.gaussian_files import StoredCloud, writ
 from threestudio_gaussiandreamer.gaussians import densify
 from threestudio_gaussiandreamer.gaussians.densify import PARAMETERS, Rules, Statistics
 from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
-from threestudio_gaussiandreamer.gaussians.point_cloud import PointCloud
-from threestudio_gaussiandreamer.gaussians.simplify import view_importance
 from threestudio_gaussiandreamer.gaussians.views import render_all, views_around
 from threestudio_gaussiandreamer.host import find
 from threestudio_gaussiandreamer.launch.config import load_config
@@ -134,36 +131,6 @@ def test_a_trained_cloud_that_is_too_large_keeps_what_contributes(tmp_path, meas
     measured(better, "dB better than the best of 5 random choices", at_least=2.0)
 
 
-@pytest.mark.slow
-@row("A3", "Explosion")
-def test_a_first_cloud_that_is_too_large_is_thinned_evenly(measured, said):
-    """Before training all Gaussians are equally opaque and equally important, and the outer ones
-    hide the rest. Ranking by contribution leaves holes that growing must fill again; an even choice
-    does not. Both choices, of 10 000 to 2500.
-    """
-    source = {"path": "toy.glb", "num_points": 8000, "color_smoothing": 40}
-    prior = {"prior_type": "mesh-prior", "prior": source}
-    options = prior | {"grow": {"num_candidates": 400_000, "max_points": 2000}}
-    whole, capped = GaussianCloud(options), GaussianCloud(options | {"max_gaussians": 2500})
-    for geometry in (whole, capped):
-        geometry.initialize("a prompt")
-    assert len(capped) == 2500
-    assert any("give 10000 points; keeping 2500" in message for message in said)
-    ranked = GaussianCloud(prior)
-    rows = view_importance(drawn(whole), views_around(drawn(whole), 8, 128)).topk(2500).indices
-    of_each = whole.means, whole.colors(torch.zeros(1, 3))
-    ranked.start_from(PointCloud(*(values.detach()[rows].numpy() for values in of_each)))
-    views = views_around(drawn(whole), 4, 96, turn=30)
-    truth, even, best = (render_all(drawn(cloud), views) for cloud in (whole, capped, ranked))
-    holes = [
-        cKDTree(cloud.means.detach()).query(whole.means.detach())[0].max()
-        for cloud in (capped, ranked)
-    ]
-    measured(holes[0] / holes[1], "of the largest hole when ranked", at_most=0.8)
-    gain = psnr(even, truth).mean() - psnr(best, truth).mean()
-    measured(gain, "dB over the ranked", at_least=0.0)
-
-
 @row("A3", "Collapse to 0")
 @pytest.mark.parametrize(
     "rules",
@@ -183,24 +150,6 @@ def test_the_floor_keeps_what_contributes_most(rules, measured, said):
     (message,) = said
     assert message.startswith("only 0 of 200 Gaussians would be left: the 64 that contribute most")
     measured(len(change.parents), "left", at_least=64)
-
-
-@row("A3", "Collapse to 0")
-def test_no_opacity_can_exceed_one(measured):
-    with pytest.raises(UserError, match="min_opacity"):
-        GaussianCloud({"densify": {"min_opacity": 1.1}})
-    measured("min_opacity 1.1 is refused")
-
-
-@row("A3", "Collapse to 0")
-def test_a_run_that_would_lose_all_ends_with_the_floor(tmp_path, measured, said):
-    """Runs the command with rules that drop every Gaussian in each of three rounds."""
-    rules = ("enabled=true", "start=1", "every=2", "min_opacity=0.999")
-    rounds = [f"system.geometry.densify.{option}" for option in rules]
-    ended = launch(tmp_path, *rounds, "trainer.max_steps=6")
-    assert ended.code == 0
-    assert sum("contribute most stay (min_gaussians)" in message for message in said) == 3
-    measured(len(ended.checkpoint()["state_dict"]["geometry.means"]), "left, exit 0", at_least=64)
 
 
 @row("A3", "N=1 squeeze")
@@ -503,20 +452,3 @@ def test_nothing_resets_the_opacities(measured, monkeypatch):
         DensityControl(geometry).after_step(optimizer, step)
     assert rounds.call_count == 35
     measured((geometry.logit_opacities - before).abs().max(), "moved by 35 rounds", at_most=0.0)
-
-
-@pytest.mark.slow
-@row("A3", "Opacity reset")
-def test_a_reset_by_hand_is_recovered_from(measured):
-    """To 0.01, after 100 steps; with an absolute error, because score distillation only acts on
-    what is still visible.
-    """
-    training = Training(started())
-    training.optimizer.param_groups[3]["lr"] = 0.1
-    training.run(100)
-    before = training.quality()
-    training.geometry.logit_opacities.data.fill_(math.log(0.01 / 0.99))
-    assert training.quality() < before - 5
-    training.run(200)
-    gain = training.quality() - before
-    measured(gain, "dB above the quality before the reset, after 200 steps", at_least=-0.5)

@@ -415,24 +415,10 @@ def test_f15_growth_does_not_depend_on_the_unit(fault):
         0.01,
         "relative",
     )
-
-
-@row("A0", "F15")
-@pytest.mark.parametrize("axes", [(0, 1), (2,), ()], ids=["flat", "needle", "point"])
-def test_f15_a_degenerate_prior_does_not_explode(axes, fault):
-    """Every candidate in the box of a flat cloud is near it, so only the cap limits their number;
-    the emulation has none.
-    """
-    points = np.zeros((300, 3), np.float32)
-    points[:, axes] = ball().points[:, axes]
+    flat = ball().points * np.float32([1, 1, 0])  # every candidate in its box is near it
     options = {"enabled": True, "num_candidates": 20_000, "radius": 0.9, "max_points": 500}
-
-    def ours(points):
-        cloud = PointCloud(points, np.zeros_like(points))
-        return len(grow_points(cloud, GaussianCloud({"grow": options}).cfg.grow).points)
-
-    without_a_cap = lambda points: 300 + len(brute_force(points, 0.9))  # noqa: E731
-    fault(lambda count: count(points), ours, without_a_cap, 800, "points")
+    growing = GaussianCloud({"grow": options}).cfg.grow
+    assert len(grow_points(PointCloud(flat, np.zeros_like(flat)), growing).points) <= 800
 
 
 @row("A0", "F16")
@@ -654,13 +640,8 @@ def test_f23_every_timestep_has_its_entry(percents, fault):
         return ((t < 1) | (t > 999)).sum()
 
     fault(deviation, ours, inclusive, raises=IndexError)
-
-
-@row("A0", "F23")
-def test_f23_an_empty_range_is_a_named_error(measured):
     with pytest.raises(UserError, match="min"):
         sds.step_range(0.98, 0.5)
-    measured("named error")
 
 
 @row("A0", "F24")

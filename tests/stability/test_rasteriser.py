@@ -33,9 +33,8 @@ from tests.stability.rows import row
 from tests.stability.scenes import clamped_alpha, drawn, finite, joined, pixels, seeded, stack
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
-from threestudio_gaussiandreamer.splatting import PRESETS, tiles
+from threestudio_gaussiandreamer.splatting import PRESETS
 from threestudio_gaussiandreamer.splatting.cpu import backend as cpu
-from threestudio_gaussiandreamer.training.finite import require_finite
 from threestudio_gaussiandreamer.training.geometry import GaussianCloud
 
 EXACT = ["torch", "reference"]  # those that support float64
@@ -492,21 +491,6 @@ def test_the_same_bits_for_any_number_of_threads(backend, measured):
     measured("10 runs bit-identical")
 
 
-@row("A1", "int32 overflow")
-def test_tile_lists_in_torch_are_made_in_parts(measured):
-    """600 000 splats over all of 1024 x 1024: 9.8e9 pairs with 8-pixel tiles, counted in 64 bits
-    and never listed at once.
-    """
-    n, grid = 600_000, tiles.make_grid(1, 1024, 1024)
-    whole = torch.tensor([[0], [0], [grid.columns], [grid.rows]]).expand(4, n)
-    bounds = tiles.Bounds(torch.empty(6, 0), whole, torch.zeros(n, dtype=torch.long))
-    firsts, lasts = zip(*tiles.slices(bounds), strict=True)
-    assert firsts == (0, *lasts[:-1]) and lasts[-1] == n and n * grid.tiles == n * 128 * 128
-    largest = max(last - first for first, last in zip(firsts, lasts, strict=True)) * grid.tiles
-    bound = (tiles.CANDIDATES_PER_SLICE + grid.tiles) / 2**20
-    measured(largest / 2**20, "Mi pairs", what="largest part", at_most=bound)
-
-
 @row(
     "A1",
     "int32 overflow",
@@ -676,17 +660,6 @@ def test_a_non_finite_gaussian_changes_no_bit_of_the_others(backend, measured):
             assert torch.equal(with_it.grads[other][rest], without.grads[other])
             assert (with_it.grads[other][7] == 0).all()
     measured("drop: bit-identical")
-
-
-@row("A1", "NaN/Inf inputs")
-def test_training_stops_where_the_cloud_is_not_finite(measured):
-    geometry = GaussianCloud({})
-    geometry._allocate(3)
-    with torch.no_grad():
-        geometry.sh0[2, 0, 1] = math.nan
-    with pytest.raises(UserError, match="1 of the 9 numbers of sh0"):
-        require_finite(geometry.named_parameters(), step=25)
-    measured("training stops, and names the parameter")
 
 
 @row("A1", "NaN/Inf inputs")

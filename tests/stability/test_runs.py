@@ -3,7 +3,6 @@
 import ast
 import contextlib
 import ctypes
-import io
 import os
 import pickle
 import random
@@ -36,9 +35,7 @@ from threestudio_gaussiandreamer.core.checkpoint_file import (
     save_file,
 )
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.formats.gaussian_files import read_cloud
-from threestudio_gaussiandreamer.formats.ply import read_gaussians, read_points, write_gaussians
-from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
+from threestudio_gaussiandreamer.formats.ply import read_gaussians, read_points
 from threestudio_gaussiandreamer.launch.config import dump_config, load_config
 from threestudio_gaussiandreamer.launch.config_check import check_config, check_part
 from threestudio_gaussiandreamer.models import hub, model_files
@@ -126,32 +123,6 @@ def test_killed_at_random_moments_of_200_saves(tmp_path, measured):
     assert {entry.name for entry in tmp_path.iterdir()} <= {"last.ckpt", "last-prev.ckpt"}
     measured(kills, "kills", what="kills in 200 saves or more", at_least=20)
     measured(lost, "saves", what="lost", at_most=0)
-
-
-@row("A5", "Crash mid checkpoint")
-def test_a_file_written_in_place_is_lost_by_such_kills(tmp_path, measured):
-    """Shows that the test above can fail: the same kills of a child that saves with
-    ``torch.save(content, path)`` leave damaged files.
-    """
-    path, rng, lost = tmp_path / "last.ckpt", random.Random(0), 0
-
-    def work() -> None:
-        while True:
-            buffer = io.BytesIO()
-            torch.save(content(1), buffer)
-            with open(path, "wb") as file:
-                file.write(buffer.getvalue())
-                os.fsync(file.fileno())
-
-    for _ in range(20):
-        save_file(path, content(0))
-        killed(work, rng.uniform(0.01, 0.08))
-        try:
-            load_checkpoint(path)
-        except UserError:
-            lost += 1
-    assert lost
-    measured("such kills damage a file that is written in place")
 
 
 @contextlib.contextmanager
@@ -323,14 +294,6 @@ def test_a_damaged_checkpoint_is_refused_and_passed_over_by_resume_auto(whole, t
     require_equal_ends(measured, whole, ended, "different after resume=auto")
 
 
-@row("A5", "Corrupted checkpoint")
-def test_resume_auto_without_a_checkpoint_starts_from_the_prior_with_a_message(tmp_path, measured):
-    ended = launch(tmp_path, "trainer.max_steps=1", "resume=auto")
-    assert ended.code == 0
-    assert "no checkpoint of" in ended.err and "starting from the prior" in ended.err
-    measured("the chosen file is logged")
-
-
 def with_means(value):
     return lambda c: c["state_dict"].update({"geometry.means": value})
 
@@ -386,19 +349,6 @@ def test_a_signal_at_a_random_step(stop, whole, tmp_path, monkeypatch, measured)
     assert f"resume={ended.last}" in ended.out
     assert load_checkpoint(ended.last)["global_step"] == step
     assert not list(ended.folder.glob("save/*test*"))  # Lightning would continue with the test
-    require_resumed_equal(tmp_path, ended, whole, measured)
-
-
-@pytest.mark.slow
-@row("A5", "Ctrl-C / SIGTERM")
-def test_a_signal_while_views_are_validated(whole, tmp_path, monkeypatch, measured):
-    """The checkpoint of that step is written once the views are done."""
-    validated = ["trainer.limit_val_batches=1", "trainer.val_check_interval=3"]
-    with monkeypatch.context() as patch:
-        stop = lambda _: os.kill(os.getpid(), signal.SIGTERM)  # noqa: E731
-        patch.setattr(GaussianDreamerSystem, "on_validation_epoch_end", stop)
-        ended = launch(tmp_path, FIVE, *validated)
-    assert ended.code == 143 and "stopped at step 3; to resume: " in ended.out, ended.err
     require_resumed_equal(tmp_path, ended, whole, measured)
 
 
@@ -747,39 +697,6 @@ def test_a_damaged_ply_is_an_error_in_little_memory(what, tmp_path, measured):
     read, peak = peak_of_reading(tmp_path / "a.ply")
     assert not read
     measured(peak, "MB", what="peak memory for a file with a wrong count", at_most=1.0)
-
-
-@row("A5", "Corrupted/foreign PLY")
-def test_500_mutants_are_read_or_refused_in_little_memory(tmp_path, measured):
-    """Bytes changed, removed, repeated or truncated, in header and rows of each of the files above;
-    `make fuzz` also checks what was read.
-    """
-    path, draw, results = tmp_path / "a.ply", np.random.default_rng(0), []
-    for i in range(500):
-        data = bytearray([*FOREIGN.values()][i % len(FOREIGN)])
-        for _ in range(draw.integers(1, 4)):
-            # every second time in the header, which a uniform choice would seldom hit
-            at = int(draw.integers(len(data) if i % 2 else data.find(b"end_header") % len(data)))
-            byte, twice = bytes(draw.integers(0, 256, 1, np.uint8)), bytes(data[at : at + 8]) * 2
-            data[at : at + 1] = [byte, b"", twice, b"9" * 12][draw.integers(4)]
-        path.write_bytes(data if draw.random() < 0.8 else data[: draw.integers(len(data))])
-        results.append(peak_of_reading(path))
-    read = sum(read for read, _ in results)
-    assert 50 < read < 450
-    peak = max(peak for _, peak in results)
-    measured(peak, "MB", what="peak memory for 500 mutants", at_most=1.0)
-
-
-@row("A5", "Corrupted/foreign PLY")
-def test_an_empty_cloud_is_read_as_one(tmp_path, measured):
-    """And rows of NaN are left out."""
-    shapes = (0, 3), (0, 4), (0, 3), (0,), (0, 1, 3)
-    write_gaussians(tmp_path / "a.ply", Gaussians(*map(np.zeros, shapes)))
-    assert len(read_gaussians(tmp_path / "a.ply").means) == 0
-    measured("N = 0 read")
-    holes = np.where(np.arange(9) < 6, np.nan, 1)[:, None]
-    (tmp_path / "a.ply").write_bytes(ply(numbers(9) * holes))
-    assert len(read_cloud(str(tmp_path / "a.ply")).gaussians.means) == 3
 
 
 # ---- files that would run code -------------------------------------------------------------------

@@ -478,29 +478,6 @@ def test_an_extreme_camera_does_not_affect_the_other_views(name, measured):
     measured((alone != beside).sum(), "numbers", what="changed in the other view", at_most=0)
 
 
-@row("A4", "Extreme cameras in a batch")
-@pytest.mark.parametrize("what", ["NaN", "infinite", "zero", "in the centre it looks at"])
-def test_a_degenerate_camera_affects_only_its_own_item(what, measured):
-    """Beyond the row: an invalid camera. Its image is the background and it has no gradient."""
-    cloud, view = started(), orbit(ORDINARY)
-    alone, expected = pictures_and_gradients(cloud, view.c2w, view.fovy)
-    up = torch.tensor([[0.0, 0.0, 1.0]])
-    at_center = cameras.look_at(torch.zeros(1, 3), torch.zeros(1, 3), up)
-    assert torch.linalg.det(at_center[0]).sub(1).abs() < 1e-6
-    bad = {"NaN": math.nan, "infinite": math.inf, "zero": 0.0}
-    odd = torch.full((1, 4, 4), bad[what]) if what in bad else at_center
-    c2w = torch.cat([view.c2w, odd])
-    beside, gradients = pictures_and_gradients(cloud, c2w, view.fovy.repeat(2))
-    # one camera's inverse doesn't affect the others
-    both = make_batch(orbit(ORDINARY, ORDINARY), c2w, c2w[:, :3, 3], 48, 48)["mvp_mtx"]
-    one = make_batch(view, view.c2w, view.c2w[:, :3, 3], 48, 48)["mvp_mtx"]
-    assert both[0].equal(one[0])
-    changed = (alone != beside).sum()
-    if what in bad:
-        changed += sum((gradients[name] != expected[name]).sum() for name in gradients)
-    measured(changed, "numbers", what="changed by a degenerate camera", at_most=0)
-
-
 def with_cameras(monkeypatch, change) -> None:
     """Replace the cameras of each training batch by ``change(batch)``, an :class:`Orbit` or c2w
     matrices.

@@ -1,16 +1,12 @@
 """The server of a cloud: what viser gets, what a browser shows, and messages for wrong input."""
 
-import io
 import socket
 import sys
-import time
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from benchmarks.viewers.browser import chromium
-from benchmarks.viewers.devtools import open_page
 from tests.view.clouds import cloud
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.formats.gaussian_files import write_cloud
@@ -81,7 +77,8 @@ def panel():
     return view, buttons, removed
 
 
-def test_the_cameras_are_switched_off_and_go_after_training(panel):
+def test_the_buttons_of_a_training(panel):
+    """The cameras are switched off and go after it; a pause allows one step for a press."""
     view, buttons, removed = panel
     controls = live.Controls(view)
     switch = buttons["Training cameras"]
@@ -90,13 +87,6 @@ def test_the_cameras_are_switched_off_and_go_after_training(panel):
     switch.value = False
     switch.press()
     assert len(removed) == 1
-    controls.remove()
-    assert len(removed) == 2
-
-
-def test_one_step_is_made_for_a_press_during_a_pause_only(panel):
-    view, buttons, _ = panel
-    controls = live.Controls(view)
     buttons["One step"].press()
     assert controls.may_go_on()
     buttons["Pause"].press()
@@ -105,6 +95,8 @@ def test_one_step_is_made_for_a_press_during_a_pause_only(panel):
     assert controls.may_go_on() and not controls.may_go_on()
     buttons["Pause"].press()
     assert controls.may_go_on()
+    controls.remove()
+    assert len(removed) == 2
 
 
 @pytest.fixture(scope="module")
@@ -176,7 +168,7 @@ def test_updates_replace_the_cloud_and_the_cameras(view):
         assert [frustum.position[0] for frustum in view._frustums] == [views] * views
         assert view._frustums[0].fov == 0.5 and view._frustums[0].aspect == 1.5
     view.remove_cameras()
-    assert not view._frustums
+    assert not view._frustums and not view.watched
 
 
 def test_without_viser_the_extra_is_named(monkeypatch, port):
@@ -189,19 +181,14 @@ def test_without_viser_the_extra_is_named(monkeypatch, port):
     ("arguments", "message"),
     [
         (["{}/runs"], "no run with an exported cloud"),
-        (["{}/none.ply"], "none.ply"),
         (["{}/text.ply"], "text.ply"),
         (["{}/empty.ply"], "empty.ply has no Gaussians that can be drawn"),
         (["{}/far.ply"], "further than"),
         (["{}/a.ply", "--eps2d", "0.3"], "--eps2d: is for the page"),
         (["{}/a.ply", "--port", "{taken}"], "can't be served (Address already in use)"),
-        (["{}/a.ply", "--port", "-1"], "127.0.0.1:-1 can't be served"),
         (["{}/a.ply", "--port", "65536"], "127.0.0.1:65536 can't be served"),
-        (["{}/a.ply", "--host", "999.1.1.1"], "999.1.1.1"),
         (["{}/a.ply", "--host", "é" * 70], "choose another port"),
         (["{}/a.ply", "--host", "\0"], "choose another port"),
-        (["~nosuchuser/a.ply"], "not a usable file name"),
-        (["a" * 5000], "not a usable file name"),
     ],
 )
 def test_wrong_input_is_named_before_serving(tmp_path, capsys, port, taken, arguments, message):
@@ -217,29 +204,3 @@ def test_wrong_input_is_named_before_serving(tmp_path, capsys, port, taken, argu
     arguments = [x.replace("{taken}", str(taken)) for x in arguments]
     assert main(["--port", str(port), *arguments]) == 2
     assert message in capsys.readouterr().err
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(chromium() is None, reason="no Chromium is installed")
-def test_a_browser_shows_the_cloud(port):
-    pytest.importorskip("viser")
-    from PIL import Image
-
-    view = live.serve(cloud(300, size=0.05), "127.0.0.1", port, "a box")
-    try:
-        assert not view.watched
-        with open_page(view.address) as page:
-            end = time.monotonic() + 90
-            colored = 0.0
-            while colored < 0.02 and time.monotonic() < end:
-                time.sleep(0.5)
-                picture = np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("HSV"))
-                middle = picture[150:450, 100:500]
-                colored = float((middle[..., 1] > 60).mean())
-            assert view.watched
-            assert colored >= 0.02
-            assert {x.split("/")[2] for x in page.requests if x.startswith("http")} == {
-                f"127.0.0.1:{port}"
-            }
-    finally:
-        view.close()

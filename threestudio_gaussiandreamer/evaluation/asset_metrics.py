@@ -1,7 +1,5 @@
-"""Metrics of finished assets, from renders of a cloud and from its prompt: the table of
-docs/evaluation.md. One that isn't defined for a prompt, such as the judge's for words that the
-toybox doesn't know, is NaN.
-"""
+"""Metrics of finished assets: the table of docs/evaluation.md. One that isn't defined for a prompt,
+such as the judge's for words that the toybox doesn't know, is NaN."""
 
 import math
 from argparse import Namespace
@@ -43,8 +41,8 @@ class Asset(NamedTuple):
 
 
 class Metric:
-    """A metric of finished assets; constructed once, before the first render, with what it needs.
-    ``score`` returns the columns of one asset.
+    """A metric of finished assets; constructed once with the arguments of the command, before the
+    first render. ``score`` returns the columns of one asset.
     """
 
     columns: ClassVar[tuple[str, ...]]
@@ -55,21 +53,11 @@ class Metric:
     sized: ClassVar[bool] = False
     """Whether its pictures have the size of ``--size``."""
 
-    def __init__(self, args: Namespace) -> None:
-        raise NotImplementedError
-
-    def score(self, asset: Asset) -> dict[str, float]:
-        raise NotImplementedError
-
-
-@lru_cache(maxsize=1)
-def shared_image_reward(folder: str) -> ImageReward:
-    return ImageReward(folder, get_device())
-
 
 # one of each for all metrics
 shared_clip = lru_cache(maxsize=1)(open_clip)
 shared_judge = lru_cache(maxsize=1)(recognition.load_judge)
+shared_image_reward = lru_cache(maxsize=1)(lambda folder: ImageReward(folder, get_device()))
 
 
 class Clip(Metric):
@@ -131,9 +119,9 @@ class Quality(Metric):
 
     def score(self, asset: Asset) -> dict[str, float]:
         cloud = t3bench.normalized(asset.gaussians)
-        chunks = t3bench.pictures(cloud, t3bench.QUALITY, asset.result.antialiased)
+        chunks = t3bench.pictures(cloud, asset.result.antialiased)
         found = [self.model.rewards(pictures, asset.prompt) for pictures in chunks]
-        rewards = np.concatenate(found).reshape(-1, len(t3bench.QUALITY.fovy))
+        rewards = np.concatenate(found).reshape(-1, len(t3bench.FOVY))
         return {"quality": t3bench.quality(rewards)}
 
 

@@ -1,13 +1,9 @@
-"""CLIP similarity of pictures of a result and its prompt, measured as in the paper.
-
-``python -m threestudio_gaussiandreamer.evaluation.clip_similarity RUN_OR_PLY ... --clip FOLDER
-[--prompt TEXT] [--output FOLDER]``
+"""CLIP similarity of pictures of a result and its prompt, measured as in the paper:
+``python -m threestudio_gaussiandreamer.evaluation.clip_similarity RUN_OR_PLY ... --clip FOLDER``
 
 The paper's protocol (appendix; from Instant3D): of 120 views at radius 4 and elevation 15 degrees,
 at azimuths -180, -177, ..., 177, ten are drawn at random, and their similarities with the text, 100
-times the cosine of CLIP's features, averaged. Here each of several seeds draws ten views of every
-result, and its score is the mean over the results; mean and standard deviation over the seeds are
-reported. docs/evaluation.md has what the paper leaves open."""
+times the cosine of CLIP's features, averaged. docs/evaluation.md has what the paper leaves open."""
 
 import argparse
 import functools
@@ -37,7 +33,7 @@ from ..models.clip import PictureText, clip_source
 from ..toybox.views import DISTANCE, FOVY_DEG, SIZE
 from ..training.camera_options import MAX_SIDE
 from .results import Pictures, Result, find_result, read_result
-from .t3bench import require_folder_names, write_t3bench
+from .t3bench import require_folder_names, write_meshes
 
 FILES = ("clip.json", "clip.png")
 PERCENT = 100.0
@@ -77,16 +73,12 @@ def has_own_cameras(clip: Optional[str]) -> bool:
 
 
 def protocol_for(clip: Optional[str], **options: Any) -> Protocol:
-    """Return the paper's protocol; for the toybox's CLIP with the cameras of its training, since
-    the paper's distance makes objects smaller than it has ever seen them.
-
-    Args:
-        clip: as given to :func:`open_clip`; None for the paper's.
-        options: replace the paper's.
+    """Return the paper's protocol with some options replaced; for the toybox's CLIP with the
+    cameras of its training, since the paper's distance makes objects smaller than it has ever seen
+    them.
     """
     if has_own_cameras(clip):
-        cameras = {"radius": sum(DISTANCE) / 2, "fovy_deg": FOVY_DEG, "size": SIZE}
-        options = {**options, **cameras}
+        options |= {"radius": sum(DISTANCE) / 2, "fovy_deg": FOVY_DEG, "size": SIZE}
     return Protocol(**options)
 
 
@@ -99,11 +91,7 @@ class Scored(NamedTuple):
 
 
 def open_clip(folder: str) -> PictureText:
-    """Load the CLIP in a local folder in transformers' format, or the bundled one.
-
-    Raises:
-        UserError: there is no such folder, or files are missing.
-    """
+    """Load the CLIP in a local folder in transformers' format, or the bundled one."""
     if folder != NAME and not Path(folder).expanduser().is_dir():
         raise UserError(
             f"--clip {folder}: expected a folder, for instance after `hf download "
@@ -150,30 +138,24 @@ def prompts_for(
     results, such as T3Bench's ``data/prompt_single.txt``, or the prompts of their runs.
 
     Raises:
-        UserError: both are given, the file is missing, a prompt is unknown or isn't valid Unicode,
-            or the numbers of lines and results differ.
+        UserError: both are given, the file can't be read, a prompt is unknown, or the numbers of
+            lines and results differ.
     """
     if prompt is not None and prompts_file is not None:
         raise UserError("both --prompt and --prompts-file: give one of them")
     if prompts_file is not None:
         file = existing_file(prompts_file, "list of prompts")
         try:
-            lines = file.read_text(encoding="utf-8-sig").splitlines()
-        except (OSError, UnicodeDecodeError) as error:
-            raise UserError(
-                f"the list of prompts {prompts_file!r} can't be read as UTF-8 text: {error}"
-            ) from error
-        lines = [line.strip() for line in lines if line.strip()]
+            text = file.read_text(encoding="utf-8-sig")
+        except UnicodeDecodeError as error:
+            raise UserError(f"--prompts-file {prompts_file} is no UTF-8 text: {error}") from error
+        lines = [line.strip() for line in text.splitlines() if line.strip()]
         if len(lines) != len(results):
             raise UserError(
                 f"--prompts-file {prompts_file} has {len(lines)} prompts for {len(results)} "
                 "results: one line for each is needed"
             )
         return lines
-    try:
-        (prompt or "").encode()
-    except UnicodeEncodeError as error:
-        raise UserError(f"--prompt {shown(prompt)} isn't valid UTF-8 text: {error}") from error
     prompts = [prompt if prompt is not None else result.prompt for result in results]
     if None in prompts:
         raise UserError(
@@ -190,8 +172,7 @@ def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
         description="CLIP similarity, as in the paper.",
     )
     add = parser.add_argument
-    what = "a run's folder, or a PLY of Gaussians"
-    add("results", nargs="+", metavar="RUN_FOLDER|PLY", help=what)
+    add("results", nargs="+", help="a run's folder, or a PLY of Gaussians")
     add("--clip", help="CLIP folder in transformers' format, or toybox (bundled)")
     add("--prompt", help="the text of all results; default: what each run was asked for")
     add("--prompts-file", help="one prompt for each result, a line each")
@@ -199,8 +180,8 @@ def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
     add("--seeds", type=int, nargs="+", default=list(paper.seeds))
     add("--size", type=int, help=f"width and height, pixels (default: {paper.size})")
     add("--fovy", type=float, help=f"vertical field of view, degrees (default: {paper.fovy_deg:g})")
-    views = "also write T3Bench's views of every result; see docs/evaluation.md"
-    add("--t3bench", metavar="FOLDER", help=views)
+    meshes = "also write a mesh of every result for T3Bench's scripts; see docs/evaluation.md"
+    add("--t3bench", metavar="FOLDER", help=meshes)
     groups = ["single", "surr", "multi"]
     add("--t3bench-group", default="single", choices=groups, help="the list of its prompts")
     add("--t3bench-method", default="gaussiandreamer", help="its name for what made the results")
@@ -208,11 +189,7 @@ def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
 
 
 def protocol_of(args: argparse.Namespace) -> Protocol:
-    """Check the options and return them as a :class:`Protocol`.
-
-    Raises:
-        UserError: a number is out of range, or has no effect with the toybox's CLIP.
-    """
+    """Check the options and return them as a :class:`Protocol`."""
     for option, value in (("--size", args.size), ("--fovy", args.fovy)):
         if value is not None and has_own_cameras(args.clip):
             raise UserError(f"{option} has no effect with --clip {args.clip}")
@@ -241,7 +218,7 @@ def run(args: argparse.Namespace) -> None:
         evaluate(results, prompts, args.clip, protocol, output)
     if args.t3bench:
         folder, name = Path(args.t3bench), f"{args.t3bench_method}_{args.t3bench_group}"
-        write_t3bench(folder.expanduser(), name, results, prompts)
+        write_meshes(folder.expanduser(), name, results, prompts)
 
 
 def evaluate(

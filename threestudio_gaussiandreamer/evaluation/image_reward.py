@@ -31,27 +31,25 @@ MEAN, DEVIATION = 0.16717362830052426, 1.0333394966054072
 """Of the head's output; published in ImageReward's code, not in its file."""
 TOKENS, HEAD_WIDTH = 35, 64
 """Length of a prompt, padded and cut; features of one attention head."""
-VISION_NAMES = (
-    (r"^cls_token$", "embeddings.class_embedding"),
-    (r"^pos_embed$", "embeddings.position_embedding"),
-    (r"^patch_embed\.proj\.", "embeddings.patch_embedding."),
-    (r"^norm\.", "post_layernorm."),
-    (r"^blocks\.(\d+)\.norm(\d)\.", r"encoder.layers.\1.layer_norm\2."),
-    (r"^blocks\.(\d+)\.attn\.proj\.", r"encoder.layers.\1.self_attn.projection."),
-    (r"^blocks\.(\d+)\.attn\.", r"encoder.layers.\1.self_attn."),
-    (r"^blocks\.", "encoder.layers."),
+VISION, BLOCK = r"^blip\.visual_encoder\.", r"vision.encoder.layers.\1."
+NAMES = (
+    (VISION + "cls_token$", "vision.embeddings.class_embedding"),
+    (VISION + "pos_embed$", "vision.embeddings.position_embedding"),
+    (VISION + r"patch_embed\.proj", "vision.embeddings.patch_embedding"),
+    (VISION + r"norm\.", "vision.post_layernorm."),
+    (VISION + r"blocks\.(\d+)\.norm", BLOCK + "layer_norm"),
+    (VISION + r"blocks\.(\d+)\.attn\.proj\.", BLOCK + "self_attn.projection."),
+    (VISION + r"blocks\.(\d+)\.attn", BLOCK + "self_attn"),
+    (VISION + r"blocks\.(\d+)\.", BLOCK),
+    (r"^blip\.text_encoder\.", "text."),
+    (r"^mlp\.layers\.", "head."),
 )
-"""Salesforce's names in the ViT, and those of transformers; the first that matches holds."""
-PARTS = {"blip.visual_encoder.": "vision.", "blip.text_encoder.": "text.", "mlp.layers.": "head."}
+"""Salesforce's names of tensors, and those here; the first that matches holds."""
 NOT_LOADED = "text.embeddings.position_ids"
 
 
 class RewardNetwork(nn.Module):
-    """ViT, BERT with cross-attention, and head.
-
-    Args:
-        vision, text: configurations of transformers' BLIP.
-    """
+    """ViT, BERT with cross-attention, and head, of two configurations of transformers' BLIP."""
 
     def __init__(self, vision: Any, text: Any) -> None:
         super().__init__()
@@ -130,37 +128,27 @@ class ImageReward:
 
 
 def open_tokenizer(vocabulary: Path) -> Any:
-    """Open BERT's tokenizer for lower-case text, which pads and cuts to ``TOKENS``.
-
-    Raises:
-        UserError: the file is no vocabulary of BERT.
-    """
+    """Open BERT's tokenizer for lower-case text, which pads and cuts to ``TOKENS``."""
     from tokenizers import BertWordPieceTokenizer
 
     try:
-        words = set(vocabulary.read_text(encoding="utf-8").splitlines())
-    except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f"the vocabulary {str(vocabulary)!r} can't be read: {error}") from error
-    if missing := {"[PAD]", "[UNK]", "[CLS]", "[SEP]"} - words:
-        raise UserError(f"{str(vocabulary)!r} is no vocabulary of BERT: no {min(missing)} in it")
-    tokenizer = BertWordPieceTokenizer(str(vocabulary), lowercase=True)
+        tokenizer = BertWordPieceTokenizer(str(vocabulary), lowercase=True)
+        tokenizer.enable_padding(length=TOKENS, pad_id=tokenizer.token_to_id("[PAD]"))
+    except Exception as error:  # tokenizers raises many kinds
+        raise UserError(f"{str(vocabulary)!r} is no vocabulary of BERT: {error}") from error
     tokenizer.enable_truncation(TOKENS)
-    tokenizer.enable_padding(length=TOKENS, pad_id=tokenizer.token_to_id("[PAD]"))
     return tokenizer
 
 
 def load_network(path: Path) -> RewardNetwork:
-    """Load the published file in float32 and evaluation mode.
-
-    Raises:
-        UserError: it is damaged, or isn't a file of ImageReward.
-    """
+    """Load the published file in float32 and evaluation mode."""
     kind = "ImageReward file"
     state = {}
     for name, value in read_state_dict(str(path), kind).items():
-        for old, new in PARTS.items():
-            if name.startswith(old):
-                state[new + renamed(name.removeprefix(old), new)] = value
+        for pattern, replacement in NAMES:
+            if re.search(pattern, name):
+                state[re.sub(pattern, replacement, name)] = value
+                break
     state.pop(NOT_LOADED, None)
     try:
         network = RewardNetwork(*configurations(state))
@@ -171,15 +159,6 @@ def load_network(path: Path) -> RewardNetwork:
         ) from error
     load_exactly(network, state, f"{kind} {str(path)!r}")
     return network.float().eval()
-
-
-def renamed(name: str, part: str) -> str:
-    """Return transformers' name of a tensor; BERT's are the same in the file."""
-    if part == "vision.":
-        for pattern, replacement in VISION_NAMES:
-            if re.search(pattern, name):
-                return re.sub(pattern, replacement, name)
-    return name
 
 
 def configurations(state: Mapping[str, Tensor]) -> tuple[Any, Any]:

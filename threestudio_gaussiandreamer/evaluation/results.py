@@ -1,7 +1,6 @@
-"""Find the Gaussians and the prompts of finished runs for evaluation, and render them from any
-camera.
-"""
+"""Find the Gaussians and the prompts of finished runs, and render them from any camera."""
 
+import contextlib
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -62,19 +61,14 @@ def find_result(place: str) -> Result:
             f"{place!r} is no run's folder with Gaussians in save/it*-export: export it first, "
             "with --export and system.exporter.formats=[ply], or name a PLY file"
         )
-    prompt, background = _prompt_and_background(folder / "configs" / "parsed.yaml")
-    return Result(run.cloud, prompt, background, run.antialiased)
-
-
-def _prompt_and_background(parsed: Path) -> tuple[Optional[str], tuple[float, float, float]]:
-    """Return prompt and background colour of the run with this configuration; None and black if
-    they aren't given.
-    """
-    if not parsed.is_file():
-        return None, BLACK
-    system = load_config(parsed).system
-    color = _background_of(system, parsed.parent.parent)
-    return _prompt_of(system.get("prompt_processor") or {}), tuple(float(value) for value in color)
+    prompt, color, parsed = None, BLACK, folder / "configs" / "parsed.yaml"
+    if parsed.is_file():
+        system = load_config(parsed).system
+        color = _background_of(system, folder)
+        # without its prompt library, the prompt can be given as an option
+        with contextlib.suppress(UserError):
+            prompt = resolve_prompt((system.get("prompt_processor") or {}).get("prompt") or "")
+    return Result(run.cloud, prompt, tuple(map(float, color)), run.antialiased)
 
 
 def _background_of(system: Mapping[str, Any], folder: Path) -> Sequence[float]:
@@ -92,24 +86,14 @@ def _background_of(system: Mapping[str, Any], folder: Path) -> Sequence[float]:
     return color
 
 
-def _prompt_of(processor: Mapping[str, Any]) -> Optional[str]:
-    try:
-        return resolve_prompt(processor.get("prompt") or "")
-    except UserError:  # the prompt library was removed; the prompt can be given as an option
-        return None
-
-
 def read_result(result: Result) -> Gaussians:
     """Read all attributes of a result's Gaussians; rows that can't be rendered are skipped."""
     return find("gaussians-prior")({"path": str(result.file)}).gaussians("")
 
 
 class Pictures:
-    """Renders a cloud with this package's rasteriser and its default options, without gradients.
-
-    Args:
-        background: its colour, RGB in [0, 1].
-        antialias: whether the cloud was trained with antialiasing.
+    """Renders a cloud with this package's rasteriser and its default options, without gradients, on
+    a background in [0, 1], with antialiasing if it was trained so.
     """
 
     def __init__(

@@ -1,19 +1,11 @@
-"""Score finished assets and compare two folders of them.
-
-``python -m threestudio_gaussiandreamer.evaluate FOLDER [FOLDER ...] --metrics clip,judge,janus
-[--clip FOLDER] [--against FOLDER]``
-
-A folder is that of one run, or holds the folders of runs at any depth. ``scorecard.csv`` has a row
-for each asset. ``scorecard.json`` has the means over the prompts with their bootstrap intervals;
-with ``--against`` it also has the paired differences over the prompts that both sides have.
-``asset_metrics.py`` lists the metrics.
-"""
+"""Score finished assets and compare two folders of them:
+``python -m threestudio_gaussiandreamer.evaluate FOLDER ... --metrics clip,judge,janus``"""
 
 import argparse
 import csv
 import functools
+import glob
 import io
-import os
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -71,10 +63,8 @@ def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
 
 
 def run(args: argparse.Namespace) -> None:
-    """Check files, prompts and output, then score all assets and write the scorecard.
-
-    Raises:
-        UserError: also if an asset can't be scored, after the scorecard of the others is written.
+    """Check files, prompts and output, then score all assets and write the scorecard; assets that
+    can't be scored are an error after it.
     """
     register_parts()
     metrics, failed = open_metrics(args), []
@@ -92,11 +82,7 @@ def run(args: argparse.Namespace) -> None:
 
 
 def open_metrics(args: argparse.Namespace) -> list[Metric]:
-    """Load the metrics of ``--metrics``.
-
-    Raises:
-        UserError: a name isn't known, or a file that a metric needs is missing.
-    """
+    """Load the metrics of ``--metrics``."""
     names = [name.strip() for name in args.metrics.split(",") if name.strip()]
     if not names:
         raise UserError(f"--metrics is empty: expected some of {', '.join(METRICS)}")
@@ -118,55 +104,34 @@ def open_metrics(args: argparse.Namespace) -> list[Metric]:
 
 
 def find_results(folders: Sequence[str], failed: list[str]) -> list[Result]:
-    """Find the finished runs in these folders, sorted by path; a run in several of them once.
-
-    Args:
-        failed: gets the messages of runs without a file of Gaussians.
-
-    Raises:
-        UserError: a folder doesn't exist or holds no finished run.
+    """Find the finished runs in these folders, also behind links; a run in several of them once.
+    ``failed`` gets the messages of runs without a file of Gaussians.
     """
-    found: dict[Path, Optional[Result]] = {}
+    places: dict[Path, str] = {}
     for folder in folders:
-        if not Path(folder).expanduser().is_dir():
-            raise UserError(f"{folder!r} is no folder: expected a run's, or one that holds runs")
-        runs = list(run_folders(Path(folder).expanduser()))
+        pattern = f"{glob.escape(str(Path(folder).expanduser()))}/**/save/it*-export"
+        exports = map(Path, glob.glob(pattern, recursive=True))
+        runs = sorted({str(export.parents[1]) for export in exports})
         if not runs:
-            raise UserError(f"{folder!r} holds no finished run, which has a save/it*-export folder")
-        for place in runs:
-            if place.resolve() in found:
-                continue
-            found[place.resolve()] = None
-            try:
-                found[place.resolve()] = find_result(str(place))
-            except UserError as error:
-                failed.append(str(error))
-    return [result for result in found.values() if result]
-
-
-def run_folders(folder: Path) -> Iterator[Path]:
-    """Yield the folders of finished runs below a folder, also behind links; runs inside runs aren't
-    searched.
-    """
-    seen = set()
-    for place, names, _ in os.walk(folder, followlinks=True):
-        names.sort()
-        if (real := os.path.realpath(place)) in seen:  # a link to a folder above
-            names.clear()
-            continue
-        seen.add(real)
-        if any(Path(place).glob("save/it*-export")):
-            names.clear()
-            yield Path(place)
+            raise UserError(
+                f"{folder!r} is no folder that holds finished runs, which have a save/it*-export"
+            )
+        for run in runs:
+            places.setdefault(Path(run).resolve(), run)
+    results = []
+    for place in places.values():
+        try:
+            results.append(find_result(place))
+        except UserError as error:
+            failed.append(str(error))
+    return results
 
 
 def scored(
     results: Sequence[Result], metrics: Sequence[Metric], failed: list[str]
 ) -> Iterator[dict[str, Any]]:
-    """Yield a row of the table for each result.
-
-    Args:
-        failed: gets the messages of those that can't be read or scored.
+    """Yield a row of the table for each result; ``failed`` gets the messages of those that can't be
+    read or scored.
     """
     for item, result in enumerate(tqdm(results, unit="asset", disable=None)):
         row: dict[str, Any] = {"asset": str(result.file.parents[2])}
@@ -217,7 +182,6 @@ def paired(first: dict[str, float], second: dict[str, float], *, seed: int = 0) 
 
 def summary(metrics: Sequence[Metric], first: Rows, second: Rows) -> dict[str, Any]:
     """Return the content of ``scorecard.json``."""
-
     content: dict[str, Any] = {}
     for column in (name for metric in metrics for name in metric.columns):
         means = [

@@ -1,13 +1,10 @@
 """Make an asset for each prompt of a list, on all GPUs or cores of a Ray cluster or this machine:
-``python -m threestudio_gaussiandreamer.farm prompts.txt --config gaussiandreamer.yaml``.
-
-The same command goes on where it was after any kind of stop, and tries failed assets again. With
-``--report`` it only writes the report of what there is."""
+``python -m threestudio_gaussiandreamer.farm prompts.txt --config gaussiandreamer.yaml``."""
 
 import argparse
-import contextlib
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
 from typing import Optional
@@ -15,6 +12,7 @@ from typing import Optional
 from ..core.command import run_command
 from ..core.errors import UserError
 from ..core.launcher import train_alone
+from ..core.options import at_least, check_options, positive
 from ..core.signals import raised_signals
 from ..launch.experiment import configure_logging
 from ..launch.folder_lock import claim, require_writable
@@ -27,7 +25,17 @@ from .report import write_report
 from .rows import check_rows, read_rows
 from .worker import Setting
 
-PROGRAM = "python -m threestudio_gaussiandreamer.farm"
+
+@dataclass
+class FarmOptions:
+    """The numeric options, with their ranges."""
+
+    price: Optional[float] = field(default=None, metadata=positive())
+    workers: Optional[int] = field(default=None, metadata=at_least(1))
+    gpus: Optional[int] = field(default=None, metadata=at_least(0))
+    cores: int = field(default=1, metadata=at_least(1))
+    retries: int = field(default=3, metadata=at_least(0))
+    time_limit: float = field(default=1800.0, metadata=positive("seconds"))
 
 
 def main(argv: Optional[Sequence[str]] = None) -> int:
@@ -46,7 +54,7 @@ def main(argv: Optional[Sequence[str]] = None) -> int:
 def parse_arguments(argv: Optional[Sequence[str]] = None) -> argparse.Namespace:
     """Parse the command line; all arguments ``key=value`` are overrides."""
     parser = argparse.ArgumentParser(
-        prog=PROGRAM,
+        prog="python -m threestudio_gaussiandreamer.farm",
         description="Make an asset for each prompt of a list.",
         epilog="Everything else is an override of the configuration: trainer.max_steps=600",
         allow_abbrev=False,
@@ -56,39 +64,24 @@ def parse_arguments(argv: Optional[Sequence[str]] = None) -> argparse.Namespace:
     add_config(parser)
     add("--out", help="folder, or URL such as s3://bucket/farm (default: in exp_root_dir)")
     add("--report", action="store_true", help="only write the report")
-    add("--price", type=positive, help="cost of one worker-hour, for the report")
+    add("--price", type=float, help="cost of one worker-hour, for the report")
     add("--address", help="of a Ray cluster, host:port or auto (default: start Ray here)")
-    add("--workers", type=whole(1), help="number of workers (default: as many as fit)")
-    add("--gpus", type=whole(0), help="number of GPUs, one per worker (default: all; 0: the CPU)")
-    add("--cores", type=whole(1), default=1, help="CPU cores per worker (default: 1)")
-    retries = "how often an asset is tried again after its worker has died (default: 3)"
-    add("--retries", type=whole(0), default=3, help=retries)
-    limit = "seconds without a step after which an asset counts as hung (default: 1800)"
-    add("--time-limit", type=positive, default=1800.0, help=limit)
+    add("--workers", type=int, help="number of workers (default: as many as fit)")
+    add("--gpus", type=int, help="number of GPUs, one per worker (default: all; 0: the CPU)")
+    cores = "CPU cores per worker (default: %(default)s)"
+    add("--cores", type=int, default=FarmOptions.cores, help=cores)
+    retries = "how often an asset is tried again after its worker has died (default: %(default)s)"
+    add("--retries", type=int, default=FarmOptions.retries, help=retries)
+    limit = "seconds without a step after which an asset counts as hung (default: %(default)g)"
+    add("--time-limit", type=float, default=FarmOptions.time_limit, help=limit)
     return parse_with_overrides(parser, argv)
-
-
-def whole(low: int) -> Callable[[str], int]:
-    def parse(text: str) -> int:
-        if not text.isdigit() or int(text) < low:
-            raise argparse.ArgumentTypeError(f"expected a whole number from {low}, got {text!r}")
-        return int(text)
-
-    return parse
-
-
-def positive(text: str) -> float:
-    """Parse a finite number above 0."""
-    with contextlib.suppress(ValueError):
-        if 0 < float(text) < float("inf"):
-            return float(text)
-    raise argparse.ArgumentTypeError(f"expected a number above 0, got {text!r}")
 
 
 def run_farm(args: argparse.Namespace) -> int:
     """Make the assets, or only the report, and return the exit code."""
     train_alone()  # whatever has started this process, such as a job of SLURM
     configure_logging(verbose=False)
+    check_options(FarmOptions, args, "--")
     total = check_rows(args.prompts)
     roots = [text for text in args.overrides if text.startswith("exp_root_dir=")]
     root = roots[-1].partition("=")[2] if roots else args.out or root_of(args.config)
@@ -101,11 +94,6 @@ def run_farm(args: argparse.Namespace) -> int:
         recipe = Recipe(tuple(map(read_config, args.config)), overrides, True, args.cores)
         recipe = check_recipe(recipe, read_rows(args.prompts))
         require_same_farm(place, recipe, before_ray=True)
-        if {"ledger", "ledger.jsonl"} & set(place.names("")):
-            raise UserError(
-                f"{place} has the ledger of an earlier version, which this one doesn't read: "
-                "choose another --out"
-            )
         lock = claim(place.folder, "another farm command is at work", ", or choose another --out")
         try:
             make_assets(args, place, recipe, total)

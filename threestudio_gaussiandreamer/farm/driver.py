@@ -1,8 +1,6 @@
 """Connect to Ray and start the workers; hand assets to them, note what became of these, and watch
-for workers that hang.
-
-Ray gives each worker its GPU or cores, restarts a worker that was killed or whose machine is gone,
-and hands it the asset again."""
+for workers that hang. Ray restarts a worker that was killed or whose machine is gone, and hands it
+the asset again."""
 
 import os
 import socket
@@ -11,7 +9,6 @@ import tempfile
 import time
 from collections import Counter, deque
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from typing import Any, Optional
 
 from tqdm import tqdm
@@ -19,7 +16,6 @@ from tqdm import tqdm
 from .. import __version__
 from ..core.errors import UserError
 from ..core.extras import require_extra
-from ..core.files import json_text
 from .board import Beat
 from .place import ASSETS, FAILED, FAILURE, FINISHED, STOPPED
 from .recipe import Job, repeat_command
@@ -40,17 +36,13 @@ SAME_ERRORS = 3
 
 
 def connect(address: Optional[str]) -> Any:
-    """Connect to the cluster at ``address``, or start Ray on this machine; return the module.
-
-    Raises:
-        UserError: Ray isn't installed, or no cluster answers.
-    """
+    """Connect to the cluster at ``address``, or start Ray on this machine; return the module."""
     require_extra("cluster", "ray")
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     import ray
 
     source, leave = "--address", "leave --address out"
-    if not address and "RAY_ADDRESS" in os.environ:
+    if not address:
         source, leave = "RAY_ADDRESS", "`unset RAY_ADDRESS`"
     address = address or os.environ.get("RAY_ADDRESS") or "local"
     options: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
@@ -60,21 +52,23 @@ def connect(address: Optional[str]) -> Any:
             os.environ.setdefault("RAY_TMPDIR", "/tmp")
     try:
         host, _, port = address.removeprefix("ray://").rpartition(":")
-        if "://" in address.removeprefix("ray://"):
+        if "://" in host:
             raise ValueError("expected host:port, such as that which `ray start --head` prints")
-        if host:  # else "local", or "auto", which Ray resolves by itself
-            # Ray's own attempt takes minutes
+        if host:  # else "local" or "auto"; Ray's own attempt takes minutes
             socket.create_connection((host.strip("[]"), int(port)), timeout=5).close()
         ray.init(address=address, **options)
     except Exception as error:  # Ray raises many kinds
-        said = (str(error).strip().splitlines() or [type(error).__name__])[0][:300]
         if address == "local":
-            raise UserError(f"Ray can't be started on this machine: {said}") from error
-        raise UserError(
-            f"{source} {address}: no Ray cluster answers there ({said}); start one with "
-            f"`ray start --head`, or {leave} to run on this machine"
-        ) from error
+            what, advice = "Ray can't be started on this machine", ""
+        else:
+            what = f"{source} {address}: no Ray cluster answers there"
+            advice = f"; start one with `ray start --head`, or {leave} to run on this machine"
+        raise UserError(f"{what} ({first_line(error)}){advice}") from error
     return ray
+
+
+def first_line(error: Exception) -> str:
+    return (str(error).strip().splitlines() or [type(error).__name__])[0][:500]
 
 
 def plan_workers(
@@ -82,9 +76,6 @@ def plan_workers(
 ) -> tuple[int, int]:
     """Return how many workers of so many cores fit into the cluster, or are asked for, and the GPUs
     of each: 1 where the cluster has some, else 0. ``gpus=None`` asks for all.
-
-    Raises:
-        UserError: the cluster has fewer.
     """
     there, cpus = int(resources.get("GPU", 0)), int(resources.get("CPU", 0))
     if gpus is not None and gpus > there:
@@ -101,11 +92,7 @@ def plan_workers(
 
 
 def start_workers(ray: Any, count: int, gpus: int, setting: Setting) -> list[Any]:
-    """Start workers with so many GPUs each, and wait until all are ready.
-
-    Raises:
-        UserError: one can't start.
-    """
+    """Start workers with so many GPUs each, and wait until all are ready."""
     cores = setting.recipe.cores
     environment = {"OMP_NUM_THREADS": str(cores), "OMP_WAIT_POLICY": "passive"}
     if not gpus:
@@ -119,8 +106,7 @@ def start_workers(ray: Any, count: int, gpus: int, setting: Setting) -> list[Any
     )(Worker)
     workers = [actor.remote() for _ in range(count)]
     try:
-        greetings = [worker.hello.remote(setting) for worker in workers]
-        ray.get(greetings, timeout=SECONDS_TO_ANSWER)
+        ray.get([worker.hello.remote(setting) for worker in workers], timeout=SECONDS_TO_ANSWER)
     except ray.exceptions.RayError as error:
         said = getattr(error, "cause", None) or (
             f"each machine needs threestudio-gaussiandreamer {__version__}: {error}"
@@ -129,25 +115,29 @@ def start_workers(ray: Any, count: int, gpus: int, setting: Setting) -> list[Any
     return workers
 
 
-@dataclass
 class Driver:
-    """Gives all remaining assets to the workers."""
+    """Gives all remaining assets to the workers.
 
-    ray: Any
-    """The module, connected to a cluster."""
-    workers: list[Any]
-    """Handles of :class:`.worker.Worker`."""
-    setting: Setting
-    jobs: Iterator[Job]
-    """The assets that aren't finished; it is advanced when a worker is idle."""
-    hang: float
-    """Seconds without a finished step after which a worker is restarted."""
-    total: int
-    """Number of assets of the farm."""
-    done: int
-    """How many were finished before."""
+    Args:
+        ray: the module, connected to a cluster.
+        workers: handles of :class:`.worker.Worker`.
+        jobs: the assets that aren't finished; it is advanced when a worker is idle.
+        hang: seconds without a finished step after which a worker is restarted.
+        total: number of assets of the farm, ``done`` of which were finished before.
+    """
 
-    def __post_init__(self) -> None:
+    def __init__(
+        self,
+        ray: Any,
+        workers: list[Any],
+        setting: Setting,
+        jobs: Iterator[Job],
+        hang: float,
+        total: int,
+        done: int,
+    ) -> None:
+        self.ray, self.workers, self.setting, self.jobs = ray, workers, setting, jobs
+        self.hang, self.total, self.done = hang, total, done
         self.idle = deque(range(len(self.workers)))
         self.running: dict[Any, tuple[int, Job]] = {}
         self.again: deque[Job] = deque()
@@ -155,7 +145,7 @@ class Driver:
         self.counts: Counter = Counter()
         self.errors: list[str] = []
         self.obstacle: Optional[str] = None
-        self.began, self.look_due = time.monotonic(), 0.0
+        self.began = time.monotonic()
         # only on terminals; elsewhere a line per asset
         self.bar = tqdm(total=self.total, initial=self.done, unit="asset", disable=None, ncols=110)
 
@@ -166,10 +156,16 @@ class Driver:
             UserError: the results can't be written, or the first assets all fail with one message.
             KeyboardInterrupt: Ctrl-C; the workers have written checkpoints.
         """
+        due = 0.0
         try:
             self.fill()
             while self.running:
-                self.step()
+                self.collect_ready()
+                if not self.obstacle:
+                    self.fill()
+                if time.monotonic() >= due:
+                    self.look_after_workers()
+                    due = time.monotonic() + POLL
         except (KeyboardInterrupt, SystemExit):
             print("\nstopping: the workers write checkpoints; once more to stop at once")
             self.tell_board_to_stop()
@@ -181,15 +177,6 @@ class Driver:
             self.bar.close()
         if self.obstacle:
             raise UserError(self.obstacle)
-
-    def step(self) -> None:
-        """Wait for outcomes, hand out new assets, and now and then look after the workers."""
-        self.collect_ready()
-        if not self.obstacle:
-            self.fill()
-        if time.monotonic() >= self.look_due:
-            self.look_after_workers()
-            self.look_due = time.monotonic() + POLL
 
     def collect_ready(self) -> None:
         """Wait up to :data:`POLL` seconds for an outcome, and note all that are there."""
@@ -218,22 +205,24 @@ class Driver:
         try:
             outcome = self.ray.get(handle)
         except self.ray.exceptions.RayError as error:  # its worker can't be restarted
-            said = (str(error).strip().splitlines() or [type(error).__name__])[0][:500]
-            outcome = {"state": FAILED, "error": f"its worker is lost: {said}"}
+            outcome = {"state": FAILED, "error": f"its worker is lost: {first_line(error)}"}
         state = outcome["state"]
         if state == FINISHED:
             self.note(job, FINISHED, f"{outcome.get('seconds', 0):.1f} s")
             return
         job, error = job._replace(spent=job.worker_seconds(time.time())), outcome["error"]
-        saving = bool(self.setting.recipe.low_memory)
-        again = state == NO_MEMORY and saving and not job.saves_memory
+        again = state == NO_MEMORY and self.setting.recipe.low_memory and not job.saves_memory
         if state in (FAILED, REFUSED) or state == NO_MEMORY and not again:
             if state != REFUSED:  # else the record is the other row's
                 self.record(job, FAILED, error)
-            self.fail(job, error)
+            self.note(job, FAILED, error)
+            self.errors.append(error)
+            if not self.done + self.counts[FINISHED] and self.errors == [error] * SAME_ERRORS:
+                same = f"the first {SAME_ERRORS} assets have failed alike, so the farm ends"
+                self.block(f"{same}: {error}")
             return
         # noted too, so that after any stop every machine makes it so
-        job = job._replace(saves_memory=job.saves_memory or again)
+        job = job._replace(saves_memory=job.saves_memory or bool(again))
         self.record(job, STOPPED, error)
         if again:
             self.note(job, "again with less memory", error)
@@ -244,22 +233,13 @@ class Driver:
         elif not self.obstacle:  # a signal that was only for its worker
             self.again.append(job)
 
-    def fail(self, job: Job, error: str) -> None:
-        """Note a failed asset; end the farm if the first assets all failed with one message."""
-        self.note(job, FAILED, error)
-        self.errors.append(error)
-        if not self.done + self.counts[FINISHED] and self.errors == [error] * SAME_ERRORS:
-            alike = f"the first {SAME_ERRORS} assets have failed alike, so the farm ends: {error}"
-            self.block(alike)
-
     def record(self, job: Job, state: str, error: str) -> None:
         """Write the record of an attempt that ended without a result."""
         record = {"state": state, "key": job.row.key, "error": error}
         record |= {"command": repeat_command(self.setting.recipe, job)}
         record |= {"worker_seconds": job.spent, "saves_memory": job.saves_memory}
-        content = json_text(record, indent=1).encode()
         try:
-            self.setting.place.write({f"{ASSETS}/{job.row.name}/{FAILURE}": content})
+            self.setting.place.write(f"{ASSETS}/{job.row.name}/{FAILURE}", record)
         except UserError as problem:  # such as a full disk
             self.block(str(problem))
 
@@ -280,17 +260,15 @@ class Driver:
         self.bar.write(f"{job.row.name}: {state}: {text}", file=sys.stderr)
 
     def look_after_workers(self) -> None:
-        """Restart hung workers, and show what the workers do."""
+        """Show what the workers do; restart those that have finished no step for ``hang`` seconds,
+        with the same asset.
+        """
         try:
             beats = self.ray.get(self.setting.board.read.remote(), timeout=2)
         except self.ray.exceptions.RayError:
             return  # the board's process is being restarted
-        self.restart_hung(beats)
         shown = [f"{beat.name} {beat.stage} {beat.step}/{beat.steps}" for beat, _ in beats.values()]
         self.bar.set_postfix_str(f"{self.counts[FAILED]} failed, {', '.join(shown)}")
-
-    def restart_hung(self, beats: dict[int, tuple[Beat, float]]) -> None:
-        """Restart workers that have finished no step for ``hang`` seconds, with the same asset."""
         for number, job in self.running.values():
             beat, seconds = beats.get(number, (None, 0.0))
             hangs = beat is not None and beat.name == job.row.name and seconds > self.hang

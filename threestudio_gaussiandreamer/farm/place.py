@@ -1,11 +1,8 @@
 """The farm's folder, on this machine or below an fsspec URL such as ``s3://bucket/farm``, and the
-records of its assets.
-
-An asset's ``result.json`` is the last of its files that is written, so that its existence means a
-complete asset; ``failed.json`` is written after an attempt that ended without a result. There is no
-other record. Below a URL, an asset is made in a scratch folder of its worker and uploaded when it
-is finished. During training its checkpoint is uploaded too, to ``parts/<name>``, from where any
-worker goes on."""
+records of its assets: ``result.json``, the last file of a complete asset, and ``failed.json`` of an
+attempt that ended without a result. Below a URL, an asset is made in a cache folder of its worker
+and uploaded when it is finished; its checkpoint during training, to ``parts/<name>``, from where
+any worker goes on."""
 
 import contextlib
 import fnmatch
@@ -34,8 +31,6 @@ failed; complete; its record is of another row."""
 LAST, FETCHED = "ckpts/last.ckpt", "ckpts/fetched.ckpt"
 NOT_UPLOADED = ("ckpts/epoch=*", "ckpts/*-prev.ckpt", FETCHED, "ckpts/.*", "ckpts-*/*", "tb_logs/*")
 NOT_UPLOADED += (RESULT,)  # comes last
-NUMBERS = ("seconds", "worker_seconds", "megabytes", "steps", "gaussians", "bytes", "attempts")
-"""Entries of a record that are numbers, if it has them."""
 MISSING = (FileNotFoundError, IsADirectoryError, NotADirectoryError)
 BATCH = 1000
 """Records that are read together."""
@@ -56,15 +51,14 @@ class AnotherRow(UserError):
 
 
 class Place:
-    """A farm's folder on a disk that all its machines share, or below a URL. ``scratch`` holds the
-    folders in which assets for a URL are made; by default it is the user's cache folder.
+    """A farm's folder on a disk that all its machines share, or below a URL.
 
     Raises:
         UserError: the URL's protocol is unknown, its package isn't installed, or its server, to
             which some connect here, doesn't answer.
     """
 
-    def __init__(self, out: str | os.PathLike, scratch: Optional[Path] = None) -> None:
+    def __init__(self, out: str | os.PathLike) -> None:
         import fsspec
 
         self.remote = "://" in str(out)
@@ -74,9 +68,9 @@ class Place:
         if not self.remote:
             return
         cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-        scratch = scratch or Path(cache, "threestudio_gaussiandreamer", "farm")
-        self.folder = scratch / hashlib.sha256(self.url.encode()).hexdigest()[:16]
-        self.uploaded: dict[str, float] = {}
+        digest = hashlib.sha256(self.url.encode()).hexdigest()[:16]
+        self.folder = Path(cache, "threestudio_gaussiandreamer", "farm", digest)
+        self.uploaded = 0.0
         try:
             self.system = fsspec.core.url_to_fs(self.url, use_listings_cache=False)[0]
         except Exception as error:  # each file system has its own
@@ -124,31 +118,28 @@ class Place:
         """Return the contents of JSON files of the farm; None for those that don't exist.
 
         Raises:
-            UserError: one isn't an object, or no record: it was written by something else.
+            UserError: one isn't an object: it was written by something else.
         """
         found = []
         for name, content in zip(names, self.read(names), strict=True):
             try:
                 found.append(None if content is None else {**json.loads(content)})
-                record = found[-1] or {}
-                scores = (record.get("scores") or {}).values()
-                sum([*(record.get(key, 0) for key in NUMBERS), *filter(None, scores)])
-            except (ValueError, TypeError, AttributeError, RecursionError) as error:
+            except (ValueError, TypeError, RecursionError) as error:
                 raise UserError(
                     f"{self}/{name} is damaged ({error}): delete it, or choose another --out"
                 ) from error
         return found
 
-    def write(self, files: Mapping[str, bytes]) -> None:
-        """Write files of the farm, each atomically, as object stores do by themselves."""
+    def write(self, name: str, content: Mapping[str, Any]) -> None:
+        """Write a JSON file of the farm atomically, as object stores do by themselves."""
+        text = json_text(content, indent=1).encode()
         if self.remote:
             with self.reached():
-                self.system.pipe({f"{self.url}/{name}": files[name] for name in files})
-            return
-        for name, content in files.items():
+                self.system.pipe_file(f"{self.url}/{name}", text)
+        else:
             make_folder((self.folder / name).parent)
             with atomic_file(self.folder / name) as file:
-                file.write(content)
+                file.write(text)
 
     def upload(self, name: str, path: Optional[Path] = None) -> None:
         """Make a file that was written below :attr:`folder` available to readers."""
@@ -168,12 +159,8 @@ class Place:
     def finished(self, row: Row) -> Optional[dict[str, Any]]:
         """Return the result of a finished asset; None if it isn't finished."""
         (record,) = self.read_json(f"{ASSETS}/{row.name}/{RESULT}")
-        ours = record and record.get("key") == row.key and has_files(record)
+        ours = record and record.get("key") == row.key
         return {"state": FINISHED, **record} if ours else None
-
-    def discard(self, row: Row) -> None:
-        """Remove what this machine has of an asset that isn't finished."""
-        shutil.rmtree(self.work_folder(row), ignore_errors=True)
 
     def fetch_checkpoint(self, row: Row, saves_memory: bool) -> None:
         """Bring the last checkpoint that was made with the low-memory configuration, or without it,
@@ -182,7 +169,7 @@ class Place:
         """
         if self.remote:
             folder = self.work_folder(row)
-            self.uploaded = {row.name: _written(folder / LAST)}  # may be older than the other
+            self.uploaded = _written(folder / LAST)  # may be older than the other
             (content,) = self.read([part_of(row, saves_memory)])
             if content is not None:
                 (folder / FETCHED).parent.mkdir(parents=True, exist_ok=True)
@@ -191,22 +178,23 @@ class Place:
     def keep_checkpoint(self, row: Row, saves_memory: bool) -> None:
         """Make the work folder's last checkpoint available to other workers."""
         path = self.work_folder(row) / LAST
-        if self.remote and _written(path) > self.uploaded.get(row.name, 0.0):
-            written = _written(path)
+        if self.remote and (written := _written(path)) > self.uploaded:
             self.upload(part_of(row, saves_memory), path)
-            self.uploaded = {row.name: written}
+            self.uploaded = written
 
     def publish(self, row: Row, result: Mapping[str, Any]) -> None:
         """Write the result of a finished asset, after all its other files are where readers get
         them, and remove what only unfinished ones have.
         """
         folder, name = self.work_folder(row), f"{ASSETS}/{row.name}"
-        for file, path in uploads(folder) if self.remote else ():
-            self.upload(f"{name}/{file}", path)
-        self.write({f"{name}/{RESULT}": json_text(result, indent=1).encode()})
+        for path in sorted(filter(Path.is_file, folder.rglob("*"))) if self.remote else ():
+            file = path.relative_to(folder).as_posix()
+            if not any(fnmatch.fnmatch(file, pattern) for pattern in NOT_UPLOADED):
+                self.upload(f"{name}/{file}", path)
+        self.write(f"{name}/{RESULT}", result)
         self.remove([f"{name}/{FAILURE}"])
         if self.remote:
-            self.discard(row)
+            shutil.rmtree(folder, ignore_errors=True)
             self.remove(part_of(row, saves_memory) for saves_memory in (False, True))
 
     def records(self, rows: Iterable[Row]) -> Iterator[tuple[Row, dict[str, Any]]]:
@@ -221,33 +209,21 @@ class Place:
                 asked = [row for row in batch if row.name in begun and row.name not in found]
                 names = [f"{ASSETS}/{row.name}/{file}" for row in asked]
                 for row, record in zip(asked, self.read_json(*names), strict=True):
-                    if record is not None and record.get("key") != row.key:
-                        record = {"state": CHANGED}
-                    if record is not None and (file == FAILURE or has_files(record)):
-                        found[row.name] = {"state": state, **record}
+                    if record is not None:
+                        ours = record.get("key") == row.key
+                        found[row.name] = {"state": state, **record} if ours else {"state": CHANGED}
             for row in batch:
                 state = RUNNING if row.name in begun else WAITING
                 yield row, found.get(row.name, {"state": state})
 
 
-def has_files(result: Mapping[str, Any]) -> bool:
-    """Return whether a result names anything that was made; without it an asset isn't finished."""
-    return "files" not in result or any(map(result.get, ("files", "picture", "page")))
+def variant(row: Row, saves_memory: bool) -> str:
+    """Return what the checkpoints of a row that are made with one configuration are marked by."""
+    return f"{row.key}{'-saves_memory' * saves_memory}"
 
 
 def part_of(row: Row, saves_memory: bool) -> str:
-    """Return where the last checkpoint of an unfinished asset is; that of another row, or of the
-    other configuration, isn't.
-    """
-    return f"{PARTS}/{row.name}/{row.key}{'-saves_memory' * saves_memory}.ckpt"
-
-
-def uploads(folder: Path) -> Iterator[tuple[str, Path]]:
-    """Yield the files of a finished asset that readers get below a URL, and their names there."""
-    for path in sorted(path for path in folder.rglob("*") if path.is_file()):
-        name = path.relative_to(folder).as_posix()
-        if not any(fnmatch.fnmatch(name, pattern) for pattern in NOT_UPLOADED):
-            yield name, path
+    return f"{PARTS}/{row.name}/{variant(row, saves_memory)}.ckpt"
 
 
 def _written(path: Path) -> float:

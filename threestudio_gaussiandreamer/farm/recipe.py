@@ -1,6 +1,5 @@
-"""What the assets of a farm are made with: its configuration and those of the rows, checked before
-any work, the launcher's arguments for an asset, and ``farm.json``, which tells one farm from
-another."""
+"""What the assets of a farm are made with: its configuration and those of the rows, the launcher's
+arguments for an asset, and ``farm.json``, which tells one farm from another."""
 
 import hashlib
 import json
@@ -16,12 +15,11 @@ from tqdm import tqdm
 
 from .. import __version__
 from ..core.errors import UserError
-from ..core.files import json_text
 from ..launch.config_source import read_yaml
 from ..launch.experiment import read_source
 from ..launch.options import find_config
 from ..launch.run_folder import program_anywhere
-from .place import ASSETS, CHANGED, FINISHED, AnotherRow, Place
+from .place import CHANGED, FINISHED, AnotherRow, Place
 from .rows import Row, read_rows
 
 FARM = "farm.json"
@@ -29,8 +27,8 @@ OF_MACHINES = ("device", "cores")
 """Entries of ``farm.json`` that are known only when Ray has told which machines there are."""
 LOW_MEMORY = "gaussiandreamer-lowmem.yaml"
 MOST_CHECKS = 500
-"""Rows of one list may have different overrides; so many are checked before any work, and further
-ones when it is their turn."""
+"""So many combinations of rows' ``config`` and ``overrides`` are checked before any work, and
+further ones when it is their turn."""
 HERE = "exp_root_dir=outputs"
 """Of a single run; the farm's may be a URL, which the launcher refuses."""
 MANAGED = {
@@ -103,19 +101,16 @@ def root_of(configs: Iterable[str]) -> str:
         raise UserError(f"exp_root_dir is {root!r}, which isn't known here: give --out") from error
 
 
-def launch_arguments(recipe: Recipe, job: Job, configs: list[str], folder: Path) -> list[str]:
-    """Return the launcher's arguments for an asset in the farm's ``folder``; ``configs`` are the
-    paths of the YAML files.
+def launch_arguments(recipe: Recipe, job: Job, configs: Iterable[str], *where: str) -> list[str]:
+    """Return the launcher's arguments for an asset.
+
+    Args:
+        configs: paths of the YAML files.
+        where: overrides that say where the run is.
     """
-    managed = {"exp_root_dir": folder, "name": ASSETS, "tag": job.row.name}
-    managed |= {"use_timestamp": "false", "resume": "auto"}
-    return [*_arguments(recipe, job, configs), *(f"{key}={managed[key]}" for key in managed)]
-
-
-def _arguments(recipe: Recipe, job: Job, configs: Iterable[str]) -> list[str]:
     device = ["--gpu", "cpu"] if recipe.cpu else []
     paths = [text for path in configs for text in ("--config", path)]
-    return [*paths, "--train", *device, *run_overrides(recipe, job)]
+    return [*paths, "--train", *device, *run_overrides(recipe, job), *where]
 
 
 def run_overrides(recipe: Recipe, job: Job) -> list[str]:
@@ -123,14 +118,6 @@ def run_overrides(recipe: Recipe, job: Job) -> list[str]:
     seed = [] if job.row.seed is None else [f"seed={job.row.seed}"]
     prompt = f"system.prompt_processor.prompt={job.row.prompt}"
     return [*recipe.overrides, *job.row.overrides, *seed, prompt]
-
-
-def require_unmanaged(recipe: Recipe, row: Row) -> None:
-    """Raise UserError for an override of an option that the farm sets."""
-    for override in (*recipe.overrides, *row.overrides):
-        key = override.partition("=")[0]
-        if key in MANAGED:
-            raise UserError(f"{key} is set by {MANAGED[key]}: remove {override[:80]!r}")
 
 
 def all_sources(recipe: Recipe, job: Job) -> list[Source]:
@@ -141,15 +128,14 @@ def all_sources(recipe: Recipe, job: Job) -> list[Source]:
 
 def repeat_command(recipe: Recipe, job: Job) -> str:
     """Return the command that makes an asset by itself, in ``outputs/``."""
-    arguments = _arguments(recipe, job, [source.name for source in all_sources(recipe, job)])
-    command = shlex.join([*program_anywhere(), *arguments, HERE])
-    return f"OMP_NUM_THREADS={recipe.cores} {command}"
+    configs = [source.name for source in all_sources(recipe, job)]
+    command = [*program_anywhere(), *launch_arguments(recipe, job, configs, HERE)]
+    return f"OMP_NUM_THREADS={recipe.cores} {shlex.join(command)}"
 
 
 def check_recipe(recipe: Recipe, rows: Iterable[Row]) -> Recipe:
-    """Check the overrides of all rows, and the configuration of the first :data:`MOST_CHECKS`
-    combinations of rows' ``config`` and ``overrides``; return the recipe with the low-memory
-    configuration, if that is valid with the farm's.
+    """Check all rows; return the recipe with the low-memory configuration, if that is valid with
+    the farm's.
 
     Raises:
         UserError: the first error, with the line of the row.
@@ -163,7 +149,9 @@ def check_recipe(recipe: Recipe, rows: Iterable[Row]) -> Recipe:
     for row in rows:
         kind = row.config, row.overrides
         try:
-            require_unmanaged(recipe, row)
+            for override in (*recipe.overrides, *row.overrides):
+                if (key := override.partition("=")[0]) in MANAGED:
+                    raise UserError(f"{key} is set by {MANAGED[key]}: remove {override[:80]!r}")
             job = job_of(row)
             if kind not in checked and len(checked) < MOST_CHECKS:
                 checked[kind] = job
@@ -229,7 +217,7 @@ def require_same_farm(place: Place, recipe: Recipe, *, before_ray: bool = False)
     (theirs,) = place.read_json(FARM)
     if theirs is None:
         if not before_ray:
-            place.write({FARM: json_text(ours, indent=1).encode()})
+            place.write(FARM, ours)
         return
     for name, here in ours.items():
         there = theirs.get(name)

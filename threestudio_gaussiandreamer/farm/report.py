@@ -13,7 +13,7 @@ from typing import Any, Optional
 from tqdm import tqdm
 
 from ..core.files import atomic_file
-from ..view.templates import write_static
+from ..view.page import write_static
 from .place import FAILED, FINISHED, Place
 from .rows import Row
 
@@ -91,11 +91,8 @@ def table_line(row: Row, record: dict[str, Any], price: Optional[float]) -> dict
     line |= {"name": row.name, "prompt": row.prompt, "seed": row.seed}
     if line["saves_memory"] is not None:
         line["saves_memory"] = "yes" if line["saves_memory"] else "no"
-    # earlier versions recorded only the last attempt's where the driver was killed
-    spent = round(max(line["worker_seconds"] or 0.0, line["seconds"] or 0.0), 3) or None
-    line["worker_seconds"] = spent
-    if price is not None and spent is not None:
-        line["cost"] = round(spent / 3600 * price, 6)
+    if price is not None and line["worker_seconds"] is not None:
+        line["cost"] = round(line["worker_seconds"] / 3600 * price, 6)
     return line
 
 

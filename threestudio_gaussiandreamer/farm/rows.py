@@ -6,7 +6,6 @@ import hashlib
 import json
 import shlex
 import unicodedata
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple, Optional
@@ -97,40 +96,29 @@ def make_row(values: Mapping[str, Any], line: int = 0) -> Row:
     for column in values:
         if column not in COLUMNS:
             raise unknown("column", column, COLUMNS)
-    prompt, seed = _prompt(values.get("prompt")), _seed(values.get("seed"))
-    name = _name(values.get("name"), prompt, seed)
+    prompt, seed, name = (values.get(column) for column in ("prompt", "seed", "name"))
+    if not isinstance(prompt, str) or not prompt.strip():
+        raise UserError(f"the prompt is {prompt!r}; expected a text, such as 'a fox'")
+    if any(unicodedata.category(character) in NOT_TEXT for character in prompt):
+        raise UserError(f"the prompt {prompt[:80]!r} has a line break or a control character")
+    prompt = require_no_marker(prompt.strip())
+    if seed in (None, ""):
+        seed = None
+    else:
+        text = "" if isinstance(seed, bool) else str(seed)
+        if not (text.isascii() and text.isdigit() and len(text) <= 10 and int(text) <= MOST_SEED):
+            raise UserError(f"the seed is {seed!r}; expected a whole number from 0 to {MOST_SEED}")
+        seed = int(text)
+    if name in (None, ""):
+        words = "_".join(prompt.split())
+        name = safe_name(words if seed is None else f"{words}-seed{seed}")
+    elif not isinstance(name, str) or safe_name(name) != name:
+        raise UserError(
+            f"the name {str(name)[:80]!r} can't be a folder's: expected for instance "
+            f"{safe_name(str(name))!r}"
+        )
     config, overrides = _texts("config", values.get("config")), _overrides(values.get("overrides"))
     return Row(name, prompt, seed, tuple(config), tuple(overrides), line)
-
-
-def _prompt(value: Any) -> str:
-    if not isinstance(value, str) or not value.strip():
-        raise UserError(f"the prompt is {value!r}; expected a text, such as 'a fox'")
-    if any(unicodedata.category(character) in NOT_TEXT for character in value):
-        raise UserError(f"the prompt {value[:80]!r} has a line break or a control character")
-    return require_no_marker(value.strip())
-
-
-def _seed(value: Any) -> Optional[int]:
-    if value is None or value == "":
-        return None
-    text = str(value)
-    whole = text.isascii() and text.isdigit() and len(text) <= 10
-    if isinstance(value, bool) or not whole or int(text) > MOST_SEED:
-        raise UserError(f"the seed is {value!r}; expected a whole number from 0 to {MOST_SEED}")
-    return int(text)
-
-
-def _name(value: Any, prompt: str, seed: Optional[int]) -> str:
-    if value is None or value == "":
-        words = "_".join(prompt.split())
-        return safe_name(words if seed is None else f"{words}-seed{seed}")
-    if not isinstance(value, str) or safe_name(value) != value:
-        raise UserError(
-            f"the name {str(value)[:80]!r} can't be a folder's: expected for instance "
-            f"{safe_name(str(value))!r}"
-        )
-    return value
 
 
 def _texts(column: str, value: Any) -> list[str]:
@@ -157,18 +145,11 @@ def _overrides(value: Any) -> list[str]:
 
 
 def _decoded(content: bytes, encoding: str) -> str:
-    if len(content) > MOST_LINE_BYTES:
+    text = content.decode(encoding, errors="replace")
+    if len(content) > MOST_LINE_BYTES or {"\0", "\ufffd"} & {*text}:
         raise UserError(
-            f"longer than {MOST_LINE_BYTES} bytes; is this a list of prompts, one per line?"
-        )
-    try:
-        text = content.decode(encoding)
-    except UnicodeDecodeError:
-        text = "\0"
-    if "\0" in text:
-        raise UserError(
-            "no UTF-8 text; expected a list of prompts (.txt, .csv, .jsonl), which Excel saves as "
-            "CSV UTF-8"
+            f"longer than {MOST_LINE_BYTES} bytes, or no UTF-8 text; expected a list of prompts "
+            "(.txt, .csv, .jsonl), which Excel saves as CSV UTF-8"
         )
     return text
 
@@ -180,16 +161,13 @@ def _from_text(texts: Iterator[str]) -> Iterator[dict[str, Any]]:
 def _from_csv(texts: Iterator[str]) -> Iterator[dict[str, Any]]:
     reader = csv.DictReader(texts, skipinitialspace=True, strict=True)
     reader.fieldnames = header = [column.strip() for column in reader.fieldnames or []]
-    for separator, name in ((";", "semicolons"), ("\t", "tabs")):
-        if len(header) == 1 and separator in header[0]:
-            raise UserError(f"columns are separated by commas, this file has {name}")
-    for column in header:
-        if column not in COLUMNS:
-            raise unknown("column", column, COLUMNS)
     if header and "prompt" not in header or len(set(header)) != len(header):
+        for column in header:
+            if column not in COLUMNS and not {";", "\t"} & {*column}:
+                raise unknown("column", column, COLUMNS)
         raise UserError(
-            "the first line must name each column once, with a column prompt; it is "
-            f"{','.join(header)!r}"
+            "the first line must name each column once, separated by commas, with a column "
+            f"prompt; it is {','.join(header)!r}"
         )
     for values in reader:
         if None in values:
@@ -203,7 +181,7 @@ def _from_csv(texts: Iterator[str]) -> Iterator[dict[str, Any]]:
 def _from_jsonl(texts: Iterator[str]) -> Iterator[dict[str, Any]]:
     for text in texts:
         try:
-            values = json.loads(text, object_pairs_hook=_named_once)
+            values = json.loads(text)
         except (ValueError, RecursionError) as error:
             raise UserError(f"can't be read as JSON: {error}") from error
         if not isinstance(values, dict):
@@ -211,16 +189,7 @@ def _from_jsonl(texts: Iterator[str]) -> Iterator[dict[str, Any]]:
         yield values
 
 
-def _named_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    if twice := [name for name, count in Counter(name for name, _ in pairs).items() if count > 1]:
-        raise ValueError(f"{twice[0]!r} is given twice")
-    return dict(pairs)
-
-
 FORMATS: dict[str, Callable[[Iterator[str]], Iterator[dict[str, Any]]]] = {
-    ".csv": _from_csv,
-    ".jsonl": _from_jsonl,
-    ".ndjson": _from_jsonl,
-    ".txt": _from_text,
-    "": _from_text,
+    **{".csv": _from_csv, ".jsonl": _from_jsonl, ".ndjson": _from_jsonl},
+    **{".txt": _from_text, "": _from_text},
 }

@@ -1,13 +1,12 @@
 """The Ray actor that makes asset after asset in one process, with the launcher's own functions.
-
-Networks, compiled kernels and extensions stay loaded. Nothing else passes from one asset to the
-next: every random draw is a function of the seed (``core/streams.py``)."""
+Networks, compiled kernels and extensions stay loaded; nothing else passes from one to the next."""
 
 import contextlib
 import errno
 import gc
 import hashlib
 import os
+import shutil
 import signal
 import socket
 import sys
@@ -26,7 +25,7 @@ from ..host import pl
 from ..models.model_files import keep_loaded, load_counts
 from ..view.run_files import RunFiles, section
 from .board import Beat
-from .place import FAILED, FINISHED, STOPPED, AnotherRow, Place, Unreachable, has_files
+from .place import ASSETS, FAILED, FINISHED, STOPPED, AnotherRow, Place, Unreachable, variant
 from .recipe import Job, Recipe, all_sources, launch_arguments
 
 BLOCKED, NO_MEMORY, REFUSED = "blocked", "no memory", "refused"
@@ -37,8 +36,6 @@ SECONDS_BETWEEN = 1.0
 """Shortest time between two reports of a worker."""
 SECONDS_FOR_LOCK = 60
 """How long an asset's folder may still be locked by a process of an earlier, killed driver."""
-SAVES_MEMORY = "saves_memory.txt"
-"""Marks an asset's folder that is made with the low-memory configuration."""
 NOT_EXPORTED = (".json", ".html", ".png")
 """Reports and pages beside the exported files, which may hold times."""
 SCORES = ("psnr", "ssim", "multi_face")
@@ -74,18 +71,18 @@ class Worker:
         """
         if self.is_ready:
             return
-        host, version, start = socket.gethostname(), setting.version, setting.start
-        if version != __version__:
+        name, host = "threestudio-gaussiandreamer", socket.gethostname()
+        if (version := setting.version) != __version__:
             raise UserError(
-                f"{host} has threestudio-gaussiandreamer {__version__}; the farm is of {version}, "
-                "and all its assets are made with one version: "
-                f"pip install threestudio-gaussiandreamer=={version} there"
+                f"{host} has {name} {__version__}; the farm is of {version}: "
+                f"pip install {name}=={version} there"
             )
-        if not os.path.isdir(start):
+        if not os.path.isdir(setting.start):
             raise UserError(
-                f"{host} has no folder {start}: start the farm in a folder that all machines share"
+                f"{host} has no folder {setting.start}: start the farm in a folder that all "
+                "machines share"
             )
-        os.chdir(start)
+        os.chdir(setting.start)
         train_alone()  # before Lightning is imported, which reads the variables
         import torch
 
@@ -116,13 +113,10 @@ class Worker:
             gc.collect()
 
     def _make(self, job: Job) -> dict[str, Any]:
+        import torch
+
         place = self.setting.place
         folder = place.work_folder(job.row)
-        if job.saves_memory != (folder / SAVES_MEMORY).is_file():
-            place.discard(job.row)  # what was made with the other configuration
-        folder.mkdir(parents=True, exist_ok=True)
-        if job.saves_memory:
-            (folder / SAVES_MEMORY).touch()
         attempt, session_attempt = count_attempts(folder, self.setting.session, job)
         if session_attempt > self.setting.retries + 1:
             times = session_attempt - 1
@@ -130,7 +124,8 @@ class Worker:
             return {"state": NO_MEMORY, "error": error}
         place.fetch_checkpoint(job.row, job.saves_memory)
         began = time.monotonic()
-        reset_peak_memory()
+        if torch.cuda.is_available():
+            torch.cuda.reset_peak_memory_stats()
         with written_log(folder / "log.txt"):
             run, code = self._run(job, folder, attempt)
         if code:
@@ -139,7 +134,7 @@ class Worker:
         seconds = round(time.monotonic() - began, 3)
         result = {"state": FINISHED, **result_of(job, folder, run), "seconds": seconds}
         result |= {"attempts": attempt, "worker_seconds": job.worker_seconds(time.time())}
-        if not has_files(result):
+        if not any(map(result.get, ("files", "picture", "page"))):
             raise UserError(f"the run has left no files in {folder}")
         place.publish(job.row, result)
         return result
@@ -157,7 +152,9 @@ class Worker:
             for i, source in enumerate(all_sources(self.setting.recipe, job)):
                 names.append(f"{temporary}/{i}-{Path(source.name).stem}.yaml")
                 Path(names[-1]).write_bytes(source.content)  # as the driver read it
-            argv = launch_arguments(self.setting.recipe, job, names, folder.parents[1])
+            where = [f"exp_root_dir={folder.parents[1]}", f"name={ASSETS}", f"tag={folder.name}"]
+            where += ["use_timestamp=false", "resume=auto"]
+            argv = launch_arguments(self.setting.recipe, job, names, *where)
             args = parse_arguments(argv)
             while True:
                 # each time, since the process that has the lock may have written checkpoints
@@ -183,19 +180,22 @@ def written_log(path: Path) -> Iterator[None]:
 
 
 def count_attempts(folder: Path, session: str, job: Job) -> tuple[int, int]:
-    """Note one more attempt in an asset's folder; return how many there were, and how many of them
-    in this session.
+    """Note one more attempt in an asset's folder, which is emptied if earlier ones had the other
+    configuration; return how many there were with this one, and how many of them in this session.
 
     Raises:
         AnotherRow: the folder's checkpoints are of another row.
     """
-    with open(folder / "attempts.txt", "a+", encoding="utf-8") as file:
-        file.seek(0)
-        earlier = [line.split() for line in file]
-        # earlier versions noted no key
-        if any(len(words) == 4 and words[1] != job.row.key for words in earlier):
-            raise AnotherRow(job.row)
-        file.write(f"{session} {job.row.key} {socket.gethostname()} {os.getpid()}\n")
+    path, made_with = folder / "attempts.txt", variant(job.row, job.saves_memory)
+    earlier = list(map(str.split, path.open(encoding="utf-8"))) if path.exists() else []
+    if not all(words[1].startswith(job.row.key) for words in earlier):
+        raise AnotherRow(job.row)
+    if any(words[1] != made_with for words in earlier):
+        shutil.rmtree(folder, ignore_errors=True)
+        earlier = []
+    folder.mkdir(parents=True, exist_ok=True)
+    with open(path, "a", encoding="utf-8") as file:
+        file.write(f"{session} {made_with} {socket.gethostname()} {os.getpid()}\n")
     return len(earlier) + 1, sum(words[0] == session for words in earlier) + 1
 
 
@@ -275,7 +275,6 @@ def result_of(job: Job, folder: Path, run: Any) -> dict[str, Any]:
         "bytes": sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()),
         "saves_memory": job.saves_memory,
         "host": socket.gethostname(),
-        "process": os.getpid(),
         "loads": load_counts(),
     }
 
@@ -297,24 +296,12 @@ def digest(folder: Path) -> str:
     return total.hexdigest()
 
 
-def reset_peak_memory() -> None:
-    """Begin to measure the peak of this process's memory (Linux), or of the GPU's."""
-    import torch
-
-    if torch.cuda.is_available():
-        torch.cuda.reset_peak_memory_stats()
-    with contextlib.suppress(OSError):
-        Path("/proc/self/clear_refs").write_text("5", encoding="utf-8")
-
-
 def peak_megabytes() -> float:
-    """Return the peak since :func:`reset_peak_memory`, of the GPU where there is one."""
+    """Return the peak of the GPU's memory in this asset; without one, of this process so far."""
+    import resource
+
     import torch
 
     if torch.cuda.is_available():
         return round(torch.cuda.max_memory_allocated() / 2**20, 1)
-    with contextlib.suppress(OSError):
-        for line in Path("/proc/self/status").read_text(encoding="utf-8").splitlines():
-            if line.startswith("VmHWM"):
-                return round(int(line.split()[1]) / 1024, 1)
-    return 0.0
+    return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1)

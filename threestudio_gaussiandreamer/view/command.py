@@ -1,12 +1,4 @@
-"""Look at clouds and runs: ``python -m threestudio_gaussiandreamer.view cloud.ply [--html]``.
-
-Without ``--html`` the cloud is served to browsers until Ctrl-C (``live.py``); with it, it is
-written as one HTML file.
-
-PATH is a file of Gaussians of any program, or a checkpoint of this package or of gsplat; or the
-folder of a run, which gets an ``index.html``, or a folder of runs, which gets a gallery. A cloud in
-the folder of a run is drawn as the run has drawn it, with its prompt; options override that. Other
-clouds are drawn with the defaults below."""
+"""Look at clouds and runs: ``python -m threestudio_gaussiandreamer.view cloud.ply [--html]``."""
 
 import argparse
 import functools
@@ -69,12 +61,7 @@ def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
 
 
 def run(args: argparse.Namespace) -> None:
-    """Write the page of a cloud, the index of a run, or the gallery of a folder of runs.
-
-    Raises:
-        UserError: an option is invalid, the file can't be read, has too many Gaussians or none, or
-            the page can't be written.
-    """
+    """Serve a cloud, or write its page, the index of a run, or the gallery of a folder of runs."""
     if args.html is None:
         serve_until_stopped(served(args))
         return
@@ -101,11 +88,7 @@ def write_cloud_page(source: Path, out: Path, args: argparse.Namespace) -> None:
 
 
 def served(args: argparse.Namespace) -> LiveView:
-    """Serve a cloud, or the last exported cloud of a run.
-
-    Raises:
-        UserError: the options are for a page, or there is no cloud, viser or free port.
-    """
+    """Serve a cloud, or the last exported cloud of a run."""
     if given := _given(args, OPTIONS[2:]):
         raise UserError(f"{' '.join(given)}: is for the page that --html writes")
     require_server(args.host, args.port)
@@ -117,9 +100,7 @@ main = functools.partial(run_command, parse, run)
 
 
 def run_folder(folder: Path, args: argparse.Namespace) -> None:
-    """Write the index of a run, and the page of its cloud if there is none, or the gallery of a
-    folder of runs.
-    """
+    """Write the index of a run, with the page of its cloud if there is none, or a gallery."""
     given = _given(args, OPTIONS)
     if args.html or given:
         raise UserError(

@@ -1,8 +1,5 @@
-"""Serve a cloud of Gaussians to browsers with viser (extra ``[viewer]``).
-
-viser always draws Gaussians with a dilation of 0.3 square pixels and colours of degree 0; the page
-that ``--html`` writes draws them with the options of the run.
-"""
+"""Serve a cloud of Gaussians to browsers with viser (extra ``[viewer]``), which always draws them
+with a dilation of 0.3 square pixels and colours of degree 0."""
 
 import contextlib
 import http
@@ -33,11 +30,7 @@ FLIP_YZ = np.diag([1.0, -1.0, -1.0])
 
 
 def require_server(host: str, port: int) -> None:
-    """Check that a server can be started.
-
-    Raises:
-        UserError: viser isn't installed, or the port can't be listened on.
-    """
+    """Raise UserError unless viser is installed and the port can be listened on."""
     require_extra("viewer", "viser")
     try:
         with socket.socket() as probe:
@@ -53,14 +46,8 @@ def require_server(host: str, port: int) -> None:
 
 
 class LiveView:
-    """A server that shows one cloud, which may change.
-
-    Args:
-        host: the address to listen on; 127.0.0.1 accepts connections from this machine only.
-        title: the heading of the panel.
-
-    Raises:
-        UserError: see :func:`require_server`.
+    """A server that shows one cloud, which may change, below a title; raises UserError as
+    :func:`require_server` does.
     """
 
     def __init__(self, host: str, port: int, title: str) -> None:
@@ -84,18 +71,13 @@ class LiveView:
         return bool(self.server.get_clients())
 
     def look_from_front(self, pose: Pose) -> None:
-        """Set the first view of browsers that connect from now on, as the page's is set."""
+        """Set the first view of browsers that connect from now on."""
         camera = self.server.initial_camera
         camera.position = tuple(camera_of(pose, WORLD_UP)[0, :3, 3].tolist())
         camera.look_at = pose.target
 
     def show(self, gaussians: Gaussians, status: str = "") -> None:
-        """Replace the cloud.
-
-        Args:
-            gaussians: finite arrays, in the world's axes.
-            status: a line below the title.
-        """
+        """Replace the cloud (finite arrays in the world's axes), and the line below the title."""
         with self.server.atomic():
             if self._splats is None:
                 self._splats = self.server.scene.add_gaussian_splats("/cloud", **splats(gaussians))
@@ -107,10 +89,9 @@ class LiveView:
     def show_cameras(
         self, c2w: Float[np.ndarray, "B 4 4"], fovy: Float[np.ndarray, " B"], aspect: float
     ) -> None:
-        """Show the frustums of the training cameras.
+        """Show the frustums of the training cameras: OpenGL's, in the world's axes.
 
         Args:
-            c2w: OpenGL cameras in the world's axes.
             fovy: radians.
             aspect: width over height.
         """
@@ -138,10 +119,8 @@ class LiveView:
 
 
 class Controls:
-    """The buttons of a training run in a view's panel: pause, step, the score model's picture and
-    the training cameras, which may hide the object.
-
-    Browsers set the flags from the server's threads; the training reads them.
+    """The buttons of a training run in a view's panel. Browsers set the flags from the server's
+    threads; the training reads them.
     """
 
     def __init__(self, view: LiveView) -> None:
@@ -191,16 +170,14 @@ class Controls:
 
 
 def is_own_page(site: Optional[str], origin: Optional[str], host: str) -> bool:
-    """Return whether a request may be answered: whether it is from a page of this server.
+    """Return whether a request is from a page of this server, or of a program that is no browser.
 
     A page of another site is told by its origin. With DNS rebinding a site's name leads to this
-    machine, so that origin and host agree; therefore names are refused that aren't known to be of
-    this machine. An address can't be rebound. Programs other than browsers send no origin; they
-    could send any, so that they are answered.
+    machine, so that origin and host agree; therefore unknown names are refused.
 
     Args:
         site: the header Host.
-        origin: the header Origin; ``None`` without one.
+        origin: the header Origin; ``None`` without one, as programs other than browsers send it.
         host: the name or address that the server listens on.
     """
     name = (urlsplit(f"http://{site or ''}").hostname or "").rstrip(".")
@@ -216,9 +193,8 @@ def is_own_page(site: Optional[str], origin: Optional[str], host: str) -> bool:
 
 @contextlib.contextmanager
 def own_pages_only(host: str) -> Iterator[list[Any]]:
-    """Let the viser server that is started in this context refuse what isn't
-    :func:`is_own_page`, since viser answers every site and has no option against that. Yield the
-    guards; a server without one isn't guarded.
+    """Let the viser server that is started in this context refuse what isn't :func:`is_own_page`:
+    viser has no option for it. Yield the guards; a server without one isn't guarded.
     """
     import websockets.asyncio.server as sockets
 
@@ -258,7 +234,7 @@ def serve(cloud: StoredCloud, host: str, port: int, title: str) -> LiveView:
     """Serve a finished cloud until the returned view is closed.
 
     Raises:
-        UserError: see :func:`require_server`; or there are no Gaussians, or they reach too far.
+        UserError: as :func:`require_server` does; or there are no Gaussians, or they reach too far.
     """
     require_gaussians(len(cloud.gaussians.means), title)
     upright = cloud.in_axes(WORLD_UP)

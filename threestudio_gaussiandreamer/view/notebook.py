@@ -1,10 +1,5 @@
-"""Show a cloud in a notebook (Jupyter, Colab, Kaggle):
-
-    from threestudio_gaussiandreamer.view.notebook import show
-    show("outputs/toybox/a_red_fox@20260101-120000")   # a run, or a file of Gaussians
-
-as the last line of a cell. The page of ``page.py`` is embedded, so it works without a server and
-without a network, and is stored with the notebook."""
+"""Show a cloud in a notebook's output (Jupyter, Colab, Kaggle): the page of ``page.py``, embedded,
+which needs no server and is stored with the notebook."""
 
 import html
 import os
@@ -48,11 +43,10 @@ def show(path: str | os.PathLike, *, height: int = 480, **options: Any) -> Embed
         path: the folder of a run, of which the last exported cloud is shown; or a file of Gaussians
             or a checkpoint.
         height: pixels.
-        options: see :func:`.cloud_page.cloud_page`.
+        options: of :func:`.page.cloud_page`.
 
     Raises:
-        UserError: the run has exported no cloud, or the page is too large for a notebook; see also
-            :func:`.cloud_page.cloud_page`.
+        UserError: also if the run has exported no cloud, or the page is too large for a notebook.
     """
     source = cloud_file(path)
     written = source.with_name("view.html")

@@ -1,20 +1,18 @@
 """Write a cloud as one HTML file that shows it in any browser with WebGL2, from disk and without a
-network request.
-
-The sources of the page are in ``web/``: the renderer executes the image model of
-``splatting/reference.py``. Its content security policy forbids every request and every script but
-its own."""
+network request. Its sources are in ``web/``: the renderer executes the image model of
+``splatting/reference.py``; the content security policy forbids every script but its own."""
 
 import base64
 import hashlib
 import io
-import json
 import math
+import os
 import zlib
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple, Optional
+from urllib.parse import quote
 
 import numpy as np
 
@@ -40,8 +38,8 @@ from .render import (
     require_gaussians,
 )
 from .run_files import RunFiles, read_any, step_of
-from .templates import WEB, fill
 
+WEB = Path(__file__).with_name("web")
 SCRIPTS = ("camera.js", "sorter.js", "cloud.js", "renderer.js", "controls.js", "main.js")
 SHADERS = ("splat.vert.glsl", "splat.frag.glsl", "screen.vert.glsl", "screen.frag.glsl")
 MAX_GAUSSIANS = 2_000_000
@@ -50,8 +48,6 @@ POSTER_SIZE = 320
 """Width and height in pixels of the picture that a browser without WebGL2 shows."""
 COARSE_MEANS = 1024
 """Steps of coarse positions along the longest side of the cloud."""
-COARSE_LOG_SCALE, COARSE_SH, COARSE_QUAT, COARSE_LOGIT = 1 / 8, 1 / 16, 1 / 32, 1 / 8
-"""Steps of the other coarse attributes; that of the harmonics is 4.5 levels of 255 of a colour."""
 
 
 class Shown(NamedTuple):
@@ -79,14 +75,10 @@ class PageOptions(NamedTuple):
 def write_page(
     path: Path, shown: Shown, options: PageOptions, before: Optional[Shown] = None
 ) -> None:
-    """Write the page of a cloud, which can save its PLY and SPZ files.
-
-    Args:
-        before: a second cloud to compare with, such as the prior; it is stored in lower precision.
+    """Write the page of :func:`page`.
 
     Raises:
-        UserError: there are too many Gaussians or none, they reach too far for float32, or the file
-            can't be written.
+        UserError: also if the file can't be written.
     """
     content = page(shown, options, before)
     with atomic_file(path) as file:
@@ -95,7 +87,14 @@ def write_page(
 
 
 def page(shown: Shown, options: PageOptions, before: Optional[Shown] = None) -> str:
-    """Make the page of :func:`write_page`; same arguments and errors."""
+    """Return the page of a cloud, which can save its PLY and SPZ files.
+
+    Args:
+        before: a second cloud to compare with, such as the prior; it is stored in lower precision.
+
+    Raises:
+        UserError: there are too many Gaussians or none, or they reach too far for float32.
+    """
     clouds = [_checked(shown, options.name)]
     if before is not None:
         before = _checked(before, before.label)
@@ -107,13 +106,12 @@ def page(shown: Shown, options: PageOptions, before: Optional[Shown] = None) -> 
     if not options.keep_background:
         options = options._replace(background=backdrop(poster, options.background))
     script, style = sources(SCRIPTS), sources(["page.css"])
-    return fill(
-        "page.html",
+    return template("page.html").render(
         policy=policy(script, style),
         title=options.title,
         style=style,
         script=script,
-        meta=_script_json(_meta(clouds, options, pose)),
+        meta=_meta(clouds, options, pose),
         poster=_poster(poster, options.background),
         data=_data_blocks(clouds),
         shaders={name: sources([name]) for name in SHADERS},
@@ -184,11 +182,8 @@ def _data_blocks(clouds: Sequence[Shown]) -> str:
 
 def packed(gaussians: Gaussians) -> bytes:
     """Compress the columns of a PLY file of N Gaussians (arrays), except the normals, which are
-    zero.
-
-    The float32 values are kept to the bit, so that the page can save the file. Each column is
-    stored as four planes (the lowest bytes of all values, then the next ones, ...), since signs and
-    exponents repeat and the lowest bytes don't."""
+    zero, to the bit, so that the page can save the file. Each column is stored as four planes (the
+    lowest bytes of all values, then the next ones, ...), since signs and exponents repeat."""
     names = [name for name, _ in gaussian_properties(gaussians.sh.shape[1])]
     stored = [number for number, name in enumerate(names) if name not in NORMALS]
     columns = np.ascontiguousarray(gaussian_columns(gaussians)[:, stored].T, dtype="<f4")
@@ -198,22 +193,16 @@ def packed(gaussians: Gaussians) -> bytes:
 
 def coarse(gaussians: Gaussians) -> Gaussians:
     """Round the attributes of a cloud that is shown for comparison only, and drop its harmonics
-    above degree 0. The rounded values are multiples of powers of two, whose lowest bytes are zero
-    and vanish when packed.
+    above degree 0. The steps are powers of two: the lowest bytes of the values are zero and vanish
+    when packed.
     """
     side = float(np.ptp(gaussians.means, axis=0).max(initial=0))
-    step = 2.0 ** np.ceil(np.log2(max(side, 1e-30) / COARSE_MEANS))
+    steps = {"means": 2.0 ** np.ceil(np.log2(max(side, 1e-30) / COARSE_MEANS)), "quats": 1 / 32}
+    steps |= {"log_scales": 1 / 8, "logit_opacities": 1 / 8, "sh": 1 / 16}
+    found = gaussians._replace(sh=gaussians.sh[:, :1])._asdict().items()
     return Gaussians(
-        means=_rounded(gaussians.means, step),
-        quats=_rounded(gaussians.quats, COARSE_QUAT),
-        log_scales=_rounded(gaussians.log_scales, COARSE_LOG_SCALE),
-        logit_opacities=_rounded(gaussians.logit_opacities, COARSE_LOGIT),
-        sh=_rounded(gaussians.sh[:, :1], COARSE_SH),
+        **{name: np.float32(np.rint(values / steps[name]) * steps[name]) for name, values in found}
     )
-
-
-def _rounded(values: np.ndarray, step: float) -> np.ndarray:
-    return (np.rint(values / step) * step).astype(np.float32)
 
 
 def _poster(poster: Any, background: Color) -> str:
@@ -240,27 +229,43 @@ def sources(names: Sequence[str]) -> str:
 
 def policy(script: str, style: str) -> str:
     """Return the content security policy of a page with one script and one style sheet."""
-    hashes = [
-        base64.b64encode(hashlib.sha256(x.encode()).digest()).decode() for x in (script, style)
-    ]
+    digests = (hashlib.sha256(x.encode()).digest() for x in (script, style))
+    ours, looks = (base64.b64encode(digest).decode() for digest in digests)
     return (
-        f"default-src 'none'; script-src 'sha256-{hashes[0]}'; style-src 'sha256-{hashes[1]}'; "
+        f"default-src 'none'; script-src 'sha256-{ours}'; style-src 'sha256-{looks}'; "
         "img-src data:; worker-src blob:; base-uri 'none'; form-action 'none'"
     )
-
-
-def _script_json(content: Any) -> str:
-    """Encode as JSON for a script element; escape what could end the element, such as "<"."""
-    text = json.dumps(content, allow_nan=False)
-    for character in "<>&\u2028\u2029":
-        text = text.replace(character, f"\\u{ord(character):04x}")
-    return text
 
 
 def decibels(psnr: Optional[float]) -> str:
     """Format the PSNR of a cloud on held-out views; empty if it isn't known."""
     known = psnr is not None and math.isfinite(psnr)
     return f"{psnr:.1f} dB on held-out views" if known else ""
+
+
+@cache
+def template(name: str) -> Any:
+    """Open a template of ``web/``, which escapes every value."""
+    import jinja2  # only where a page is written
+
+    return jinja2.Environment(
+        loader=jinja2.FileSystemLoader(WEB),
+        undefined=jinja2.StrictUndefined,
+        **{"autoescape": True, "trim_blocks": True, "lstrip_blocks": True},
+    ).get_template(name)
+
+
+def write_static(path: Path, name: str, **values: Any) -> None:
+    """Write the page of a template that has no scripts; raises UserError if it can't be written."""
+    content = template(name).render(values).encode(errors="replace")  # a name needn't be UTF-8
+    with atomic_file(path, durable=False) as file:
+        file.write(content)
+
+
+def address(path: Path, page_folder: Path) -> str:
+    """Return the relative address of a file from a page in ``page_folder``."""
+    # as bytes, since a name needn't be UTF-8
+    return quote(os.fsencode(os.path.relpath(path, page_folder).replace(os.sep, "/")))
 
 
 # ---- the page of a file --------------------------------------------------------------------------
@@ -277,9 +282,8 @@ def cloud_page(
     background: Optional[str] = None,
     up: Optional[str] = None,
 ) -> tuple[Shown, PageOptions]:
-    """Read a file of Gaussians or a checkpoint, and return what :func:`page` makes of it.
-
-    Options that aren't given are those of the run whose folder contains the file, else defaults.
+    """Read a file of Gaussians or a checkpoint, and return the arguments of :func:`page`. Options
+    that aren't given are those of the run whose folder contains the file, else defaults.
 
     Args:
         title: by default the prompt of the run, or the file's name.
@@ -292,7 +296,15 @@ def cloud_page(
         UserError: an option is invalid, which the message names as the command does; or the file
             can't be read, or has no or too many Gaussians.
     """
-    color = None if background is None else _color(background)
+    color = None
+    if background is not None:
+        try:
+            red, green, blue = bytes.fromhex(background.removeprefix("#"))
+        except ValueError as error:
+            raise UserError(
+                f"--background: expected RRGGBB, such as ff8000, got {background!r}"
+            ) from error
+        color = (red / 255, green / 255, blue / 255)
     if eps2d is not None and not 0 <= eps2d < 1e6:
         raise UserError(f"--eps2d: expected a number of square pixels from 0 on, got {eps2d:g}")
     if preset is not None and preset not in PRESETS:
@@ -319,12 +331,3 @@ def cloud_page(
         keep_background=bool(color or (run and run.background_is_given)),
     )
     return Shown(stored, "result", quality), options
-
-
-def _color(text: str) -> Color:
-    """Parse a colour such as ff8000."""
-    try:
-        red, green, blue = bytes.fromhex(text.removeprefix("#"))
-    except ValueError as error:
-        raise UserError(f"--background: expected RRGGBB, such as ff8000, got {text!r}") from error
-    return (red / 255, green / 255, blue / 255)

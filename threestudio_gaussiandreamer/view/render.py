@@ -82,10 +82,8 @@ def require_gaussians(count: int, name: str) -> None:
 
 
 def first_pose(cloud: StoredCloud) -> Pose:
-    """Return the pose that shows the whole cloud from the front.
-
-    Raises:
-        UserError: the cloud is too large for float32.
+    """Return the pose that shows the whole cloud from the front. Raises UserError for a cloud that
+    is too large for float32.
     """
     gaussians = cloud.gaussians.tensors()
     ball = bounds(gaussians)
@@ -118,41 +116,24 @@ def _whole(cloud: Gaussians, ball: Ball) -> Ball:
     return middle, float(((means - middle).norm(dim=1) + reach).max())
 
 
+@torch.no_grad()
 def render(
     cloud: StoredCloud, settings: RenderSettings, poses: list[Pose], size: int
 ) -> Float[Tensor, "V size size 4"]:
-    """Render square views: premultiplied colour, and alpha.
-
-    Args:
-        size: pixels each way.
-    """
-    return torch.cat([_render_view(cloud, settings, pose, size) for pose in poses])
-
-
-@torch.no_grad()
-def _render_view(
-    cloud: StoredCloud, settings: RenderSettings, pose: Pose, size: int
-) -> Float[Tensor, "1 size size 4"]:
-    gaussians = cloud.gaussians.tensors()
-    c2w = camera_of(pose, cloud.up)
-    fovy = torch.tensor([math.radians(pose.fovy)])
-    colors = sh_to_unclamped_colors(gaussians.sh, gaussians.means - c2w[:, :3, 3])
-    out = rasterize(
-        gaussians.means,
-        gaussians.quats,
-        gaussians.log_scales.exp(),
-        gaussians.logit_opacities.sigmoid(),
-        bounded_colors(colors) if settings.bound_colors else colors.clamp_min(0),
-        *to_opencv(c2w, fovy, size, size),
-        size,
-        size,
-        near=settings.near,
-        far=settings.far,
-        eps2d=settings.eps2d,
-        antialias=settings.antialias,
-        alpha_min=settings.alpha_min,
-    )
-    return torch.cat([out.image, out.alpha], -1)
+    """Render square views, ``size`` pixels each way: premultiplied colour, and alpha."""
+    gaussians, views = cloud.gaussians.tensors(), []
+    options = settings._asdict()
+    bound_colors = options.pop("bound_colors")
+    shape = (gaussians.means, gaussians.quats, gaussians.log_scales.exp())
+    for pose in poses:
+        c2w, fovy = camera_of(pose, cloud.up), torch.tensor([math.radians(pose.fovy)])
+        colors = sh_to_unclamped_colors(gaussians.sh, gaussians.means - c2w[:, :3, 3])
+        colors = bounded_colors(colors) if bound_colors else colors.clamp_min(0)
+        look = (gaussians.logit_opacities.sigmoid(), colors)
+        camera = (*to_opencv(c2w, fovy, size, size), size, size)
+        out = rasterize(*shape, *look, *camera, **options)
+        views.append(torch.cat([out.image, out.alpha], -1))
+    return torch.cat(views)
 
 
 def camera_of(pose: Pose, up: str) -> Float[Tensor, "1 4 4"]:

@@ -1,6 +1,5 @@
-"""Read what a run has left in its folder, and the Gaussians of any file.
-
-Of a run's folder no file is trusted: what is missing or damaged is left out."""
+"""Read what a run has left in its folder, and the Gaussians of any file. What is missing or damaged
+in a run's folder is left out."""
 
 import json
 import os
@@ -33,8 +32,6 @@ from ..gaussians.stored_state import require_cloud
 from .render import RenderSettings
 
 T = TypeVar("T", dict, list)
-MAX_BYTES = 4 << 20
-"""Largest configuration or file of scores that is read."""
 
 
 @dataclass(frozen=True)
@@ -128,11 +125,8 @@ class RunFiles:
         return next(filter(Path.is_file, found), None)
 
     def psnr(self, key: str, step: Optional[int] = None) -> Optional[float]:
-        """Return dB on held-out views; None if they aren't known.
-
-        Args:
-            key: "prior" or "result".
-            step: only if it was measured at this step.
+        """Return dB of the "prior" or "result" on held-out views, with ``step`` only if it was
+        measured at this step; None if they aren't known.
         """
         found = section(self.scores, key)
         psnr = found.get("psnr")
@@ -143,11 +137,9 @@ class RunFiles:
 def cloud_file(path: str | os.PathLike, hint: str = "") -> Path:
     """Return the last exported cloud of a run, or the file of Gaussians or checkpoint itself.
 
-    Args:
-        hint: end of the message for a folder.
-
     Raises:
-        UserError: the file is missing, or the folder is no run with an exported cloud.
+        UserError: the file is missing, or the folder is no run with an exported cloud; that message
+            ends with ``hint``.
     """
     if not is_folder(path):
         return existing_file(path, "file of Gaussians or checkpoint")
@@ -182,11 +174,9 @@ def section(content: Any, *keys: str) -> Mapping[str, Any]:
 
 
 def read_text(path: Path) -> str:
-    """Read a text file; an empty text if there is none, it is too large or no UTF-8."""
+    """Read a text file; an empty text if there is none or it is no UTF-8."""
     try:
-        with open(path, "rb") as file:
-            content = file.read(MAX_BYTES + 1)
-        return content.decode() if len(content) <= MAX_BYTES else ""
+        return path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError):
         return ""
 
@@ -203,11 +193,7 @@ def read_json(path: Path, kind: type[T]) -> T:
 def read_yaml(path: Path) -> dict[str, Any]:
     """Read a mapping from a YAML file; an empty one if there is none or it is damaged."""
     try:
-        text = read_text(path)
-        # a ``parsed.yaml`` has no aliases, which can expand without limit
-        if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text)):
-            return {}
-        content = yaml.safe_load(text)
+        content = yaml.safe_load(read_text(path))
     except (ValueError, RecursionError, yaml.YAMLError):
         return {}
     return content if isinstance(content, dict) else {}
@@ -216,19 +202,11 @@ def read_yaml(path: Path) -> dict[str, Any]:
 # ---- Gaussians -----------------------------------------------------------------------------------
 
 CHECKPOINT_ENDINGS = (".ckpt", ".pt", ".pth")
+TENSORS = ("means", "quats", "log_scales", "logit_opacities", "sh0", "sh_rest")
+GSPLATS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 CHECKPOINTS = {
-    "state_dict": {
-        name: f"geometry.{name}"
-        for name in ("means", "quats", "log_scales", "logit_opacities", "sh0", "sh_rest")
-    },
-    "splats": {
-        "means": "means",
-        "quats": "quats",
-        "log_scales": "scales",
-        "logit_opacities": "opacities",
-        "sh0": "sh0",
-        "sh_rest": "shN",
-    },
+    "state_dict": {name: f"geometry.{name}" for name in TENSORS},
+    "splats": dict(zip(TENSORS, GSPLATS, strict=True)),
 }
 """The names of the Gaussians' tensors in checkpoints of this package and of gsplat's trainer."""
 
@@ -253,11 +231,7 @@ def read_any(source: Path, up: Optional[str] = None, option: str = "PATH") -> St
 
 
 def from_checkpoint(file: Path) -> Gaussians:
-    """Read the Gaussians of a training checkpoint.
-
-    Raises:
-        UserError: it has none.
-    """
+    """Read the Gaussians of a training checkpoint; raises UserError if it has none."""
     content = load_file(file)
     for key, names in CHECKPOINTS.items():
         state = content.get(key) if isinstance(content, dict) else None
@@ -268,6 +242,5 @@ def from_checkpoint(file: Path) -> Gaussians:
             harmonics = torch.cat([values.pop("sh0"), values.pop("sh_rest")], 1)
             return Gaussians(sh=harmonics, **values).arrays()
     raise UserError(
-        f"{file} holds no cloud of Gaussians: it has neither {CHECKPOINTS['state_dict']['means']} "
-        "nor gsplat's splats"
+        f"{file} holds no cloud of Gaussians: neither geometry.means nor gsplat's splats"
     )

@@ -1,8 +1,5 @@
 """The index of a run and the gallery of a folder of runs, ``index.html`` in them: static pages that
-open from disk.
-
-The index has the viewer, pictures, scores, curves, what the configuration changes, times, and links
-to all files; the gallery a picture, the prompt and the scores of each run."""
+open from disk."""
 
 import csv
 import math
@@ -17,10 +14,9 @@ from ..core.errors import UserError
 from ..core.files import atomic_file, json_text
 from ..core.logs import warn
 from ..metrics import MULTI_FACE_NOTE
-from .page import decibels
+from .page import address, decibels, write_static
 from .render import backdrop_of_file, hex_color
 from .run_files import RunFiles, is_run, read_json, read_text, read_yaml, step_of
-from .templates import address, write_static
 
 NAME = "index.html"
 CURVES = {
@@ -31,8 +27,7 @@ CURVES = {
 }
 """Columns of the logs and what they are called."""
 SCORES = {"psnr": "dB", "ssim": "SSIM", "multi_face": "multi-face", "gaussians": "Gaussians"}
-MAX_FILES, MAX_COMMANDS, MAX_POINTS = 5000, 10, 400
-VALIDATION_PICTURES = 8
+MAX_COMMANDS, MAX_POINTS, VALIDATION_PICTURES = 10, 400, 8
 TIMES = "times.json"
 """What the launcher notes of each stage: its name, when it began, and its seconds."""
 WIDTH, HEIGHT, LEFT, BOTTOM, TOP = 340, 180, 56, 160, 22
@@ -63,7 +58,6 @@ def write_index(folder: Path) -> Path:
         if isinstance(run.scores.get(key), dict)
     ]
     curves = read_curves(folder, list(CURVES))
-    groups, more = _files(folder)
     write_static(
         path,
         "run.html",
@@ -83,16 +77,13 @@ def write_index(folder: Path) -> Path:
         commands=read_text(folder / "cmd.txt").splitlines()[-MAX_COMMANDS:],
         changes=config_changes(folder / "configs"),
         times=list(_times(run)),
-        groups=groups,
-        more_files=more,
+        groups=_files(folder),
     )
     return path
 
 
 def number(value: float) -> str:
-    """Format a number with five digits, or all that are before its point; none is large enough for
-    an exponent.
-    """
+    """Format a number with five digits, or all that are before its point."""
     return f"{value:,.0f}" if abs(value) >= 1e4 else f"{value:.5g}"
 
 
@@ -129,14 +120,12 @@ def _times(run: RunFiles) -> Iterator[tuple[str, str, str]]:
             yield text, "", f"{_shown(run.scores[name])} s"
 
 
-def _files(folder: Path) -> tuple[list[tuple[str, list[dict[str, str]]]], int]:
-    """Return the files of every folder at the top, and how many are left out."""
+def _files(folder: Path) -> Iterator[tuple[str, list[dict[str, str]]]]:
+    """Yield the files of every folder at the top."""
     files = sorted(path for path in folder.rglob("[!.]*") if path.is_file() and path.name != NAME)
-    groups = []
-    for name, group in groupby(files[:MAX_FILES], lambda path: path.relative_to(folder).parts[0]):
+    for name, group in groupby(files, lambda path: path.relative_to(folder).parts[0]):
         items = [_file(path, folder) for path in group]
-        groups.append((f"{name} ({len(items)})" if (folder / name).is_dir() else name, items))
-    return groups, max(len(files) - MAX_FILES, 0)
+        yield f"{name} ({len(items)})" if (folder / name).is_dir() else name, items
 
 
 def _file(path: Path, folder: Path, name: str = "") -> dict[str, str]:
@@ -148,33 +137,25 @@ def _file(path: Path, folder: Path, name: str = "") -> dict[str, str]:
 
 
 def note_time(folder: Path, stage: str, began: datetime, seconds: float) -> None:
-    """Append a finished stage to the times of a run.
-
-    Raises:
-        UserError: the file can't be written.
-    """
+    """Append a finished stage to the times of a run; raises UserError if it can't be written."""
     entry = {"stage": stage, "began": began.isoformat(sep=" ", timespec="seconds")}
     times = [*read_json(folder / TIMES, list), entry | {"seconds": round(seconds, 1)}]
     with atomic_file(folder / TIMES, durable=False) as file:
         file.write(json_text(times, indent=1).encode())
 
 
-# ---- what differs from the base configuration ----------------------------------------------------
-
-
 def config_changes(folder: Path) -> list[tuple[str, str, str]]:
     """Return key, value in the base file and value in the run, for those that differ.
 
     Args:
-        folder: ``configs`` of the run: ``raw.yaml``, the file that the run names first, and
-            ``parsed.yaml``. Values of the base file that refer to others are left out.
+        folder: ``configs`` of the run, with ``raw.yaml``, the base file, and ``parsed.yaml``.
     """
     base = dict(leaves(read_yaml(folder / "raw.yaml")))
     return [
         (key, _short(base.get(key, "–")), _short(value))
         for key, value in leaves(read_yaml(folder / "parsed.yaml"))
         if (key in USERS or key.partition(".")[0] in SECTIONS)
-        and "${" not in str(base.get(key))
+        and "${" not in str(base.get(key))  # which refers to another value
         and (key not in base or base[key] != value)
     ]
 
@@ -192,8 +173,6 @@ def _short(value: Any) -> str:
     text = str(value)
     return text if len(text) <= 200 else f"{text[:200]}..."
 
-
-# ---- curves --------------------------------------------------------------------------------------
 
 Curve = list[tuple[float, float]]
 """Steps and values, by step."""
@@ -223,9 +202,7 @@ def read_curves(folder: Path, names: Sequence[str]) -> dict[str, Curve]:
 
 
 def drawn(curve: Curve, title: str) -> dict[str, Any]:
-    """Return the picture of a curve over steps; values that span several powers of ten are drawn on
-    a logarithmic axis.
-    """
+    """Return the picture of a curve over steps, logarithmic for several powers of ten."""
     curve = curve[:: -(-len(curve) // MAX_POINTS)]
     steps, values = zip(*curve, strict=True)
     low, high = min(values), max(values)
@@ -250,13 +227,9 @@ def _scaled(values: Sequence[float], first: float, last: float) -> list[float]:
     return [first + (last - first) * ((value - low) / span if span else 0.5) for value in values]
 
 
-# ---- the gallery ---------------------------------------------------------------------------------
-
-
 def write_gallery(folder: Path) -> Path:
-    """Write the gallery of the runs in a folder, and their own indices; returns its path.
-
-    Where a run's index can't be written, a warning is given, and its card leads to its folder.
+    """Write the gallery of the runs in a folder, and their own indices; returns its path. Where an
+    index can't be written, a warning is given, and the card leads to the run's folder.
 
     Raises:
         UserError: there is no run in the folder, or the gallery can't be written.
