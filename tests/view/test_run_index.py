@@ -117,6 +117,7 @@ def test_a_white_object_does_not_vanish_on_the_page(full_run):
         assert re.search(r'<img [^>]*poster.png"[^>]*style="background: #202020"', page.read_text())
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(chromium() is None, reason="no Chromium is installed")
 def test_a_phone_shows_the_pages_without_scrolling_sideways(full_run):
     """And numbers in one line."""

@@ -1,12 +1,7 @@
 """Convert a file of Gaussians: ``python -m threestudio_gaussiandreamer.convert IN OUT``.
 
-The formats are those of the extensions: .ply, .compressed.ply, .spz, .sog, .glb, .usda and .usdz
-are read and written, .splat, .ksplat, meta.json (SOG), .gltf, .usd and .usdc are read; IN may also
-be a checkpoint. The command says what OUT can't hold of IN, and ``--check`` measures the PSNR
-between them.
-
-A .glb or .obj is a textured mesh of the cloud's surface; ``--gaussians`` writes the Gaussians
-themselves into a .glb, and a .spz.glb holds them always, as SPZ, which CesiumJS needs."""
+The formats are those of the extensions. A .glb or .obj is a textured mesh of the cloud's surface;
+``--gaussians`` writes the Gaussians themselves into a .glb, and a .spz.glb holds them always."""
 
 import argparse
 import os
@@ -109,11 +104,7 @@ def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
 
 
 def run(args: argparse.Namespace) -> None:
-    """Check options and files, convert, and print what was written and what is lost.
-
-    Raises:
-        UserError: an option is invalid, a file can't be read or written, or it holds no Gaussians.
-    """
+    """Check options and files, convert, and print what was written and what is lost."""
     args.output = str(through_link(args.output))
     mesh = suffix_of(args.output) in WRITERS and not args.gaussians
     formats = WRITTEN if args.gaussians else tuple(dict.fromkeys((*WRITTEN, *WRITERS)))
@@ -181,11 +172,7 @@ def _check_options(args: argparse.Namespace, suffix: str, mesh: bool) -> None:
 
 
 def _read(source: Path, args: argparse.Namespace) -> StoredCloud:
-    """Read IN and apply the options but ``--harmonics``.
-
-    Raises:
-        UserError: it can't be read, or holds no Gaussians that can be drawn.
-    """
+    """Read IN and apply the options but ``--harmonics``."""
     stored = read_any(source, args.up, "IN")
     if not len(stored.gaussians.means):
         raise UserError(f"{args.source} holds no Gaussians that can be drawn: nothing is written")
@@ -215,11 +202,7 @@ def mesh_options(args: argparse.Namespace, antialias: bool) -> MeshOptions:
 
 
 def write_mesh(args: argparse.Namespace, stored: StoredCloud) -> None:
-    """Convert a cloud and write the mesh; print what was written.
-
-    Raises:
-        UserError: the Gaussians form no surface, or a file can't be written.
-    """
+    """Convert a cloud and write the mesh; print what was written."""
     gaussians = stored.in_axes(WORLD_UP).gaussians
     mesh = mesh_from_gaussians(gaussians, mesh_options(args, stored.antialiased), "--")
     rotation = rotation_between(WORLD_UP, "y")

@@ -189,11 +189,7 @@ OPAQUE = 0.95
 
 
 class Scores:
-    """Scores by the judge and the CLIP in one folder.
-
-    Args:
-        models: ``toybox``, or the folder of an export.
-    """
+    """Scores by the judge and the CLIP in one folder: ``toybox``, or that of an export."""
 
     def __init__(self, models: str) -> None:
         args = Namespace(judge=models, clip=models, size=SIZE)

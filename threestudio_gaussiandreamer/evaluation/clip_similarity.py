@@ -136,10 +136,6 @@ def prompts_for(
 ) -> list[str]:
     """Return the prompt of each result: ``prompt``, the file's non-empty lines in the order of the
     results, such as T3Bench's ``data/prompt_single.txt``, or the prompts of their runs.
-
-    Raises:
-        UserError: both are given, the file can't be read, a prompt is unknown, or the numbers of
-            lines and results differ.
     """
     if prompt is not None and prompts_file is not None:
         raise UserError("both --prompt and --prompts-file: give one of them")

@@ -1,10 +1,7 @@
 """ImageReward (Xu et al. 2023): how well people like a picture for a prompt, by the published file
-``ImageReward.pt``, run by transformers' BLIP.
-
-The file holds a BLIP (a ViT, and a BERT that attends to it) under Salesforce's names, and five
-linear layers that map the first token's features to the reward. Sizes are taken from the tensors.
-A reward is standardised over the pictures that ImageReward was trained on: mean 0, deviation 1.
-"""
+``ImageReward.pt``, run by transformers' BLIP: a ViT, a BERT that attends to it, and five linear
+layers that map the first token's features to the reward, which is standardised to mean 0 and
+deviation 1 over the pictures that it was trained on."""
 
 import re
 from collections.abc import Mapping
@@ -72,11 +69,8 @@ class RewardNetwork(nn.Module):
     def forward(
         self, pixels: Float[Tensor, "B 3 S S"], ids: Tensor, mask: Tensor
     ) -> Float[Tensor, " B"]:
-        """Return the rewards of pictures for one prompt.
-
-        Args:
-            pixels: normalised as for CLIP.
-            ids, mask: (1, L) tokens, and which of them aren't padding.
+        """Return the rewards of pictures, normalised as for CLIP, for one prompt: (1, L) tokens,
+        and which of them aren't padding.
         """
         features = self.vision(pixels).last_hidden_state
         count = len(features)
@@ -90,10 +84,8 @@ class RewardNetwork(nn.Module):
 
 
 class ImageReward:
-    """ImageReward from a folder with ``ImageReward.pt`` and BERT's ``vocab.txt``.
-
-    Raises:
-        UserError: transformers isn't installed, or a file is missing, damaged or another one.
+    """ImageReward from a folder with ``ImageReward.pt`` and BERT's ``vocab.txt``; raises UserError
+    for files that are missing, damaged or others.
     """
 
     def __init__(self, folder: str, device: torch.device) -> None:

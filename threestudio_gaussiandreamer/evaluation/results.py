@@ -41,10 +41,8 @@ class Result(NamedTuple):
 
 
 def find_result(place: str) -> Result:
-    """Find the result of the last export in a run's folder; a PLY file is a result itself.
-
-    Raises:
-        UserError: there is no such file or folder, or it has no Gaussians.
+    """Find the result of the last export in a run's folder; a PLY file is a result itself. Raises
+    UserError if there is no such file or folder, or it has no Gaussians.
     """
     folder = Path(place).expanduser()
     if not folder.is_dir():
@@ -115,11 +113,8 @@ class Pictures:
     def render(
         self, c2w: Float[Tensor, "V 4 4"], fovy: Float[Tensor, " V"], size: int, *, chunk: int = 4
     ) -> Iterator[Float[np.ndarray, "B H W 3"]]:
-        """Yield renders in [0, 1], ``chunk`` views at a time.
-
-        Args:
-            fovy: vertical fields of view, radians.
-            size: height and width of the pictures, pixels.
+        """Yield renders in [0, 1], ``chunk`` views at a time, ``size`` pixels each way; ``fovy`` is
+        in radians, vertical.
         """
         for views, angles in zip(c2w.split(chunk), fovy.split(chunk), strict=True):
             with torch.no_grad():  # no decorator, which --typecheck would hide the generator from

@@ -36,11 +36,7 @@ LONGEST_NAME = 240
 def write_meshes(
     folder: Path, name: str, results: Sequence[Result], prompts: Sequence[str]
 ) -> None:
-    """Write meshes into ``folder``, a checkout of T3Bench; the results into a folder ``name``.
-
-    Raises:
-        UserError: a file can't be written.
-    """
+    """Write meshes into ``folder``, a checkout of T3Bench; the results into a folder ``name``."""
     try:
         for result, prompt in zip(results, prompts, strict=True):
             export = folder / "outputs_mesh_t3" / name / folder_name(prompt) / "save/it0-export"

@@ -150,11 +150,8 @@ class Driver:
         self.bar = tqdm(total=self.total, initial=self.done, unit="asset", disable=None, ncols=110)
 
     def run(self) -> None:
-        """Make the assets.
-
-        Raises:
-            UserError: the results can't be written, or the first assets all fail with one message.
-            KeyboardInterrupt: Ctrl-C; the workers have written checkpoints.
+        """Make the assets; raises UserError if the results can't be written, or the first assets
+        all fail with one message. Ctrl-C is raised when the workers have written checkpoints.
         """
         due = 0.0
         try:

@@ -51,11 +51,8 @@ class AnotherRow(UserError):
 
 
 class Place:
-    """A farm's folder on a disk that all its machines share, or below a URL.
-
-    Raises:
-        UserError: the URL's protocol is unknown, its package isn't installed, or its server, to
-            which some connect here, doesn't answer.
+    """A farm's folder on a disk that all its machines share, or below a URL; raises UserError for a
+    URL whose protocol, package or server isn't there.
     """
 
     def __init__(self, out: str | os.PathLike) -> None:
@@ -115,10 +112,8 @@ class Place:
             return [content if isinstance(content, bytes) else None for content in found]
 
     def read_json(self, *names: str) -> list[Optional[dict[str, Any]]]:
-        """Return the contents of JSON files of the farm; None for those that don't exist.
-
-        Raises:
-            UserError: one isn't an object: it was written by something else.
+        """Return the contents of JSON files of the farm; None for those that don't exist. Raises
+        UserError for one that isn't an object.
         """
         found = []
         for name, content in zip(names, self.read(names), strict=True):
@@ -163,9 +158,8 @@ class Place:
         return {"state": FINISHED, **record} if ours else None
 
     def fetch_checkpoint(self, row: Row, saves_memory: bool) -> None:
-        """Bring the last checkpoint that was made with the low-memory configuration, or without it,
-        beside what this machine has of the asset; ``resume=auto`` takes the one with the highest
-        step.
+        """Bring the last checkpoint that was made with one configuration beside what this machine
+        has of the asset; ``resume=auto`` takes the one with the highest step.
         """
         if self.remote:
             folder = self.work_folder(row)

@@ -102,12 +102,7 @@ def root_of(configs: Iterable[str]) -> str:
 
 
 def launch_arguments(recipe: Recipe, job: Job, configs: Iterable[str], *where: str) -> list[str]:
-    """Return the launcher's arguments for an asset.
-
-    Args:
-        configs: paths of the YAML files.
-        where: overrides that say where the run is.
-    """
+    """Return the launcher's arguments for an asset, of which ``where`` says where the run is."""
     device = ["--gpu", "cpu"] if recipe.cpu else []
     paths = [text for path in configs for text in ("--config", path)]
     return [*paths, "--train", *device, *run_overrides(recipe, job), *where]
@@ -135,10 +130,7 @@ def repeat_command(recipe: Recipe, job: Job) -> str:
 
 def check_recipe(recipe: Recipe, rows: Iterable[Row]) -> Recipe:
     """Check all rows; return the recipe with the low-memory configuration, if that is valid with
-    the farm's.
-
-    Raises:
-        UserError: the first error, with the line of the row.
+    the farm's. Errors name the line of the row.
     """
     from .. import register_parts
     from ..launch.extensions import load_extensions
@@ -178,10 +170,8 @@ def check_job(recipe: Recipe, job: Job) -> None:
 
 
 def unfinished(place: Place, prompts: Path, total: int) -> tuple[int, Iterator[Job]]:
-    """Return the number of finished assets of a prompt list with ``total`` rows, and the others.
-
-    Raises:
-        AnotherRow: the record of an asset is of another row.
+    """Return the number of finished assets of a prompt list with ``total`` rows, and the others;
+    raises AnotherRow for an asset whose record is of another row.
     """
     finished: set[int] = set()
     begun: dict[int, tuple[float, bool]] = {}
@@ -200,9 +190,6 @@ def unfinished(place: Place, prompts: Path, total: int) -> tuple[int, Iterator[J
 def require_same_farm(place: Place, recipe: Recipe, *, before_ray: bool = False) -> None:
     """Check that a folder is new or of the same farm, and note the farm in a new one;
     ``before_ray`` without what depends on the machines, and without a note.
-
-    Raises:
-        UserError: the folder belongs to another farm; the message names what differs.
     """
     ours = {
         "version": __version__,

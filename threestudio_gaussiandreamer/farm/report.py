@@ -37,11 +37,8 @@ NUMBERS = ("seconds", "worker_seconds", "megabytes", "psnr", "ssim", "multi_face
 def write_report(
     place: Place, rows: Iterable[Row], total: int, price: Optional[float] = None
 ) -> tuple[Path, Counter]:
-    """Write the report of a farm; return its first page and the number of assets of each state.
-
-    Args:
-        rows: the prompt list, ``total`` rows.
-        price: of an hour of one worker; None: the table has no cost.
+    """Write the report of a farm with ``total`` rows; return its first page and the number of
+    assets of each state. ``price`` is that of an hour of one worker.
     """
     folder = place.folder / FOLDER
     folder.mkdir(parents=True, exist_ok=True)

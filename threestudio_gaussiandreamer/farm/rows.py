@@ -41,11 +41,8 @@ class Row(NamedTuple):
 
 
 def read_rows(path: Path) -> Iterator[Row]:
-    """Yield the rows of a prompt list; the format follows from the extension.
-
-    Raises:
-        UserError: the file is missing, has another extension, isn't UTF-8 text, or has a line that
-            is too long, an unknown column, or an invalid value; the message names the line.
+    """Yield the rows of a prompt list; the format follows from the extension. Raises UserError for
+    a missing or invalid file, whose message names the line.
     """
     existing_file(path, "prompt list")
     suffix = path.suffix.lower()
@@ -70,10 +67,8 @@ def read_rows(path: Path) -> Iterator[Row]:
 
 
 def check_rows(path: Path) -> int:
-    """Read a whole prompt list and return its number of rows.
-
-    Raises:
-        UserError: as :func:`read_rows`, the list has no prompt, or two rows have the same name.
+    """Return the number of rows of a prompt list; raises UserError as :func:`read_rows`, for a list
+    without prompts, and for two rows of one name.
     """
     lines: dict[bytes, int] = {}
     for row in read_rows(path):

@@ -63,11 +63,8 @@ class Worker:
     is_ready = False
 
     def hello(self, setting: Setting) -> None:
-        """Prepare this process.
-
-        Raises:
-            UserError: this machine has another version of the package, or not the folder that the
-                farm was started in.
+        """Prepare this process; raises UserError if this machine has another version of the
+        package, or not the folder that the farm was started in.
         """
         if self.is_ready:
             return
@@ -182,9 +179,7 @@ def written_log(path: Path) -> Iterator[None]:
 def count_attempts(folder: Path, session: str, job: Job) -> tuple[int, int]:
     """Note one more attempt in an asset's folder, which is emptied if earlier ones had the other
     configuration; return how many there were with this one, and how many of them in this session.
-
-    Raises:
-        AnotherRow: the folder's checkpoints are of another row.
+    Raises AnotherRow if the folder's checkpoints are of another row.
     """
     path, made_with = folder / "attempts.txt", variant(job.row, job.saves_memory)
     earlier = list(map(str.split, path.open(encoding="utf-8"))) if path.exists() else []

@@ -1,14 +1,7 @@
-"""Prune a finished cloud to a budget: ``python -m threestudio_gaussiandreamer.prune IN OUT
---psnr 40``.
+"""Prune a finished cloud: ``python -m threestudio_gaussiandreamer.prune IN OUT --psnr 40``
 
-IN is a file of Gaussians in any format that is read (docs/formats.md), or a checkpoint;
-OUT is a PLY or SPZ file. From PLY to PLY the axes are kept; otherwise a PLY is written with -y up,
-as viewers expect. The report is written to OUT.json, and views of the cloud before (top) and after
-pruning to OUT.png.
-
-OUT stores the PSNR to the original cloud that ``--psnr`` or ``--within`` has guaranteed, so that
-pruning it again counts from the original: with the same budget or a stricter one nothing is
-removed."""
+From PLY to PLY the axes are kept; otherwise a PLY is written with -y up, as viewers expect. OUT
+stores the PSNR to the original cloud, so that pruning it again counts from the original."""
 
 import argparse
 import functools
@@ -75,12 +68,7 @@ def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
 
 
 def run(args: argparse.Namespace) -> dict[str, Any]:
-    """Check options and files, prune, and write the files; return the report.
-
-    Raises:
-        UserError: an option is invalid, a file can't be read or written, or the budget can't be
-            met.
-    """
+    """Check options and files, prune, and write the files; return the report."""
     options = PruneOptions(**{x.name: getattr(args, x.name) for x in fields(PruneOptions)})
     check_options(PruneOptions, options, "--")
     args.output = str(through_link(args.output))

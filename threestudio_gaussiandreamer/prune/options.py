@@ -47,12 +47,7 @@ class PruneOptions:
 
     @staticmethod
     def check(cfg: "PruneOptions") -> None:
-        """Check that at most one budget is given, and its value.
-
-        Raises:
-            UserError: more than one budget, a number out of its range, or one of ``within`` and
-                ``quality`` without the other.
-        """
+        """Check that at most one budget is given, and its value."""
         given = [name for name in BUDGETS if getattr(cfg, name) is not None]
         if len(given) > 1:
             raise UserError(f"{given[1]}: give one budget only; {given[0]} is set too")
@@ -106,11 +101,7 @@ def budget_of(
 
 
 def parse_number(value: Any, option: str, unit: str = "") -> float:
-    """Parse a finite number, with or without its unit.
-
-    Raises:
-        UserError: ``value`` is no finite number.
-    """
+    """Parse a finite number, with or without its unit."""
     text = str(value).strip()
     number = text[: -len(unit)] if unit and text.lower().endswith(unit.lower()) else text
     try:
@@ -123,11 +114,7 @@ def parse_number(value: Any, option: str, unit: str = "") -> float:
 
 
 def parse_count(value: Any, option: str) -> int:
-    """Parse a whole number of at least 1.
-
-    Raises:
-        UserError: ``value`` is no such number.
-    """
+    """Parse a whole number of at least 1."""
     found = parse_number(value, option)
     if found < 1 or found != int(found):
         raise UserError(f"{option}: expected a whole number from 1 on, got {found:g}")
@@ -135,11 +122,7 @@ def parse_count(value: Any, option: str) -> int:
 
 
 def parse_bytes(value: Any, option: str) -> int:
-    """Parse a size such as 500kB or 2MB into bytes; k, M and G are powers of 1000.
-
-    Raises:
-        UserError: ``value`` is no size.
-    """
+    """Parse a size such as 500kB or 2MB into bytes; k, M and G are powers of 1000."""
     # no two neighbouring parts of the pattern match the same character, so it takes linear time
     found = re.fullmatch(r"([\d.]+)\s*(k|m|g)?b?", str(value).strip().lower())
     if not found:

@@ -61,15 +61,7 @@ class PruneResult(NamedTuple):
 
 
 def read(path: str, up: Optional[str] = None) -> StoredCloud:
-    """Read the Gaussians of a file or a checkpoint.
-
-    Args:
-        up: overrides the up axis that the file states.
-
-    Raises:
-        UserError: there is no such file, or it has no Gaussians or spherical harmonics that can be
-            rendered.
-    """
+    """Read the Gaussians of a file or a checkpoint; ``up`` overrides the up axis that it states."""
     stored = read_any(existing_file(path, "file of Gaussians or checkpoint"), up, "IN")
     if not len(stored.gaussians.means):
         raise UserError(f"{path} holds no Gaussians that can be drawn: there is nothing to prune")
@@ -148,11 +140,7 @@ def remaining_budget(asked: Budget, stored: StoredCloud) -> Budget:
 
 
 def _count_within(size: int, stored: StoredCloud, suffix: str, where: str) -> int:
-    """Return the largest count whose evenly strided subset encodes to at most ``size`` bytes.
-
-    Raises:
-        UserError: a single Gaussian takes more.
-    """
+    """Return the largest count whose evenly strided subset encodes to at most ``size`` bytes."""
     whole = len(stored.gaussians.means)
 
     def bytes_of(count: int) -> int:

@@ -231,10 +231,8 @@ def splats(gaussians: Gaussians) -> dict[str, np.ndarray]:
 
 
 def serve(cloud: StoredCloud, host: str, port: int, title: str) -> LiveView:
-    """Serve a finished cloud until the returned view is closed.
-
-    Raises:
-        UserError: as :func:`require_server` does; or there are no Gaussians, or they reach too far.
+    """Serve a finished cloud until the returned view is closed; raises UserError as
+    :func:`require_server` does, or if there are no Gaussians, or they reach too far.
     """
     require_gaussians(len(cloud.gaussians.means), title)
     upright = cloud.in_axes(WORLD_UP)

@@ -75,11 +75,7 @@ class PageOptions(NamedTuple):
 def write_page(
     path: Path, shown: Shown, options: PageOptions, before: Optional[Shown] = None
 ) -> None:
-    """Write the page of :func:`page`.
-
-    Raises:
-        UserError: also if the file can't be written.
-    """
+    """Write the page of :func:`page`; raises UserError also if the file can't be written."""
     content = page(shown, options, before)
     with atomic_file(path) as file:
         # a title may be a file's name, whose bytes needn't be UTF-8
@@ -193,8 +189,7 @@ def packed(gaussians: Gaussians) -> bytes:
 
 def coarse(gaussians: Gaussians) -> Gaussians:
     """Round the attributes of a cloud that is shown for comparison only, and drop its harmonics
-    above degree 0. The steps are powers of two: the lowest bytes of the values are zero and vanish
-    when packed.
+    above degree 0, to multiples of powers of two, whose lowest bytes vanish when packed.
     """
     side = float(np.ptp(gaussians.means, axis=0).max(initial=0))
     steps = {"means": 2.0 ** np.ceil(np.log2(max(side, 1e-30) / COARSE_MEANS)), "quats": 1 / 32}

@@ -135,11 +135,8 @@ class RunFiles:
 
 
 def cloud_file(path: str | os.PathLike, hint: str = "") -> Path:
-    """Return the last exported cloud of a run, or the file of Gaussians or checkpoint itself.
-
-    Raises:
-        UserError: the file is missing, or the folder is no run with an exported cloud; that message
-            ends with ``hint``.
+    """Return the last exported cloud of a run, or the file of Gaussians or checkpoint itself;
+    raises UserError, with ``hint`` at its end, for a folder that is no run with an exported cloud.
     """
     if not is_folder(path):
         return existing_file(path, "file of Gaussians or checkpoint")

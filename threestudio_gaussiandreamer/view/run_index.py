@@ -42,11 +42,7 @@ OWN_PAGE = "script-src 'none'; object-src 'none'"
 
 
 def write_index(folder: Path) -> Path:
-    """Write the index of a run, from what there is; returns its path.
-
-    Raises:
-        UserError: it can't be written.
-    """
+    """Write the index of a run, from what there is; returns its path. Raises UserError if it can't."""
     run, path = RunFiles(folder), folder / NAME
     videos = sorted(run.save.glob("it*-test.mp4"), key=step_of)
     exported = sorted(filter(Path.is_file, run.export.iterdir())) if run.export else []
@@ -145,10 +141,8 @@ def note_time(folder: Path, stage: str, began: datetime, seconds: float) -> None
 
 
 def config_changes(folder: Path) -> list[tuple[str, str, str]]:
-    """Return key, value in the base file and value in the run, for those that differ.
-
-    Args:
-        folder: ``configs`` of the run, with ``raw.yaml``, the base file, and ``parsed.yaml``.
+    """Return key, value in the base file and value in the run, for those that differ, of the folder
+    ``configs`` of a run, with ``raw.yaml``, the base file, and ``parsed.yaml``.
     """
     base = dict(leaves(read_yaml(folder / "raw.yaml")))
     return [
@@ -179,10 +173,8 @@ Curve = list[tuple[float, float]]
 
 
 def read_curves(folder: Path, names: Sequence[str]) -> dict[str, Curve]:
-    """Read columns of the CSV logs of a run; a resumed run has several, of which later ones win.
-
-    Returns:
-        the curves that have at least two finite values.
+    """Return the columns with at least two finite values of the CSV logs of a run; a resumed run
+    has several logs, of which later ones win.
     """
     values: dict[str, dict[float, float]] = {name: {} for name in names}
     logs = folder.glob("csv_logs/version_*/metrics.csv")
@@ -230,9 +222,6 @@ def _scaled(values: Sequence[float], first: float, last: float) -> list[float]:
 def write_gallery(folder: Path) -> Path:
     """Write the gallery of the runs in a folder, and their own indices; returns its path. Where an
     index can't be written, a warning is given, and the card leads to the run's folder.
-
-    Raises:
-        UserError: there is no run in the folder, or the gallery can't be written.
     """
     patterns = ["/".join(["*"] * depth) for depth in range(1, MAX_DEPTH + 1)]
     found = [path for pattern in patterns for path in folder.glob(pattern) if is_run(path)]
