@@ -224,22 +224,6 @@ def test_a_partial_video_is_an_error(kind, tmp_path, measured):
 
 
 @row("A5", "Disk full, read-only")
-def test_a_folder_that_becomes_read_only(tmp_path, monkeypatch, measured):
-    with contextlib.ExitStack() as locked:
-
-        def lock(system):
-            folder = Path(system._save_dir).parent / "ckpts"
-            locked.enter_context(permissions_count_for_root())
-            folder.chmod(0o555)
-            locked.callback(folder.chmod, 0o755)
-
-        at_step(monkeypatch, 3, lock)
-        ended = launch(tmp_path, *EVERY_STEP)
-    assert_stopped_cleanly(ended, "Permission denied")
-    measured("named error, exit code 2, earlier file intact, no temporary")
-
-
-@row("A5", "Disk full, read-only")
 def test_a_read_only_output_root_is_named_before_any_work(tmp_path, measured):
     tmp_path.chmod(0o555)
     with permissions_count_for_root():
@@ -300,9 +284,7 @@ def with_means(value):
 
 INCONSISTENT = {
     "without loops": (lambda c: c.pop("loops"), "it has no loops"),
-    "without optimizer_states": (lambda c: c.pop("optimizer_states"), "it has no optimizer_states"),
     "0-d means": (with_means(torch.tensor(1.0)), "geometry.means"),
-    "means (N, 2)": (with_means(torch.zeros(120, 2)), "geometry.means"),
     "a mean more": (with_means(torch.zeros(121, 3)), "geometry.log_scales"),
     "means as a list": (with_means([1.0, 2.0]), "geometry.means"),
     "no means": (lambda c: c["state_dict"].pop("geometry.means"), "geometry.means"),
@@ -377,7 +359,6 @@ MODULES = {
     "ImportError": ("import nothing_of_this_name", "custom/part.py:1: ModuleNotFoundError"),
     "syntax": ("def f(:", "custom/part.py:1: "),
     "an exception": ("\n\nraise RuntimeError('broken')", "custom/part.py:3: RuntimeError: broken"),
-    "sys.exit()": ("import sys\nsys.exit()", "custom/part.py:2: SystemExit"),
     "sys.exit(0)": ("import sys\nsys.exit(0)", "custom/part.py:2: SystemExit: 0"),
     "a name that is taken": (TAKEN, "custom/part.py:2"),
 }
@@ -398,14 +379,6 @@ def test_a_module_that_fails_is_named_with_its_line(what, tmp_path, monkeypatch,
     assert_refused(launch_with(source, monkeypatch, tmp_path), "can't be imported", message)
     assert not (tmp_path / "out").exists()
     measured("named error at load")
-
-
-@row("A5", "Failed custom module")
-def test_a_signal_while_a_module_is_imported_is_not_its_fault(tmp_path, monkeypatch, measured):
-    source = "import os, signal\nos.kill(os.getpid(), signal.SIGTERM)"
-    ended = launch_with(source, monkeypatch, tmp_path)
-    assert ended.code == 143 and "can't be imported" not in ended.err
-    measured("SIGTERM stays SIGTERM")
 
 
 @row("A5", "Failed custom module")
