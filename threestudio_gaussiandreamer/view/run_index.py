@@ -42,7 +42,7 @@ OWN_PAGE = "script-src 'none'; object-src 'none'"
 
 
 def write_index(folder: Path) -> Path:
-    """Write the index of a run, from what there is; returns its path. Raises UserError if it can't."""
+    """Write the index of a run, from what there is; returns its path."""
     run, path = RunFiles(folder), folder / NAME
     videos = sorted(run.save.glob("it*-test.mp4"), key=step_of)
     exported = sorted(filter(Path.is_file, run.export.iterdir())) if run.export else []
