@@ -13,8 +13,7 @@ import torch
 from threestudio_gaussiandreamer.core import distributed, streams
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.diffusion import sds
-from threestudio_gaussiandreamer.training.camera_options import CameraConfig
-from threestudio_gaussiandreamer.training.data import TrainCameras
+from threestudio_gaussiandreamer.training.data import CameraConfig, TrainCameras
 
 SCRIPT = """
     import sys, torch

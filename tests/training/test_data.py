@@ -8,8 +8,7 @@ import pytest
 import torch
 
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.training.camera_options import CameraConfig
-from threestudio_gaussiandreamer.training.data import GaussianDreamerDataModule
+from threestudio_gaussiandreamer.training.data import CameraConfig, GaussianDreamerDataModule
 
 KEYS = dict.fromkeys(("elevation", "azimuth", "camera_distances", "fovy"), (4,))
 KEYS |= dict.fromkeys(("camera_positions", "light_positions"), (4, 3))
@@ -99,15 +98,14 @@ def test_a_pool_repeats_its_cameras_and_still_covers_the_circle():
 
 def test_the_views_of_a_pool_are_known_beforehand_unless_cameras_move():
     data = module(train_views=8)
-    views = data.pool_views()
-    assert len(views["fovy"]) == 8
-    assert [views[name] for name in ("height", "width", "batch_size")] == [32, 48, 4]
-    assert data.views_to_prefetch(1) is None and data.views_to_prefetch(2)
+    assert data.views_to_prefetch(1) is None
+    views = data.views_to_prefetch(2)
+    assert (len(views["fovy"]), views["height"], views["width"]) == (8, 32, 48)
     known = {tuple(c2w) for c2w in views["c2w"].flatten(1).tolist()}
     assert {tuple(c2w) for b in batches(data, 20) for c2w in b["c2w"].flatten(1).tolist()} == known
-    assert module().pool_views() is None
-    assert module(train_views=8, up_perturb=0.1).pool_views() is None
-    assert module(train_views=8, height=[16, 32], resolution_milestones=[3]).pool_views() is None
+    milestone = {"train_views": 8, "height": [16, 32], "resolution_milestones": [3]}
+    for changing in ({}, {"train_views": 8, "up_perturb": 0.1}, milestone):
+        assert module(**changing).views_to_prefetch(9) is None
 
 
 def test_progressive_views_widen_from_the_evaluation_view():

@@ -31,7 +31,7 @@ from ..host import get_device
 from ..models.bundled import CLIP, NAME, model_part
 from ..models.clip import PictureText, clip_source
 from ..toybox.views import DISTANCE, FOVY_DEG, SIZE
-from ..training.camera_options import MAX_SIDE
+from ..training.data import MAX_SIDE
 from .results import Pictures, Result, find_result, read_result
 from .t3bench import require_folder_names, write_meshes
 

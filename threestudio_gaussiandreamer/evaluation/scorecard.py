@@ -22,7 +22,7 @@ from ..core.files import atomic_file, json_text, output_folder
 from ..core.options import shown
 from ..core.streams import numpy_generator
 from ..models.bundled import NAME
-from ..training.camera_options import MAX_SIDE
+from ..training.data import MAX_SIDE
 from .asset_metrics import METRICS, Asset, Metric
 from .clip_similarity import Protocol, has_own_cameras
 from .results import Result, find_result, read_result

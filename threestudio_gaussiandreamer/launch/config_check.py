@@ -24,7 +24,7 @@ from ..core.options import (
     shown,
 )
 from ..host import find, pl, validate_schedule
-from ..training.camera_options import sizes_of_stages
+from ..training.data import sizes_of_stages
 from .live_viewer import ViewerConfig
 from .part_kinds import check_kind, find_part
 

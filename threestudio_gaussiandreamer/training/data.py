@@ -2,11 +2,9 @@
 test cameras.
 
 Batch keys, units and options are those of threestudio's ``random-camera-datamodule``, under whose
-name it is also registered in the built-in host. There are three differences. Rays are computed only
-with ``rays: true``, since splatting doesn't need them, and at 4 x 1024^2 they take half a second of
-CPU time per step. A batch is a function of (seed, step), so a resumed run has the same cameras as
-an uninterrupted one. Step k is trained with the batch of step k: no batch is prefetched with the
-previous resolution, and there is no degenerate third batch.
+name it is also registered in the built-in host, except that rays are computed only with
+``rays: true``, that a batch is a function of (seed, step), so that a resumed run has the same
+cameras, and that step k is trained with the batch of step k: none is prefetched.
 
 ========================  ==========================================================================
 option                    meaning
@@ -34,7 +32,9 @@ import bisect
 import itertools
 import math
 from collections.abc import Callable
-from typing import Any, Optional
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Any, ClassVar, List, Optional, Tuple
 
 import torch
 from jaxtyping import Int
@@ -44,9 +44,105 @@ from torch.utils.data import DataLoader, Dataset, IterableDataset
 from .. import cameras
 from ..cameras import Orbit, OrbitRanges
 from ..core.distributed import own_rows, require_shareable
+from ..core.errors import UserError
+from ..core.memory import count_of, require_memory
+from ..core.options import Rule, at_least, in_range, interval, is_list, is_whole, satisfies
 from ..core.streams import generator
 from ..host import Updateable, parse_structured, pl, register, register_builtin, run_seed
-from .camera_options import CameraConfig, sizes_of_stages
+
+MAX_SIDE = 16_384
+"""Pixels of a picture each way."""
+FAR = 1e6
+"""Distances of cameras and lights, world units: float32 keeps places to some digits in it."""
+TRAIN_BYTES, EVAL_BYTES, CAMERA_BYTES = 64, 32, 256
+"""What a pixel of a training view, a pixel of an evaluated view, and a camera take at least."""
+FOVY = 1e-3, 179.999, "degrees"
+DISTANCE = 1e-6, FAR, "world units"
+LENGTH = in_range(0, FAR, "world units")
+ONE_VIEW = satisfies("1: views are evaluated one at a time", lambda count: count == 1)
+PIXELS = in_range(1, MAX_SIDE, "pixels")
+Range = Tuple[float, float]
+
+
+def whole_numbers(high: int) -> Rule:
+    """Return the rule for whole numbers from 1 to ``high``, or lists of such."""
+
+    def holds(value: Any) -> bool:
+        values = value if is_list(value) else [value]
+        return len(values) > 0 and all(is_whole(v) and 1 <= v <= high for v in values)
+
+    return satisfies(f"whole numbers from 1 to {high}", holds)
+
+
+@dataclass
+class CameraConfig:
+    height: Any = field(default=64, metadata=whole_numbers(MAX_SIDE))
+    width: Any = field(default=64, metadata=whole_numbers(MAX_SIDE))
+    batch_size: Any = field(default=1, metadata=whole_numbers(4096))
+    resolution_milestones: List[int] = field(default_factory=list)
+    eval_height: int = field(default=512, metadata=PIXELS)
+    eval_width: int = field(default=512, metadata=PIXELS)
+    eval_batch_size: int = field(default=1, metadata=ONE_VIEW)
+    n_val_views: int = field(default=1, metadata=count_of("views", 1, CAMERA_BYTES))
+    n_test_views: int = field(default=120, metadata=count_of("views", 1, CAMERA_BYTES))
+    elevation_range: Range = field(default=(-10, 60), metadata=interval(-90, 90, "degrees"))
+    azimuth_range: Range = field(default=(-180, 180), metadata=interval(-36_000, 36_000, "degrees"))
+    camera_distance_range: Range = field(default=(1.5, 4.0), metadata=interval(*DISTANCE))
+    fovy_range: Range = field(default=(40, 70), metadata=interval(*FOVY))
+    camera_perturb: float = field(default=0.0, metadata=LENGTH)
+    center_perturb: float = field(default=0.0, metadata=LENGTH)
+    up_perturb: float = field(default=0.0, metadata=LENGTH)
+    light_position_perturb: float = field(default=1.0, metadata=LENGTH)
+    light_distance_range: Range = field(default=(0.8, 1.5), metadata=interval(0, *DISTANCE[1:]))
+    eval_elevation_deg: float = field(default=15.0, metadata=in_range(-90, 90, "degrees"))
+    eval_camera_distance: float = field(default=4.0, metadata=in_range(*DISTANCE))
+    eval_fovy_deg: float = field(default=70.0, metadata=in_range(*FOVY))
+    batch_uniform_azimuth: bool = True
+    progressive_until: int = field(default=0, metadata=at_least(0, "steps"))
+    rays_d_normalize: bool = True
+    train_views: int = field(default=0, metadata=count_of("views", 0, CAMERA_BYTES))
+    rays: bool = False
+    n_view: int = field(default=1, metadata=in_range(1, 64, "views"))
+
+    REMOVED: ClassVar[dict[str, Any]] = {"hold_steps": (1, "each step has its own cameras")}
+
+    @staticmethod
+    def check(cfg: Any) -> None:
+        milestones, listed = list(cfg.resolution_milestones), False
+        if any(later <= earlier for earlier, later in pairwise([0, *milestones])):
+            raise UserError(
+                f"resolution_milestones: expected increasing steps above 0, got {milestones}"
+            )
+        for name in ("height", "width", "batch_size"):
+            count = len(values) if is_list(values := getattr(cfg, name)) else 1
+            listed |= count > 1
+            if count not in (1, len(milestones) + 1):
+                raise UserError(
+                    f"{name}: {count} entries need {count - 1} resolution_milestones, the steps at "
+                    f"which the next entry applies, got {len(milestones)}"
+                )
+        if milestones and not listed:
+            needed = f"{len(milestones) + 1} entries"
+            raise UserError(f"resolution_milestones: give height, width or batch_size {needed}")
+        if cfg.train_views and cfg.n_view > 1:
+            raise UserError("train_views: a fixed pool of views has no groups: set n_view=1")
+        if cfg.train_views and cfg.progressive_until:
+            raise UserError("progressive_until: the angles of a fixed pool of views don't widen")
+        for height, width, batch in sizes_of_stages(cfg):
+            if batch % cfg.n_view:
+                expected = f"expected multiples of n_view={cfg.n_view}"
+                raise UserError(f"batch_size: {expected}, got {batch}")
+            what = f"{batch} views of {height} x {width} pixels"
+            require_memory("batch_size", TRAIN_BYTES * height * width * batch, what)
+        what = f"pictures of {cfg.eval_height} x {cfg.eval_width} pixels"
+        require_memory("eval_height", EVAL_BYTES * cfg.eval_height * cfg.eval_width, what)
+
+
+def sizes_of_stages(cfg: Any) -> list[tuple[int, int, int]]:
+    """Return height, width and number of the views in a step of each stage."""
+    stages = range(len(cfg.resolution_milestones) + 1)
+    sizes = [v if is_list(v) else [v] for v in (cfg.height, cfg.width, cfg.batch_size)]
+    return [tuple(values[min(i, len(values) - 1)] for values in sizes) for i in stages]
 
 
 def make_batch(
@@ -95,32 +191,32 @@ class TrainCameras(IterableDataset, Updateable):
     def __init__(self, cfg: CameraConfig) -> None:
         self.cfg = cfg
         self.next_step: Callable[[], int] = lambda: 0
-        self._views_by_size: dict[tuple[int, int], dict[str, Any]] = {}
+        self._pool_batches: dict[tuple[int, int], dict[str, Any]] = {}  # all views, by their size
         self.sizes = sizes_of_stages(cfg)
         for _, _, batch_size in self.sizes:
             require_shareable(batch_size, "data.batch_size", together=cfg.n_view)
-        angles = cfg.elevation_range, cfg.azimuth_range
-        self.ranges = OrbitRanges(*map(tuple, (*angles, cfg.camera_distance_range, cfg.fovy_range)))
-        self.pool = None
-        if cfg.train_views:
-            self.pool = cameras.camera_pool(cfg.train_views, self.ranges, run_seed())
+        ranges = cfg.elevation_range, cfg.azimuth_range, cfg.camera_distance_range, cfg.fovy_range
+        self.ranges, count = OrbitRanges(*map(tuple, ranges)), cfg.train_views
+        self.pool = cameras.camera_pool(count, self.ranges, run_seed()) if count else None
+        self.moves = bool(cfg.camera_perturb or cfg.center_perturb or cfg.up_perturb)
 
     def __iter__(self):
-        yield from itertools.count(self.next_step())
+        return itertools.count(self.next_step())
 
     def collate(self, step: int) -> dict[str, Any]:
         """Return this process's views of the batch for ``step``, a function of (seed, step)."""
-        height, width, batch_size = self.sizes[
-            bisect.bisect_right(self.cfg.resolution_milestones, step)
-        ]
+        stage = bisect.bisect_right(self.cfg.resolution_milestones, step)
+        height, width, batch_size = self.sizes[stage]
         rng, rows = generator(run_seed(), "camera", step), own_rows(batch_size)
-        index = self._pick(batch_size, rng) if self.pool else None
-        if self.pool and not (self.moves or self.cfg.rays):
-            views = self._views_of_pool(height, width)
-            lights = self._lights(views["c2w"][index], rng)[rows]
-            batch = {k: v[index[rows]] if torch.is_tensor(v) else v for k, v in views.items()}
-            return batch | {"light_positions": lights}
         if self.pool:
+            index = self._pick(batch_size, rng)
+            if not (self.moves or self.cfg.rays):
+                if (size := (height, width)) not in self._pool_batches:
+                    self._pool_batches[size] = orbit_batch(self.pool, *size)
+                views = self._pool_batches[size]
+                lights = self._lights(views["c2w"][index], rng)[rows]
+                batch = {k: v[index[rows]] if torch.is_tensor(v) else v for k, v in views.items()}
+                return batch | {"light_positions": lights}
             orbit = self.pool.rows(index)
         else:
             orbit = self._sample(batch_size, self._ranges(step), rng)
@@ -128,12 +224,6 @@ class TrainCameras(IterableDataset, Updateable):
         lights = self._lights(c2w, rng)
         own, rays = (orbit.rows(rows), c2w[rows], lights[rows]), self.cfg.rays
         return make_batch(*own, height, width, rays, self.cfg.rays_d_normalize)
-
-    def _views_of_pool(self, height: int, width: int) -> dict[str, Any]:
-        """Return one batch of all views of the pool, with any lights."""
-        if (height, width) not in self._views_by_size:
-            self._views_by_size[height, width] = orbit_batch(self.pool, height, width)
-        return self._views_by_size[height, width]
 
     def _sample(self, batch_size: int, ranges: OrbitRanges, rng: torch.Generator) -> Orbit:
         uniform = self.cfg.batch_uniform_azimuth
@@ -145,11 +235,10 @@ class TrainCameras(IterableDataset, Updateable):
         """Draw ``batch_size`` views of the pool, one from each azimuth sector (the pool is ordered
         by azimuth).
         """
-        u, views = torch.rand(batch_size, generator=rng), len(self.pool.azimuth)
-        sector = (
-            (u + torch.arange(batch_size)) / batch_size if self.cfg.batch_uniform_azimuth else u
-        )
-        return (sector * views).long().clamp_max(views - 1)
+        share, views = torch.rand(batch_size, generator=rng), len(self.pool.azimuth)
+        if self.cfg.batch_uniform_azimuth:
+            share = (share + torch.arange(batch_size)) / batch_size
+        return (share * views).long().clamp_max(views - 1)
 
     def _ranges(self, step: int) -> OrbitRanges:
         """Widen elevation and azimuth from the evaluation view to the full range over
@@ -161,11 +250,6 @@ class TrainCameras(IterableDataset, Updateable):
             elevation=tuple((1 - r) * start + r * e for e in self.ranges.elevation),
             azimuth=tuple(r * a for a in self.ranges.azimuth),
         )
-
-    @property
-    def moves(self) -> bool:
-        """Whether cameras are shifted at random."""
-        return bool(self.cfg.camera_perturb or self.cfg.center_perturb or self.cfg.up_perturb)
 
     def _perturbed(self, orbit: Orbit, rng: torch.Generator) -> Tensor:
         if not self.moves:
@@ -195,14 +279,9 @@ class EvalCameras(Dataset, Updateable):
         self.cfg = cfg
         count = cfg.n_val_views if split == "val" else cfg.n_test_views
         # without 360 degrees, which would repeat the first view in a looped video
-        azimuth = torch.linspace(0.0, 360.0, count + 1)[:-1]
-        same = torch.ones(count)
-        self.orbit = Orbit(
-            same * cfg.eval_elevation_deg,
-            azimuth,
-            same * cfg.eval_camera_distance,
-            same * math.radians(cfg.eval_fovy_deg),
-        )
+        azimuth, same = torch.linspace(0.0, 360.0, count + 1)[:-1], torch.ones(count)
+        distance, fovy = same * cfg.eval_camera_distance, same * math.radians(cfg.eval_fovy_deg)
+        self.orbit = Orbit(same * cfg.eval_elevation_deg, azimuth, distance, fovy)
 
     def __len__(self) -> int:
         return len(self.orbit.azimuth)
@@ -239,22 +318,18 @@ class GaussianDreamerDataModule(pl.LightningDataModule):
         cameras = self.train_dataset
         return DataLoader(cameras, batch_size=None, collate_fn=cameras.collate)
 
-    def pool_views(self) -> Optional[dict[str, Any]]:
-        """Return ``c2w``, ``fovy``, ``height``, ``width``, ``batch_size`` of all views of a fixed
-        pool; None where those change.
+    def views_to_prefetch(self, steps: float) -> Optional[dict[str, Any]]:
+        """Return ``c2w``, ``fovy``, ``height`` and ``width`` of all views of a fixed pool if
+        ``steps`` more steps will draw about as many; None where those change.
         """
         cameras = self.train_dataset
         if cameras.pool is None or cameras.moves or len(cameras.sizes) > 1:
             return None
-        sizes = dict(zip(("height", "width", "batch_size"), cameras.sizes[0], strict=True))
-        return {"c2w": cameras.pool.c2w, "fovy": cameras.pool.fovy, **sizes}
-
-    def views_to_prefetch(self, steps: float) -> Optional[dict[str, Any]]:
-        """Return :meth:`pool_views` if ``steps`` more steps will draw about as many views."""
-        views = self.pool_views()
-        if views is None or steps * views["batch_size"] < len(views["c2w"]):
+        ((height, width, batch_size),) = cameras.sizes
+        if steps * batch_size < len(cameras.pool.azimuth):
             return None
-        return views
+        orbit = cameras.pool
+        return {"c2w": orbit.c2w, "fovy": orbit.fovy, "height": height, "width": width}
 
     def val_dataloader(self) -> DataLoader:
         return self._in_order(self.val_dataset)

@@ -30,8 +30,7 @@ from ..core.memory import require_memory
 from ..core.options import at_least, in_range
 from ..meshes.mesh import SurfaceDistance
 from ..meshes.raycast import over_background
-from .camera_options import MAX_SIDE
-from .data import orbit_batch
+from .data import MAX_SIDE, orbit_batch
 from .renderer import require_outputs
 
 VIEW_BYTES = 40
