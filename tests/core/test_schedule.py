@@ -52,10 +52,6 @@ def test_an_end_that_is_no_whole_number_is_refused(value):
         validate_schedule(value, "lr")
 
 
-def test_exponential_interpolation_is_the_geometric_mean_half_way():
-    assert C([0, 1.0, 100.0, 10], 0, 5, interpolation="exp") == pytest.approx(10.0)
-
-
 @pytest.mark.parametrize(
     "value",
     [

@@ -50,8 +50,12 @@ from threestudio_gaussiandreamer.guidance.base import NonFiniteScore
 from threestudio_gaussiandreamer.splatting import tiles
 from threestudio_gaussiandreamer.splatting.projection import quats_to_rotations
 from threestudio_gaussiandreamer.training.density import DensityControl
-from threestudio_gaussiandreamer.training.geometry import LEARNING_RATES, STATISTICS, GaussianCloud
-from threestudio_gaussiandreamer.training.initialization import grow_points
+from threestudio_gaussiandreamer.training.geometry import (
+    LEARNING_RATES,
+    STATISTICS,
+    GaussianCloud,
+    grow_points,
+)
 from threestudio_gaussiandreamer.training.system import GaussianDreamerSystem
 
 CONFIGS = Path(__file__).parents[2] / "configs"

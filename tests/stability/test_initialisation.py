@@ -26,8 +26,7 @@ from threestudio_gaussiandreamer.gaussians.views import render_all, views_around
 from threestudio_gaussiandreamer.meshes.load import load_mesh
 from threestudio_gaussiandreamer.meshes.mesh import face_areas, sample_surface
 from threestudio_gaussiandreamer.metrics import psnr
-from threestudio_gaussiandreamer.training.geometry import GaussianCloud
-from threestudio_gaussiandreamer.training.initialization import grow_points
+from threestudio_gaussiandreamer.training.geometry import GaussianCloud, grow_points
 
 
 def rng(seed: int = 0) -> np.random.Generator:

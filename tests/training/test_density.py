@@ -35,9 +35,9 @@ def after_step(density, step=0):
 def test_a_round_says_how_many_it_left_and_another_step_leaves_the_cloud():
     density = control(budget=None)
     means = density.cloud.means
-    assert after_step(density) == DensityOutcome(10, 10, False, None)
+    assert after_step(density) == DensityOutcome(10, 10, None)
     assert density.cloud.means is means
-    assert after_step(control(budget=5)) == DensityOutcome(10, 8, True, None)
+    assert after_step(control(budget=5)) == DensityOutcome(10, 8, None)
 
 
 def test_a_cloud_larger_than_max_gaussians_is_reported():

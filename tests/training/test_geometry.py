@@ -14,8 +14,7 @@ from threestudio_gaussiandreamer.gaussians.grow import nearest_distance_scales
 from threestudio_gaussiandreamer.host import BaseGeometry, find
 from threestudio_gaussiandreamer.splatting import Rasterized
 from threestudio_gaussiandreamer.training.density import DensityControl
-from threestudio_gaussiandreamer.training.geometry import GaussianCloud
-from threestudio_gaussiandreamer.training.initialization import grow_points
+from threestudio_gaussiandreamer.training.geometry import GaussianCloud, grow_points
 
 register_parts()
 NO_GROWTH = {"enabled": False}
@@ -49,22 +48,6 @@ def test_each_point_becomes_one_gaussian_as_the_paper_says(sphere_points):
     nearest = torch.from_numpy(nearest_distance_scales(sphere_points.points, "nearest"))
     assert torch.allclose(geometry.scales(), nearest[:, None].expand(-1, 3), rtol=1e-5)
     assert torch.equal(geometry.quats, torch.tensor([1.0, 0, 0, 0]).expand(400, 4))
-
-
-def test_scales_and_their_gradients_are_those_of_a_clamp(sphere_points):
-    """Whether or not any scale is out of the range, which decides how they are computed."""
-    geometry = started(sphere_points)
-    for out_of_range in (False, True):
-        logs = geometry.log_scales.detach().clone()
-        if out_of_range:
-            logs[0], logs[1] = torch.tensor([-30.0, -20.0, 5.0]), torch.tensor([20.0, 10.0, -5.0])
-        geometry.log_scales.data.copy_(logs)
-        expected = logs.requires_grad_().clamp(*densify.LOG_SCALE_RANGE).exp()
-        upstream = torch.randn(expected.shape)
-        found = geometry.scales()
-        assert torch.equal(found, expected)
-        (gradient,) = torch.autograd.grad(found, geometry.log_scales, upstream)
-        assert torch.equal(gradient, torch.autograd.grad(expected, logs, upstream)[0])
 
 
 def test_growing_is_configured_and_seeded(sphere_points, monkeypatch):

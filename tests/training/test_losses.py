@@ -6,11 +6,11 @@ import pytest
 import torch
 
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.host import find, register
+from threestudio_gaussiandreamer.host import register
 from threestudio_gaussiandreamer.training.losses import (
-    REGULARISERS,
     check_losses,
     loggable,
+    regularisers,
     require_gradients,
     total,
     total_variation,
@@ -31,7 +31,7 @@ def test_total_variation_of_a_step_edge():
 
 
 def test_each_regulariser_is_weighted_and_computed_only_where_it_has_a_weight():
-    ours = {name: REGULARISERS[name] for name in ("sparsity", "opaque", "tv")}
+    ours = {name: regularisers()[name] for name in ("sparsity", "opaque", "tv")}
     out = {"opacity": torch.full((1, 4, 4, 1), 0.5), "comp_rgb": torch.rand(1, 4, 4, 3)}
     out = {name: picture.requires_grad_() for name, picture in out.items()}
     guided = {"loss_sds": torch.tensor(2.0), "grad_norm": torch.tensor(1.0)}
@@ -118,14 +118,3 @@ def test_gradients_that_reach_no_gaussian_are_named():
         require_gradients(cloud, losses)
     cloud(torch.ones(2)).sum().backward()
     require_gradients(cloud, losses)
-
-
-def test_the_table_of_earlier_versions_registers_and_names_the_new_way(caplog):
-    def earlier(out):
-        return out["comp_rgb"].mean()
-
-    REGULARISERS["earlier"] = earlier
-    assert "write @register('earlier-regulariser')" in caplog.text
-    assert find("earlier-regulariser") is REGULARISERS["earlier"] is earlier
-    with pytest.raises(UserError, match="the name 'tv-regulariser' is taken"):
-        REGULARISERS["tv"] = earlier

@@ -13,7 +13,7 @@ from benchmarks.viewers.browser import chromium
 from benchmarks.viewers.devtools import open_page
 from tests.training.runs import launch, length, run_folder
 from threestudio_gaussiandreamer.core.images import read
-from threestudio_gaussiandreamer.training.pages import discard_turntable
+from threestudio_gaussiandreamer.training.export import discard_turntable
 
 SHORT = [*length(2)]
 

@@ -36,19 +36,24 @@ class Schedule(NamedTuple):
     in_epochs: bool
 
 
-def C(value: Any, epoch: int, global_step: int, interpolation: str = "linear") -> float:
+def C(value: Any, epoch: int, global_step: int) -> float:
     """Evaluate a schedule at a step of training.
 
     Args:
         value: a number, a schedule in one of the forms above, or a parsed one, which is faster.
-        interpolation: between two knots, "linear" or "exp" (linear in the logarithm; the values
-            must be positive).
 
     Raises:
-        UserError: ``value`` is no schedule, or the interpolation is unknown.
+        UserError: ``value`` is no schedule.
     """
-    schedule = parse_schedule(value)
-    return _interpolate(schedule, epoch if schedule.in_epochs else global_step, interpolation)
+    steps, values, in_epochs = parse_schedule(value)
+    now = epoch if in_epochs else global_step
+    if now <= steps[0]:
+        return values[0]
+    for i in range(1, len(steps)):
+        if now < steps[i]:
+            t = (now - steps[i - 1]) / (steps[i] - steps[i - 1])
+            return values[i - 1] + (values[i] - values[i - 1]) * t
+    return values[-1]
 
 
 def C_max(value: Any) -> float:
@@ -115,22 +120,6 @@ def parse_schedule(value: Any, name: str = "the schedule") -> Schedule:
             f"{FORMS}"
         )
     return Schedule(steps, values, in_epochs=all(fractional))
-
-
-def _interpolate(schedule: Schedule, now: float, interpolation: str) -> float:
-    steps, values, _ = schedule
-    if interpolation not in ("linear", "exp"):
-        raise UserError(f"unknown interpolation {interpolation!r}: expected 'linear' or 'exp'")
-    if now <= steps[0]:
-        return values[0]
-    for i in range(1, len(steps)):
-        if now < steps[i]:
-            t = (now - steps[i - 1]) / (steps[i] - steps[i - 1])
-            start, end = values[i - 1], values[i]
-            if interpolation == "linear":
-                return start + (end - start) * t
-            return math.exp(math.log(start) * (1 - t) + math.log(end) * t)
-    return values[-1]
 
 
 def _is_number(value: Any) -> bool:

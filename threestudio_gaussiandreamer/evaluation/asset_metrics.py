@@ -21,7 +21,7 @@ from ..toybox import recognition
 from ..toybox.kinds import KINDS
 from ..toybox.views import BACKGROUND, SIZE
 from ..toybox.words import attributes_in
-from ..training.initialization import gaussians_on_points
+from ..training.geometry import gaussians_on_points
 from . import t3bench
 from .clip_similarity import Protocol, open_clip, protocol_for, score
 from .image_reward import SOURCES, ImageReward

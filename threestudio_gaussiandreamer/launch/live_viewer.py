@@ -26,7 +26,7 @@ from ..core.options import in_range
 from ..formats.gaussian_files import StoredCloud
 from ..gaussians.gaussians import Gaussians, drawable
 from ..host import info, pl
-from ..training.pictures import score_panels
+from ..training.events import score_panels
 from ..view.live import Controls, LiveView
 from ..view.render import first_pose
 

@@ -13,13 +13,14 @@ As gsplat's ``Strategy``, one object is called around every optimiser step; anot
 
 ``step`` counts finished optimiser steps. The statistics are buffers of the cloud, so that they are
 in its checkpoint. What is cloned and split: ``gaussians/densify.py``; what is dropped to meet a
-budget: ``gaussians/importance.py``; the options: ``density_options.py``.
+budget: ``gaussians/importance.py``; the options: the head of ``geometry.py``.
 """
 
+import inspect
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import Any, NamedTuple, Optional
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, NamedTuple, Optional
 
 import torch
 from jaxtyping import Float
@@ -29,15 +30,15 @@ from ..core.distributed import all_max, all_sum, draw_shared
 from ..core.errors import UserError
 from ..core.host_copies import to_device
 from ..core.methods import require_method
+from ..core.options import at_least, between, in_range, positive
 from ..core.streams import generator
 from ..gaussians import densify, importance
 from ..gaussians.densify import Change, Rules, Statistics
 from ..gaussians.importance import AddedBackground, Need
 from ..host import find, parse_structured, register, run_seed
 from ..splatting import Rasterized
-from .density_options import AUTO, min_count, rounds_of
 
-SET_ROUNDS = "set system.geometry.{}.start, stop and every accordingly"
+AUTO = "auto"
 DECAY = 0.1
 """How much the logits of the opacities fall in each step while ``budget: auto`` prunes, in units of
 their learning rate: a Gaussian that the loss doesn't hold up fades until it can go (after natural
@@ -49,14 +50,67 @@ there on, more Gaussians don't pay."""
 MeanError = Callable[[], Float[Tensor, ""]]
 
 
+@dataclass
+class DensifyConfig:
+    enabled: bool = False
+    start: int = field(default=400, metadata=at_least(0))
+    stop: int = field(default=900, metadata=at_least(0))
+    every: int = field(default=100, metadata=at_least(1))
+    grad_threshold: float = field(default=2e-4, metadata=at_least(0))
+    split_scale: float = field(default=0.04, metadata=positive())
+    min_opacity: float = field(default=0.05, metadata=in_range(0, 1 - 1e-6))
+    max_scale: float = field(default=0.4, metadata=positive("world units"))
+    absgrad: bool = False
+
+    @staticmethod
+    def check(cfg: Any) -> None:
+        if cfg.enabled:
+            require_order(cfg)
+
+
+@dataclass
+class PruneConfig:
+    start: int = field(default=100, metadata=at_least(0))
+    stop: int = field(default=900, metadata=at_least(0))
+    every: int = field(default=50, metadata=at_least(1))
+    keep: float = field(default=0.8, metadata=between(0, 1))
+    gain: float = field(default=0.5, metadata=between(0, 6, "dB"))
+    likeness: float = field(default=40.0, metadata=at_least(0, "dB"))
+    REMOVED: ClassVar[dict[str, Any]] = {
+        "quality": (0.1, "budget=auto goes by prune.gain"),
+        "score": ("removal", "the removal error ranks Gaussians"),
+    }
+
+    @staticmethod
+    def check(cfg: Any) -> None:
+        require_order(cfg)
+
+
+def require_order(cfg: Any) -> None:
+    """Raise UserError unless a schedule of rounds starts before it stops."""
+    if cfg.start >= cfg.stop:
+        raise UserError(f"stop: expected more than start ({cfg.start}), got {cfg.stop}")
+
+
+def min_count(cfg: Any) -> int:
+    """Return how many Gaussians pruning leaves at least under the budget of a geometry."""
+    return max(cfg.min_gaussians, 0 if cfg.budget == AUTO else cfg.budget)
+
+
+def rounds_of(schedule: Any) -> range:
+    """Return the steps at which a schedule with ``start``, ``stop`` and ``every`` has a round: the
+    multiples of ``every``.
+    """
+    first = math.ceil(schedule.start / schedule.every) * schedule.every
+    return range(first, schedule.stop, schedule.every)
+
+
 class DensityOutcome(NamedTuple):
     """What :meth:`DensityControl.after_step` did."""
 
     before: int
     after: int
     """Number of Gaussians after the changes."""
-    replaced: bool
-    """Whether the parameters of the cloud were replaced."""
     needed: Optional[Need]
     """What a round of ``budget: auto`` found; None for any other."""
 
@@ -118,13 +172,7 @@ class DensityRule:
         return f"{count:,} of {start:,} Gaussians" if start else f"{count:,} Gaussians"
 
 
-HOOKS = {
-    "schedule_problem": ("step", "max_steps"),
-    "before_backward": ("pictures", "step", "error"),
-    "after_backward": ("out", "width", "height", "loss_scale"),
-    "after_step": ("optimizer", "step"),
-    "summary": (),
-}
+HOOKS = ("schedule_problem", "before_backward", "after_backward", "after_step", "summary")
 
 
 def density_rule(cloud: Any) -> DensityRule:
@@ -139,7 +187,8 @@ def density_rule(cloud: Any) -> DensityRule:
             f"system.geometry.density_type is {cloud.cfg.density_type!r}: expected a class that is "
             f"derived from {DensityRule.__module__}.DensityRule"
         )
-    for name, arguments in HOOKS.items():
+    for name in HOOKS:
+        _, *arguments = inspect.signature(getattr(DensityRule, name)).parameters
         require_method(rule, name, *arguments)
     return rule(cloud)
 
@@ -180,37 +229,22 @@ class DensityControl(DensityRule):
         do what it is to. Return None if there is no such problem.
         """
         end = max_steps if max_steps > 0 else math.inf
-        problems = (
-            self._limit_problem(step),
-            self._densification_problem(step, end),
-            self._pruning_problem(step, end),
-        )
+        problems = self._densification_problem(step, end), self._pruning_problem(step, end)
         return "; ".join(filter(None, problems)) or None
 
-    def _limit_problem(self, step: int) -> Optional[str]:
-        """Describe a cloud, which can only be a checkpoint's, that stays larger than allowed."""
-        count, limit, densify = (
-            len(self.cloud),
-            self.cloud.cfg.max_gaussians,
-            self.cloud.cfg.densify,
-        )
-        if count <= limit or (densify.enabled and max(rounds_of(densify), default=0) > step):
-            return None
-        return (
-            f"the checkpoint has {count} Gaussians, more than system.geometry.max_gaussians "
-            f"({limit}), which limits only the start and densification: for fewer, set "
-            "system.geometry.budget, or prune the result"
-        )
-
     def _densification_problem(self, step: int, end: float) -> Optional[str]:
-        if not self.cloud.cfg.densify.enabled:
-            return None
-        rounds, count = rounds_of(self.cloud.cfg.densify), len(self.cloud)
-        if not rounds:
-            return f"densification has no round: {SET_ROUNDS.format('densify')}"
-        if late := late_rounds("densification", "densify", rounds, end):
-            return late
-        if rounds[-1] > step and count >= self.cloud.cfg.max_gaussians:
+        cfg, count, most = self.cloud.cfg.densify, len(self.cloud), self.cloud.cfg.max_gaussians
+        rounds = rounds_of(cfg) if cfg.enabled else range(0)
+        left = max(rounds, default=0) > step
+        if count > most and not left:  # of a checkpoint
+            return (
+                f"the checkpoint has {count} Gaussians, more than system.geometry.max_gaussians "
+                f"({most}), which limits only the start and densification: for fewer, set "
+                "system.geometry.budget, or prune the result"
+            )
+        if cfg.enabled and (problem := round_problem("densification", "densify", rounds, end)):
+            return problem
+        if left and count >= most:
             return (
                 f"densification can only replace what it drops: there are {count} Gaussians, the "
                 "most that system.geometry.max_gaussians allows"
@@ -218,13 +252,11 @@ class DensityControl(DensityRule):
         return None
 
     def _pruning_problem(self, step: int, end: float) -> Optional[str]:
-        budget, rounds, count = self.cloud.cfg.budget, self.prune_rounds, len(self.cloud)
+        budget, keep, count = self.cloud.cfg.budget, self.cloud.cfg.prune.keep, len(self.cloud)
         if budget is None:
             return None
-        if not rounds:
-            return f"pruning has no round: {SET_ROUNDS.format('prune')}"
-        if late := late_rounds("pruning", "prune", rounds, end):
-            return late
+        if problem := round_problem("pruning", "prune", rounds := self.prune_rounds, end):
+            return problem
         if budget == AUTO and rounds.step < importance.SAMPLES:
             return (
                 f"budget=auto samples once a step, too rarely in {rounds.step} steps a round: set "
@@ -232,21 +264,17 @@ class DensityControl(DensityRule):
             )
         if budget == AUTO or count <= budget:
             return None
-        return self._shortage([round_ for round_ in rounds if step < round_ <= end])
-
-    def _shortage(self, remaining: list[int]) -> Optional[str]:
-        """Describe why these rounds are too few for the budget; return None if they suffice."""
-        budget, keep, count = self.cloud.cfg.budget, self.cloud.cfg.prune.keep, len(self.cloud)
-        if not remaining:
+        left = [round_ for round_ in rounds if step < round_ <= end]
+        if not left:
             return (
                 f"no round of pruning remains, so {count} Gaussians are kept instead of {budget}: "
-                f"{SET_ROUNDS.format('prune')}"
+                "set system.geometry.prune.start, stop and every accordingly"
             )
-        share = self.kept_share(count, remaining[0])
+        share = self.kept_share(count, left[0])
         if share >= keep - 0.005:  # equal in the two decimals of the message
             return None
         return (
-            f"{len(remaining)} rounds of pruning must reduce {count} Gaussians to {budget}: "
+            f"{len(left)} rounds of pruning must reduce {count} Gaussians to {budget}: "
             f"each keeps {share:.2f} instead of {keep:g}, which loses more quality; use more "
             "rounds (system.geometry.prune.every) or start with fewer"
         )
@@ -273,8 +301,7 @@ class DensityControl(DensityRule):
             mean = max(float(error()), LEAST_ERROR) if error else likely
             pixels = pictures["comp_rgb"].numel()
             self.cloud.error += all_sum(torch.full_like(self.cloud.error, mean * pixels))
-        rng = generator(run_seed(), "removal", step)
-        image = pictures["comp_rgb"]
+        rng, image = generator(run_seed(), "removal", step), pictures["comp_rgb"]
         # Composite over a random background per view, so that Gaussians of the background's colour
         # still have a removal error.
         random = draw_shared(len(image), lambda count: torch.rand(count, 1, 1, 3, generator=rng))
@@ -306,11 +333,10 @@ class DensityControl(DensityRule):
             loss_scale: the factor of automatic mixed precision on the gradients.
         """
         cloud = self.cloud
-        if out.means2d.grad is not None and self.cloud.cfg.densify.enabled:
+        if out.means2d.grad is not None and cloud.cfg.densify.enabled:
             pixels = out.means2d.absgrad if cloud.wants_absgrad else out.means2d.grad
-            cloud.gradient_sum += all_sum(
-                densify.screen_gradients(pixels, width, height, loss_scale).sum(0)
-            )
+            norms = densify.screen_gradients(pixels, width, height, loss_scale)
+            cloud.gradient_sum += all_sum(norms.sum(0))
             cloud.gradient_count += all_sum((out.radii > 0).sum(0))
         torch.maximum(cloud.contribution, all_max(out.contribution.amax(0)), out=cloud.contribution)
 
@@ -323,15 +349,20 @@ class DensityControl(DensityRule):
             optimizer: its parameters and rows of its state are updated with the Gaussians.
             step: number of finished optimiser steps.
         """
-        before, needed = len(self.cloud), None
+        before, change, needed = len(self.cloud), None, None
         if self.cloud.cfg.budget == AUTO and self.pruning_at(step - 1):
             self.decay_opacities(optimizer)
-        change = self._densify(step)
+        if self.cloud.cfg.densify.enabled and step in rounds_of(self.cloud.cfg.densify):
+            change = self.densified(step)
+            self.cloud.gradient_sum.zero_()
+            self.cloud.gradient_count.zero_()
+            if not change.is_new.any() and len(change.parents) == before:
+                change = None
         if self.cloud.cfg.budget is not None and step in self.prune_rounds:
             change, needed = self._prune(step, change)
         if change is not None:
             self.cloud.apply_change(change, optimizer)
-        return DensityOutcome(before, len(self.cloud), change is not None, needed)
+        return DensityOutcome(before, len(self.cloud), needed)
 
     @torch.no_grad()
     def decay_opacities(self, optimizer: torch.optim.Optimizer) -> None:
@@ -340,28 +371,16 @@ class DensityControl(DensityRule):
             if group.get("name") == "logit_opacities":
                 self.cloud.logit_opacities.sub_(DECAY * group["lr"])
 
-    def _densify(self, step: int) -> Optional[Change]:
-        """Return the change by a round of densification at ``step``; None if there is no round or
-        nothing is cloned, split or dropped.
-        """
-        if not self.cloud.cfg.densify.enabled or step not in rounds_of(self.cloud.cfg.densify):
-            return None
-        change = self.densified(step)
-        self.cloud.gradient_sum.zero_()
-        self.cloud.gradient_count.zero_()
-        return change if change.is_new.any() or len(change.parents) < len(self.cloud) else None
-
     def densified(self, step: int) -> Change:
-        """Clone, split and drop Gaussians according to the statistics."""
-        cfg, cloud = self.cloud.cfg.densify, self.cloud
-        rules = Rules(
-            cfg.grad_threshold,
-            cfg.split_scale,
-            cfg.min_opacity,
-            cfg.max_scale,
-            self._cap(),
-            self.cloud.cfg.min_gaussians,
-        )
+        """Clone, split and drop Gaussians according to the statistics. With a budget that is a
+        number there are then at most the larger of it and the current number.
+        """
+        cfg, cloud, budget = self.cloud.cfg.densify, self.cloud, self.cloud.cfg.budget
+        most = cloud.cfg.max_gaussians
+        if budget not in (None, AUTO):
+            most = min(most, max(budget, len(cloud)))
+        sizes = cfg.split_scale, cfg.min_opacity, cfg.max_scale
+        rules = Rules(cfg.grad_threshold, *sizes, most, cloud.cfg.min_gaussians)
         gradient = cloud.gradient_sum / cloud.gradient_count.clamp_min(1)
         return densify.densify_and_prune(
             cloud.parameters_by_name(),
@@ -369,14 +388,6 @@ class DensityControl(DensityRule):
             rules,
             generator(run_seed(), "split", step),
         )
-
-    def _cap(self) -> int:
-        """Return the largest number of Gaussians after densification: ``max_gaussians``, and with a
-        budget that is a number at most the larger of it and the current number.
-        """
-        if self.cloud.cfg.budget in (None, AUTO):
-            return self.cloud.cfg.max_gaussians
-        return min(self.cloud.cfg.max_gaussians, max(self.cloud.cfg.budget, len(self.cloud)))
 
     def _prune(self, step: int, first: Optional[Change]) -> tuple[Change, Optional[Need]]:
         """Prune once towards the budget.
@@ -411,12 +422,13 @@ class DensityControl(DensityRule):
         return f"{super().summary()}: {why.get(budget, f'the budget is {budget}')}"
 
 
-def late_rounds(what: str, option: str, rounds: range, end: float) -> Optional[str]:
-    """Describe how many rounds would come after the last step; return None if none would."""
+def round_problem(what: str, option: str, rounds: range, end: float) -> Optional[str]:
+    """Describe that there are no rounds, or how many would come after the last step."""
     late = sum(round_ > end for round_ in rounds)
-    if not late:
+    if rounds and not late:
         return None
+    found = f"{late} of the {len(rounds)} rounds of {what} would come after step {end}, the last"
     return (
-        f"{late} of the {len(rounds)} rounds of {what} would come after step {end}, the last: "
-        f"{SET_ROUNDS.format(option)}"
+        f"{found if late else f'{what} has no round'}: set system.geometry.{option}.start, stop "
+        "and every accordingly"
     )

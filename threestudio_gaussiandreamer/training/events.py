@@ -1,25 +1,30 @@
-"""Numbers of a step, held-out scores and validation pictures for the run's loggers, such as
-TensorBoard.
+"""What a run logs and shows, in loggers such as TensorBoard: numbers of a step, held-out scores,
+and validation pictures, which are rows in the format of the host's ``save_image_grid``.
 """
 
+import math
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import Any, Optional
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
 from ..core.host_copies import DelayedReads
 from ..core.images import read as read_image
+from ..guidance.base import ScoreDistillation
+from ..guidance.known_truth import truth_of
 from ..host import info
+from .data import GaussianDreamerDataModule
 
 LOGGED_SCORES = ("psnr", "ssim", "multi_face", "floater_mass")
+SCORE_PICTURES = ("imgs_noisy", "imgs_1step", "imgs_final")
+Panel = dict[str, Any]
 
 
 class StepLog:
-    """Logs the numbers of training steps in order. Those of a GPU are logged when they have
-    arrived, so that the host doesn't wait for the GPU; see ``reads``.
-    """
+    """Logs the numbers of training steps in order; those of a GPU when they have arrived."""
 
     def __init__(self) -> None:
         self.reads = DelayedReads()
@@ -29,15 +34,11 @@ class StepLog:
         also for callbacks, and those ``shown`` on the progress bar. Lightning's ``log_dict`` takes
         about a millisecond of processor time for each.
         """
-        on_gpu = {
-            name: value.detach()
-            for name, value in numbers.items()
-            if isinstance(value, Tensor) and value.is_cuda
-        }
+        on_gpu = {k: v.detach() for k, v in numbers.items() if isinstance(v, Tensor) and v.is_cuda}
         known = {name: None if name in on_gpu else float(value) for name, value in numbers.items()}
         late = tuple(on_gpu)  # not the tensors, whose memory is needed
-        epoch = trainer.current_epoch
-        step = trainer.global_step - 1  # as Lightning, which counts these steps from 0
+        # as Lightning, which counts these steps from 0
+        epoch, step = trainer.current_epoch, trainer.global_step - 1
 
         def log(found: Float[Tensor, " N"]) -> None:
             values = known | dict(zip(late, found.tolist(), strict=True))
@@ -69,11 +70,79 @@ def log_scores(
         info(f"{key}: {scores['psnr']:.2f} dB, SSIM {scores['ssim']:.4f} on {views} held-out views")
 
 
-def log_picture(loggers: Iterable[Any], tag: str, path: str, step: int) -> None:
-    """Add the picture at ``path`` to every TensorBoard logger; the others have no pictures, or get
-    them from the host.
+def save_pictures(system: Any, batch: dict[str, Any]) -> None:
+    """Save a row of pictures: the render, its depth and normals, the ground truth if there is one,
+    and the score model's noisy and denoised images.
     """
-    for logger in loggers:
-        add = getattr(logger.experiment, "add_image", None)
-        if add is not None:
-            add(tag, read_image(path), step, dataformats="HWC")
+    out = system(batch)
+    images, truth = _render_panels(out), true_views(system.guidance, batch, out)
+    if truth is not None:
+        images.append(rgb_panel(truth[0]))
+    if isinstance(system.guidance, ScoreDistillation):
+        evaluated = system.guide(out, batch, guidance_eval=True)["eval"]
+        images += score_panels(evaluated, out["comp_rgb"].shape[1:3])
+    view, step = int(batch["index"][0]), system.true_global_step
+    name = f"it{step}-{view}.png"
+    system.save_image_grid(name, images, name="validation_step", step=step)
+    for logger in system.loggers:  # those without pictures get them from the host
+        if add := getattr(logger.experiment, "add_image", None):
+            picture = read_image(system.get_save_path(name))
+            add(f"validation/{view}", picture, step, dataformats="HWC")
+
+
+def _render_panels(out: Mapping[str, Any]) -> list[Panel]:
+    """Arrange colour, depth, normals and alpha of the first view of a render."""
+    depth, alpha = out["depth"][0, ..., 0], out["opacity"][0, ..., 0]
+    visible = depth[alpha > 0.5]
+    near, far = (float(visible.min()), float(visible.max()) + 1e-6) if len(visible) else (0.0, 1.0)
+    panels = [rgb_panel(out["comp_rgb"][0]), _grey_panel(depth, (near, far), "jet")]
+    if "comp_normal" in out:  # own renderers may return none
+        panels.append(rgb_panel(out["comp_normal"][0]))
+    return [*panels, _grey_panel(alpha, (0, 1), None)]
+
+
+def score_panels(evaluated: Mapping[str, Any], size: tuple[int, int]) -> list[Panel]:
+    """Arrange the score model's pictures of the first view: noisy, denoised in one step, and
+    denoised in many; ``evaluated`` is the output of :meth:`.ScoreDistillation.evaluate`.
+
+    Args:
+        size: (height, width) to which they are resized, pixels.
+    """
+    images = [evaluated[name][:1].movedim(-1, 1) for name in SCORE_PICTURES]
+    images = [F.interpolate(x, size, mode="bilinear", align_corners=False) for x in images]
+    return [rgb_panel(image[0].movedim(0, -1).clamp(0, 1)) for image in images]
+
+
+def rgb_panel(image: Float[Tensor, "H W 3"]) -> Panel:
+    return {"type": "rgb", "img": image, "kwargs": {"data_format": "HWC"}}
+
+
+def _grey_panel(image: Float[Tensor, "H W"], data_range: Any, cmap: Any) -> Panel:
+    return {"type": "grayscale", "img": image, "kwargs": {"cmap": cmap, "data_range": data_range}}
+
+
+def true_views(
+    guidance: Any, batch: dict[str, Any], out: Mapping[str, Any]
+) -> Optional[Float[Tensor, "B H W 3"]]:
+    """Render the ground truth of a batch, with the background and size of its renders ``out``; None
+    if ``guidance`` has none.
+    """
+    truth = truth_of(guidance)
+    if truth is None:
+        return None
+    return truth.render(batch, out["comp_rgb_bg"].detach(), size=out["comp_rgb"].shape[1:3])
+
+
+def prefetch_truth(system: Any) -> None:
+    """Announce all cameras of a fixed pool to the ground truth, if the run of ``system`` will use
+    most of them.
+    """
+    truth, trainer = truth_of(system.guidance), system.trainer
+    if truth is None or not isinstance(trainer.datamodule, GaussianDreamerDataModule):
+        return
+    steps = math.inf if trainer.max_steps < 0 else trainer.max_steps - system.global_step
+    views = trainer.datamodule.views_to_prefetch(steps)
+    if views is None:
+        return
+    size = (views[side] // system.renderer.cfg.downsample for side in ("height", "width"))
+    truth.prefetch(views["c2w"].to(system.device), views["fovy"].to(system.device), *size)

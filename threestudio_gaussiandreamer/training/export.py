@@ -1,5 +1,15 @@
-"""Exports of a run: the files of ``exporter_type`` of the cloud as it is, and of the cloud pruned
-to ``system.prune``.
+"""What a run leaves: the files of ``exporter_type`` of the cloud as it is, and of the cloud pruned
+to ``system.prune``; and the files that show it:
+
+==========================  =======================================================================
+file in ``save/``           content
+==========================  =======================================================================
+it<step>-export/view.html   page for browsers: the cloud, and the initial cloud for comparison
+it<step>-export/poster.png  one view with a transparent background
+it<step>-test.mp4           the turntable of the test views
+it<step>-test.webp          fewer frames as an animated picture, for pages that play no video
+prior/gaussians.spz         the initial cloud, before training
+==========================  =======================================================================
 """
 
 import functools
@@ -10,6 +20,8 @@ from pathlib import Path
 from typing import Any, Optional
 
 from ..core.errors import UserError, unknown
+from ..core.files import atomic_file
+from ..core.images import write_animation
 from ..exporters.files import (
     RESERVED,
     BundleExporter,
@@ -18,23 +30,29 @@ from ..exporters.files import (
     outputs_of,
     read_gaussians,
 )
-from ..formats.gaussian_files import StoredCloud, write_cloud
+from ..formats.gaussian_files import StoredCloud, read_cloud, write_cloud
 from ..formats.ply import write_points
 from ..formats.spz import VERSION
+from ..gaussians.axes import VIEWER_UP
 from ..gaussians.point_cloud import PointCloud
 from ..gaussians.surface import Surface
 from ..host import ExporterOutput, find, warn
 from ..meshes.mesh import Mesh
 from ..meshes.write import write_obj, write_textured_mesh
 from ..prune import PruneOptions, prune_to_budget, write_report
-from ..view.render import RenderSettings
-from .pages import prompt_of, write_pages
-from .renderer import SplattingRenderer
+from ..view.page import MAX_GAUSSIANS, PageOptions, Shown, decibels, page
+from ..view.render import WHITE, RenderSettings, first_pose, picture
+from ..view.run_files import RunFiles
+from .background import FlatBackground
 
+FIRST_CLOUD = "prior/gaussians.spz"
+PAGE, POSTER = "view.html", "poster.png"
+POSTER_SIZE = 512
+"""Pixels each way."""
+TURNTABLE_FRAMES, TURNTABLE_SIZE, TURNTABLE_SECONDS = 40, 256, 4.0
+"""Of the animated picture: largest number of frames, longest side in pixels, seconds."""
 SUMMARY = ("held_out/compare.png", "it*-test.*", "it*-export/*.*", "it*-export/pruned/*.*")
 """Files below the folder of results that the last message of a run names."""
-
-
 Spent = Optional[float]
 """PSNR in dB that a cloud has been pruned to."""
 CLOUDS = ("ply", "spz", "gaussians")
@@ -43,16 +61,16 @@ CLOUDS = ("ply", "spz", "gaussians")
 
 class GaussianSavers:
     """The ``save_<save_type>`` that our exporters name, for a system of the host; each writes
-    below the system's folder and returns the path.
+    below the system's folder.
     """
 
-    def save_ply(self, filename: str, stored: StoredCloud, pruned_to: Spent = None) -> str:
-        return self.save_gaussians(filename, stored, ".ply", pruned_to)
+    def save_ply(self, filename: str, stored: StoredCloud, pruned_to: Spent = None) -> None:
+        self.save_gaussians(filename, stored, ".ply", pruned_to)
 
     def save_spz(
         self, filename: str, stored: StoredCloud, pruned_to: Spent = None, version: int = VERSION
-    ) -> str:
-        return self.save_gaussians(filename, stored, ".spz", pruned_to, spz_version=version)
+    ) -> None:
+        self.save_gaussians(filename, stored, ".spz", pruned_to, spz_version=version)
 
     def save_gaussians(
         self,
@@ -61,26 +79,35 @@ class GaussianSavers:
         suffix: str,
         pruned_to: Spent = None,
         **options: Any,
-    ) -> str:
-        path = self.get_save_path(filename)
-        stored = stored._replace(pruned_to=pruned_to, antialiased=drawing(self).antialias)
-        write_cloud(path, stored, suffix, **options)
-        return path
+    ) -> None:
+        antialiased = settings_of(self).antialias
+        stored = stored._replace(pruned_to=pruned_to, antialiased=antialiased)
+        write_cloud(self.get_save_path(filename), stored, suffix, **options)
 
-    def save_points(self, filename: str, cloud: PointCloud) -> str:
-        path = self.get_save_path(filename)
-        write_points(path, cloud)
-        return path
+    def save_points(self, filename: str, cloud: PointCloud) -> None:
+        write_points(self.get_save_path(filename), cloud)
 
-    def save_textured_mesh(self, filename: str, mesh: Mesh, unlit: bool) -> str:
+    def save_textured_mesh(self, filename: str, mesh: Mesh, unlit: bool) -> None:
         path = self.get_save_path(filename)
         write_textured_mesh(path, mesh, unlit=unlit, name=prompt_of(self))
-        return path
 
-    def save_surface(self, filename: str, surface: Surface) -> str:
-        path = self.get_save_path(filename)
-        write_obj(path, surface)
-        return path
+    def save_surface(self, filename: str, surface: Surface) -> None:
+        write_obj(self.get_save_path(filename), surface)
+
+
+def settings_of(system: Any) -> RenderSettings:
+    """Return how a system draws."""
+    bound = system.geometry.cfg.bound_colors
+    return RenderSettings.of(system.renderer.cfg, bound_colors=bound)
+
+
+def prompt_of(system: Any) -> str:
+    """Return the prompt of a training run, else the text in the configuration."""
+    prompt = getattr(system.prompt_utils, "prompt", None)
+    return str(prompt or system.cfg.prompt_processor.get("prompt") or "")
+
+
+# -- exports ---------------------------------------------------------------------------------------
 
 
 def export(system: Any) -> None:
@@ -90,14 +117,10 @@ def export(system: Any) -> None:
     Raises:
         Exception: the first error of one of these, after all others are written.
     """
-    folder = export_folder(system)
-    _call_each(
-        {
-            **writers(system, system.geometry, folder),
-            "the page": lambda: write_pages(system, folder),
-            "system.prune": lambda: export_pruned(system),
-        }
-    )
+    folder = f"it{system.true_global_step}-export"
+    calls = writers(system, system.geometry, folder)
+    calls |= {"the page": lambda: write_pages(system, folder)}
+    _call_each(calls | {"system.prune": lambda: export_pruned(system, f"{folder}/pruned")})
 
 
 def _call_each(calls: Mapping[str, Callable[[], Any]]) -> None:
@@ -116,13 +139,8 @@ def _call_each(calls: Mapping[str, Callable[[], Any]]) -> None:
         raise first
 
 
-def export_folder(system: Any) -> str:
-    """Name the folder of this step's exports, below the folder of results."""
-    return f"it{system.true_global_step}-export"
-
-
 def writers(
-    system: Any, geometry: Any, folder: str, pruned_to: Optional[float] = None
+    system: Any, geometry: Any, folder: str, pruned_to: Spent = None
 ) -> dict[str, Callable[[], None]]:
     """Return a function for each format of the exporter of ``system`` that writes its files of a
     geometry.
@@ -134,31 +152,25 @@ def writers(
     parts = {"geometry": geometry, "material": system.material, "background": system.background}
     exporter = find(system.cfg.exporter_type)(system.cfg.exporter, **parts)
     if isinstance(exporter, (FileExporter, BundleExporter)):
-        exporter.drawing = drawing(system)
+        drawn = settings_of(system)
+        exporter.drawing = Drawing(drawn.eps2d, drawn.antialias)
     single = {system.cfg.exporter_type: lambda: outputs_of(exporter)}
     formats = exporter.by_format() if isinstance(exporter, BundleExporter) else single
-    names: set[str] = set()
+    written: set[str] = set()
 
     def write(outputs: Callable[[], list[ExporterOutput]]) -> None:
         for out in outputs():
-            require_new_name(out.save_name, names)
+            # names that differ only in case are the same on some file systems
+            name = os.path.normpath(out.save_name).casefold()
+            if name in written or Path(name).parts[:1] in [(reserved,) for reserved in RESERVED]:
+                raise UserError(
+                    f"save_name {out.save_name!r}: another file of the export has this name"
+                )
+            written.add(name)
             noted = {"pruned_to": pruned_to} if out.save_type in CLOUDS else {}
             save(system, out, f"{folder}/{out.save_name}", noted)
 
     return {name: functools.partial(write, outputs) for name, outputs in formats.items()}
-
-
-def require_new_name(name: str, names: set[str]) -> None:
-    """Add the name of a file to those of an export.
-
-    Raises:
-        UserError: there is a file of this name, or a run writes one itself. Names that differ only
-            in case count as the same.
-    """
-    key = os.path.normpath(name).casefold()
-    if key in names or Path(key).parts[:1] in [(reserved,) for reserved in RESERVED]:
-        raise UserError(f"save_name {name!r}: another file of the export has this name")
-    names.add(key)
 
 
 def save(system: Any, out: ExporterOutput, path: str, noted: Mapping[str, Any]) -> None:
@@ -181,48 +193,115 @@ def save(system: Any, out: ExporterOutput, path: str, noted: Mapping[str, Any]) 
     write(path, **params)
 
 
-def export_pruned(system: Any) -> None:
-    """Write the same files of the cloud pruned to ``system.prune``, if it is given, into the
-    folder ``pruned`` beside them, with the prune command's report.
+def export_pruned(system: Any, folder: str) -> None:
+    """Write the same files of the cloud pruned to ``system.prune``, if it is given, into ``folder``
+    with the prune command's report. Dilation and antialiasing are the renderer's unless given.
     """
-    options = prune_options(system)
+    options, drawn = PruneOptions(**vars(system.cfg.prune)), settings_of(system)
     if not options.asked_for:
         return
-    folder, suffix = f"{export_folder(system)}/pruned", _suffix(system.cfg)
-    result = prune_to_budget(
-        StoredCloud(read_gaussians(system.geometry)), options, suffix, "system.prune."
-    )
-    geometry = find(system.cfg.geometry_type)(system.cfg.geometry)
+    if options.eps2d is None:
+        options.eps2d = drawn.eps2d
+    if options.antialias is None:
+        options.antialias = drawn.antialias
+    # a budget in bytes is that of the SPZ file where it is exported
+    cfg = system.cfg
+    spz = cfg.exporter_type == "spz-exporter" or "spz" in cfg.exporter.get("formats", ())
+    suffix = ".spz" if spz else ".ply"
+    cloud = StoredCloud(read_gaussians(system.geometry))
+    result = prune_to_budget(cloud, options, suffix, "system.prune.")
+    geometry = find(cfg.geometry_type)(cfg.geometry)
     geometry.set_arrays(**result.after.gaussians._asdict())
     _call_each(writers(system, geometry, folder, result.after.pruned_to))
     write_report(system.get_save_path(f"{folder}/report"), result, suffix, options)
 
 
-def prune_options(system: Any) -> PruneOptions:
-    """Return ``system.prune``, with the dilation and antialiasing of our renderer unless given."""
-    options, drawn = PruneOptions(**vars(system.cfg.prune)), drawing(system)
-    if options.eps2d is None:
-        options.eps2d = drawn.eps2d
-    if options.antialias is None:
-        options.antialias = drawn.antialias
-    return options
-
-
-def drawing(system: Any) -> Drawing:
-    """Return how a system draws; with another renderer than ours, as most viewers do."""
-    renderer = getattr(system, "renderer", None)
-    if not isinstance(renderer, SplattingRenderer):
-        return Drawing()
-    settings = RenderSettings.of(renderer.cfg, bound_colors=True)
-    return Drawing(settings.eps2d, settings.antialias)
-
-
-def _suffix(cfg: Any) -> str:
-    """Return the format that a budget in bytes holds for: SPZ where it is exported."""
-    spz = cfg.exporter_type == "spz-exporter" or "spz" in cfg.exporter.get("formats", ())
-    return ".spz" if spz else ".ply"
-
-
 def exported_files(folder: Path) -> list[str]:
     """List the results below ``folder`` that a user wants to open."""
     return [str(path) for pattern in SUMMARY for path in sorted(folder.glob(pattern))]
+
+
+# -- pages and turntables --------------------------------------------------------------------------
+
+
+def save_first_cloud(system: Any) -> None:
+    """Keep the cloud that training starts with, so that pages can show it beside the result."""
+    if system.cfg.pages and system.trainer.is_global_zero:
+        first = StoredCloud(read_gaussians(system.geometry))
+        write_cloud(system.get_save_path(FIRST_CLOUD), first, ".spz")
+
+
+def write_pages(system: Any, folder: str) -> None:
+    """Write the page and the poster of the cloud of ``system`` into the folder of the exports,
+    unless ``system.pages`` is off or a page can't show it.
+    """
+    if not system.cfg.pages:
+        return
+    run, settings = RunFiles(Path(system.get_save_dir()).parent), settings_of(system)
+    options = PageOptions(
+        title=prompt_of(system) or run.folder.name,
+        name="gaussians",
+        settings=settings,
+        background=_background(system.background),
+        keep_background=run.background_is_given,
+    )
+    cloud = StoredCloud(read_gaussians(system.geometry)).in_axes(VIEWER_UP)
+    cloud = cloud._replace(antialiased=settings.antialias)
+    result = Shown(cloud, "result", decibels(run.psnr("result", system.true_global_step)))
+    try:
+        content = page(result, options, _first_cloud(run))
+    except UserError as error:
+        warn(f"no {PAGE} is written: {error}")
+        return
+    with atomic_file(system.get_save_path(f"{folder}/{PAGE}")) as file:
+        file.write(content.encode())
+    with atomic_file(system.get_save_path(f"{folder}/{POSTER}"), durable=False) as file:
+        picture(cloud, settings, first_pose(cloud), POSTER_SIZE).save(file, "png")
+
+
+def _background(background: Any) -> tuple[float, float, float]:
+    """Return the colour that test views are shown on; white for backgrounds that aren't flat."""
+    if not FlatBackground.is_flat(background):
+        return WHITE
+    learned = background.cfg.mode == "learned"
+    return tuple(background.color(1)[0].tolist() if learned else background.cfg.color)
+
+
+def _first_cloud(run: RunFiles) -> Optional[Shown]:
+    """Return the cloud that training has started with, if it is there and a page can show it."""
+    path = run.save / FIRST_CLOUD
+    if not path.is_file():
+        return None
+    cloud = read_cloud(str(path))
+    shown = 0 < len(cloud.gaussians.means) <= MAX_GAUSSIANS
+    return Shown(cloud, "prior", decibels(run.psnr("prior"))) if shown else None
+
+
+def turntable_name(system: Any) -> str:
+    """Return the name of the folder of test pictures, and of the video without its suffix."""
+    return f"it{system.true_global_step}-test"
+
+
+def discard_turntable(system: Any) -> None:
+    """Remove the pictures of an earlier test of the same step, which may have had more views."""
+    for path in Path(system.get_save_dir(), turntable_name(system)).glob("*.png"):
+        path.unlink(missing_ok=True)  # another test may remove them too
+
+
+def write_turntable(system: Any) -> None:
+    """Write the pictures ``it<step>-test/<number>.png`` as a video, and fewer of them as WebP.
+
+    A video that can't be written is a warning, since the exports follow.
+    """
+    name = turntable_name(system)
+    options = {"save_format": "mp4", "fps": 30, "name": "test", "step": system.true_global_step}
+    try:
+        system.save_img_sequence(name, name, r"(\d+)\.png", **options)
+    except UserError as error:
+        warn(str(error))
+    folder = Path(system.get_save_dir(), name)
+    # every n-th frame, with n rounded up, so that at most TURNTABLE_FRAMES are left
+    frames = sorted(folder.glob("*.png"), key=lambda path: int(path.stem))
+    chosen = frames[:: -(-len(frames) // TURNTABLE_FRAMES) or 1]
+    if chosen and system.cfg.pages:
+        write_animation(folder.with_suffix(".webp"), chosen, TURNTABLE_SIZE, TURNTABLE_SECONDS)

@@ -5,9 +5,8 @@ Adam's moments stay NaN once they are, and the rasteriser skips Gaussians with N
 check such a run would end without an error, and with holes in the object.
 """
 
-from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
-from typing import Any, Optional
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -24,34 +23,14 @@ LIMITS = {"means": 1e9, "log_scales": 30.0, "sh0": 1e9, "sh_rest": 1e9}
 """Magnitudes from which on a cloud is lost, although its numbers are finite: no camera sees that
 far, and scales of e^30 are far beyond the e^10 that is drawn at most."""
 
-Named = Iterable[tuple[str, Tensor]]
-
-
-class RecentLosses:
-    """The losses of the steps since the last check, read only if parameters aren't finite."""
-
-    def __init__(self) -> None:
-        self._steps: deque[tuple[int, dict[str, Tensor]]] = deque(maxlen=CHECK_EVERY)
-
-    def add(self, step: int, losses: Mapping[str, Tensor]) -> None:
-        self._steps.append((step, {name: loss.detach() for name, loss in losses.items()}))
-
-    def first_bad(self) -> str:
-        """Return which loss was NaN or infinite first, for a message; empty if none was."""
-        for step, losses in self._steps:
-            for name, loss in losses.items():
-                if not loss.isfinite().all():
-                    return f", after the weighted loss_{name} was {loss.item()} in step {step}"
-        return ""
-
 
 class NonFiniteParameters(UserError):
     """Training produced NaN or infinity."""
 
 
 def optimizer_tensors(optimizer: torch.optim.Optimizer) -> Iterator[tuple[str, Tensor]]:
-    """Yield every parameter of an optimiser with the name of its group, and every state tensor with
-    its own, such as ``means.exp_avg``.
+    """Yield every parameter of an optimiser with its group's name, and every tensor of its state
+    with its own, such as ``means.exp_avg``.
     """
     for group in optimizer.param_groups:
         name = group.get("name", "parameters")
@@ -62,36 +41,43 @@ def optimizer_tensors(optimizer: torch.optim.Optimizer) -> Iterator[tuple[str, T
                     yield f"{name}.{key}", value
 
 
-def training_tensors(
-    module: torch.nn.Module, optimizers: Iterable[torch.optim.Optimizer]
-) -> Iterator[tuple[str, Tensor]]:
-    """Yield every parameter of a module, and the tensors of its optimisers, with their names."""
-    yield from module.named_parameters()
-    for optimizer in optimizers:
-        yield from optimizer_tensors(optimizer)
-
-
 @torch.no_grad()
-def require_finite(tensors: Named, step: int, losses: Optional[RecentLosses] = None) -> None:
+def require_finite(
+    tensors: Iterable[tuple[str, Tensor]],
+    step: int,
+    losses: Iterable[tuple[int, Mapping[str, Tensor]]] = (),
+) -> None:
     """Check that no tensor, of any shape, contains NaN, infinity or, of a cloud, numbers beyond
     ``LIMITS``; synchronises with the device once.
+
+    Args:
+        losses: the weighted losses of the steps since the last check, read only for the message.
 
     Raises:
         NonFiniteParameters: the message has the name of the first tensor that isn't finite, the
             number of its bad values, and the loss that may be the cause.
     """
-    named = [(name, values) for name, values in tensors if values.numel()]
-    ranges = [torch.stack(values.aminmax()) for _, values in named]
-    fits = [_fits(name, found).all() for (name, _), found in zip(named, ranges, strict=True)]
-    if not fits or torch.stack([found.to(fits[0].device) for found in fits]).all():
+    named = [
+        (name, values, LIMITS.get(name.rpartition(".")[2], torch.finfo(values.dtype).max))
+        for name, values in tensors
+        if values.numel()
+    ]
+    fits = [(torch.stack(values.aminmax()).abs() <= limit).all() for _, values, limit in named]
+    if not fits or torch.stack([fit.to(fits[0].device) for fit in fits]).all():
         return
-    name, values = next(pair for pair, fit in zip(named, fits, strict=True) if not fit)
+    name, values, limit = named[[bool(fit) for fit in fits].index(False)]
     bad, what = ~values.isfinite(), "NaN or infinite"
     if not bad.any():
-        bad, what = ~_fits(name, values), f"beyond {LIMITS[name.rpartition('.')[2]]:g}"
+        bad, what = values.abs() > limit, f"beyond {limit:g}"
+    causes = (
+        f", after the weighted loss_{loss} was {value.item()} in step {number}"
+        for number, of_step in losses
+        for loss, value in of_step.items()
+        if not value.isfinite().all()
+    )
     raise NonFiniteParameters(
         f"step {step}: {int(bad.sum())} of the {values.numel()} numbers of {name} "
-        f"are {what}{losses.first_bad() if losses else ''}: the run stops, and nothing of "
+        f"are {what}{next(causes, '')}: the run stops, and nothing of "
         "this state is saved or exported. "
         "Usual causes are a guidance that returns NaN, an optimiser without a positive eps "
         "(system.optimizer.args), weights of losses that overflow float32 (system.loss), too "
@@ -116,12 +102,6 @@ def require_optimised(
             )
 
 
-def _fits(name: str, values: Tensor) -> Tensor:
-    """Return where the values of a tensor are finite and within its limit; NaN is in no range."""
-    limit = LIMITS.get(name.rpartition(".")[2], torch.finfo(values.dtype).max)
-    return values.abs() <= limit
-
-
 def warn_if_invisible(opacity: Float[Tensor, "B H W 1"], step: int) -> None:
     """Warn if all renders of the first step are empty: it then trains no Gaussian."""
     if step == 0 and not all_max(opacity.detach().amax()):
@@ -139,19 +119,14 @@ class LossScale:
     def __init__(self) -> None:
         self.skipped_steps = 0
 
-    @property
-    def numbers(self) -> dict[str, float]:
-        """Return what is logged."""
-        return {"train/skipped_steps": self.skipped_steps}
-
     def value(self, trainer: Any) -> float:
         """Return the current factor on the gradients; 1 without mixed precision."""
         scaler = getattr(trainer.precision_plugin, "scaler", None)
         return 1.0 if scaler is None else float(scaler.get_scale())
 
     def has_skipped(self, trainer: Any, before: float) -> bool:
-        """Return whether the step that began with the scale ``before`` was skipped; if so, count
-        and report it.
+        """Return whether the step that began with the scale ``before`` was skipped, with a
+        warning.
         """
         if self.value(trainer) >= before:
             return False

@@ -43,12 +43,14 @@ keep_attributes     with gaussians-prior: start from all attributes of that clou
 ==================  ================================================================================
 """
 
+import contextlib
 import logging
+import math
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, List
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
@@ -56,20 +58,36 @@ from torch import Tensor, nn
 from ..core.errors import UserError
 from ..core.host_copies import DelayedReads
 from ..core.lazy_mapping import LazyMapping
+from ..core.memory import count_of
 from ..core.methods import require_method
-from ..core.options import at_least, between, in_range, one_of, positive, schedule
+from ..core.options import (
+    at_least,
+    between,
+    in_range,
+    interval,
+    is_whole,
+    one_of,
+    positive,
+    schedule,
+    shown,
+)
 from ..core.schedule import parse_schedule
+from ..core.streams import numpy_generator
 from ..gaussians import densify, sh
 from ..gaussians.densify import LOG_SCALE_RANGE, PARAMETERS, Change
-from ..gaussians.grow import SCALE_RULES
+from ..gaussians.gaussians import Gaussians
+from ..gaussians.grow import SCALE_RULES, grow, nearest_distance_scales
 from ..gaussians.merge import merge_duplicates
 from ..gaussians.point_cloud import PointCloud
+from ..gaussians.simplify import keep_best, view_importance
 from ..gaussians.stored_state import SHAPES, require_cloud
-from ..host import BaseGeometry, C, find, register, warn
-from .density_options import DensifyConfig, PruneConfig, as_budget, check_budget, min_count
-from .initialization import GrowConfig, gaussians_on_points, grow_points, most_visible
+from ..gaussians.views import views_around
+from ..host import BaseGeometry, C, find, register, run_seed, warn
+from .density import AUTO, DensifyConfig, PruneConfig, min_count
 
 logger = logging.getLogger(__name__)
+CAP_VIEWS = (32, 256)
+"""Views that rank the Gaussians of a trained cloud that is too large, and their pixels each way."""
 STATISTICS = ("gradient_sum", "gradient_count", "contribution", "removal")
 AUTO_STATE = {"error": 0.0, "gain": -1.0, "started_with": 0.0}
 """Numbers of a run and their first values: squared error of the views in which ``removal`` was
@@ -84,6 +102,16 @@ LEARNING_RATES = {
     "sh0": "lr_sh",
     "sh_rest": "lr_sh_rest",
 }
+
+
+@dataclass
+class GrowConfig:
+    enabled: bool = True
+    num_candidates: int = field(default=1_000_000, metadata=count_of("candidates", 0, 48))
+    radius: float = field(default=0.01, metadata=positive(most=100))
+    color_range: List[float] = field(default_factory=lambda: [0.0, 0.2], metadata=interval())
+    clamp: bool = True
+    max_points: int = field(default=400_000, metadata=at_least(0))
 
 
 @register("gaussiandreamer-cloud")
@@ -115,7 +143,14 @@ class GaussianCloud(BaseGeometry):
         density: dict = field(default_factory=dict)
 
         def __post_init__(self) -> None:
-            self.budget = as_budget(self.budget)
+            if isinstance(self.budget, str):
+                self.budget = self.budget.lower()
+                with contextlib.suppress(ValueError):
+                    self.budget = float(self.budget)  # 5e3 is text to PyYAML
+            if isinstance(self.budget, float) and self.budget.is_integer():
+                self.budget = int(self.budget)
+            if self.budget == "none":
+                self.budget = None
 
         @staticmethod
         def check(cfg: Any) -> None:
@@ -129,7 +164,12 @@ class GaussianCloud(BaseGeometry):
                     f"max_gaussians: expected min_gaussians ({cfg.min_gaussians}) or more, got "
                     f"{cfg.max_gaussians}"
                 )
-            check_budget(cfg)
+            number = is_whole(cfg.budget) and cfg.budget >= cfg.min_gaussians
+            if not (number or cfg.budget in (None, AUTO)):
+                raise UserError(
+                    "budget: expected none, auto or a number from min_gaussians "
+                    f"({cfg.min_gaussians}) on, got {shown(cfg.budget)}"
+                )
 
     cfg: Config
     SECTION = "system.geometry."
@@ -156,19 +196,10 @@ class GaussianCloud(BaseGeometry):
                 "system.geometry.prior, or resume and weights must name a checkpoint of one"
             )
 
-    def _shapes(self, n: int) -> dict[str, tuple[int, ...]]:
-        harmonics = {"sh0": (n, 1, 3), "sh_rest": (n, self.bands - 1, 3)}
-        return {
-            "means": (n, 3),
-            "log_scales": (n, 3),
-            "quats": (n, 4),
-            "logit_opacities": (n,),
-            **harmonics,
-        }
-
     def _allocate(self, n: int, device: torch.device | str = "cpu") -> None:
-        for name, shape in self._shapes(n).items():
-            setattr(self, name, nn.Parameter(torch.zeros(shape, device=device)))
+        for name, shape in SHAPES.items():
+            shape = (self.bands - 1 if side < 0 else side for side in shape)
+            setattr(self, name, nn.Parameter(torch.zeros(n, *shape, device=device)))
         for name in STATISTICS:
             self.register_buffer(name, torch.zeros(n, device=device))
         for name, start in AUTO_STATE.items():
@@ -179,11 +210,10 @@ class GaussianCloud(BaseGeometry):
     ) -> None:
         """Take the size from the checkpoint before its tensors are copied in."""
         means = state_dict.get(prefix + "means")
-        if (
-            isinstance(means, Tensor) and means.dim() and len(means) != len(self)
-        ):  # otherwise torch reports the invalid entry
+        # otherwise torch reports the invalid entry
+        if isinstance(means, Tensor) and means.dim() and len(means) != len(self):
             self._allocate(len(means), self.means.device)
-        if prefix + "means" in state_dict:
+        if means is not None:
             if len(self):
                 require_cloud(state_dict, {name: prefix + name for name in SHAPES}, "the state")
             # older checkpoints have none of these
@@ -198,13 +228,7 @@ class GaussianCloud(BaseGeometry):
         """Compute standard deviations along the axes, world units; clamped where exp would over- or
         underflow float32.
         """
-        logs, (low, high) = self.log_scales, LOG_SCALE_RANGE
-        # on a CPU looking is faster than the gradient of a clamp; on a GPU it would wait for it
-        if logs.device.type == "cpu" and logs.numel():
-            least, most = torch.aminmax(logs.detach())
-            if low <= least.item() and most.item() <= high:
-                return logs.exp()
-        return logs.clamp(low, high).exp()
+        return self.log_scales.clamp(*LOG_SCALE_RANGE).exp()
 
     def opacities(self) -> Float[Tensor, " N"]:
         return torch.sigmoid(self.logit_opacities)
@@ -230,18 +254,15 @@ class GaussianCloud(BaseGeometry):
         if self.bands == 1:
             colors = sh.sh0_to_rgb(self.sh0.squeeze(1))
         else:
-            dirs = torch.nn.functional.normalize(
-                self.means.detach()[None] - camera_positions[:, None], dim=-1
-            )
+            dirs = self.means.detach()[None] - camera_positions[:, None]
+            dirs = nn.functional.normalize(dirs, dim=-1)
             colors = sh.sh_to_unclamped_colors(self.sh, dirs)
         return sh.bounded_colors(colors) if self.cfg.bound_colors else colors.clamp_min(0.0)
 
     @torch.no_grad()
     def clamp_colors(self) -> None:
-        """Clamp the constant band to colours in [0, 1], unless ``bound_colors`` is off.
-
-        Called after each step of the optimiser, so that what is stored and exported is in the
-        range too. The bands above it add to this colour by direction and aren't changed.
+        """Clamp the constant band to colours in [0, 1], unless ``bound_colors`` is off: after each
+        step of the optimiser, so that what is stored and exported is in the range too.
         """
         if self.cfg.bound_colors:
             self.sh0.clamp_(*(sh.rgb_to_sh0(bound) for bound in (0.0, 1.0)))
@@ -267,8 +288,14 @@ class GaussianCloud(BaseGeometry):
         prior = self.prior()
         if self.cfg.keep_attributes and hasattr(prior, "gaussians"):
             arrays = prior.gaussians(prompt)
-            trained = most_visible(arrays.tensors(), self.cfg.max_gaussians, self.means.device)
-            self.warn_of_dropped_bands(trained.sh)
+            trained = self._most_visible(arrays.tensors())
+            if trained.sh[:, self.bands :].any():
+                logger.warning(
+                    "the prior's colours depend on the view, with spherical harmonics of degree "
+                    "%d: system.geometry.sh_degree=%d drops the bands above; set it to %d to keep "
+                    "them",
+                    trained.sh_degree, self.cfg.sh_degree, trained.sh_degree,
+                )  # fmt: skip
             self.set_arrays(**trained._asdict())
             cloud = prior.cloud(arrays)
         else:
@@ -281,25 +308,23 @@ class GaussianCloud(BaseGeometry):
         self.started_with.fill_(start)
         return cloud
 
-    def warn_of_dropped_bands(self, sh: Any) -> None:
-        """Warn if spherical harmonics have colours by direction that ``sh_degree`` leaves out."""
-        if torch.as_tensor(sh)[:, self.bands :].any():
-            degree = round(sh.shape[1] ** 0.5) - 1
-            logger.warning(
-                "the prior's colours depend on the view, with spherical harmonics of degree %d: "
-                "system.geometry.sh_degree=%d drops the bands above; set it to %d to keep them",
-                degree, self.cfg.sh_degree, degree,
-            )  # fmt: skip
+    def _most_visible(self, cloud: Gaussians) -> Gaussians:
+        """Select at most ``max_gaussians`` of a trained cloud: those with the largest contribution
+        to views from all around.
+        """
+        count, most = len(cloud.means), self.cfg.max_gaussians
+        if count <= most:
+            return cloud
+        said = "the prior has %d Gaussians; keeping the %d that contribute most (max_gaussians)"
+        logger.warning(said, count, most)
+        cloud = cloud.tensors(self.means.device)
+        return keep_best(cloud, view_importance(cloud, views_around(cloud, *CAP_VIEWS)), most)
 
     def merge_duplicates(self) -> None:
         """Merge groups of near-identical Gaussians, until the budget is met or none are left."""
         merged = merge_duplicates(self.parameters_by_name(), at_least=min_count(self.cfg)).values
-        if len(merged["means"]) < len(self):
-            logger.info(
-                "%d of %d Gaussians are duplicates of others: merged",
-                len(self) - len(merged["means"]),
-                len(self),
-            )
+        if fewer := len(self) - len(merged["means"]):
+            logger.info("%d of %d Gaussians are duplicates of others: merged", fewer, len(self))
             self.set_arrays(sh=torch.cat([merged.pop("sh0"), merged.pop("sh_rest")], 1), **merged)
 
     def start_from(self, cloud: PointCloud) -> None:
@@ -326,24 +351,20 @@ class GaussianCloud(BaseGeometry):
         """Warn once if some Gaussians have scales at the bounds of ``LOG_SCALE_RANGE``; on a GPU
         when it is known, see ``reads``.
         """
-        if not self._warned:
-            low, high = LOG_SCALE_RANGE
-            clamped = ((self.log_scales < low) | (self.log_scales > high)).any(-1)
-            self.reads.submit(clamped, self._warn)
+        low, high = LOG_SCALE_RANGE
 
-    def _warn(self, clamped: Bool[Tensor, " N"]) -> None:
-        """Warn of the Gaussians whose sizes are clamped, unless there has been a warning."""
-        if self._warned or not clamped.any():
-            return
-        self._warned = True
-        logger.warning(
-            "%d of %d Gaussians are drawn at e^%g or e^%g, the bounds of their sizes; the first is "
-            "number %d",
-            clamped.sum(),
-            len(clamped),
-            *LOG_SCALE_RANGE,
-            clamped.nonzero()[0],
-        )
+        def tell(clamped: Bool[Tensor, " N"]) -> None:
+            if not self._warned and clamped.any():
+                self._warned = True
+                first = clamped.nonzero()[0]
+                logger.warning(
+                    "%d of %d Gaussians are drawn at e^%g or e^%g, the bounds of their sizes; the "
+                    "first is number %d", clamped.sum(), len(clamped), low, high, first,
+                )  # fmt: skip
+
+        if not self._warned:
+            clamped = ((self.log_scales < low) | (self.log_scales > high)).any(-1)
+            self.reads.submit(clamped, tell)
 
     def parameters_by_name(self) -> dict[str, nn.Parameter]:
         return {name: getattr(self, name) for name in PARAMETERS}
@@ -354,10 +375,9 @@ class GaussianCloud(BaseGeometry):
         """Return one optimiser group per attribute, named after it; the rates are set every step by
         :meth:`set_learning_rates`.
         """
-        named = self.parameters_by_name().items()
         return [
             {"params": [parameter], "name": name, "lr": 0.0}
-            for name, parameter in named
+            for name, parameter in self.parameters_by_name().items()
             if parameter.numel() or name != "sh_rest"
         ]
 
@@ -366,7 +386,7 @@ class GaussianCloud(BaseGeometry):
             if group.get("name") in LEARNING_RATES:
                 group["lr"] = C(getattr(self.cfg, LEARNING_RATES[group["name"]]), epoch, step)
 
-    @contextmanager
+    @contextlib.contextmanager
     def steps_by_size(self) -> Iterator[None]:
         """Let a step of the optimiser see the means in the unit ``size``, if that is the unit of
         their rate: as u with mean + R diag(scales) u, which starts at zero.
@@ -423,3 +443,47 @@ class GaussianCloud(BaseGeometry):
                 raise UserError(
                     f"the change of the cloud has {name} of shape {found}; expected {expected}"
                 )
+
+
+def grow_points(cloud: PointCloud, cfg: GrowConfig, ground: int = 0) -> PointCloud:
+    """Grow points and perturb their colours (the paper's Algorithm 1), within ``max_points``.
+
+    Args:
+        ground: how many points at the end of ``cloud`` are a prior's ground: they neither grow
+            nor count for the box, and stay at the end.
+    """
+    if not cfg.enabled:
+        return cloud
+    if ground:
+        figure, layer = cloud.split(len(cloud.points) - ground)
+        return grow_points(figure, cfg).followed_by(layer)
+    options = {k: v for k, v in vars(cfg).items() if k not in ("enabled", "color_range")}
+    rng = numpy_generator(run_seed(), "grow")
+    return grow(cloud, color_range=tuple(cfg.color_range), **options, generator=rng)
+
+
+def gaussians_on_points(cloud: PointCloud, cfg: Any) -> Gaussians:
+    """Make one Gaussian of each point: its colour, opacity ``init_opacity``, an isotropic scale
+    from the nearest distances.
+
+    Args:
+        cfg: the geometry's, for ``scale_rule``, ``scale_factor``, ``init_opacity`` and
+            ``max_gaussians``. Of more points a uniform choice is kept: all have the same opacity,
+            so that selecting by contribution to renders would prefer outer ones and leave holes.
+    """
+    points, colors, most = cloud.points, cloud.colors, cfg.max_gaussians
+    if len(points) > most:
+        said = "the prior and its growth give %d points; keeping %d, evenly (max_gaussians)"
+        logger.warning(said, len(points), most)
+        rng = numpy_generator(run_seed(), "cap")
+        rows = np.sort(rng.choice(len(points), most, replace=False))
+        points, colors = points[rows], colors[rows]
+    scales = nearest_distance_scales(points, cfg.scale_rule) * cfg.scale_factor
+    colors = torch.from_numpy(np.ascontiguousarray(colors, np.float32))
+    return Gaussians(
+        means=points,
+        quats=np.tile(np.float32([1, 0, 0, 0]), (len(points), 1)),
+        log_scales=np.repeat(np.log(scales)[:, None], 3, 1),
+        logit_opacities=np.full(len(points), math.log(cfg.init_opacity / (1 - cfg.init_opacity))),
+        sh=sh.rgb_to_sh0(colors).numpy()[:, None],
+    )

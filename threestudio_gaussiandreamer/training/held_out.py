@@ -6,7 +6,6 @@ show another side of the object (multi-face); fraction of the opacity far from t
 mass); fraction of pixels with a colour outside [0, 1] (out of gamut); mean saturation of the
 colours relative to the ground truth's."""
 
-import json
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -30,6 +29,7 @@ from ..core.memory import require_memory
 from ..core.options import at_least, in_range
 from ..meshes.mesh import SurfaceDistance
 from ..meshes.raycast import over_background
+from ..view.run_files import read_json
 from .data import MAX_SIDE, orbit_batch
 from .renderer import require_outputs
 
@@ -94,27 +94,21 @@ class HeldOut:
 
     @torch.no_grad()
     def render(self, renderer: Any, chunk: int = 4) -> tuple[Tensor, Tensor]:
-        """Render the held-out views.
-
-        Returns:
-            unclamped pictures (V, H, W, 3) and their background colours (V, 3), on the CPU.
+        """Render the held-out views; return unclamped pictures (V, H, W, 3) and their background
+        colours (V, 3), on the CPU.
         """
         modes = [(module, module.training) for module in (renderer, renderer.background)]
         for module, _ in modes:
             module.eval()
-        images, backgrounds = [], []
+        images, backgrounds, side = [], [], self.cfg.size * renderer.cfg.downsample
         for start in range(0, self.cfg.views, chunk):
             part = self.orbit.rows(slice(start, start + chunk))
-            side = self.cfg.size * renderer.cfg.downsample
             out = require_outputs(renderer, renderer(**orbit_batch(part, side, side)))
             images.append(out["comp_rgb"].cpu())
             backgrounds.append(out["comp_rgb_bg"].cpu().mean((1, 2)))
         for module, training in modes:
             module.train(training)
         return torch.cat(images), torch.cat(backgrounds)
-
-    def truth_on(self, backgrounds: Float[Tensor, "V 3"]) -> Float[Tensor, "V H W 3"]:
-        return over_background(self.truth, backgrounds[:, None, None])
 
     def multi_face(
         self, images: Float[Tensor, "V H W 3"], backgrounds: Float[Tensor, "V 3"]
@@ -142,12 +136,10 @@ CLOCKS = ("seconds", "cpu_seconds")
 
 
 class Snapshot(NamedTuple):
-    """The held-out views of a cloud at one step, and what else its scores need."""
+    """The held-out views of a cloud at one step, not clamped, and what else its scores need."""
 
-    step: int
-    elapsed: dict[str, float]
+    known: dict[str, float]
     images: Float[Tensor, "V H W 3"]
-    """Unclamped."""
     backgrounds: Float[Tensor, "V 3"]
     means: Float[Tensor, "N 3"]
     opacities: Float[Tensor, " N"]
@@ -160,7 +152,7 @@ class Measurements:
     def __init__(self, held_out: HeldOut, folder: Path) -> None:
         self.held_out, self.folder = held_out, folder
         self.path = folder / "metrics.json"
-        self.values: dict[str, Any] = _read_scores(self.path)
+        self.values: dict[str, Any] = read_json(self.path, dict)
         self.seconds = np.array([self.values.get(name, 0.0) for name in CLOCKS], np.float64)
         self._started: Optional[np.ndarray] = None
         self._postponed: dict[str, Snapshot] = {}
@@ -181,11 +173,9 @@ class Measurements:
         """Exclude the time in this context from the training time."""
         running = self._started is not None
         self.stop_clock()
-        try:
-            yield
-        finally:
-            if running:
-                self.start_clock()
+        yield
+        if running:
+            self.start_clock()
 
     @torch.no_grad()
     def score(self, key: str, renderer: Any, step: int) -> dict[str, dict[str, Any]]:
@@ -217,13 +207,14 @@ class Measurements:
         cloud = renderer.geometry
         images, backgrounds = self.held_out.render(renderer)
         means, opacities = cloud.means.detach().clone(), cloud.opacities().detach().clone()
-        return Snapshot(step, self._elapsed(), images, backgrounds, means, opacities)
+        known = {"step": step, **self._elapsed(), "gaussians": len(means)}
+        return Snapshot(known, images, backgrounds, means, opacities)
 
     def _score(self, key: str, cloud: Snapshot) -> dict[str, Any]:
         images, held_out = cloud.images.clamp(0, 1), self.held_out
-        truth = held_out.truth_on(cloud.backgrounds)
+        truth = over_background(held_out.truth, cloud.backgrounds[:, None, None])
         relative = metrics.saturation(images) / max(metrics.saturation(truth), 1e-6)
-        scores = {"step": cloud.step, **cloud.elapsed, "gaussians": len(cloud.means)} | {
+        scores = cloud.known | {
             "psnr": round(float(metrics.psnr(images, truth).mean()), 3),
             "ssim": round(float(metrics.ssim(images, truth).mean()), 4),
             "multi_face": round(held_out.multi_face(images, cloud.backgrounds), 4),
@@ -240,9 +231,7 @@ class Measurements:
         return scores
 
     def _elapsed(self) -> dict[str, float]:
-        return {
-            name: round(float(value), 3) for name, value in zip(CLOCKS, self.seconds, strict=True)
-        }
+        return dict(zip(CLOCKS, self.seconds.round(3).tolist(), strict=True))
 
     def write(self) -> None:
         self.values |= self._elapsed()
@@ -256,9 +245,8 @@ class Measurements:
         """
         folder = self.folder / "held_out"
         folder.mkdir(parents=True, exist_ok=True)
-        rows = {key: _row(renders), "truth": _row(truth)}
-        for name, row in rows.items():
-            write_image(folder / f"{name}.png", row)
+        for name, images in ((key, renders), ("truth", truth)):
+            write_image(folder / f"{name}.png", _row(images))
         pictures = []
         for path in (folder / f"{name}.png" for name in ("prior", "result", "truth")):
             with suppress(UserError):  # an earlier run's picture is missing or damaged
@@ -270,8 +258,7 @@ class Measurements:
         """Format a table of the main scores of prior and result."""
         lines = ["              dB     SSIM   multi-face   Gaussians   seconds"]
         for key in ("prior", "result"):
-            if key in self.values:
-                v = self.values[key]
+            if v := self.values.get(key):
                 face = f"{100 * v['multi_face']:.0f} %"
                 lines.append(
                     f"{key:<10}{v['psnr']:6.2f}   {v['ssim']:6.4f}   {face:>10}   "
@@ -282,15 +269,6 @@ class Measurements:
 
 def _now() -> np.ndarray:
     return np.array([time.perf_counter(), time.process_time()])
-
-
-def _read_scores(path: Path) -> dict[str, Any]:
-    """Read what an earlier run has stored; empty if the file is missing or damaged."""
-    try:
-        values = json.loads(path.read_bytes()) if path.is_file() else {}
-    except (OSError, ValueError, RecursionError):
-        return {}
-    return values if isinstance(values, dict) else {}
 
 
 def _row(images: Float[Tensor, "V H W 3"], count: int = 6) -> np.ndarray:

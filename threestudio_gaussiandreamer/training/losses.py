@@ -12,10 +12,9 @@ All are means over pixels, whereas score distillation is a sum over latents: rai
 proportion to height x width.
 """
 
-import functools
 import inspect
 from collections import ChainMap
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Optional
 
 import torch
@@ -25,9 +24,14 @@ from torch import Tensor
 from ..core.errors import UserError, unknown
 from ..core.schedule import Schedule, parse_schedule
 from ..guidance.base import ScoreDistillation
-from ..host import find, names, register, warn
+from ..host import find, names, register
 
 SUFFIX = "-regulariser"
+
+
+def regularisers() -> dict[str, Callable[[Mapping[str, Any]], Tensor]]:
+    """Return the registered regularisers by the names of their losses."""
+    return {name.removesuffix(SUFFIX): find(name) for name in names() if name.endswith(SUFFIX)}
 
 
 def weighted_losses(
@@ -46,54 +50,49 @@ def weighted_losses(
         found = ", ".join(guided) or "nothing"
         raise UserError(f"the guidance returned no loss_*, such as loss_sds: it returned {found}")
     check_weights(weights, raw)
-    raw |= {name: _of_renders(name, out) for name in REGULARISERS if weights.get(name)}
+    raw |= {k: _of_renders(k, call, out) for k, call in regularisers().items() if weights.get(k)}
     return {name: value * weights[name] for name, value in raw.items()}
 
 
 class _Outputs(ChainMap):
     """What a regulariser sees, computed when it is read; what is missing is named."""
 
-    def __init__(self, reader: str, out: Any) -> None:
-        super().__init__(out)
-        self.reader = reader
-
     def __missing__(self, name: str) -> None:
-        raise unknown(f"output that {self.reader}{SUFFIX} reads:", name, self)
+        raise unknown(f"output that {self.reader} reads:", name, self)
 
 
-def _of_renders(name: str, out: Mapping[str, Any]) -> Float[Tensor, ""]:
+def _of_renders(name: str, call: Any, out: Mapping[str, Any]) -> Float[Tensor, ""]:
     """Return a regulariser of a step's outputs.
 
     Raises:
-        UserError: it reads an output that there isn't, or doesn't return one number with a
+        UserError: it reads an output that there isn't, or doesn't return one finite number with a
             gradient.
     """
-    value = REGULARISERS[name](_Outputs(name, out))
+    seen, name = _Outputs(out), name + SUFFIX
+    seen.reader = name
+    value = call(seen)
     if not isinstance(value, Tensor) or value.numel() != 1 or not value.requires_grad:
         found = type(value).__name__
         if isinstance(value, Tensor):
             found = f"a tensor of shape {tuple(value.shape)}"
             found += "" if value.requires_grad else " without a gradient"
         raise UserError(
-            f"{name}{SUFFIX} returned {found}; expected one number that is computed from the "
-            "renders or the cloud, as from .mean()"
+            f"{name} returned {found}; expected one number that is computed from the renders or "
+            "the cloud, as from .mean()"
         )
     # on a GPU, looking would wait for it: there finite.py names it at its next check
     if value.device.type == "cpu" and not value.isfinite():
-        raise UserError(f"{name}{SUFFIX} returned {value.item()}: expected a finite number")
+        raise UserError(f"{name} returned {value.item()}: expected a finite number")
     return value.reshape(())
 
 
 def total(losses: Mapping[str, Tensor], guidance: str) -> Float[Tensor, ""]:
-    """Return the sum of the weighted losses.
-
-    Args:
-        guidance: its name, for the message.
+    """Return the sum of the weighted losses of a guidance and the regularisers.
 
     Raises:
-        UserError: the sum has no gradient.
+        UserError: one that isn't a plain 0 has no gradient.
     """
-    loss = functools.reduce(torch.add, losses.values())
+    loss = sum(losses.values())
     # a plain 0 is a loss that is switched off; only one without a gradient has to be looked at
     constant = [name for name, value in losses.items() if not value.requires_grad and value != 0]
     if constant or not loss.requires_grad:
@@ -124,17 +123,16 @@ def weight_schedules(options: Mapping[str, Any]) -> dict[str, Schedule]:
 
 
 def loggable(guided: Mapping[str, Any], losses: Mapping[str, Tensor]) -> dict[str, Any]:
-    """Return the names and values to log: the scalars of a guidance that aren't losses (guidances
-    also return pictures and latents) nor ``error_to_truth``, and the weighted losses.
+    """Return the names and values to log: the scalars of a guidance (which also returns pictures
+    and latents) but ``error_to_truth``, and the weighted losses instead of its own.
     """
+    weighted = {f"loss_{name}": value.detach() for name, value in losses.items()}
     scalars = {
         name: value
         for name, value in guided.items()
-        if not name.startswith("loss_")
-        and name != "error_to_truth"
+        if not (name.startswith("loss_") or name == "error_to_truth")
         and (isinstance(value, (int, float)) or isinstance(value, Tensor) and value.numel() == 1)
     }
-    weighted = {f"loss_{name}": value.detach() for name, value in losses.items()}
     return {f"train/{name}": value for name, value in (scalars | weighted).items()}
 
 
@@ -151,12 +149,12 @@ def logged_names(guidance: type, options: Iterable[str]) -> Optional[set[str]]:
 
 
 def check_losses(guidance: type, options: Mapping[str, Any]) -> None:
-    """Check the keys of ``system.loss``, if the class of the guidance declares its losses.
+    """Check the keys of ``system.loss``, and if the class of the guidance declares its losses, that
+    they fit those: see :func:`check_weights`.
 
     Raises:
-        UserError: a key isn't ``lambda_*``, no weight is other than 0, a regulariser isn't a
-            function of one argument, the losses are declared by a string, or see
-            :func:`check_weights`.
+        UserError: a key isn't ``lambda_*``, every weight is 0, a regulariser isn't a function of
+            one argument, or the losses are declared by a string.
     """
     for name in options:
         if not name.startswith("lambda_"):
@@ -164,13 +162,13 @@ def check_losses(guidance: type, options: Mapping[str, Any]) -> None:
                 f"unknown key 'system.loss.{name}': weights of losses are called "
                 "lambda_<loss>, such as lambda_sds"
             )
-    if options and all(map(_is_none_or_zero, options.values())):
+    if options and not any(options.values()):
         raise UserError(
             "system.loss: every weight is 0, so that nothing would be trained: give one, such as "
             "system.loss.lambda_sds=1"
         )
-    for name, function in REGULARISERS.items():
-        if not _is_none_or_zero(options.get(f"lambda_{name}")):
+    for name, function in regularisers().items():
+        if options.get(f"lambda_{name}"):
             _require_function(name + SUFFIX, function)
     known = getattr(guidance, "LOSSES", None)  # also of guidances that aren't ScoreDistillation
     if isinstance(known, str):
@@ -181,24 +179,22 @@ def check_losses(guidance: type, options: Mapping[str, Any]) -> None:
 
 def check_weights(weights: Mapping[str, Any], losses: Iterable[str]) -> None:
     """Check that every weight belongs to a loss or a regulariser, and that every loss has a weight.
-
-    A weight of 0 or None without a loss is accepted: this is how an overlay removes the weight of
-    an earlier file.
+    A weight of 0 or None without a loss is how an overlay removes that of an earlier file.
 
     Raises:
         UserError: a weight or a loss has no counterpart, or a loss has a regulariser's name.
     """
+    ours = regularisers()
     for name, weight in weights.items():
-        if name not in losses and name not in REGULARISERS and not _is_none_or_zero(weight):
-            known = [f"lambda_{n}" for n in (*losses, *REGULARISERS)]
+        if name not in losses and name not in ours and weight:
+            known = [f"lambda_{n}" for n in (*losses, *ours)]
             error = unknown("weight system.loss.lambda_*", f"lambda_{name}", known)
-            way_out = (
-                f"to leave it out: system.loss.lambda_{name}=0; a regulariser of your own is a "
-                f"function below @register({name + SUFFIX!r})"
+            raise UserError(
+                f"{str(error).removesuffix('.')} (to leave it out: system.loss.lambda_{name}=0; a "
+                f"regulariser of your own is a function below @register({name + SUFFIX!r}))"
             )
-            raise UserError(f"{str(error).removesuffix('.')} ({way_out})")
     for name in losses:
-        if name in REGULARISERS:
+        if name in ours:
             raise UserError(
                 f"{name}{SUFFIX} has the name of the guidance's loss_{name}; choose another one"
             )
@@ -209,18 +205,13 @@ def check_weights(weights: Mapping[str, Any], losses: Iterable[str]) -> None:
             )
 
 
-def _is_none_or_zero(weight: Any) -> bool:
-    return weight is None or isinstance(weight, (int, float)) and weight == 0
-
-
 def foreign_weights(options: Iterable[str], guidance: Any) -> list[str]:
     """Return the keys of ``system.loss`` that belong to neither a regulariser nor a loss that the
     class of the guidance declares as ``LOSSES``; an empty list if it declares none.
     """
-    losses = getattr(guidance, "LOSSES", None)
-    if losses is None:
+    if (losses := getattr(guidance, "LOSSES", None)) is None:
         return []
-    known = {f"lambda_{name}" for name in (*losses, *REGULARISERS)}
+    known = {f"lambda_{name}" for name in (*losses, *regularisers())}
     return [key for key in options if key.startswith("lambda_") and key not in known]
 
 
@@ -256,26 +247,3 @@ def total_variation(out: Mapping[str, Any]) -> Float[Tensor, ""]:
     """Return the mean absolute difference of vertical neighbours plus that of horizontal ones."""
     differences = out["comp_rgb"].diff(dim=1), out["comp_rgb"].diff(dim=2)
     return sum(found.abs().sum() / max(found.numel(), 1) for found in differences)
-
-
-class _Regularisers(Mapping[str, Callable[[Mapping[str, Any]], Tensor]]):
-    """The registered regularisers by the names of their losses."""
-
-    def __getitem__(self, name: str) -> Callable[[Mapping[str, Any]], Tensor]:
-        if name + SUFFIX not in names():
-            raise KeyError(name)
-        return find(name + SUFFIX)
-
-    def __setitem__(self, name: str, function: Callable[[Mapping[str, Any]], Tensor]) -> None:
-        """Register a function, as was documented once."""
-        warn(f"REGULARISERS[{name!r}] = ...: write @register({name + SUFFIX!r}) above the function")
-        register(name + SUFFIX)(function)
-
-    def __iter__(self) -> Iterator[str]:
-        return (name.removesuffix(SUFFIX) for name in names() if name.endswith(SUFFIX))
-
-    def __len__(self) -> int:
-        return len(list(iter(self)))
-
-
-REGULARISERS = _Regularisers()

@@ -27,43 +27,27 @@ RATE = schedule(min=0)
 
 def make_optimizer(options: Any, groups: Groups) -> torch.optim.Optimizer:
     """Build the optimiser over parameter groups that bring their own learning rates."""
-    name = options.get("name", "Adam")
-    foreign, arguments = foreign_arguments(name, DEFAULTS), options.get("args") or {}
+    name, given = options.get("name", "Adam"), options.get("args") or {}
+    foreign = foreign_arguments(name, DEFAULTS)
     ours = {key: value for key, value in DEFAULTS.items() if key not in foreign}
-    given = {
-        key: tuple(value) if is_list(value) else value
-        for key, value in arguments.items()
-        if value is not None
-    }
-    return getattr(torch.optim, name)(groups, lr=0.0, **ours | given)
-
-
-def drop_gradients(optimizer: torch.optim.Optimizer) -> None:
-    """Set all gradients to None, in a fifth of the time of ``zero_grad``, which records the call
-    for torch's profiler.
-    """
-    for group in optimizer.param_groups:
-        for parameter in group["params"]:
-            parameter.grad = None
+    given = ours | {key: value for key, value in given.items() if value is not None}
+    given = {key: tuple(value) if is_list(value) else value for key, value in given.items()}
+    return getattr(torch.optim, name)(groups, lr=0.0, **given)
 
 
 def restore_arguments(optimizer: torch.optim.Optimizer) -> None:
     """Set the numbers of this configuration, such as betas and weight decay, in all groups; a
     checkpoint has restored those of its run. Learning rates are set in each step.
     """
-    numbers = {
-        name: value
-        for name, value in optimizer.defaults.items()
-        if isinstance(value, (int, float, list, tuple)) and not isinstance(value, bool)
-    }
-    numbers.pop("lr", None)
+    kinds = int, float, list, tuple
+    numbers = {k: v for k, v in optimizer.defaults.items() if isinstance(v, kinds) and k != "lr"}
     for group in optimizer.param_groups:
-        group.update(numbers)
+        group.update({k: v for k, v in numbers.items() if not isinstance(v, bool)})
 
 
 def accepted_arguments(name: str) -> dict[str, Any]:
-    """Return the arguments of an optimiser of ``torch.optim`` with their defaults, without those
-    that the system gives; empty if there is no such optimiser.
+    """Return the defaults of an optimiser's arguments, without those that the system gives; empty
+    if ``torch.optim`` has no such optimiser.
     """
     kind = getattr(torch.optim, str(name), None)
     parameters = inspect.signature(kind).parameters if isinstance(kind, type) else {}
@@ -98,41 +82,29 @@ def check_optimizer(options: Any, scheduler: Any = None) -> None:
     name, arguments = options.get("name", "Adam"), options.get("args") or {}
     if not isinstance(getattr(torch.optim, str(name), None), type):
         known = [name for name, value in vars(torch.optim).items() if isinstance(value, type)]
-        working = [known_name for known_name in known if _works({"name": known_name})]
+        working = [known_name for known_name in known if not _refusal({"name": known_name})]
         raise unknown("system.optimizer.name", name, working)
     if not isinstance(arguments, Mapping):
         raise UserError(f"optimizer.args: expected keys and values, got {arguments!r}")
-    try:
-        _try_step(options)
-    except Exception as error:  # of many types
+    if error := _refusal(options):
         accepted = accepted_arguments(name)
         wrong = [unknown("argument", key, accepted) for key in arguments if key not in accepted]
-        refused = [
-            f".args.{key}"
-            for key, value in arguments.items()
-            if not _works({"name": name, "args": {key: value}})
-        ]
-        raise UserError(
-            f"optimizer{refused[0] if refused and not wrong else ''}: {name} doesn't accept this: "
-            f"{wrong[0] if wrong else str(error).splitlines()[0]}"
-        ) from error
+        refused = [k for k, v in arguments.items() if _refusal({"name": name, "args": {k: v}})]
+        where = f".args.{refused[0]}" if refused and not wrong else ""
+        said = str(wrong[0] if wrong else error).splitlines()[0]
+        raise UserError(f"optimizer{where}: {name} doesn't accept this: {said}") from error
 
 
-def _works(options: Mapping[str, Any]) -> bool:
-    """Return whether an optimiser of ``torch.optim`` can train the parts with these options."""
+def _refusal(options: Mapping[str, Any]) -> Optional[Exception]:
+    """Make the optimiser of some parameters, and a step; return the error if it can't be done."""
     try:
-        _try_step(options)
-    except Exception:  # of many types
-        return False
-    return True
-
-
-def _try_step(options: Mapping[str, Any]) -> None:
-    """Make the optimiser of some parameters, and a step."""
-    optimizer = make_optimizer(options, [_some_group(), _some_group()])
-    arguments = options.get("args") or {}
-    if not (arguments.get("capturable") and get_device().type == "cuda"):
-        optimizer.step()  # on the CPU, which would refuse what a GPU takes
+        optimizer = make_optimizer(options, [_some_group(), _some_group()])
+        capturable = (options.get("args") or {}).get("capturable")
+        if not (capturable and get_device().type == "cuda"):
+            optimizer.step()  # on the CPU, which would refuse what a GPU takes
+    except Exception as error:  # of many types
+        return error
+    return None
 
 
 def _check_rates(params: Any) -> None:
@@ -163,10 +135,18 @@ class PartRates:
         """Return the groups of our background, and of other packages' parts that have parameters.
 
         Raises:
-            UserError: such a part has no learning rate, or there is a rate without such a part; or
-                the geometry has parameters in none of its own groups.
+            UserError: such a part has no learning rate, there is a rate without such a part, or a
+                class that is derived from our geometry has parameters in none of its groups.
         """
-        _require_groups(system.geometry)
+        geometry = system.geometry
+        for name, parameter in _without_group(geometry, geometry.parameter_groups()).items():
+            if parameter.numel():
+                kind = type(geometry).__name__
+                raise UserError(
+                    f"{kind} has the parameter {name} without a learning rate: define "
+                    f"{kind}.parameter_groups, which adds {{'params': [...], 'name': {name!r}, "
+                    "'lr': ...} to those of super()"
+                )
         return [group for name in PARTS for group in self._groups_of(name, getattr(system, name))]
 
     def _groups_of(self, name: str, part: Optional[torch.nn.Module]) -> Groups:
@@ -202,18 +182,6 @@ def _without_group(part: torch.nn.Module, groups: Groups) -> dict[str, torch.nn.
         for name, parameter in part.named_parameters()
         if parameter.requires_grad and id(parameter) not in grouped
     }
-
-
-def _require_groups(geometry: Any) -> None:
-    """Check that each parameter of a class that is derived from our geometry would be trained."""
-    kind = type(geometry).__name__
-    for name, parameter in _without_group(geometry, geometry.parameter_groups()).items():
-        if parameter.numel():
-            raise UserError(
-                f"{kind} has the parameter {name} without a learning rate: define "
-                f"{kind}.parameter_groups, which adds {{'params': [...], 'name': {name!r}, "
-                "'lr': ...} to those of super()"
-            )
 
 
 def _some_group() -> dict[str, Any]:

@@ -15,8 +15,9 @@ downsample  1, or 2: return the 2x2 box of the rendered size (the paper renders 
 ==========  ========================================================================================
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import torch
@@ -37,18 +38,13 @@ from .background import FlatBackground
 
 
 def check_backend(option: str, name: str) -> None:
-    """Raise UserError unless the backend exists and runs here; ``auto`` always finds one.
-
-    Args:
-        option: the path of the option, for the message.
-    """
+    """Raise UserError, which names the option's path, unless the backend exists and runs here."""
     if name == "auto":
         return
     reasons = available_backends()
     if name not in reasons:
         raise unknown(option, name, ["auto", *reasons])
-    reason = reasons[name] or refusal(name, get_device())
-    if reason is not None:
+    if reason := reasons[name] or refusal(name, get_device()):
         raise UserError(
             f"{option}: {name} can't be used here: {reason} (auto takes the fastest that can)"
         )
@@ -114,8 +110,7 @@ class SplattingRenderer(Rasterizer):
             ``comp_rgb`` (B, H, W, 3), ``opacity`` and ``depth`` (B, H, W, 1), ``comp_normal``
             (B, H, W, 3) in [0, 1], ``comp_rgb_bg``, the background, (B, 1, 1, 3) or (B, H, W, 3),
             ``rasterized`` for density control, and ``gaussian_opacities`` (N,), which the removal
-            error is differentiated by. ``depth`` and ``comp_normal`` are computed when they are
-            first read.
+            error is differentiated by. Depth and normals are computed when they are first read.
         """
         cloud, device = self.geometry, self.geometry.means.device
         c2w, fovy = c2w.to(device, torch.float32), fovy.to(device, torch.float32)
@@ -132,15 +127,16 @@ class SplattingRenderer(Rasterizer):
                 **{name: getattr(self.cfg, name) for name in DRAWING},
                 absgrad=self.training and getattr(cloud, "wants_absgrad", False),
             )
-            image, background = out.image, color[:, None, None] if flat else None
-            if not flat:
+            if flat:
+                image, background = out.image, color[:, None, None]
+            else:
                 image, background = self._composite(out, c2w, fovy, batch)
+        records = torch.is_grad_enabled()
 
-        def depth() -> Tensor:
-            return out.depth / out.alpha.clamp_min(1e-6)
-
-        def normals() -> Tensor:
-            return normals_from_depth(depth(), out.alpha, c2w, fovy)
+        def surface(normals: bool) -> Tensor:
+            with torch.set_grad_enabled(records), without_autocast(device.type):
+                depth = out.depth / out.alpha.clamp_min(1e-6)
+                return normals_from_depth(depth, out.alpha, c2w, fovy) if normals else depth
 
         pictures = {
             "comp_rgb": image,
@@ -149,8 +145,8 @@ class SplattingRenderer(Rasterizer):
             "rasterized": out,
             "gaussian_opacities": opacities,
         }
-        later = {"depth": depth, "comp_normal": normals}
-        return LazyMapping(pictures, {k: postponed(call, device.type) for k, call in later.items()})
+        later = {"depth": partial(surface, False), "comp_normal": partial(surface, True)}
+        return LazyMapping(pictures, later)
 
     def _composite(
         self, out: Rasterized, c2w: Tensor, fovy: Tensor, batch: dict[str, Any]
@@ -160,32 +156,16 @@ class SplattingRenderer(Rasterizer):
         rays = batch.get("rays_d")
         if rays is None or rays.shape[1:3] != (height, width):
             rays = cameras.ray_directions(c2w, fovy, height, width)
-        background = self.background(rays.to(out.image))
-        if not isinstance(background, Tensor):
-            raise UserError(
-                f"{type(self.background).__name__} returned {type(background).__name__}; expected "
-                f"a tensor of colours {tuple(out.image.shape)}"
-            )
-        if background.shape != out.image.shape:
-            raise UserError(
-                f"{type(self.background).__name__} returned colours {tuple(background.shape)} for "
-                f"directions {tuple(rays.shape)}; expected {tuple(out.image.shape)}"
-            )
+        background, wanted = self.background(rays.to(out.image)), tuple(out.image.shape)
+        name, found = type(self.background).__name__, type(background).__name__
+        if isinstance(background, Tensor):
+            found = f"a tensor {tuple(background.shape)}"
+        if getattr(background, "shape", None) != wanted:
+            raise UserError(f"{name} returned {found}; expected a tensor of colours {wanted}")
         # on a GPU, looking would wait for it
         if background.device.type == "cpu" and not background.isfinite().all():
-            raise UserError(f"{type(self.background).__name__} returned colours that aren't finite")
+            raise UserError(f"{name} returned colours that aren't finite")
         return out.image + (1 - out.alpha) * background, background
-
-
-def postponed(compute: Callable[[], Tensor], device: str) -> Callable[[], Tensor]:
-    """Return a function that records gradients if they are recorded now, without autocast."""
-    records = torch.is_grad_enabled()
-
-    def computed() -> Tensor:
-        with torch.set_grad_enabled(records), without_autocast(device):
-            return compute()
-
-    return computed
 
 
 def normals_from_depth(

@@ -22,13 +22,13 @@ prune          options of a second, pruned export. Its budget is one of count; b
                (dB that may be lost against the ground truth); auto (dB: twice as many would gain
                less). quality, size and steps are as in
                the prune command; eps2d and antialias by default the renderer's
-pages          write a page that shows the cloud in a browser, and more: see ``pages.py``
+pages          write a page that shows the cloud in a browser, and more: see ``export.py``
 =============  =====================================================================================
 """
 
 import contextlib
-from collections import ChainMap
-from collections.abc import Mapping
+from collections import ChainMap, deque
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Optional
@@ -39,6 +39,7 @@ from torch import Tensor
 from ..core.distributed import average_gradients, from_first, rank
 from ..core.errors import UserError
 from ..core.host_copies import flush_reads
+from ..core.methods import require_class_method
 from ..gaussians.stored_state import SHAPES, require_cloud
 from ..guidance.external import (
     call_guidance,
@@ -48,20 +49,37 @@ from ..guidance.external import (
     trainable_groups,
 )
 from ..guidance.known_truth import truth_of
-from ..host import BaseLift3DSystem, C, find, info, register, validate_schedule, warn
+from ..host import (
+    BaseLift3DSystem,
+    C,
+    find,
+    info,
+    parse_structured,
+    register,
+    validate_schedule,
+    warn,
+)
 from ..metrics import psnr_of_error
+from ..priors.base import preflight_prior
 from ..priors.cache import cached_cloud
 from ..prune import PruneOptions
 from .density import DensityOutcome, MeanError, density_rule
-from .events import StepLog, log_scores
-from .export import GaussianSavers, export, exported_files
+from .events import StepLog, log_scores, prefetch_truth, rgb_panel, save_pictures, true_views
+from .export import (
+    GaussianSavers,
+    discard_turntable,
+    export,
+    exported_files,
+    save_first_cloud,
+    turntable_name,
+    write_turntable,
+)
 from .finite import (
     CHECK_EVERY,
     LossScale,
-    RecentLosses,
+    optimizer_tensors,
     require_finite,
     require_optimised,
-    training_tensors,
     warn_if_invisible,
 )
 from .held_out import EvaluationConfig, HeldOut, Measurements
@@ -74,15 +92,14 @@ from .losses import (
     weight_schedules,
     weighted_losses,
 )
-from .optimizer import PartRates, check_optimizer, drop_gradients, make_optimizer, restore_arguments
-from .pages import discard_turntable, save_first_cloud, turntable_name, write_turntable
-from .pictures import prefetch_truth, rgb_panel, save_pictures, true_views
-from .preflight import check_parts, preflight_parts
+from .optimizer import PartRates, check_optimizer, make_optimizer, restore_arguments
 from .renderer import require_outputs
 
 Outputs, Batch, Losses = Mapping[str, Any], dict[str, Any], dict[str, Tensor]
 GUIDANCE_LR = 1e-4
 """Learning rate of parameters that a guidance trains itself, such as the LoRA of VSD."""
+OURS = {"geometry": "gaussiandreamer-cloud", "renderer": "gaussiandreamer-splatting"}
+"""Parts whose methods, options or outputs the system uses beyond those of the host's."""
 
 
 @register("gaussiandreamer-system")
@@ -114,20 +131,13 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
 
     @staticmethod
     def logged(cfg: Any) -> Optional[set[str]]:
-        """Return the names that a run of this configuration logs, for ``checkpoint.monitor``; None
-        if the class of its guidance doesn't declare them.
-        """
+        """Return the names that a run logs, for ``checkpoint.monitor``; None if unknown."""
         return logged_names(find(cfg.guidance_type), cfg.loss)
 
     @staticmethod
     def check_checkpoint(checkpoint: dict[str, Any], what: str) -> None:
-        """Check a checkpoint before any object is built from it; called by the launcher.
-
-        Args:
-            what: the file, for messages.
-
-        Raises:
-            UserError: the cloud is empty, or tensors of the cloud or the guidance are malformed.
+        """Raise UserError if the cloud of a checkpoint is empty or malformed; called by the
+        launcher before any object is built from the file ``what``.
         """
         if "geometry.means" in checkpoint["state_dict"]:
             names = {name: f"geometry.{name}" for name in SHAPES}
@@ -143,21 +153,18 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         self.automatic_optimization = False
         self.__dict__["guidance"] = self.measurements = self.prompt_utils = None
         self.loss_scale = LossScale()
-        self.step_log, self.recent_losses = StepLog(), RecentLosses()
+        self.step_log = StepLog()
+        self.recent_losses: deque[tuple[int, Losses]] = deque(maxlen=CHECK_EVERY)
         self._learnt: Optional[dict[str, Tensor]] = None
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         of_parts = self.part_rates.groups(self)
-        self.preflight()
+        preflight_parts(self.geometry, self.cfg)
         self.prepare_guidance()
         self.ensure_cloud()
         of_guidance = trainable_groups(self.guidance, GUIDANCE_LR)
         groups = self.geometry.parameter_groups() + of_parts + of_guidance
         return make_optimizer(self.cfg.optimizer, groups)
-
-    def preflight(self) -> None:
-        """Check what prior, prompts and guidance need, such as files, before loading models."""
-        preflight_parts(self.geometry, self.cfg)
 
     def prepare_guidance(self) -> None:
         """Build prompt processor and guidance. Called before the prior runs, so that missing
@@ -188,7 +195,9 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
     def require_finite(self) -> None:
         """Check parameters and optimiser state; see :mod:`.finite`."""
         require_optimised(self.geometry, self.trainer.optimizers)
-        tensors = training_tensors(self, self.trainer.optimizers)
+        tensors = list(self.named_parameters())
+        for optimizer in self.trainer.optimizers:
+            tensors += optimizer_tensors(optimizer)
         require_finite(tensors, self.true_global_step, self.recent_losses)
 
     def ensure_cloud(self) -> None:
@@ -211,17 +220,11 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         )
         return {name: value.cpu() for name, value in self.geometry.state_dict().items()}
 
-    @property
-    def writes_results(self) -> bool:
-        """Whether this process renders, scores and exports results: only the first one does."""
-        return rank() == 0
-
     def on_fit_start(self) -> None:
         super().on_fit_start()
-        truth = truth_of(self.guidance)
-        measures = self.writes_results and self._save_dir is not None
-        if measures and truth is not None and truth.mesh is not None:
-            held_out = HeldOut(self.cfg.evaluation, truth.mesh)
+        mesh = getattr(truth_of(self.guidance), "mesh", None)
+        if mesh is not None and self._save_dir is not None and not rank():
+            held_out = HeldOut(self.cfg.evaluation, mesh)
             self.measurements = Measurements(held_out, Path(self._save_dir))
 
     def on_train_start(self) -> None:
@@ -268,10 +271,11 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
             optimizer.step()
         self.geometry.clamp_colors()
         if self.loss_scale.has_skipped(self.trainer, loss_scale):
-            self.step_log.write(self.trainer, self.loss_scale.numbers)
+            skipped = {"train/skipped_steps": self.loss_scale.skipped_steps}
+            self.step_log.write(self.trainer, skipped)
         if self.global_step % CHECK_EVERY == 0:
             self.require_finite()
-        drop_gradients(optimizer)
+        optimizer.zero_grad()
 
     def control_density(self, optimizer: torch.optim.Optimizer) -> None:
         """Densify and prune on schedule; log what a round of ``budget: auto`` found."""
@@ -279,10 +283,8 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         # optimiser in Lightning's wrapper.
         outcome = self.density.after_step(optimizer.optimizer, self.global_step)
         if not isinstance(outcome, DensityOutcome | None):
-            raise UserError(
-                f"{type(self.density).__name__}.after_step returned {type(outcome).__name__}; "
-                "expected None or a DensityOutcome"
-            )
+            found = f"{type(self.density).__name__}.after_step returned {type(outcome).__name__}"
+            raise UserError(f"{found}; expected None or a DensityOutcome")
         if outcome and outcome.needed and outcome.needed.gain >= 0:
             self.step_log.write(self.trainer, {"prune/gain": outcome.needed.gain})
             info(f"step {self.global_step}: {outcome}")
@@ -310,7 +312,8 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         now = self.true_current_epoch, self.true_global_step
         weights = {name: C(weight, *now) for name, weight in self.loss_weights.items()}
         losses = weighted_losses(guided, ChainMap(out, self.geometry.drawn()), weights)
-        self.recent_losses.add(self.global_step, losses)
+        detached = {name: loss.detach() for name, loss in losses.items()}
+        self.recent_losses.append((self.global_step, detached))
         return losses
 
     def guide(self, out: Outputs, batch: Batch, **options: Any) -> dict[str, Any]:
@@ -372,7 +375,7 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
     # -- pictures ----------------------------------------------------------------------------------
 
     def validation_step(self, batch: dict[str, Any], batch_idx: int) -> None:
-        if not self.writes_results:
+        if rank():  # only the first process renders, scores and exports results
             return
         with self.measurements.paused_clock() if self.measurements else contextlib.nullcontext():
             save_pictures(self, batch)
@@ -381,17 +384,16 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         pass
 
     def test_step(self, batch: dict[str, Any], batch_idx: int) -> None:
-        if not self.writes_results:
-            return
-        name = f"{turntable_name(self)}/{int(batch['index'][0])}.png"
-        panels = [rgb_panel(self(batch)["comp_rgb"][0])]
-        self.save_image_grid(name, panels, name="test_step", step=self.true_global_step)
+        if not rank():
+            name = f"{turntable_name(self)}/{int(batch['index'][0])}.png"
+            panels = [rgb_panel(self(batch)["comp_rgb"][0])]
+            self.save_image_grid(name, panels, name="test_step", step=self.true_global_step)
 
     def on_test_epoch_end(self) -> None:
-        if self.writes_results:
+        if not rank():
             write_turntable(self)
-        if self.writes_results and self.guidance is not None:
-            export(self)
+            if self.guidance is not None:
+                export(self)
 
     def on_validation_start(self) -> None:
         self.ensure_cloud()
@@ -399,17 +401,66 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
 
     def on_test_start(self) -> None:
         self.on_validation_start()
-        if self.writes_results:
+        if not rank():
             discard_turntable(self)
 
     def on_predict_start(self) -> None:
         self.on_validation_start()
         super().on_predict_start()
-        if self.writes_results and self.exporter.cfg.save_video:
+        if not rank() and self.exporter.cfg.save_video:
             discard_turntable(self)
 
     def on_predict_epoch_end(self) -> None:
-        if self.writes_results:
+        if not rank():
             if self.exporter.cfg.save_video:
                 self.on_test_epoch_end()
             export(self)
+
+
+# -- the parts of a configuration ------------------------------------------------------------------
+
+
+def check_parts(cfg: Any) -> None:
+    """Raise UserError if a part that the system needs isn't named, or isn't derived from the class
+    that it needs.
+    """
+    for name in ("geometry", "renderer", "guidance", "prompt_processor"):
+        if not getattr(cfg, f"{name}_type"):
+            raise UserError(f"{name}_type is empty: name a registered part")
+    for name, ours in OURS.items():
+        part, base = getattr(cfg, f"{name}_type"), find(ours)
+        if not issubclass(find(part), base):
+            raise UserError(
+                f"{name}_type is {part!r}: gaussiandreamer-system needs {ours}, or a class that is "
+                f"derived from {base.__module__}.{base.__name__}"
+            )
+
+
+def preflight_parts(geometry: Any, cfg: Any) -> None:
+    """Check what the parts of a run need from outside, such as files, before any long work: call
+    ``preflight`` of the prior, if the cloud is empty, and of the classes of prompt processor and
+    guidance with their options.
+
+    Raises:
+        UserError: something is missing; the message names the part's section.
+    """
+    if not len(geometry):
+        with _named("system.geometry.prior"):
+            preflight_prior(geometry.prior(), geometry.cfg.keep_attributes)
+    for name in ("prompt_processor", "guidance"):
+        part = find(getattr(cfg, f"{name}_type"))
+        if hasattr(part, "preflight"):
+            require_class_method(part, "preflight")
+            with _named(f"system.{name}"):
+                part.preflight(parse_structured(part.Config, getattr(cfg, name)))
+
+
+@contextlib.contextmanager
+def _named(section: str) -> Iterator[None]:
+    """Put a section of the configuration in front of errors that don't name it."""
+    try:
+        yield
+    except UserError as error:
+        if section in str(error):
+            raise
+        raise UserError(f"{section}: {error}") from error
