@@ -9,4 +9,4 @@ __version__ = "0.1.0"
 
 def register_parts() -> None:
     """Import every module that registers a part; calling it again does nothing."""
-    from .launch import registry_imports  # noqa: F401
+    from .launch import parts  # noqa: F401

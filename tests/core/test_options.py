@@ -1,5 +1,6 @@
 """Rules declared at the fields of a ``Config``, and the function that checks them."""
 
+import time
 from dataclasses import dataclass, field
 from enum import Enum
 from pathlib import Path
@@ -10,7 +11,7 @@ from omegaconf import OmegaConf
 
 from threestudio_gaussiandreamer.core import options
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.core.options import check_options, parse_structured
+from threestudio_gaussiandreamer.core.options import check_options, escape, parse_structured
 
 
 @dataclass
@@ -162,3 +163,16 @@ def test_a_check_may_raise_any_value_error():
 
     with pytest.raises(UserError, match="part.low: expected less than high"):
         check_options(Config, Config(), "part.")
+
+
+@pytest.mark.parametrize("text", ["${a}", "\\${a}", "x\\\\${", "\\\\", "${${", "a\\b ${c} \\\\${d"])
+def test_escaped_text_is_read_back(text):
+    assert OmegaConf.create({"text": escape(text)}).text == text
+
+
+def test_a_sequence_of_backslashes_takes_linear_time():
+    """100 kB from a file; a search that starts at every backslash takes a minute."""
+    text = "\\" * 100_000
+    started = time.process_time()
+    assert escape(text) == text
+    assert time.process_time() - started < 1

@@ -28,7 +28,7 @@ from threestudio_gaussiandreamer.host import (
     names,
     register,
 )
-from threestudio_gaussiandreamer.launch.part_kinds import check_kind
+from threestudio_gaussiandreamer.launch.parts import check_kind
 from threestudio_gaussiandreamer.meshes.load import load_mesh
 from threestudio_gaussiandreamer.meshes.write import write_obj, write_textured_mesh
 from threestudio_gaussiandreamer.training.export import save

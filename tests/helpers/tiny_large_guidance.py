@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from tests.helpers.tiny_guidance import BATCH
 from threestudio_gaussiandreamer.cameras import orbit_c2w
 from threestudio_gaussiandreamer.host import find
-from threestudio_gaussiandreamer.launch import registry_imports  # noqa: F401
+from threestudio_gaussiandreamer.launch import parts  # noqa: F401
 
 
 def guidance(kind: str, folder: Any, **options: Any) -> Any:

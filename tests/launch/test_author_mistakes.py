@@ -208,11 +208,6 @@ MISTAKES = {
         ["system.geometry_type=own-geometry"],
         "whose configure calls super().configure()",
     ),
-    "guidance: forgot super().configure": (
-        PART.format("guidance", "guidance.mock", "MockGuidance") + FORGOTTEN,
-        ["system.guidance_type=own-guidance"],
-        "Ownguidance.configure must call super().configure",
-    ),
     "density rule: no base class": (
         DENSITY.replace("Own(DensityRule)", "Own(BaseObject)") + "    pass",
         [OWN_DENSITY],

@@ -5,7 +5,6 @@ import dataclasses
 import re
 
 import pytest
-import torch
 import yaml
 from omegaconf import OmegaConf
 
@@ -14,7 +13,7 @@ from threestudio_gaussiandreamer import host, register_parts
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.launch.config import load_config
 from threestudio_gaussiandreamer.launch.config_check import check_config, check_part
-from threestudio_gaussiandreamer.launch.part_kinds import check_kind
+from threestudio_gaussiandreamer.launch.parts import check_kind
 
 register_parts()
 
@@ -73,8 +72,7 @@ def demo():
         ("trainer.max_time=5", "trainer.max_time: expected a text such as '00:12:00:00'"),
         ("trainer.check_val_every_n_epoch=0", "trainer.check_val_every_n_epoch: expected 1"),
         ("trainer.precision=transformer-engine", "trainer: Requirement 'transformer_engine"),
-        ("trainer.strategy=ddp_spawn", "trainer.strategy: ddp_spawn can't start processes"),
-        ("trainer.num_nodes=2", "trainer.num_nodes: expected 1, got 2"),
+        ("trainer.num_nodes=2", "trainer.num_nodes: expected 1 without a launcher of several"),
         ("trainer.limit_val_batches=" + 400 * "9", "trainer.limit_val_batches: expected a whole"),
         ("data.eval_camera_distance=1e30", "data.eval_camera_distance: expected a number from"),
         ("system.guidance.guidance_scale=1e38", "system.guidance.guidance_scale: expected a"),
@@ -90,16 +88,17 @@ def demo():
         ("trainer.val_check_interval=0", "trainer.val_check_interval: expected a whole number of"),
         ("trainer.val_check_interval=0.5", "trainer.val_check_interval: expected a whole number"),
         ("trainer.log_every_n_steps=-1", "trainer.log_every_n_steps: expected 0 or more"),
-        ("trainer.strategy=foo", "unknown trainer.strategy 'foo': choose from auto, ddp, "),
-        ("trainer.strategy=ddp_fork_find_unused_parameters_true", "can't start processes of this"),
+        (
+            "trainer.strategy=ddp_spawn",
+            "unknown trainer.strategy 'ddp_spawn': choose from auto, ddp",
+        ),
         ("trainer.enable_checkpointing=false", "trainer.enable_checkpointing is set by the"),
         ("checkpoint.filename=../../x", "checkpoint.filename is '../../x'"),
-        ("checkpoint.filename='{step}/../../../x'", "expected a name below the folder"),
-        ('checkpoint.filename="a\\0b"', "of at most 200 bytes without NUL"),
-        (f"checkpoint.filename={300 * 'x'}", "of at most 200 bytes without NUL"),
-        ("checkpoint.filename='{step'", "which isn't a format: expected '}'"),
-        ("checkpoint.filename='{epoch:z}'", "which isn't a format: "),
-        ("checkpoint.filename='{step[0]}'", "which isn't a format: "),
+        ("checkpoint.filename='{step}/../../../x'", "below the folder of the checkpoints"),
+        ('checkpoint.filename="a\\0b"', "of names of at most 200 bytes"),
+        (f"checkpoint.filename={300 * 'x'}", "of names of at most 200 bytes"),
+        ("checkpoint.filename='{step'", "expected a format such as '{epoch}-{step}'"),
+        ("checkpoint.filename='{step[0]}'", "expected a format such as '{epoch}-{step}'"),
     ],
 )
 def test_a_wrong_value_is_refused_by_the_check(demo, override, message):
@@ -182,9 +181,6 @@ def test_a_guidance_that_takes_no_render_is_refused():
         def __call__(self):
             return {}
 
-    class NoForward(torch.nn.Module):
-        pass
-
     class Threestudios(host.BaseObject):
         def __call__(self, rgb, prompt_utils, elevation, *, azimuth, **kwargs):
             return {}
@@ -193,6 +189,4 @@ def test_a_guidance_that_takes_no_render_is_refused():
         check_kind("system.guidance_type", "uncallable", Uncallable)
     with pytest.raises(UserError, match=r"called as __call__\(rgb, ...\): too many positional"):
         check_kind("system.guidance_type", "no-argument", NoArgument)
-    with pytest.raises(UserError, match=r"NoForward has no forward\(rgb, ...\)"):
-        check_kind("system.guidance_type", "no-forward", NoForward)
     check_kind("system.guidance_type", "threestudios", Threestudios)

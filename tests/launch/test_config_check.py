@@ -17,8 +17,7 @@ from threestudio_gaussiandreamer.launch.config_check import (
     check_part,
     check_shared_views,
 )
-from threestudio_gaussiandreamer.launch.extensions import load_extensions
-from threestudio_gaussiandreamer.launch.part_kinds import check_kind, find_part
+from threestudio_gaussiandreamer.launch.parts import check_kind, find_part, load_extensions
 
 register_parts()
 CONFIGS = Path(__file__).parents[2] / "configs"
@@ -70,17 +69,6 @@ def test_a_dictionary_of_a_part_is_checked_by_its_default(weights, message):
     check_part("part", "table-part", {"weights": valid, "free": {"anything": "x"}})
 
 
-def test_a_strategy_whose_package_is_missing_is_refused(folder, monkeypatch):
-    from lightning.pytorch.strategies import deepspeed
-
-    monkeypatch.setattr(deepspeed, "_DEEPSPEED_AVAILABLE", False)
-    for strategy in ("deepspeed", "DeepSpeed_stage_2"):
-        with pytest.raises(
-            UserError, match="trainer.strategy: .*you must have DeepSpeed installed"
-        ):
-            check_config(load(f"trainer.strategy={strategy}"))
-
-
 @pytest.mark.parametrize(
     ("override", "message"),
     [
@@ -97,13 +85,13 @@ def test_a_strategy_whose_package_is_missing_is_refused(folder, monkeypatch):
         ("system.loss.lambda_fit=[1,2]", "system.loss.lambda_fit has 2 elements"),
         ("system.loggers.wadb.enable=true", "unknown key 'system.loggers.wadb'"),
         ("system.loggers.wandb.enabled=true", "unknown key 'system.loggers.wandb.enabled'"),
-        ("trainer.max_steps=many", "trainer.max_steps is 'many' (str); expected one of: int"),
-        ("trainer.max_steps=2.5", "trainer.max_steps is 2.5 (float)"),
+        ("trainer.max_steps=many", "trainer.max_steps: expected a whole number, got 'many'"),
+        ("trainer.max_steps=2.5", "trainer.max_steps: expected a whole number, got 2.5"),
+        ("trainer.limit_val_batches=many", "limit_val_batches: expected a whole number or a num"),
         ("trainer.precision=17", "trainer: Precision 17 is invalid"),
-        ("trainer.limit_train_batches=2", "limit_train_batches: views are drawn without end"),
         ("trainer.limit_train_batches=0", "set trainer.max_steps for a short run, got 0"),
-        ("trainer.limit_train_batches=1", "limit_train_batches: views are drawn without end"),
-        ("trainer.overfit_batches=2", "trainer.overfit_batches: views are drawn without end"),
+        ("trainer.limit_train_batches=1", "expected no value, since views are drawn without end"),
+        ("trainer.overfit_batches=2", "trainer.overfit_batches: expected no value, since views"),
         ("trainer.accelerator=cpu", "trainer.accelerator is set by --gpu"),
         ("trainer.logger=false", "trainer.logger is set by the launcher"),
         ("checkpoint.every_n_steps=3", "unknown key 'checkpoint.every_n_steps'"),
@@ -133,6 +121,9 @@ def test_a_valid_configuration_passes(folder):
             "trainer.max_time=00:01:00:00",
         )
     )
+    cfg = load("trainer.max_steps='12'", "trainer.strategy=ddp")
+    check_config(cfg)
+    assert cfg.trainer.max_steps == 12
     check_config(load_config("tiny.yaml", cli_args=["system.exporter_type=dummy-exporter"]))
 
 
@@ -253,41 +244,17 @@ class InheritedConfig(FooGuidance):
         """Adds no option."""
 
 
-def test_options_of_a_config_without_decorator_are_not_ignored():
-    for part in (Undecorated, PlainConfig):
-        with pytest.raises(UserError, match="Config is no dataclass: write @data"):
-            require_dataclass(part)
+@pytest.mark.parametrize("part", [Undecorated, PlainConfig, UntypedOption])
+def test_options_that_would_be_ignored_are_named(part):
+    with pytest.raises(UserError, match="Config is no dataclass with typed .* color: float = "):
+        require_dataclass(part)
     require_dataclass(InheritedConfig)
-
-
-def test_an_option_without_a_type_is_named():
-    with pytest.raises(UserError, match=r"Config\.color has no type: write color: float = "):
-        require_dataclass(UntypedOption)
 
 
 def test_an_endless_run_needs_its_own_number_for_checkpoints(folder):
     with pytest.raises(UserError, match="checkpoint.every_n_train_steps is -1, as trainer.max_st"):
         check_config(load("trainer.max_steps=-1"))
     check_config(load("trainer.max_steps=-1", "checkpoint.every_n_train_steps=5"))
-
-
-def test_options_of_the_base_class_must_not_be_missing():
-    class Detached(FooGuidance):
-        @dataclass
-        class Config:
-            color: float = 0.5
-
-    class WithOption(BaseObject):
-        @dataclass
-        class Config(BaseObject.Config):
-            ground: bool = False
-
-    class Derived(WithOption):
-        Config = Detached.Config
-
-    require_dataclass(Detached)  # its base has no option
-    with pytest.raises(UserError, match="Config lacks ground: derive it from WithOption.Config"):
-        require_dataclass(Derived)
 
 
 def test_a_part_that_is_no_class_is_refused():

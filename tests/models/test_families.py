@@ -71,7 +71,7 @@ def test_the_parts_and_configurations_that_messages_name_exist():
     from pathlib import Path
 
     from threestudio_gaussiandreamer.host import find
-    from threestudio_gaussiandreamer.launch import registry_imports  # noqa: F401
+    from threestudio_gaussiandreamer.launch import parts  # noqa: F401
 
     configs = Path(__file__).parents[2] / "configs"
     for family in families.FAMILIES:

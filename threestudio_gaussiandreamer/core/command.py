@@ -4,7 +4,6 @@ traceback."""
 import contextlib
 import errno
 import importlib
-import io
 import os
 import signal
 import sys
@@ -15,7 +14,6 @@ from typing import Any, Optional
 from .errors import Terminated, UserError
 from .extras import error_of_extra
 from .launcher import require_numbers
-from .methods import error_of_configure
 from .signals import raised_signals
 
 
@@ -96,9 +94,9 @@ def exit_code(error: Exception, verbose: bool = False) -> int:
 
     Raises:
         Exception: ``error`` itself, unless it is a UserError, a BrokenPipeError, or about a missing
-            module of an extra or a part without ``super().configure``.
+            module of an extra.
     """
-    error = error_of_extra(error) or error_of_configure(error) or error
+    error = error_of_extra(error) or error
     if not isinstance(error, (UserError, BrokenPipeError)):
         raise error
     if verbose:
@@ -115,71 +113,54 @@ def exit_code(error: Exception, verbose: bool = False) -> int:
     return 128 + 13  # SIGPIPE, which Windows doesn't have
 
 
-class TolerantFile(io.FileIO):
-    """A raw file that discards everything after the first write error, for instance when the
-    terminal was closed, or when the output is redirected to a disk that is full.
+class Tolerant:
+    """A text stream that escapes characters which its encoding doesn't have, and whose descriptor
+    becomes the null device after the first write error, for instance when the terminal was closed,
+    or when the output is redirected to a disk that is full.
 
     A closed pipe still raises BrokenPipeError, which ends the command as usual.
     """
 
-    lost = False
+    def __init__(self, stream: Any) -> None:
+        self.stream = stream
 
-    def write(self, data: Any) -> Optional[int]:
-        if self.lost:
-            return len(data)
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.stream, name)
+
+    def write(self, text: str) -> int:
+        encoding = self.stream.encoding or "utf-8"
+        self._try(self.stream.write, text.encode(encoding, "backslashreplace").decode(encoding))
+        return len(text)
+
+    def flush(self) -> None:
+        self._try(self.stream.flush)
+
+    def _try(self, call: Callable, *arguments: Any) -> None:
         try:
-            return super().write(data)
+            call(*arguments)
         except BrokenPipeError:
             raise
         except OSError as error:
-            self.lost = True
+            os.dup2(os.open(os.devnull, os.O_WRONLY), self.stream.fileno())
             # EIO: the terminal is gone, and with it standard error
-            if error.errno != errno.EIO and self.fileno() == 1:
+            if error.errno != errno.EIO and self.stream.fileno() == 1:
                 print(
                     f"standard output can't be written ({error.strerror}): going on without it",
                     file=sys.stderr,
                 )
-            return len(data)
 
 
 @contextlib.contextmanager
 def tolerant_output() -> Iterator[None]:
-    """Replace ``sys.stdout`` and ``sys.stderr`` by streams that ignore write errors, and that
-    escape characters which their encoding doesn't have.
-
-    Streams that Python couldn't open, since their descriptors were closed (``>&-``), are replaced
-    by the null device.
+    """Let ``sys.stdout`` and ``sys.stderr`` ignore write errors. Streams that Python couldn't open,
+    since their descriptors were closed (``>&-``), are replaced by the null device.
     """
     earlier = sys.stdout, sys.stderr
-    with contextlib.ExitStack() as opened:
-        sys.stdout, sys.stderr = (
-            opened.enter_context(open(os.devnull, "w", encoding="utf-8"))
-            if stream is None
-            else _tolerant(stream)
-            for stream in earlier
-        )
+    with open(os.devnull, "w", encoding="utf-8") as null:
+        sys.stdout, sys.stderr = (Tolerant(null if s is None else s) for s in earlier)
         try:
             yield
         finally:
             with contextlib.suppress(OSError, ValueError):
                 sys.stdout.flush()
             sys.stdout, sys.stderr = earlier
-
-
-def _tolerant(stream: Any) -> Any:
-    """Reopen a stream's descriptor as a :class:`TolerantFile`; return streams without one as they
-    are.
-    """
-    buffer = getattr(stream, "buffer", None)
-    is_unbuffered = isinstance(buffer, io.FileIO)  # python -u, or PYTHONUNBUFFERED
-    if not isinstance(buffer if is_unbuffered else getattr(buffer, "raw", None), io.FileIO):
-        return stream
-    stream.flush()
-    file = TolerantFile(buffer.fileno(), "wb", closefd=False)
-    return io.TextIOWrapper(
-        file if is_unbuffered else io.BufferedWriter(file),
-        encoding=stream.encoding,
-        errors="backslashreplace",
-        line_buffering=stream.line_buffering,
-        write_through=stream.write_through,
-    )

@@ -1,7 +1,7 @@
 """Check that the class of a user's part has what is used of it."""
 
 import inspect
-from typing import Any, Optional
+from typing import Any
 
 from .errors import UserError
 
@@ -25,19 +25,15 @@ def require_method(owner: type, name: str, *parameters: str, more: bool = False)
     Raises:
         UserError: there is none, it is abstract, or it takes other arguments.
     """
-    given = ", ".join([*parameters, *(["..."] if more else [])])
-    call, found = f"{name}({given})", find_method(owner, name)
-    method = getattr(owner, name, None)
+    call = f"{name}({', '.join([*parameters, *['...'] * more])})"
+    found, method = find_method(owner, name), getattr(owner, name, None)
     if found is None or not callable(method):
         raise UserError(f"{owner.__name__} has no {call}")
     # bound already, or an object that an instance doesn't bind, such as functools.partial
     takes_no_self = isinstance(found, (classmethod, staticmethod)) or not hasattr(found, "__get__")
+    signature = inspect.signature(method)
     try:
-        signature = inspect.signature(method)
-    except ValueError:  # of some builtin functions
-        return
-    bind = signature.bind_partial if more else signature.bind
-    try:
+        bind = signature.bind_partial if more else signature.bind
         bind(*(parameters if takes_no_self else ("self", *parameters)))
     except TypeError as error:
         raise UserError(
@@ -51,56 +47,24 @@ def require_class_method(owner: type, name: str) -> None:
         raise UserError(f"{owner.__name__}.{name} needs @classmethod above it")
 
 
-def error_of_configure(error: Exception) -> Optional[UserError]:
-    """Return the error that names the ``configure`` of a part without ``super().configure``, if
-    that is why an attribute is missing; else None.
-    """
-    part, name = getattr(error, "obj", None), getattr(error, "name", None)
-    if not isinstance(error, AttributeError) or isinstance(part, type):
-        return None
-    found = [vars(base)["configure"] for base in type(part).__mro__ if "configure" in vars(base)]
-    codes = [call.__code__ for call in found if inspect.isfunction(call)]
-    names = [(*code.co_names, *code.co_consts) for code in codes]
-    # set by the configure of a base class, also as a buffer, or a property that reads what it sets
-    missing = any(name in known for known in names[1:]) or hasattr(type(part), name or "")
-    if not names or "configure" in names[0] or not missing:
-        return None
-    return UserError(
-        f"{found[0].__qualname__} must call super().configure with the arguments that it gets: "
-        f"{type(part).__name__} has no {name!r}"
-    )
-
-
-def _is_untyped(config: type, name: str, value: Any) -> bool:
-    """Return whether a member of a class of options looks like one without a type."""
-    is_member = name.startswith("_") or callable(value) or hasattr(value, "__get__")
-    return not (is_member or name.isupper() or name in inspect.get_annotations(config))
-
-
 def require_dataclass(owner: Any) -> None:
     """Check the options of a part, ``Config``.
 
     Raises:
-        UserError: it isn't a dataclass, lacks the decorator, without which options that a subclass
-            adds are ignored, has an option without a type, which is ignored too, or isn't derived
-            from that of the part's base class.
+        UserError: it has what would be ignored: options without the decorator or without a type.
     """
-    config, bases = owner.Config, getattr(owner.Config, "__dataclass_fields__", None)
-    own = vars(config)
-    defined = inspect.get_annotations(config).keys() | (own.keys() & (bases or {}).keys())
-    if bases is None or ("__dataclass_fields__" not in own and defined):
+    config, types = owner.Config, inspect.get_annotations(owner.Config)
+    names = [
+        name
+        for name, value in {**dict.fromkeys(types), **vars(config)}.items()
+        if not (name.startswith("_") or name.isupper() or callable(value))
+        and not hasattr(value, "__get__")
+    ]
+    if "__dataclass_fields__" in vars(config):
+        names = [name for name in names if name not in types]
+    if names or not hasattr(config, "__dataclass_fields__"):
+        option = names[0] if names else "color"
         raise UserError(
-            f"{owner.__name__}.Config is no dataclass: write @dataclass above its class line"
+            f"{owner.__name__}.Config is no dataclass with typed options: write @dataclass above "
+            f"its class line, and {option}: float = ..., for instance"
         )
-    if untyped := [name for name, value in own.items() if _is_untyped(config, name, value)]:
-        raise UserError(
-            f"{owner.__name__}.Config.{untyped[0]} has no type: write {untyped[0]}: "
-            f"{type(own[untyped[0]]).__name__} = ..."
-        )
-    for base in owner.__mro__:
-        missing = getattr(getattr(base, "Config", None), "__dataclass_fields__", {}).keys() - bases
-        if missing:
-            raise UserError(
-                f"{owner.__name__}.Config lacks {', '.join(sorted(missing))}: derive it from "
-                f"{base.__name__}.Config"
-            )

@@ -9,6 +9,7 @@ the option's name, to which the path of the section is prepended. None is accept
 default of a field. Every number must be representable in float32 or int64."""
 
 import dataclasses
+import re
 import string
 import types
 import typing
@@ -16,7 +17,7 @@ from collections.abc import Callable, Collection, Mapping, MutableMapping, Seque
 from enum import Enum
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Optional
+from typing import Any
 
 from .errors import UserError, unknown
 from .logs import info, warn
@@ -64,30 +65,27 @@ def satisfies(expected: str, holds: Callable[[Any], bool]) -> Rule:
 def positive(unit: str = "", most: float = FLOAT32_MAX) -> Rule:
     """Accept numbers that are above 0, also after conversion to float32, and at most ``most``."""
     bound = "" if most == FLOAT32_MAX else f" and at most {most:g}"
-    return satisfies(
-        f"a number above 0{bound}{_with_unit(unit)}", lambda v: is_positive(v) and v <= most
-    )
+    return _numbers(f"a number above 0{bound}", unit, lambda v: FLOAT32_TINY <= v <= most)
 
 
 def at_least(low: float, unit: str = "") -> Rule:
     """Accept numbers of ``low`` or more."""
-    return satisfies(f"{low:g} or more{_with_unit(unit)}", lambda v: is_number(v) and v >= low)
+    return _numbers(f"{low:g} or more", unit, lambda v: v >= low)
 
 
 def in_range(low: float, high: float, unit: str = "") -> Rule:
     """Accept numbers from ``low`` to ``high``, both included."""
-    return satisfies(
-        f"a number from {low:g} to {high:g}{_with_unit(unit)}",
-        lambda v: is_number(v) and low <= v <= high,
-    )
+    return _numbers(f"a number from {low:g} to {high:g}", unit, lambda v: low <= v <= high)
 
 
 def between(low: float, high: float, unit: str = "") -> Rule:
     """Accept numbers between ``low`` and ``high``, both excluded."""
-    return satisfies(
-        f"a number between {low:g} and {high:g}{_with_unit(unit)}",
-        lambda v: is_number(v) and low < v < high,
-    )
+    return _numbers(f"a number between {low:g} and {high:g}", unit, lambda v: low < v < high)
+
+
+def _numbers(expected: str, unit: str, holds: Callable[[Any], bool]) -> Rule:
+    expected += f" ({unit})" if unit else ""
+    return satisfies(expected, lambda value: is_number(value) and holds(value))
 
 
 def one_of(choices: Collection[str] | Callable[[], Collection[str]]) -> Rule:
@@ -144,10 +142,6 @@ def required(purpose: str) -> Rule:
     return rule(check)
 
 
-def _with_unit(unit: str) -> str:
-    return f" ({unit})" if unit else ""
-
-
 # -- values ----------------------------------------------------------------------------------------
 
 
@@ -158,11 +152,6 @@ def is_number(value: Any) -> bool:
         and not isinstance(value, bool)
         and -FLOAT32_MAX <= value <= FLOAT32_MAX
     )
-
-
-def is_positive(value: Any) -> bool:
-    """Return whether ``value`` is a number above 0, also after conversion to float32."""
-    return is_number(value) and value >= FLOAT32_TINY
 
 
 def is_whole(value: Any) -> bool:
@@ -182,15 +171,10 @@ def is_numbers(value: Any, count: int) -> bool:
 
 def shown(value: Any) -> str:
     """Format ``value`` for a message, shortened to ``SHOWN`` characters."""
-    text = (
-        _digits(value) if isinstance(value, int) else repr(list(value) if is_list(value) else value)
-    )
+    if isinstance(value, int) and value.bit_length() >= 256:  # repr has a limit
+        return f"an integer of {value.bit_length()} bits"
+    text = repr(list(value) if is_list(value) else value)
     return text if len(text) <= SHOWN else f"{text[: SHOWN - 3]}..."
-
-
-def _digits(value: int) -> str:
-    """Format an integer; Python raises an error for one of more than 4300 digits."""
-    return repr(value) if value.bit_length() < 256 else f"an integer of {value.bit_length()} bits"
 
 
 def require_representable(path: str, value: Any) -> None:
@@ -245,9 +229,7 @@ def _filled(config_class: Any, values: Any, prefix: str) -> Any:
         given[key] = _converted(prefix + key, value, hints[key])
     try:
         return config_class(**given)
-    except TypeError as error:
-        raise UserError(f"{config_class.__qualname__}: {error}") from error
-    except ValueError as error:  # of __post_init__
+    except (TypeError, ValueError) as error:  # of __post_init__, or a value is missing
         raise UserError(_located(str(error), prefix, options)) from error
 
 
@@ -256,8 +238,13 @@ def _converted(path: str, value: Any, annotation: Any) -> Any:
     kind, inner = typing.get_origin(annotation) or annotation, typing.get_args(annotation)
     if kind in (typing.Union, types.UnionType):
         choices = [choice for choice in inner if choice is not type(None)]
-        is_open = value is None or len(choices) != 1
-        return value if is_open else _converted(path, value, choices[0])
+        if len(choices) == 1 and value is not None:
+            return _converted(path, value, choices[0])
+        given = float if type(value) is int and float in choices else type(value)
+        if SCALARS.keys() >= {*choices} and given not in inner:
+            expected = " or ".join(SCALARS[choice] for choice in choices)
+            raise UserError(f"{path}: expected {expected}, got {shown(value)}")
+        return value
     if kind in SCALARS:
         return _scalar(path, value, kind)
     if kind in (list, tuple):
@@ -355,14 +342,11 @@ def _check_table(path: str, values: Any, default: Any) -> None:
         if key not in default:
             raise unknown("key", key, default, prefix=f"{path}.")
         _check_table(f"{path}.{key}", value, default[key])
-        given, expected = _kind(value), _kind(default[key])
+        given, expected = (
+            SCALARS.get(float if type(v) is int else type(v)) for v in (value, default[key])
+        )
         if None not in (given, expected) and given != expected:
             raise UserError(f"{path}.{key}: expected {expected}, got {value!r}")
-
-
-def _kind(value: Any) -> Optional[str]:
-    kinds = {"true or false": bool, "a number": (int, float), "a text": str}
-    return next((name for name, kind in kinds.items() if isinstance(value, kind)), None)
 
 
 def _plain(value: Any) -> Any:
@@ -440,3 +424,16 @@ def _located(message: str, prefix: str, names: Collection[str]) -> str:
         return message
     begins_with_option = message[: len(message) - len(message.lstrip(NAME_CHARACTERS))] in names
     return prefix + message if begins_with_option else f"{prefix.rstrip('.')}: {message}"
+
+
+def escape(value: Any) -> Any:
+    """Escape each ``${`` in a string, or in the strings of nested lists and dicts, so that
+    OmegaConf resolves it to the original text.
+    """
+    if isinstance(value, str):
+        # Backslashes are literal except right before "${". The lookbehind makes a run of them match
+        # from its start only, which keeps the search linear in its length.
+        return re.sub(r"(?<!\\)(\\*)\$\{", lambda match: 2 * match[1] + r"\${", value)
+    if isinstance(value, dict):
+        return {key: escape(item) for key, item in value.items()}
+    return [escape(item) for item in value] if isinstance(value, list) else value

@@ -15,7 +15,7 @@ from tqdm import tqdm
 
 from .. import __version__
 from ..core.errors import UserError
-from ..launch.config_source import read_yaml
+from ..launch.config import read_yaml
 from ..launch.experiment import read_source
 from ..launch.options import find_config
 from ..launch.run_folder import program_anywhere
@@ -133,7 +133,7 @@ def check_recipe(recipe: Recipe, rows: Iterable[Row]) -> Recipe:
     the farm's. Errors name the line of the row.
     """
     from .. import register_parts
-    from ..launch.extensions import load_extensions
+    from ..launch.parts import load_extensions
 
     register_parts()
     load_extensions()

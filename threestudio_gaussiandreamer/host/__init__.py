@@ -24,16 +24,11 @@ def _threestudio_is_importable() -> bool:
     """
     try:
         import threestudio
-    except ModuleNotFoundError as error:
-        if error.name == "threestudio":
+    except Exception as error:
+        if isinstance(error, ModuleNotFoundError) and error.name == "threestudio":
             return False
         raise UserError(
             f"threestudio is on the Python path but can't be imported: {error}; fix it or remove it"
-        ) from error
-    except Exception as error:
-        raise UserError(
-            f"threestudio is on the Python path but can't be imported: {error!r}; fix it or "
-            "remove it"
         ) from error
     return hasattr(threestudio, "register")
 
@@ -55,6 +50,7 @@ if _threestudio_is_importable():
     from threestudio.utils.misc import get_device, get_rank
 
     NAME = "threestudio"
+    IDENTITY = ("__module__", "__qualname__")
 
     class Checked:
         """Puts checked options, an instance of ``Config``, in the place of those that threestudio's
@@ -67,11 +63,8 @@ if _threestudio_is_importable():
             given = {} if cfg is None else cfg
             options = self.__dict__["_options"] = parse_structured(self.Config, given, self.SECTION)
             # threestudio parses neither nested options nor those of earlier versions
-            names = [key for key, v in vars(options).items() if not dataclasses.is_dataclass(v)]
-            if OmegaConf.is_config(given):
-                given = OmegaConf.masked_copy(given, names)
-            else:
-                given = {name: given[name] for name in names if name in given}
+            flat = [key for key, v in vars(options).items() if not dataclasses.is_dataclass(v)]
+            given = {name: given[name] for name in flat if name in given}
             super().__init__(given, *args, **kwargs)
 
         @property
@@ -133,18 +126,12 @@ if _threestudio_is_importable():
             raise unknown("part", name, names()) from None
 
     def register(name: str) -> Callable[[type], type]:
-        """Return a class decorator that registers the class as ``name``; registering the same class
-        again has no effect.
-        """
+        """Return a decorator that registers a class as ``name``; again the same one is harmless."""
 
         def enter(cls: type) -> type:
             taken = threestudio.__modules__.get(name)
-            if taken is not None and (taken.__module__, taken.__qualname__) == (
-                cls.__module__,
-                cls.__qualname__,
-            ):
-                return cls
-            return threestudio.register(name)(cls)
+            is_same = taken and all(getattr(taken, n) == getattr(cls, n) for n in IDENTITY)
+            return cls if is_same else threestudio.register(name)(cls)
 
         return enter
 
@@ -184,33 +171,3 @@ def item_seed() -> int:
     processes that train one cloud together.
     """
     return run_seed() if rank() == 0 else derive_seed(run_seed(), "rank", rank())
-
-
-__all__ = [
-    "NAME",
-    "BaseBackground",
-    "BaseGeometry",
-    "BaseLift3DSystem",
-    "BaseMaterial",
-    "BaseModule",
-    "BaseObject",
-    "BaseSystem",
-    "C",
-    "Exporter",
-    "ExporterOutput",
-    "Rasterizer",
-    "Updateable",
-    "debug",
-    "find",
-    "get_device",
-    "info",
-    "item_seed",
-    "names",
-    "parse_structured",
-    "pl",
-    "register",
-    "register_builtin",
-    "run_seed",
-    "validate_schedule",
-    "warn",
-]

@@ -1,33 +1,48 @@
-"""The configuration of a run: YAML files, then ``key=value`` overrides, merged, resolved and typed.
+"""The configuration of a run: YAML files, then ``key=value`` overrides, merged and resolved.
 
 Sections, key names, resolvers and the output tree are threestudio's. Two things differ: loading
-makes no folder, and what is text stays text (see ``config_source.py``). The sources are read by
-``config_source.py``; the folder is named by ``run_folder.py``."""
+makes no folder, and texts are read verbatim: on the command line
+``system.prompt_processor.prompt=1984`` is the text "1984", and ``prompt=${x}`` isn't an
+interpolation. What the options mean is checked in ``config_check.py``."""
 
-import functools
+import contextlib
 import os
-from collections.abc import Iterator, Sequence
+import re
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, fields
-from itertools import combinations
 from pathlib import Path
 from typing import Any, Optional
 
 import omegaconf
+import yaml
 from omegaconf import MISSING, DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from ..core.errors import UserError
 from ..core.files import atomic_file
-from ..core.interpolation import escape
-from ..core.options import parse_structured
+from ..core.options import escape, parse_structured, satisfies
 from ..core.schedule import C_max
 from ..host import find, info, names
 from ..prompts.prompts import read_prompt
 from ..training.losses import foreign_weights
 from ..training.optimizer import foreign_arguments
-from .config_source import is_text, map_strings, parse_overrides, protect, read_yaml, unprotect
 from .ddp import planned_processes
 from .run_folder import name_folders
+
+TEXTS = re.compile(
+    r"name|tag|description|"
+    r".*prompt_processor\.(prompt|negative_prompt|prompt_(front|side|back|overhead))"
+)
+"""Keys whose values are texts, never YAML."""
+PATH_ENDINGS = ("path", "mesh", "_file", "_dir", "resume", "weights")
+"""Keys whose values are paths, which may contain "#" or ": "; only null and interpolations have a
+meaning."""
+PROTECTED = "$\ue000{"
+"""Replaces "${" in texts while interpolations are resolved; U+E000 is for private use."""
+MOST_DEPTH = 32
+MOST_NODES = 10_000
+MOST_BYTES = 1 << 20
+SECTIONS = ("data", "system", "trainer", "checkpoint", "viewer")
 
 
 @dataclass
@@ -39,7 +54,10 @@ class ExperimentConfig:
     name: str = "default"
     description: str = ""
     tag: str = ""
-    seed: int = 0
+    seed: int = field(
+        default=0,
+        metadata=satisfies("a whole number from 0 to 2^32 - 1", lambda seed: 0 <= seed < 2**32),
+    )
     use_timestamp: bool = True
     timestamp: Optional[str] = None
     exp_root_dir: str = "outputs"
@@ -81,60 +99,303 @@ def load_config(*paths: str | os.PathLike, cli_args: Sequence[str] = (), n_gpus:
             unknown, a ``???`` or an interpolation is left open, a value has the wrong type; see
             also :func:`planned_processes`.
     """
-    sources = [
-        _with_prompt_from_file(source)
-        for source in [*map(read_yaml, paths), parse_overrides(cli_args)]
-    ]
+    sources = [*map(read_yaml, paths), parse_overrides(cli_args)]
     if given := [name for name in COMPUTED if name in sources[-1]]:
         raise UserError(
             f"{given[0]} is computed: set exp_root_dir, name and tag for the folder of a run, and "
             "--gpu or trainer.devices for the GPUs"
         )
-    merged = _merge(sources)
-    _name_own_object(merged, sources)
-    trainer = {name: _trainer_option(merged, name) for name in ("devices", "num_nodes")}
-    merged.n_gpus = planned_processes(n_gpus, trainer).total
-    _require_mandatory(OmegaConf.to_container(merged))
-    resolved = _resolve(merged)
-    _zero_null_weights(resolved.get("system"))
+    merged: dict[str, Any] = {}
+    for source in sources:
+        _read_prompt_file(source)
+        merged = _overlaid(merged, source, final=source is sources[-1])
+    merged = _overlaid(merged, _own_object(merged, sources))
+    _require_sections(merged)
+    if missing := sorted(_missing_keys(merged)):
+        example = "a corgi" if TEXTS.fullmatch(missing[0]) else "..."
+        raise UserError(
+            f"no value for {', '.join(missing)}: set it in the YAML or as {missing[0]}={example!r}"
+        )
+    resolved = _resolved(merged, n_gpus)
+    loss = (resolved.get("system") or {}).get("loss")
+    if isinstance(loss, dict):  # null is no loss, too
+        loss |= {name: 0 for name, weight in loss.items() if weight is None}
     cfg = OmegaConf.structured(parse_structured(ExperimentConfig, escape(resolved)))
     name_folders(cfg, paths)
     return cfg
-
-
-def _trainer_option(merged: DictConfig, name: str) -> Any:
-    """Return an option before all are resolved; None if it can't be, which is reported later."""
-    try:
-        return OmegaConf.select(merged, f"trainer.{name}")
-    except OmegaConfBaseException:
-        return None
 
 
 def dump_config(path: str | os.PathLike, cfg: Any) -> None:
     """Write a configuration from which :func:`load_config` restores the same run, without
     ``resume`` and ``new_folder``.
     """
-    plain = OmegaConf.create(OmegaConf.to_container(cfg, resolve=False))
-    if "resume" in plain:
-        plain.resume = None
+    plain = OmegaConf.to_container(cfg, resolve=False) | {"resume": None}
     plain.pop("new_folder", None)
     if not plain.get("viewer"):
         plain.pop("viewer", None)  # threestudio doesn't know the key
     with atomic_file(path) as file:
-        file.write(OmegaConf.to_yaml(plain).encode())
+        file.write(OmegaConf.to_yaml(OmegaConf.create(plain)).encode())
 
 
-def _with_prompt_from_file(source: dict[str, Any]) -> dict[str, Any]:
+# -- files and overrides ---------------------------------------------------------------------------
+
+
+def read_yaml(path: str | os.PathLike) -> dict[str, Any]:
+    """Read a YAML file as a mapping, in which interpolations and ``???`` are still text. Prompts
+    that look like numbers or booleans (``prompt: 1984``) are text.
+
+    Raises:
+        UserError: the file is missing, isn't UTF-8, isn't valid YAML (with line and column), or
+            isn't a mapping.
+    """
+    what = f"the configuration {path}"
+    try:
+        with open(path, "rb") as file:
+            content = file.read(MOST_BYTES + 1)
+        source = content.decode("utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise UserError(f"{what} can't be read: {error}") from error
+    if len(content) > MOST_BYTES:
+        raise UserError(f"{what} is larger than {MOST_BYTES >> 20} MiB")
+    with _yaml_errors(what):
+        node = _bounded(what, source)
+        values = OmegaConf.create(source)
+    if not isinstance(values, DictConfig):
+        raise UserError(f"{what} must hold sections and keys, such as 'name: demo'")
+    values = OmegaConf.to_container(values)
+    _restore_texts(values, node)
+    return _mapped(values, _protect_escaped, what)
+
+
+def parse_overrides(arguments: Iterable[str]) -> dict[str, Any]:
+    """Parse ``section.key=value`` arguments into a mapping. Values are YAML, except texts and
+    paths, which are read verbatim.
+
+    Raises:
+        UserError: an argument isn't ``key=value``, or its value isn't valid YAML.
+    """
+    overrides = OmegaConf.create({})
+    for argument in arguments:
+        key, equals, value = argument.partition("=")
+        if not equals or not re.match(r"[^\W\d]", key):
+            raise UserError(
+                f"{argument!r} isn't an override: expected key=value, such as "
+                "trainer.max_steps=1200"
+            )
+        try:
+            argument.encode()  # undecodable bytes are lone surrogates
+        except UnicodeEncodeError as error:
+            raise UserError(f"{key!r} or its value isn't valid UTF-8 text: {error}") from error
+        if key.count(".") >= MOST_DEPTH:
+            raise UserError(f"{key[:80]!r}... is no key: sections lie at most {MOST_DEPTH} deep")
+        if key == "resume" and not value.strip():
+            # of an unset variable in a script; to start over would set the run's checkpoints aside
+            raise UserError("resume= has no value: write resume=auto, a file, or resume=null")
+        with _yaml_errors(f"the value of {key}"):
+            if TEXTS.fullmatch(key):
+                OmegaConf.update(overrides, key, protect(value), force_add=True)
+            elif key.endswith(PATH_ENDINGS):
+                path = None if value in ("", "null", "~") else value
+                OmegaConf.update(overrides, key, path, force_add=True)
+            else:
+                _bounded(f"the value of {key}", value)
+                overrides.merge_with_dotlist([argument])
+    return _mapped(OmegaConf.to_container(overrides), str, "the command line")
+
+
+@contextlib.contextmanager
+def _yaml_errors(what: str) -> Iterator[None]:
+    """Convert what YAML's and OmegaConf's parsers raise in this context to a UserError."""
+    try:
+        yield
+    except UserError:
+        raise
+    except (yaml.YAMLError, OmegaConfBaseException, ValueError, RecursionError) as error:
+        mark = getattr(error, "problem_mark", None)
+        place = f"line {mark.line + 1}, column {mark.column + 1}: " if mark else ""
+        problem = getattr(error, "problem", None) or str(error).splitlines()[0]
+        raise UserError(f"{what} isn't valid YAML: {place}{problem}") from error
+
+
+def _bounded(what: str, source: str) -> Any:
+    """Return the YAML node of a source, from which no value is constructed.
+
+    The pure Python parser is used, since deep recursion in libyaml ends the process.
+
+    Raises:
+        UserError: it is so deeply nested, or expands through aliases to so many values, that
+            constructing it would crash.
+    """
+    sizes: dict[int, int] = {}
+
+    def size(node: Any, depth: int) -> int:
+        nested = node.value.count("${") if isinstance(node, yaml.ScalarNode) else depth
+        if nested > MOST_DEPTH:
+            raise RecursionError
+        if id(node) not in sizes:
+            sizes[id(node)] = MOST_NODES  # of an alias inside of the section that it names
+            inner = [] if isinstance(node, yaml.ScalarNode) else node.value
+            if isinstance(node, yaml.MappingNode):
+                inner = [item for pair in inner for item in pair]
+            sizes[id(node)] = 1 + sum(size(item, depth + 1) for item in inner)
+        return sizes[id(node)]
+
+    try:
+        node = yaml.compose(source, Loader=yaml.SafeLoader)
+        if node is None or size(node, 0) < MOST_NODES:
+            return node
+    except RecursionError:
+        pass
+    raise UserError(
+        f"{what} must be at most {MOST_DEPTH} levels deep and hold fewer than {MOST_NODES} values"
+    )
+
+
+def _restore_texts(values: dict[str, Any], node: Any, section: str = "") -> None:
+    """Replace values of text keys that YAML has converted to numbers or booleans by the characters
+    in the file, which the unconverted ``node`` has.
+    """
+    for key_node, value_node in node.value if isinstance(node, yaml.MappingNode) else ():
+        name, key = key_node.value, f"{section}{key_node.value}"
+        if isinstance(values.get(name), dict):
+            _restore_texts(values[name], value_node, f"{key}.")
+        elif isinstance(values.get(name), (bool, int, float)) and TEXTS.fullmatch(key):
+            values[name] = value_node.value
+
+
+def protect(text: str) -> str:
+    """Replace ``${`` in a text, so that it isn't resolved as an interpolation, also where another
+    value refers to this one; it is restored when all are resolved.
+
+    Raises:
+        UserError: the text is ``???``, OmegaConf's marker of a missing value.
+    """
+    if text == MISSING:
+        raise UserError(
+            f"{MISSING!r} can't be a text: in configurations it means that a value is missing; "
+            "add a word"
+        )
+    return text.replace("${", PROTECTED)
+
+
+def _protect_escaped(text: str) -> str:
+    """Unescape and protect a YAML string in which every ``${`` is escaped, as in a ``parsed.yaml``;
+    return other strings unchanged.
+    """
+    if "${" not in text or re.search(r"(?<!\\)(\\\\)*\$\{", text):
+        return text
+    half = lambda match: "\\" * (len(match[1]) // 2) + PROTECTED  # noqa: E731
+    return re.sub(r"(?<!\\)(\\+)\$\{", half, text)
+
+
+def _mapped(value: Any, change: Callable[[str], str], what: str) -> Any:
+    """Return a copy of dictionaries and lists in which every string is ``change(string)``.
+
+    Raises:
+        UserError: a key isn't a string, such as ``on``, which is ``true`` in YAML.
+    """
+    if isinstance(value, dict):
+        if wrong := [key for key in value if not isinstance(key, str)]:
+            raise UserError(
+                f"{what} has the key {wrong[0]!r}, which isn't a word: put it in quotes if it is "
+                "meant so"
+            )
+        return {key: _mapped(child, change, what) for key, child in value.items()}
+    if isinstance(value, list):
+        return [_mapped(child, change, what) for child in value]
+    return change(value) if isinstance(value, str) else value
+
+
+# -- overlays --------------------------------------------------------------------------------------
+
+
+def _overlaid(
+    earlier: dict[str, Any], later: dict[str, Any], path: str = "", final: bool = False
+) -> dict[str, Any]:
+    """Return ``earlier`` with the values of ``later`` in the place of its own.
+
+    If ``later`` changes a part (``x_type``), the options in ``earlier``'s section ``x`` that the
+    new part doesn't have are left out, so that ``system.geometry.prior_type=random-prior`` suffices
+    to select another prior; so are the arguments that a new optimiser doesn't take, and the weights
+    of losses that another guidance doesn't return.
+
+    Args:
+        path: of the section, with a final dot.
+        final: ``later`` is the command line, which can't empty a section of a part.
+    """
+    earlier = dict(earlier)
+    for key, new in later.items():
+        if key in earlier and new not in (earlier[key], MISSING):
+            _leave_out_foreign(earlier, f"{path}{key}", new)
+    merged = earlier | later
+    for key, new in later.items():
+        old, place = earlier.get(key), f"{path}{key}"
+        is_reference = isinstance(old, str) and "${" in old and isinstance(new, dict)
+        if is_reference or {type(old), type(new)} == {dict, list}:
+            kind = "a reference" if is_reference else "a list"
+            raise UserError(
+                f"the configurations can't be merged: {place} is {kind} in one and a section in "
+                "another"
+            )
+        if isinstance(old, dict) and isinstance(new, dict):
+            merged[key] = _overlaid(old, new, f"{place}.", final)
+        elif final and old and isinstance(old, dict) and new is None:
+            if not path or f"{key}_type" in earlier:
+                raise UserError(
+                    f"{place} is empty, which would remove its {len(old)} keys: set one of them, "
+                    f"such as {place}.{next(iter(old))}=<value>"
+                )
+    return merged
+
+
+def _leave_out_foreign(values: dict[str, Any], path: str, name: Any) -> None:
+    """Remove the options that belong to the part or optimiser before ``name``, which the key
+    ``path`` selects, from the sections beside it.
+    """
+    section = path.rpartition(".")[2].removesuffix("_type")
+    part = find(name) if path.endswith("_type") and name in names() else None
+    foreign: dict[str, list[str]] = {}
+    if hasattr(part, "Config") and isinstance(values.get(section), dict):
+        known = {option.name for option in fields(part.Config)}
+        foreign[section] = [key for key in values[section] if key not in known]
+    if path == "system.guidance_type" and part and isinstance(values.get("loss"), dict):
+        foreign["loss"] = foreign_weights(values["loss"], part)
+    if path == "system.optimizer.name" and isinstance(values.get("args"), dict):
+        foreign["args"] = foreign_arguments(name, values["args"])
+    for section, keys in foreign.items():
+        values[section] = {key: v for key, v in values[section].items() if key not in keys}
+        if keys:
+            place = f"{path.rpartition('.')[0]}.{section}".lstrip(".")
+            info(f"{place}: {name} has no {', '.join(keys)}; left out")
+
+
+def _read_prompt_file(source: dict[str, Any]) -> None:
     """Replace ``prompt_processor.prompt_file`` by a ``prompt`` with the file's text, so that the
     tag can refer to it.
     """
     section = _value_at(source, "system.prompt_processor")
-    if not isinstance(section, dict) or section.get("prompt_file") is None:
-        return source
-    if "prompt" in section:
-        raise UserError("system.prompt_processor has both prompt and prompt_file: give one of them")
-    section["prompt"] = protect(read_prompt(section.pop("prompt_file")))
-    return source
+    if isinstance(section, dict) and section.get("prompt_file") is not None:
+        if "prompt" in section:
+            raise UserError(
+                "system.prompt_processor has both prompt and prompt_file: give one of them"
+            )
+        section["prompt"] = protect(read_prompt(section.pop("prompt_file")))
+
+
+def _own_object(merged: dict[str, Any], sources: list[dict[str, Any]]) -> dict[str, Any]:
+    """Return what names a prompt that no model reads by the mesh or cloud that a later file or the
+    command line gives, instead of what the earlier file says of its own object.
+    """
+    keys = ("prompt_processor.prompt", "guidance.mesh", "geometry.prior.path")
+    is_read = _value_at(merged, "system.prompt_processor_type") != "plain-prompt-processor"
+    for source in [] if is_read else reversed(sources):
+        found = [_value_at(source, f"system.{key}") for key in keys]
+        prompt, *files = [text if _is_plain_text(text) else None for text in found]
+        if prompt is not None:
+            break
+        if path := next(filter(None, files), None):
+            return {"system": {"prompt_processor": {"prompt": protect(Path(path).stem)}}}
+    return {}
 
 
 def _value_at(source: Any, key: str) -> Any:
@@ -144,155 +405,22 @@ def _value_at(source: Any, key: str) -> Any:
     return source
 
 
-def _name_own_object(merged: DictConfig, sources: list[dict[str, Any]]) -> None:
-    """Let a prompt that no model reads be the name of the mesh or cloud that a later file or the
-    command line gives, instead of what the earlier file says of its own object.
-    """
-    system = merged.get("system")
-    if not system or system.get("prompt_processor_type") != "plain-prompt-processor":
-        return
-    place, keys = "system.prompt_processor.prompt", ("guidance.mesh", "geometry.prior.path")
-    for source in reversed(sources):
-        if _own_text(source, place) is not None:
-            return
-        if path := next(filter(None, (_own_text(source, f"system.{key}") for key in keys)), None):
-            OmegaConf.update(merged, place, protect(Path(path).stem), force_add=True)
-            return
+def _is_plain_text(value: Any) -> bool:
+    """Return whether a value is a text that is neither missing nor refers to another value."""
+    return isinstance(value, str) and value != MISSING and "${" not in value
 
 
-def _own_text(source: dict[str, Any], key: str) -> Optional[str]:
-    """Return the text at a dotted key; None for a missing value and one that refers to another."""
-    value = _value_at(source, key)
-    return value if isinstance(value, str) and not _is_open(value) else None
-
-
-def _is_open(value: Any) -> bool:
-    """Return whether a value is missing or refers to another one."""
-    return isinstance(value, str) and (value == MISSING or "${" in value)
-
-
-def _merge(sources: list[dict[str, Any]]) -> DictConfig:
-    *files, overrides = sources
-    try:
-        merged: dict[str, Any] = functools.reduce(_overlaid, files, {})
-        _require_values(merged, overrides)
-        merged = _overlaid(merged, overrides)
-    except (OmegaConfBaseException, TypeError) as error:
-        clash = next(filter(None, (_clash(a, b) for a, b in combinations(sources, 2))), None)
-        reason = f"{clash} is a list in one and a section in another" if clash else _explain(error)
-        raise UserError(f"the configurations can't be merged: {reason}") from error
-    for name in ("data", "system", "trainer", "checkpoint", "viewer"):
+def _require_sections(merged: dict[str, Any]) -> None:
+    for name in SECTIONS:
         if merged.get(name, {}) is None:  # YAML reads "trainer:" without content as null
             merged[name] = {}
         section = merged.get(name, {})
-        if not isinstance(section, dict) and not _is_open(section):  # that is reported later
+        # what is missing or a reference is reported later
+        if not isinstance(section, (dict, str)) or _is_plain_text(section):
             raise UserError(
                 f"{name} must be a section of keys and values, got {section!r}: set a key, such "
                 f"as {name}.<key>=<value>"
             )
-    return OmegaConf.create(merged)
-
-
-def _overlaid(earlier: dict[str, Any], later: dict[str, Any]) -> dict[str, Any]:
-    _forget_replaced_parts(earlier, later)
-    return OmegaConf.to_container(OmegaConf.merge(earlier, later))
-
-
-def _require_values(merged: dict[str, Any], overrides: dict[str, Any], path: str = "") -> None:
-    """Check that no override empties the section of a part or of the launcher, as ``trainer=``."""
-    for key, override in overrides.items():
-        section = merged.get(key)
-        if not isinstance(section, dict) or not section:
-            continue
-        if isinstance(override, dict):
-            _require_values(section, override, f"{path}{key}.")
-        elif override is None and (not path or f"{key}_type" in merged):
-            raise UserError(
-                f"{path}{key} is empty, which would remove its {len(section)} keys: set one of "
-                f"them, such as {path}{key}.{next(iter(section))}=<value>"
-            )
-
-
-def _forget_replaced_parts(earlier: dict[str, Any], later: dict[str, Any], path: str = "") -> None:
-    """Remove options from ``earlier`` that are invalid after a merge with ``later``, in place.
-
-    If ``later`` changes a part (``x_type``), the options in ``earlier``'s section ``x`` that the
-    new part doesn't have are removed, so that ``system.geometry.prior_type=random-prior`` suffices
-    to select another prior; so are the arguments that a new optimiser doesn't take. If ``later``
-    has a mandatory value (``???``), ``earlier``'s value is removed too, which OmegaConf's merge
-    would keep."""
-    for key, theirs in later.items():
-        if theirs == MISSING:
-            earlier.pop(key, None)
-            continue
-        section = key.removesuffix("_type")
-        mine = earlier.get(key)
-        if isinstance(mine, dict) and isinstance(theirs, dict):
-            _forget_replaced_parts(mine, theirs, f"{path}{key}.")
-            continue
-        if key not in earlier or mine == theirs:
-            continue
-        if f"{path}{key}" == "system.optimizer.name":
-            _keep_arguments_of(earlier.get("args"), theirs)
-        if section != key:
-            _keep_options_of(earlier.get(section), theirs, f"{path}{section}")
-            if f"{path}{section}" == "system.guidance":
-                _keep_weights_of(earlier.get("loss"), theirs)
-
-
-def _keep_options_of(section: Any, type_name: Any, path: str) -> None:
-    config_class = getattr(find(type_name), "Config", None) if type_name in names() else None
-    if config_class is None or not isinstance(section, dict):
-        return
-    known = {field.name for field in fields(config_class)}
-    _leave_out([key for key in section if key not in known], section, type_name, path)
-
-
-def _keep_arguments_of(arguments: Any, optimizer: Any) -> None:
-    if isinstance(arguments, dict):
-        foreign = foreign_arguments(optimizer, arguments)
-        _leave_out(foreign, arguments, optimizer, "system.optimizer.args")
-
-
-def _keep_weights_of(loss: Any, guidance: Any) -> None:
-    """Remove the weights of losses that belong to the replaced guidance."""
-    if guidance in names() and isinstance(loss, dict):
-        _leave_out(foreign_weights(loss, find(guidance)), loss, guidance, "system.loss")
-
-
-def _leave_out(foreign: list[str], section: dict[str, Any], type_name: str, path: str) -> None:
-    for key in foreign:
-        section.pop(key)
-    if foreign:
-        info(f"{path}: {type_name} has no {', '.join(foreign)}; left out")
-
-
-def _zero_null_weights(system: Any) -> None:
-    """Replace null among the weights of losses by 0, which parts of the system can compute with."""
-    loss = system.get("loss") if isinstance(system, dict) else None
-    if isinstance(loss, dict):
-        loss |= {key: 0 for key, weight in loss.items() if weight is None}
-
-
-def _clash(a: dict[str, Any], b: dict[str, Any], section: str = "") -> Optional[str]:
-    """Return the first key that is a list in one of the two and a section in the other."""
-    for key, one in a.items():
-        other = b.get(key)
-        if {type(one), type(other)} == {dict, list}:
-            return f"{section}{key}"
-        if isinstance(one, dict) and isinstance(other, dict):
-            if found := _clash(one, other, f"{section}{key}."):
-                return found
-    return None
-
-
-def _require_mandatory(cfg: dict[str, Any]) -> None:
-    missing = sorted(_missing_keys(cfg))
-    if missing:
-        example = "a corgi" if is_text(missing[0]) else "..."
-        raise UserError(
-            f"no value for {', '.join(missing)}: set it in the YAML or as {missing[0]}={example!r}"
-        )
 
 
 def _missing_keys(values: dict[str, Any], section: str = "") -> Iterator[str]:
@@ -304,22 +432,33 @@ def _missing_keys(values: dict[str, Any], section: str = "") -> Iterator[str]:
             yield from _missing_keys(value, f"{section}{key}.")
 
 
-def _resolve(cfg: DictConfig) -> dict[str, Any]:
+# -- interpolations --------------------------------------------------------------------------------
+
+
+def _resolved(merged: dict[str, Any], n_gpus: int) -> dict[str, Any]:
+    """Return the values without interpolations, and with the number of processes, to which they may
+    refer.
+    """
     register_resolvers()
     try:
+        cfg = OmegaConf.create(merged)
+        asked = {
+            name: OmegaConf.select(cfg, f"trainer.{name}") for name in ("devices", "num_nodes")
+        }
+        cfg.n_gpus = planned_processes(n_gpus, asked).total
         values = OmegaConf.to_container(cfg, resolve=True)
     except OmegaConfBaseException as error:
-        raise UserError(f"an interpolation can't be resolved: {_explain(error)}") from error
-    except (TypeError, ValueError, ArithmeticError, AttributeError) as error:
-        raise UserError(f"a resolver failed: {error}") from error
+        key, message = getattr(error, "full_key", None), str(error).splitlines()[0]
+        raise UserError(
+            f"an interpolation can't be resolved: {f'{key}: ' if key else ''}{message}"
+        ) from error
     except RecursionError as error:
         raise UserError("an interpolation leads to itself") from error
-    return map_strings(values, unprotect)
-
-
-def _explain(error: Exception) -> str:
-    message, key = str(error).splitlines()[0], getattr(error, "full_key", None)
-    return f"{key}: {message}" if key else message
+    except UserError:
+        raise
+    except (TypeError, ValueError, ArithmeticError, AttributeError) as error:
+        raise UserError(f"a resolver failed: {error}") from error
+    return _mapped(values, lambda text: text.replace(PROTECTED, "${"), "the configuration")
 
 
 def register_resolvers() -> None:

@@ -6,8 +6,8 @@ The key ``x_type`` names the part that the section ``x`` beside it configures: `
 
 import inspect
 import os
-import types
-import typing
+from collections.abc import Mapping
+from dataclasses import field, make_dataclass
 from typing import Any
 
 import torch
@@ -17,18 +17,19 @@ from ..core.distributed import require_shareable
 from ..core.errors import UserError, unknown
 from ..core.methods import require_dataclass
 from ..core.options import (
+    Rule,
+    at_least,
     drop_removed,
+    one_of,
     parse_structured,
     require_mapping,
-    require_representable,
+    satisfies,
     shown,
 )
 from ..host import find, pl, validate_schedule
 from ..training.data import sizes_of_stages
 from .live_viewer import ViewerConfig
-from .part_kinds import check_kind, find_part
-
-MisconfigurationException = pl.utilities.exceptions.MisconfigurationException
+from .parts import check_kind, find_part
 
 LAUNCHER_SETS = {
     "accelerator": "--gpu",
@@ -42,26 +43,44 @@ LAUNCHER_SETS = {
 }
 # left out when the trainer is built for the check, since they start or look for other processes
 NEEDS_PROCESSES = ("strategy", "num_nodes", "sync_batchnorm")
-# refused: they start processes that don't import custom parts, and then wait forever
-SPAWNING = ("ddp_spawn", "ddp_fork", "ddp_notebook")
-# smallest valid values, which Lightning itself doesn't check before training
-AT_LEAST = {
-    "log_every_n_steps": 0,
-    "num_sanity_val_steps": -1,
-    "max_steps": -1,
-    "min_steps": 0,
-    "check_val_every_n_epoch": 1,
-    "accumulate_grad_batches": 1,
+CLUSTER = ("MASTER_ADDR", "SLURM_NTASKS")
+ENDLESS = "no value, since views are drawn without end; set trainer.max_steps for a short run"
+TRAINER: dict[str, Rule] = {
+    "log_every_n_steps": at_least(0),
+    "num_sanity_val_steps": at_least(-1),
+    "max_steps": at_least(-1),
+    "min_steps": at_least(0),
+    "check_val_every_n_epoch": at_least(1),
+    "accumulate_grad_batches": at_least(1),
+    # Lightning takes 1.0 for all batches and 1 for one
+    "limit_train_batches": satisfies(ENDLESS, lambda share: repr(share) == "1.0"),
+    "overfit_batches": satisfies(ENDLESS, lambda share: share == 0),
+    "limit_test_batches": satisfies(
+        "more than 0, since results are exported after the test views (for one view: "
+        "data.n_test_views=1)",
+        lambda share: share != 0,
+    ),
+    "val_check_interval": satisfies(
+        "a whole number of steps above 0 (for no validation: trainer.limit_val_batches=0)",
+        lambda steps: steps != 0 and not (isinstance(steps, float) and steps != 1),
+    ),
+    "max_time": satisfies(
+        "a text such as '00:12:00:00' (days, hours, minutes, seconds)",
+        lambda time: not isinstance(time, (int, float)),
+    ),
+    "num_nodes": satisfies(
+        f"1 without a launcher of several machines, which sets {' or '.join(CLUSTER)}",
+        lambda count: count == 1 or any(name in os.environ for name in CLUSTER),
+    ),
+    "strategy": one_of(("auto", "ddp")),
 }
-# the only values that work where views are drawn without end, as repr shows them: Lightning takes
-# 1.0 for all batches and 1 for one; None: the key isn't given
-DEFAULTS_ONLY = {"limit_train_batches": ("None", "1.0"), "overfit_batches": ("None", "0", "0.0")}
-CLUSTER = {"MASTER_ADDR", "SLURM_NTASKS"}
+"""What Lightning itself doesn't check before training, or what has no use here."""
 LONGEST_NAME = 200
 """Longest name of a checkpoint, bytes; file systems allow 255, of which numbers and suffixes need
 some.
 """
-LOGGER_KEYS = ("enable", "project", "name")
+DATA = ("gaussiandreamer-datamodule", "random-camera-datamodule")
+"""Data modules that draw new views in each step."""
 
 
 def check_config(cfg: Any) -> None:
@@ -72,21 +91,14 @@ def check_config(cfg: Any) -> None:
         UserError: an unknown key or name (with the nearest valid one), or a value of the wrong type
             or out of range. The message is about the first error and begins with its dotted path.
     """
-    for section in cfg:
-        require_representable(section, cfg[section])
-    if not 0 <= cfg.seed < 2**32:
-        raise UserError(f"seed is {cfg.seed}; expected a whole number from 0 to 2^32 - 1")
     # the trainer first, since schedules of parts may refer to its number of steps
-    _check_arguments("trainer", cfg.trainer, pl.Trainer)
-    _check_trainer_ranges(cfg.trainer)
-    _check_strategy(cfg.trainer.get("strategy"))
+    _check_arguments("trainer", cfg.trainer, pl.Trainer, TRAINER)
     parse_structured(ViewerConfig, cfg.viewer, "viewer.")
     check_part("data", cfg.data_type, cfg.data)
     check_part("system", cfg.system_type, cfg.system)
     _check_loss(cfg.system.get("loss"), getattr(find(cfg.system_type), "LOSSES", None))
     check_sections(cfg)
-    _check_loggers(cfg.system.get("loggers"))
-    _check_arguments("checkpoint", cfg.checkpoint, pl.callbacks.ModelCheckpoint)
+    _check_arguments("checkpoint", cfg.checkpoint, pl.callbacks.ModelCheckpoint, {})
     if cfg.checkpoint.get("every_n_train_steps") == cfg.trainer.get("max_steps") == -1:
         raise UserError(
             "checkpoint.every_n_train_steps is -1, as trainer.max_steps, from which configurations "
@@ -142,131 +154,40 @@ def _check_loss(loss: Any, known: Any) -> None:
         validate_schedule(weight, f"system.loss.{key}")
 
 
-def _check_loggers(loggers: Any) -> None:
-    for name, options in (loggers or {}).items():
-        if name != "wandb":
-            raise unknown("key", name, ["wandb"], prefix="system.loggers.")
-        require_mapping(f"system.loggers.{name}", options)
-        for key in options:
-            if key not in LOGGER_KEYS:
-                raise unknown("key", key, LOGGER_KEYS, prefix="system.loggers.wandb.")
-
-
-def _check_arguments(section: str, values: Any, owner: type) -> None:
-    parameters = dict(inspect.signature(owner.__init__).parameters)
-    parameters.pop("self")
+def _check_arguments(section: str, values: Any, owner: type, rules: Mapping[str, Rule]) -> None:
+    """Check a section against the arguments of a class of Lightning, as against a ``Config``; what
+    isn't given as a number where one is expected becomes one.
+    """
     require_mapping(section, values)
-    for key, value in values.items():
+    for key in values:
         if key in LAUNCHER_SETS:
             raise UserError(f"{section}.{key} is set by {LAUNCHER_SETS[key]}: remove it")
-        if key not in parameters:
-            allowed = [name for name in parameters if name not in LAUNCHER_SETS]
-            raise unknown("key", key, allowed, prefix=f"{section}.")
-        _check_type(f"{section}.{key}", value, parameters[key].annotation)
-
-
-def _check_type(path: str, value: Any, annotation: Any) -> None:
-    """Raise UserError unless ``value`` has one of the plain types that ``annotation`` allows.
-
-    If the annotation also allows objects or literals, nothing is checked here: :func:`build` does.
-    """
-    accepted = _plain_types(annotation)
-    if not accepted or (
-        isinstance(value, int) and not isinstance(value, bool) and float in accepted
-    ):
-        return
-    if type(value) not in accepted:
-        known = ", ".join(
-            sorted("null" if kind is type(None) else kind.__name__ for kind in accepted)
-        )
-        raise UserError(f"{path} is {value!r} ({type(value).__name__}); expected one of: {known}")
-
-
-def _plain_types(annotation: Any) -> set[type]:
-    """Return the types of an annotation such as ``Optional[Union[int, float]]``; an empty set if it
-    has other types than int, float, bool, str and None.
-    """
-    if typing.get_origin(annotation) in (typing.Union, types.UnionType):
-        inner = [_plain_types(argument) for argument in typing.get_args(annotation)]
-        return set().union(*inner) if all(inner) else set()
-    return {annotation} if annotation in (int, float, bool, str, type(None)) else set()
-
-
-def _check_trainer_ranges(trainer: Any) -> None:
-    for key, lowest in AT_LEAST.items():
-        if (trainer.get(key) if trainer.get(key) is not None else lowest) < lowest:
-            raise UserError(f"trainer.{key}: expected {lowest} or more, got {trainer[key]}")
-    for key, defaults in DEFAULTS_ONLY.items():
-        if repr(trainer.get(key)) not in defaults:
-            raise UserError(
-                f"trainer.{key}: views are drawn without end, so this has no use; set "
-                f"trainer.max_steps for a short run, got {trainer[key]}"
-            )
-    if isinstance(trainer.get("max_time"), (int, float)):
-        raise UserError(
-            "trainer.max_time: expected a text such as '00:12:00:00' (days, hours, minutes, "
-            f"seconds), got {trainer.max_time}"
-        )
-    if trainer.get("num_nodes", 1) != 1 and not CLUSTER & os.environ.keys():
-        raise UserError(
-            f"trainer.num_nodes: expected 1, got {trainer.num_nodes}; several machines need a "
-            f"launcher that sets {' or '.join(sorted(CLUSTER))}"
-        )
-    interval = trainer.get("val_check_interval")
-    if interval == 0 or (isinstance(interval, float) and interval != 1):
-        raise UserError(
-            "trainer.val_check_interval: expected a whole number of steps above 0, got "
-            f"{interval} (for no validation: trainer.limit_val_batches=0)"
-        )
-    if trainer.get("limit_test_batches") in (0, 0.0):
-        raise UserError(
-            "trainer.limit_test_batches: expected more than 0, since results are exported after "
-            "the test views (for one view: data.n_test_views=1)"
-        )
-
-
-def _check_strategy(name: Any) -> None:
-    """Check that Lightning has the strategy, and that what it needs is installed.
-
-    Raises:
-        UserError: it is unknown, can't be used here, or can't be constructed.
-    """
-    registry = pl.strategies.StrategyRegistry
-    known = registry.available_strategies()
-    name = "auto" if name is None else str(name).lower()
-    if name == "auto":
-        return
-    if name not in known:
-        raise unknown("trainer.strategy", name, ["auto", *known])
-    if name.startswith(SPAWNING):
-        raise UserError(
-            f"trainer.strategy: {name} can't start processes of this program; give --gpu 0,1,... "
-            "alone, or ddp"
-        )
-    build("trainer.strategy", registry.get, {"name": name})
+    arguments = [
+        (name, given.annotation, field(default=given.default, metadata=rules.get(name, {})))
+        for name, given in inspect.signature(owner).parameters.items()
+        if name not in LAUNCHER_SETS
+    ]
+    typed = parse_structured(make_dataclass(owner.__name__, arguments), values, f"{section}.")
+    for key in values:
+        if type(getattr(typed, key)) in (bool, int, float):
+            values[key] = getattr(typed, key)
 
 
 def _check_file_name(checkpointing: Any) -> None:
     """Raise UserError unless Lightning can make names of files from ``checkpoint.filename``."""
-    name = checkpointing.filename
-    if name is None:
-        return
-    start = {"epoch": torch.tensor(0), "step": torch.tensor(0)}
     try:
-        made = checkpointing.format_checkpoint_name(start)
-    except Exception as error:  # of str.format, for instance ValueError, KeyError, AttributeError
-        raise UserError(
-            f"checkpoint.filename is {name!r}, which isn't a format: {error}"
-        ) from error
-    if os.path.isabs(made) or os.path.normpath(made).startswith(os.pardir):
-        raise UserError(
-            f"checkpoint.filename is {name!r}; expected a name below the folder of the checkpoints"
+        made = checkpointing.format_checkpoint_name(
+            {"epoch": torch.tensor(0), "step": torch.tensor(0)}
         )
-    longest = max(len(os.fsencode(part)) for part in made.split(os.sep))
-    if "\0" in made or longest > LONGEST_NAME:
+        longest = max(len(os.fsencode(part)) for part in made.split(os.sep))
+        is_inside = not os.path.isabs(made) and not os.path.normpath(made).startswith(os.pardir)
+    except Exception as error:  # of str.format, for instance ValueError, KeyError, AttributeError
+        is_inside, longest, made = False, 0, str(error)
+    if not is_inside or longest > LONGEST_NAME or "\0" in made:
         raise UserError(
-            f"checkpoint.filename is {shown(name)}; expected names of at most {LONGEST_NAME} bytes "
-            "without NUL"
+            f"checkpoint.filename is {shown(checkpointing.filename)}; expected a format such as "
+            f"'{{epoch}}-{{step}}', of names of at most {LONGEST_NAME} bytes below the folder of "
+            "the checkpoints"
         )
 
 
@@ -301,15 +222,12 @@ def build(section: str, owner: type, arguments: dict) -> Any:
         raise UserError(f"{section}: {str(error) or type(error).__name__}") from error
 
 
-def plain(section: Any) -> dict:
+def plain(section: Any) -> Any:
     """Convert a section to plain Python values."""
-    return typing.cast(dict, OmegaConf.to_container(section, resolve=True))
+    return OmegaConf.to_container(section, resolve=True)
 
 
 # -- options that contradict each other in different sections --------------------------------------
-
-DATA = ("gaussiandreamer-datamodule", "random-camera-datamodule")
-"""Data modules that draw new views in each step."""
 
 
 def check_sections(cfg: Any) -> None:
@@ -326,40 +244,30 @@ def check_sections(cfg: Any) -> None:
     if options is None:
         return
     guidance = parse_structured(options, cfg.system.get("guidance"))
-    _check_view_groups(guidance, cfg.data)
+    # a model that sees several views together must get them together
+    together, given = getattr(guidance, "n_view", 1), cfg.data.get("n_view", 1)
+    if together not in (1, given):
+        raise UserError(
+            f"data.n_view: the guidance sees {together} views of an object together, got {given}: "
+            f"set data.n_view={together} and data.batch_size to a multiple of it"
+        )
     if hasattr(options, "check_render_size") and cfg.data_type in DATA:
-        _check_render_sizes(options, guidance, cfg)
+        data = parse_structured(find(cfg.data_type).Config, cfg.data)
+        downsample = (cfg.system.get("renderer") or {}).get("downsample", 1)
+        for height, width, _ in sizes_of_stages(data):
+            options.check_render_size(guidance, height // downsample, width // downsample)
     if hasattr(guidance, "view_dependent_prompting"):
         _check_prompts(guidance, cfg.system)
 
 
 def check_shared_views(cfg: Any) -> None:
     """Raise UserError if the processes that are to train can't share the views of a step."""
-    if cfg.data_type not in DATA:
-        return
-    data = parse_structured(find(cfg.data_type).Config, cfg.data)
-    for *_, views in sizes_of_stages(data):
-        require_shareable(
-            views, "data.batch_size", together=getattr(data, "n_view", 1), processes=cfg.n_gpus
-        )
-
-
-def _check_view_groups(guidance: Any, data: Any) -> None:
-    """Raise UserError unless a model that sees several views together gets them together."""
-    together, given = getattr(guidance, "n_view", 1), data.get("n_view", 1)
-    if together not in (1, given):
-        raise UserError(
-            f"data.n_view: the guidance sees {together} views of an object together, got {given}: "
-            f"set data.n_view={together} and data.batch_size to a multiple of it"
-        )
-
-
-def _check_render_sizes(options: type, guidance: Any, cfg: Any) -> None:
-    """Raise UserError where the guidance can't compare the renders of a training stage."""
-    data = parse_structured(find(cfg.data_type).Config, cfg.data)
-    downsample = (cfg.system.get("renderer") or {}).get("downsample", 1)
-    for height, width, _ in sizes_of_stages(data):
-        options.check_render_size(guidance, height // downsample, width // downsample)
+    if cfg.data_type in DATA:
+        data = parse_structured(find(cfg.data_type).Config, cfg.data)
+        for *_, views in sizes_of_stages(data):
+            require_shareable(
+                views, "data.batch_size", together=getattr(data, "n_view", 1), processes=cfg.n_gpus
+            )
 
 
 def _check_prompts(guidance: Any, system: Any) -> None:
@@ -371,13 +279,15 @@ def _check_prompts(guidance: Any, system: Any) -> None:
         )
     if not (system.get("prompt_processor") or {}).get("use_perp_neg"):
         return
-    refused = "system.prompt_processor.use_perp_neg: Perp-Neg compares the prompts of views"
+    reason = ""
     if getattr(guidance, "n_view", 1) > 1:
-        raise UserError(f"{refused}, and this guidance has one prompt for all: set it to false")
-    if not guidance.view_dependent_prompting:
-        raise UserError(f"{refused}: set system.guidance.view_dependent_prompting=true")
-    if getattr(guidance, "view_contrast", 0):
+        reason = "and this guidance has one prompt for all: set it to false"
+    elif not guidance.view_dependent_prompting:
+        reason = "of which there is one: set system.guidance.view_dependent_prompting=true"
+    elif getattr(guidance, "view_contrast", 0):
+        reason = "as view_contrast does: set it to false, or system.guidance.view_contrast=0"
+    if reason:
         raise UserError(
-            "view_contrast and Perp-Neg both compare the prompts of views: set "
-            "system.prompt_processor.use_perp_neg=false, or system.guidance.view_contrast=0"
+            "system.prompt_processor.use_perp_neg: Perp-Neg compares the prompts of views, "
+            f"{reason}"
         )

@@ -78,8 +78,7 @@ def list_parts() -> None:
     from .. import register_parts
 
     register_parts()
-    from .extensions import load_extensions
-    from .part_kinds import parts_by_kind
+    from .parts import load_extensions, parts_by_kind
 
     load_extensions()
     for kind, parts in parts_by_kind().items():
@@ -140,7 +139,7 @@ def prepare(args: argparse.Namespace, argv: Sequence[str], **options: Any) -> "R
         from .. import register_parts
         from .config import load_config
         from .config_check import check_config
-        from .extensions import load_extensions
+        from .parts import load_extensions
         from .run import Run
 
         register_parts()

@@ -18,7 +18,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from ..core.checkpoint_file import newest_readable
 from ..core.errors import UserError
-from ..core.interpolation import escape
+from ..core.options import escape
 from ..host import info, warn
 from .options import PROGRAM
 

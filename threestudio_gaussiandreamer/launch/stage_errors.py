@@ -10,7 +10,6 @@ from typing import Any, Optional
 
 from ..core.errors import UserError, raised_in
 from ..host import pl, warn
-from .config_check import MisconfigurationException
 from .ddp import is_lost_process
 
 # errors of the file system that end a run with a message instead of a traceback
@@ -44,7 +43,7 @@ def lightning_errors(checkpoint: Optional[str], changes: Sequence[str] = ()) -> 
         if isinstance(stop.__context__, KeyboardInterrupt):
             raise KeyboardInterrupt from None
         raise
-    except MisconfigurationException as error:
+    except pl.utilities.exceptions.MisconfigurationException as error:
         raise UserError(f"trainer: {error}") from error
     except (RuntimeError, ValueError, KeyError) as error:
         if is_lost_process(error):

@@ -1,5 +1,6 @@
 """Base classes of the parts of a system, and the host's own minimal parts."""
 
+from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Optional, Tuple
@@ -78,6 +79,7 @@ class BaseBackground(BaseModule):
 
     cfg: Config
 
+    @abstractmethod
     def forward(self, dirs: Tensor) -> Tensor:
         raise NotImplementedError(f"{type(self).__name__}.forward")
 

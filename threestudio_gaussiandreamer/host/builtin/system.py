@@ -34,7 +34,9 @@ class BaseSystem(pl.LightningModule, Updateable, SaverMixin):
 
     @dataclass
     class Config:
-        loggers: dict = field(default_factory=dict)
+        loggers: dict = field(
+            default_factory=lambda: {"wandb": {"enable": False, "project": "", "name": ""}}
+        )
         loss: dict = field(default_factory=dict)
         optimizer: dict = field(default_factory=dict)
         scheduler: Optional[dict] = None

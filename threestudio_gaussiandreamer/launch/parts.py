@@ -1,0 +1,195 @@
+"""The registered parts: those of this package, and the user's own in ``./custom``, of which every
+module is imported, so that its ``@register`` decorators run.
+
+As in threestudio, a folder with an ``__init__.py`` is imported under its own name, which may have
+hyphens, and may use relative imports; a file ``part.py`` is imported as ``custom/part``. Names that
+end in ``_disabled`` or begin with a dot are skipped."""
+
+import importlib.util
+import sys
+import traceback
+from importlib.machinery import PathFinder
+from pathlib import Path
+from typing import Any, Optional
+
+from torch import nn
+
+from ..core.errors import Terminated, UserError
+from ..core.methods import require_method
+from ..exporters.files import require_export
+from ..guidance.base import ScoreDistillation
+from ..guidance.variants import Variant
+from ..host import (
+    BaseBackground,
+    BaseGeometry,
+    BaseMaterial,
+    Exporter,
+    Rasterizer,
+    find,
+    info,
+    names,
+    pl,
+)
+from ..priors.base import Prior
+from ..prompts.prompt_processors import TextEncoderPromptProcessor
+from ..training.density import DensityRule
+from ..training.losses import SUFFIX
+
+MODULES = {
+    "training": "data background renderer density geometry",
+    "priors": "mesh point_cloud gaussians random shap_e point_e motion anny",
+    "guidance": "exact_score mock stable_diffusion deep_floyd mvdream stable_diffusion_3",
+    "prompts": "prompts prompt_processors",
+    "exporters": "files",
+}
+"""The modules of each room that register parts, or import those which do; the system is last."""
+
+for room, modules in (*MODULES.items(), ("training", "system")):
+    for module in modules.split():
+        importlib.import_module(f"..{room}.{module}", __package__)
+
+KINDS: dict[str, type] = {
+    "data": pl.LightningDataModule,
+    "system": pl.LightningModule,
+    "geometry": BaseGeometry,
+    "material": BaseMaterial,
+    "background": BaseBackground,
+    "renderer": Rasterizer,
+    "exporter": Exporter,
+    "prior": Prior,
+    "density": DensityRule,
+    "guidance": ScoreDistillation,
+    "variant": Variant,
+    "prompt_processor": TextEncoderPromptProcessor,
+}
+"""The base class of each kind of part, by the name of its section.
+
+Parts of other packages may have other base classes; a part is refused only if it derives from the
+base class of a different kind.
+"""
+CALLS = {"guidance": "rgb", "background": "dirs"}
+"""The first argument of a call, of the kinds that other packages write without our base class."""
+
+
+def find_part(path: str, type_name: Any) -> type:
+    """Return the part that the key ``path`` names; the message of an error names the key too."""
+    if not type_name:
+        hint = ""
+        if path == "data_type":
+            hint = " (an overlay needs the configuration that it changes before it)"
+        raise UserError(f"{path} is empty: name a registered part{hint}")
+    if not isinstance(type_name, str):
+        raise UserError(f"{path} is {type_name!r}; expected the name of a registered part")
+    try:
+        return find(type_name)
+    except UserError as error:
+        hint = (
+            " (own parts are imported from the folder custom in the working folder, which has "
+            "none; a run's folder has a copy in code)"
+        )
+        raise UserError(f"{path}: {error}{'' if Path('custom').is_dir() else hint}") from error
+
+
+def check_kind(path: str, type_name: str, part: Any) -> None:
+    """Raise UserError if the part of a section is no class, is known to be of another kind, or
+    can't be called.
+    """
+    if not isinstance(part, type):
+        raise UserError(f"{path}: {type_name} is a {type(part).__name__}; register a class")
+    kind, found = path.rpartition(".")[2].removesuffix("_type"), _kind_of(part)
+    if found not in (None, kind) and kind in KINDS:
+        choices = [name for name in names() if _kind_of(find(name)) == kind]
+        raise UserError(
+            f"{path} is {type_name!r}, a part of the kind {found}; expected one of the kind "
+            f"{kind}: choose from {', '.join(choices)}"
+        )
+    try:
+        if kind in CALLS:
+            call = "forward" if issubclass(part, nn.Module) else "__call__"
+            require_method(part, call, CALLS[kind], more=True)
+        elif kind == "exporter":
+            require_export(part)
+    except UserError as error:
+        raise UserError(f"{path}: {error}") from error
+
+
+def parts_by_kind() -> dict[str, list[str]]:
+    """Return the names of the registered parts; the kind "other" has those without a base class
+    that tells theirs, such as guidances that are plain objects.
+    """
+    found: dict[str, list[str]] = {}
+    for name in names():
+        is_loss = name.endswith(SUFFIX)
+        kind = "regulariser" if is_loss else _kind_of(find(name)) or "other"
+        found.setdefault(kind, []).append(name)
+    return {kind: found[kind] for kind in (*KINDS, "regulariser", "other") if kind in found}
+
+
+def _kind_of(part: Any) -> Optional[str]:
+    # of threestudio's parts, the base class of threestudio
+    bases = {kind: vars(base).get("HOST", base) for kind, base in KINDS.items()}
+    is_class = isinstance(part, type)
+    return next((kind for kind in bases if is_class and issubclass(part, bases[kind])), None)
+
+
+# -- the user's own --------------------------------------------------------------------------------
+
+
+def load_extensions(folder: Path = Path("custom")) -> list[str]:
+    """Import all extensions in ``folder``, sorted by name, and return their module names.
+
+    Raises:
+        UserError: the folder can't be read, or an extension fails to import; the message names the
+            file, the line and the cause.
+    """
+    try:
+        entries = sorted(folder.iterdir()) if folder.is_dir() else []
+    except OSError as error:
+        raise UserError(f"the extensions in {folder} can't be read: {error}") from error
+    return [_load(entry) for entry in entries if _is_extension(entry)]
+
+
+def _is_extension(entry: Path) -> bool:
+    if entry.name.startswith((".", "__")) or entry.stem.endswith("_disabled"):
+        return False
+    if not entry.is_dir() and entry.suffix != ".py":
+        return False
+    if not (file := _file_of(entry)).is_file():
+        info(f"{entry} is no extension: {file} is no file")
+    return file.is_file()
+
+
+def _file_of(entry: Path) -> Path:
+    return entry / "__init__.py" if entry.is_dir() else entry
+
+
+def _load(entry: Path) -> str:
+    name, file = entry.name if entry.is_dir() else f"custom/{entry.stem}", _file_of(entry)
+    loaded = sys.modules.get(name)
+    if loaded is not None and Path(loaded.__file__ or "").resolve() == file.resolve():
+        return name
+    installed = PathFinder.find_spec(name) if entry.is_dir() else None
+    if installed and installed.origin or name in sys.stdlib_module_names:
+        raise UserError(f"the extension {entry} has the name of a module: rename the folder")
+    spec = importlib.util.spec_from_file_location(name, file.resolve())
+    sys.modules[name] = module = importlib.util.module_from_spec(spec)
+    try:
+        spec.loader.exec_module(module)
+    except (Exception, SystemExit) as error:
+        del sys.modules[name]
+        if isinstance(error, Terminated):
+            raise
+        raise UserError(
+            f"the extension {entry} can't be imported: {_cause(error, entry)}"
+        ) from error
+    return name
+
+
+def _cause(error: BaseException, entry: Path) -> str:
+    """Describe an error as ``file:line: message``, with the innermost line in the extension."""
+    if isinstance(error, SyntaxError) and error.lineno:
+        return f"{error.filename}:{error.lineno}: {error.msg}"
+    root, what = str(entry.resolve()), f"{type(error).__name__}: {error}"
+    frames = traceback.extract_tb(error.__traceback__)
+    inside = [frame for frame in frames if frame.filename.startswith(root)]
+    return f"{inside[-1].filename}:{inside[-1].lineno}: {what}" if inside else what
