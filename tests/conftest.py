@@ -8,7 +8,6 @@ os.environ.setdefault("HF_HUB_OFFLINE", "1")
 # the tests' tensors are the CPU's; what needs a GPU is in benchmarks/splatting/gpu_check.py
 os.environ["CUDA_VISIBLE_DEVICES"] = ""
 
-import functools
 import shutil
 import signal
 from collections.abc import Callable
@@ -44,19 +43,6 @@ def no_traces_of_runs(monkeypatch):
     """
     monkeypatch.setenv("PL_GLOBAL_SEED", "0")
     monkeypatch.setattr(logs.logger, "propagate", True)
-
-
-@pytest.fixture(autouse=True, scope="session")
-def small_turntables():
-    """Render the turntables of priors with few pixels, because the GIF takes as long as a short
-    run.
-    """
-    from threestudio_gaussiandreamer.priors import cache
-
-    small = functools.partial(cache.save_turntable, views=2, size=16)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(cache, "save_turntable", small)
-        yield
 
 
 @pytest.fixture(scope="session")

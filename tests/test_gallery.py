@@ -12,7 +12,7 @@ TESTED = {
 
 
 def test_what_finished_runs_leave(gallery):
-    prior = {f"save/prior/{name}" for name in ("points.npz", "points.ply", "turntable.gif")}
+    prior = {f"save/prior/{name}" for name in ("points.npz", "points.ply")}
     step_4 = {"ckpts/epoch=0-step=4.ckpt", "save/it4-0.png"}
     assert TESTED | prior | step_4 <= files(gallery("trained"))
     assert TESTED <= (resumed := files(gallery("resumed"))) and not resumed & (prior | step_4)

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from tests.helpers.tiny_3d_models import JOINTS
+from threestudio_gaussiandreamer.priors.anny import BONES, METRES, Person, target_weights
 from threestudio_gaussiandreamer.priors.body_pose import BODY_JOINTS, PARENTS
 from threestudio_gaussiandreamer.priors.body_pose import JOINTS as NAMES
-from threestudio_gaussiandreamer.priors.makehuman import BONES, METRES, Person, target_weights
 
 SIDES = 4
 RADIUS = 0.05

@@ -13,7 +13,7 @@ from tests.priors.cases import rng, walk
 from threestudio_gaussiandreamer.formats import ply
 from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
 from threestudio_gaussiandreamer.gaussians.point_cloud import PointCloud
-from threestudio_gaussiandreamer.priors.makehuman import Person, load_body
+from threestudio_gaussiandreamer.priors.anny import Person, load_body
 from threestudio_gaussiandreamer.priors.smpl_fit import load_body_model
 
 

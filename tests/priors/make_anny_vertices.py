@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
-from threestudio_gaussiandreamer.priors.makehuman import Person, load_body
+from threestudio_gaussiandreamer.priors.anny import Person, load_body
 
 PATH = Path(__file__).with_name("anny_vertices.csv")
 PERSON = Person(gender=0.3, age=0.2, muscle=0.7, weight=0.2, height=0.8, proportions=0.3)

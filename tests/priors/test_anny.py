@@ -10,8 +10,7 @@ from tests.helpers.prior_contract import PriorContract, assert_valid
 from tests.priors.cases import bvh_text, needs_anny, random_local
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.host import find
-from threestudio_gaussiandreamer.priors.anny import AnnyPrior
-from threestudio_gaussiandreamer.priors.makehuman import load_body
+from threestudio_gaussiandreamer.priors.anny import AnnyPrior, load_body
 
 
 def make(**options):

@@ -1,4 +1,4 @@
-"""The prior runs once per (prior, options, their files, prompt, seed) and folder; its turntable."""
+"""The prior runs once per (prior, options, their files, prompt, seed) and folder."""
 
 import importlib.util
 import os
@@ -8,15 +8,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.formats.ply import read_points
 from threestudio_gaussiandreamer.gaussians.point_cloud import PointCloud
 from threestudio_gaussiandreamer.host import BaseObject
 from threestudio_gaussiandreamer.priors.cache import (
     cache_key,
     cached_cloud,
-    save_turntable,
-    turntable,
 )
 from threestudio_gaussiandreamer.priors.mesh import MeshPrior
 
@@ -117,34 +114,3 @@ def test_changed_code_runs_the_prior_again(tmp_path):
     third = key_of(path)
     other.write_text("a = 3\n")
     assert len({first, second, third, key_of(path)}) == 4
-
-
-@pytest.fixture(scope="module")
-def sphere():
-    """Return 20,000 points around a distant centre: red on the +x side, blue on the +y side, else
-    green.
-    """
-    points = np.random.default_rng(0).normal(size=(20_000, 3))
-    points *= 40 / np.linalg.norm(points, axis=1, keepdims=True)
-    x, y, _ = points.T
-    side = np.where(x > np.abs(y), 0, np.where(y > np.abs(x), 2, 1))
-    return PointCloud(points.astype(np.float32) + [100, -50, 7], np.eye(3, dtype=np.float32)[side])
-
-
-def test_the_turntable_begins_at_the_front_and_turns_to_plus_y(sphere, tmp_path):
-    pictures = turntable(sphere, views=4, size=64)
-    assert pictures.shape == (4, 64, 64, 3) and pictures.dtype == np.uint8
-    middle = pictures[:, 29:35, 29:35].mean(axis=(1, 2))
-    wanted = [[255, 0, 0], [0, 0, 255], [0, 255, 0]]
-    np.testing.assert_allclose(middle[:3], wanted, atol=25)  # a point's alpha is at most 0.95
-    border = [pictures[:, 0], pictures[:, -1], pictures[:, :, 0], pictures[:, :, -1]]
-    assert (np.concatenate(border, axis=1) == 255).all()
-    covered = (pictures < 250).any(axis=-1).mean()
-    assert 0.45 < covered < 0.6  # a disc of 1 / 1.3 of the height would be 0.46; its edges are soft
-    one = turntable(PointCloud(np.zeros((1, 3)), np.zeros((1, 3))), views=1, size=32)
-    assert (one < 128).any()
-    save_turntable(sphere, tmp_path / "prior.gif", views=5, size=32)
-    with Image.open(tmp_path / "prior.gif") as image:
-        assert image.n_frames == 5 and image.size == (32, 32) and image.info["loop"] == 0
-    with pytest.raises(UserError, match="cannot write"):
-        save_turntable(sphere, tmp_path / "nowhere" / "prior.gif", views=1, size=32)

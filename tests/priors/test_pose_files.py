@@ -10,11 +10,9 @@ from threestudio_gaussiandreamer.priors.body_pose import (
     BODY_JOINTS,
     INDEX,
     JOINTS,
+    joint_names,
     named_pose,
     posed,
-)
-from threestudio_gaussiandreamer.priors.pose_files import (
-    joint_names,
     read_axis_angles,
     read_bvh,
     read_pose,

@@ -55,17 +55,13 @@ class Ended(NamedTuple):
 
 
 def launch(folder: Path, *overrides: str, stage: str = "--train", config: Path = DEMO) -> Ended:
-    """Run the small demo below ``folder`` and restore the environment.
-
-    The prior's turntable is off, because it takes longer than the rest.
-    """
+    """Run the small demo below ``folder`` and restore the environment."""
     out, err = io.StringIO(), io.StringIO()
     prior = any(option.startswith("system.geometry.prior_type=") for option in overrides)
     small = [o for o in SMALL if not (prior and o.startswith("system.geometry.prior."))]
     arguments = ["--config", str(config), stage, "--gpu", "cpu", f"exp_root_dir={folder}"]
     with (
         mock.patch.dict(os.environ),
-        mock.patch("threestudio_gaussiandreamer.priors.cache.save_turntable"),
         contextlib.redirect_stdout(out),
         contextlib.redirect_stderr(err),
     ):

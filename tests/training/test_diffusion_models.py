@@ -133,7 +133,7 @@ def assert_trained(folder, rate, ground=0):
     # 0.999; float32 rounds at 1e-7
     assert 0.5 * rate < moved.max() < 3.2 * STEPS * rate + 1e-6
     save = folder / "save"
-    for name in (f"it{STEPS}-0.png", f"it{STEPS}-test.mp4", "prior/turntable.gif"):
+    for name in (f"it{STEPS}-0.png", f"it{STEPS}-test.mp4", "prior/points.npz"):
         assert (save / name).is_file(), name
     losses = [
         float(row["train/loss_sds"])

