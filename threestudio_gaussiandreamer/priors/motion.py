@@ -89,8 +89,7 @@ def read_motions(path: str) -> Motions:
     """Return the motions of an NPZ or NPY file.
 
     Raises:
-        UserError: missing, pickled, of another layout, without frames, or not finite; the message
-            says what to do.
+        UserError: missing, of another layout, without frames, or not finite.
     """
     with reading(path, "motion file") as file:
         arrays = read_arrays(file, "motion file", ["motion"], ["text", "lengths"])
@@ -216,9 +215,17 @@ class MotionPrior(Prior):
         if len(choices) > 1:
             best = self._best(fitted(targets, ROUGH)[1], self._motion_text(prompt), names)
         # fitted separately, so that the result doesn't depend on the other choices
-        residuals, meshes = fitted(targets[[best]], FINE)
-        report_residuals(residuals[0], names[best], cfg.max_residual_mm)
-        return meshes[0]
+        (residuals,), (mesh,) = fitted(targets[[best]], FINE)
+        worst, mean = int(residuals.argmax()), residuals.mean()
+        found = f"{mean:.1f} mm mean, {residuals[worst]:.1f} mm at the {JOINTS[worst]}"
+        if mean > cfg.max_residual_mm:
+            raise UserError(
+                f"SMPL does not fit {names[best]}: its joints are off by {found}: are the "
+                "positions in metres, y up and in SMPL's order? Choose another frame or raise "
+                f"max_residual_mm ({cfg.max_residual_mm:g})"
+            )
+        info(f"SMPL fitted to {names[best]}: {found}")
+        return mesh
 
     def _motion_text(self, prompt: str) -> str:
         text = self.cfg.motion_text or reduced_prompt(prompt)
@@ -241,14 +248,8 @@ class MotionPrior(Prior):
 
 
 def offered_frames(motions: Motions, sample: Optional[int], frame: Any) -> list[tuple[int, int]]:
-    """Return the (motion, frame) pairs to choose from.
-
-    Args:
-        sample: index of a motion; None for all.
-        frame: index of a frame, which is then the only choice, or "clip".
-
-    Raises:
-        UserError: there is no such motion or frame.
+    """Return the (motion, frame) pairs to choose from: of one motion, or of all if ``sample`` is
+    None; one frame, or evenly spaced ones if ``frame`` is "clip".
     """
     count = len(motions.lengths)
     if sample is not None and sample >= count:
@@ -261,38 +262,16 @@ def offered_frames(motions: Motions, sample: Optional[int], frame: Any) -> list[
     return [(s, int(f)) for s in samples for f in np.unique(frames[s])]
 
 
-def report_residuals(residuals: Float[np.ndarray, "K"], name: str, limit: float) -> None:
-    """Log the distances of the body's joints from the motion's, millimetres.
-
-    Raises:
-        UserError: the mean distance exceeds ``limit``.
-    """
-    worst = int(residuals.argmax())
-    found = f"{residuals.mean():.1f} mm mean, {residuals[worst]:.1f} mm at the {JOINTS[worst]}"
-    if residuals.mean() > limit:
-        raise UserError(
-            f"SMPL does not fit {name}: its joints are off by {found}: are the positions in "
-            "metres, y up and in SMPL's order? Choose another frame or raise max_residual_mm "
-            f"({limit:g})"
-        )
-    info(f"SMPL fitted to {name}: {found}")
-
-
 def body_pictures(mesh: Mesh) -> Float[np.ndarray, "V H W 3"]:
-    """Render the body in shaded grey on white, from the front and from both sides of the front."""
-    vertices = mesh.vertices / np.abs(mesh.vertices).max()
-    caster = MeshCaster(shaded(Mesh(vertices, mesh.faces)))
-    azimuths, ones = torch.tensor(VIEW_AZIMUTHS), torch.ones(len(VIEW_AZIMUTHS))
-    views = orbit_c2w(VIEW_ELEVATION * ones, azimuths, VIEW_DISTANCE * ones).numpy()
-    pictures = caster.render_views([(c2w, VIEW_FOVY) for c2w in views], PICTURE_SIZE, PICTURE_SIZE)
-    return over_background(pictures, np.ones(3, np.float32))
-
-
-def shaded(mesh: Mesh) -> Mesh:
-    """Return ``mesh`` with grey vertex colours by Lambertian shading."""
+    """Render the body in Lambertian grey on white, from the front and from both sides of it."""
     normals = np.zeros_like(mesh.vertices)
     for corner in range(3):
         np.add.at(normals, mesh.faces[:, corner], face_normals(mesh))
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    grey = 0.25 + 0.6 * np.maximum(normals @ LIGHT, 0.0)
-    return mesh._replace(vertex_colors=np.repeat(grey[:, None], 3, axis=1).astype(np.float32))
+    grey = (0.25 + 0.6 * np.maximum(normals @ LIGHT, 0.0)).astype(np.float32)
+    vertices, colors = mesh.vertices / np.abs(mesh.vertices).max(), np.repeat(grey[:, None], 3, 1)
+    caster = MeshCaster(Mesh(vertices, mesh.faces, vertex_colors=colors))
+    azimuths, ones = torch.tensor(VIEW_AZIMUTHS), torch.ones(len(VIEW_AZIMUTHS))
+    views = orbit_c2w(VIEW_ELEVATION * ones, azimuths, VIEW_DISTANCE * ones).numpy()
+    pictures = caster.render_views([(c2w, VIEW_FOVY) for c2w in views], PICTURE_SIZE, PICTURE_SIZE)
+    return over_background(pictures, np.ones(3, np.float32))

@@ -12,24 +12,16 @@ from typing import Optional
 
 SUBJECT = "Someone"
 VERBS = (
-    "aim balance bend bow box brace catch cartwheel celebrate charge cheer clap climb crawl "
-    "crouch curtsy dance dash dive dodge draw"
-    " drink drive duck eat embrace fall fight flex flip fly gallop gesture golf greet grab "
-    "hang hit hold hop hug hurdle jab jog juggle"
-    " jump kick kneel knock land lean leap lie lift limp look lunge march meditate move nod "
-    "pace paddle perform pick pirouette play point"
-    " pose practice practise pray pull punch push raise reach read recline rest ride roll row "
-    "run salute shake shoot shout shrug shuffle"
-    " sing sit skate ski skip slap sleep slide sneak spin sprint squat stand stagger step "
-    "stomp stop stretch stride strike stroll strum"
-    " stumble swim swing swipe talk tap throw tiptoe toss trot tumble turn twirl twist type "
-    "wait walk wave wield work yawn yell"
+    "aim balance bend bow box brace catch cartwheel celebrate charge cheer clap climb crawl crouch "
+    "curtsy dance dash dive dodge draw drink drive duck eat embrace fall fight flex flip fly "
+    "gallop gesture golf greet grab hang hit hold hop hug hurdle jab jog juggle jump kick kneel "
+    "knock land lean leap lie lift limp look lunge march meditate move nod pace paddle perform "
+    "pick pirouette play point pose practice practise pray pull punch push raise reach read "
+    "recline rest ride roll row run salute shake shoot shout shrug shuffle sing sit skate ski skip "
+    "slap sleep slide sneak spin sprint squat stand stagger step stomp stop stretch stride strike "
+    "stroll strum stumble swim swing swipe talk tap throw tiptoe toss trot tumble turn twirl twist "
+    "type wait walk wave wield work yawn yell"
 ).split()
-DOUBLED = set(
-    "clap flip hug hit hop jab jog nod pat run sit skip slap spin squat step stop strum swim tap "
-    "trot".split()
-)
-"""Verbs whose last letter is written twice before "-ing"."""
 POSSESSIVES = re.compile(r"\b(?:his|her|its|their|my|your|our)\b", re.IGNORECASE)
 
 
@@ -40,17 +32,14 @@ def third_person(verb: str) -> str:
     return verb + ("es" if verb.endswith(("s", "sh", "ch", "x", "z", "o")) else "s")
 
 
-def progressive(verb: str) -> str:
-    """ "kick" -> "kicking", "run" -> "running", "ride" -> "riding", "lie" -> "lying"."""
-    if verb.endswith("ie"):
-        return verb[:-2] + "ying"
-    if verb.endswith("e") and not verb.endswith(("ee", "oe")):
-        return verb[:-1] + "ing"
-    return verb + (verb[-1] if verb in DOUBLED else "") + "ing"
+def is_progressive(word: str) -> bool:
+    """Return whether a word is one as "kicking", "running", "riding" or "lying"."""
+    stem = word.removesuffix("ing")
+    once = stem[:-1] if stem[-1:] == stem[-2:-1] else stem
+    return stem != word and not {stem, once, f"{stem}e", f"{stem[:-1]}ie"}.isdisjoint(VERBS)
 
 
-FORMS = {third_person(verb): verb for verb in VERBS}
-PROGRESSIVES = {progressive(verb): verb for verb in VERBS}
+THIRD_PERSONS = set(map(third_person, VERBS))
 
 
 def reduced_prompt(prompt: str) -> Optional[str]:
@@ -60,13 +49,16 @@ def reduced_prompt(prompt: str) -> Optional[str]:
     A verb of the kind "kicks" comes before one of the kind "kicking", which may belong to the
     subject ("a flying fox jumps"), and both before one of the kind "kick", which may be a noun, and
     which becomes "kicks"."""
-    for forms in (FORMS, PROGRESSIVES, {verb: verb for verb in VERBS}):
+    for is_verb, form in (
+        (THIRD_PERSONS.__contains__, str),
+        (is_progressive, "is {}".format),
+        (VERBS.__contains__, third_person),
+    ):
         for match in re.finditer(r"[A-Za-z]+", prompt):
             word = match.group().lower()
-            if match.start() and word in forms:
-                verb = f"is {word}" if forms is PROGRESSIVES else third_person(forms[word])
+            if match.start() and is_verb(word):
                 clause = re.split(r"[,.;:!?]", prompt[match.end() :], maxsplit=1)[0]
-                return " ".join(f"{SUBJECT} {verb} {POSSESSIVES.sub('the', clause)}".split())
+                return " ".join(f"{SUBJECT} {form(word)} {POSSESSIVES.sub('the', clause)}".split())
     return None
 
 

@@ -1,9 +1,8 @@
-"""SMPL's pose, and optionally its shape, from the positions of its joints: a small optimisation
-with priors.
+"""SMPL's pose and shape from the positions of its joints, with smplx's kinematics.
 
 The body model is the user's own file of SMPL, SMPL-H or SMPL-X, whose first 22 joints are the same.
-The kinematics are smplx's. What is minimised, over the rotations of all joints (axis-angle), a
-translation and a few shape coefficients, summed over the frames, which share nothing:
+What is minimised, over the rotations of all joints (axis-angle), a translation and a few shape
+coefficients, summed over the frames, which share nothing:
 
     sum_j |joint_j - target_j|^2 / s^2 + pose |theta|^2 + shape |beta|^2
         + limits sum max(0, low - theta, theta - high)^2,   s = 10 mm
@@ -29,7 +28,8 @@ from .body_pose import BODY_JOINTS
 
 FIELDS = ("v_template", "shapedirs", "posedirs", "J_regressor", "weights", "kintree_table", "f")
 """Arrays of a body model's file that are used."""
-SMPL_JOINTS = 24
+SMPL_JOINTS, SHAPES = 24, 10
+"""Joints of SMPL, and the shape coefficients that are used."""
 TRUNK = (0, 1, 2, 3, 6, 9, 13, 14, 16, 17)
 """Pelvis, hips, spine, collars and shoulders, which move almost as one."""
 SCALE = 0.01
@@ -42,12 +42,11 @@ DEGREES = math.pi / 180
 KNEE = {0: (0, 150), 1: (-15, 15), 2: (-15, 15)}
 ANKLE = {0: (-60, 60), 1: (-45, 45), 2: (-45, 45)}
 LIMITS = {
-    # joint: axis: (low, high) in degrees. Knees bend about x, the elbows about y, the left one's
-    # negative side.
-    **{4: KNEE, 5: KNEE, 18: {1: (-150, 5)}, 19: {1: (-5, 150)}},
+    **{4: KNEE, 5: KNEE, 18: {1: (-150, 5)}, 19: {1: (-5, 150)}},  # elbows bend about y
     **{joint: dict.fromkeys(range(3), (-60, 60)) for joint in (3, 6, 9, 12, 15)},  # spine, head
     **{7: ANKLE, 8: ANKLE},
 }
+"""Joint: axis: (low, high), degrees."""
 
 
 class BodyModel(NamedTuple):
@@ -74,11 +73,8 @@ class BodyFit(NamedTuple):
     """Distance of each fitted joint from where it should be, millimetres."""
 
 
-def load_body_model(path: str, *, num_shape: int = 10) -> BodyModel:
+def load_body_model(path: str) -> BodyModel:
     """Read the user's body model, an NPZ or SMPL's own PKL, of which no code is run.
-
-    Args:
-        num_shape: shape coefficients that are used.
 
     Raises:
         UserError: missing, or not a body model; the message says what to do.
@@ -93,7 +89,7 @@ def load_body_model(path: str, *, num_shape: int = 10) -> BodyModel:
     directions = _tensor(arrays["posedirs"]).reshape(vertices * 3, 9 * (joints - 1))
     return BodyModel(
         template=_tensor(arrays["v_template"]),
-        shape_directions=_tensor(arrays["shapedirs"][:, :, :num_shape]),
+        shape_directions=_tensor(arrays["shapedirs"][:, :, :SHAPES]),
         pose_directions=directions.T.contiguous(),
         joint_regressor=_tensor(arrays["J_regressor"]),
         parents=parents,
@@ -103,10 +99,7 @@ def load_body_model(path: str, *, num_shape: int = 10) -> BodyModel:
 
 
 def fit_bodies(
-    model: BodyModel,
-    targets: Float[np.ndarray, "F K 3"],
-    *,
-    iterations: int = 300,
+    model: BodyModel, targets: Float[np.ndarray, "F K 3"], *, iterations: int = 300
 ) -> BodyFit:
     """Return bodies whose joints are where ``targets`` has them.
 
@@ -133,11 +126,8 @@ def fit_bodies(
 def energy(
     model: BodyModel, body: tuple[Tensor, Tensor, Tensor], wanted: Tensor, weight: float
 ) -> Tensor:
-    """Compute the objective of the fit, summed over the frames; see the module's docstring.
-
-    Args:
-        body: pose, shape and translation.
-        weight: of the pose prior.
+    """Compute the objective of the fit, with this weight of the pose prior, summed over the frames.
+    ``body`` is pose, shape and translation.
     """
     pose, shape, _ = body
     found = posed_joints(model, *body)[:, : wanted.shape[1]]
@@ -161,9 +151,7 @@ def posed_joints(
     shape: Float[Tensor, "F B"],
     translation: Float[Tensor, "F 3"],
 ) -> Float[Tensor, "F J 3"]:
-    """Return the joint positions; cheaper than the whole body, whose vertices are needed for the
-    surface only.
-    """
+    """Return the joint positions, which is cheaper than the whole body."""
     from smplx.lbs import batch_rigid_transform, batch_rodrigues
 
     frames, joints = pose.shape[:2]
@@ -224,9 +212,7 @@ def _minimise(body: tuple[Tensor, ...], loss: Callable[[], Tensor], iterations: 
 
 
 def _check(arrays: dict[str, np.ndarray]) -> None:
-    """Raise Unreadable unless the arrays are those of a body with SMPL's 22 joints or more, of
-    finite numbers, whose faces name vertices and whose joints hang on earlier ones.
-    """
+    """Raise Unreadable unless the arrays are those of a body with SMPL's 22 joints or more."""
     vertices, joints = len(arrays["v_template"]), len(arrays["J_regressor"])
     expected = {
         "v_template": (vertices, 3),
@@ -237,20 +223,16 @@ def _check(arrays: dict[str, np.ndarray]) -> None:
         "kintree_table": (2, joints),
         "f": (len(arrays["f"]), 3),
     }
-    fits = joints >= BODY_JOINTS and all(arrays[n].shape == s for n, s in expected.items())
     parents, faces = arrays["kintree_table"].astype(np.int64), arrays["f"].astype(np.int64)
-    sound = (
-        fits
+    shapes = ", ".join(f"{name} {arrays[name].shape}" for name in FIELDS)
+    require(
+        joints >= BODY_JOINTS
+        and all(arrays[name].shape == shape for name, shape in expected.items())
         and all(np.isfinite(values).all() for values in arrays.values())
         and ((parents[0, 1:] >= 0) & (parents[0, 1:] < np.arange(1, joints))).all()
-        and ((faces >= 0) & (faces < vertices)).all()
-    )
-    shapes = ", ".join(f"{name} {arrays[name].shape}" for name in FIELDS)
-    problem = "it is damaged" if fits else f"it has other arrays ({shapes})"
-    require(
-        sound,
-        f"{problem}: finite numbers that fit each other, of {BODY_JOINTS} joints or more, were "
-        "expected; get it again",
+        and ((faces >= 0) & (faces < vertices)).all(),
+        f"it is damaged, or has other arrays ({shapes}): finite numbers that fit each other, of "
+        f"{BODY_JOINTS} joints or more, were expected; get it again",
     )
 
 
