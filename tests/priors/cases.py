@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from threestudio_gaussiandreamer.host import find
 from threestudio_gaussiandreamer.priors.body_pose import BODY_JOINTS, INDEX, LIMBS, PARENTS
-from threestudio_gaussiandreamer.priors.smpl_fit import posed_joints
+from threestudio_gaussiandreamer.priors.motion import posed_joints
 
 OPTIONS = {
     "mesh-prior": {"path": "box.ply"},

@@ -14,7 +14,7 @@ from threestudio_gaussiandreamer.formats import ply
 from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
 from threestudio_gaussiandreamer.gaussians.point_cloud import PointCloud
 from threestudio_gaussiandreamer.priors.anny import Person, load_body
-from threestudio_gaussiandreamer.priors.smpl_fit import load_body_model
+from threestudio_gaussiandreamer.priors.motion import load_body_model
 
 
 @pytest.fixture(scope="session")

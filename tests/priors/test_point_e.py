@@ -81,10 +81,11 @@ def test_names_and_shapes_are_the_published_ones():
 
 
 @torch.no_grad()
-def test_the_transformer_is_its_formula():
+def test_the_transformer_is_its_formula(monkeypatch):
     """One block of two heads, written in numpy."""
     torch.manual_seed(0)
-    model = PointTransformer(width=16, layers=1, heads=2).double()
+    monkeypatch.setattr(module, "HEAD_CHANNELS", 8)
+    model = PointTransformer(width=16, layers=1).double()
     x = torch.randn(1, 5, 16, dtype=torch.float64)
     block = model.backbone.resblocks[0].state_dict()
     state = {name: value.numpy() for name, value in block.items()}
@@ -105,7 +106,7 @@ def test_the_transformer_is_its_formula():
     h = h + linear(np.concatenate(heads, axis=-1), "attn.c_proj")
     inner = linear(norm(h, "ln_2"), "mlp.c_fc")
     h = h + linear(inner * 0.5 * (1 + np.vectorize(math.erf)(inner / math.sqrt(2))), "mlp.c_proj")
-    np.testing.assert_allclose(model.backbone(x)[0].numpy(), h, atol=1e-12)
+    np.testing.assert_allclose(model.backbone.resblocks(x)[0].numpy(), h, atol=1e-12)
 
 
 @torch.no_grad()
@@ -166,7 +167,8 @@ def test_the_default_is_4096_points(monkeypatch):
     monkeypatch.undo()
     cfg = PointEPrior({"checkpoint": "x.pt"}).cfg
     assert (cfg.num_points + module.UPSAMPLED, cfg.num_steps, cfg.guidance_scale) == (4096, 64, 3)
-    assert (*module.SIGMA_MAX, *module.CHURN) == (120, 160, 3, 0)
+    numbers = [(kind.sigma_max, kind.churn) for kind in (BaseModel, Upsampler)]
+    assert numbers == [(120, 3), (160, 0)]
 
 
 def test_units_and_axes(point_e, monkeypatch):

@@ -18,6 +18,7 @@ from threestudio_gaussiandreamer.models.clip import (
     load_tokenizer,
     text_condition,
 )
+from threestudio_gaussiandreamer.priors import point_e
 from threestudio_gaussiandreamer.priors import shap_e as module
 from threestudio_gaussiandreamer.priors.point_e import PointTransformer
 from threestudio_gaussiandreamer.priors.shap_e import (
@@ -183,7 +184,7 @@ class OriginalShapE(PointTransformer):
     """
 
     def __init__(self):
-        super().__init__(width=16, layers=2, heads=2)
+        super().__init__(width=16, layers=2)
         self.input_proj, self.output_proj = torch.nn.Linear(8, 16), torch.nn.Linear(16, 16)
         self.clip_embed = torch.nn.Linear(tiny.FEATURES, 16)
         self.pos_emb = torch.nn.Parameter(torch.randn(16, 16))
@@ -191,14 +192,15 @@ class OriginalShapE(PointTransformer):
     def forward(self, z, timesteps, condition):
         points = self.input_proj(z) + self.pos_emb
         tokens = [self.clip_embed(condition)[:, None], self.time_token(timesteps), points]
-        h = self.backbone(self.ln_pre(torch.cat(tokens, dim=1)))
+        h = self.backbone.resblocks(self.ln_pre(torch.cat(tokens, dim=1)))
         return self.output_proj(self.ln_post(h)[:, 2:])
 
 
 @pytest.fixture
-def finetuned(tmp_path):
+def finetuned(tmp_path, monkeypatch):
     """Return a network, and its weights as Cap3D saves them, with the training state."""
     torch.manual_seed(5)
+    monkeypatch.setattr(point_e, "HEAD_CHANNELS", 8)
     network, path = OriginalShapE(), tmp_path / "shapE_finetuned_with_330kdata.pth"
     state = {f"wrapped.{name}": value for name, value in network.state_dict().items()}
     optimizer = torch.optim.AdamW(network.parameters(), lr=1e-5).state_dict()
@@ -225,10 +227,12 @@ BLOCKS = "wrapped.backbone.resblocks"
     "change, message",
     [
         (lambda state: state.pop("wrapped.ln_pre.bias"), 'Missing key.*"norm_in.bias"'),
-        (lambda state: state.update({"wrapped.extra.weight": torch.zeros(1)}), "wrapped.extra"),
-        (lambda state: state.update({"ln_pre.weight": torch.zeros(1)}), 'ed key.*"ln_pre.weight"'),
+        (
+            lambda state: state.update({"wrapped.extra.weight": torch.zeros(1)}),
+            'ed key.*"extra.weight"',
+        ),
         (lambda state: state.update({"wrapped.ln_pre.bias": torch.zeros(7)}), "size mismatch"),
-        (lambda state: state.update({f"{BLOCKS}.0.attn.c_qkv.bias": torch.zeros(7)}), "heads"),
+        (lambda state: state.update({f"{BLOCKS}.0.attn.c_qkv.bias": torch.zeros(7)}), "c_qkv.bias"),
         (lambda state: state.update({f"{BLOCKS}.7.ln_1.bias": torch.zeros(16)}), "Unexpected"),
         (lambda state: state.clear(), "no weights by name"),
     ],

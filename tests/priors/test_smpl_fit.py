@@ -12,8 +12,8 @@ import torch
 from tests.helpers import tiny_3d_models as tiny
 from tests.priors.cases import joints_of
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.priors import smpl_fit
-from threestudio_gaussiandreamer.priors.smpl_fit import (
+from threestudio_gaussiandreamer.priors import motion as smpl_fit
+from threestudio_gaussiandreamer.priors.motion import (
     beyond_limits,
     fit_bodies,
     load_body_model,

@@ -53,7 +53,7 @@ def is_color(value: Any) -> bool:
 
 
 def points(low: int) -> Rule:
-    """Return the rule for a number of points: at least ``low``, and few enough for the memory."""
+    """Return the rule for a number of points: ``low`` or more, and few enough for the memory."""
     return count_of("points", low, POINT_BYTES)
 
 
@@ -62,10 +62,8 @@ SCALE = positive("world units", most=1e6)
 
 
 def preflight_prior(prior: Any, keep_attributes: bool) -> None:
-    """Check within seconds that a prior can run; other hosts' priors have no check.
-
-    Args:
-        keep_attributes: whether every attribute of its Gaussians is to be taken, if it has any.
+    """Check within seconds that a prior can run, and, if ``keep_attributes``, that every attribute
+    of its Gaussians can be taken; other hosts' priors have no check.
 
     Raises:
         UserError: a requirement, such as a file, is missing, or its options exclude that.
@@ -162,20 +160,18 @@ class FilePrior(Prior):
 
 
 def file_axes(cfg: Any, kind: str) -> tuple[str, Optional[str]]:
-    """Return the axes of the file that are up and the front: the producer's, which must write files
-    of this ``kind`` (``GAUSSIANS`` or ``MESH`` of ``formats/producers.py``), or the options.
+    """Return the axes of the file that are up and the front: those of the options, or of the
+    producer, which must write files of this ``kind`` (see ``formats/producers.py``).
     """
     return producer_axes(cfg.producer, kind) if cfg.producer else (cfg.up, cfg.front)
 
 
-def chosen_colors(
-    color: Any, count: int, generator: np.random.Generator
-) -> Float[np.ndarray, "P 3"]:
+def chosen_colors(color: Any, count: int, rng: np.random.Generator) -> Float[np.ndarray, "P 3"]:
     """Return ``count`` colours: uniformly random in [0, 1] if ``color`` is "random",
     else all equal to it: "grey" or three numbers in [0, 1].
     """
     if color == "random":
-        return generator.random((count, 3), np.float32)
+        return rng.random((count, 3), np.float32)
     return np.tile(np.float32([GREY] * 3 if color == "grey" else list(color)), (count, 1))
 
 
@@ -186,8 +182,8 @@ def points_of(prior: Any, prompt: str) -> PointCloud:
 
 
 def validated(cloud: PointCloud, name: str) -> PointCloud:
-    """Return ``cloud`` as float32 without the rows that are not finite, its colours clipped to [0,
-    1].
+    """Return ``cloud`` as float32 without the rows that are not finite, its colours clipped to
+    [0, 1].
 
     Raises:
         UserError: it isn't a PointCloud, there are no points, points, colours and normals aren't
@@ -205,8 +201,8 @@ def validated(cloud: PointCloud, name: str) -> PointCloud:
     given = {"points": points, "colours": colors, "normals": normals}
     shapes = {kind: values.shape for kind, values in given.items() if values is not None}
     if points.ndim != 2 or set(shapes.values()) != {(len(points), 3)}:
-        shapes = ", ".join(f"{kind} {shape}" for kind, shape in shapes.items())
-        raise UserError(f"{name} gave {shapes}; expected (P, 3) for all")
+        found = ", ".join(f"{kind} {shape}" for kind, shape in shapes.items())
+        raise UserError(f"{name} gave {found}; expected (P, 3) for all")
     if not len(points):
         raise UserError(f"{name} gave no points: its source is empty")
     if faces is not None:
@@ -222,16 +218,13 @@ def validated(cloud: PointCloud, name: str) -> PointCloud:
     if finite.any() and outside.any(axis=1).mean() > 0.5:
         low, high = colors[finite].min(), colors[finite].max()
         raise UserError(f"{name} gave colours from {low:g} to {high:g}; expected [0, 1]")
-    cloud = PointCloud(points, colors.clip(0.0, 1.0), normals=normals, faces=faces)
+    if not finite.all():
+        report_non_finite(int((~finite).sum()), len(points), name)
+        if faces is not None:  # those all of whose corners are kept
+            faces = (np.cumsum(finite) - 1)[faces[finite[faces].all(axis=1)]]
     if normals is not None:
-        cloud = cloud._replace(normals=np.nan_to_num(normals))
-    if finite.all():
-        return cloud
-    report_non_finite(int((~finite).sum()), len(points), name)
-    if faces is not None:  # those all of whose corners are kept
-        faces = (np.cumsum(finite) - 1)[faces[finite[faces].all(axis=1)]]
-    rows = (None if values is None else values[finite] for values in cloud[:3])
-    return PointCloud(*rows, faces=faces)
+        normals = np.nan_to_num(normals[finite])
+    return PointCloud(points[finite], colors[finite].clip(0.0, 1.0), normals, faces)
 
 
 def _as_array(values: Any, dtype: Any = np.float32) -> Float[np.ndarray, "..."]:
@@ -251,9 +244,7 @@ def report_non_finite(bad: int, count: int, name: str) -> None:
 
 
 def ground_layer(cloud: PointCloud, cfg: Any, generator: np.random.Generator) -> PointCloud:
-    """Return a horizontal square of randomly coloured points, centred below the box of ``cloud``
-    (paper, appendix).
-    """
+    """Return a square of randomly coloured points, centred below ``cloud`` (paper, appendix)."""
     low, high = cloud.points.min(axis=0), cloud.points.max(axis=0)
     side = cfg.ground_size * ((high - low).max() or 1.0)
     places = generator.uniform(-0.5, 0.5, (cfg.ground_points, 3)) * [side, side, 0.0]

@@ -112,11 +112,7 @@ class GaussiansPrior(FilePrior):
 
 
 def gaussian_file(path: str) -> Path:
-    """Return the path of a file of Gaussians, of which no more than a PLY's header is read.
-
-    Raises:
-        UserError: the file is missing, or its extension isn't one that is read and it isn't a PLY.
-    """
+    """Return the path of a file of Gaussians, of which no more than a PLY's header is read."""
     file = existing_file(path, "file of Gaussians")
     if suffix_of(file.name) in PLY_SUFFIXES:
         if not is_gaussian_ply(file) and not is_compressed_ply(file):
@@ -133,9 +129,7 @@ def gaussian_file(path: str) -> Path:
 
 
 def normalized(gaussians: Gaussians, scale: float) -> Gaussians:
-    """Translate and scale Gaussians so that the box of their centres is centred at the origin and
-    half its longest side is ``scale``.
-    """
+    """Centre the box of the centres at the origin, with half its longest side ``scale``."""
     middle = (gaussians.means.min(axis=0) + gaussians.means.max(axis=0)) / 2
     factor = np.float32(scale / (longest_side(gaussians.means) / 2 or 1.0))
     log_scales = gaussians.log_scales + np.log(factor)

@@ -70,21 +70,15 @@ class SampledPrior(Prior):
     def condition(
         self, name: str, folder: Path, prompt: str, parts: tuple[str, str] = ("", ""), **how: Any
     ) -> Float[Tensor, "1 D"]:
-        """Return the prompt's features.
-
-        Args:
-            name: the model's, for :func:`.model_files.loaded`.
-            parts: folders of the text encoder and of the tokenizer below ``folder``.
-            how: further arguments of ``load_text_encoder``.
+        """Return the prompt's features by the text encoder and tokenizer of a model, in these
+        ``parts`` below ``folder``; ``how`` is for ``load_text_encoder``.
         """
-        encoder, tokenizer = parts
-
-        def load() -> Any:
-            return load_text_encoder(folder, encoder, **how).to(self.device)
-
-        network = loaded((f"{name} text_encoder", str(folder), self.device, *how.values()), load)
+        network = loaded(
+            (f"{name} text_encoder", str(folder), self.device, *how.values()),
+            lambda: load_text_encoder(folder, parts[0], **how).to(self.device),
+        )
         key = (f"{name} tokenizer", str(folder))
-        tokens = loaded(key, lambda: load_tokenizer(folder, tokenizer))
+        tokens = loaded(key, lambda: load_tokenizer(folder, parts[1]))
         return text_condition(tokens, network, self.cfg.prompt or prompt)
 
     def with_unconditional(self, condition: Float[Tensor, "1 D"]) -> Float[Tensor, "N D"]:
@@ -99,36 +93,28 @@ def torch_generator(generator: np.random.Generator) -> torch.Generator:
 
 
 def karras_sigmas(steps: int, sigma_max: float, sigma_min: float = SIGMA_MIN) -> list[float]:
-    """Return ``steps`` noise levels from ``sigma_max`` to ``sigma_min``, then 0; evenly spaced in
-    ``sigma^(1/7)`` (eq. 5).
-    """
+    """Return ``steps`` noise levels, evenly spaced in ``sigma^(1/7)`` (eq. 5), and 0."""
     high, low = sigma_max ** (1 / RHO), sigma_min ** (1 / RHO)
     return [float((high + t * (low - high)) ** RHO) for t in np.linspace(0, 1, steps)] + [0.0]
 
 
 def cosine_alphas_cumprod(steps: int = 1024) -> Float[np.ndarray, "T"]:
-    """Return abar of the cosine schedule (Nichol and Dhariwal 2021, eq. 17), with betas clipped to
-    0.999.
-    """
+    """Return abar of the cosine schedule (Nichol and Dhariwal 2021, eq. 17), betas up to 0.999."""
     curve = np.cos((np.arange(steps + 1) / steps + 0.008) / 1.008 * np.pi / 2) ** 2
     return np.cumprod(1 - np.minimum(1 - curve[1:] / curve[:-1], 0.999))
 
 
 def linear_alphas_cumprod(steps: int = 1024) -> Float[np.ndarray, "T"]:
-    """Return abar of the linear schedule (Ho et al. 2020), rescaled from 1000 to ``steps``
-    timesteps.
-    """
+    """Return abar of the linear schedule (Ho et al. 2020), rescaled from 1000 timesteps."""
     return np.cumprod(1 - np.linspace(0.1 / steps, 20 / steps, steps))
 
 
 def timestep_of(sigma: float, alphas_cumprod: Float[np.ndarray, "T"]) -> int:
-    """Return the largest timestep whose noise level is at most ``sigma``, or 0.
-
-    The fractional timestep is interpolated linearly in abar and truncated.
+    """Return the largest timestep whose noise level is at most ``sigma``, or 0: interpolated
+    linearly in abar and truncated.
     """
-    level = 1 / (sigma**2 + 1)
-    # np.interp requires increasing values
-    return int(np.interp(-level, -alphas_cumprod, np.arange(len(alphas_cumprod))))
+    levels = -alphas_cumprod  # np.interp requires increasing values
+    return int(np.interp(-1 / (sigma**2 + 1), levels, np.arange(len(levels))))
 
 
 def guided_denoiser(
@@ -181,10 +167,9 @@ def sample_heun(
     Args:
         noise: standard normal, of the sample's shape and on its device.
         sigmas: decreasing noise levels that end with 0 (:func:`karras_sigmas`).
-        churn: the paper's S_churn, the amount of noise that is added at each step; 0 makes the
-            sampler deterministic.
+        churn: the paper's S_churn, the amount of noise that is added at each step.
         generator: a CPU generator for that noise.
-        progress: title of a progress bar on terminals; if empty, there is no bar.
+        progress: title of a progress bar on terminals.
     """
     from tqdm import tqdm
 

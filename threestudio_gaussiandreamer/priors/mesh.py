@@ -51,10 +51,8 @@ from .base import COLOR, FilePrior, Prior, chosen_colors, file_axes, points
 
 logger = logging.getLogger(__name__)
 
-SMOOTHING_ROWS, SMOOTHING_ENTRIES = 8192, 2**22
-"""Largest number of points whose colours are averaged at a time, and of all their neighbours
-together. They bound the memory.
-"""
+SMOOTHED = 2**22
+"""Neighbours that are averaged at a time, which bounds the memory."""
 
 
 class MeshFilePrior(FilePrior):
@@ -132,26 +130,22 @@ def centred(cloud: PointCloud) -> PointCloud:
 
 
 def colored_cloud(mesh: Mesh, cfg: Any, generator: np.random.Generator) -> PointCloud:
-    """Return :func:`mesh_cloud` of ``cfg.num_points`` in the colours of ``cfg.color``."""
-    cloud = mesh_cloud(mesh, cfg.num_points, generator)
+    """Return the vertices of ``mesh`` with its faces, or ``cfg.num_points`` points on its surface,
+    in the colours of ``cfg.color``.
+    """
+    if cfg.num_points == 0:
+        cloud = PointCloud(mesh.vertices, vertex_surface_colors(mesh), faces=mesh.faces)
+    else:
+        points, faces, barycentric = sample_surface(mesh, cfg.num_points, generator)
+        colors = surface_colors(mesh, faces, barycentric)
+        cloud = PointCloud(points, colors, normals=face_normals(mesh)[faces])
     if cfg.color is None:
         return cloud
     return cloud._replace(colors=chosen_colors(cfg.color, len(cloud.points), generator))
 
 
-def mesh_cloud(mesh: Mesh, num_points: int, generator: np.random.Generator) -> PointCloud:
-    """Return the vertices of ``mesh`` with its faces, or ``num_points`` points on its surface."""
-    if num_points == 0:
-        return PointCloud(mesh.vertices, vertex_surface_colors(mesh), faces=mesh.faces)
-    points, face_index, barycentric = sample_surface(mesh, num_points, generator)
-    colors = surface_colors(mesh, face_index, barycentric)
-    return PointCloud(points=points, colors=colors, normals=face_normals(mesh)[face_index])
-
-
 def face_normals(mesh: Mesh) -> Float[np.ndarray, "F 3"]:
-    """Return unit normals, towards the side on which the corners are counter-clockwise; zero for a
-    face without area.
-    """
+    """Return unit normals by the right-hand rule; zero for a face without area."""
     a, b, c = np.moveaxis(mesh.vertices[mesh.faces], 1, 0)
     normals = np.cross(b - a, c - a)
     lengths = np.linalg.norm(normals, axis=1, keepdims=True)
@@ -162,15 +156,11 @@ def smoothed_colors(cloud: PointCloud, neighbours: int) -> Float[np.ndarray, "P 
     """Return each colour averaged over the ``neighbours`` nearest points, itself among them."""
     from scipy.spatial import cKDTree
 
-    tree = cKDTree(cloud.points)
+    tree, count = cKDTree(cloud.points), min(neighbours, len(cloud.points))
     colors = torch.from_numpy(np.array(cloud.colors))  # a copy: torch warns of read-only arrays
-    neighbours = min(neighbours, len(cloud.points))
-
-    def average(points: Float[np.ndarray, "Q 3"]) -> Float[np.ndarray, "Q 3"]:
+    averages = []
+    for part in np.array_split(cloud.points, -(-count * len(cloud.points) // SMOOTHED)):
         # a range, since the result for k=1 would lack the second dimension
-        _, nearest = tree.query(points, k=range(1, neighbours + 1), workers=-1)
-        return F.embedding_bag(torch.from_numpy(nearest), colors, mode="mean").numpy()
-
-    rows = min(SMOOTHING_ROWS, max(1, SMOOTHING_ENTRIES // neighbours))
-    starts = range(0, len(cloud.points), rows)
-    return np.concatenate([average(cloud.points[start : start + rows]) for start in starts])
+        _, nearest = tree.query(part, k=range(1, count + 1), workers=-1)
+        averages.append(F.embedding_bag(torch.from_numpy(nearest), colors, mode="mean").numpy())
+    return np.concatenate(averages)

@@ -80,12 +80,7 @@ class PointCloudPrior(FilePrior):
 
 
 def point_file(path: str) -> Path:
-    """Return the path of a file of points, of which no more than a PLY's header is read.
-
-    Raises:
-        UserError: the file is missing, its format is unknown, or it isn't the PLY that its name
-            says.
-    """
+    """Return the path of a file of points, of which no more than a PLY's header is read."""
     file, known = existing_file(path, "point cloud"), [f".{name}" for name in mesh_formats()]
     if file.suffix.lower() == ".ply":
         require_ply(file)
@@ -95,18 +90,12 @@ def point_file(path: str) -> Path:
 
 
 def axes_kind(path: Path) -> str:
-    """Return the mesh format whose default axes apply to the file. Formats of point clouds have z
-    up, as PLY.
-    """
+    """Return the mesh format whose default axes apply; point clouds have z up, as PLY."""
     return "ply" if path.suffix.lower() in READERS else path.suffix.lower().lstrip(".")
 
 
 def load_points(path: Path) -> PointCloud:
-    """Read the points of a file in its own axes; the extension determines the format.
-
-    Raises:
-        UserError: the file can't be read or has no points.
-    """
+    """Read the points of a file in its own axes; the extension determines the format."""
     with reading(path, "point cloud"):
         return READERS.get(path.suffix.lower(), read_mesh_points)(path)
 
@@ -114,13 +103,13 @@ def load_points(path: Path) -> PointCloud:
 def rotated(cloud: PointCloud, rotation: Float[np.ndarray, "3 3"]) -> PointCloud:
     """Return the cloud with points and normals rotated."""
     normals = None if cloud.normals is None else cloud.normals @ rotation.T
-    with np.errstate(invalid="ignore"):  # infinity times zero is NaN; such rows are dropped later
+    with np.errstate(invalid="ignore"):  # rows that aren't finite are dropped later
         return cloud._replace(points=cloud.points @ rotation.T, normals=normals)
 
 
 def normalized(cloud: PointCloud, scale: float) -> PointCloud:
-    """Translate and scale the cloud so that its bounding box is centred at the origin and half its
-    longest side is ``scale``. Rows that are not finite are ignored for the box.
+    """Centre the box of the cloud's finite rows at the origin, with half its longest side
+    ``scale``.
     """
     points = np.asarray(cloud.points, np.float64)
     finite = points[np.isfinite(points).all(axis=1)]
@@ -131,7 +120,7 @@ def normalized(cloud: PointCloud, scale: float) -> PointCloud:
 
 
 def read_npz(path: Path) -> PointCloud:
-    """Read the arrays ``points`` (P, 3) and optionally ``colors`` (P, 3) and ``normals`` (P, 3)."""
+    """Read ``points``, and optionally ``colors`` and ``normals``, each (P, 3)."""
     arrays = read_arrays(path, "point cloud", ["points"], ["colors", "normals"])
     return _cloud(path, arrays["points"], arrays.get("colors"), arrays.get("normals"))
 

@@ -14,9 +14,9 @@ prompt, ...         see ``priors/karras.py``; the upsampler isn't guided
 ground, ...         see ``priors/base.py``
 ==================  ================================================================================
 
-The user downloads the files (addresses in ``docs/models.md``); they are loaded with
-``weights_only``. On a CPU sampling takes minutes. The result has no faces. The axes are those of
-Shap-E, which was trained on renders of the same scenes: z up and front -y, which is rotated to +x.
+The user downloads the files (``docs/models.md``). On a CPU sampling takes minutes. The axes are
+those of Shap-E, which was trained on renders of the same scenes: z up and front -y, which becomes
++x.
 
 The networks, which diffusers lacks, are written from the architecture that the checkpoints fix
 (Nichol et al. 2022, "Point-E"; published by OpenAI under MIT): a plain transformer without
@@ -53,8 +53,6 @@ from .weights import load_exactly, read_state_dict
 
 UPSAMPLED = 3072
 """Number of points that the upsampler adds."""
-SIGMA_MAX, CHURN = (120.0, 160.0), (3.0, 0.0)
-"""Highest noise level, and S_churn of Karras et al., of the base model and of the upsampler."""
 HEAD_CHANNELS = 64
 IMAGE_CELLS = 256
 """16 x 16 patches of the ViT-L/14 that the upsampler was trained with."""
@@ -84,8 +82,8 @@ class PointEPrior(SampledPrior):
         REMOVED: ClassVar[dict[str, Any]] = {
             **SampledPrior.Config.REMOVED,
             "num_upsampled": (UPSAMPLED, f"it is {UPSAMPLED}"),
-            "sigma_max": (list(SIGMA_MAX), f"they are {SIGMA_MAX}"),
-            "churn": (list(CHURN), f"it is {CHURN}"),
+            "sigma_max": ([120.0, 160.0], "they are 120 and 160"),
+            "churn": ([3.0, 0.0], "it is 3 and 0"),
         }
 
     cfg: Config
@@ -102,53 +100,47 @@ class PointEPrior(SampledPrior):
         cfg, rng = self.cfg, karras.torch_generator(generator)
         info(f"Point-E: {cfg.prompt or prompt!r} on {self.device}")
         condition = self.condition("Point-E", locate(clip_source(cfg.clip)), prompt)
-        points = self._coarse_points(condition, rng)
-        if cfg.upsampler:
-            network = kept_network(Upsampler, cfg.upsampler, self.device)
-            levels = karras.linear_alphas_cumprod()
-            denoise = karras.guided_denoiser(mean_of(network, points), levels)
-            points = torch.cat([points, self._sampled(denoise, UPSAMPLED, 1, rng)], dim=-1)
-        free_memory()
-        rows = points[0].T.cpu().numpy()
-        colors = rows[:, 3:].clip(0, 255).round() / np.float32(255)
-        return self.placed(PointCloud(points=rows[:, :3], colors=colors))
-
-    def _coarse_points(
-        self, condition: Float[Tensor, "1 D"], rng: torch.Generator
-    ) -> Float[Tensor, "1 6 N"]:
-        cfg, path = self.cfg, model_part(self.cfg.checkpoint, POINTS)
-        network = kept_network(BaseModel, path, self.device)
+        network = self._network(BaseModel, model_part(cfg.checkpoint, POINTS))
         given, expected = condition.shape[-1], network.clip_embed.in_features
         if given != expected:
             raise UserError(
                 f"clip: {cfg.clip!r} has {given} features, but the checkpoint was trained "
                 f"with {expected}: use ViT-L/14"
             )
-        predict = mean_of(network, self.with_unconditional(condition))
-        levels = karras.cosine_alphas_cumprod()
-        denoise = karras.guided_denoiser(predict, levels, scale=cfg.guidance_scale)
-        return self._sampled(denoise, cfg.num_points, 0, rng)
+        conditions, levels = self.with_unconditional(condition), karras.cosine_alphas_cumprod()
+        predict, scale = mean_of(network, conditions), cfg.guidance_scale
+        denoise = karras.guided_denoiser(predict, levels, scale=scale)
+        points = self._sampled(denoise, BaseModel, cfg.num_points, rng)
+        if cfg.upsampler:
+            predict = mean_of(self._network(Upsampler, cfg.upsampler), points)
+            denoise = karras.guided_denoiser(predict, karras.linear_alphas_cumprod())
+            points = torch.cat([points, self._sampled(denoise, Upsampler, UPSAMPLED, rng)], dim=-1)
+        free_memory()
+        rows = points[0].T.cpu().numpy()
+        colors = rows[:, 3:].clip(0, 255).round() / np.float32(255)
+        return self.placed(PointCloud(points=rows[:, :3], colors=colors))
+
+    def _network(self, kind: type["PointTransformer"], path: str) -> Any:
+        key = (kind.title, path, self.device)
+        return loaded(key, lambda: load_network(kind, path).to(self.device))
 
     def _sampled(
-        self, denoise: Any, count: int, stage: int, rng: torch.Generator
+        self,
+        denoise: karras.Denoiser,
+        kind: type["PointTransformer"],
+        count: int,
+        rng: torch.Generator,
     ) -> Float[Tensor, "1 6 N"]:
-        """Return ``count`` points in Point-E's units: positions, and colours in [0, 255].
-
-        Args:
-            stage: 0 for the base model, 1 for the upsampler.
-        """
+        """Return ``count`` points in Point-E's units: positions, and colours in [0, 255]."""
         noise = torch.randn(1, CHANNELS, count, generator=rng).to(self.device)
-        sigmas = karras.karras_sigmas(self.cfg.num_steps, SIGMA_MAX[stage])
-        title = ("Point-E", "Point-E upsampler")[stage]
-        options = {"churn": CHURN[stage], "generator": rng, "progress": title}
+        sigmas = karras.karras_sigmas(self.cfg.num_steps, kind.sigma_max)
+        options = {"churn": kind.churn, "generator": rng, "progress": kind.title}
         sample = karras.sample_heun(denoise, noise, sigmas, **options)
         return (sample - BIASES.to(self.device)) / SCALES.to(self.device)
 
 
 def mean_of(network: nn.Module, condition: Tensor) -> karras.Network:
-    """Return a network under a condition, restricted to the mean, the first half of its output
-    channels. The second half is the variance.
-    """
+    """Return a network under a condition, without the variance in its second half of channels."""
     return lambda z, timesteps: network(z, timesteps, condition)[:, :CHANNELS]
 
 
@@ -166,8 +158,8 @@ class Mlp(nn.Module):
 
 
 class Attention(nn.Module):
-    """Self-attention whose packed projection is ordered head by head: query, key and value of the
-    first head come first.
+    """Self-attention whose packed projection is ordered head by head: first the query, key and
+    value of the first head.
     """
 
     def __init__(self, width: int, heads: int) -> None:
@@ -195,32 +187,26 @@ class Block(nn.Module):
         return x + self.mlp(self.ln_2(x))
 
 
-class Backbone(nn.Module):
-    def __init__(self, width: int, layers: int, heads: int) -> None:
-        super().__init__()
-        self.resblocks = nn.Sequential(*(Block(width, heads) for _ in range(layers)))
-
-    def forward(self, x: Tensor) -> Tensor:
-        return self.resblocks(x)
-
-
 class PointTransformer(nn.Module):
-    """What both networks have: points and extra tokens through one transformer, and the points'
-    part of the result.
-    """
+    """Points and extra tokens through one transformer, and the points' part of the result."""
 
     title: ClassVar[str]
     file: ClassVar[str]
     """The published one."""
     projection: ClassVar[str]
     """Name of a weight that only this network has, with as many columns as features of CLIP."""
+    sigma_max: ClassVar[float]
+    """The highest noise level."""
+    churn: ClassVar[float]
+    """S_churn of Karras et al."""
 
-    def __init__(self, width: int, layers: int, heads: Optional[int] = None) -> None:
+    def __init__(self, width: int, layers: int) -> None:
         super().__init__()
         self.width = width
         self.time_embed = Mlp(width)
         self.ln_pre = nn.LayerNorm(width)
-        self.backbone = Backbone(width, layers, heads or width // HEAD_CHANNELS)
+        blocks = nn.Sequential(*(Block(width, width // HEAD_CHANNELS) for _ in range(layers)))
+        self.backbone = nn.ModuleDict({"resblocks": blocks})
         self.ln_post = nn.LayerNorm(width)
         self.input_proj = nn.Linear(CHANNELS, width)
         self.output_proj = nn.Linear(width, 2 * CHANNELS)
@@ -232,7 +218,7 @@ class PointTransformer(nn.Module):
         self, points: Float[Tensor, "B 6 N"], tokens: list[Tensor]
     ) -> Float[Tensor, "B 12 N"]:
         h = torch.cat([*tokens, self.input_proj(points.transpose(1, 2))], dim=1)
-        h = self.ln_post(self.backbone(self.ln_pre(h)))
+        h = self.ln_post(self.backbone.resblocks(self.ln_pre(h)))
         return self.output_proj(h[:, -points.shape[-1] :]).transpose(1, 2)
 
 
@@ -240,12 +226,10 @@ class BaseModel(PointTransformer):
     """From noise to coarse points, given the text's features (``base40M-textvec``)."""
 
     title, file = "Point-E base checkpoint", "base_40m_textvec.pt"
-    projection = "clip_embed.weight"
+    projection, sigma_max, churn = "clip_embed.weight", 120.0, 3.0
 
-    def __init__(
-        self, width: int = 512, layers: int = 12, features: int = 768, heads: Optional[int] = None
-    ) -> None:
-        super().__init__(width, layers, heads)
+    def __init__(self, width: int = 512, layers: int = 12, features: int = 768) -> None:
+        super().__init__(width, layers)
         self.clip_embed = nn.Linear(features, width)
 
     def forward(
@@ -259,12 +243,10 @@ class Upsampler(PointTransformer):
     """From noise to further points, given the coarse ones (``upsample``)."""
 
     title, file = "Point-E upsampler checkpoint", "upsample_40m.pt"
-    projection = "clip_embed.1.weight"
+    projection, sigma_max, churn = "clip_embed.1.weight", 160.0, 0.0
 
-    def __init__(
-        self, width: int = 512, layers: int = 12, features: int = 1024, heads: Optional[int] = None
-    ) -> None:
-        super().__init__(width, layers, heads)
+    def __init__(self, width: int = 512, layers: int = 12, features: int = 1024) -> None:
+        super().__init__(width, layers)
         self.cond_point_proj = nn.Linear(CHANNELS, width)
         self.clip_embed = nn.Sequential(nn.LayerNorm(features), nn.Linear(features, width))
         self.register_buffer("channel_scales", SCALES[:, 0].clone())
@@ -286,9 +268,7 @@ class Upsampler(PointTransformer):
 
 
 def timestep_embedding(timesteps: Real[Tensor, " B"], width: int) -> Float[Tensor, "B W"]:
-    """Return cosines, then sines, of frequencies that fall from 1 to 1/10000 (Vaswani et
-    al. 2017).
-    """
+    """Return cosines, then sines, of frequencies from 1 to 1/10000 (Vaswani et al. 2017)."""
     steps = torch.arange(width // 2, device=timesteps.device)
     frequencies = torch.exp(-math.log(10000) * steps / (width // 2))
     angles = timesteps.float()[:, None] * frequencies
@@ -296,11 +276,6 @@ def timestep_embedding(timesteps: Real[Tensor, " B"], width: int) -> Float[Tenso
 
 
 # Loading ------------------------------------------------------------------------------------------
-
-
-def kept_network(kind: type[PointTransformer], path: str, device: torch.device) -> Any:
-    """Return the network of :func:`load_network` on ``device``, see ``models/model_files.py``."""
-    return loaded((kind.title, path, device), lambda: load_network(kind, path).to(device))
 
 
 def load_network(kind: type[PointTransformer], path: str) -> Any:

@@ -28,11 +28,9 @@ with a camera on that side. So the front becomes +x by a quarter turn, (x, y, z)
 
 The latents are sampled by ``karras.py`` and not by ``ShapEPipeline``: its scheduler takes the noise
 levels from the training schedule (403 to 0.108 in place of 160 to 1e-3), clamps after guidance
-rather than before, and the pipeline offers no grid size. The signed distances that the published
-code surrounds the grid with make its surface smaller by ``(grid_size - 1) / (grid_size + 1)``; so
-does ours."""
+rather than before, and the pipeline offers no grid size. As in the published code the signed
+distances around the grid make the surface smaller by ``(grid_size - 1) / (grid_size + 1)``."""
 
-import re
 from collections.abc import Collection
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -119,9 +117,7 @@ class ShapEPrior(SampledPrior):
         return Source(self.cfg.model, picks, option, self.cfg.revision, download)
 
     def _sample(self, folder: Path, prompt: str, rng: torch.Generator) -> Float[Tensor, "1 N D"]:
-        """Return latents of the shape, from text features through the text-to-latent network; both
-        are dropped on return.
-        """
+        """Return latents of the shape, from text features through the text-to-latent network."""
         cfg, parts = self.cfg, ("text_encoder", "tokenizer")
         condition = self.condition("Shap-E", folder, prompt, parts, allow_bin=cfg.allow_bin)
         prior = self._part(folder, "prior")
@@ -129,7 +125,13 @@ class ShapEPrior(SampledPrior):
         shape = (1, prior.config.num_embeddings, prior.config.embedding_dim)
         noise = torch.randn(shape, generator=rng).to(self.device)
         half = cfg.half_precision and noise.device.type == "cuda"
-        network = prior_network(prior, self.with_unconditional(condition), half=half)
+        conditions = self.with_unconditional(condition)
+
+        def network(z: Tensor, timesteps: Tensor) -> Tensor:
+            with torch.autocast(z.device.type, torch.float16, enabled=half):
+                output = prior(z, timesteps, conditions).predicted_image_embedding
+            return output[..., : z.shape[-1]]  # the rest is the variance, which isn't used
+
         options = {"scale": cfg.guidance_scale, "prediction": prediction}
         denoise = karras.guided_denoiser(network, alphas_cumprod, **options)
         sigmas = karras.karras_sigmas(cfg.num_inference_steps, SIGMA_MAX)
@@ -162,24 +164,7 @@ def read_schedule(folder: Path) -> tuple[Float[np.ndarray, "T"], str]:
     from diffusers import HeunDiscreteScheduler
 
     scheduler = load_settings(HeunDiscreteScheduler, folder, "scheduler")
-    prediction = scheduler.config.prediction_type
-    if prediction not in ("sample", "epsilon"):
-        raise UserError(
-            f"the scheduler in {str(folder)!r} has the prediction type {prediction!r}: "
-            "Shap-E's is 'sample'"
-        )
-    return scheduler.alphas_cumprod.double().numpy(), prediction
-
-
-def prior_network(prior: Any, conditions: Float[Tensor, "N D"], *, half: bool) -> karras.Network:
-    """Wrap diffusers' network with its conditions, one for each item."""
-
-    def predict(z: Tensor, timesteps: Tensor) -> Tensor:
-        with torch.autocast(z.device.type, torch.float16, enabled=half):
-            output = prior(z, timesteps, conditions).predicted_image_embedding
-        return output[..., : z.shape[-1]]  # the rest is the variance, which isn't used
-
-    return predict
+    return scheduler.alphas_cumprod.double().numpy(), scheduler.config.prediction_type
 
 
 @torch.no_grad()
@@ -188,9 +173,6 @@ def decoded(
 ) -> PointCloud:
     """Return the mesh of ``latents`` by marching cubes, with the texture field's colours at its
     vertices.
-
-    Raises:
-        UserError: the latents are not finite, or the signed distance is negative everywhere.
     """
     if not torch.isfinite(latents).all():
         raise UserError(
@@ -198,13 +180,8 @@ def decoded(
         )
     hook = renderer.mesh_decoder.register_forward_hook(_refuse_empty)
     try:
-        mesh = renderer.decode_to_mesh(
-            latents, latents.device, grid_size=grid_size, query_batch_size=QUERY_BATCH_SIZE
-        )
-    except torch.OutOfMemoryError as error:
-        raise UserError(
-            f"Shap-E's grid of {grid_size}^3 does not fit the memory: set grid_size lower"
-        ) from error
+        options = {"grid_size": grid_size, "query_batch_size": QUERY_BATCH_SIZE}
+        mesh = renderer.decode_to_mesh(latents, latents.device, **options)
     finally:
         hook.remove()  # the renderer may be kept for the next prompt
     channels = torch.stack([mesh.vertex_channels[name] for name in "RGB"], dim=-1)
@@ -217,9 +194,7 @@ def decoded(
 
 
 def _refuse_empty(decoder: Any, inputs: tuple, mesh: Any) -> None:
-    """Raise UserError for a mesh without faces. This is a forward hook of the marching cubes,
-    because the renderer's next steps fail on a mesh without vertices.
-    """
+    """Raise UserError for a mesh without faces, on which the renderer's next steps would fail."""
     if not len(mesh.faces):
         raise UserError(
             "Shap-E found no surface for this prompt: try another seed, another prompt or a "
@@ -243,21 +218,13 @@ RENAMED = {
     "mlp.c_fc": "ff.net.0.proj",
     "mlp.c_proj": "ff.net.2",
 }
-"""OpenAI's names of layers and diffusers', those of a block without the block's."""
-NAME = re.compile(r"wrapped\.(?:backbone\.resblocks\.(\d+)\.)?(.+)\.(weight|bias)")
-"""A block's number, the layer and the kind of weight."""
+"""OpenAI's names of layers, and diffusers'."""
 UNUSED_BY_SHAP_E = ("clip_mean", "clip_std")
-"""Parameters that diffusers' class has for another model; Shap-E's checkpoint lacks them and its
-sampling ignores them.
-"""
+"""Parameters that diffusers' class has for another model."""
 
 
 def load_original_prior(prior: nn.Module, path: str) -> None:
-    """Replace the weights of diffusers' ``prior`` by those of OpenAI's format in the file ``path``.
-
-    Raises:
-        UserError: the file can't be read, or its names or shapes are not those of this model.
-    """
+    """Replace the weights of diffusers' ``prior`` by those in OpenAI's format."""
     heads = prior.config.num_attention_heads
     state = to_diffusers(read_state_dict(path, "Shap-E checkpoint"), heads)
     own = prior.state_dict()
@@ -267,31 +234,20 @@ def load_original_prior(prior: nn.Module, path: str) -> None:
 
 def to_diffusers(state: dict[str, Tensor], heads: int) -> dict[str, Tensor]:
     """Convert OpenAI's names and layouts to those of ``PriorTransformer``, the same network with
-    query, key and value apart; other names stay.
+    query, key and value apart, whose rows OpenAI packs head by head; other names stay.
     """
     converted: dict[str, Tensor] = {}
     for name, value in state.items():
-        found = NAME.fullmatch(name)
-        block, layer, kind = found.groups() if found else (None, "", "")
-        start = "" if block is None else f"transformer_blocks.{block}."
-        if name == "wrapped.pos_emb":
+        name = name.removeprefix("wrapped.")
+        name = name.replace("backbone.resblocks.", "transformer_blocks.")
+        for original, ours in RENAMED.items():
+            name = name.replace(f"{original}.", f"{ours}.")
+        if name == "pos_emb":
             converted["positional_embedding"] = value[None]
-        elif layer == "attn.c_qkv":
-            parts = zip("qkv", unpacked(value, heads), strict=True)
-            converted |= {f"{start}attn1.to_{part}.{kind}": rows for part, rows in parts}
+        elif ".attn.c_qkv." in name and len(value) % (3 * heads) == 0:
+            rows = value.reshape(heads, 3, -1, *value.shape[1:])
+            for letter, part in zip("qkv", rows.unbind(dim=1), strict=True):
+                converted[name.replace("attn.c_qkv", f"attn1.to_{letter}")] = part.flatten(0, 1)
         else:
-            converted[f"{start}{RENAMED[layer]}.{kind}" if layer in RENAMED else name] = value
+            converted[name] = value
     return converted
-
-
-def unpacked(value: Tensor, heads: int) -> tuple[Tensor, ...]:
-    """Query, key and value rows of a packed projection, whose rows are ordered head by head:
-    (heads, 3, channels).
-    """
-    if len(value) % (3 * heads):
-        raise UserError(
-            f"the checkpoint packs query, key and value into {len(value)} rows, which are not "
-            f"for {heads} heads"
-        )
-    rows = value.reshape(heads, 3, -1, *value.shape[1:])
-    return tuple(torch.flatten(part, 0, 1) for part in rows.unbind(dim=1))
