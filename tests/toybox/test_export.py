@@ -17,7 +17,7 @@ from threestudio_gaussiandreamer.models.bundled import DIGESTS, digest_of, read_
 from threestudio_gaussiandreamer.models.clip import PictureText, clip_source
 from threestudio_gaussiandreamer.priors.point_e import PointEPrior
 from threestudio_gaussiandreamer.prompts import prompt_processors  # noqa: F401
-from threestudio_gaussiandreamer.toybox import models, warm_start
+from threestudio_gaussiandreamer.toybox import models, train
 from threestudio_gaussiandreamer.toybox.export import main
 from threestudio_gaussiandreamer.toybox.loop import averaged_weights, is_trained
 from threestudio_gaussiandreamer.toybox.tokens import open_tokenizer, token_ids
@@ -120,7 +120,7 @@ def test_a_training_continues_from_the_weights(exported, trained, tmp_path):
     shutil.copytree(exported, weights)
     (weights / "training.json").write_text(json.dumps(record))
     tokenizer_before = (trained / "tokenizer" / "vocab.json").read_bytes()
-    warm_start.start_from(weights, there, STAGES)
+    train.start_from(weights, there)
     assert (tmp_path / "tokenizer" / "vocab.json").read_bytes() == tokenizer_before
     for name in STAGES:
         expected, found = averaged_weights(trained, name), averaged_weights(tmp_path, name)
@@ -128,7 +128,7 @@ def test_a_training_continues_from_the_weights(exported, trained, tmp_path):
             if "heads" not in key or name == "judge":
                 assert torch.allclose(found[key], value, **HALF), key
         run = training(tmp_path, name)
-        assert run.earlier == record[name]["trainings"] and run.progress.seconds == 0
+        assert run.progress.earlier == record[name]["trainings"] and run.progress.seconds == 0
         assert run.progress.history == ([record[name]["last"]] if record[name]["last"] else [])
         before = run.progress.images
         assert before == training(trained, name).progress.images
@@ -140,7 +140,7 @@ def test_weights_of_another_size_are_refused(exported, tmp_path, monkeypatch):
     monkeypatch.setattr(models, "VISION_LAYERS", 2)
     monkeypatch.setattr(models, "FEATURES", 64)
     with pytest.raises(UserError, match="'text'.*of another model"):
-        warm_start.start_from(exported, options(tmp_path), STAGES)
+        train.start_from(exported, options(tmp_path))
 
 
 def test_an_untrained_folder_and_a_target_that_can_not_be_made_are_messages(tmp_path, capsys):
@@ -163,11 +163,11 @@ def test_a_full_disk_is_one_message_and_the_export_can_be_repeated(trained, tmp_
 
 
 def test_a_full_disk_at_the_start_from_weights_is_mended_by_a_second_call(exported, tmp_path):
-    start = exported, options(tmp_path), {"text": STAGES["text"]}
+    start = exported, options(tmp_path)
     for size in (3000, 20000):  # in the vocabulary, and in a checkpoint
         with largest_file(size), pytest.raises(UserError, match="cannot write"):
-            warm_start.start_from(*start)
-    warm_start.start_from(*start)
+            train.start_from(*start)
+    train.start_from(*start)
     assert is_trained(tmp_path, "text") and open_tokenizer(tmp_path)
 
 
@@ -177,4 +177,4 @@ def test_a_missing_or_damaged_record_of_weights_is_named(tmp_path):
             (tmp_path / "training.json").write_bytes(content)
         problem = "does not exist" if content is None else "training.json' is damaged"
         with pytest.raises(UserError, match=problem):
-            warm_start.start_from(tmp_path, options(tmp_path / "run"), STAGES)
+            train.start_from(tmp_path, options(tmp_path / "run"))

@@ -1,7 +1,5 @@
-"""Train the autoencoder on clean pictures and on renders of rough Gaussians.
-
-In its first iterations, score distillation encodes renders of semi-transparent Gaussians, for which
-the encoder's gradients must be useful.
+"""Train the autoencoder on clean pictures and on renders of rough Gaussians, since score
+distillation encodes such renders in its first iterations.
 """
 
 import functools
@@ -25,8 +23,7 @@ SPLAT_SHARE = 0.2
 """Fraction of the pictures that are renders of rough Gaussians."""
 FULL_EVERY = 4
 """One step in four trains on pictures of the full size, a quarter as many; the others on pictures
-of half the size. Crops would be as cheap, but group normalisation computes other statistics on
-them, and colours were learnt much more slowly.
+of half the size. On crops, colours were learnt much more slowly.
 """
 KL_WEIGHT = 2e-4
 EDGE_WEIGHT, SQUARE_WEIGHT = 1.0, 2.0
@@ -35,7 +32,6 @@ EDGE_WEIGHT, SQUARE_WEIGHT = 1.0, 2.0
 class AutoencoderBatch(NamedTuple):
     images: Float[Tensor, "B 3 s s"]
     noise: Float[Tensor, "B 4 s/8 s/8"]
-    """Of the latents."""
 
 
 class AutoencoderData(StepData):
@@ -105,11 +101,7 @@ class AutoencoderStage(Stage):
 
 
 def rough_render(shard: Shard, row: int, rng: np.random.Generator) -> UInt8[np.ndarray, "s s 4"]:
-    """Render the object of picture ``row`` as a few hundred half-transparent Gaussians.
-
-    Returns:
-        Premultiplied RGBA bytes.
-    """
+    """Render the object of picture ``row`` as a few hundred half-transparent Gaussians."""
     views = len(shard.rgba) // len(shard.points)
     gaussians = rough_gaussians(shard.points[row // views].astype(np.float32), rng)
     angles = (shard.elevation[row], shard.azimuth[row], np.mean(DISTANCE), math.radians(FOVY_DEG))
@@ -121,13 +113,8 @@ def rough_render(shard: Shard, row: int, rng: np.random.Generator) -> UInt8[np.n
 def rough_gaussians(
     points: Float[np.ndarray, "P 6"], rng: np.random.Generator
 ) -> tuple[np.ndarray, ...]:
-    """Make Gaussians of a random number, size, opacity and error of place and colour.
-
-    Args:
-        points: places on a surface and their colours.
-
-    Returns:
-        Means, quaternions, scales, opacities and colours, as ``rasterize`` takes them.
+    """Make Gaussians of a random number, size, opacity and error of place and colour from places
+    on a surface and their colours; return them as the first arguments of ``rasterize``.
     """
     points = points[: int(rng.integers(200, 1000))]
     count = len(points)

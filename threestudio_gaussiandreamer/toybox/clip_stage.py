@@ -2,9 +2,8 @@
 image encoder, on the features of the trained text encoder, which stay fixed ("locked" text, after
 Zhai et al. 2022).
 
-The U-Net and the points model are trained on the text encoder too. Prompts cost nothing to make and
-little to encode, so it sees far more of them than there are pictures, and small encoders learn to
-associate colours with parts from classifiers much earlier than from the contrastive loss.
+Small encoders learn to associate colours with parts from classifiers much earlier than from the
+contrastive loss.
 """
 
 import functools
@@ -16,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from torch.utils.data import Dataset
 
@@ -48,7 +47,6 @@ class TextData(Dataset):
     batch: int
     tokenizer: Any
     held_out: bool = False
-    """Whether the objects are those withheld from training."""
 
     def __getitem__(self, step: int) -> TextBatch:
         start, texts, labels = step * self.batch, [], []
@@ -65,10 +63,7 @@ class TextData(Dataset):
 
 
 class TextStage(Stage):
-    """Minimise the cross entropy of linear classifiers on CLIP's text features.
-
-    The classifiers are dropped afterwards.
-    """
+    """Minimise the cross entropy of linear classifiers on CLIP's text features."""
 
     name = "text"
     batch_size = 128
@@ -120,9 +115,6 @@ def text_features(
 def trained_clip(folder: Path, vocabulary_size: int, stage: str) -> Any:
     """Return a CLIPModel with a stage's averaged weights, without gradients; after "text" its image
     encoder is random.
-
-    Raises:
-        UserError: the stage isn't trained.
     """
     clip, weights = models.clip_model(vocabulary_size), averaged_weights(folder, stage)
     whole = stage == ClipStage.name
@@ -141,8 +133,7 @@ class ClipBatch(NamedTuple):
     """As CLIP takes them."""
     ids: Int[Tensor, "B 32"]
     labels: Int[Tensor, "B L"]
-    has_text: Tensor
-    """(B,) bool: false for empty prompts."""
+    has_text: Bool[Tensor, " B"]
 
 
 @dataclass(frozen=True)
@@ -163,10 +154,7 @@ class ClipData(StepData):
 
 
 class ClipStage(Stage):
-    """Minimise CLIP's contrastive loss (Radford et al. 2021) and that of attribute classifiers.
-
-    The classifiers are dropped afterwards.
-    """
+    """Minimise CLIP's contrastive loss (Radford et al. 2021) and that of attribute classifiers."""
 
     name = "clip"
     batch_size = 128

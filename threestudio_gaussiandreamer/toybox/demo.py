@@ -82,13 +82,7 @@ def is_option(word: str) -> bool:
 
 
 def run(args: argparse.Namespace) -> None:
-    """Train the prompts that aren't finished, then write sheet and table.
-
-    Raises:
-        UserError: a prompt is empty or no text, there are no such models, or another demo uses the
-            folder.
-        SystemExit: the launcher has failed, and said why.
-    """
+    """Train the prompts that aren't finished, then write sheet and table."""
     for prompt in args.prompts:
         if not prompt.strip():
             raise UserError(f'a prompt is empty: give one such as "{PROMPTS[0]}"')
@@ -108,11 +102,7 @@ def run(args: argparse.Namespace) -> None:
 
 
 def open_folder(root: Path, record: dict[str, Any]) -> RunFolder:
-    """Lock the newest unfinished folder of the same prompts and options, or else a new one.
-
-    Raises:
-        UserError: another demo works in it.
-    """
+    """Lock the newest unfinished folder of the same prompts and options, or else a new one."""
     for path in sorted(root.glob(f"*/{RECORD}"), reverse=True):
         if read_json(path, dict) == record and not (path.parent / SHEET).exists():
             print(f"continuing {path.parent}", flush=True)
@@ -161,10 +151,6 @@ def train(folder: Path, index: int, args: argparse.Namespace) -> Path:
 def launch(options: list[str]) -> None:
     """Run the launcher in a process of its own, and wait for it even after Ctrl-C: it has received
     the signal too, and writes a checkpoint.
-
-    Raises:
-        SystemExit: it has failed.
-        KeyboardInterrupt, Terminated: a signal has stopped it.
     """
     program = [sys.executable, "-m", "threestudio_gaussiandreamer.launch.experiment"]
     with raised_signals() as received:
@@ -219,13 +205,11 @@ def samples(
     model: str, prompt: str, orbit: Orbit, *, guidance_scale: float, seed: int = 0
 ) -> Float[Tensor, "V 3 s s"]:
     """Draw a picture in [0, 1] with the 2D model itself for the direction of each view, by DDIM;
-    prompts name left and right. So is what the score distillation is guided towards, without a
-    contrast of views.
+    prompts name left and right.
 
     Args:
         model: ``toybox``, a folder or a hub id.
         guidance_scale: of classifier-free guidance; 1 is none.
-        seed: of the noise.
     """
     named = {"pretrained_model_name_or_path": model}
     texts = {"prompt": prompt, "negative_prompt": "", "view_dependent_left_and_right": True}
@@ -250,11 +234,10 @@ def samples(
 
 def sheet(prompts: Sequence[str], stages: Sequence[Stages]) -> Any:
     """Arrange a row of pictures for each prompt: three of each stage."""
-    pictures = [each[name][0] for each in stages for name in STAGES]
-    count = len(SHOWN)
-    named = [[f"{name}: {prompt}", *[""] * (count - 1)] for prompt in prompts for name in STAGES]
-    texts = [text for three in named for text in three]
-    return contact_sheet(torch.cat(pictures), texts, columns=len(STAGES) * count)
+    pictures = torch.cat([each[name][0] for each in stages for name in STAGES])
+    first = [f"{name}: {prompt}" for prompt in prompts for name in STAGES]
+    texts = [text for one in first for text in (one, *[""] * (len(SHOWN) - 1))]
+    return contact_sheet(pictures, texts, columns=len(STAGES) * len(SHOWN))
 
 
 def table(prompts: Sequence[str], runs: Sequence[Path], stages: Sequence[Stages]) -> str:

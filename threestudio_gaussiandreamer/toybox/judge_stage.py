@@ -1,9 +1,8 @@
 """Train the judge, a classifier that evaluates the other networks, on data of a separate seed.
 
-Most of its pictures show objects as Gaussians with errors. A result of score distillation consists
-of a few thousand Gaussians, whose patterns are irregular and have blurred edges; a classifier that
-has seen only ray-cast pictures takes such edges for other colours. No network of the toybox takes
-part in these renders, so the judge stays independent of those that it evaluates.
+Most of its pictures show objects as Gaussians with errors, as results of score distillation; a
+classifier that has seen only ray-cast pictures takes their blurred edges for other colours. No
+network of the toybox takes part in these renders.
 """
 
 import dataclasses
@@ -32,10 +31,8 @@ SPLATS_VERSION = 1
 """Changes with :func:`imperfect_gaussians`, so that no training reads earlier pictures."""
 COUNT = (800, 4000)
 """Range of the number of Gaussians."""
-WAVES = 6
-"""Number of plane waves of a smooth error."""
-WAVELENGTH = (0.15, 0.8)
-"""Range of the wavelengths of smooth errors, world units."""
+WAVES, WAVELENGTH = 6, (0.15, 0.8)
+"""Number of plane waves of a smooth error, and the range of their lengths, world units."""
 COLOR_SHIFT, SHAPE_SHIFT = 0.06, 0.025
 """Largest standard deviations of smooth displacements of the pattern and of the shape, world units.
 """
@@ -57,14 +54,8 @@ class SplatShards(Shards):
 
 
 def imperfect_gaussians(mesh: Mesh, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
-    """Cover a surface with Gaussians whose pattern, shape and colours have errors.
-
-    The sizes of the errors are random, between none and the constants above, and the same for all
-    Gaussians of an object.
-
-    Returns:
-        Means (N, 3), quaternions (N, 4), scales (N, 3), opacities (N,), and colours (N, 3) in
-        [0, 1].
+    """Cover a surface with Gaussians whose pattern, shape and colours have errors, of random sizes
+    up to the constants above; return them as the first arguments of ``rasterize``.
     """
     count = int(rng.integers(*COUNT))
     points, faces, barycentric = sample_surface(mesh, count, rng)
@@ -83,11 +74,8 @@ def imperfect_gaussians(mesh: Mesh, rng: np.random.Generator) -> tuple[np.ndarra
 def smooth_field(
     points: Float[np.ndarray, "P 3"], deviation: float, rng: np.random.Generator
 ) -> Float[np.ndarray, "P 3"]:
-    """Evaluate a random smooth vector field, a sum of plane waves, at these points.
-
-    Args:
-        points: world units.
-        deviation: standard deviation of each component, in the unit of the result.
+    """Evaluate a random smooth vector field, a sum of plane waves, at these points; each component
+    has this standard deviation.
     """
     directions = rng.normal(size=(3, WAVES))
     lengths = rng.uniform(*WAVELENGTH, WAVES)
@@ -156,8 +144,5 @@ class JudgeStage(Stage):
         return batches
 
     def evaluate(self, model: nn.Module) -> dict[str, float]:
-        """Return the share recognised of each attribute, and the mean of all in renders of
-        Gaussians.
-        """
         found, in_splats = (accuracies(model(one.images), one.labels) for one in self.held_out)
         return found | {"mean_in_renders_of_gaussians": float(np.mean(list(in_splats.values())))}

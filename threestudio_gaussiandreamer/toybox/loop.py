@@ -1,10 +1,6 @@
-"""The training loop of all networks of the toybox.
-
-It saves checkpoints from which it can be resumed, keeps an exponential moving average of the
-weights, and writes loss curves.
-
-All random draws are functions of (seed, stage, step), so a resumed training gives the same result
-as an uninterrupted one.
+"""The training loop of all networks of the toybox, with an exponential moving average of the
+weights. All random draws are functions of (seed, stage, step), so a resumed training gives the same
+result as an uninterrupted one.
 """
 
 import itertools
@@ -43,10 +39,7 @@ LOG_EVERY, SAVE_SECONDS = 50, 300.0
 
 @dataclass(frozen=True)
 class StepData(Dataset, ABC):
-    """The batches of one stage, indexed by step.
-
-    Objects are sent to worker processes, so they hold no networks.
-    """
+    """The batches of one stage, indexed by step. It is sent to worker processes."""
 
     shards: Shards
     batch: int
@@ -58,16 +51,13 @@ class StepData(Dataset, ABC):
     """Whether rows are objects instead of pictures."""
 
     def __getitem__(self, step: int) -> Any:
-        """Return the batch of ``step``: a tensor, or a named tuple of tensors and numbers, on the
-        CPU.
-        """
         stream, per_object = f"{self.stream}-rows", self.per_object
         place = row_batch(self.shards, stream, self.batch, self.pool, step, per_object=per_object)
         return self.make(*place, numpy_generator(self.shards.seed, f"{self.stream}-batch", step))
 
     @abstractmethod
     def make(self, index: int, rows: np.ndarray, rng: np.random.Generator) -> Any:
-        """Make the batch of these rows of shard ``index``."""
+        """Make the batch of these rows of shard ``index``: a named tuple of tensors and numbers."""
 
 
 @dataclass(frozen=True)
@@ -86,12 +76,9 @@ class MixedData(Dataset):
 
 
 def moved(batch: Any, device: torch.device) -> Any:
-    """Return a tensor, or a named tuple of tensors and numbers, on ``device``."""
-    if isinstance(batch, torch.Tensor):
-        return batch.to(device, non_blocking=True)
-    if isinstance(batch, tuple):
-        return type(batch)(*(moved(value, device) for value in batch))
-    return batch
+    """Return a named tuple of tensors and numbers on ``device``."""
+    on_it = (v.to(device, non_blocking=True) if torch.is_tensor(v) else v for v in batch)
+    return type(batch)(*on_it)
 
 
 def torch_generator(rng: np.random.Generator) -> torch.Generator:
@@ -118,11 +105,7 @@ def is_trained(folder: Path, *names: str) -> bool:
 
 
 def averaged_weights(folder: Path, name: str) -> dict[str, Tensor]:
-    """Read the averaged weights of a stage's checkpoint.
-
-    Raises:
-        UserError: the stage isn't trained yet, or its file is damaged.
-    """
+    """Read the averaged weights of a stage's checkpoint."""
     path = checkpoint_path(folder, name)
     if not path.exists():
         raise UserError(f"{path} is missing: train the stage {name!r} first")
@@ -141,7 +124,7 @@ class Options:
     seed: int = 0
     device: str = "cpu"
     pool: int = 40
-    """Number of shards of training data; a stage visits them in a cycle."""
+    """Number of shards, which a stage visits in a cycle."""
     shard_objects: int = 256
     precision: str = "float32"
     """Either "float32", or "bfloat16" for autocast on GPUs and on CPUs that multiply it."""
@@ -152,12 +135,11 @@ class Options:
 
     @property
     def shards(self) -> Shards:
-        """The shards of the training."""
         return Shards(self.folder / "shards", self.seed, objects=self.shard_objects)
 
 
 class Stage(ABC):
-    """The training of one network, ``model``; :class:`Training` also averages its weights."""
+    """What the training of one network needs."""
 
     name: ClassVar[str]
     batch_size: ClassVar[int]
@@ -177,11 +159,11 @@ class Stage(ABC):
 
     @abstractmethod
     def build(self) -> nn.Module:
-        """Build the network with random weights, and load the networks that its training uses."""
+        """Build the network, and load the networks that its training uses."""
 
     @abstractmethod
     def data(self) -> Dataset:
-        """Return the batches, indexed by step, on the CPU; it is sent to worker processes."""
+        """Return the batches, indexed by step, on the CPU."""
 
     def batches(self, step: int) -> Iterator[Any]:
         """Yield the batches from ``step`` on, on the stage's device."""
@@ -202,9 +184,7 @@ class Stage(ABC):
         """Return the loss of one batch, and further scalars to log."""
 
     def frozen(self) -> tuple[str, ...]:
-        """Return name prefixes of the parameters that stay fixed, since other networks were trained
-        with them.
-        """
+        """Return name prefixes of the parameters with which other networks were trained."""
         return ()
 
     def evaluate(self, model: nn.Module) -> dict[str, float]:
@@ -221,6 +201,10 @@ class Progress:
     seconds: float = 0.0
     history: list[dict[str, float]] = field(default_factory=list)
     """One entry for each :data:`LOG_EVERY` steps: the means of the metrics."""
+    measured: dict[str, float] = field(default_factory=dict)
+    """Numbers on withheld objects."""
+    earlier: list[dict[str, Any]] = field(default_factory=list)
+    """Device and hours of the trainings whose exported weights this one started from."""
 
 
 class Training:
@@ -234,9 +218,6 @@ class Training:
             self.model.parameters(), lr=stage.learning_rate, betas=(0.9, 0.99), weight_decay=0.01
         )
         self.progress = Progress()
-        self.measured: dict[str, float] = {}
-        self.earlier: list[dict[str, Any]] = []
-        """Device and hours of the trainings whose exported weights this one started from."""
         self.target, self.limit = stage.images, math.inf
         self.signum = 0
         if self.path.exists():
@@ -279,11 +260,7 @@ class Training:
         return progress
 
     def train_step(self, batch: Any) -> dict[str, Tensor]:
-        """Update the weights and their average once.
-
-        Raises:
-            UserError: the gradient isn't finite; weights and average aren't changed.
-        """
+        """Update the weights and their average once, unless the gradient isn't finite."""
         progress, device = self.progress, self.stage.device.type
         factor = rate_factor(progress.step, self.done)
         for group in self.optimizer.param_groups:
@@ -306,19 +283,13 @@ class Training:
         return {"loss": loss.detach(), "grad_norm": norm, **metrics}
 
     def save(self) -> None:
-        """Write the checkpoint and the curves.
-
-        Raises:
-            UserError: the disk is full or the folder can't be written; an existing file is kept.
-        """
+        """Write the checkpoint and the curves."""
         cuda = self.stage.device.type == "cuda"
         content = {
             "model": self.model.state_dict(),
             "ema": self.ema.state_dict(),
             "optimizer": self.optimizer.state_dict(),
             "constants": self.stage.constants,
-            "measured": self.measured,
-            "earlier": self.earlier,
             "device": torch.cuda.get_device_name(self.stage.device) if cuda else "cpu",
             **vars(self.progress),
         }
@@ -335,9 +306,8 @@ class Training:
             self.model.load_state_dict(content["model"])
             self.ema.load_state_dict(content["ema"])
             self.optimizer.load_state_dict(content["optimizer"])
-            self.progress = Progress(**{name: content[name] for name in vars(Progress())})
+            self.progress = Progress(**{k: content[k] for k in vars(Progress()) if k in content})
             self.stage.constants.update(content["constants"])
-            self.measured, self.earlier = content["measured"], content.get("earlier", [])
         except (KeyError, TypeError, RuntimeError) as error:
             raise UserError(f"{self.path} isn't a checkpoint of this stage: {error}") from error
         print(f"{self.stage.name}: resumed after {self.progress.images} images", flush=True)
@@ -364,9 +334,9 @@ class Training:
     @torch.no_grad()
     def _measure(self) -> None:
         """Evaluate the averaged model on withheld objects."""
-        self.measured = self.stage.evaluate(self.ema.module.eval())
+        self.progress.measured = measured = self.stage.evaluate(self.ema.module.eval())
         place = f"{self.stage.name}  {self.progress.images}  withheld objects:"
-        print(place, _text(self.measured), flush=True)
+        print(place, _text(measured), flush=True)
 
     def _on_signal(self, number: int, frame: Any) -> None:
         self.signum = number
@@ -384,9 +354,6 @@ def _average(averages: list[Tensor], current: list[Tensor], count: Any) -> None:
 
 def rate_factor(step: int, done: float) -> float:
     """Return the multiplier of the learning rate: linear warm-up to 1, constant, then a linear
-    decrease to zero.
-
-    Args:
-        done: fraction of the training that is done.
+    decrease to zero, by the fraction of the training that is ``done``.
     """
     return min(1.0, (step + 1) / WARMUP) * min(1.0, max(0.0, 1 - done) / DECAY_SHARE)

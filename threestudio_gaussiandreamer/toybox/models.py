@@ -99,9 +99,7 @@ def unet() -> Any:
 
 @torch.no_grad()
 def _start_with_little_noise(network: Any) -> None:
-    """Initialise the posterior's standard deviation to exp(-3); at 1 the noise would exceed the
-    signal at the start of training.
-    """
+    """Initialise the posterior's standard deviation to exp(-3)."""
     for convolution in (network.quant_conv, network.post_quant_conv):
         nn.init.dirac_(convolution.weight)
         nn.init.zeros_(convolution.bias)
@@ -111,10 +109,8 @@ def _start_with_little_noise(network: Any) -> None:
 
 @torch.no_grad()
 def start_as_identity(network: nn.Module) -> None:
-    """Initialise every block of a diffusers network to pass its input on unchanged.
-
-    Residual branches start at zero and resampling convolutions as averages, so that colours pass
-    through from the first step, and training needs far fewer steps.
+    """Initialise every block of a diffusers network to pass its input on unchanged, so that
+    training needs far fewer steps: residual branches start at zero, resampling as averages.
     """
     for name, module in network.named_modules():
         if name.endswith(("conv2", "proj_out")):

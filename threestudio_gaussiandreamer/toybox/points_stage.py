@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from ..diffusion import sds
@@ -17,11 +17,8 @@ from .loop import Stage, StepData, normal, torch_generator
 from .tokens import object_prompts, open_tokenizer, token_ids
 from .world import RADIUS
 
-POINTS = 256
-"""Of one training sample; a set transformer takes any number later."""
-TIMESTEPS = 1024
-"""Of Point-E's diffusion."""
-EMPTY_SHARE = 0.1
+POINTS, TIMESTEPS, EMPTY_SHARE = 256, 1024, 0.1
+"""Points of a training sample, timesteps of Point-E's diffusion, share of empty prompts."""
 
 
 class PointsBatch(NamedTuple):
@@ -30,9 +27,7 @@ class PointsBatch(NamedTuple):
     noise: Float[Tensor, "B 6 N"]
     t: Int[Tensor, " B"]
     ids: Int[Tensor, "B 32"]
-    """Tokens of the prompts."""
-    empty: Tensor
-    """(B,) bool: whether the condition is zero, for classifier-free guidance."""
+    empty: Bool[Tensor, " B"]
 
 
 @dataclass(frozen=True)
@@ -41,7 +36,7 @@ class PointsData(StepData):
     stream, per_object = "points", True
 
     def make(self, index: int, rows: np.ndarray, rng: np.random.Generator) -> PointsBatch:
-        shard = self.shards.get_light(index)
+        shard = self.shards.get(index)
         texts = object_prompts(shard.labels[rows * self.shards.views], rng)
         chosen = rng.permuted(np.tile(np.arange(shard.points.shape[1]), (len(rows), 1)), axis=1)
         places = np.take_along_axis(shard.points[rows], chosen[:, :POINTS, None], axis=1)
@@ -89,9 +84,8 @@ class PointsStage(Stage):
 
 
 def network_units(points: Float[Tensor, "B N 6"]) -> Float[Tensor, "B 6 N"]:
-    """Convert points of the world to the units of Point-E's networks.
-
-    Their front is -y and their unit is 2 RADIUS; then follow the published scales and biases.
+    """Convert points of the world to the units of Point-E's networks: their front is -y and their
+    unit 2 RADIUS; then follow the published scales and biases.
     """
     x, y, z = (points[..., i] / (2 * RADIUS) for i in range(3))
     turned = torch.stack([y, -x, z, *(255 * points[..., i] for i in (3, 4, 5))], dim=1)

@@ -28,14 +28,10 @@ from .views import DISTANCE, FOVY_DEG, LABELS
 from .world import Attributes
 
 VERSION = 2
-"""Changes with what is read from the same probabilities, so that no scores of different readings
-are compared. Version 1 read every attribute alone.
-"""
+"""Changes with what is read from the same probabilities."""
 ELEVATION_DEG = 15.0
 OFFSETS_DEG = (-22.5, 22.5)
-"""Azimuths of a quadrant's two views, relative to its middle. They keep away from its borders, at
-+-45 degrees, where the right answer is ambiguous.
-"""
+"""Azimuths of a quadrant's two views, relative to its middle."""
 EXCHANGEABLE = ("striped", "checkered")
 """Patterns that look alike with their two colours exchanged."""
 

@@ -28,9 +28,6 @@ LENGTH = 32
 def write_tokenizer(folder: Path, words: Sequence[str]) -> None:
     """Write the vocabulary, merges and configuration of a CLIPTokenizer into ``folder``, and the
     list of ``words`` that prompts/known_words.py reads.
-
-    Raises:
-        UserError: the disk is full, or the folder can't be written.
     """
     output_folder(folder, "the tokenizer")
     merges = word_merges(words)
@@ -55,11 +52,7 @@ def write_tokenizer(folder: Path, words: Sequence[str]) -> None:
 
 
 def copy_tokenizer(source: Path, folder: Path) -> None:
-    """Copy the files of a tokenizer.
-
-    Raises:
-        UserError: the disk is full, or the folder can't be written.
-    """
+    """Copy the files of a tokenizer."""
     output_folder(folder, "the tokenizer")
     for path in sorted(source.iterdir(), key=lambda path: path.name == SETTINGS):
         with atomic_file(folder / path.name) as file:
@@ -109,8 +102,7 @@ def open_tokenizer(folder: Path) -> Any:
     """Load the training's tokenizer, which is written on first use.
 
     Raises:
-        UserError: it is of an earlier version of the toybox, and lacks words; or it can't be
-            written.
+        UserError: it is of an earlier version of the toybox, and lacks words.
     """
     from transformers import CLIPTokenizer
 
@@ -141,9 +133,8 @@ def training_prompts(shard: Shard, rows: np.ndarray, rng: np.random.Generator) -
 def joined_prompts(
     shard: Shard, objects: np.ndarray, views: int, rng: np.random.Generator
 ) -> list[str]:
-    """Write prompts for all views of these objects: the same words, and each view's direction.
-
-    Some objects have only empty prompts, and some only prompts without a direction.
+    """Write prompts for all views of these objects: the same words, and each view's direction; or
+    of some only empty prompts, or prompts without a direction.
     """
     texts: list[str] = []
     for row in objects:

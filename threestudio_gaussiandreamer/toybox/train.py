@@ -1,8 +1,7 @@
 """Train the toybox's models: ``python -m threestudio_gaussiandreamer.toybox.train FOLDER``.
 
 Stages run in order, each up to its number of images, and go on from their checkpoints, so the same
-command continues a training that was stopped anywhere. It runs unchanged on a GPU (``--device cuda
---precision bfloat16``).
+command continues a training that was stopped anywhere.
 """
 
 import argparse
@@ -18,21 +17,24 @@ from pathlib import Path
 from typing import Optional
 
 import torch
+from torch import Tensor
 
 from ..core.command import run_command
 from ..core.errors import UserError, unknown
-from ..core.files import output_folder
+from ..core.files import existing_file, output_folder
 from ..core.options import shown
 from ..core.signals import interrupt
 from ..launch.folder_lock import claim
+from ..models.bundled import RECORD
+from ..view.run_files import read_json
+from . import tokens
 from .autoencoder_stage import AutoencoderStage
-from .clip_stage import ClipStage, TextStage
+from .clip_stage import TEXT_PARTS, ClipStage, TextStage
 from .judge_stage import SEED_OFFSET, JudgeStage, judge_shards
-from .loop import Options, Stage, Training
+from .loop import Options, Progress, Stage, Training, is_trained
 from .points_stage import PointsStage
-from .unet_stage import UNetStage
+from .unet_stage import LATENT_SCALE, UNetStage
 from .views import Shards
-from .warm_start import start_from
 
 IN_ORDER = TextStage, ClipStage, AutoencoderStage, UNetStage, PointsStage, JudgeStage
 STAGES: dict[str, type[Stage]] = {stage.name: stage for stage in IN_ORDER}
@@ -62,11 +64,7 @@ def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
 
 
 def options_of(args: argparse.Namespace) -> Options:
-    """Return the checked options.
-
-    Raises:
-        UserError: an unknown stage, a number out of range, or no such device.
-    """
+    """Return the checked options."""
     for name in args.stages:
         if name not in STAGES:
             raise unknown("stage", name, STAGES)
@@ -122,13 +120,69 @@ def train(
             interrupt(training.signum)
 
 
-def run(args: argparse.Namespace) -> None:
-    """Check the options, and train.
+def start_from(weights: Path, options: Options) -> None:
+    """Write a checkpoint for every stage of ``weights``, a folder that ``toybox.export`` wrote, of
+    which the training folder has none. Optimisers start without state; the attribute classifiers,
+    which aren't published, start at random.
 
     Raises:
-        UserError: an option is invalid, or a file can't be written or doesn't fit.
-        Terminated, KeyboardInterrupt: a signal stopped the training; a checkpoint is written.
+        UserError: a file is missing or damaged, or holds another model.
     """
+    path = existing_file(weights / RECORD, "record of the toybox's weights")
+    record = read_json(path, dict)
+    if not record or not all(isinstance(seen, dict) for seen in record.values()):
+        raise UserError(f"the record of the toybox's weights {str(path)!r} is damaged")
+    if not (options.folder / "tokenizer" / tokens.SETTINGS).is_file():
+        source = weights / "stable-diffusion" / "tokenizer"
+        existing_file(source / tokens.SETTINGS, "tokenizer")
+        tokens.copy_tokenizer(source, options.folder / "tokenizer")
+    for name in (name for name in STAGES if name in record):
+        if is_trained(options.folder, name):
+            continue
+        training, seen = Training(STAGES[name](options)), record[name]
+        try:
+            state, classified = read_weights(weights, name), name in ("text", "clip")
+            training.model.load_state_dict(state, strict=not classified)
+            if name == "unet":
+                vae = read_json(weights / "stable-diffusion/vae/config.json", dict)
+                training.stage.constants[LATENT_SCALE] = float(vae["scaling_factor"])
+        except (RuntimeError, KeyError) as error:
+            raise UserError(
+                f"the weights of {name!r} in {str(weights)!r} are of another model than those "
+                f"of this version: {error}"
+            ) from error
+        training.ema.module.load_state_dict(training.model.state_dict())
+        training.ema.n_averaged.fill_(seen["steps"])
+        training.progress = Progress(
+            seen["steps"],
+            seen["images"],
+            history=[seen["last"]] if seen["last"] else [],
+            measured=seen["withheld"],
+            earlier=seen["trainings"],
+        )
+        training.save()
+
+
+def read_weights(weights: Path, name: str) -> dict[str, Tensor]:
+    """Read an export's weights of a stage's network, float32; of "clip" all but the text encoder,
+    which the stage has from the one before.
+    """
+    from safetensors.torch import load_file
+    from transformers import CLIPModel
+
+    if name in ("text", "clip"):
+        state = CLIPModel.from_pretrained(weights / "clip").float().state_dict()
+        prefix = "" if name == "text" else "clip."
+        kept = (key for key in state if key.startswith(TEXT_PARTS) == (name == "text"))
+        return {f"{prefix}{key}": state[key] for key in kept}
+    of_diffusion = "stable-diffusion/{}/diffusion_pytorch_model.safetensors"
+    files = {"autoencoder": of_diffusion.format("vae"), "unet": of_diffusion.format("unet")}
+    path = existing_file(weights / files.get(name, f"{name}.safetensors"), "weights")
+    return {key: value.float() for key, value in load_file(path).items()}
+
+
+def run(args: argparse.Namespace) -> None:
+    """Check the options, and train."""
     options = options_of(args)
     output_folder(options.folder, "FOLDER")
     if args.workers:
@@ -136,7 +190,7 @@ def run(args: argparse.Namespace) -> None:
         workers = min(args.workers, os.cpu_count() or 1)
         render_shards([options.shards, *of_judge], options.pool, workers)
     if args.from_weights:
-        start_from(args.from_weights, options, STAGES)
+        start_from(args.from_weights, options)
     train(options, args.stages, args.images, 60 * args.minutes)
 
 

@@ -19,22 +19,12 @@ from ..diffusion import sds
 from ..models.multiview_unet import views_attended_together
 from . import models, words
 from .clip_stage import trained_clip
-from .loop import (
-    MixedData,
-    Stage,
-    StepData,
-    averaged_weights,
-    moved,
-    normal,
-    torch_generator,
-)
+from .loop import MixedData, Stage, StepData, averaged_weights, moved, normal, torch_generator
 from .tokens import joined_prompts, open_tokenizer, token_ids, training_prompts, view_prompts
 from .views import SIZE, with_backgrounds
 
 RANDOM_BACKGROUNDS = 0.05
-"""Fraction of pictures with a random background. It is small because with a fraction of 0.5 score
-distillation produced haze around the object.
-"""
+"""Of the pictures; with 0.5 score distillation produced haze around the object."""
 SNR_GAMMA = 5.0
 LATENT_SCALE = "latent_scale"
 TIMESTEPS = models.SCHEDULE["num_train_timesteps"]
@@ -52,7 +42,6 @@ class UNetBatch(NamedTuple):
     noise: Float[Tensor, "B 4 s s"]
     t: Int[Tensor, " B"]
     ids: Int[Tensor, "B 32"]
-    """Tokens of the prompts."""
     views: int = 1
     """Number of consecutive pictures whose self-attention is joined."""
 
@@ -65,15 +54,13 @@ class UNetData(StepData):
     stream = "unet"
 
     def make(self, index: int, rows: np.ndarray, rng: np.random.Generator) -> UNetBatch:
-        texts = training_prompts(self.shards.get_light(index), rows, rng)
+        texts = training_prompts(self.shards.get(index), rows, rng)
         return self._noised(index, rows, texts, rng, views=1)
 
     def _noised(
         self, index: int, rows: np.ndarray, texts: list[str], rng: np.random.Generator, views: int
     ) -> UNetBatch:
-        """Draw a timestep for each object of ``views`` pictures of shard ``index``, then latents
-        and noise.
-        """
+        """Draw a timestep for each object of ``views`` pictures, then latents and noise."""
         t = sds.stratified_timesteps(len(rows) // views, TIMESTEPS, torch_generator(rng))
         mean, std = kept_moments(self.moments[index])[:, torch.from_numpy(rows)].float()
         latents = mean + std * normal(rng, mean.shape)
@@ -91,7 +78,7 @@ class JoinedViewsData(UNetData):
 
     def make(self, index: int, rows: np.ndarray, rng: np.random.Generator) -> UNetBatch:
         views = self.shards.views
-        texts = joined_prompts(self.shards.get_light(index), rows, views, rng)
+        texts = joined_prompts(self.shards.get(index), rows, views, rng)
         pictures = (rows[:, None] * views + np.arange(views)).reshape(-1)
         return self._noised(index, pictures, texts, rng, views)
 
@@ -106,10 +93,8 @@ class UNetStage(Stage):
     """Train v-prediction with the weights SNR + 1 of Salimans and Ho (2022), where the SNR is
     truncated as in Hang et al. (2023).
 
-    One prompt in ten is empty, for classifier-free guidance. In most steps the self-attention joins
-    the views of an object, as in MVDream (Shi et al. 2023, section 3.1), so that their prompts and
-    what the views have in common have to tell the directions apart; the weights are the same with
-    and without joined views.
+    In most steps the self-attention joins the views of an object, as in MVDream (Shi et al. 2023,
+    section 3.1), so that their prompts have to tell the directions apart.
     """
 
     name = "unet"
@@ -187,9 +172,7 @@ class UNetStage(Stage):
         return found
 
     def _moments(self, index: int) -> Path:
-        """Return the file of a shard's posteriors, which is written on first use: their means and
-        deviations (2, N, 4, s, s), float16.
-        """
+        """Return the file of a shard's posteriors, float16, which is written on first use."""
         name = f"{self.encoder_digest[:12]}-{SIZE}-{self.shards.path(index).stem}.pt"
         path = self.options.folder / "latents" / name
         if not path.is_file():
@@ -205,9 +188,7 @@ class UNetStage(Stage):
     def _posteriors(
         self, rgba: UInt8[np.ndarray, "N H W 4"], rng: np.random.Generator, *, random_share: float
     ) -> Float[Tensor, "2 N 4 s s"]:
-        """Return means and deviations of the posteriors of pictures, composited over backgrounds
-        of which this share is random.
-        """
+        """Return means and deviations of the posteriors of pictures over backgrounds."""
         found = []
         for part in np.array_split(rgba, -(-len(rgba) // ENCODED_AT_ONCE)):
             images = with_backgrounds(part, rng, random_share=random_share).to(self.device)
@@ -217,11 +198,8 @@ class UNetStage(Stage):
 
 
 def truncated_weight(abar: Float[Tensor, " B"]) -> Float[Tensor, " B"]:
-    """Return the weight of v's squared error, (min(SNR, gamma) + 1) / (SNR + 1).
-
-    That of the picture's error is min(SNR, gamma) + 1. It doesn't fall to 0 with the SNR as
-    min(SNR, gamma) does, so that high noise levels keep their weight: only there does the prompt
-    decide between left and right.
+    """Return the weight of v's squared error, (min(SNR, gamma) + 1) / (SNR + 1). High noise levels
+    keep their weight: only there does the prompt decide between left and right.
     """
     snr = abar / (1 - abar)
     return (snr.clamp(max=SNR_GAMMA) + 1) / (snr + 1)
@@ -242,11 +220,7 @@ def digest(module: nn.Module) -> str:
 
 
 def frozen_autoencoder(folder: Any) -> nn.Module:
-    """Load the trained autoencoder's averaged weights, without gradients.
-
-    Raises:
-        UserError: it isn't trained.
-    """
+    """Load the trained autoencoder's averaged weights, without gradients."""
     vae = models.autoencoder()
     vae.load_state_dict(averaged_weights(folder, "autoencoder"))
     return vae.eval().requires_grad_(False)

@@ -40,8 +40,6 @@ BACKGROUND = (0.5, 0.5, 0.5)
 """Background of nearly all pictures; no object has this colour."""
 OBJECTS, VIEWS, POINTS = 256, 4, 1024
 """Objects per shard, views per object, and points per object."""
-LIGHT_SHARDS = 128
-"""Number of shards that are cached in memory without their pictures, 3 MB each."""
 HELD_OUT_OBJECTS = 64
 """Number of objects for evaluation, which are withheld from training."""
 
@@ -93,9 +91,8 @@ class Shards:
 
     def path(self, index: int) -> Path:
         """Return the file of shard ``index``."""
-        sort = self.file_names[self.held_out]
-        name = f"{sort}-world{VERSION}-{self.seed}-{self.objects}x{self.views}-{index:05d}.npz"
-        return self.folder / name
+        sort, size = self.file_names[self.held_out], f"{self.objects}x{self.views}"
+        return self.folder / f"{sort}-world{VERSION}-{self.seed}-{size}-{index:05d}.npz"
 
     def ensure(self, index: int) -> None:
         """Render shard ``index`` into its file, unless that exists."""
@@ -110,18 +107,9 @@ class Shards:
     @lru_cache(maxsize=4)  # noqa: B019
     def get(self, index: int) -> Shard:
         """Return shard ``index``."""
-        return self._read(index)
-
-    @lru_cache(maxsize=LIGHT_SHARDS)  # noqa: B019
-    def get_light(self, index: int) -> Shard:
-        """Return shard ``index`` without its pictures, which take nearly all of its size."""
-        return self._read(index, pictures=False)
-
-    def _read(self, index: int, *, pictures: bool = True) -> Shard:
         self.ensure(index)
         with np.load(self.path(index), allow_pickle=False) as file:
-            rgba = file["rgba"] if pictures else np.zeros((0, SIZE, SIZE, 4), np.uint8)
-            return Shard(rgba, *(file[name] for name in Shard._fields[1:]))
+            return Shard(**file)
 
     def held_out_shard(self) -> Shard:
         """Return the shard of withheld objects for evaluation."""
@@ -150,7 +138,7 @@ class Shards:
 
 
 def draw_orbit(count: int, rng: np.random.Generator) -> Orbit:
-    """Draw ``count`` views, one in each of as many azimuth sectors, with a random first sector."""
+    """Draw ``count`` views, one in each of as many azimuth sectors, the first of them random."""
     start = rng.uniform(0, 360)
     azimuth = start + 360 / count * (np.arange(count) + rng.uniform(0, 1, count))
     overhead = rng.uniform(size=count) < OVERHEAD_SHARE
@@ -197,22 +185,16 @@ def attributes_of(row: Int[np.ndarray, " L"]) -> Attributes:
 def with_backgrounds(
     rgba: UInt8[np.ndarray, "N H W 4"], rng: np.random.Generator, *, random_share: float
 ) -> Float[torch.Tensor, "N 3 H W"]:
-    """Composite pictures over BACKGROUND, and a share of them over random backgrounds.
-
-    Args:
-        random_share: fraction of pictures whose background is a random colour or a gradient between
-            two.
-
-    Returns:
-        Pictures in [0, 1], float32.
+    """Composite pictures over BACKGROUND, and a share of them over a random colour or a gradient
+    between two; return pictures in [0, 1].
     """
     count, height = rgba.shape[:2]
     top, bottom = (rng.uniform(0, 1, (count, 3, 1, 1)) for _ in range(2))
     bottom = np.where(rng.uniform(size=(count, 1, 1, 1)) < 0.5, top, bottom)
     ramp = np.linspace(0, 1, height)[:, None]
-    fixed = rng.uniform(size=(count, 1, 1, 1)) >= random_share
-    fixed_color = np.array(BACKGROUND)[:, None, None]
-    background = np.where(fixed, fixed_color, top + (bottom - top) * ramp).astype(np.float32)
+    fixed, grey = rng.uniform(size=(count, 1, 1, 1)) >= random_share, np.array(BACKGROUND)
+    ramp = top + (bottom - top) * ramp
+    background = np.where(fixed, grey[:, None, None], ramp).astype(np.float32)
     # with the channels in front, the arithmetic runs along whole rows of pixels
     channels = torch.from_numpy(rgba.transpose(0, 3, 1, 2)).float().contiguous().div_(255)
     return channels[:, :3] + (1 - channels[:, 3:]) * torch.from_numpy(background)
@@ -221,11 +203,8 @@ def with_backgrounds(
 def render_gaussians(
     gaussians: Sequence[np.ndarray], orbit: Orbit, *, eps2d: float
 ) -> Float[np.ndarray, "N s s 4"]:
-    """Render Gaussians from these cameras; return premultiplied RGBA in [0, 1].
-
-    Args:
-        gaussians: means, quaternions, scales, opacities and colours, as ``rasterize`` takes them.
-        eps2d: dilation, square pixels.
+    """Render Gaussians, given as the first arguments of ``rasterize``, from these cameras; return
+    premultiplied RGBA in [0, 1].
     """
     viewmats, Ks = to_opencv(orbit.c2w, orbit.fovy, SIZE, SIZE)
     gaussians = [torch.from_numpy(np.float32(values)) for values in gaussians]
@@ -237,13 +216,11 @@ def render_gaussians(
 def row_batch(
     shards: Shards, stream: str, batch: int, pool: int, step: int, *, per_object: bool = False
 ) -> tuple[int, Int[np.ndarray, " B"]]:
-    """Return (shard, rows) of the batch of ``step``, a function of (seed, stream, step).
+    """Return (shard, rows) of the batch of ``step``, a function of (seed, stream, step), where
+    ``pool`` shards are visited cyclically.
 
-    Each pass over a shard visits its rows in random order; an incomplete last batch is dropped.
-
-    Args:
-        pool: number of shards that are visited cyclically.
-        per_object: rows are objects instead of pictures.
+    Each pass over a shard visits its rows (pictures, or objects) in random order; an incomplete
+    last batch is dropped.
     """
     rows = shards.objects * (1 if per_object else shards.views)
     batch = min(batch, rows)

@@ -87,11 +87,8 @@ of ...").
 
 
 def direction(elevation: float, azimuth: float) -> str:
-    """Return the direction of a view, with the prompt processors' thresholds and
+    """Return the direction of a view (degrees), with the prompt processors' thresholds and
     ``view_dependent_left_and_right``.
-
-    Args:
-        elevation, azimuth: degrees.
     """
     shifted = (azimuth + 180) % 360 - 180
     if elevation > OVERHEAD:
@@ -130,9 +127,8 @@ def describe(attributes: Attributes, rng: np.random.Generator) -> str:
 def prompt_of(
     attributes: Attributes, elevation: float, azimuth: float, rng: np.random.Generator
 ) -> str:
-    """Write a training prompt of one view.
-
-    It is empty, names no direction, or names it as the prompt processors write it.
+    """Write a training prompt of one view: empty, without a direction, or with it as the prompt
+    processors write it.
     """
     share = rng.random()
     if share < EMPTY_SHARE:
@@ -199,8 +195,7 @@ def attributes_in(prompt: str) -> Optional[Attributes]:
     """Return the attributes that a prompt names; None if it names no kind of object or no colour.
 
     The colour directly in front of a part or an accessory belongs to that. Of the other colours the
-    first is the body's and the second the pattern's. A pattern without a second colour is ignored,
-    as are unknown words.
+    first is the body's and the second the pattern's. A pattern without a second colour is ignored.
     """
     words = _meanings(prompt)
     kind = next((meaning for role, meaning in words if role == "kind"), None)
@@ -229,11 +224,8 @@ def _meanings(prompt: str) -> list[Word]:
 def _colored(
     words: list[Word], role: str, meaning: str = ""
 ) -> tuple[Optional[int], Optional[str], Optional[str]]:
-    """Find the first word of a role, and of this meaning if one is given, with a colour before it.
-
-    Returns:
-        the colour's index in ``words``, the word's meaning and its colour; three None if none is
-        found.
+    """Find the first word of a role, and of this meaning if one is given, with a colour before it;
+    return the colour's index in ``words``, the word's meaning and its colour, or three None.
     """
     pairs = enumerate(zip(words, words[1:], strict=False))
     for place, ((before, color), (word, found)) in pairs:

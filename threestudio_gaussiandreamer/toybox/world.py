@@ -2,9 +2,8 @@
 
 An object has a kind, a colour, a pattern in a second colour, and at most one extra: a part in a
 different colour, or an accessory. Meshes are in world axes (z up, front +x), centred, and inside a
-sphere of radius :data:`RADIUS`. Shading is baked into the vertex colours, since the ray caster
-applies none. It doesn't depend on the view, so Gaussians without view-dependent colour can
-represent it.
+sphere of radius :data:`RADIUS`. Shading that doesn't depend on the view is baked into the vertex
+colours, since the ray caster applies none.
 
 Some combinations of attributes are withheld from all training (:func:`withheld`), to measure
 generalisation.
@@ -157,13 +156,10 @@ SIZE = CELL * PERIODS
 
 def texture(attributes: Attributes) -> Float[np.ndarray, "H W 3"]:
     """Draw the object's colours: float32 (256, 272, 3), row 0 on top."""
-    color, named = (
-        attributes.color,
-        (attributes.second, attributes.part, attributes.accessory_color),
-    )
-    second, *others = (np.float32(COLORS[name or color]) for name in named)
-    mask = _pattern_mask(attributes.pattern)
-    pattern = np.where(mask[..., None], second, np.float32(COLORS[color]))
+    a = attributes
+    names = (a.color, a.second, a.part, a.accessory_color)
+    color, second, *others = (np.float32(COLORS[name or a.color]) for name in names)
+    pattern = np.where(_pattern_mask(a.pattern)[..., None], second, color)
     plain = np.stack([*others, *map(np.float32, DETAILS.values())])
     column = np.zeros((SIZE, CELL, 3), np.float32)
     column[: CELL * len(plain)] = np.repeat(plain, CELL, axis=0)[:, None]
