@@ -67,9 +67,7 @@ def test_a_network_of_timesteps_gives_the_exact_denoiser():
 
 
 def test_schedules_and_timesteps():
-    """The end points given by the formulas; the linear schedule is Ho et al.'s, rescaled from 1000
-    to 1024 timesteps.
-    """
+    """The end points given by the formulas."""
     cosine, linear = karras.cosine_alphas_cumprod(), karras.linear_alphas_cumprod()
     for levels in (cosine, linear):
         assert len(levels) == 1024 and (np.diff(levels) < 0).all()

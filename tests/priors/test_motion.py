@@ -24,11 +24,11 @@ from threestudio_gaussiandreamer.priors.motion import (
 )
 
 FAST = {"num_points": 500}
-VIEWS = len(module.VIEW_AZIMUTHS)
 
 
 @pytest.fixture
-def options(motion_file, body_file, clip):
+def options(motion_file, body_file, clip, monkeypatch):
+    monkeypatch.setattr(module, "FINE", 60)
     return FAST | {"motion": str(motion_file), "body_model": str(body_file), "clip": clip}
 
 
@@ -67,8 +67,7 @@ def test_the_motion_of_a_prompt(prompt, motion, monkeypatch, capsys):
 
 def test_layouts_of_motions(motion_file, body, tmp_path):
     motions = read_motions(str(motion_file))
-    assert motions.positions.shape == (2, 6, 22, 3) and motions.lengths == [6, 4]
-    assert motions.texts == ["Someone kicks"] * 2
+    assert motions.texts == ["Someone kicks"] * 2 and motions.lengths == [6, 4]
     np.testing.assert_array_equal(motions.positions[0], walk(body))
     for joints in (22, 24):
         frames = np.random.default_rng(0).normal(size=(5, joints, 3))
@@ -94,13 +93,11 @@ ZEROS = np.zeros((1, 22, 3, 5))
 @pytest.mark.parametrize(
     "content, message",
     [
-        (b"", "motion file"),
         (b"PK\x03\x04 broken", "motion file"),
         ({"joints": ZEROS}, "no array 'motion', only joints"),
         ({"motion": np.zeros((1, 25, 6, 5))}, "rotations"),
         ({"motion": np.zeros((1, 21, 3, 5))}, r"\(1, 21, 3, 5\).*22 or 24 joints"),
         ({"motion": ZEROS[..., :0]}, r"\(1, 22, 3, 0\)"),
-        ({"motion": np.full((1, 22, 3, 5), "x")}, "numbers"),
         ({"motion": np.full((1, 22, 3, 5), np.nan)}, "NaN"),
         ({"motion": np.zeros((2, 22, 3, 5)), "lengths": np.array([5])}, "lengths must be 2"),
         ({"motion": ZEROS, "lengths": np.array([6])}, "from 1 to 5"),
@@ -131,7 +128,6 @@ def asked(monkeypatch):
 
     monkeypatch.setattr(module, "picture_similarities", scores)
     monkeypatch.setattr(module, "NUM_FRAMES", 2)
-    monkeypatch.setattr(module, "FINE", 60)
     return texts
 
 
@@ -199,8 +195,7 @@ def test_a_rotated_body_is_turned_to_face_plus_x(body):
         turned = z_up(joints) @ facing(joints).T
         across = turned[[2, 17]] - turned[[1, 16]]  # right of left along -y
         np.testing.assert_allclose(across[:, 0], 0, atol=1e-9)
-        assert across[1, 1] < -0.3
-        assert turned[15, 2] > turned[0, 2] > turned[7, 2]  # head up
+        assert across[1, 1] < -0.3 and turned[15, 2] > turned[0, 2] > turned[7, 2]  # head up
     lying = np.zeros((22, 3))  # hips and shoulders above each other: not turned
     lying[[1, 16], 1], lying[[2, 17], 1] = 0.1, -0.1
     np.testing.assert_array_equal(facing(lying), np.eye(3))

@@ -14,7 +14,6 @@ from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.guidance import stable_diffusion  # noqa: F401
 from threestudio_gaussiandreamer.host import find
 from threestudio_gaussiandreamer.models.bundled import DIGESTS, digest_of, read_digests
-from threestudio_gaussiandreamer.models.clip import PictureText, clip_source
 from threestudio_gaussiandreamer.priors.point_e import PointEPrior
 from threestudio_gaussiandreamer.prompts import prompt_processors  # noqa: F401
 from threestudio_gaussiandreamer.toybox import models, train
@@ -80,12 +79,6 @@ def test_the_guidance_sees_what_the_training_saw(guidance, prompts, unet_stage):
     mean = guidance.vae.encode(images * 2 - 1).latent_dist.mean * guidance.vae.config.scaling_factor
     expected = unet_stage.vae.encode(images * 2 - 1).latent_dist.mean * unet_stage.scale
     assert torch.allclose(mean, expected, **HALF)
-
-
-def test_clip_compares_pictures_with_texts(exported):
-    clip = PictureText(clip_source(str(exported / "clip")), torch.device("cpu"))
-    pictures = np.random.default_rng(0).random((3, 100, 100, 3), np.float32)
-    assert (np.abs(clip.similarities(pictures, PROMPT)) <= 1).all()
 
 
 def test_the_point_e_prior_loads_the_points_model(exported, trained):
@@ -162,17 +155,19 @@ def test_a_full_disk_is_one_message_and_the_export_can_be_repeated(trained, tmp_
     assert set(read_digests(target)) == files - {DIGESTS}
 
 
-def test_a_full_disk_at_the_start_from_weights_is_mended_by_a_second_call(exported, tmp_path):
-    start = exported, options(tmp_path)
+def test_a_full_disk_at_the_start_from_weights_is_mended_by_a_second_call(
+    exported, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(train, "STAGES", {"text": STAGES["text"]})
     for size in (3000, 20000):  # in the vocabulary, and in a checkpoint
         with largest_file(size), pytest.raises(UserError, match="cannot write"):
-            train.start_from(*start)
-    train.start_from(*start)
+            train.start_from(exported, options(tmp_path))
+    train.start_from(exported, options(tmp_path))
     assert is_trained(tmp_path, "text") and open_tokenizer(tmp_path)
 
 
 def test_a_missing_or_damaged_record_of_weights_is_named(tmp_path):
-    for content in (None, b"{", b"[]", b'{"text": 3}', b"\xff"):
+    for content in (None, b"[]", b'{"text": 3}', b"\xff"):
         if content is not None:
             (tmp_path / "training.json").write_bytes(content)
         problem = "does not exist" if content is None else "training.json' is damaged"

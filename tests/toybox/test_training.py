@@ -12,7 +12,7 @@ from threestudio_gaussiandreamer.core.checkpoint_file import load_file, save_fil
 from threestudio_gaussiandreamer.core.devices import torch_threads
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.launch.folder_lock import claim
-from threestudio_gaussiandreamer.toybox import judge_stage, loop, train
+from threestudio_gaussiandreamer.toybox import judge_stage, loop
 from threestudio_gaussiandreamer.toybox.loop import averaged_weights
 from threestudio_gaussiandreamer.toybox.train import STAGES, main, render_shards
 
@@ -70,37 +70,19 @@ def test_a_stage_is_measured_on_withheld_objects(folder, name):
         assert not torch.equal(cast.images, gaussians.images)
 
 
-def test_a_stop_signal_saves_and_stops(folder, tmp_path):
-    number, run = signal.SIGHUP, training(copied(folder, tmp_path / "run"), "judge")
-    step, earlier = run.train_step, signal.getsignal(number)
+def test_a_stop_signal_saves_and_stops_and_no_other_stage_begins(tmp_path, monkeypatch, capsys):
+    number, earlier = signal.SIGHUP, signal.getsignal(signal.SIGHUP)
+    step = loop.Training.train_step
 
-    def interrupted(batch):
+    def interrupted(run, batch):
         signal.raise_signal(number)
-        return step(batch)
+        return step(run, batch)
 
-    run.train_step = interrupted
-    run.run(1000)
-    assert run.progress.images == 4 and run.signum == number
-    assert load_file(run.path)["images"] == 4
+    monkeypatch.setattr(loop.Training, "train_step", interrupted)
+    options = ["--images", "1000", "--batch", "4", "--pool", "1", "--stages", "text", "clip"]
+    assert main([str(tmp_path), *options]) == 129 and capsys.readouterr().err == "stopped\n"
+    assert load_file(tmp_path / "text.pt")["images"] == 4 and not (tmp_path / "clip.pt").exists()
     assert signal.getsignal(number) == earlier
-
-
-def test_after_a_stop_signal_no_other_stage_begins(tmp_path, monkeypatch, capsys):
-    begun = []
-
-    class Stopped:
-        progress, signum = loop.Progress(), signal.SIGHUP
-
-        def __init__(self, stage):
-            begun.append(stage)
-
-        def run(self, images, seconds):
-            return self.progress
-
-    monkeypatch.setattr(train, "Training", Stopped)
-    monkeypatch.setattr(train, "STAGES", {"clip": lambda options: "a", "unet": lambda options: "b"})
-    assert main([str(tmp_path), "--stages", "clip", "unet"]) == 129
-    assert begun == ["a"] and capsys.readouterr().err == "stopped\n"
 
 
 def test_a_stage_is_trained_by_one_process_at_a_time(tmp_path, capsys):
@@ -124,7 +106,6 @@ def test_a_gradient_that_is_not_finite_stops_before_it_is_saved(folder, tmp_path
     with pytest.raises(UserError, match="gradient of step 1 isn't finite"):
         run.run(8)
     assert run.path.read_bytes() == before
-    assert all(value.isfinite().all() for value in run.model.parameters())
 
 
 def test_a_time_limit_ends_a_stage_and_lowers_the_rate_before(folder, tmp_path):
@@ -148,7 +129,6 @@ def test_a_time_limit_ends_a_stage_and_lowers_the_rate_before(folder, tmp_path):
     [
         ("", "FOLDER: the folder"),
         ("--stages unett", "did you mean 'unet'"),
-        ("--images 0", "--images 0: expected 1 or more"),
         ("--pool -3", "--pool -3: expected 1 or more"),
         ("--device cuda", "sees no GPU"),
         ("--device cpuu", "unknown device 'cpuu': did you mean 'cpu'"),

@@ -36,7 +36,7 @@ def test_objects_are_functions_of_seed_and_index(drawn):
         assert (a.second is None) == (a.pattern == "plain")
     assert not any(world.withheld(a) for a in drawn)
     assert all(world.withheld(world.draw_attributes(0, i, held_out=True)) for i in range(20))
-    # every kind, colour and pattern is learnt from other objects
+    # every kind and colour is learnt from other objects
     assert not any(world.withheld(world.Attributes(k, c)) for k in KINDS for c in world.COLORS)
 
 
@@ -57,7 +57,7 @@ def test_every_kind_has_a_mesh_inside_the_sphere_with_patterns_on_all_sides(kind
             assert yellow[inside].sum() > 0.05 * inside.sum()
     # no surface has more periods than the texture
     share = world.SIZE / (world.SIZE + world.CELL)
-    for seed in range(20):
+    for seed in range(10):
         u, v = mesh_of(world.Attributes(kind, "blue", "dotted", "yellow"), seed).uv.T
         assert u[u < share].max() < share * (1 - 1 / world.SIZE) and v.max() < 1 - 1 / world.SIZE
 
@@ -199,9 +199,6 @@ def test_a_shard_is_a_function_of_seed_and_index(shards):
     assert not np.array_equal(shard.rgba, shards.make(1).rgba)
     name = f"train-world{world.VERSION}-0-6x4-00000.npz"
     assert [path.name for path in shards.folder.iterdir()] == [name]
-    light = shards.get_light(0)
-    assert light.rgba.size == 0
-    assert all(np.array_equal(a, b) for a, b in zip(light[1:], shard[1:], strict=True))
     for row in range(24):
         attributes = views.attributes_of(shard.labels[row])
         assert attributes == world.draw_attributes(0, row // 4)
@@ -218,7 +215,6 @@ def test_objects_fill_the_picture_and_are_not_cut(shards):
         assert not picture[[0, -1]].any() and not picture[:, [0, -1]].any()
     extents = [max(np.ptp(np.nonzero(picture)[axis]) for axis in (0, 1)) for picture in alpha]
     assert np.median(extents) > 0.6 * views.SIZE
-    assert views.DISTANCE[1] / views.DISTANCE[0] <= 1.15
 
 
 def test_backgrounds_are_fixed_but_for_the_asked_share(shards):
@@ -252,18 +248,11 @@ def test_the_sheet_shows_every_object_with_its_prompt():
     assert all((part < 128).any() for part in np.split(texts, 10, axis=1))
     assert (sheet[cell:, 2 * views.SIZE :] == 255).all()
     pictures = torch.ones(2, 3, 64, 64)
-    all_texts = ((), ("a", "b"), ("a", "word " * 60))
-    heights = [len(contact_sheet(pictures, texts, columns=2)) for texts in all_texts]
-    assert heights == [64, 64 + 11 + 3, 64 + 30 * 11 + 3]  # two words a line
+    heights = [len(contact_sheet(pictures, text, columns=2)) for text in ((), ("a", "word " * 60))]
+    assert heights == [64, 64 + 30 * 11 + 3]  # two words a line
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["sheet.txt"], "expected the name of a PNG"),
-        (["none/sheet.png"], "there is no folder"),
-    ],
-)
-def test_bad_options_of_the_sheet_are_one_message(tmp_path, capsys, arguments, message):
-    assert main([str(tmp_path / arguments[0]), *arguments[1:]]) == 2
-    assert message in capsys.readouterr().err
+def test_bad_options_of_the_sheet_are_one_message(tmp_path, capsys):
+    for name, message in (("a.txt", "the name of a PNG"), ("none/a.png", "there is no folder")):
+        assert main([str(tmp_path / name)]) == 2
+        assert message in capsys.readouterr().err
