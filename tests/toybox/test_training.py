@@ -79,6 +79,7 @@ def test_a_stop_signal_saves_and_stops_and_no_other_stage_begins(tmp_path, monke
         return step(run, batch)
 
     monkeypatch.setattr(loop.Training, "train_step", interrupted)
+    monkeypatch.setattr(loop.Training, "_measure", lambda run: None)
     options = ["--images", "1000", "--batch", "4", "--pool", "1", "--stages", "text", "clip"]
     assert main([str(tmp_path), *options]) == 129 and capsys.readouterr().err == "stopped\n"
     assert load_file(tmp_path / "text.pt")["images"] == 4 and not (tmp_path / "clip.pt").exists()
