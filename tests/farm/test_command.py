@@ -68,7 +68,7 @@ UNKNOWN = ("out/${name}", "${oc.env:NOWHERE}", "???")
         ("a fox", ["--out", "held"], "another farm command is at work in"),
         ("a fox", ["--workers", "0"], "--workers: expected 1 or more, got 0"),
         ("a fox", ["--gpus", "-1"], "--gpus"),
-        ("a fox", ["--time-limit", "nan"], "--time-limit: expected a finite number"),
+        ("a fox", ["--time-limit", "nan"], "--time-limit: expected a number above 0"),
         ("a fox", ["--price", "-2"], "--price"),
         ("a fox", ["--nothing"], "unrecognized option --nothing"),
     ],

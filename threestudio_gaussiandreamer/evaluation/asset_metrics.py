@@ -71,8 +71,8 @@ class Clip(Metric):
         self.protocol = protocol_for(args.clip, seeds=(0, 1, 2), size=args.size)
 
     def score(self, asset: Asset) -> dict[str, float]:
-        scored = score(asset.result, asset.prompt, asset.item, self.clip, self.protocol)
-        return {"clip": float(scored.per_seed.mean())}
+        found, _ = score(asset.result, asset.prompt, asset.item, self.clip, self.protocol)
+        return {"clip": float(found.mean())}
 
 
 class Directions(Metric):
@@ -213,9 +213,7 @@ def result_of(run: Path, prompt: str) -> Asset:
 
 
 def prior_of(run: Path, asset: Asset) -> Asset:
-    """Return the points that a run started from, drawn nearly opaque and as large as their
-    distances.
-    """
+    """Return the points that a run started from, nearly opaque and as large as their distances."""
     arrays = read_arrays(run / "save/prior/points.npz", "prior", ["points", "colors"])
     cloud = PointCloud(arrays["points"], arrays["colors"])
     size = {"scale_rule": "nearest", "scale_factor": 1.0, "init_opacity": OPAQUE}

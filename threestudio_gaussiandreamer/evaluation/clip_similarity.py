@@ -82,14 +82,6 @@ def protocol_for(clip: Optional[str], **options: Any) -> Protocol:
     return Protocol(**options)
 
 
-class Scored(NamedTuple):
-    """The scores of one result."""
-
-    per_seed: Float[np.ndarray, " S"]
-    thumbnails: list[np.ndarray]
-    """The views of the first seed, uint8."""
-
-
 def open_clip(folder: str) -> PictureText:
     """Load the CLIP in a local folder in transformers' format, or the bundled one."""
     if folder != NAME and not Path(folder).expanduser().is_dir():
@@ -102,8 +94,12 @@ def open_clip(folder: str) -> PictureText:
     )
 
 
-def score(result: Result, prompt: str, item: int, clip: PictureText, protocol: Protocol) -> Scored:
-    """Score one result with all seeds; a view that several seeds draw is rendered once."""
+def score(
+    result: Result, prompt: str, item: int, clip: PictureText, protocol: Protocol
+) -> tuple[Float[np.ndarray, " S"], list[np.ndarray]]:
+    """Return one result's score for each seed, and the views of the first one, uint8; a view that
+    several seeds draw is rendered once.
+    """
     draws = [protocol.draw(seed, item) for seed in protocol.seeds]
     needed = np.unique(np.concatenate(draws))
     orbit = protocol.orbit.rows(needed)
@@ -115,7 +111,7 @@ def score(result: Result, prompt: str, item: int, clip: PictureText, protocol: P
         similarity[rows] = PERCENT * clip.similarities(images, prompt)
         thumbnails |= {row: _thumbnail(image) for row, image in zip(rows, images, strict=True)}
     means = np.array([similarity[draw].mean() for draw in draws])
-    return Scored(means, [thumbnails[row] for row in draws[0]])
+    return means, [thumbnails[row] for row in draws[0]]
 
 
 def _mean_and_spread(per_seed: Float[np.ndarray, " S"]) -> dict[str, Any]:
@@ -184,15 +180,21 @@ def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
     return parser.parse_args(argv)
 
 
+def picture_size(given: Optional[int]) -> int:
+    """Return the value of ``--size``, or the paper's."""
+    size = Protocol().size if given is None else given
+    if not 1 <= size <= MAX_SIDE:
+        raise UserError(f"--size {shown(size)}: expected 1 to {MAX_SIDE} pixels")
+    return size
+
+
 def protocol_of(args: argparse.Namespace) -> Protocol:
     """Check the options and return them as a :class:`Protocol`."""
     for option, value in (("--size", args.size), ("--fovy", args.fovy)):
         if value is not None and has_own_cameras(args.clip):
             raise UserError(f"{option} has no effect with --clip {args.clip}")
-    size = Protocol().size if args.size is None else args.size
+    size = picture_size(args.size)
     fovy = Protocol().fovy_deg if args.fovy is None else args.fovy
-    if not 1 <= size <= MAX_SIDE:
-        raise UserError(f"--size {shown(size)}: expected 1 to {MAX_SIDE} pixels")
     if not 0 < fovy < 180:
         raise UserError(f"--fovy {fovy}: expected degrees between 0 and 180")
     return protocol_for(args.clip, seeds=tuple(args.seeds), fovy_deg=fovy, size=size)
@@ -224,16 +226,14 @@ def evaluate(
     protocol: Protocol,
     output: Path,
 ) -> None:
-    """Score all results, print the scores, and write ``clip.json`` and ``clip.png``, which has a
-    row of the first seed's views for each result.
-    """
+    """Score all results, print the scores, and write ``clip.json`` and ``clip.png``."""
     clip, scores, each, rows = open_clip(clip_folder), [], [], []
     for item, (result, prompt) in enumerate(zip(results, prompts, strict=True)):
-        scored = score(result, prompt, item, clip, protocol)
-        scores.append(scored.per_seed)
-        numbers = _mean_and_spread(scored.per_seed)
-        views, text = np.concatenate(scored.thumbnails, axis=1), f"{numbers['mean']:.2f}  {prompt}"
-        rows.append(picture_files.with_texts(views, [text]))
+        per_seed, views = score(result, prompt, item, clip, protocol)
+        scores.append(per_seed)
+        numbers = _mean_and_spread(per_seed)
+        text = f"{numbers['mean']:.2f}  {prompt}"
+        rows.append(picture_files.with_texts(np.concatenate(views, axis=1), [text]))
         each.append({"result": str(result.file), "prompt": prompt, **numbers})
         print(f"{numbers['mean']:6.2f}  {prompt}  {result.file}", flush=True)
     total = _mean_and_spread(np.mean(scores, axis=0))

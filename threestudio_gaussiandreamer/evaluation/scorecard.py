@@ -19,12 +19,10 @@ from .. import register_parts
 from ..core.command import run_command
 from ..core.errors import UserError, unknown
 from ..core.files import atomic_file, json_text, output_folder
-from ..core.options import shown
 from ..core.streams import numpy_generator
 from ..models.bundled import NAME
-from ..training.data import MAX_SIDE
 from .asset_metrics import METRICS, Asset, Metric
-from .clip_similarity import Protocol, has_own_cameras
+from .clip_similarity import Protocol, has_own_cameras, picture_size
 from .results import Result, find_result, read_result
 
 FILES = ("scorecard.csv", "scorecard.json")
@@ -86,8 +84,7 @@ def open_metrics(args: argparse.Namespace) -> list[Metric]:
     names = [name.strip() for name in args.metrics.split(",") if name.strip()]
     if not names:
         raise UserError(f"--metrics is empty: expected some of {', '.join(METRICS)}")
-    if args.size is not None and not 1 <= args.size <= MAX_SIDE:
-        raise UserError(f"--size {shown(args.size)}: expected 1 to {MAX_SIDE} pixels")
+    size = picture_size(args.size)
     for name in names:
         if name not in METRICS:
             raise unknown("metric", name, METRICS)
@@ -99,7 +96,7 @@ def open_metrics(args: argparse.Namespace) -> list[Metric]:
     sized = [METRICS[name] for name in names if METRICS[name].sized]
     if args.size is not None and all(metric.needs[0] == own for metric in sized):
         raise UserError("--size has no effect on these metrics, whose pictures have their own size")
-    args.size = Protocol().size if args.size is None else args.size
+    args.size = size
     return [METRICS[name](args) for name in names]
 
 
@@ -130,9 +127,7 @@ def find_results(folders: Sequence[str], failed: list[str]) -> list[Result]:
 def scored(
     results: Sequence[Result], metrics: Sequence[Metric], failed: list[str]
 ) -> Iterator[dict[str, Any]]:
-    """Yield a row of the table for each result; ``failed`` gets the messages of those that can't be
-    read or scored.
-    """
+    """Yield a row of the table for each result; ``failed`` gets the messages of the others."""
     for item, result in enumerate(tqdm(results, unit="asset", disable=None)):
         row: dict[str, Any] = {"asset": str(result.file.parents[2])}
         try:

@@ -4,7 +4,6 @@
 import argparse
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
 from typing import Optional
@@ -12,7 +11,7 @@ from typing import Optional
 from ..core.command import run_command
 from ..core.errors import UserError
 from ..core.launcher import train_alone
-from ..core.options import at_least, check_options, positive
+from ..core.options import RULE, at_least, positive
 from ..core.signals import raised_signals
 from ..launch.experiment import configure_logging
 from ..launch.folder_lock import claim, require_writable
@@ -25,17 +24,11 @@ from .report import write_report
 from .rows import check_rows, read_rows
 from .worker import Setting
 
-
-@dataclass
-class FarmOptions:
-    """The numeric options, with their ranges."""
-
-    price: Optional[float] = field(default=None, metadata=positive())
-    workers: Optional[int] = field(default=None, metadata=at_least(1))
-    gpus: Optional[int] = field(default=None, metadata=at_least(0))
-    cores: int = field(default=1, metadata=at_least(1))
-    retries: int = field(default=3, metadata=at_least(0))
-    time_limit: float = field(default=1800.0, metadata=positive("seconds"))
+RULES = {
+    **{"price": positive(), "time_limit": positive("seconds"), "workers": at_least(1)},
+    **{"gpus": at_least(0), "cores": at_least(1), "retries": at_least(0)},
+}
+"""Of the numeric options."""
 
 
 def main(argv: Optional[Sequence[str]] = None) -> int:
@@ -69,11 +62,11 @@ def parse_arguments(argv: Optional[Sequence[str]] = None) -> argparse.Namespace:
     add("--workers", type=int, help="number of workers (default: as many as fit)")
     add("--gpus", type=int, help="number of GPUs, one per worker (default: all; 0: the CPU)")
     cores = "CPU cores per worker (default: %(default)s)"
-    add("--cores", type=int, default=FarmOptions.cores, help=cores)
+    add("--cores", type=int, default=1, help=cores)
     retries = "how often an asset is tried again after its worker has died (default: %(default)s)"
-    add("--retries", type=int, default=FarmOptions.retries, help=retries)
+    add("--retries", type=int, default=3, help=retries)
     limit = "seconds without a step after which an asset counts as hung (default: %(default)g)"
-    add("--time-limit", type=float, default=FarmOptions.time_limit, help=limit)
+    add("--time-limit", type=float, default=1800.0, help=limit)
     return parse_with_overrides(parser, argv)
 
 
@@ -81,7 +74,9 @@ def run_farm(args: argparse.Namespace) -> int:
     """Make the assets, or only the report, and return the exit code."""
     train_alone()  # whatever has started this process, such as a job of SLURM
     configure_logging(verbose=False)
-    check_options(FarmOptions, args, "--")
+    for name, rule in RULES.items():
+        if (value := getattr(args, name)) is not None:
+            rule[RULE](f"--{name.replace('_', '-')}", value)
     total = check_rows(args.prompts)
     roots = [text for text in args.overrides if text.startswith("exp_root_dir=")]
     root = roots[-1].partition("=")[2] if roots else args.out or root_of(args.config)

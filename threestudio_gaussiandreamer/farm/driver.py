@@ -257,9 +257,7 @@ class Driver:
         self.bar.write(f"{job.row.name}: {state}: {text}", file=sys.stderr)
 
     def look_after_workers(self) -> None:
-        """Show what the workers do; restart those that have finished no step for ``hang`` seconds,
-        with the same asset.
-        """
+        """Show what the workers do; restart those that hang, with the same asset."""
         try:
             beats = self.ray.get(self.setting.board.read.remote(), timeout=2)
         except self.ray.exceptions.RayError:

@@ -177,9 +177,7 @@ class Place:
             self.uploaded = written
 
     def publish(self, row: Row, result: Mapping[str, Any]) -> None:
-        """Write the result of a finished asset, after all its other files are where readers get
-        them, and remove what only unfinished ones have.
-        """
+        """Write the result of a finished asset after its other files; remove its failure."""
         folder, name = self.work_folder(row), f"{ASSETS}/{row.name}"
         for path in sorted(filter(Path.is_file, folder.rglob("*"))) if self.remote else ():
             file = path.relative_to(folder).as_posix()

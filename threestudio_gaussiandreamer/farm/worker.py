@@ -281,9 +281,7 @@ def exported(folder: Path) -> list[Path]:
 
 
 def digest(folder: Path) -> str:
-    """Return the digest of the names and contents of the exported files, which a single run of the
-    same arguments reproduces.
-    """
+    """Return the digest of the exported files, which a single run with these arguments has."""
     total = hashlib.sha256()
     for path in exported(folder):
         content = hashlib.sha256(path.read_bytes()).hexdigest()

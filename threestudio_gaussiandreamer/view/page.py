@@ -177,9 +177,10 @@ def _data_blocks(clouds: Sequence[Shown]) -> str:
 
 
 def packed(gaussians: Gaussians) -> bytes:
-    """Compress the columns of a PLY file of N Gaussians (arrays), except the normals, which are
-    zero, to the bit, so that the page can save the file. Each column is stored as four planes (the
-    lowest bytes of all values, then the next ones, ...), since signs and exponents repeat."""
+    """Compress the columns of a PLY file of N Gaussians (arrays) except the normals, which are
+    zero, to the bit. Each column is four planes (the lowest bytes of all values, then the next
+    ones, ...), since signs and exponents repeat.
+    """
     names = [name for name, _ in gaussian_properties(gaussians.sh.shape[1])]
     stored = [number for number, name in enumerate(names) if name not in NORMALS]
     columns = np.ascontiguousarray(gaussian_columns(gaussians)[:, stored].T, dtype="<f4")

@@ -220,8 +220,8 @@ def _scaled(values: Sequence[float], first: float, last: float) -> list[float]:
 
 
 def write_gallery(folder: Path) -> Path:
-    """Write the gallery of the runs in a folder, and their own indices; returns its path. Where an
-    index can't be written, a warning is given, and the card leads to the run's folder.
+    """Write the gallery of the runs in a folder, and their own indices; returns its path. An index
+    that can't be written is a warning.
     """
     patterns = ["/".join(["*"] * depth) for depth in range(1, MAX_DEPTH + 1)]
     found = [path for pattern in patterns for path in folder.glob(pattern) if is_run(path)]
