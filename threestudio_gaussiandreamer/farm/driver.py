@@ -51,8 +51,8 @@ def connect(address: Optional[str]) -> Any:
         if len(tempfile.gettempdir()) > LONGEST_FOLDER and os.path.isdir("/tmp"):
             os.environ.setdefault("RAY_TMPDIR", "/tmp")
     try:
-        host, _, port = address.removeprefix("ray://").rpartition(":")
-        if "://" in host:
+        host, _, port = (place := address.removeprefix("ray://")).rpartition(":")
+        if "://" in place:
             raise ValueError("expected host:port, such as that which `ray start --head` prints")
         if host:  # else "local" or "auto"; Ray's own attempt takes minutes
             socket.create_connection((host.strip("[]"), int(port)), timeout=5).close()

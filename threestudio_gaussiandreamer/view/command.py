@@ -2,7 +2,6 @@
 
 import argparse
 import functools
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Optional
@@ -24,8 +23,6 @@ from .page import cloud_page, write_page
 from .run_files import RunFiles, cloud_file, is_run, read_any
 from .run_index import write_gallery, write_index
 
-LONG_WORK = 200_000
-"""Gaussians from which writing a page takes seconds, so that it is announced."""
 OPTIONS = ("title", "up", "eps2d", "preset", "antialias", "bound_colors", "background")
 """Arguments of :func:`.page.cloud_page`; all but the first two are of pages only."""
 PAGE_SUFFIXES = (".html", ".htm")
@@ -80,10 +77,8 @@ def run(args: argparse.Namespace) -> None:
 def write_cloud_page(source: Path, out: Path, args: argparse.Namespace) -> None:
     """Write the page of a file or checkpoint, as its run has drawn it or as the options say."""
     shown, options = cloud_page(source, **{name: getattr(args, name) for name in OPTIONS})
-    count = len(shown.cloud.gaussians.means)
-    if count > LONG_WORK:
-        print(f"{out}: packing {count:,} Gaussians", file=sys.stderr, flush=True)
     write_page(out, shown, options)
+    count = len(shown.cloud.gaussians.means)
     print(f"{out}: {count:,} Gaussians, {out.stat().st_size / 1e6:.2f} MB")
 
 

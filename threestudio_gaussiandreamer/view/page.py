@@ -166,14 +166,11 @@ def _meta(clouds: Sequence[Shown], options: PageOptions, pose: Pose) -> dict[str
     }
 
 
-def _data_blocks(clouds: Sequence[Shown]) -> str:
+def _data_blocks(clouds: Sequence[Shown]) -> dict[str, str]:
     blocks = {f"cloud-{i}": packed(shown.cloud.gaussians) for i, shown in enumerate(clouds)}
     stored = clouds[0].cloud
     blocks["spz"] = spz_bytes(stored.in_axes(SPZ_UP).gaussians, notes_of(stored, ".spz"))
-    return "\n".join(
-        f'<script type="text/plain" id="{name}">{base64.b64encode(data).decode()}</script>'
-        for name, data in blocks.items()
-    )
+    return {name: base64.b64encode(data).decode() for name, data in blocks.items()}
 
 
 def packed(gaussians: Gaussians) -> bytes:

@@ -116,7 +116,7 @@ def _times(run: RunFiles) -> Iterator[tuple[str, str, str]]:
             yield text, "", f"{_shown(run.scores[name])} s"
 
 
-def _files(folder: Path) -> Iterator[tuple[str, list[dict[str, str]]]]:
+def _files(folder: Path) -> Iterator[tuple[str, list[dict[str, Any]]]]:
     """Yield the files of every folder at the top."""
     files = sorted(path for path in folder.rglob("[!.]*") if path.is_file() and path.name != NAME)
     for name, group in groupby(files, lambda path: path.relative_to(folder).parts[0]):
@@ -124,11 +124,10 @@ def _files(folder: Path) -> Iterator[tuple[str, list[dict[str, str]]]]:
         yield f"{name} ({len(items)})" if (folder / name).is_dir() else name, items
 
 
-def _file(path: Path, folder: Path, name: str = "") -> dict[str, str]:
-    text, size = name or str(path.relative_to(folder)), ""
+def _file(path: Path, folder: Path, name: str = "") -> dict[str, Any]:
+    text, size = name or str(path.relative_to(folder)), 0
     with suppress(FileNotFoundError):  # another stage has replaced it since the folder was listed
-        count = path.stat().st_size
-        size = f"{count / 1e6:.1f} MB" if count >= 1e6 else f"{count / 1e3:.1f} kB"
+        size = path.stat().st_size
     return {"href": address(path, folder), "text": text, "size": size}
 
 
@@ -140,13 +139,13 @@ def note_time(folder: Path, stage: str, began: datetime, seconds: float) -> None
         file.write(json_text(times, indent=1).encode())
 
 
-def config_changes(folder: Path) -> list[tuple[str, str, str]]:
+def config_changes(folder: Path) -> list[tuple[str, Any, Any]]:
     """Return key, value in the base file and value in the run, for those that differ, of the folder
     ``configs`` of a run, with ``raw.yaml``, the base file, and ``parsed.yaml``.
     """
     base = dict(leaves(read_yaml(folder / "raw.yaml")))
     return [
-        (key, _short(base.get(key, "–")), _short(value))
+        (key, base.get(key, "–"), value)
         for key, value in leaves(read_yaml(folder / "parsed.yaml"))
         if (key in USERS or key.partition(".")[0] in SECTIONS)
         and "${" not in str(base.get(key))  # which refers to another value
@@ -161,11 +160,6 @@ def leaves(content: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
             yield from leaves(value, f"{prefix}{name}.")
         else:
             yield f"{prefix}{name}", value
-
-
-def _short(value: Any) -> str:
-    text = str(value)
-    return text if len(text) <= 200 else f"{text[:200]}..."
 
 
 Curve = list[tuple[float, float]]
