@@ -16,6 +16,8 @@ floaters, isn't implemented: score distillation doesn't recover the opacities th
 and pruning by contribution removes floaters as well."""
 
 import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Mapping, NamedTuple
 
 import torch
@@ -172,6 +174,20 @@ def rotate(quats: Float[Tensor, "N 4"], vectors: Float[Tensor, "N 3"]) -> Float[
     quats = torch.nn.functional.normalize(quats, dim=-1)
     w, u = quats[:, :1], quats[:, 1:]
     return vectors + 2 * torch.linalg.cross(u, torch.linalg.cross(u, vectors) + w * vectors)
+
+
+@contextmanager
+@torch.no_grad()
+def steps_by_size(
+    means: Float[Tensor, "N 3"], scales: Float[Tensor, "N 3"], quats: Float[Tensor, "N 4"]
+) -> Iterator[None]:
+    """Let a step of an optimiser see the means as u with mean + R diag(scales) u, which starts at
+    zero: with a rate in standard deviations, each Gaussian has a trust region in its own metric.
+    """
+    scales, quats, before = scales.detach(), quats.detach().clone(), means.detach().clone()
+    means.grad = scales * rotate(quats * quats.new_tensor([1.0, -1.0, -1.0, -1.0]), means.grad)
+    yield
+    means.copy_(before + rotate(quats, scales * (means - before)))
 
 
 def update_optimizer(

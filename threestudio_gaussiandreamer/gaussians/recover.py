@@ -12,18 +12,19 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..core.streams import generator
+from .densify import steps_by_size
 from .gaussians import Gaussians
-from .views import Views, bounds, draw, psnr_lower_bound, render_with_contribution
+from .views import Views, draw, psnr_lower_bound, render_with_contribution
 
 LEARNING_RATES = {
-    "means": 2e-4,
+    "means": 0.05,
     "quats": 4e-3,
     "log_scales": 1e-2,
     "logit_opacities": 2e-2,
     "sh": 5e-3,
 }
-"""Learning rates of Adam after a round that prunes 20 %; that of the means is in units of the
-cloud's radius.
+"""Learning rates of Adam after a round that prunes 20 %; that of the means is in standard
+deviations along each axis.
 """
 LR_SCALES = (1.0, 1 / 4, 1 / 16, 1 / 64)
 """Learning-rate multipliers, tried from largest to smallest: the length of Adam's steps doesn't
@@ -131,7 +132,6 @@ def recover(
     """
     leaves = cloud.map(lambda values: values.detach().clone().requires_grad_())
     rates = {name: lr_scale * rate for name, rate in LEARNING_RATES.items()}
-    rates["means"] *= bounds(cloud)[1]
     groups = [{"params": [leaf], "name": name} for name, leaf in leaves._asdict().items()]
     adam = torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-15)
     for step, rows in enumerate(_batches(len(images), steps, seed)):
@@ -139,7 +139,8 @@ def recover(
             group["lr"] = rates[group["name"]] * (1 - step / steps)
         image, _ = draw(leaves, views, rows)
         ((image - images[rows]) ** 2).mean().backward()
-        adam.step()
+        with steps_by_size(leaves.means, leaves.log_scales.exp(), leaves.quats):
+            adam.step()
         adam.zero_grad(set_to_none=True)
         leaves.sh.data[:, 0].clamp_(-sh_reach, sh_reach)
     return leaves.map(Tensor.detach)

@@ -46,7 +46,6 @@ keep_attributes     with gaussians-prior: start from all attributes of that clou
 import contextlib
 import logging
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any, List
 
@@ -386,22 +385,13 @@ class GaussianCloud(BaseGeometry):
             if group.get("name") in LEARNING_RATES:
                 group["lr"] = C(getattr(self.cfg, LEARNING_RATES[group["name"]]), epoch, step)
 
-    @contextlib.contextmanager
-    def steps_by_size(self) -> Iterator[None]:
-        """Let a step of the optimiser see the means in the unit ``size``, if that is the unit of
-        their rate: as u with mean + R diag(scales) u, which starts at zero.
+    def steps_by_size(self) -> contextlib.AbstractContextManager[None]:
+        """Let a step of the optimiser see the means in standard deviations, if that is the unit of
+        their rate.
         """
-        means = self.means
-        if self.cfg.lr_means_unit != "size" or means.grad is None:
-            yield
-            return
-        with torch.no_grad():
-            scales, quats, before = self.scales(), self.quats.detach().clone(), means.clone()
-            inverse = quats * quats.new_tensor([1.0, -1.0, -1.0, -1.0])
-            means.grad = scales * densify.rotate(inverse, means.grad)
-        yield
-        with torch.no_grad():
-            means.copy_(before + densify.rotate(quats, scales * (means - before)))
+        if self.cfg.lr_means_unit != "size" or self.means.grad is None:
+            return contextlib.nullcontext()
+        return densify.steps_by_size(self.means, self.scales(), self.quats)
 
     @property
     def wants_absgrad(self) -> bool:
