@@ -50,7 +50,7 @@ STEPS = (
     Step("training/renderer.py", "forward", "convert host cameras to OpenCV, composite"),
     Step("splatting/api.py", "rasterize", "validate, choose a backend, splat"),
     Step("guidance/base.py", "ScoreDistillation", "encode, add noise, predict, weigh, clip"),
-    Step("diffusion/sds.py", "add_noise", "the formulas of score distillation"),
+    Step("diffusion/sds.py", "diffuse", "the formulas of score distillation"),
     Step("training/density.py", "DensityControl", "clone, split and drop Gaussians after the step"),
     Step("core/checkpoint_file.py", "save_file", "write a checkpoint atomically"),
 )

@@ -72,9 +72,9 @@ def test_the_hook_watches_the_package():
 import threestudio_gaussiandreamer.core.typecheck as typecheck
 typecheck.install()
 import torch
-from threestudio_gaussiandreamer.diffusion.sds import add_noise
+from threestudio_gaussiandreamer.diffusion.sds import diffuse
 try:
-    add_noise("not a tensor", torch.ones(1), torch.ones(1))
+    diffuse("not a tensor", torch.ones(1), torch.ones(1))
 except TypeError as error:
     print(type(error).__name__)
 """

@@ -3,8 +3,8 @@
 import pytest
 import torch
 
+from tests.diffusion.test_exact_score import denoised
 from threestudio_gaussiandreamer.diffusion import rectified_flow, sds
-from threestudio_gaussiandreamer.diffusion.exact_score import denoise
 
 SIGMA = torch.tensor([0.002, 0.3, 0.6, 0.95, 0.999], dtype=torch.float64)
 
@@ -21,7 +21,7 @@ def test_a_noisy_latent_lies_on_the_straight_path():
     ends = torch.tensor([0.0, 1.0], dtype=torch.float64)
     assert rectified_flow.abar_of_sigma(ends).tolist() == [1.0, 0.0]
     assert rectified_flow.sigma_of_abar(1 - ends).tolist() == [0.0, 1.0]
-    z = sds.add_noise(x, eps, abar)
+    z = sds.diffuse(x, eps, abar)
     path = (1 - SIGMA)[:, None] * x + SIGMA[:, None] * eps
     torch.testing.assert_close(rectified_flow.on_path(z, abar), path)
     torch.testing.assert_close(rectified_flow.noise_of_velocity(eps - x, z, abar), eps)
@@ -37,34 +37,25 @@ def test_the_scheduler_of_diffusers_has_the_same_sigmas():
     assert sigmas[0] == 0 and (sigmas.diff() > 0).all()
 
 
-def mixture_velocity(z, sigma, centers, shares, std):
-    """Compute E[eps - x | z] of a flow from a mixture of Gaussians, from its own posterior."""
-    variance = (1 - sigma) ** 2 * std**2 + sigma**2
-    gap = z[None] - (1 - sigma) * centers
-    weight = torch.softmax(shares.log() - gap.square().sum(1) / (2 * variance), 0)[:, None]
-    x0 = (weight * (centers + (1 - sigma) * std**2 / variance * gap)).sum(0)
-    return (z - x0) / sigma
-
-
 @pytest.mark.parametrize("sigma", [0.05, 0.5, 0.95])
 def test_a_mixtures_velocity_is_its_score(sigma):
     """The velocity's posterior, in the flow's own variables, against the exact score."""
-    centers, shares, std = randn(4, 3), torch.tensor([0.1, 0.2, 0.3, 0.4]).double(), 0.4
+    centers, shares = randn(4, 3), torch.tensor([0.1, 0.2, 0.3, 0.4]).double()
     level = torch.tensor([sigma], dtype=torch.float64)
     abar = rectified_flow.abar_of_sigma(level)
     z = randn(1, 3, seed=1)
-    eps = denoise(z, abar, centers, std=std, log_prior=shares.log()[None]).eps
-    on_path = rectified_flow.on_path(z, abar)[0]
-    v = mixture_velocity(on_path, sigma, centers, shares, std)[None]
-    torch.testing.assert_close(
-        rectified_flow.noise_of_velocity(v, z, abar), eps, rtol=1e-9, atol=1e-9
-    )
+    eps, _ = denoised(z, abar, centers, shares.log()[None])
+    on_path = rectified_flow.on_path(z, abar)
+    gaps = (on_path - (1 - sigma) * centers).square().sum(1)
+    x0 = torch.softmax(shares.log() - gaps / (2 * sigma**2), 0) @ centers
+    found = rectified_flow.noise_of_velocity((on_path - x0) / sigma, z, abar)  # E[eps - x | z]
+    torch.testing.assert_close(found, eps, rtol=1e-9, atol=1e-9)
 
 
 def test_the_weight_of_x0_gives_the_distance_to_the_denoised_picture():
     x, eps, guess = randn(3, 5, 7)
     abar = rectified_flow.abar_of_sigma(SIGMA)
-    z = sds.add_noise(x, eps, abar)
+    z = sds.diffuse(x, eps, abar)
     torch.testing.assert_close(sds.predict_x0(z, eps, abar), x)
     grad = sds.per_item(sds.WEIGHTS["x0"](abar), eps) * (guess - eps)
     torch.testing.assert_close(grad, x - sds.predict_x0(z, guess, abar), rtol=1e-9, atol=1e-9)

@@ -18,8 +18,8 @@ from tests.helpers.tiny_guidance import (
 from threestudio_gaussiandreamer.guidance import base, text_to_image
 from threestudio_gaussiandreamer.guidance.base import NonFiniteScore
 from threestudio_gaussiandreamer.guidance.stable_diffusion import (
-    PerItemLossScale,
     StableDiffusionGuidance,
+    with_loss_scales,
 )
 from threestudio_gaussiandreamer.guidance.text_to_image import weights_type
 
@@ -143,11 +143,14 @@ def test_the_scale_of_the_loss_does_not_matter_in_half_precision(models, prompts
 def test_the_loss_scale_of_each_item_is_undone():
     x = torch.randn(3, 5, generator=torch.Generator().manual_seed(0)).requires_grad_()
     seen, results = [], []
-    loss_scale = PerItemLossScale(results.append)
-    inner = loss_scale.enter(x) * 1.0
-    inner.register_hook(seen.append)
+
+    def network(x):
+        inner = x * 1.0
+        inner.register_hook(seen.append)
+        return inner * 1.0
+
     weights = torch.tensor([[1e-12], [0.0], [3e12]])
-    (loss_scale.leave(inner * 1.0) * weights).sum().backward()
+    (with_loss_scales(network, x, results.append) * weights).sum().backward()
     torch.testing.assert_close(x.grad, weights.expand(3, 5), rtol=0, atol=0)
     peaks = seen[0].abs().amax(1)
     assert (peaks[[0, 2]] >= 64).all() and (peaks[[0, 2]] < 128).all() and peaks[1] == 0

@@ -11,7 +11,6 @@ from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.diffusion import sds
 from threestudio_gaussiandreamer.guidance import exact_score
 from threestudio_gaussiandreamer.guidance.exact_score import ExactScoreGuidance
-from threestudio_gaussiandreamer.guidance.picture_bank import direction_indices
 from threestudio_gaussiandreamer.meshes.raycast import MeshCaster
 from threestudio_gaussiandreamer.splatting.cpu import backend as cpu
 
@@ -187,22 +186,6 @@ def test_direction_bins_pull_towards_views_of_the_cameras_side(mesh_path, monkey
     assert front.argmax() == 0 and back.argmax() == 1
 
 
-def test_directions_follow_threestudios_rules():
-    elevation = torch.tensor([0.0, 0, 0, 0, 0, 61, 0, 0])
-    azimuth = torch.tensor([0.0, 44, 46, 134, 136, 0, -170, 350])
-    names = [
-        ("side", "front", "back", "overhead")[i] for i in direction_indices(elevation, azimuth)
-    ]
-    assert names == ["front", "front", "side", "side", "back", "overhead", "back", "front"]
-
-
-def test_a_direction_without_bank_views_takes_all(mesh_path):
-    exact = guidance(mesh_path, mode="direction-bins")
-    elevation, azimuth = torch.tensor([70.0, 10.0, 10.0]), torch.tensor([0.0, 0.0, 180.0])
-    overhead, front, back = exact._members({"elevation": elevation, "azimuth": azimuth}, 3)
-    assert overhead.all() and 0 < front.sum() < 24 and not (front & back).any()
-
-
 @pytest.mark.parametrize(("mode", "modes"), [("view-exact", 1), ("view-agnostic", 25)])
 def test_the_cameras_own_view_is_one_of_the_modes(mesh_path, mode, modes):
     exact = guidance(mesh_path, mode=mode)
@@ -219,20 +202,6 @@ def test_evaluation_shows_the_truth(mesh_path):
     for name in ("imgs_1step", "imgs_1orig", "imgs_final"):  # float32 noise times sigma/a
         target = exact.truth.render(views, BACKGROUNDS)
         torch.testing.assert_close(out[name], target, rtol=0, atol=1e-4)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"mesh": ""}, "guidance.mesh"),
-        ({"mesh": "nowhere.glb"}, "does not exist"),
-        ({"mode": "view-exat"}, "did you mean 'view-exact'"),
-        ({"bank_distance_range": [3.0, 2.0]}, "bank_distance_range"),
-    ],
-)
-def test_bad_options_of_the_exact_score_are_named(mesh_path, options, message):
-    with pytest.raises(UserError, match=message):
-        guidance(**{"mesh_path": mesh_path, **options})
 
 
 def test_sizes_that_do_not_fit_are_named(mesh_path):
@@ -275,17 +244,6 @@ def test_one_of_the_two_predictions_counts_as_one_evaluation(mesh_path):
 BANK = {"mesh": "toy.glb", "mode": "direction-bins", "guidance_scale": 7.5}
 
 
-def test_options_without_effect_are_refused():
-    without = {"mesh": "toy.glb", "mode": "view-exact", "guidance_scale": 1.0}
-    ExactScoreGuidance.preflight(without | {"bank_seed": 3})
-    for option in ({"bank_views": 12}, {"bank_fovy_range": [40, 50]}, {"latent_size": 16}):
-        with pytest.raises(UserError, match=f"{next(iter(option))} has no effect with space=pix"):
-            ExactScoreGuidance.preflight(without | option)
-        ExactScoreGuidance.preflight(without | option | {"space": "latent"})
-        if "latent_size" not in option:
-            ExactScoreGuidance.preflight(BANK | option)
-
-
 def test_what_could_train_nothing_is_refused(mesh_path):
     with pytest.raises(UserError, match="guidance_scale: csd-variant .* zero with 0: set it to"):
         ExactScoreGuidance.preflight(BANK | {"guidance_scale": 0, "variant_type": "csd-variant"})
@@ -298,13 +256,3 @@ def test_a_picture_that_cant_be_pooled_to_the_latent_is_refused_before_the_mesh_
     with pytest.raises(UserError, match="pictures of 64x64 can't be pooled to a latent 33 high"):
         ExactScoreGuidance(options | {"image_size": 64})
     ExactScoreGuidance.preflight(options | {"mesh": "toy.glb", "image_size": 66})
-
-
-def test_guidance_without_a_direction_is_warned_of(monkeypatch):
-    messages = []
-    monkeypatch.setattr(exact_score, "warn", messages.append)
-    ExactScoreGuidance.preflight(BANK)
-    ExactScoreGuidance.preflight(BANK | {"mode": "view-agnostic", "guidance_scale": 1.0})
-    assert not messages
-    ExactScoreGuidance.preflight(BANK | {"mode": "view-agnostic"})
-    assert "guidance_scale has no effect with mode=view-agnostic" in messages[0]

@@ -3,9 +3,9 @@
 import pytest
 import torch
 
+from tests.diffusion.test_exact_score import denoised
 from threestudio_gaussiandreamer.diffusion import exact_score, sds
-from threestudio_gaussiandreamer.guidance.known_truth import composite
-from threestudio_gaussiandreamer.guidance.picture_bank import Bank, mixture_of, modes_of
+from threestudio_gaussiandreamer.guidance.picture_bank import Bank, Modes, composite, mixture_of
 
 MEMBERS = torch.tensor(
     [[True, True, False, True, False, True, True], [False] * 6 + [True], [True] * 7]
@@ -30,9 +30,9 @@ def bank(request):
 
 
 def predicted(mixtures, z, abar, conditional):
-    modes, log_prior = modes_of(mixtures)
-    prior = log_prior if conditional else None
-    return exact_score.denoise(z.flatten(1), abar, modes, std=0.05, log_prior=prior)
+    modes, z = Modes.of(mixtures), z.flatten(1)
+    distances, prior = modes.squared_distances(z, abar), modes.log_prior if conditional else None
+    return exact_score.denoise(z, abar, distances, modes.weighted_sum, prior)
 
 
 @pytest.mark.parametrize("guided", [False, True])
@@ -56,12 +56,8 @@ def test_scores_are_those_of_pictures_composited_on_the_background_of_each_item(
             modes = bank.latent.encode(composite(pictures, backgrounds[item]))
             modes = torch.cat([own[item], modes])
             alone = predicted(mixtures[item], z[item], ABAR[item], conditional)
-            expected = exact_score.denoise(
-                z[item].flatten(1).double(), ABAR[item], modes.flatten(1).double(), std=0.05
-            )
-            for found in (alone, together and type(together)(*(x[item] for x in together))):
+            expected = denoised(z[item].flatten(1).double(), ABAR[item], modes.flatten(1).double())
+            for found in (alone, together and [x[item] for x in together]):
                 if found is not None:
-                    torch.testing.assert_close(found.eps.double(), expected.eps, rtol=0, atol=1e-4)
-                    torch.testing.assert_close(
-                        found.perplexity, expected.perplexity, rtol=1e-3, atol=0
-                    )
+                    torch.testing.assert_close(found[0].double(), expected[0], rtol=0, atol=1e-4)
+                    torch.testing.assert_close(found[1], expected[1], rtol=1e-3, atol=0)

@@ -5,7 +5,7 @@ import torch
 
 import tests.guidance.test_external  # noqa: F401  registers test-learning-guidance
 from tests.helpers import tiny_models
-from tests.helpers.guidance_runs import assert_resumes, checkpoint, config, diffusion, run
+from tests.helpers.guidance_runs import assert_resumes, config, diffusion, run
 from threestudio_gaussiandreamer import register_parts
 from threestudio_gaussiandreamer.host import BaseObject, register
 from threestudio_gaussiandreamer.priors.random import RandomPrior
@@ -69,22 +69,6 @@ def test_a_guidance_by_name_gets_the_full_batch_and_all_its_losses_count(tmp_pat
     prompt_utils, keys = MultiviewDouble.seen[0]
     assert prompt_utils.prompt == "a painted toy"
     assert BATCH_KEYS <= keys
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("family", ["stable-diffusion", "deep-floyd"])
-def test_a_run_with_a_tiny_real_model(tmp_path, monkeypatch, family):
-    """Prompt, text encoder, VAE, UNet, SDS, test and export, with the configuration that a user
-    writes for the real weights.
-    """
-    pytest.importorskip("diffusers")
-    monkeypatch.chdir(tmp_path)
-    make = getattr(tiny_models, family.replace("-", "_"))
-    system = diffusion(make(tmp_path / "model"), family=family)
-    assert run(config(tmp_path / "run.yaml", **system), tmp_path) == 0
-    save = tmp_path / "demo" / "t" / "save"
-    assert (save / "it3-0.png").is_file() and (save / "it3-export" / "gaussians.ply").is_file()
-    assert torch.isfinite(checkpoint(tmp_path)["state_dict"]["geometry.means"]).all()
 
 
 NOISES = {

@@ -144,18 +144,6 @@ def test_evaluation_has_what_the_hosts_saver_reads():
 
 
 @pytest.mark.parametrize(
-    ("cfg", "message"),
-    [
-        ({"max_step_percent": 1.5}, "max_step_percent: expected values of 1 or less"),
-        ({"weighting_strategy": "sdss"}, "did you mean 'sds'"),
-    ],
-)
-def test_bad_options_are_named_at_once(cfg, message):
-    with pytest.raises(UserError, match=message):
-        Stub(cfg)
-
-
-@pytest.mark.parametrize(
     ("returned", "message"),
     [
         (lambda z: z, r"returned \(4, 3, 6, 5\); expected a pair"),

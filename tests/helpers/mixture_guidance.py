@@ -36,8 +36,8 @@ class MixtureGuidance(PixelGuidance):
 
     def predict(self, z, t, condition):
         abar = self.abar_of(t)
-        self.evaluations += len(z) * (2 if self.guided else 1)
-        uncond = noise_of(z, abar, MODES) if self.guided else None
+        self.evaluations += len(z) * (2 if self.needs_unconditional else 1)
+        uncond = noise_of(z, abar, MODES) if self.needs_unconditional else None
         return noise_of(z, abar, MODES[: self.CONDITIONAL]), uncond
 
 

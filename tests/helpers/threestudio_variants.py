@@ -97,11 +97,11 @@ class GivenNetworks(VSD):
         self.scheduler.register_to_config(prediction_type="epsilon")
         self.alphas, self.num_train_timesteps = self.scheduler.alphas_cumprod, 1000
         self.set_min_max_steps()
-        lora = ours.variant.particles(ours).lora
+        lora = ours.variant.particles(ours)
 
         def network(z, t, encoder_hidden_states, class_labels=None, cross_attention_kwargs=None):
             if class_labels is None:
-                return SimpleNamespace(sample=ours.noise(z, t.long(), encoder_hidden_states))
+                return SimpleNamespace(sample=ours.predict_rows(z, t.long(), encoder_hidden_states))
             with lora.applied(ours.unet, class_labels):
                 return ours.unet(z, t, encoder_hidden_states=encoder_hidden_states)
 
@@ -123,7 +123,7 @@ def compare_vsd(models, prediction, dropped):
     options = {"guidance_scale": 7.5, "view_dependent_prompting": False}
     ours = tiny.guidance(models, prediction, **options, variant_type="vsd-variant")
     particles = ours.variant.particles(ours)
-    weights = list(particles.lora.parameters())
+    weights = list(particles.parameters())
     for weight in weights:
         weight.data += 0.2 * torch.randn(weight.shape)
     particles.optimizer.step = lambda: None

@@ -93,12 +93,3 @@ def test_perp_neg_of_left_and_right_sides():
     for row, pair in enumerate([(front, left), (front, right), (left, front), (right, front)]):
         assert torch.equal(negative[row], torch.stack(pair))
     assert torch.equal(weights[0], weights[1]) and torch.equal(weights[2], weights[3])
-
-
-def test_perp_neg_of_a_batch_is_perp_neg_of_each_view():
-    out, where = output(), views((0.0, 0.0), (10.0, 100.0), (70.0, 20.0), (-5.0, -170.0))
-    embeddings, weights = out.get_text_embeddings_perp_neg(*where)
-    for i in range(4):
-        alone, weight = out.get_text_embeddings_perp_neg(*(values[i : i + 1] for values in where))
-        assert torch.equal(alone, embeddings[[i, 4 + i, 8 + 2 * i, 9 + 2 * i]])
-        assert torch.equal(weight[0], weights[i])

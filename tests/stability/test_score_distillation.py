@@ -223,7 +223,7 @@ def test_the_gradient_at_the_first_and_last_timestep_is_finite(name, measured):
     abar, t = sds.sd_alphas_cumprod(), torch.tensor([1, 500, 999])
     pull = sds.WEIGHTS[name](abar) * (abar / (1 - abar)).sqrt()
     x, noise = torch.randn(2, 3, 4, 8, 8, generator=seeded())
-    z = sds.add_noise(x, noise, abar[t])
+    z = sds.diffuse(x, noise, abar[t])
     values = z, sds.predict_x0(z, noise, abar[t]), sds.WEIGHTS[name](abar[t])
     assert all(value.isfinite().all() for value in values)
     share = 100 * pull[20:100].sum() / pull[20:981].sum()

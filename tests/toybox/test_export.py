@@ -74,7 +74,7 @@ def test_the_guidance_sees_what_the_training_saw(guidance, prompts, unet_stage):
     v = unet_stage.model(z, t, encoder_hidden_states=tokens).sample
     abar = unet_stage.alphas_cumprod[t].float().reshape(-1, 1, 1, 1)
     expected = abar.sqrt() * v + (1 - abar).sqrt() * z
-    assert torch.allclose(guidance.noise(z, t, tokens), expected, **HALF)
+    assert torch.allclose(guidance.predict_rows(z, t, tokens), expected, **HALF)
     images = torch.rand(2, 3, 128, 128, generator=torch.Generator().manual_seed(0))
     mean = guidance.vae.encode(images * 2 - 1).latent_dist.mean * guidance.vae.config.scaling_factor
     expected = unet_stage.vae.encode(images * 2 - 1).latent_dist.mean * unet_stage.scale

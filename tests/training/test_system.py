@@ -22,7 +22,7 @@ from tests.training.runs import (
 )
 from threestudio_gaussiandreamer.formats.ply import read_gaussians
 from threestudio_gaussiandreamer.gaussians.sh import sh0_to_rgb
-from threestudio_gaussiandreamer.guidance.known_truth import MeshTruth
+from threestudio_gaussiandreamer.guidance.picture_bank import MeshTruth
 from threestudio_gaussiandreamer.launch.experiment import main
 from threestudio_gaussiandreamer.training import held_out as evaluate
 from threestudio_gaussiandreamer.training import system as system_module

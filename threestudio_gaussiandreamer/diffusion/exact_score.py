@@ -1,14 +1,12 @@
 """The optimal denoiser of a known image distribution, in closed form.
 
-The data are narrow Gaussians around K known images of d values, p(x0) = sum_k pi_k N(x_k, s^2 I).
-With z = a x0 + sigma eps, where a = sqrt(abar) and sigma = sqrt(1 - abar) as in ``sds.py``, and
-v = a^2 s^2 + sigma^2:
+The data are K known images x_k of d values, with probabilities pi_k. With z = a x0 + sigma eps,
+where a = sqrt(abar) and sigma = sqrt(1 - abar) as in ``sds.py``:
 
-    p_t(z)  = sum_k pi_k N(z; a x_k, v I)
-    gamma_k = softmax_k(log pi_k - |z - a x_k|^2 / 2v)          responsibilities
-    m       = sum_k gamma_k x_k
-    D       = E[x0 | z] = m + (a s^2 / v) (z - a m)             denoised
-    eps_hat = (z - a D) / sigma = sigma (z - a m) / v = -sigma grad log p_t(z)
+    p_t(z)  = sum_k pi_k N(z; a x_k, sigma^2 I)
+    gamma_k = softmax_k(log pi_k - |z - a x_k|^2 / 2 sigma^2)   responsibilities
+    m       = sum_k gamma_k x_k = E[x0 | z]                     denoised
+    eps_hat = (z - a m) / sigma = -sigma grad log p_t(z)
 
 Distances are expanded to |z|^2 - 2 a z x + a^2 |x|^2 in float64, which is several times faster than
 sums of squared differences. In float32 the expansion has errors of about one nat in the logits at
@@ -18,7 +16,8 @@ The closed-form denoiser memorises: for d above a few hundred it returns the nea
 (Scarvelis et al. 2023, "Closed-Form Diffusion Models"). The perplexity of the responsibilities
 measures this: it is then 1."""
 
-from typing import Any, NamedTuple, Optional
+from collections.abc import Callable
+from typing import NamedTuple, Optional
 
 import torch
 import torch.nn.functional as F
@@ -32,39 +31,6 @@ CPU_CHUNK_ELEMENTS, GPU_CHUNK_ELEMENTS = 2**18, 2**24
 """Largest number of elements of a temporary, unless one image has more: 2 MiB in float64, which the
 caches of a CPU hold, and 128 MiB, since on a GPU each operation is a launch.
 """
-
-
-class Denoised(NamedTuple):
-    """Result of :func:`denoise` for noisy images z (B, d)."""
-
-    eps: Float[Tensor, "B d"]
-    """The optimal prediction of the noise."""
-    denoised: Float[Tensor, "B d"]
-    """E[x0 | z]."""
-    responsibilities: Float[Tensor, "B K"]
-    """float64, rows sum to 1."""
-    perplexity: Float[Tensor, " B"]
-    """exp of the responsibilities' entropy, in [1, K]: the effective number of images that could
-    have given z; float64.
-    """
-
-
-class ImageTensor(NamedTuple):
-    """Images in a tensor, shared or per item."""
-
-    images: Float[Tensor, "*batch K d"]
-
-    def squared_distances(
-        self, z: Float[Tensor, "B d"], abar: Float[Tensor, " B"]
-    ) -> Float[Tensor, "B K"]:
-        """Compute |z - sqrt(abar) x_k|^2 in float64; a single image may have any distance."""
-        if self.images.shape[-2] == 1:  # its responsibility is 1 at any distance
-            return z.new_zeros((len(z), 1), dtype=torch.float64)
-        return squared_distances(z, self.images, abar)
-
-    def weighted_sum(self, weights: Float[Tensor, "B K"]) -> Float[Tensor, "B d"]:
-        """Sum the images with weights >= 0, in the weights' type."""
-        return weighted_sum(weights, self.images)
 
 
 def images_per_chunk(elements: int, device: torch.device) -> int:
@@ -104,54 +70,28 @@ def expanded_distances(
     return distances.clamp_min_(0)
 
 
-def responsibilities(
-    distances: Float[Tensor, "B K"],
-    variance: Float[Tensor, " B"],
-    *,
-    log_prior: Optional[Float[Tensor, "*prior K"]] = None,
-) -> Float[Tensor, "B K"]:
-    """Compute gamma = softmax(log pi - distances / 2v) in float64.
-
-    ``log_prior`` need not be normalised; -inf excludes an image."""
-    logits = -distances / (2 * variance.to(distances)[:, None])
-    if log_prior is not None:
-        logits = logits + log_prior.to(logits)
-    return torch.softmax(logits, dim=1)
-
-
 def denoise(
     z: Float[Tensor, "B d"],
     abar: Float[Tensor, " B"],
-    bank: Any,
-    *,
-    std: float = 0.0,
+    distances: Float[Tensor, "B K"],
+    mean_of: Callable[[Float[Tensor, "B K"]], Float[Tensor, "B d"]],
     log_prior: Optional[Float[Tensor, "*prior K"]] = None,
-    distances: Optional[Float[Tensor, "B K"]] = None,
-) -> Denoised:
-    """Compute the exact score at z, in the form of the optimal noise prediction.
+) -> tuple[Float[Tensor, "B d"], Float[Tensor, " B"]]:
+    """Return the optimal prediction of the noise in z, and the perplexity of the responsibilities:
+    exp of their entropy, in [1, K], the effective number of images that could have given z.
 
     Args:
         abar: cumulative product of 1 - beta, per item, in (0, 1).
-        bank: the images x_k, shared (K, d) or per item (B, K, d), or an object with the methods of
-            :class:`ImageTensor`.
-        std: s, the standard deviation of each mode, >= 0.
-        log_prior: log pi_k, not necessarily normalised; by default uniform.
-        distances: the squared distances to the images if they are already known, for instance for
-            two mixtures of one bank.
+        distances: |z - sqrt(abar) x_k|^2, float64.
+        mean_of: returns the sum of the images with the responsibilities as weights.
+        log_prior: log pi_k, not necessarily normalised; -inf excludes an image. By default uniform.
     """
-    images = ImageTensor(bank) if isinstance(bank, Tensor) else bank
-    variance = abar.double() * std**2 + 1 - abar.double()
-    if distances is None:
-        distances = images.squared_distances(z, abar)
-    gamma = responsibilities(distances, variance, log_prior=log_prior)
-    mean = images.weighted_sum(gamma.to(z))
-    residual = z - sds.per_item(abar.double().sqrt(), z) * mean
-    eps = sds.per_item((1 - abar.double()).sqrt() / variance, z) * residual
-    denoised = (
-        mean + sds.per_item(abar.double().sqrt() * std**2 / variance, z) * residual if std else mean
-    )
-    entropy = -torch.special.xlogy(gamma, gamma).sum(1)
-    return Denoised(eps, denoised, gamma, entropy.exp())
+    variance = 1 - abar.double()
+    logits = -distances / (2 * variance.to(distances)[:, None])
+    gamma = torch.softmax(logits if log_prior is None else logits + log_prior.to(logits), dim=1)
+    residual = z - sds.per_item(abar.double().sqrt(), z) * mean_of(gamma.to(z))
+    eps = sds.per_item(variance.sqrt() / variance, z) * residual
+    return eps, (-torch.special.xlogy(gamma, gamma).sum(1)).exp()
 
 
 def weighted_sum(

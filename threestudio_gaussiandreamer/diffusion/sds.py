@@ -94,7 +94,7 @@ def stratified_timesteps(batch: int, num_train: int, rng: torch.Generator) -> In
     return (fractions * num_train).long().clamp(max=num_train - 1)
 
 
-def add_noise(
+def diffuse(
     x: Float[Tensor, "B *d"], noise: Float[Tensor, "B *d"], abar: Float[Tensor, " B"]
 ) -> Float[Tensor, "B *d"]:
     """Compute z = sqrt(abar) x + sqrt(1 - abar) eps (DDPM eq. 4)."""
@@ -105,7 +105,7 @@ def predict_x0(
     z: Float[Tensor, "B *d"], eps: Float[Tensor, "B *d"], abar: Float[Tensor, " B"]
 ) -> Float[Tensor, "B *d"]:
     """Compute the denoised x0 = (z - sqrt(1 - abar) eps) / sqrt(abar), the inverse of
-    ``add_noise``.
+    :func:`diffuse`.
     """
     return (z - per_item((1 - abar).sqrt(), z) * eps) / per_item(abar.sqrt(), z)
 

@@ -1,15 +1,12 @@
-"""Score distillation: the computation that all guidances share, from a render to the gradient of
-its latent.
+"""Score distillation: what all guidances share, from a render to the gradient of its latent.
 
     x = encode(render),  z = sqrt(abar) x + sqrt(1 - abar) eps,  grad = w(t) (eps_hat(z, t) - eps),
                          dloss/dx = grad / B
 
-A variant (``variants/``) replaces eps_hat - eps by another residual, for every guidance alike. A
-guidance is a subclass that says how to ``encode`` and ``decode``, what to ``condition`` on, and
-how to ``predict`` the noise, with and without its condition; classifier-free guidance, its interval
-and rescaling are computed from that pair here. Networks may run in half precision; this module
-computes in float32. Timesteps and noise are functions of (seed, step, item), so a resumed run draws
-the same values as an uninterrupted one.
+A variant (``variants/``) replaces eps_hat - eps by another residual. A guidance is a subclass that
+says how to ``encode`` and ``decode``, what to ``condition`` on, and how to ``predict`` the noise,
+with and without its condition; classifier-free guidance, its interval and rescaling are computed
+from that pair here, in float32. Timesteps and noise are functions of (seed, step, item).
 
 ==================  ================================================================================
 option              meaning
@@ -54,7 +51,7 @@ from ..core.methods import require_method
 from ..core.options import in_range, interval, one_of, schedule
 from ..diffusion import sds
 from ..host import BaseObject, C, find, names, parse_structured, run_seed, warn
-from .types import Batch, Latents, Noised, Residual, State, Timesteps, items_of
+from .types import Batch, Latents, Noised, Residual, State, Timesteps, items_of, require_pair
 from .variants import Variant
 from .variants.base import GUIDANCE_SCALE, require_unset
 from .variants.vsd import GaussianParticles
@@ -62,7 +59,11 @@ from .variants.vsd import GaussianParticles
 __all__ = ["GUIDANCE_SCALE", "NonFiniteScore", "ScoreDistillation"]
 
 EVAL_ITEMS, EVAL_STEPS = 4, 20
-"""Most items that ``guidance_eval`` shows, and DDIM steps from the noise to ``imgs_final``."""
+"""Items that ``guidance_eval`` shows at most, and DDIM steps to ``imgs_final``."""
+ADVICE = (
+    "use full precision (half_precision_weights=false), and check the model, the variant and the "
+    "prior"
+)
 MAX_BAD_STEPS = 10
 """A run ends after so many steps in a row in which the score of some item was NaN or infinite."""
 
@@ -122,9 +123,6 @@ class ScoreDistillation(BaseObject, ABC):
     UNGUIDED_IGNORES: tuple[str, ...] = ("guidance_interval", "recon_std_rescale")
     """Options that have no effect if ``guidance_scale`` is 1."""
 
-    PARTICLES_IGNORE: tuple[str, ...] = ("rank", "lr")
-    """Options of ``vsd-variant`` that :meth:`particle_model` doesn't read."""
-
     LOSSES: tuple[str, ...] = ("sds",)
     """Names of the losses that a step returns, without the prefix ``loss_``."""
 
@@ -132,7 +130,7 @@ class ScoreDistillation(BaseObject, ABC):
     """Why ``vsd-variant`` can't be used."""
 
     KNOWS_TRUTH = False
-    """Whether instances have an attribute ``truth``, see :mod:`.known_truth`."""
+    """Whether instances have an attribute ``truth``, see :func:`.truth_of`."""
 
     @abstractmethod
     def encode(self, rgb: Float[Tensor, "B 3 H W"], **batch: Any) -> Latents:
@@ -150,29 +148,23 @@ class ScoreDistillation(BaseObject, ABC):
     def predict(
         self, z: Latents, t: Timesteps, condition: Any
     ) -> tuple[Latents, Optional[Latents]]:
-        """Predict the noise in z, conditional and unconditional (None if it isn't ``guided``);
-        called without gradients.
+        """Predict the noise in z, conditional and unconditional; called without gradients. The
+        second may be None unless ``needs_unconditional``.
         """
 
     def select(self, condition: Any, rows: Int[Tensor, " R"]) -> Any:
         """Return the conditions of some items; subclasses whose conditions aren't None, a tensor or
         a list with one entry per item override this.
         """
-        if condition is None:
-            return None
         if isinstance(condition, list):
             return [condition[row] for row in rows.tolist()]
-        if not isinstance(condition, Tensor):
-            raise UserError(
-                f"{type(self).__name__} has conditions of type {type(condition).__name__}: define "
-                f"its method select, which guidance_interval and {self.cfg.variant_type} need"
-            )
-        return condition[rows]
+        if condition is not None and not isinstance(condition, Tensor):
+            name, kind = type(self).__name__, type(condition).__name__
+            raise UserError(f"{name} has conditions of type {kind}: define its method select")
+        return None if condition is None else condition[rows]
 
     def particle_model(self, options: Any) -> Any:
-        """Return the model of the renders' own distribution that ``vsd-variant``, whose options are
-        given, trains.
-        """
+        """Return the model of the renders that ``vsd-variant``, whose options are given, trains."""
         return GaussianParticles()
 
     @classmethod
@@ -186,8 +178,8 @@ class ScoreDistillation(BaseObject, ABC):
 
     @classmethod
     def preflight(cls, cfg: Any) -> None:
-        """Raise UserError if a requirement of this configuration, such as a model's file, is
-        missing; takes seconds, and is called before any long work.
+        """Raise UserError if what these options need, such as a model's file, is missing; takes
+        seconds, and is called before any long work.
         """
         cfg = parse_structured(cls.Config, cfg)
         variant_class(cfg).preflight(cls, cfg)
@@ -200,9 +192,7 @@ class ScoreDistillation(BaseObject, ABC):
         return True
 
     def known_residual(self, latents: Latents, condition: Any) -> Optional[Residual]:
-        """Return eps_hat - eps and abar if they don't depend on the noise, which isn't drawn then;
-        None if they do.
-        """
+        """Return eps_hat - eps and abar if they don't depend on the noise; None if they do."""
         return None
 
     def report(self) -> dict[str, float]:
@@ -226,11 +216,9 @@ class ScoreDistillation(BaseObject, ABC):
         return self.variant.RENDERS
 
     @property
-    def guided(self) -> bool:
-        """Whether ``predict`` returns the unconditional score too: for classifier-free guidance, or
-        since the variant needs it.
-        """
-        return is_guided(self.cfg, self.variant)
+    def needs_unconditional(self) -> bool:
+        """Whether ``predict`` returns the unconditional prediction too."""
+        return needs_unconditional(self.cfg, self.variant)
 
     def update_step(self, epoch: int, global_step: int, on_load_weights: bool = False) -> None:
         """Evaluate the schedules at this step."""
@@ -259,13 +247,12 @@ class ScoreDistillation(BaseObject, ABC):
         Returns:
             ``loss_sds``; ``grad_norm`` of the batch, and ``grad_norm_0``, ... of each item;
             ``min_step``, ``max_step``; ``bad_items``, the number of items whose score isn't finite;
-            ``evaluations``, those of the score model in this step, one per item and prompt; the
-            entries of :meth:`report`; and ``eval``, if requested.
+            ``evaluations`` of the score model, one per item and prompt; what the ``report`` methods
+            return; and ``eval``, if requested.
 
         Raises:
-            NonFiniteScore: in each of the last ``MAX_BAD_STEPS`` steps the score of at least one
-                item wasn't finite. On a GPU it is raised when that is known, which may be in a
-                later step, also in its backward pass.
+            NonFiniteScore: in each of the last ``MAX_BAD_STEPS`` steps the score of an item wasn't
+                finite. On a GPU it is raised when that is known, maybe in a later step.
         """
         self.evaluations = 0
         with without_autocast(rgb.device.type):
@@ -274,14 +261,9 @@ class ScoreDistillation(BaseObject, ABC):
             with torch.no_grad():
                 condition = self.condition(prompt_utils, **batch)
                 found = self.variant.residual(self, latents, condition, batch)
-                residual, abar = self.variant.checked(found, latents)
-                grad, bad = self._gradient(residual, abar)
+                grad, bad = self._gradient(found, latents)
             if not guidance_eval:  # an evaluation isn't a training step
-                advice = (
-                    "use full precision (half_precision_weights=false), and check the model, the "
-                    "variant and the prior"
-                )
-                self.count_bad(bad, "the score", advice)
+                self.count_bad(bad, "the score", ADVICE)
                 self.variant.learn(self, latents.detach(), condition, batch, ~bad)
             if images.requires_grad and may_have_any(bad):
                 # if the encoder's derivative is infinite, its product with a zero gradient is NaN
@@ -295,9 +277,7 @@ class ScoreDistillation(BaseObject, ABC):
     def _result(
         self, loss: Float[Tensor, ""], norms: Float[Tensor, " B"], bad_items: Float[Tensor, ""]
     ) -> dict[str, Any]:
-        """Return the loss and what is logged, from the norm of the gradient of each item and the
-        number of bad items.
-        """
+        """Return the loss and what is logged; ``norms`` are those of each item's gradient."""
         out = {
             "loss_sds": loss,
             "grad_norm": torch.linalg.vector_norm(norms),
@@ -309,10 +289,13 @@ class ScoreDistillation(BaseObject, ABC):
         }
         return out | (self.report() or {}) | (self.variant.report() or {})
 
-    def _gradient(
-        self, residual: Latents, abar: Float[Tensor, " B"]
-    ) -> tuple[Latents, Bool[Tensor, " B"]]:
-        """Weight and clip the residual; also return which items aren't finite, which are zero."""
+    def _gradient(self, found: Any, latents: Latents) -> tuple[Latents, Bool[Tensor, " B"]]:
+        """Weight and clip the residual that the variant found; also return which items aren't
+        finite, which are set to zero.
+        """
+        shapes, name = (tuple(latents.shape), (len(latents),)), type(self.variant).__name__
+        said = f"the residual and abar, tensors of the shapes {shapes}"
+        residual, abar = require_pair(f"{name}.residual", found, [shapes], said)
         weight = sds.WEIGHTS[self.cfg.weighting_strategy](abar)
         grad = sds.per_item(weight, residual) * residual
         bad = find_bad_items(grad)
@@ -321,8 +304,8 @@ class ScoreDistillation(BaseObject, ABC):
         return grad if self.grad_clip is None else grad.clamp(-self.grad_clip, self.grad_clip), bad
 
     def count_bad(self, bad: Bool[Tensor, " B"], what: str, advice: str) -> None:
-        """Count items that aren't finite, when their number is known; warn of them, or raise
-        NonFiniteScore with the advice after ``MAX_BAD_STEPS`` steps in a row.
+        """Warn of items that aren't finite, when their number is known, or raise NonFiniteScore
+        with the advice after ``MAX_BAD_STEPS`` steps in a row.
         """
         self.reads.submit(bad, functools.partial(self._note_bad, self.step, what, advice))
 
@@ -330,10 +313,8 @@ class ScoreDistillation(BaseObject, ABC):
         self.bad_items += (count := int(bad.sum()))
         self.bad_steps[what] = self.bad_steps[what] + 1 if count else 0
         if self.bad_steps[what] >= MAX_BAD_STEPS:
-            raise NonFiniteScore(
-                f"{what} had NaN or infinity in {self.bad_steps[what]} steps in a row (step "
-                f"{step}, {self.bad_items} items so far): {advice}"
-            )
+            said = f"{what} had NaN or infinity in {self.bad_steps[what]} steps in a row"
+            raise NonFiniteScore(f"{said} (step {step}, {self.bad_items} items so far): {advice}")
         if count:
             warn(f"step {step}: {what} of {count} of {len(bad)} items isn't finite: left out")
 
@@ -354,19 +335,18 @@ class ScoreDistillation(BaseObject, ABC):
         """Predict the noise with guidance: that of ``guidance_scale`` for items inside of
         ``guidance_interval``, none for others.
         """
-        options, count = self.cfg, len(self.alphas_cumprod)
-        low, high = (share * count for share in options.guidance_interval)
-        scale, rescale = options.guidance_scale, options.recon_std_rescale
+        cfg, count = self.cfg, len(self.alphas_cumprod)
+        low, high = (share * count for share in cfg.guidance_interval)
+        options = {"scale": cfg.guidance_scale, "rescale": cfg.recon_std_rescale}
+        guided = functools.partial(self.guided_noise, **options)
         inside = None if (low, high) == (0, count) else (t >= low) & (t <= high)
         if inside is None or inside.all():
-            return self.guided_noise(z, t, condition, scale, rescale=rescale)
+            return guided(z, t, condition)
         eps = torch.empty_like(z)
-        for rows, is_inside in ((inside.nonzero()[:, 0], True), ((~inside).nonzero()[:, 0], False)):
-            some = (z[rows], t[rows], self.select(condition, rows))
-            if is_inside and len(rows):
-                eps[rows] = self.guided_noise(*some, scale, rescale=rescale)
-            elif len(rows):
-                eps[rows] = self.conditional(*some)
+        for predict, chosen in ((guided, inside), (self.conditional, ~inside)):
+            rows = chosen.nonzero()[:, 0]
+            if len(rows):
+                eps[rows] = predict(z[rows], t[rows], self.select(condition, rows))
         return eps
 
     def guided_noise(
@@ -378,27 +358,16 @@ class ScoreDistillation(BaseObject, ABC):
             scale: 1 for no guidance.
             rescale: see ``recon_std_rescale``.
         """
-        if scale == 1 or not rescale:
-            eps = self.at_scale(z, t, condition, scale)
-            if eps is not None:
-                return eps.to(z)
         cond, uncond = self._pair(self.predict(z, t, condition), z)
-        if uncond is None:
+        if uncond is None and scale != 1:
             _warn_of_no_effect(scale, type(self).__name__)
-            uncond = cond
-        guided = sds.classifier_free(cond, uncond, scale)
-        return sds.rescaled(guided, cond, z, self.abar_of(t), rescale) if rescale else guided
-
-    def at_scale(self, z: Latents, t: Timesteps, condition: Any, scale: float) -> Optional[Latents]:
-        """Predict the noise with guidance of this scale in one evaluation; None where the model
-        needs the unconditional prediction for it.
-        """
-        return self._pair(self.predict(z, t, condition), z)[0] if scale == 1 else None
+        eps = cond if uncond is None else sds.classifier_free(cond, uncond, scale)
+        if rescale and scale != 1:
+            eps = sds.rescaled(eps, cond, z, self.abar_of(t), rescale)
+        return eps
 
     def both(self, z: Latents, t: Timesteps, condition: Any) -> tuple[Latents, Latents]:
-        """Predict the noise, conditional and unconditional; the same if the score model has only
-        one.
-        """
+        """Predict the noise, conditional and unconditional; twice the same if there is only one."""
         cond, uncond = self._pair(self.predict(z, t, condition), z)
         return cond, cond if uncond is None else uncond
 
@@ -412,27 +381,18 @@ class ScoreDistillation(BaseObject, ABC):
 
     def empty_prompt(self, z: Latents, t: Timesteps, condition: Any) -> Optional[Latents]:
         """Predict the noise for an empty prompt, where the unconditional score is that of a
-        negative prompt; None where the unconditional score is all there is.
+        negative prompt; else None.
         """
         return None
 
     def _pair(self, found: Any, z: Latents) -> tuple[Latents, Optional[Latents]]:
-        """Return what ``predict`` returned, in the type of z.
-
-        Raises:
-            UserError: it isn't a pair of predictions in the shape of z; a smaller tensor would be
-                broadcast.
-        """
-        entries = found if isinstance(found, (tuple, list)) else [found]
-        shapes = [tuple(x.shape) if isinstance(x, Tensor) else type(x).__name__ for x in entries]
+        """Return what ``predict`` returned, in the type of z, after a look at its shapes."""
         shape = tuple(z.shape)
-        if entries is not found or shapes not in ([shape, shape], [shape, "NoneType"]):
-            raise UserError(
-                f"{type(self).__name__}.predict returned {' and '.join(map(str, shapes))}; "
-                "expected a pair, the conditional and the unconditional prediction (or None), of "
-                f"the shape {shape} of the noisy latents"
-            )
-        cond, uncond = found
+        said = (
+            f"a pair, conditional and unconditional (or None), of the shape {shape} of the latents"
+        )
+        accepted = [(shape, shape), (shape, "NoneType")]
+        cond, uncond = require_pair(f"{type(self).__name__}.predict", found, accepted, said)
         return cond.to(z), None if uncond is None else uncond.to(z)
 
     # The noise of a step
@@ -444,27 +404,24 @@ class ScoreDistillation(BaseObject, ABC):
 
     def draw_timesteps(self, latents: Latents) -> tuple[Timesteps, Float[Tensor, " B"]]:
         """Draw this step's timesteps t; also return their abar, float64."""
-        t = sds.timesteps(
-            len(latents),
-            self.min_step,
-            self.max_step,
-            seed=run_seed(),
-            step=self.step,
-            num_train=len(self.alphas_cumprod),
-            first=first_item(len(latents)),
-        )
+        return self.timesteps_between(latents, self.min_step, self.max_step, "timestep")
+
+    def timesteps_between(
+        self, latents: Latents, low: int, high: int, stream: str
+    ) -> tuple[Timesteps, Float[Tensor, " B"]]:
+        """Draw timesteps, uniform on [low, high], from a random stream of this step; and abar."""
+        options = {"seed": run_seed(), "step": self.step, "num_train": len(self.alphas_cumprod)}
+        options |= {"stream": stream, "first": first_item(len(latents))}
+        t = sds.timesteps(len(latents), low, high, **options)
         abar = self.alphas_cumprod.double().cpu()[t]
         return to_device(t, latents.device), to_device(abar, latents.device)
 
     @torch.no_grad()
-    def add_noise(self, latents: Latents) -> Noised:
-        """Draw this step's timesteps and noise, and add the noise to ``latents``."""
-        return self.noised(latents, self.normal(latents, "noise"))
-
-    def noised(self, latents: Latents, noise: Latents) -> Noised:
-        """Add a given noise to ``latents`` at this step's timesteps."""
+    def add_noise(self, latents: Latents, noise: Optional[Latents] = None) -> Noised:
+        """Add noise to ``latents`` at this step's timesteps: this step's, unless it is given."""
+        noise = self.normal(latents, "noise") if noise is None else noise
         t, abar = self.draw_timesteps(latents)
-        return Noised(t, abar, noise, sds.add_noise(latents, noise, abar))
+        return Noised(t, abar, noise, sds.diffuse(latents, noise, abar))
 
     def normal(self, like: Float[Tensor, "B *d"], stream: str) -> Float[Tensor, "B *d"]:
         """Draw this step's standard normal numbers, of the shape and on the device of ``like``."""
@@ -472,8 +429,8 @@ class ScoreDistillation(BaseObject, ABC):
         return streams.normal_per_item(tuple(like.shape), *place)
 
 
-def is_guided(cfg: Any, variant: Variant | type[Variant]) -> bool:
-    """Return whether these options, with this variant, need the unconditional score too."""
+def needs_unconditional(cfg: Any, variant: Variant | type[Variant]) -> bool:
+    """Return whether these options, with this variant, need the unconditional prediction too."""
     return cfg.guidance_scale != 1 or variant.NEEDS_UNCONDITIONAL
 
 
@@ -494,10 +451,7 @@ def variant_class(cfg: Any) -> type[Variant]:
 @functools.lru_cache
 def _warn_of_no_effect(scale: float, name: str) -> None:
     """Warn, once per process, of a scale where there is only one prediction."""
-    warn(
-        f"guidance_scale={scale:g} has no effect: {name}.predict returns no unconditional "
-        "prediction"
-    )
+    warn(f"guidance_scale={scale:g} has no effect: {name}.predict returns no unconditional one")
 
 
 def _knots(*schedules: Any) -> set[int]:
@@ -510,52 +464,44 @@ def _knots(*schedules: Any) -> set[int]:
 def score_pictures(
     guidance: Any, noised: Noised, prompt_utils: Any, batch: Batch
 ) -> dict[str, Any]:
-    """Decode the noisy latents and the predictions of a guidance's score model.
-
-    Returns:
-        pictures (B, H, W, 3) in [0, 1]: ``imgs_noisy``, the noisy latents; ``imgs_1step``,
-        denoised in one step with guidance; ``imgs_1orig``, denoised in one step with the
-        conditional score only; ``imgs_final``, denoised in ``EVAL_STEPS`` steps; and ``texts``,
-        ``noise_levels`` and ``bs``, the number of items."""
+    """Return pictures (B, H, W, 3) in [0, 1], under threestudio's names: ``imgs_noisy``, the noisy
+    latents; denoised in one step with guidance ``imgs_1step``, with the conditional score alone
+    ``imgs_1orig``; in ``EVAL_STEPS`` steps ``imgs_final``; and captions.
+    """
     size, views = len(noised.t), getattr(guidance.cfg, "n_view", 1)
     count = min(size, max(EVAL_ITEMS // views, 1) * views)
     batch = items_of(batch, size, slice(count))
     t, abar, _, z = (values[:count] for values in noised)
     condition = guidance.condition(prompt_utils, **batch)
+    table = guidance.alphas_cumprod.double().to(z.device)
     latents = {
         "imgs_noisy": z,
         "imgs_1step": sds.predict_x0(z, guidance.predict_noise(z, t, condition), abar),
         "imgs_1orig": sds.predict_x0(z, guidance.predict(z, t, condition)[0].float(), abar),
         "imgs_final": sds.ddim_sample(
-            lambda z, t: guidance.predict_noise(z, t, condition),
-            z,
-            t,
-            guidance.alphas_cumprod.double().to(z.device),
-            steps=EVAL_STEPS,
+            lambda z, t: guidance.predict_noise(z, t, condition), z, t, table, steps=EVAL_STEPS
         ),
     }
-    images = {
-        name: guidance.decode(value).float().movedim(1, -1) for name, value in latents.items()
-    }
+    images = {name: guidance.decode(x).float().movedim(1, -1) for name, x in latents.items()}
     levels = (t / len(guidance.alphas_cumprod)).tolist()
     return {"bs": count, "noise_levels": levels, "texts": _captions(levels, batch), **images}
 
 
 def _captions(levels: list[float], batch: Batch) -> list[str]:
     """Write threestudio's captions: noise level, elevation, azimuth and distance of each item."""
-    shown = (("e", "elevation", 1), ("a", "azimuth", 1), ("c", "camera_distances", 2))
-    columns = [[f"n{level:.02f}" for level in levels]] + [
-        [f"{letter}{float(value):.0{digits}f}" for value in batch[name]]
+    shown = (("n", "noise", 2), ("e", "elevation", 1), ("a", "azimuth", 1))
+    shown, values = (*shown, ("c", "camera_distances", 2)), {"noise": levels, **batch}
+    columns = [
+        [f"{letter}{float(value):.{digits}f}" for value in values[name]]
         for letter, name, digits in shown
-        if name in batch
+        if name in values
     ]
     return ["\n".join(lines) for lines in zip(*columns, strict=True)]
 
 
 def find_bad_items(grad: Float[Tensor, "B *d"]) -> Bool[Tensor, " B"]:
-    """Return which items contain NaN or infinity. If the sum over all elements is finite then so
-    are the elements.
-    """
+    """Return which items contain NaN or infinity."""
+    # if the sum over all elements is finite then so are the elements
     if not grad.is_cuda and grad.sum().isfinite():
         return torch.zeros(len(grad), dtype=torch.bool, device=grad.device)
     return ~torch.isfinite(grad).flatten(1).all(dim=1)

@@ -2,9 +2,8 @@
 weights, no prompt.
 
 It replaces a diffusion model to measure or demonstrate the pipeline offline, and says nothing about
-the quality of a real one. The data distribution is a mixture of narrow Gaussians
-around ray-cast pictures of the mesh (formulas and limits: ``exact_score.py``), composited on the
-render's own background.
+the quality of a real one. The data are ray-cast pictures of the mesh on the render's own background
+(formulas and limits: ``diffusion/exact_score.py``).
 
 ==================  ================================================================================
 option              meaning
@@ -30,9 +29,8 @@ guidance_scale      1 = none (the default here); otherwise the unconditional mix
                     with this view in it
 ==================  ================================================================================
 
-A mixture over the bank doesn't depend on the camera's distance either, so a faint start first moves
-towards far views. To measure multi-face alone, give cameras and bank the same single distance and
-angle of view."""
+A mixture over the bank doesn't depend on the camera's distance either: to measure multi-face alone,
+give cameras and bank the same single distance and angle of view."""
 
 import itertools
 import math
@@ -50,16 +48,24 @@ from ..core.given_gradient import given_gradient
 from ..core.memory import count_of, require_memory
 from ..core.options import at_least, in_range, interval, one_of, required
 from ..diffusion import sds
-from ..diffusion.exact_score import COLOR_MATRIX, Denoised, LinearLatent, denoise
-from ..host import parse_structured, register, warn
+from ..diffusion.exact_score import COLOR_MATRIX, LinearLatent, denoise
+from ..host import parse_structured, register
 from ..meshes.load import AXES, load_mesh, mesh_file
 from ..meshes.raycast import MeshCaster
+from ..prompts.view_prompts import direction_indices, view_directions
 from ..splatting.cpu import known_picture
-from .base import GUIDANCE_SCALE, ScoreDistillation, is_guided, variant_class
-from .known_truth import MeshTruth, background_of, composite, resized
-from .picture_bank import Bank, Mixture, direction_indices, mixture_of, modes_of
+from .base import GUIDANCE_SCALE, ScoreDistillation, needs_unconditional, variant_class
+from .picture_bank import (
+    Bank,
+    MeshTruth,
+    Mixture,
+    Modes,
+    background_of,
+    composite,
+    mixture_of,
+    resized,
+)
 from .types import Latents, Residual, Timesteps
-from .variants.base import require_unset
 from .variants.sds import SDS
 
 MODES = ("view-exact", "direction-bins", "view-agnostic")
@@ -68,8 +74,6 @@ BANK_BYTES = 16
 """Memory per pixel of the bank while it is cast, bytes."""
 MAX_MODE_BYTES = 2**31
 """Largest memory of a bank in the space of pixels; over backgrounds of pixels, of each item's."""
-OF_BANK = ("bank_views", "bank_distance_range", "bank_fovy_range")
-"""Without its seed, which series of runs set for all of them."""
 BANK_ELEVATIONS = (-10.0, 60.0)
 """Degrees."""
 
@@ -120,7 +124,7 @@ class ExactScoreGuidance(ScoreDistillation):
         @staticmethod
         def check_render_size(cfg: Any, height: int, width: int) -> None:
             """Check that renders of this size can be compared, see :func:`picture_size`."""
-            picture_size(cfg, is_guided(cfg, variant_class(cfg)), height, width)
+            picture_size(cfg, needs_unconditional(cfg, variant_class(cfg)), height, width)
 
     cfg: Config
     REPORTS = ("perplexity",)
@@ -142,18 +146,7 @@ class ExactScoreGuidance(ScoreDistillation):
     @classmethod
     def preflight(cls, cfg: Any) -> None:
         super().preflight(cfg)
-        cfg = parse_structured(cls.Config, cfg)
-        mesh_file(cfg.mesh)
-        if cfg.space == "pixel":  # the variance of a latent is that of the bank
-            require_unset(cls, cfg, ("latent_size",), "with space=pixel")
-            if cfg.mode == "view-exact" and cfg.guidance_scale == 1:
-                reason = "with space=pixel, mode=view-exact and guidance_scale=1: without a bank"
-                require_unset(cls, cfg, OF_BANK, reason)
-        if cfg.guidance_scale != 1 and not cls.is_text_guided(cfg):
-            warn(
-                "system.guidance.guidance_scale has no effect with mode=view-agnostic, whose "
-                "unconditional score is the conditional one: 1 makes half as many evaluations"
-            )
+        mesh_file(parse_structured(cls.Config, cfg).mesh)
 
     @classmethod
     def is_text_guided(cls, cfg: Any) -> bool:
@@ -186,14 +179,22 @@ class ExactScoreGuidance(ScoreDistillation):
         **batch: Any,
     ) -> Optional[tuple[Float[Tensor, "B H W 3"], Float[Tensor, " B"], float]]:
         """Return the gradient of the renders, the sum of the squares of the latents' per item, and
-        the mean squared error of the renders; None if other options, or values that aren't finite,
-        need the general path.
+        the mean squared error of the renders, where the score is that of one picture per item, of
+        the render's pixels, and nothing but its weight is applied to it; else, or if values aren't
+        finite, None.
         """
-        size, background = rgb.shape[1:3], background_of(comp_rgb_bg, len(rgb), rgb.device)
-        general = rgb_as_latents or guidance_eval or background.shape[1:3] != (1, 1)
-        if general or not known_picture.is_available(rgb.device) or not self._is_one_picture(size):
+        cfg, size = self.cfg, tuple(rgb.shape[1:3])
+        background = background_of(comp_rgb_bg, len(rgb), rgb.device)
+        is_one_picture = (
+            (cfg.mode, cfg.space, type(self.variant)) == ("view-exact", "pixel", SDS)
+            and self._picture_size(*size) == size
+            and background.shape[1:3] == (1, 1)
+            and self.grad_clip is None
+            and not (self.needs_unconditional or rgb_as_latents or guidance_eval)
+        )
+        if not is_one_picture or not known_picture.is_available(rgb.device):
             return None
-        self._size = tuple(size)
+        self._size = size
         pictures = self.truth.pictures.planes(c2w, fovy, *size)
         _, abar = self.draw_timesteps(rgb)
         weight = sds.WEIGHTS[self.cfg.weighting_strategy](abar).float()
@@ -205,19 +206,6 @@ class ExactScoreGuidance(ScoreDistillation):
             return None
         factors = zip(squares, weight.tolist(), scale.tolist(), strict=True)
         return *found, sum(square / (2 * w * s) ** 2 for square, w, s in factors) / rgb.numel()
-
-    def _is_one_picture(self, size: tuple[int, int]) -> bool:
-        """Return whether the score is that of one picture per item without width, of the pixels of
-        renders of this size, and nothing but its weight is applied to it.
-        """
-        options = self.cfg
-        return (
-            (options.mode, options.space) == ("view-exact", "pixel")
-            and self._picture_size(*size) == tuple(size)
-            and not self.guided
-            and self.grad_clip is None
-            and type(self.variant) is SDS
-        )
 
     def encode(self, rgb: Float[Tensor, "B 3 H W"], **batch: Any) -> Latents:
         self._size = self._picture_size(*rgb.shape[-2:])
@@ -235,20 +223,18 @@ class ExactScoreGuidance(ScoreDistillation):
         fovy: Tensor,
         **batch: Any,
     ) -> list[Mixture]:
-        """Return the mixture of each item. ``encode`` must be called before, since it sets the size
-        of the pictures.
-        """
+        """Return the mixture of each item, for pictures of the size that ``encode`` has set."""
         if self._size is None:
             raise UserError("exact-score-guidance takes renders, not latents (rgb_as_latents)")
         background = background_of(comp_rgb_bg, len(c2w), c2w.device)
         rgba = self.truth.pictures(c2w, fovy, *self._size)
         own = self._latent().encode(composite(rgba, background))
         members = self._members(batch, len(c2w))
-        if not self.guided and not members.any():
+        if not self.needs_unconditional and not members.any():
             return [Mixture(view) for view in own]
         bank = self.bank(*self._size)
         items = zip(own, members, background, strict=True)
-        return [mixture_of(*item, bank, self.guided) for item in items]
+        return [mixture_of(*item, bank, self.needs_unconditional) for item in items]
 
     def predict(
         self, z: Latents, t: Timesteps, condition: list[Mixture]
@@ -257,33 +243,33 @@ class ExactScoreGuidance(ScoreDistillation):
         by_pictures = itertools.groupby(condition, lambda mixture: id(mixture.pictures))
         groups = [list(group) for _, group in by_pictures]
         sizes = [len(group) for group in groups]
-        parts = zip(z.flatten(1).split(sizes), abar.split(sizes), groups, strict=True)
-        predictions = [self._predict_items(*part) for part in parts]
-        self.evaluations += len(z) * (2 if self.guided else 1)
-        self._perplexity = float(torch.cat([cond.perplexity for cond, _ in predictions]).mean())
-        eps = torch.cat([cond.eps for cond, _ in predictions]).view_as(z)
-        if not self.guided:
-            return eps, None
-        return eps, torch.cat([uncond.eps for _, uncond in predictions]).view_as(z)
+        conditional, perplexities, unconditional = [], [], []
+        for z_some, abar_some, group in zip(
+            z.flatten(1).split(sizes), abar.split(sizes), groups, strict=True
+        ):
+            modes = Modes.of(group)
+            known = z_some, abar_some, modes.squared_distances(z_some, abar_some)
+            eps, perplexity = denoise(*known, modes.weighted_sum, modes.log_prior)
+            conditional.append(eps)
+            perplexities.append(perplexity)
+            if self.needs_unconditional:
+                unconditional.append(denoise(*known, modes.weighted_sum)[0])
+        self.evaluations += len(z) * (2 if self.needs_unconditional else 1)
+        self._perplexity = float(torch.cat(perplexities).mean())
+        uncond = torch.cat(unconditional).view_as(z) if unconditional else None
+        return torch.cat(conditional).view_as(z), uncond
 
     def conditional(self, z: Latents, t: Timesteps, condition: list[Mixture]) -> Latents:
-        return self._one_of_both(0, z, t, condition)
+        self.evaluations -= len(z) * self.needs_unconditional  # one counts as of a network
+        return super().conditional(z, t, condition)
 
     def unconditional(self, z: Latents, t: Timesteps, condition: list[Mixture]) -> Latents:
-        return self._one_of_both(1, z, t, condition)
-
-    def _one_of_both(self, index: int, z: Tensor, t: Tensor, condition: list[Mixture]) -> Tensor:
-        """Predict one of the two, which share most of their computation, and count one evaluation
-        per item, as of a network.
-        """
-        before = self.evaluations
-        eps = self.both(z, t, condition)[index]
-        self.evaluations = before + len(z)
-        return eps
+        self.evaluations -= len(z) * self.needs_unconditional
+        return super().unconditional(z, t, condition)
 
     def known_residual(self, latents: Latents, condition: list[Mixture]) -> Optional[Residual]:
-        """Return sqrt(abar / (1 - abar)) (x - x_1) for mixtures of one picture without width, in
-        whose score the noise cancels.
+        """Return sqrt(abar / (1 - abar)) (x - x_1) for mixtures of one picture, where the noise
+        cancels.
         """
         if any(mixture.pictures is not None for mixture in condition):
             return None
@@ -293,29 +279,18 @@ class ExactScoreGuidance(ScoreDistillation):
         return difference.mul_(sds.per_item((abar / (1 - abar)).sqrt(), difference)), abar
 
     def report(self) -> dict[str, float]:
-        """Return the perplexity of the responsibilities, the effective number of modes per noisy
-        latent: at 1 only the nearest picture counts.
-        """
+        """Return the perplexity of the responsibilities, the effective number of modes."""
         return {"perplexity": self._perplexity}
-
-    def _predict_items(
-        self, z: Float[Tensor, "B d"], abar: Float[Tensor, " B"], mixtures: list[Mixture]
-    ) -> tuple[Denoised, Optional[Denoised]]:
-        """Return the conditional prediction, and the unconditional one if there is guidance, of
-        items with the same pictures.
-        """
-        modes, log_prior = modes_of(mixtures)
-        distances = modes.squared_distances(z, abar)
-        cond = denoise(z, abar, modes, log_prior=log_prior, distances=distances)
-        return cond, denoise(z, abar, modes, distances=distances) if self.guided else None
 
     def _members(self, batch: dict[str, Any], count: int) -> Bool[Tensor, "B K"]:
         """Return a mask of the bank's views in the conditional mixture of each item."""
         mode, views = self.cfg.mode, self.cfg.bank_views
         if mode != "direction-bins":
             return torch.full((count, views), mode == "view-agnostic")
-        bank = direction_indices(self.bank_orbit.elevation, self.bank_orbit.azimuth)
-        members = bank == direction_indices(batch["elevation"], batch["azimuth"]).cpu()[:, None]
+        orbit, directions = self.bank_orbit, view_directions()
+        bank = direction_indices(directions, orbit.elevation, orbit.azimuth, orbit.azimuth)
+        angles = batch["elevation"].cpu(), batch["azimuth"].cpu()
+        members = bank == direction_indices(directions, *angles, angles[1])[:, None]
         # if no view of the bank has this direction, as overhead below 60 degrees, take all
         return torch.where(members.any(dim=1, keepdim=True), members, torch.ones_like(members))
 
@@ -343,15 +318,13 @@ class ExactScoreGuidance(ScoreDistillation):
 
     def _picture_size(self, height: int, width: int) -> tuple[int, int]:
         """Return the size of the compared pictures for a render of this size."""
-        return picture_size(self.cfg, self.guided, height, width)
+        return picture_size(self.cfg, self.needs_unconditional, height, width)
 
 
-def picture_size(cfg: Any, guided: bool, height: int, width: int) -> tuple[int, int]:
+def picture_size(cfg: Any, unconditional: bool, height: int, width: int) -> tuple[int, int]:
     """Return the size of the compared pictures for a render of this size: ``image_size`` high, with
-    the render's aspect.
-
-    Raises:
-        UserError: pictures of that size need too much memory, or can't be pooled to the latent.
+    the render's aspect. Raise UserError if a bank of them, which the ``unconditional`` prediction
+    needs too, is too large for the memory, or they can't be pooled to the latent.
     """
     size = cfg.image_size
     height, width = (size, max(1, round(width * size / height))) if size else (height, width)
@@ -359,7 +332,7 @@ def picture_size(cfg: Any, guided: bool, height: int, width: int) -> tuple[int, 
         pooling_factor(height, width, cfg.latent_size)
         return height, width
     needed = 12 * cfg.bank_views * height * width
-    if (cfg.mode != "view-exact" or guided) and needed > MAX_MODE_BYTES:
+    if (cfg.mode != "view-exact" or unconditional) and needed > MAX_MODE_BYTES:
         raise UserError(
             f"a bank of {cfg.bank_views} views of {height}x{width} pixels needs "
             f"up to {needed / 2**30:.1f} GiB for each item:"
@@ -369,9 +342,7 @@ def picture_size(cfg: Any, guided: bool, height: int, width: int) -> tuple[int, 
 
 
 def pooling_factor(height: int, width: int, latent_size: int) -> int:
-    """Return how many pixels each way a latent of this height has; raise UserError if pictures of
-    this size can't be pooled to it.
-    """
+    """Return the pixels each way of a latent pixel; raise UserError if that is no whole number."""
     factor = height // latent_size
     if factor * latent_size != height or width % max(factor, 1):
         raise UserError(

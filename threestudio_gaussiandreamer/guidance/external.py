@@ -24,14 +24,10 @@ def call_guidance(
     batch: dict[str, Any],
     **options: Any,
 ) -> dict[str, Any]:
-    """Call ``guidance`` with these renders.
-
-    A guidance gets those of ``prompt_utils``, the entries of the batch and the options that its
-    signature accepts; image-conditioned ones (zero123), for example, have no prompt. threestudio
-    passes the prompt as the second positional argument, so that argument may have any name.
-
-    Raises:
-        UserError: the guidance returns no dict, or a ``loss_*`` that isn't a single finite number.
+    """Call ``guidance`` with these renders, and those of ``prompt_utils``, the entries of the batch
+    and the options that its signature accepts. The second positional argument gets the prompt under
+    any name, as from threestudio. Raise UserError if it returns no dict, or a ``loss_*`` that isn't
+    a single finite number.
     """
     call = guidance.forward if isinstance(guidance, nn.Module) else guidance.__call__
     arguments = inspect.signature(call).parameters
@@ -46,10 +42,7 @@ def call_guidance(
     if isinstance(guidance, ScoreDistillation):
         return out
     if not isinstance(out, dict):
-        raise UserError(
-            f"{name} returned {type(out).__name__}: a guidance returns a dict with its losses "
-            "as loss_*"
-        )
+        raise UserError(f"{name} returned {type(out).__name__}: expected a dict with loss_*")
     losses = {key: value for key, value in out.items() if key.startswith("loss_")}
     return out | {key: _loss(value, f"{name} returned {key}", rgb) for key, value in losses.items()}
 
@@ -69,12 +62,19 @@ def _loss(value: Any, what: str, rgb: Tensor) -> Float[Tensor, ""]:
 @contextmanager
 def own_randomness(step: int) -> Iterator[None]:
     """Seed torch's global generators with (seed, step) in this context, for guidances that draw
-    from them; restore their state afterwards. A resumed run thus draws the same values as an
-    uninterrupted one, and validation doesn't change those of training.
+    from them, so that a resumed run draws the same; restore their state afterwards.
     """
     with torch.random.fork_rng([torch.cuda.current_device()] if torch.cuda.is_available() else []):
         torch.manual_seed(derive_seed(item_seed(), "guidance", step))
         yield
+
+
+def truth_of(guidance: Any) -> Any:
+    """Return the ground truth that renders are compared with, if a guidance has one; else None. It
+    has the methods of :class:`.MeshTruth`, whose ``mesh`` may be None. A guidance that has computed
+    the mean squared error of a step's renders to it returns that as ``error_to_truth``.
+    """
+    return getattr(guidance, "truth", None)
 
 
 def trainable_parameters(guidance: Any) -> dict[str, nn.Parameter]:
@@ -99,14 +99,9 @@ def learnt_weights(guidance: Any) -> dict[str, Tensor]:
 
 
 def restore_learnt(guidance: Any, weights: dict[str, Tensor]) -> None:
-    """Restore parameters that :func:`learnt_weights` returned.
-
-    Raises:
-        UserError: their names or shapes differ.
-    """
+    """Restore what :func:`learnt_weights` returned; raise UserError if names or shapes differ."""
     if isinstance(guidance, ScoreDistillation):
-        guidance.restore(weights)
-        return
+        return guidance.restore(weights)
     own = trainable_parameters(guidance)
     shapes = [{name: value.shape for name, value in part.items()} for part in (own, weights)]
     if shapes[0] != shapes[1]:

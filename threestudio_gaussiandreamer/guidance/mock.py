@@ -1,11 +1,8 @@
 """``mock-guidance``: for tests of a pipeline; needs neither weights nor a mesh.
 
-The score of a distribution with one picture for each view: a disc with soft edges in a colour that
-the prompt gives, brighter on top, in front of the render's background. With an image ``y`` of the
-disc in [-1, 1] the optimal denoiser is known: eps_hat = (z - sqrt(abar) y) / sqrt(1 - abar).
-
-It takes the options of ``guidance/base.py``. Every variant of the distillation works with it, and
-any prompt processor. It says nothing about the quality of a run.
+The exact score, eps_hat = (z - sqrt(abar) y) / sqrt(1 - abar), of one picture y for each view: a
+disc in a colour that the prompt gives, in front of the render's background. It takes the options of
+``guidance/base.py``, every variant and any prompt processor.
 
 =============================  ===================================================================
 option                         meaning
@@ -30,8 +27,7 @@ from .base import ScoreDistillation
 RADIUS = 0.6
 """Of the disc, in units of half the picture's side."""
 UNCONDITIONAL = 0.99
-"""Contrast of the picture without a prompt: the two predictions differ, but little, so that
-guidance scales of 100 aren't far from 1."""
+"""Contrast of the picture without a prompt: near 1, since guidance scales may be 100."""
 
 
 def prompt_color(prompt: str) -> list[float]:
@@ -72,8 +68,7 @@ class MockGuidance(ScoreDistillation):
     ) -> tuple[Tensor, Tensor]:
         self.evaluations += len(z)
         abar = sds.per_item(self.abar_of(t), z)
-        guided, unguided = (
+        return tuple(
             (z - abar.sqrt() * share * condition) / (1 - abar).sqrt()
             for share in (1.0, UNCONDITIONAL)
         )
-        return guided, unguided

@@ -3,12 +3,9 @@ that sees several views of an object together, MVDream (Shi et al. 2023), which 
 several sides.
 
 Takes conversions of MVDream to diffusers' format (``models/multiview_unet.py``) and the prompt
-processor of Stable Diffusion. Each ``n_view`` consecutive views of a batch are one object: the
-data module makes them with ``data.n_view``, at one elevation and evenly spaced azimuths, and they
-get the same timestep, as in training. A single view, which validation shows, is attended alone.
-
-A camera is its matrix from camera to world, by rows, with its position scaled to length 1.
-MVDream's world and cameras are the host's: z up, the front towards +x, columns right, up, back.
+processor of Stable Diffusion. Each ``n_view`` consecutive views of a batch are one object, at one
+elevation, with evenly spaced azimuths and one timestep. A single view, which validation shows, is
+attended alone. MVDream's world and cameras are the host's: z up, the front towards +x.
 
 Options in addition to those of ``guidance/stable_diffusion.py``:
 
@@ -65,6 +62,7 @@ class MVDreamGuidance(StableDiffusionGuidance):
 
     cfg: Config
     family = MULTI_VIEW
+    INPUTS = (("projection", None),)
     NO_LORA = "MVDream predicts several together"
     # without view contrast and Perp-Neg, which it doesn't have
     UNGUIDED_IGNORES = ("guidance_interval", "recon_std_rescale")
@@ -85,9 +83,6 @@ class MVDreamGuidance(StableDiffusionGuidance):
     def prepare_denoiser(self, network: nn.Module) -> nn.Module:
         attend_across_views(network, self.cfg.n_view)
         return super().prepare_denoiser(network)
-
-    def require_inputs(self) -> None:
-        """Do nothing: the family and its settings leave no other inputs."""
 
     def condition(self, prompt_utils: Any, **batch: Any) -> Condition:
         """See :meth:`.ScoreDistillation.condition`.

@@ -1,30 +1,113 @@
-"""Pictures of a mesh from views around it: the modes of the exact score's mixtures."""
+"""Pictures of a mesh: those of a batch's cameras, the ground truth, and a bank of views around it,
+the modes of the exact score's mixtures.
+"""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple, Optional
 
 import torch
-from jaxtyping import Bool, Float, Int, UInt8
+import torch.nn.functional as F
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from ..diffusion.exact_score import (
-    ImageTensor,
     LinearLatent,
     expanded_distances,
     images_per_chunk,
     squared_distances,
     weighted_sum,
 )
-from ..prompts.view_prompts import view_directions
-from .known_truth import composite
+from ..meshes.raycast import MeshCaster, TargetCache
+
+Size = tuple[int, int]
+"""Height and width, pixels."""
+
+
+class MeshTruth:
+    """Ray casts a mesh, and caches the pictures of recent cameras.
+
+    Args:
+        mesh: casts rays at the mesh.
+        supersample: rays per pixel and axis.
+        max_cached: largest number of cached pictures, which are stored as uint8.
+        prefetch_size: maps a render's size to that of the picture that training needs for it.
+    """
+
+    def __init__(
+        self,
+        mesh: MeshCaster,
+        supersample: int,
+        max_cached: int,
+        prefetch_size: Callable[[int, int], Size],
+    ) -> None:
+        self.mesh, self._prefetch_size = mesh, prefetch_size
+        self.pictures = TargetCache(mesh, supersample, max_cached)
+
+    @torch.no_grad()
+    def render(
+        self,
+        batch: dict[str, Any],
+        background: Optional[Tensor] = None,
+        *,
+        size: Optional[Size] = None,
+    ) -> Float[Tensor, "B H W 3"]:
+        """Render the ground truth from the views of a batch.
+
+        Args:
+            batch: has ``c2w``, ``fovy``, ``height`` and ``width``.
+            background: (B, 1, 1, 3) or (B, H, W, 3); None for black.
+            size: (height, width) of the pictures, pixels; None for the batch's size.
+        """
+        height, width = size or (batch["height"], batch["width"])
+        rgba = self.pictures(batch["c2w"], batch["fovy"], height, width)
+        background = background_of(background, len(rgba), rgba.device)
+        return composite(rgba, background).movedim(1, -1)
+
+    @torch.no_grad()
+    def prefetch(
+        self, c2w: Float[Tensor, "V 4 4"], fovy: Float[Tensor, " V"], height: int, width: int
+    ) -> None:
+        """Plan to cast these views, most of which training will need, in large batches, if all fit
+        into the cache.
+        """
+        if len(c2w) <= self.pictures.capacity:
+            self.pictures.plan(c2w, fovy, *self._prefetch_size(height, width))
+
+
+def background_of(
+    background: Optional[Tensor], batch: int, device: torch.device
+) -> Float[Tensor, "B bh bw 3"]:
+    """Return the background of the renders, detached, or black if it is None."""
+    if background is None:
+        return torch.zeros(batch, 1, 1, 3, device=device)
+    return background.detach().float().expand(batch, -1, -1, -1)
+
+
+def composite(
+    rgba: UInt8[Tensor, "B H W 4"], background: Float[Tensor, "#B bh bw 3"]
+) -> Float[Tensor, "B 3 H W"]:
+    """Composite premultiplied pictures over the background, which is resized to their size."""
+    background = background.movedim(-1, 1)
+    if background.shape[-2:] != (1, 1):
+        background = resized(background, tuple(rgba.shape[1:3]))
+    rgba = rgba.movedim(-1, 1).contiguous().to(background).div_(255)
+    return ((1 - rgba[:, 3:]) * background).add_(rgba[:, :3])
+
+
+def resized(images: Float[Tensor, "B c H W"], size: tuple[int, int]) -> Float[Tensor, "B c h w"]:
+    """Resize images: average blocks if the sizes divide evenly, else bilinear with antialiasing."""
+    height, width = images.shape[-2:]
+    if (height, width) == size:
+        return images
+    if height % size[0] == 0 and width % size[1] == 0:
+        return F.avg_pool2d(images, (height // size[0], width // size[1]))
+    return F.interpolate(images, size, mode="bilinear", align_corners=False, antialias=True)
 
 
 class Pictures(NamedTuple):
     """Encoded pictures, each a linear combination of its layers: channel c of picture k is
-    ``sum_l mixing[c, l] layers[k, l]``.
-
-    Over a colour, the layers are the picture over black and the share of the colour in each pixel.
-    Distances follow from scalar products with the layers, so a bank needn't be composited on the
-    colour of each item.
+    ``sum_l mixing[c, l] layers[k, l]``. Over a colour, the layers are the picture over black and
+    the share of the colour in each pixel: a bank needn't be composited on the colour of each item.
     """
 
     layers: Float[Tensor, "K l h w"]
@@ -65,21 +148,31 @@ class Mixture(NamedTuple):
     mixing: Optional[Float[Tensor, "c l"]] = None
     """Of the pictures' layers."""
     log_prior: Optional[Float[Tensor, " K"]] = None
-    """0 for the modes of the conditional mixture, -inf for others, which belong only to the
-    unconditional mixture or to none. Without pictures it is None.
-    """
+    """0 for the modes of the conditional mixture, -inf for others."""
 
 
 class Modes(NamedTuple):
     """The modes of the items of a batch whose mixtures have the same pictures."""
 
     own: Float[Tensor, "B d"]
-    pictures: Pictures
-    mixing: Float[Tensor, "B c l"]
+    pictures: Optional[Pictures]
+    mixing: Optional[Float[Tensor, "B c l"]]
+    log_prior: Optional[Float[Tensor, "B K"]]
+
+    @staticmethod
+    def of(mixtures: list[Mixture]) -> "Modes":
+        own = torch.stack([mixture.own for mixture in mixtures]).flatten(1)
+        pictures = mixtures[0].pictures
+        if pictures is None:
+            return Modes(own, None, None, None)
+        mixing = torch.stack([mixture.mixing for mixture in mixtures])
+        return Modes(own, pictures, mixing, torch.stack([m.log_prior for m in mixtures]))
 
     def squared_distances(
         self, z: Float[Tensor, "B d"], abar: Float[Tensor, " B"]
     ) -> Float[Tensor, "B K"]:
+        if self.pictures is None:  # the responsibility of a single mode is 1 at any distance
+            return z.new_zeros((len(z), 1), dtype=torch.float64)
         wide, mixing = z.double(), self.mixing.double()
         of_layers = (mixing.mT @ wide.unflatten(1, (mixing.shape[1], -1))).flatten(1)
         parts = [of_layers @ part.flatten(1).double().mT for part in _chunks(self.pictures.layers)]
@@ -88,22 +181,11 @@ class Modes(NamedTuple):
         return torch.cat([squared_distances(z, self.own[:, None], abar), distances], dim=1)
 
     def weighted_sum(self, weights: Float[Tensor, "B K"]) -> Float[Tensor, "B d"]:
+        if self.pictures is None:
+            return weights * self.own
         layers = weighted_sum(weights[:, 1:], self.pictures.layers.flatten(1))
         found = self.mixing.to(layers) @ layers.unflatten(1, (self.mixing.shape[2], -1))
         return weights[:, :1] * self.own + found.flatten(1)
-
-
-def modes_of(
-    mixtures: list[Mixture],
-) -> tuple[Any, Optional[Float[Tensor, "B K"]]]:
-    """Return the modes of mixtures with the same pictures, and the logarithms of their priors."""
-    own = torch.stack([mixture.own for mixture in mixtures]).flatten(1)
-    pictures = mixtures[0].pictures
-    if pictures is None:
-        return ImageTensor(own[:, None]), None
-    mixing = torch.stack([mixture.mixing for mixture in mixtures])
-    log_prior = torch.stack([mixture.log_prior for mixture in mixtures])
-    return Modes(own, pictures, mixing), log_prior
 
 
 def mixture_of(
@@ -111,18 +193,19 @@ def mixture_of(
     members: Bool[Tensor, " K"],
     background: Float[Tensor, "bh bw 3"],
     bank: Bank,
-    guided: bool,
+    whole: bool,
 ) -> Mixture:
     """Return a mixture whose conditional modes are the camera's own view and the ``members`` of a
-    bank; if it is ``guided``, the whole bank is in its unconditional mixture.
+    bank.
 
     Args:
         background: what the bank is composited on: one colour (1, 1, 3) or pixels (H', W', 3).
+        whole: whether the unconditional mixture, the whole bank, is needed too.
     """
     if background.shape[:2] == (1, 1):
         pictures, mixing = bank.pictures, _mixing_of_color(bank.latent, background)
     else:
-        rows = torch.arange(len(members)) if guided else members.nonzero().flatten()
+        rows = torch.arange(len(members)) if whole else members.nonzero().flatten()
         members = members[rows]
         chunks = rows.to(bank.rgba.device).split(
             images_per_chunk(bank.rgba[0].numel(), rows.device)
@@ -134,18 +217,6 @@ def mixture_of(
     conditional = torch.cat([torch.ones(1, dtype=torch.bool), members])
     log_prior = torch.where(conditional, 0.0, -torch.inf).to(background.device)
     return Mixture(own, pictures, mixing, log_prior)
-
-
-def direction_indices(
-    elevation: Float[Tensor, " B"], azimuth: Float[Tensor, " B"]
-) -> Int[Tensor, " B"]:
-    """Classify views in degrees by threestudio's rules for view-dependent prompts: 0 side, 1 front,
-    2 back, 3 overhead.
-    """
-    indices = torch.zeros_like(azimuth, dtype=torch.long)
-    for index, direction in enumerate(view_directions()):
-        indices[direction.condition(elevation, azimuth, azimuth)] = index
-    return indices
 
 
 def _mixing_of_color(latent: LinearLatent, color: Float[Tensor, "1 1 3"]) -> Float[Tensor, "c l"]:

@@ -6,6 +6,7 @@ Options: those of ``guidance/text_to_image.py``."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -47,10 +48,10 @@ class StableDiffusionGuidance(TextToImageDistillation):
         self.vae = self.network(
             AutoencoderKL, folder, "vae", lambda vae: vae.to(self.device), dtype=self.vae_dtype
         )
-        self.require_inputs()
+        self.require_text_to_image(self.vae.config.latent_channels)
         factor = 2 ** (len(self.vae.config.block_out_channels) - 1)
         self.image_size = self.size_of_images(factor)
-        factor *= self.patch_size
+        factor *= self.denoiser.config.get("patch_size") or 1
         if self.image_size % factor:
             raise UserError(
                 f"system.guidance.image_size: expected a multiple of {factor}, got "
@@ -61,15 +62,6 @@ class StableDiffusionGuidance(TextToImageDistillation):
         """Return the number type of the VAE."""
         return self.dtype
 
-    def require_inputs(self) -> None:
-        """Raise UserError if the model needs inputs that this guidance doesn't have."""
-        self.require_text_to_image(self.vae.config.latent_channels)
-
-    @property
-    def patch_size(self) -> int:
-        """Height and width of the network's patches, latents."""
-        return 1
-
     def encode(self, rgb: Float[Tensor, "B 3 H W"], **batch: Any) -> Latents:
         """Draw latents from the VAE's posterior, scaled to unit variance, float32. The draw is a
         function of (seed, step, item).
@@ -77,8 +69,9 @@ class StableDiffusionGuidance(TextToImageDistillation):
         images = resized(rgb, self.image_size) * 2 - 1
         if self.vae_dtype == torch.float32:
             return self._encode(images)
-        loss_scale = PerItemLossScale(self._count_bad_backward)
-        return loss_scale.leave(self._encode(loss_scale.enter(images)))
+        advice = "set system.guidance.half_precision_weights=false"
+        count_bad = partial(self.count_bad, what="the VAE's gradient", advice=advice)
+        return with_loss_scales(self._encode, images, count_bad)
 
     def _encode(self, images: Float[Tensor, "B 3 s s"]) -> Latents:
         images = images.to(self.vae_dtype)
@@ -108,57 +101,47 @@ class StableDiffusionGuidance(TextToImageDistillation):
         images = torch.cat([self.vae.decode(latent).sample for latent in latents.split(1)]).float()
         return (images / 2 + 0.5).clamp(0, 1)
 
-    def _count_bad_backward(self, bad: Bool[Tensor, " B"]) -> None:
-        self.count_bad(
-            bad, "the VAE's gradient", "set system.guidance.half_precision_weights=false"
-        )
 
-
-class PerItemLossScale:
-    """A separate loss scale for each item, for one forward and backward pass of a half-precision
-    network, whose input is passed to ``enter`` and its output to ``leave``. In the backward pass
-    the gradient of each item is multiplied by a power of two where it enters the network, and
-    divided by it in float32 where it leaves.
+def with_loss_scales(
+    network: Callable[[Tensor], Tensor],
+    images: Float[Tensor, "B *d"],
+    on_result: Callable[[Bool[Tensor, " B"]], None],
+) -> Float[Tensor, "B *e"]:
+    """Return ``network(images)`` of a half-precision network with a separate loss scale for each
+    item: in the backward pass the gradient of each item is multiplied by a power of two where it
+    enters the network, and divided by it in float32 where it leaves.
 
     Args:
         on_result: called in the backward pass with a mask, (B,) bool, of items whose gradient isn't
             finite; those gradients are set to zero.
     """
+    scale = torch.ones(())
 
-    def __init__(self, on_result: Callable[[Bool[Tensor, " B"]], None]) -> None:
-        self.on_result = on_result
-        self.scale: Tensor = torch.ones(())
-
-    def enter(self, x: Float[Tensor, "B *d"]) -> Float[Tensor, "B *d"]:
-        if x.requires_grad:
-            x.register_hook(self._unscaled)
-        return x
-
-    def leave(self, y: Float[Tensor, "B *e"]) -> Float[Tensor, "B *e"]:
-        if y.requires_grad:
-            y.register_hook(self._scaled)
-        return y
-
-    def _scaled(self, grad: Float[Tensor, "B *e"]) -> Float[Tensor, "B *e"]:
+    def scaled(grad: Float[Tensor, "B *e"]) -> Float[Tensor, "B *e"]:
+        nonlocal scale
         peak = grad.abs().amax(dim=tuple(range(1, grad.dim())), keepdim=True)
-        self.scale = torch.where(peak > 0, PEAK / torch.exp2(peak.log2().floor()), 1.0)
-        return grad * self.scale
+        scale = torch.where(peak > 0, PEAK / torch.exp2(peak.log2().floor()), 1.0)
+        return grad * scale
 
-    def _unscaled(self, grad: Float[Tensor, "B *d"]) -> Float[Tensor, "B *d"]:
+    def unscaled(grad: Float[Tensor, "B *d"]) -> Float[Tensor, "B *d"]:
         bad = find_bad_items(grad)
-        self.on_result(bad)
-        scale = self.scale.reshape(-1, *[1] * (grad.dim() - 1))
-        return without_bad_items(grad, bad) / scale
+        on_result(bad)
+        return without_bad_items(grad, bad) / scale.reshape(-1, *[1] * (grad.dim() - 1))
+
+    if images.requires_grad:
+        images.register_hook(unscaled)
+    output = network(images)
+    if output.requires_grad:
+        output.register_hook(scaled)
+    return output
 
 
 @register("gaussiandreamer-stable-diffusion-xl-guidance")
 class StableDiffusionXLGuidance(StableDiffusionGuidance):
     """Its UNet is also conditioned on the pooled embedding of the prompt, and on the sizes in
     pixels of the training picture before cropping, of the cropped corner and of the result (Podell
-    et al. 2023, section 2.2): here the size that the model sees, (0, 0), and that size again.
-
-    The published VAE overflows in float16 (``force_upcast`` in its settings): with float16 weights
-    it stays in float32, unless it is one that was mended for half precision.
+    et al. 2023, section 2.2): here the size that the model sees, (0, 0), and that size again. A VAE
+    that overflows in float16 (``force_upcast`` in its settings) stays in float32.
     """
 
     @dataclass
@@ -167,6 +150,7 @@ class StableDiffusionXLGuidance(StableDiffusionGuidance):
 
     cfg: Config
     family = XL_FAMILY
+    INPUTS = ((None, "text_time"),)
 
     def vae_type(self, folder: Path) -> torch.dtype:
         from diffusers import AutoencoderKL
@@ -185,9 +169,6 @@ class StableDiffusionXLGuidance(StableDiffusionGuidance):
         self.pooled_width = (
             config.projection_class_embeddings_input_dim - SIZES * config.addition_time_embed_dim
         )
-
-    def require_inputs(self) -> None:
-        self.require_text_to_image(self.vae.config.latent_channels, ("text_time",))
 
     def run_network(
         self, z: Latents, t: Timesteps, embeddings: Embeddings, **inputs: Tensor

@@ -1,10 +1,9 @@
 """Guidance ``gaussiandreamer-stable-diffusion-3-guidance``: score distillation from a rectified
 flow, Stable Diffusion 3 or 3.5 (Esser et al. 2024).
 
-The transformer predicts the velocity v = eps - x of the path z = (1 - sigma) x + sigma eps. Here it
-is converted to a prediction of the noise of a diffusion with the same ratio of picture and noise
-(``diffusion/rectified_flow.py``), so that all options of score distillation apply, and all
-variants but VSD, whose LoRA is of a UNet.
+The transformer predicts the velocity v = eps - x of the path z = (1 - sigma) x + sigma eps, which
+is converted to the noise of a diffusion with the same ratio of picture and noise
+(``diffusion/rectified_flow.py``): all options and all variants but VSD apply.
 With ``weighting_strategy: rectified_flow`` the gradient is that of RFDS (Yang et al. 2024,
 "Text-to-image rectified flow as plug-and-play priors", arXiv 2406.03293, the baseline loss),
 
@@ -55,10 +54,6 @@ class StableDiffusion3Guidance(StableDiffusionGuidance):
     def denoiser(self) -> Any:
         return self.transformer
 
-    @property
-    def patch_size(self) -> int:
-        return self.transformer.config.patch_size
-
     def set_schedule(self, folder: Path) -> None:
         """Read the shift and the number of the timesteps of the model's training."""
         from diffusers import FlowMatchEulerDiscreteScheduler
@@ -84,7 +79,8 @@ class StableDiffusion3Guidance(StableDiffusionGuidance):
 
     def size_of_images(self, factor: int = 1) -> int:
         size = super().size_of_images(factor)
-        largest = self.transformer.config.pos_embed_max_size * self.patch_size * factor
+        config = self.transformer.config
+        largest = config.pos_embed_max_size * config.patch_size * factor
         if size > largest:
             raise UserError(
                 f"system.guidance.image_size: {self.cfg.pretrained_model_name_or_path} knows "

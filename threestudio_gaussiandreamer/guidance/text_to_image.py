@@ -31,10 +31,9 @@ enable_vae_slicing                  let the VAE, where there is one, encode one 
 ==================================  ================================================================
 
 View contrast is eps_c' = eps_c + view_contrast (eps_c - eps_o), where o is the prompt of the view
-from the other side of the object. It is the negation of a concept as in composable diffusion (Liu
-et al. 2022, arXiv:2206.01714); Perp-Neg (Armandpour et al. 2023) takes away only what is
-perpendicular to eps_c - eps_u. Each view at or above the share ``CONTRAST_FROM`` of the timesteps,
-which decide the view, costs one more evaluation. Outside of ``guidance_interval`` there is none.
+from the other side of the object: the negation of a concept as in composable diffusion (Liu et al.
+2022, arXiv:2206.01714). It costs one more evaluation of each view at or above the share
+``CONTRAST_FROM`` of the timesteps, which decide the view; outside of ``guidance_interval`` none.
 
 A UNet with ``time_cond_proj_dim`` takes the guidance scale as an input (Meng et al. 2023,
 arXiv:2210.03142), such as that of a latent consistency model (Luo et al. 2023, arXiv:2310.04378),
@@ -43,7 +42,6 @@ and predicts the noise with guidance in one evaluation.
 
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field
-from functools import lru_cache
 from pathlib import Path
 from typing import Any, ClassVar, Optional
 
@@ -66,32 +64,22 @@ from .types import Condition, Embeddings, Latents, Timesteps, view_of_row
 from .variants.vsd import LoRAParticles
 
 USUAL_SCALES = (0, 200)
-"""Guidance scales beyond these are worth a warning: above twice the paper's results saturate, and
-those below 0 lead away from the prompt.
-"""
+"""Guidance scales beyond these are worth a warning: results saturate, or leave the prompt."""
 TERMINAL_ABAR = 2.0**-24
-"""Replaces an ``abar`` of exactly 0, which schedules with zero terminal SNR have at the last step,
-since ``predict_x0`` divides by its square root.
-"""
+"""Replaces an abar of 0, of schedules with zero terminal SNR: its root is divided by."""
 CONTRAST_FROM = 0.4
 """Smallest timestep, as a share of all, at which view contrast is applied."""
 TAKEN_SCALES = (1, 20)
 """Those that a network which takes the scale may know; latent consistency models' are 3 to 15."""
 SCALE_UNIT = 1000.0
 """Factor of the scale in its embedding."""
-ENLARGED = 4
-"""Renders that are enlarged by a larger factor are worth a warning."""
 NOT_ADAPTABLE = ("enable_torch_compile", "enable_sequential_cpu_offload")
 """Options that replace the UNet's forward pass, where ``vsd-variant`` trains a LoRA."""
-
-
 HALF_TYPES = {"float16": torch.float16, "bfloat16": torch.bfloat16}
 
 
 def weights_type(cfg: Any, device: torch.device) -> torch.dtype:
-    """Return the number type of a network's weights: on a GPU ``half_precision_type``; on a CPU
-    bfloat16, if ``half_precision_on_cpu`` is set and the CPU multiplies it; else float32.
-    """
+    """Return the number type of a network's weights, float32 unless half precision is chosen."""
     if not cfg.half_precision_weights:
         return torch.float32
     if device.type == "cuda":
@@ -101,17 +89,13 @@ def weights_type(cfg: Any, device: torch.device) -> torch.dtype:
 
 
 def cpu_multiplies_bfloat16() -> bool:
-    """Return whether the CPU has instructions that multiply bfloat16 (AVX-512 BF16, AMX). Others
-    convert each number, which takes more time than float32.
-    """
+    """Return whether the CPU multiplies bfloat16; others, which convert it, are slower with it."""
     has = getattr(torch.cpu, "get_capabilities", dict)()  # older torch doesn't report any
     return any(has.get(name, False) for name in ("avx512_bf16", "amx_bf16"))
 
 
 class TextToImageDistillation(ScoreDistillation):
-    """Score distillation from a network that is conditioned on text embeddings. Subclasses define
-    how images are encoded.
-    """
+    """Score distillation from a network that is conditioned on text embeddings."""
 
     @dataclass
     class Config(ScoreDistillation.Config):
@@ -149,11 +133,12 @@ class TextToImageDistillation(ScoreDistillation):
     components: ClassVar[tuple[str, ...]] = ("unet", "scheduler")
     family: ClassVar[Family] = FAMILY
     """The models that this guidance takes."""
+    INPUTS: ClassVar[tuple[tuple, ...]] = ((None, None), (None, "text"))
+    """Kinds of embeddings beside the tokens that the network may have: of classes, and of more."""
     scale_width: Optional[int] = None
     """Width of the guidance scale's embedding; None if the network doesn't take the scale."""
     # guidance_interval also limits view contrast and Perp-Neg, which need no scale
     UNGUIDED_IGNORES = ("recon_std_rescale",)
-    PARTICLES_IGNORE = ()
 
     # Loading
     # ----------------------------------------------------------------------------------------------
@@ -185,27 +170,21 @@ class TextToImageDistillation(ScoreDistillation):
             warn(
                 f"system.guidance.guidance_scale={self.cfg.guidance_scale:g}: expected {low} to "
                 f"{high} (1: none) for {self.cfg.pretrained_model_name_or_path}"
-                + ("" if self.scale_width is None else ", which takes the scale as an input")
             )
 
     def set_schedule(self, folder: Path) -> None:
-        """Read the noise schedule of the model's training, float64, and the prediction type of its
-        UNet.
-        """
+        """Read the noise schedule of the model's training and the prediction type of its UNet."""
         from diffusers import DDPMScheduler
 
         scheduler = load_settings(DDPMScheduler, folder, "scheduler")
         settings = DDPMScheduler.load_config(folder, subfolder="scheduler")
         if not settings.keys() & {"beta_schedule", "trained_betas"}:
-            raise UserError(
-                f"{self.cfg.pretrained_model_name_or_path} has no known noise schedule: "
-                "its scheduler has no beta_schedule"
-            )
+            name = self.cfg.pretrained_model_name_or_path
+            raise UserError(f"the scheduler of {name} has no beta_schedule")
         self.prediction_type = scheduler.config.prediction_type
         if self.prediction_type not in PREDICTIONS:
-            raise unknown(
-                "prediction_type of the model's scheduler", self.prediction_type, PREDICTIONS
-            )
+            what = "prediction_type of the model's scheduler"
+            raise unknown(what, self.prediction_type, PREDICTIONS)
         self.set_alphas_cumprod(torch.cumprod(1 - scheduler.betas.double(), dim=0))
 
     def set_alphas_cumprod(self, abar: Float[Tensor, " T"]) -> None:
@@ -232,8 +211,8 @@ class TextToImageDistillation(ScoreDistillation):
         self.text_width = self.unet.config.encoder_hid_dim or self.unet.config.cross_attention_dim
 
     def size_of_images(self, factor: int = 1) -> int:
-        """Return height and width of the images for the model, pixels: ``image_size``, or
-        ``factor`` times the latent size that the model was trained with. Warn if they differ.
+        """Return the height and width of images: ``image_size``, or ``factor`` times the latent
+        size of the model's training. Warn if they differ.
         """
         cfg, trained = self.cfg, self.denoiser.config.sample_size
         size = trained * factor if isinstance(trained, int) else None
@@ -249,18 +228,16 @@ class TextToImageDistillation(ScoreDistillation):
             )
         return cfg.image_size or size
 
-    def require_text_to_image(
-        self, channels: int, embedding_types: tuple[Optional[str], ...] = (None, "text")
-    ) -> None:
-        """Raise UserError if the network has other inputs than an image and such embeddings."""
-        wanted = {"in_channels": (channels,), "class_embed_type": (None,)}
-        wanted["addition_embed_type"] = embedding_types
-        given = {name: self.denoiser.config.get(name) for name in wanted}
-        if other := [f"{name} {given[name]}" for name in wanted if given[name] not in wanted[name]]:
+    def require_text_to_image(self, channels: int) -> None:
+        """Raise UserError if the network has other inputs than latents and a text."""
+        names = ("in_channels", "class_embed_type", "addition_embed_type")
+        given = tuple(self.denoiser.config.get(name) for name in names)
+        if given not in [(channels, *kinds) for kinds in self.INPUTS]:
+            said = ", ".join(f"{name} {value}" for name, value in zip(names, given, strict=True))
             raise UserError(
-                f"{self.cfg.pretrained_model_name_or_path} needs other inputs than text "
-                f"({', '.join(other)}), like models for inpainting, depth or upscaling: use a "
-                "model that makes images from text alone"
+                f"{self.cfg.pretrained_model_name_or_path} needs other inputs than text ({said}), "
+                "like models for inpainting, depth or upscaling: use a model that makes images "
+                "from text alone"
             )
 
     def network(
@@ -279,7 +256,7 @@ class TextToImageDistillation(ScoreDistillation):
         Args:
             prepare: moves it to its device and applies options of this part.
             dtype: number type, in place of this part's.
-            read: reads it from the folder, with the arguments of :func:`.model_files.load_network`.
+            read: has the arguments of :func:`.model_files.load_network`.
             key: what ``prepare`` depends on, beside the options that begin with ``enable_``.
         """
         dtype = dtype or self.dtype
@@ -353,18 +330,18 @@ class TextToImageDistillation(ScoreDistillation):
         return condition.select(rows)
 
     def conditional(self, z: Latents, t: Timesteps, condition: Condition) -> Latents:
-        return self.noise(z, t, condition.embeddings[: len(z)])
+        return self.predict_rows(z, t, condition.embeddings[: len(z)])
 
     def unconditional(self, z: Latents, t: Timesteps, condition: Condition) -> Latents:
-        return self.noise(z, t, condition.embeddings[len(z) : 2 * len(z)])
+        return self.predict_rows(z, t, condition.embeddings[len(z) : 2 * len(z)])
 
     def empty_prompt(self, z: Latents, t: Timesteps, condition: Condition) -> Optional[Latents]:
         if condition.empty is None:
             return None
-        return self.noise(z, t, condition.empty.expand(len(z), -1, -1))
+        return self.predict_rows(z, t, condition.empty.expand(len(z), -1, -1))
 
     def particle_model(self, options: Any) -> LoRAParticles:
-        return LoRAParticles(self, options)
+        return LoRAParticles(self.unet, options.rank, options.lr)
 
     @classmethod
     def check_particle_model(cls, cfg: Any) -> None:
@@ -375,23 +352,23 @@ class TextToImageDistillation(ScoreDistillation):
                 f"the plain UNet: set {found[0]}=false"
             )
 
-    def at_scale(
-        self, z: Latents, t: Timesteps, condition: Condition, scale: float
-    ) -> Optional[Latents]:
-        """See the base class; Perp-Neg and scales below 1 need the unconditional prediction."""
-        if condition.negative_weights is not None:
-            return super().at_scale(z, t, condition, scale)
-        if scale != 1 and (self.scale_width is None or scale < 1):
-            return None
-        eps = self.noise(z, t, condition.embeddings[: len(z)], scale)
+    def guided_noise(
+        self, z: Latents, t: Timesteps, condition: Condition, scale: float, *, rescale: float = 0.0
+    ) -> Latents:
+        """See the base class; one evaluation per view where that is all that is needed."""
+        takes_scale = self.scale_width is not None and scale > 1 and not rescale
+        if condition.negative_weights is not None or not (takes_scale or scale == 1):
+            return super().guided_noise(z, t, condition, scale, rescale=rescale)
+        eps = self.predict_rows(z, t, condition.embeddings[: len(z)], scale)
         return self._contrasted(eps, z, t, condition, scale)
 
     def predict(
         self, z: Latents, t: Timesteps, condition: Condition
     ) -> tuple[Latents, Optional[Latents]]:
         batch, perp = len(z), condition.negative_weights
-        rows = len(condition.embeddings) if self.guided or perp is not None else batch
-        eps = self.noise(z, t, condition.embeddings[:rows])
+        everything = self.needs_unconditional or perp is not None
+        rows = len(condition.embeddings) if everything else batch
+        eps = self.predict_rows(z, t, condition.embeddings[:rows])
         cond, uncond = eps[:batch], eps[batch : 2 * batch] if rows > batch else None
         if perp is None:
             return self._contrasted(cond, z, t, condition), uncond
@@ -400,20 +377,18 @@ class TextToImageDistillation(ScoreDistillation):
     def _contrasted(
         self, eps: Latents, z: Latents, t: Timesteps, condition: Condition, scale: float = 1.0
     ) -> Latents:
-        """Return the conditional predictions ``eps`` with view contrast, if the condition has it.
-
-        Args:
-            scale: of guidance in ``eps``, if the network takes it as an input.
+        """Return the conditional predictions ``eps``, which have guidance of this scale, with view
+        contrast, if the condition has it.
         """
         if condition.opposite is None:
             return eps
         rows = (t >= CONTRAST_FROM * len(self.alphas_cumprod)).nonzero()[:, 0]
         if not len(rows):
             return eps
-        other = self.noise(z[rows], t[rows], condition.opposite[rows], scale)
+        other = self.predict_rows(z[rows], t[rows], condition.opposite[rows], scale)
         return eps.index_add(0, rows, eps[rows] - other, alpha=self.cfg.view_contrast)
 
-    def noise(
+    def predict_rows(
         self, z: Latents, t: Timesteps, embeddings: Embeddings, scale: float = 1.0
     ) -> Float[Tensor, "kB c h w"]:
         """Predict the noise, float32, for each row of ``embeddings`` and the latent of its view, in
@@ -432,9 +407,7 @@ class TextToImageDistillation(ScoreDistillation):
     def run_network(
         self, z: Latents, t: Timesteps, embeddings: Embeddings, **inputs: Tensor
     ) -> Latents:
-        """Return the output of the network, of the model's prediction type, for as many rows of
-        ``embeddings`` as of latents.
-        """
+        """Return the output of the network, for as many rows of embeddings as of latents."""
         tokens = embeddings.to(self.dtype)
         return self.unet(z.to(self.dtype), t, encoder_hidden_states=tokens, **inputs).sample
 
@@ -453,21 +426,9 @@ def resized(images: Float[Tensor, "B 3 H W"], size: int) -> Float[Tensor, "B 3 s
     """Resize images to the model's size, with antialiasing if they shrink by more than a factor of
     2, since bilinear sampling would skip pixels.
     """
-    height, width = images.shape[-2:]
-    if (height, width) == (size, size):
+    if images.shape[-2:] == (size, size):
         return images
-    _warn_of_small_renders(height, width, size)
-    antialias = max(height, width) > 2 * size
+    antialias = max(images.shape[-2:]) > 2 * size
     return F.interpolate(
         images, (size, size), mode="bilinear", align_corners=False, antialias=antialias
     )
-
-
-@lru_cache
-def _warn_of_small_renders(height: int, width: int, size: int) -> None:
-    """Warn, once per process, of renders that the model gets blurred."""
-    if min(height, width) * ENLARGED < size:
-        warn(
-            f"renders of {width} x {height} are enlarged to the {size} x {size} of the model, "
-            "which sees them blurred: give a larger data.width and data.height"
-        )

@@ -15,9 +15,7 @@ Timesteps = Int[Tensor, " B"]
 Good = Bool[Tensor, " B"]
 """Items whose residual is finite."""
 Residual = tuple[Latents, Float[Tensor, " B"]]
-"""A residual e of the latents, and abar of each item, float64, of which the weight w(t) of e is a
-function.
-"""
+"""A residual e of the latents, and abar of each item, float64, which gives e its weight."""
 State = dict[str, Tensor]
 Embeddings = Float[Tensor, "kB N F"]
 """Of a text-to-image network, a row for each row of a :class:`Condition`."""
@@ -34,20 +32,16 @@ class Noised(NamedTuple):
 
 
 class Condition(NamedTuple):
-    """The text embeddings of B views, k rows per view. What else a model is conditioned on is in
-    further tokens of each row (``models/text_encoders.py``).
+    """The text embeddings of B views, k rows per view, with what else a model is conditioned on in
+    further tokens (:func:`.text_encoders.pack`).
     """
 
     embeddings: Embeddings
-    """Prompts of all views, negative prompts of all views, and with Perp-Neg two further rows for
-    each view, adjacent.
-    """
+    """Prompts of all views, their negative prompts, and with Perp-Neg two rows of each view."""
     negative_weights: Optional[Float[Tensor, "B 2"]]
     """The weights of the two Perp-Neg rows, <= 0; None without Perp-Neg."""
     empty: Optional[Float[Tensor, "_ N F"]] = None
-    """The embedding of an empty prompt, if the variant needs it and the prompts have it; B rows if
-    it depends on the view.
-    """
+    """Of an empty prompt, if the variant needs it; B rows if it depends on the view."""
     opposite: Optional[Float[Tensor, "B N F"]] = None
     """The prompts of the opposite views; None without view contrast."""
 
@@ -70,13 +64,23 @@ def view_of_row(views: int, rows: int, device: torch.device | str = "cpu") -> In
 
 
 def items_of(batch: Batch, size: int, index: Any) -> Batch:
-    """Select items of a batch of ``size`` items; ``index`` is anything that indexes a tensor's
-    first dimension.
-    """
+    """Select items of a batch of ``size`` items by what indexes a tensor's first dimension."""
     return {
         k: v[index] if isinstance(v, Tensor) and v.dim() and len(v) == size else v
         for k, v in batch.items()
     }
+
+
+def require_pair(what: str, found: Any, accepted: list[tuple], expected: str) -> Any:
+    """Return what a method returned; raise UserError unless it is a pair of one of the ``accepted``
+    pairs of shapes, with "NoneType" for None: others might be broadcast.
+    """
+    entries = found if isinstance(found, (tuple, list)) else (found,)
+    shapes = tuple(tuple(x.shape) if isinstance(x, Tensor) else type(x).__name__ for x in entries)
+    if entries is not found or shapes not in accepted:
+        said = " and ".join(map(str, shapes))
+        raise UserError(f"{what} returned {said}; expected {expected}")
+    return found
 
 
 def require_resumable(state: State, names: set[str]) -> None:

@@ -1,9 +1,7 @@
 """The models that the package contains: the name ``toybox``, wherever a model is named.
 
-The folder of any training's export (``toybox/export.py``) can be named in its place. Of either, the
-option for a diffusion model takes the sub-folder ``stable-diffusion``, that for a CLIP takes
-``clip``, and that for Point-E's weights takes ``points.safetensors``. Digests of the files detect
-damage before anything is loaded.
+The folder of a training's export (``toybox/export.py``) can be named in its place. Of either, each
+option takes its part. Digests of the files detect damage before anything is loaded.
 """
 
 import contextlib
@@ -19,9 +17,7 @@ from ..core.files import atomic_file
 NAME = "toybox"
 FOLDER = Path(__file__).parents[1] / "assets" / NAME
 RECORD, DIGESTS = "training.json", "SHA256SUMS"
-"""The export's record of its training, which marks such a folder, and the digests of its other
-files in the format of ``sha256sum``.
-"""
+"""The record of the training, which marks an export, and its digests as of ``sha256sum``."""
 LINE = re.compile(rb"([0-9a-f]{64})  (.+)")
 DIFFUSION, CLIP = "stable-diffusion", "clip"
 POINTS, JUDGE = "points.safetensors", "judge.safetensors"
@@ -37,14 +33,9 @@ EXPORT_AGAIN = (
 
 
 def model_part(name: str, part: str) -> str:
-    """Return the path of one of the bundled models if ``name`` is their name, or that of one in the
-    folder of an export; return any other ``name`` unchanged.
-
-    Args:
-        part: DIFFUSION, CLIP, POINTS or JUDGE.
-
-    Raises:
-        UserError: a file is missing or damaged; the message says how to get it again.
+    """Return the path of a part, DIFFUSION, CLIP, POINTS or JUDGE, of the bundled models or of an
+    export if ``name`` is theirs, and any other ``name`` unchanged. Raise UserError if a file is
+    missing or damaged.
     """
     if name == NAME:
         require_intact(FOLDER, part)
@@ -67,10 +58,8 @@ def is_export(folder: Path) -> bool:
 
 @functools.lru_cache
 def require_intact(folder: Path, part: str) -> None:
-    """Compare the files of a part with their digests, once per process.
-
-    Raises:
-        UserError: one is missing or differs; or the part isn't in the list of digests.
+    """Compare the files of a part with their digests, once per process; raise UserError if one is
+    missing or differs, or the part isn't in the list of digests.
     """
     digests = read_digests(folder)
     names = [name for name in digests if name.partition("/")[0] == part]
@@ -84,11 +73,7 @@ def require_intact(folder: Path, part: str) -> None:
 
 
 def read_digests(folder: Path) -> dict[str, str]:
-    """Return the SHA-256 of each file by its path below ``folder``; empty without a list.
-
-    Raises:
-        UserError: the list is damaged.
-    """
+    """Return the SHA-256 of each file by its path below ``folder``; empty without a list."""
     path = folder / DIGESTS
     try:
         found = [LINE.fullmatch(line) for line in path.read_bytes().splitlines()]

@@ -5,7 +5,7 @@ similarity of pictures and texts.
 ViT-L/14 (``openai/clip-vit-large-patch14``); similarities can be computed with any CLIP.
 """
 
-from collections.abc import Collection
+from functools import partial
 from pathlib import Path
 from typing import Any, Optional
 
@@ -20,25 +20,16 @@ from .hub import Source, locate
 from .model_files import free_memory, load_network, load_settings, needed_files
 
 MEAN, STD = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
-"""Mean and standard deviation of CLIP's training pictures per channel, used by all of OpenAI's and
-OpenCLIP's models.
-"""
+"""Mean and standard deviation of CLIP's training pictures per channel."""
 
 
 def clip_source(
     model: str, *, option: str = "system.geometry.prior.clip", allow_bin: Optional[bool] = None
 ) -> Source:
-    """Describe a CLIP with both encoders and its tokenizer, in a folder or on the hub.
-
-    Args:
-        model: the folder or hub id.
-        option: the option that ``model`` is the value of, for messages.
-        allow_bin: see :func:`.model_files.component_weights`.
+    """Describe a CLIP with both encoders and its tokenizer, the value of ``option``: a folder or a
+    hub id. For ``allow_bin`` see :func:`.model_files.component_weights`.
     """
-
-    def picks(names: Collection[str]) -> list[str]:
-        return needed_files(names, [""], allow_bin=allow_bin)
-
+    picks = partial(needed_files, components=[""], allow_bin=allow_bin)
     return Source(model_part(model, CLIP), picks, option)
 
 
@@ -58,20 +49,14 @@ def load_tokenizer(folder: Path, component: str = "") -> Any:
 
 
 def token_ids(tokenizer: Any, text: str) -> Tensor:
-    """Return token ids (1, L), truncated to the model's length.
-
-    They aren't padded: CLIP's attention is causal, so padding would not change the features.
-    """
+    """Return token ids (1, L), truncated to the model's length, not padded: attention is causal."""
     length = min(tokenizer.model_max_length, 77)
     return tokenizer(text, truncation=True, max_length=length, return_tensors="pt").input_ids
 
 
 @torch.no_grad()
 def text_condition(tokenizer: Any, encoder: Any, text: str) -> Float[Tensor, "1 D"]:
-    """Return the text's features, scaled to length sqrt(D), so that their variance is about 1.
-
-    Point-E and Shap-E take zeros in their place for the unconditional prediction.
-    """
+    """Return the text's features, scaled to length sqrt(D)."""
     features = encoder(token_ids(tokenizer, text).to(encoder.device)).text_embeds.float()
     return features / features.norm(dim=-1, keepdim=True) * features.shape[-1] ** 0.5
 
@@ -104,9 +89,7 @@ class PictureText:
 def picture_similarities(
     source: Source, pictures: Float[np.ndarray, "N H W 3"], text: str, *, device: torch.device
 ) -> Float[np.ndarray, "N"]:
-    """Return the cosine similarity of each picture (values in [0, 1]) and ``text``; the model is
-    loaded for this call and freed.
-    """
+    """Return what :meth:`PictureText.similarities` does; the model is loaded and freed."""
     scores = PictureText(source, device).similarities(pictures, text)
     free_memory()
     return scores
@@ -119,9 +102,7 @@ def _unit_features(output: Any) -> Tensor:
 
 
 def preprocessed(pictures: Float[np.ndarray, "N H W 3"], size: int) -> Float[Tensor, "N 3 S S"]:
-    """Resize pictures (values in [0, 1]) bicubically, and normalise them as CLIP's training
-    pictures.
-    """
+    """Resize pictures in [0, 1] bicubically, and normalise them as CLIP's training pictures."""
     pixels = torch.from_numpy(np.ascontiguousarray(pictures, np.float32)).permute(0, 3, 1, 2)
     if pixels.shape[-2:] != (size, size):
         smooth = {"mode": "bicubic", "antialias": True}

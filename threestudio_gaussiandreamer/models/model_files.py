@@ -1,10 +1,9 @@
 """Select the needed files of a model in diffusers' or transformers' format, load them, and keep
 networks for processes with several runs.
 
-A model of several components has a sub-folder for each (``unet``, ``vae``, ``text_encoder``, ...).
-The files of a single network lie in the model's folder itself; its component is named "". Weights
-are read from safetensors, since a pickle could run code; if a caller allows ``.bin`` files, they
-are read with ``weights_only``."""
+A model of several components has a sub-folder for each (``unet``, ``vae``, ``text_encoder``, ...);
+the component of a single network is "". Weights are read from safetensors, since a pickle could run
+code; if a caller allows ``.bin`` files, they are read with ``weights_only``."""
 
 import gc
 import hashlib
@@ -70,15 +69,12 @@ def needed_files(
             continue
         has_tokenizer = component in WITHOUT_WEIGHTS.keys() - {"scheduler"} or not component
         if has_tokenizer and not any(vocabulary <= set(own) for vocabulary in VOCABULARIES):
-            problems.append(
-                f"the tokenizer's {prefix}tokenizer.json, or {prefix}vocab.json and "
-                f"{prefix}merges.txt, are missing"
-            )
+            other = f"{prefix}vocab.json and {prefix}merges.txt"
+            problems.append(f"the tokenizer's {prefix}tokenizer.json, or {other}, are missing")
         needed += [prefix + name for name in own if name.endswith((".json", ".txt", ".model"))]
         if component not in WITHOUT_WEIGHTS:
             try:
-                found = component_weights(names, component, half=half, allow_bin=allow_bin)
-                needed += found.files
+                needed += component_weights(names, component, half=half, allow_bin=allow_bin).files
             except UserError as error:
                 problems.append(str(error))
     if problems:
@@ -89,21 +85,16 @@ def needed_files(
 def component_weights(
     names: Collection[str], component: str, *, half: bool = False, allow_bin: Optional[bool] = None
 ) -> Weights:
-    """Select the weight files of one component: in the preferred precision if that set is complete,
-    else in the other one.
+    """Select the weight files of one component: in half precision if that is preferred and the set
+    is complete, else in the other one. Raise UserError if there is no complete set.
 
     Args:
-        half: prefer half precision.
         allow_bin: accept ``.bin`` files if there is no safetensors. None is False for callers
-            without such an option: messages don't suggest to set it.
-
-    Raises:
-        UserError: there is no complete set of files that may be read.
+            without such an option, which messages don't suggest.
     """
     prefix, own = _own(names, component)
     for variant in (*HALF_VARIANTS, None) if half else (None, *HALF_VARIANTS):
-        files = _complete_set(own, variant)
-        if files:
+        if files := _complete_set(own, variant):
             return Weights([prefix + name for name in files], variant, True)
     pickled = [prefix + name for name in own if name in PICKLED]
     if allow_bin and pickled:
@@ -121,9 +112,7 @@ def component_weights(
 
 
 def _own(names: Collection[str], component: str) -> tuple[str, list[str]]:
-    """Return the prefix of a component's files ("unet/"), and the names of the files directly in
-    its folder, without the prefix.
-    """
+    """Return the prefix "unet/" of a component's files, and their names without it."""
     prefix = f"{component}/" if component else ""
     own = [name.removeprefix(prefix) for name in names if name.startswith(prefix)]
     return prefix, [name for name in own if "/" not in name]
@@ -147,9 +136,8 @@ def pipeline_settings(folder: Path) -> dict[str, Any]:
 
 
 def fingerprint(folder: Path, components: Iterable[str]) -> str:
-    """Return a digest of the content of these components, independent of the folder's name. Of
-    files above 1 MiB the size and about sixteen samples of 64 KiB are read: that distinguishes
-    differently trained weights, but may not notice a single changed byte.
+    """Return a digest of the content of these components: of files above 1 MiB of their size and
+    sixteen samples, which distinguish differently trained weights.
     """
     digest = hashlib.sha256()
     for component in sorted(components):
@@ -166,29 +154,22 @@ def fingerprint(folder: Path, components: Iterable[str]) -> str:
 def load_network(
     loader: Any, folder: Path, component: str = "", *, half=False, allow_bin=None, **options: Any
 ) -> Any:
-    """Load a network with ``from_pretrained`` of diffusers or transformers from local files.
+    """Return a network on the CPU, in evaluation mode, loaded with ``from_pretrained`` of diffusers
+    or transformers from local files. Raise UserError if these are damaged or lack weights.
 
     Args:
         half, allow_bin: see :func:`component_weights`.
         options: further arguments of ``from_pretrained``, such as ``dtype``.
-
-    Returns:
-        the network on the CPU, in evaluation mode.
-
-    Raises:
-        UserError: its files are damaged, lack weights, or are not what the libraries expect.
     """
     from transformers.utils import logging
 
     weights = component_weights(files_below(folder), component, half=half, allow_bin=allow_bin)
     options |= {"use_safetensors": weights.safe, "variant": weights.variant}
-    level = logging.get_verbosity()
+    options["output_loading_info"], level = True, logging.get_verbosity()
     # no report of weights that the network doesn't have, as those of CLIP's other encoder
     logging.set_verbosity_error()
     try:
-        network, report = load_settings(
-            loader, folder, component, output_loading_info=True, **options
-        )
+        network, report = load_settings(loader, folder, component, **options)
     finally:
         logging.set_verbosity(level)
     # if weights are missing, both libraries only warn and initialise them at random
@@ -202,7 +183,7 @@ def load_network(
 
 def load_settings(loader: Any, folder: Path, component: str = "", **options: Any) -> Any:
     """Load a tokenizer or a scheduler with ``from_pretrained`` from local files; raise UserError if
-    they are damaged or not what the libraries expect.
+    the libraries can't.
     """
     options |= {"subfolder": component, "local_files_only": True}
     with loading_errors(f"{component or loader.__name__} of the model in {str(folder)!r}"):
@@ -233,9 +214,7 @@ _keeps = False
 
 
 def keep_loaded(keep: bool = True) -> None:
-    """Keep networks from now on, for processes with several runs; with ``keep=False`` drop those
-    that were kept. Otherwise each run loads its networks and drops them at its end.
-    """
+    """Keep networks from now on, for processes with several runs, or drop those that were kept."""
     global _keeps
     _keeps = keep
     _counts.clear()
@@ -244,12 +223,11 @@ def keep_loaded(keep: bool = True) -> None:
 
 
 def loaded(key: tuple[Hashable, ...], load: Callable[[], Any]) -> Any:
-    """Return ``load()``, or what it returned for the same key earlier. Changes of a network (its
-    device, compilation) must happen inside ``load``.
+    """Return ``load()``, or what it returned for the same key earlier, if networks are kept.
 
     Args:
-        key: the network's name for :func:`load_counts`, then all that ``load`` depends on: folder,
-            component, number type, device and options.
+        key: the network's name for :func:`load_counts`, then all that ``load`` depends on, which
+            also changes the network: folder, number type, device and options.
     """
     if key in _kept:
         return _kept[key]

@@ -3,14 +3,11 @@ three encoders for Stable Diffusion XL and 3. An encoder is loaded for one call 
 which are small, are kept where ``model_files.py`` keeps networks.
 
 As in diffusers' pipelines, texts are padded to the model's length, and longer ones truncated with a
-warning; CLIP's tokens for Stable Diffusion XL and 3 are the states before its last layer. The
-result is float32 on the CPU, without gradients. The pooled embedding of Stable Diffusion XL and 3
-is a last token that is padded with zeros (:func:`pack`)."""
+warning. The result is float32 on the CPU, without gradients. The pooled embedding of Stable
+Diffusion XL and 3 is a last token (:func:`pack`)."""
 
-import contextlib
 import hashlib
 import json
-import os
 import textwrap
 from collections.abc import Callable
 from functools import partial
@@ -22,7 +19,6 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from ..core.errors import UserError
 from ..core.extras import require_extra
 from ..core.files import atomic_file, output_folder
 from ..host import debug, get_device, warn
@@ -36,9 +32,7 @@ T5_LENGTH = 256
 """Number of tokens that Stable Diffusion 3's pipeline takes from T5."""
 T5_WIDTH = 4096
 CACHE_FORMAT = 1
-"""Version of the cache's content, part of the key: increase it when an encoder's output for the
-same model and text changes.
-"""
+"""Part of the cache's key: increase it when the output for the same model and text changes."""
 
 
 def encode_clip(folder: Path, texts: list[str]) -> list[Float[Tensor, "N F"]]:
@@ -90,11 +84,8 @@ def encode_sd3(
     folder: Path, texts: list[str], *, use_t5: bool = True
 ) -> list[Float[Tensor, "N F"]]:
     """Return the embeddings of Stable Diffusion 3, one (334, 4096) per text: the tokens of both
-    CLIP encoders side by side, padded to T5's width, then T5's; and their pooled embeddings.
-
-    Args:
-        use_t5: if false, zeros take the place of T5's tokens, as in diffusers' pipeline without its
-            third encoder.
+    CLIP encoders side by side, padded to T5's width, then T5's, or zeros, as in diffusers' pipeline
+    without its third encoder; and their pooled embeddings.
     """
     from transformers import CLIPTextModelWithProjection
 
@@ -115,8 +106,8 @@ def encode_sd3(
 def _clip(
     folder: Path, suffix: str, texts: list[str], encoder_class: Any
 ) -> tuple[Float[Tensor, "T N F"], Float[Tensor, "T P"]]:
-    """Return tokens and pooled embeddings of one CLIP encoder, one text at a time, so that the
-    result doesn't depend on the other texts.
+    """Return the states before the last layer and the pooled embeddings of one CLIP encoder, one
+    text at a time, so that the result doesn't depend on the other texts.
     """
     ids = clip_tokens(folder, texts, suffix).input_ids
 
@@ -153,14 +144,8 @@ def with_encoder(
 def t5_states(
     folder: Path, texts: list[str], *, suffix: str = "", length: int, uses_mask: bool = True
 ) -> Float[Tensor, "T N F"]:
-    """Return the last hidden states of the T5 encoder that is the component "text_encoder" and
-    ``suffix``.
-
-    On a GPU the encoder runs in half precision and takes about 11 GB; float32 takes 19 GB.
-
-    Args:
-        length: number of tokens.
-        uses_mask: hide the padding, as the model was trained.
+    """Return the last hidden states of a T5 encoder, of ``length`` tokens; on a GPU in half
+    precision, which takes 11 of 19 GB. ``uses_mask``: hide the padding, as the model was trained.
     """
     # without these modules transformers chooses another tokenizer class
     require_extra("diffusion", "sentencepiece", "google.protobuf")
@@ -178,9 +163,7 @@ def t5_states(
 
 
 def _one_by_one(encoder: Any, tokens: Any, *, uses_mask: bool) -> Float[Tensor, "T N F"]:
-    """Encode each text by itself: in a batch its last bits would depend on the other texts, so on
-    which ones are in the cache already.
-    """
+    """Encode each text by itself: in a batch its last bits would depend on the other texts."""
     found = []
     for ids, mask in zip(tokens.input_ids.split(1), tokens.attention_mask.split(1), strict=True):
         attention = mask.to(encoder.device) if uses_mask else None
@@ -227,23 +210,9 @@ def _freed(run: Callable[[torch.device], Any]) -> Any:
 # --------------------------------------------------------------------------------------------------
 
 
-def require_cache_folder(folder: Path) -> None:
-    """Raise UserError unless embeddings can be written into ``folder``, which isn't made."""
-    existing = next(path for path in (folder, *folder.absolute().parents) if os.path.lexists(path))
-    what = "is read-only" if existing.is_dir() else "is no folder"
-    try:
-        for path in (folder.absolute(), *folder.parts):  # are the names valid?
-            with contextlib.suppress(FileNotFoundError, NotADirectoryError):
-                (existing / path).lstat()
-        is_usable = existing.is_dir() and os.access(existing, os.W_OK | os.X_OK)
-    except (OSError, ValueError) as error:  # too long; NUL
-        is_usable, what = False, f"can't have it: {getattr(error, 'strerror', error)}"
-    if not is_usable:
-        raise UserError(
-            f"the folder of text embeddings {str(folder)[:200]!r} can't be written "
-            f"({str(existing)!r} {what}): set system.prompt_processor.cache_dir to another "
-            "one, or use_cache=false"
-        )
+def require_cache_folder(folder: str) -> Path:
+    """Make the folder of embeddings; raise UserError if it can't be made or written."""
+    return output_folder(folder, "system.prompt_processor.cache_dir, or set use_cache=false")
 
 
 class EmbeddingCache:
@@ -279,7 +248,7 @@ class EmbeddingCache:
         """Store one embedding atomically; raise UserError if the folder can't be written."""
         from safetensors.torch import save
 
-        output_folder(self.folder, "system.prompt_processor.cache_dir")
+        require_cache_folder(self.folder)
         content = {"embedding": embedding.float().cpu().contiguous()}
         with atomic_file(self.path(text)) as file:
             file.write(save(content, metadata={"text": text}))

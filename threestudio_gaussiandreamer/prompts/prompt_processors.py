@@ -117,17 +117,10 @@ class TextEncoderPromptProcessor(BaseObject):
 
     @classmethod
     def preflight(cls, cfg: Any) -> None:
-        """Check within seconds that the cache can be used; called before any model is loaded.
-
-        A read-only folder passes if it exists, since it may hold all embeddings of this run.
-
-        Raises:
-            UserError: the cache's folder can't be made.
-        """
+        """Make the cache's folder. A read-only one passes, since it may hold all embeddings."""
         cfg = parse_structured(cls.Config, cfg)
-        folder = Path(cfg.cache_dir).expanduser()
-        if cfg.use_cache and not is_folder(folder):
-            require_cache_folder(folder)
+        if cfg.use_cache and not is_folder(cfg.cache_dir):
+            require_cache_folder(cfg.cache_dir)
 
     def configure(self) -> None:
         require_extra("diffusion", "diffusers", "transformers")

@@ -69,6 +69,16 @@ def view_directions(*, left_and_right: bool = False) -> List[Direction]:
     return [Direction(*item) for item in conditions.items()]
 
 
+def direction_indices(
+    directions: List[Direction], elevation: Tensor, azimuth: Tensor, camera_distances: Tensor
+) -> Int[Tensor, " B"]:
+    """Return the index of the direction of each view, given by (B,) in degrees and world units."""
+    indices = torch.zeros_like(elevation, dtype=torch.long)
+    for index, direction in enumerate(directions):
+        indices[direction.condition(elevation, azimuth, camera_distances)] = index
+    return indices
+
+
 def shifted(azimuth: Float[Tensor, " B"]) -> Float[Tensor, " B"]:
     """Return the azimuth, in degrees, shifted to [-180, 180)."""
     return (azimuth + 180) % 360 - 180
@@ -102,10 +112,7 @@ class PromptEmbeddings:
         camera_distances: Float[Tensor, " B"],
     ) -> Int[Tensor, " B"]:
         """Return the index of each view's direction, which is its row of ``*_vd``."""
-        indices = torch.zeros_like(elevation, dtype=torch.long)
-        for name, condition in self.directions:
-            indices[condition(elevation, azimuth, camera_distances)] = self.direction2idx[name]
-        return indices
+        return direction_indices(self.directions, elevation, azimuth, camera_distances)
 
     def get_text_embeddings(
         self,

@@ -70,7 +70,7 @@ class PointsStage(Stage):
 
     def loss(self, model: nn.Module, batch: PointsBatch) -> tuple[Tensor, dict[str, Tensor]]:
         condition = self.condition(batch.ids) * ~batch.empty[:, None]
-        z = sds.add_noise(batch.points, batch.noise, self.alphas_cumprod[batch.t])
+        z = sds.diffuse(batch.points, batch.noise, self.alphas_cumprod[batch.t])
         predicted = mean_of(model, condition)(z, batch.t).float()
         errors = (predicted - batch.noise).square()
         parts = {"mse_points": errors[:, :3].mean(), "mse_colors": errors[:, 3:].mean()}

@@ -139,7 +139,7 @@ class UNetStage(Stage):
     def _errors(self, model: nn.Module, batch: UNetBatch) -> Float[Tensor, " B"]:
         """Return the squared errors of v."""
         abar, noise, x = self.alphas_cumprod[batch.t], batch.noise, batch.latents * self.scale
-        z = sds.add_noise(x, noise, abar)
+        z = sds.diffuse(x, noise, abar)
         v = sds.per_item(abar.sqrt(), x) * noise - sds.per_item((1 - abar).sqrt(), x) * x
         with torch.no_grad():
             tokens = self.text_model(batch.ids).last_hidden_state

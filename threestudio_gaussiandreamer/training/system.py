@@ -47,8 +47,8 @@ from ..guidance.external import (
     own_randomness,
     restore_learnt,
     trainable_groups,
+    truth_of,
 )
-from ..guidance.known_truth import truth_of
 from ..host import (
     BaseLift3DSystem,
     C,

@@ -1,17 +1,14 @@
 """The base class of variants of score distillation.
 
 A variant turns the predictions of a score model into the residual e of the latents x =
-encode(render); all else is the same for each: the gradient is w(t) e, clipped, without items that
-aren't finite (``guidance/base.py``). The notation is that of ``diffusion/sds.py``, and of
-classifier-free guidance: eps_c and eps_u are the conditional and the unconditional prediction,
+encode(render); the gradient is w(t) e (``guidance/base.py``). The notation is that of
+``diffusion/sds.py``; eps_c and eps_u are the conditional and the unconditional prediction, and
 eps_hat = eps_u + guidance_scale (eps_c - eps_u)."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Any, ClassVar
-
-from torch import Tensor
 
 from ...core.errors import UserError
 from ...core.options import in_range, require_defaults
@@ -24,11 +21,8 @@ OFF = {"recon_std_rescale": 0.0}
 
 
 def require_unset(guidance: type, cfg: Any, names: Collection[str], reason: str) -> None:
-    """Raise UserError if options of a guidance that have no effect are neither at their defaults
-    nor off; see :func:`.require_defaults`.
-    """
-    prefix = "system.guidance."
-    require_defaults(guidance.Config, cfg, names, reason, prefix=prefix, neutral=OFF)
+    """Raise UserError if options without effect are set; see :func:`.require_defaults`."""
+    require_defaults(guidance.Config, cfg, names, reason, prefix=guidance.SECTION, neutral=OFF)
 
 
 class Variant(BaseObject, ABC):
@@ -64,14 +58,11 @@ class Variant(BaseObject, ABC):
 
     @classmethod
     def preflight(cls, guidance: type, cfg: Any) -> None:
-        """Raise UserError if the variant doesn't work with a guidance of this class and these
-        options; called before any model is loaded.
-        """
+        """Raise UserError if the variant doesn't work with this class and these options."""
         if cls.NEEDS_TEXT and not guidance.is_text_guided(cfg):
             raise UserError(
                 f"system.guidance.variant_type: {cfg.variant_type} follows the difference of "
-                "conditional and unconditional score, which is zero with these options of the "
-                "guidance"
+                "conditional and unconditional score, which is zero with the guidance's options"
             )
         require_unset(guidance, cfg, cls.IGNORES, f"with {cfg.variant_type}")
 
@@ -85,27 +76,11 @@ class Variant(BaseObject, ABC):
             batch: the host's batch, and the outputs of the renderer in ``RENDERS``.
         """
 
-    def checked(self, found: Any, latents: Latents) -> Residual:
-        """Return what :meth:`residual` returned; raise UserError if it isn't a pair of tensors of
-        these shapes, since others might be broadcast.
-        """
-        expected = (tuple(latents.shape), (len(latents),))
-        pair = found if isinstance(found, tuple) else (found,)
-        shapes = tuple(tuple(x.shape) if isinstance(x, Tensor) else type(x).__name__ for x in pair)
-        if shapes != expected:
-            raise UserError(
-                f"{type(self).__name__}.residual returned {shapes}; expected the residual and "
-                f"abar, tensors of the shapes {expected}"
-            )
-        return found
-
     def learn(
         self, guidance: Any, latents: Latents, condition: Any, batch: Batch, good: Good
     ) -> None:
-        """Train what the variant trains, after the residual of a training step has been computed.
-
-        Args:
-            good: items whose residual is finite.
+        """Train what the variant trains, after the residual of a training step has been computed;
+        ``good`` are the items whose residual is finite.
         """
 
     def report(self) -> dict[str, float]:

@@ -51,5 +51,5 @@ class CFD(Variant):
             first_item(len(latents)),
             *(batch[name] for name in (*self.RENDERS, "c2w", "fovy")),
         )
-        noised = guidance.noised(latents, noise)
+        noised = guidance.add_noise(latents, noise)
         return guidance.predict_noise(noised.z, noised.t, condition) - noise, noised.abar

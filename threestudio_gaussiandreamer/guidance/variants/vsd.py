@@ -5,9 +5,8 @@
 eps_particles predicts the noise in the renders' own distribution; it is trained beside the cloud to
 minimise E |eps_particles(z_t, t, camera) - eps|^2 on the renders (eq. 8). For text-to-image models
 it is the UNet with a LoRA in its attention (:class:`LoRAParticles`). For a score in closed form it
-is the optimal denoiser of a Gaussian with the renders' running mean and variance, of all cameras
-together (:class:`GaussianParticles`): a perfect model of a single cloud's renders would give SDS,
-from which VSD differs by what the particle model cannot represent.
+is the optimal denoiser of a Gaussian with the renders' mean and variance
+(:class:`GaussianParticles`): a perfect model of a single cloud's renders would give SDS.
 
 ==============  ====================================================================================
 option          meaning
@@ -22,29 +21,19 @@ import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from functools import partial
+from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from ...core.distributed import all_sum, average_gradients, first_item
-from ...core.host_copies import to_device
-from ...core.options import in_range, positive, require_defaults
+from ...core.options import in_range, positive
 from ...core.streams import generator
 from ...diffusion import sds
-from ...host import parse_structured, register, run_seed
-from ..types import (
-    Batch,
-    Condition,
-    Good,
-    Latents,
-    Noised,
-    Residual,
-    State,
-    items_of,
-    require_resumable,
-)
+from ...host import register, run_seed
+from ..types import Batch, Good, Latents, Noised, Residual, State, items_of, require_resumable
 from .base import Variant
 
 ADAPTED = re.compile(r"\.(to_q|to_k|to_v|to_out\.0)$")
@@ -57,16 +46,6 @@ CAMERA_DROPOUT = 0.1
 MOMENTS = ("exp_avg", "exp_avg_sq", "step")
 MOMENTUM = 0.95
 """Share of the moving averages of :class:`GaussianParticles` that a step keeps."""
-
-
-class Renders(NamedTuple):
-    """The renders of a step that a particle model learns from; there may be none."""
-
-    latents: Latents
-    condition: Any
-    """The guidance's conditions of these items."""
-    batch: Batch
-    """The host's batch of these items."""
 
 
 class GaussianParticles:
@@ -84,7 +63,7 @@ class GaussianParticles:
     def __init__(self) -> None:
         self._state: State = {}
 
-    def predict(self, score: Any, noised: Noised, condition: Any, batch: Batch) -> Latents:
+    def predict(self, guidance: Any, noised: Noised, condition: Any, batch: Batch) -> Latents:
         """Predict the noise; called without gradients."""
         if self._state.get("mean", noised.z[:0]).shape != noised.z.shape[1:]:
             return noised.noise
@@ -97,16 +76,17 @@ class GaussianParticles:
         return sigma * residual / (abar * variance + sigma**2)
 
     @torch.no_grad()
-    def learn(self, score: Any, renders: Renders) -> dict[str, float]:
-        """Learn from the renders of a step; return numbers to log."""
-        seen = renders.latents
-        count = all_sum(seen.new_tensor(float(len(seen))))
-        total, square = all_sum(seen.sum(0)), all_sum(seen.square().sum(0))
+    def learn(
+        self, guidance: Any, latents: Latents, condition: Any, batch: Batch
+    ) -> dict[str, float]:
+        """Learn from the renders of a step, of which there may be none; return numbers to log."""
+        count = all_sum(latents.new_tensor(float(len(latents))))
+        total, square = all_sum(latents.sum(0)), all_sum(latents.square().sum(0))
         if not count:
             return {}
         new = {"weight": torch.ones_like(count), "mean": total / count, "square": square / count}
         old = self._state
-        if old.get("mean", seen[:0]).shape != seen.shape[1:]:
+        if old.get("mean", latents[:0]).shape != latents.shape[1:]:
             old = {name: torch.zeros_like(value) for name, value in new.items()}
         self._state = {
             name: MOMENTUM * old[name].to(value) + (1 - MOMENTUM) * value
@@ -124,32 +104,35 @@ class GaussianParticles:
         self._state = dict(state)
 
 
-class LoRA(nn.Module):
-    """Low-rank additions (Hu et al. 2021) to the linear layers of a UNet's attention, and an
-    embedding of the camera, float32. The UNet isn't changed: hooks apply the additions, which are
-    zero at the start.
+class LoRAParticles(nn.Module):
+    """The renders' denoiser as a UNet with low-rank additions (Hu et al. 2021) to the linear layers
+    of its attention and an embedding of the camera, float32, which Adam trains with the prompts of
+    the views. The UNet isn't changed: hooks apply the additions, which are zero at the start.
 
     Args:
-        network: the UNet; it isn't changed and not stored.
-        rank: rank of the additions.
-        seed: of the initial values.
+        network: the UNet; it isn't stored.
+        rank: of the additions.
+        lr: learning rate.
     """
 
-    def __init__(self, network: nn.Module, rank: int, seed: int) -> None:
+    def __init__(self, network: nn.Module, rank: int, lr: float) -> None:
         super().__init__()
-        layers = dict(adapted_layers(network))
+        layers = adapted_layers(network)
         width = network.time_embedding.linear_2.out_features
-        device = next(network.parameters()).device
-        rng = generator(seed, "lora")
-        self.names = list(layers)
-        self.down, self.up = nn.ParameterList(), nn.ParameterList()
-        for layer in layers.values():
-            down = torch.randn(rank, layer.in_features, generator=rng) / rank
-            self.down.append(nn.Parameter(down.to(device)))
-            self.up.append(nn.Parameter(torch.zeros(layer.out_features, rank, device=device)))
-        down = torch.randn(width, CAMERA, generator=rng) / CAMERA**0.5
-        self.camera_in = nn.Parameter(down.to(device))
-        self.camera_out = nn.Parameter(torch.zeros(width, width, device=device))
+        device, rng = next(network.parameters()).device, generator(run_seed(), "lora")
+
+        def drawn(rows: int, columns: int, scale: float) -> nn.Parameter:
+            values = torch.randn(rows, columns, generator=rng) / scale
+            return nn.Parameter(values.to(device))
+
+        def zeros(rows: int, columns: int) -> nn.Parameter:
+            return nn.Parameter(torch.zeros(rows, columns, device=device))
+
+        self.down = nn.ParameterList(drawn(rank, layer.in_features, rank) for layer in layers)
+        self.up = nn.ParameterList(zeros(layer.out_features, rank) for layer in layers)
+        self.camera_in = drawn(width, CAMERA, CAMERA**0.5)
+        self.camera_out = zeros(width, width)
+        self.optimizer = torch.optim.Adam(self.parameters(), lr=lr, betas=BETAS)
 
     @contextmanager
     def applied(self, network: nn.Module, camera: Float[Tensor, "B 16"]) -> Iterator[None]:
@@ -158,12 +141,12 @@ class LoRA(nn.Module):
         Args:
             camera: the camera of each item; zeros for none.
         """
-        layers = dict(adapted_layers(network))
-        handles = [
-            layers[name].register_forward_hook(self._addition(index))
-            for index, name in enumerate(self.names)
-        ]
         embedding = nn.functional.silu(camera.float() @ self.camera_in.T) @ self.camera_out.T
+        layers = zip(adapted_layers(network), self.down, self.up, strict=True)
+        handles = [
+            layer.register_forward_hook(partial(_with_low_rank, down, up))
+            for layer, down, up in layers
+        ]
         handles.append(
             network.time_embedding.register_forward_hook(
                 lambda module, inputs, output: output + embedding.to(output)
@@ -175,67 +158,40 @@ class LoRA(nn.Module):
             for handle in handles:
                 handle.remove()
 
-    def _addition(self, index: int) -> Any:
-        def add(module: nn.Module, inputs: tuple[Tensor, ...], output: Tensor) -> Tensor:
-            added = inputs[0].float() @ self.down[index].T @ self.up[index].T
-            return output + added.to(output)
-
-        return add
-
-
-def adapted_layers(network: nn.Module) -> Iterator[tuple[str, nn.Linear]]:
-    """Yield name and layer of each linear layer of the attention of a UNet."""
-    for name, layer in network.named_modules():
-        if isinstance(layer, nn.Linear) and ADAPTED.search(name):
-            yield name, layer
-
-
-class LoRAParticles:
-    """The renders' denoiser as a UNet with a :class:`LoRA`, trained by Adam.
-
-    The prompts are those of the views, as for the pre-trained score.
-
-    Args:
-        guidance: has the UNet.
-        options: ``rank``, ``lr``; see ``variants/vsd.py``.
-    """
-
-    def __init__(self, guidance: Any, options: Any) -> None:
-        self.options = options
-        self.lora = LoRA(guidance.unet, options.rank, run_seed())
-        self.optimizer = torch.optim.Adam(self.lora.parameters(), lr=options.lr, betas=BETAS)
-
     @torch.no_grad()
-    def predict(self, score: Any, noised: Noised, condition: Condition, batch: Batch) -> Latents:
-        """Predict the noise; ``score`` is the guidance."""
+    def predict(self, guidance: Any, noised: Noised, condition: Any, batch: Batch) -> Latents:
         camera = batch["c2w"].to(noised.z.device).flatten(1)
-        with self.lora.applied(score.unet, camera):
-            return score.conditional(noised.z, noised.t, condition)
+        with self.applied(guidance.unet, camera):
+            return guidance.conditional(noised.z, noised.t, condition)
 
     @torch.enable_grad()
-    def learn(self, score: Any, renders: Renders) -> dict[str, float]:
+    def learn(
+        self, guidance: Any, latents: Latents, condition: Any, batch: Batch
+    ) -> dict[str, float]:
         """Take a noisy copy of each render, and one step of Adam on the mean squared error of their
         predicted noise (ProlificDreamer, eq. 8).
         """
         self.optimizer.zero_grad(set_to_none=True)
-        report = self._backward(score, renders) if len(renders.latents) else {}
-        average_gradients(self.lora.parameters())
-        if all(p.grad is not None and p.grad.isfinite().all() for p in self.lora.parameters()):
+        report = self._backward(guidance, latents, condition, batch) if len(latents) else {}
+        average_gradients(self.parameters())
+        if all(p.grad is not None and p.grad.isfinite().all() for p in self.parameters()):
             self.optimizer.step()
         return report
 
-    def _backward(self, score: Any, renders: Renders) -> dict[str, float]:
+    def _backward(
+        self, guidance: Any, latents: Latents, condition: Any, batch: Batch
+    ) -> dict[str, float]:
         """Set the gradient of one noisy copy of each render; return its mean squared error."""
-        noised = particle_noise(score, renders.latents)
-        camera = renders.batch["c2w"].to(noised.z.device).flatten(1)
+        noised = particle_noise(guidance, latents)
+        camera = batch["c2w"].to(noised.z.device).flatten(1)
         first = first_item(len(camera))
-        rng = generator(run_seed(), "lora camera 0", score.step, first)
+        rng = generator(run_seed(), "lora camera 0", guidance.step, first)
         kept = torch.rand(len(camera), 1, generator=rng) >= CAMERA_DROPOUT
-        with self.lora.applied(score.unet, camera * kept.to(camera)):
-            difference = score.conditional(noised.z, noised.t, renders.condition) - noised.noise
+        with self.applied(guidance.unet, camera * kept.to(camera)):
+            difference = guidance.conditional(noised.z, noised.t, condition) - noised.noise
         # the sum's gradient at the network's output has the size of the noise, so that it neither
         # overflows nor underflows in half precision; the mean is taken in float32 afterwards
-        parameters = list(self.lora.parameters())
+        parameters = list(self.parameters())
         gradients = torch.autograd.grad(difference.square().sum(), parameters)
         for parameter, gradient in zip(parameters, gradients, strict=True):
             parameter.grad = gradient / difference.numel()
@@ -243,23 +199,24 @@ class LoRAParticles:
 
     def state(self) -> State:
         """Return weights and, after the first step of Adam, its moments, by name."""
-        moments = {
-            f"{key}.{name}": self.optimizer.state[parameter][key]
-            for name, parameter in self.lora.named_parameters()
+        own, moments = dict(self.named_parameters()), self.optimizer.state
+        return {name: value.detach() for name, value in own.items()} | {
+            f"{key}.{name}": moments[value][key]
+            for name, value in own.items()
             for key in MOMENTS
-            if parameter in self.optimizer.state
+            if value in moments
         }
-        return {name: value.detach() for name, value in self.lora.named_parameters()} | moments
 
     @torch.no_grad()
     def restore(self, state: State) -> None:
         """Restore weights and moments; an empty state is that of a run before its first step."""
-        own = dict(self.lora.named_parameters())
-        moments = {f"{key}.{name}" for key in MOMENTS for name in own}
-        same = {
+        own = dict(self.named_parameters())
+        names = {
             name for name, value in own.items() if state.get(name, value[:0]).shape == value.shape
         }
-        require_resumable(state, same | (moments if len(state) > len(own) else set()))
+        if len(state) > len(own):
+            names |= {f"{key}.{name}" for key in MOMENTS for name in own}
+        require_resumable(state, names)
         for name, parameter in own.items() if state else ():
             parameter.copy_(state[name])
             if f"step.{name}" in state:
@@ -271,17 +228,27 @@ class LoRAParticles:
                 }
 
 
-def particle_noise(score: Any, latents: Latents) -> Noised:
-    """Add noise at timesteps from 1 to the last, uniform, drawn independently of those
-    of the error.
-    """
-    count = len(score.alphas_cumprod)
-    options = {"seed": run_seed(), "step": score.step, "num_train": count}
-    options |= {"stream": "lora timestep 0", "first": first_item(len(latents))}
-    t = sds.timesteps(len(latents), 0, count - 1, **options)
-    abar = to_device(score.alphas_cumprod.double().cpu()[t], latents.device)
-    noise = score.normal(latents, "lora noise 0")
-    return Noised(to_device(t, latents.device), abar, noise, sds.add_noise(latents, noise, abar))
+def adapted_layers(network: nn.Module) -> list[nn.Linear]:
+    """Return the linear layers of the attention of a UNet."""
+    return [
+        layer
+        for name, layer in network.named_modules()
+        if isinstance(layer, nn.Linear) and ADAPTED.search(name)
+    ]
+
+
+def _with_low_rank(
+    down: Tensor, up: Tensor, layer: nn.Module, inputs: tuple[Tensor, ...], output: Tensor
+) -> Tensor:
+    return output + (inputs[0].float() @ down.T @ up.T).to(output)
+
+
+def particle_noise(guidance: Any, latents: Latents) -> Noised:
+    """Add noise at timesteps from 1 to the last, drawn independently of those of the residual."""
+    last = len(guidance.alphas_cumprod) - 1
+    t, abar = guidance.timesteps_between(latents, 0, last, "lora timestep 0")
+    noise = guidance.normal(latents, "lora noise 0")
+    return Noised(t, abar, noise, sds.diffuse(latents, noise, abar))
 
 
 @register("vsd-variant")
@@ -308,13 +275,6 @@ class VSD(Variant):
     def preflight(cls, guidance: Any, cfg: Any) -> None:
         super().preflight(guidance, cfg)
         guidance.check_particle_model(cfg)
-        require_defaults(
-            cls.Config,
-            parse_structured(cls.Config, cfg.variant),
-            guidance.PARTICLES_IGNORE,
-            f"with {guidance.__name__}",
-            prefix="system.guidance.variant.",
-        )
 
     def particles(self, guidance: Any) -> Any:
         """Return the particle model, which is built on first use, when the networks are loaded."""
@@ -331,12 +291,11 @@ class VSD(Variant):
     def learn(
         self, guidance: Any, latents: Latents, condition: Any, batch: Batch, good: Good
     ) -> None:
-        renders = Renders(latents, condition, batch)
         if not good.all():
             rows = good.nonzero()[:, 0]
-            seen = items_of(batch, len(latents), rows.cpu())
-            renders = Renders(latents[rows], guidance.select(condition, rows), seen)
-        self._numbers = self.particles(guidance).learn(guidance, renders)
+            batch = items_of(batch, len(latents), rows.cpu())
+            latents, condition = latents[rows], guidance.select(condition, rows)
+        self._numbers = self.particles(guidance).learn(guidance, latents, condition, batch)
 
     def report(self) -> dict[str, float]:
         return self._numbers
