@@ -244,13 +244,6 @@ def test_one_of_the_two_predictions_counts_as_one_evaluation(mesh_path):
 BANK = {"mesh": "toy.glb", "mode": "direction-bins", "guidance_scale": 7.5}
 
 
-def test_what_could_train_nothing_is_refused(mesh_path):
-    with pytest.raises(UserError, match="guidance_scale: csd-variant .* zero with 0: set it to"):
-        ExactScoreGuidance.preflight(BANK | {"guidance_scale": 0, "variant_type": "csd-variant"})
-    with pytest.raises(UserError, match="renders, not latents"):
-        guidance(mesh_path)(uniform(1, 16, 16, 3), None, rgb_as_latents=True, **batch(0.0))
-
-
 def test_a_picture_that_cant_be_pooled_to_the_latent_is_refused_before_the_mesh_is_read():
     options = BANK | {"mesh": "no.glb", "space": "latent", "latent_size": 33}
     with pytest.raises(UserError, match="pictures of 64x64 can't be pooled to a latent 33 high"):

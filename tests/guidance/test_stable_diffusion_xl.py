@@ -2,8 +2,6 @@
 against float64 and in closed form.
 """
 
-import json
-
 import pytest
 import torch
 
@@ -115,12 +113,3 @@ def test_other_models_are_refused_by_name(model, tmp_path):
     with pytest.raises(UserError, match="64 channels.*takes 32"):
         guide = tiny.guidance("stable-diffusion", other)
         tiny.gradient(guide, tiny.prompts(KIND, model), renders())
-
-
-def test_the_refiner_is_refused(tmp_path):
-    folder = tiny_large_models.stable_diffusion_xl(tmp_path / "refiner")
-    index = folder / "model_index.json"
-    settings = json.loads(index.read_text()) | {"requires_aesthetics_score": True}
-    index.write_text(json.dumps(settings))
-    with pytest.raises(UserError, match="refiner.*use the base model"):
-        tiny.guidance(KIND, folder)

@@ -171,10 +171,8 @@ class ScoreDistillation(BaseObject, ABC):
     def check_particle_model(cls, cfg: Any) -> None:
         """Raise UserError if ``vsd-variant`` can't be used with these options of the guidance."""
         if cls.NO_LORA:
-            raise UserError(
-                f"vsd-variant trains a LoRA in a UNet of single views, and {cls.NO_LORA}: use "
-                "another system.guidance.variant_type"
-            )
+            said = "vsd-variant trains a LoRA in a UNet of single views"
+            raise UserError(f"{said}, and {cls.NO_LORA}: use another system.guidance.variant_type")
 
     @classmethod
     def preflight(cls, cfg: Any) -> None:

@@ -2,8 +2,7 @@
 IF's first stage, 64 x 64.
 
 Options: those of ``guidance/text_to_image.py``; ``guidance_scale`` is 20 unless given, as in
-threestudio. The UNet also predicts the variance of its reverse step, which
-distillation doesn't need."""
+threestudio."""
 
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -1,6 +1,4 @@
-"""Guidances of this and other packages as threestudio's systems use them: calls with any of the
-signatures that its guidances have, and what they train themselves.
-"""
+"""Guidances of this and other packages as threestudio's systems use them."""
 
 import inspect
 from collections.abc import Iterator
@@ -78,7 +76,7 @@ def truth_of(guidance: Any) -> Any:
 
 
 def trainable_parameters(guidance: Any) -> dict[str, nn.Parameter]:
-    """Return the parameters that a guidance trains, by name; empty for most guidances."""
+    """Return the parameters that a guidance trains, by name."""
     named = guidance.named_parameters() if isinstance(guidance, nn.Module) else ()
     return {name: parameter for name, parameter in named if parameter.requires_grad}
 
@@ -90,9 +88,7 @@ def trainable_groups(guidance: Any, lr: float) -> list[dict[str, Any]]:
 
 
 def learnt_weights(guidance: Any) -> dict[str, Tensor]:
-    """Return the trained parameters of a guidance, for a checkpoint; of this package's guidances,
-    the state of the variant.
-    """
+    """Return what a guidance has learnt, for a checkpoint: its parameters or its state."""
     if isinstance(guidance, ScoreDistillation):
         return guidance.state()
     return {name: parameter.detach() for name, parameter in trainable_parameters(guidance).items()}

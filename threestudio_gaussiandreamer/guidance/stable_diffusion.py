@@ -18,7 +18,6 @@ from torch.utils.checkpoint import checkpoint
 from ..core.errors import UserError
 from ..host import register, register_builtin
 from ..models.hub import STABLE_DIFFUSION_XL as XL_FAMILY
-from ..models.model_files import pipeline_settings
 from ..models.text_encoders import unpack
 from ..prompts.prompt_processors import STABLE_DIFFUSION_XL
 from .base import find_bad_items, without_bad_items
@@ -159,11 +158,6 @@ class StableDiffusionXLGuidance(StableDiffusionGuidance):
         return torch.float32 if overflows and self.dtype == torch.float16 else self.dtype
 
     def load(self, folder: Path) -> None:
-        if pipeline_settings(folder).get("requires_aesthetics_score"):
-            raise UserError(
-                f"{self.cfg.pretrained_model_name_or_path} is Stable Diffusion XL's refiner, which "
-                "only finishes pictures: use the base model"
-            )
         super().load(folder)
         config = self.unet.config
         self.pooled_width = (

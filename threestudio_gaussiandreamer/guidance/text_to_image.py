@@ -64,7 +64,7 @@ from .types import Condition, Embeddings, Latents, Timesteps, view_of_row
 from .variants.vsd import LoRAParticles
 
 USUAL_SCALES = (0, 200)
-"""Guidance scales beyond these are worth a warning: results saturate, or leave the prompt."""
+"""Guidance scales beyond these are worth a warning."""
 TERMINAL_ABAR = 2.0**-24
 """Replaces an abar of 0, of schedules with zero terminal SNR: its root is divided by."""
 CONTRAST_FROM = 0.4
@@ -217,10 +217,8 @@ class TextToImageDistillation(ScoreDistillation):
         cfg, trained = self.cfg, self.denoiser.config.sample_size
         size = trained * factor if isinstance(trained, int) else None
         if size is None and cfg.image_size is None:
-            raise UserError(
-                f"{cfg.pretrained_model_name_or_path} has sample_size {trained}: set "
-                "system.guidance.image_size, pixels"
-            )
+            said = f"{cfg.pretrained_model_name_or_path} has sample_size {trained}"
+            raise UserError(f"{said}: set system.guidance.image_size, pixels")
         if None not in (size, cfg.image_size) and cfg.image_size != size:
             warn(
                 f"system.guidance.image_size={cfg.image_size}: {cfg.pretrained_model_name_or_path} "
@@ -275,7 +273,7 @@ class TextToImageDistillation(ScoreDistillation):
 
     def prepare_denoiser(self, network: nn.Module) -> nn.Module:
         """Move the network that predicts the noise to its device, and apply this part's options."""
-        # transformers have no such method: torch's attention needs little memory without
+        # the transformer of Stable Diffusion 3 has no such method
         if self.cfg.enable_attention_slicing and hasattr(network, "set_attention_slice"):
             network.set_attention_slice(1)
         if self.cfg.enable_sequential_cpu_offload:
@@ -299,10 +297,8 @@ class TextToImageDistillation(ScoreDistillation):
                 ``PromptProcessorOutput``.
         """
         if not hasattr(prompt_utils, "get_text_embeddings"):
-            raise UserError(
-                "this guidance needs text embeddings: set system.prompt_processor_type to the "
-                "processor of its model"
-            )
+            said = "set system.prompt_processor_type to the processor of its model"
+            raise UserError(f"this guidance needs text embeddings: {said}")
         elevation, azimuth = batch["elevation"], batch["azimuth"]
         more = (batch["camera_distances"], self.cfg.view_dependent_prompting)
         views, other = (elevation, azimuth, *more), None
@@ -347,10 +343,8 @@ class TextToImageDistillation(ScoreDistillation):
     def check_particle_model(cls, cfg: Any) -> None:
         super().check_particle_model(cfg)
         if found := [name for name in NOT_ADAPTABLE if getattr(cfg, name)]:
-            raise UserError(
-                f"system.guidance.{found[0]}: vsd-variant trains a LoRA in the UNet, which needs "
-                f"the plain UNet: set {found[0]}=false"
-            )
+            said = "vsd-variant trains a LoRA in the plain UNet"
+            raise UserError(f"system.guidance.{found[0]}: {said}: set {found[0]}=false")
 
     def guided_noise(
         self, z: Latents, t: Timesteps, condition: Condition, scale: float, *, rescale: float = 0.0

@@ -68,20 +68,17 @@ def require_intact(folder: Path, part: str) -> None:
         with contextlib.suppress(OSError):
             if digest_of(folder / name) == digests.get(name):
                 continue
-        path = str(folder / name)
-        raise UserError(f"the file {path!r} is missing or damaged: {_remedy(folder)}")
+        path, remedy = str(folder / name), REINSTALL if folder == FOLDER else EXPORT_AGAIN
+        raise UserError(f"the file {path!r} is missing or damaged: {remedy}")
 
 
 def read_digests(folder: Path) -> dict[str, str]:
-    """Return the SHA-256 of each file by its path below ``folder``; empty without a list."""
-    path = folder / DIGESTS
+    """Return the SHA-256 of each file by its path below ``folder``; empty without a whole list."""
     try:
-        found = [LINE.fullmatch(line) for line in path.read_bytes().splitlines()]
+        found = [LINE.fullmatch(line) for line in (folder / DIGESTS).read_bytes().splitlines()]
         return {os.fsdecode(line[2]): line[1].decode() for line in found}
-    except FileNotFoundError:
+    except (OSError, TypeError):  # TypeError: a line of another form
         return {}
-    except (OSError, TypeError) as error:  # TypeError: a line of another form
-        raise UserError(f"{str(path)!r} is damaged: {_remedy(folder)}") from error
 
 
 def write_digests(folder: Path) -> None:
@@ -95,7 +92,3 @@ def write_digests(folder: Path) -> None:
 def digest_of(path: Path) -> str:
     """Return the SHA-256 of a file's content."""
     return hashlib.sha256(path.read_bytes()).hexdigest()
-
-
-def _remedy(folder: Path) -> str:
-    return REINSTALL if folder == FOLDER else EXPORT_AGAIN

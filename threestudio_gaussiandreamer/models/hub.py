@@ -211,15 +211,19 @@ def locate(source: Source, *, download: bool = True) -> Optional[Path]:
 
 def _checked(folder: Path, source: Source) -> Path:
     """Return ``folder``; raise UserError if needed files are missing or something else."""
-    names = files_below(folder)
+    for name in _picked(source, files_below(folder)):
+        require_content(folder / name, f"{source}: {name}")
+    return folder
+
+
+def _picked(source: Source, names: Collection[str]) -> list[str]:
+    """Return the needed files of a model, given all; the error names the model."""
     try:
-        for name in source.picks(names):
-            require_content(folder / name, name)
+        return source.picks(names)
     except UserError as error:
         hint = " Is it a model in the format of diffusers (with model_index.json) or transformers?"
         known = "model_index.json" in names or "config.json" in names
         raise UserError(f"{source} can't be used: {error}.{'' if known else hint}") from error
-    return folder
 
 
 def _near_folders(folder: Path) -> str:
@@ -237,10 +241,7 @@ def _files_on_hub(source: Source) -> dict[str, int]:
     api = HfApi(endpoint=os.environ.get("HF_ENDPOINT") or None)
     model = _with_timeout(lambda: api.model_info(source.name, **options))
     sizes = {file.rfilename: file.size or 0 for file in model.siblings or ()}
-    try:
-        return {name: sizes[name] for name in source.picks(list(sizes))}
-    except UserError as error:
-        raise UserError(f"{source} can't be used: {error}.") from error
+    return {name: sizes[name] for name in _picked(source, list(sizes))}
 
 
 def _with_timeout(ask: Callable[[], Any]) -> Any:

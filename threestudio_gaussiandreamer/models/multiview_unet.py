@@ -1,9 +1,8 @@
 """Load the UNet of MVDream (Shi et al. 2023) from the folders of its conversions to diffusers'
 format, such as ``ashawkey/mvdream-sd2.1-diffusers``.
 
-Those folders hold a ``MultiViewUNetModel``, whose code lies beside the weights and isn't run here.
-It is Stable Diffusion's UNet in the naming of CompVis's latent-diffusion, with two additions, so
-diffusers' own UNet computes it:
+Those folders hold a ``MultiViewUNetModel`` with its code, which isn't run. It is Stable Diffusion's
+UNet in the naming of CompVis's latent-diffusion, with two additions; diffusers' UNet computes it:
 
 * an embedding of the camera, added to that of the timestep: a "projection" class embedding;
 * self-attention over all views of an object together: the tokens of its views are joined before
@@ -20,7 +19,6 @@ import torch
 from torch import Tensor, nn
 from torch.utils.hooks import RemovableHandle
 
-from ..core.errors import UserError
 from .model_files import component_weights, files_below, loading_errors
 
 CAMERA = 16
@@ -31,12 +29,8 @@ LDM_PREFIX = "model.diffusion_model."
 def load_multiview_unet(
     unet_class: Any, folder: Path, component: str, *, half: bool, torch_dtype: torch.dtype
 ) -> nn.Module:
-    """Load the network as diffusers' UNet; its cameras are ``class_labels`` (B, 16).
-
-    Args: see :func:`.model_files.load_network`.
-
-    Raises:
-        UserError: the files are damaged, or the weights don't fit the settings.
+    """Load the network as diffusers' UNet; its cameras are ``class_labels`` (B, 16). See
+    :func:`.model_files.load_network`.
     """
     from diffusers.loaders.single_file_utils import convert_ldm_unet_checkpoint
     from safetensors.torch import load_file
@@ -44,10 +38,6 @@ def load_multiview_unet(
     weights = component_weights(files_below(folder), component, half=half)
     with loading_errors(f"{component} of the model in {str(folder)!r}"):
         settings = json.loads((folder / component / "config.json").read_text(encoding="utf-8"))
-        if settings.get("camera_dim") != CAMERA:
-            raise UserError(
-                f"the model's camera_dim is {settings.get('camera_dim')}; {CAMERA} is expected"
-            )
         options = unet_options(settings)
         with torch.device("meta"):
             unet = unet_class(**options)

@@ -19,7 +19,6 @@ from ..host import BaseObject, register
 
 DIRECTIONS = ("side", "front", "back", "overhead")
 """The view directions in the order of threestudio's view-dependent prompts."""
-MAX_PROMPT_BYTES = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -62,19 +61,13 @@ def given_prompt(cfg: Any) -> str:
 
 
 def read_prompt(path: str) -> str:
-    """Read a prompt file verbatim, except for one line break at its end.
-
-    Raises:
-        UserError: the file is missing, isn't UTF-8, or is larger than ``MAX_PROMPT_BYTES``.
+    """Read a prompt file verbatim, except for one line break at its end; raise UserError if it is
+    missing or isn't UTF-8.
     """
     file = existing_file(path, "prompt file (system.prompt_processor.prompt_file)")
-    what = f"the prompt file {str(file)!r}"
     try:
-        with open(file, "rb") as opened:
-            content = opened.read(MAX_PROMPT_BYTES + 1)
-        text = content.decode("utf-8-sig")
+        text = file.read_bytes().decode("utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f"{what} can't be read as UTF-8 text: {error}") from error
-    if len(content) > MAX_PROMPT_BYTES:
-        raise UserError(f"{what} has more than {MAX_PROMPT_BYTES} bytes: is it the right file?")
+        said = f"the prompt file {str(file)!r} can't be read as UTF-8 text"
+        raise UserError(f"{said}: {error}") from error
     return text.removesuffix("\n").removesuffix("\r")

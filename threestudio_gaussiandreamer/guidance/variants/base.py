@@ -16,13 +16,12 @@ from ...host import BaseObject, warn
 from ..types import Batch, Good, Latents, Residual, State, require_resumable
 
 GUIDANCE_SCALE = in_range(-1e6, 1e6)
-OFF = {"recon_std_rescale": 0.0}
-"""Values with which options do nothing, where a guidance's default is another."""
 
 
 def require_unset(guidance: type, cfg: Any, names: Collection[str], reason: str) -> None:
     """Raise UserError if options without effect are set; see :func:`.require_defaults`."""
-    require_defaults(guidance.Config, cfg, names, reason, prefix=guidance.SECTION, neutral=OFF)
+    off = {"prefix": guidance.SECTION, "neutral": {"recon_std_rescale": 0.0}}
+    require_defaults(guidance.Config, cfg, names, reason, **off)
 
 
 class Variant(BaseObject, ABC):

@@ -7,9 +7,7 @@ Dreamer XL, arXiv:2405.11252), who write the paper's loss in this form.
     z_t = one more step of it, from s to t
     e = eps_hat(z_t, t) - eps_u(z_s, s)
 
-eps_u is the guidance's unconditional prediction: that for the negative prompt, if there is one. The
-paper has the empty prompt there.
-
+eps_u is the prediction for the negative prompt, if there is one; in the paper for the empty prompt.
 The interval is 0.05 of the timesteps, and a step of the inversion to s takes 0.2 of them: the
 paper's delta_T and delta_S. Its ``guidance_scale`` is 7.5. There are no options."""
 

@@ -5,11 +5,9 @@ direction of the prompt and that of the data's domain, without the predicted noi
     delta_D = eps_0                         if t < threshold, where the noise in eps_0 is small
             = eps_0 - eps_n                 otherwise        (the paper's eq. 6)
 
-eps_0 is the prediction for an empty prompt, eps_n that for the negative prompt. A score model
-without a negative prompt has delta_D = 0 at large t, and eps_0 is its unconditional score.
-
-The threshold is 0.2 of the timesteps and the ``guidance_scale`` 7.5 in the paper. There are no
-options."""
+eps_0 is the prediction for an empty prompt, eps_n that for the negative prompt; without one they
+are the unconditional score. The threshold is 0.2 of the timesteps and the ``guidance_scale`` 7.5 in
+the paper. There are no options."""
 
 from dataclasses import dataclass
 from typing import Any

@@ -2,9 +2,7 @@
 
     e = eps_hat(z_t, t) - eps
 
-This is the default; it has no options. Clipping (``grad_clip``) and rescaling
-(``recon_std_rescale``) are options of the guidance; the latter has no effect on the CSD and NFSD
-variants."""
+This is the default; it has no options."""
 
 from typing import Any
 
