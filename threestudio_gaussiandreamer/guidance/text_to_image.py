@@ -124,10 +124,8 @@ class TextToImageDistillation(ScoreDistillation):
         def check(cfg: Any) -> None:
             ScoreDistillation.Config.check(cfg)
             if cfg.view_contrast and not cfg.view_dependent_prompting:
-                raise UserError(
-                    "view_contrast compares the prompts of opposite views: set "
-                    "view_dependent_prompting=true, or view_contrast=0"
-                )
+                said = "set view_dependent_prompting=true, or view_contrast=0"
+                raise UserError(f"view_contrast compares the prompts of opposite views: {said}")
 
     cfg: Config
     components: ClassVar[tuple[str, ...]] = ("unet", "scheduler")
@@ -139,9 +137,6 @@ class TextToImageDistillation(ScoreDistillation):
     """Width of the guidance scale's embedding; None if the network doesn't take the scale."""
     # guidance_interval also limits view contrast and Perp-Neg, which need no scale
     UNGUIDED_IGNORES = ("recon_std_rescale",)
-
-    # Loading
-    # ----------------------------------------------------------------------------------------------
 
     @classmethod
     def preflight(cls, cfg: Any) -> None:
@@ -285,9 +280,6 @@ class TextToImageDistillation(ScoreDistillation):
         else:
             network.to(self.device)
         return torch.compile(network) if self.cfg.enable_torch_compile else network
-
-    # Score distillation
-    # ---------------------------------------------------------------------------------------
 
     def condition(self, prompt_utils: Any, **batch: Any) -> Condition:
         """Return the text embeddings of the batch's views.
