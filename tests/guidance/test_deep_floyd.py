@@ -74,8 +74,7 @@ def test_the_variance_that_the_unet_also_predicts_is_left_out(model, prompts):
     before, _ = gradient(guide, prompts[True], rgb)
     with torch.no_grad():
         guide.unet.conv_out.weight[3:] += 1.0
-    after, out = gradient(guide, prompts[True], rgb, guidance_eval=True)
-    assert torch.equal(before, after) and out["eval"]["imgs_final"].shape == (4, 16, 16, 3)
+    assert torch.equal(before, gradient(guide, prompts[True], rgb)[0])
 
 
 def test_the_render_is_seen_at_the_models_size(model, prompts):

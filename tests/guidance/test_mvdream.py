@@ -7,6 +7,7 @@ from tests.helpers import tiny_large_guidance as tiny
 from tests.helpers.tiny_guidance import Recorder, relative, renders
 from threestudio_gaussiandreamer.cameras import orbit_c2w
 from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.guidance import base
 from threestudio_gaussiandreamer.guidance.mvdream import camera_matrices
 
 pytest.importorskip("diffusers")
@@ -95,8 +96,11 @@ def test_the_gradient_towards_known_views_is_the_closed_form(model, prompts, sha
     assert relative(mine, expected[[2, 0, 3, 1]]) > 0.1, "views could be exchanged"
 
 
-def test_a_single_view_is_evaluated_alone_and_parts_of_a_group_are_refused(model, prompts):
+def test_a_single_view_is_evaluated_alone_and_parts_of_a_group_are_refused(
+    model, prompts, monkeypatch
+):
     """With one view per group the network is that of the view alone."""
+    monkeypatch.setattr(base, "EVAL_STEPS", 2)
     guides = [tiny.guidance(KIND, model, n_view=count) for count in (4, 1)]
     pictures = [
         guide(renders(1), prompts, **first(ring(), 1), guidance_eval=True)["eval"]["imgs_final"]

@@ -95,13 +95,6 @@ def test_half_precision_and_a_vae_that_overflows(
     assert relative(mine, reference_gradient(folder, prompts, rgb, scale=100.0)) < 0.5
 
 
-def test_perp_neg_and_the_pictures_of_the_evaluation(model):
-    prompt_utils = tiny.prompts(KIND, model, use_perp_neg=True)
-    guide = tiny.guidance(KIND, model)
-    out = guide(renders(), prompt_utils, **tiny.views(), guidance_eval=True)["eval"]
-    assert out["imgs_final"].shape == (4, 64, 64, 3) and out["imgs_final"].isfinite().all()
-
-
 def test_other_models_are_refused_by_name(model, tmp_path):
     other = tiny_models.stable_diffusion(tmp_path / "sd")
     said = "isn't Stable Diffusion XL, but Stable Diffusion 1.x.*--config gaussiandreamer.yaml"

@@ -25,23 +25,16 @@ VARIANTS = [
 ]
 
 
-def surface(size=16, views=2):
-    """Return the renderer's outputs of a wall two units away."""
-    return {
-        "depth": torch.full((views, size, size, 1), 2.0),
-        "opacity": torch.ones(views, size, size, 1),
-    }
-
-
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_every_variant_works_with_a_diffusion_model(models, prompts, variant):
     pytest.importorskip("diffusers")
     guide = tiny.guidance(models, guidance_scale=7.5, variant_type=variant)
     rgb, views = tiny.renders(2), {"c2w": torch.eye(4).repeat(2, 1, 1), "fovy": torch.ones(2)}
-    for perp_neg in (False, True):
-        out = guide(rgb, prompts[perp_neg], **tiny.first(2), **views, **surface())
-        (grad,) = torch.autograd.grad(out["loss_sds"], rgb)
-        assert grad.isfinite().all() and grad.abs().max() > 0 and out["evaluations"] >= 4
+    # the renderer's outputs of a wall two units away
+    wall = {"depth": torch.full((2, 16, 16, 1), 2.0), "opacity": torch.ones(2, 16, 16, 1)}
+    out = guide(rgb, prompts[True], **tiny.first(2), **views, **wall)
+    (grad,) = torch.autograd.grad(out["loss_sds"], rgb)
+    assert grad.isfinite().all() and grad.abs().max() > 0 and out["evaluations"] >= 4
 
 
 @pytest.mark.parametrize(
@@ -131,17 +124,14 @@ def test_the_conditions_of_a_diffusion_model_are_selected_by_view(models, prompt
 def test_an_empty_negative_prompt_is_the_empty_prompt(models):
     """It isn't evaluated a second time."""
     pytest.importorskip("diffusers")
-    folder = models["epsilon"]
-    evaluations = []
+    options = {"pretrained_model_name_or_path": str(models["epsilon"]), "prompt": "a fox"}
+    guide = tiny.guidance(models, variant_type="nfsd-variant")
     for negative in ("ugly", ""):
         prompt_utils = find("gaussiandreamer-stable-diffusion-prompt-processor")(
-            {"pretrained_model_name_or_path": str(folder), "prompt": "a fox"}
-            | {"negative_prompt": negative, "use_cache": False}
+            options | {"negative_prompt": negative, "use_cache": False}
         )()
-        guide = tiny.guidance(models, variant_type="nfsd-variant")
-        _, out = tiny.gradient(guide, prompt_utils, tiny.renders())
-        evaluations.append(out["evaluations"])
-    assert evaluations == [3 * 4, 2 * 4]
+        is_other = guide.condition(prompt_utils, **tiny.BATCH).empty is not None
+        assert is_other == bool(negative)
 
 
 @pytest.mark.parametrize("variant", ["sds", "ism", "sdi"])
@@ -253,8 +243,6 @@ def test_the_default_of_mvdream_is_not_refused_without_guidance(tmp_path):
             MVDreamGuidance.preflight(name | more | given)
         with pytest.raises(UserError, match="recon_std_rescale has no effect .*: leave it at 0.5"):
             MVDreamGuidance.preflight(name | more | {"recon_std_rescale": 0.3})
-        with pytest.raises(UserError, match="guidance_interval has no effect with"):
-            MVDreamGuidance.preflight(name | more | {"guidance_interval": [0.2, 0.8]})
 
 
 def diffusion(models, **options):

@@ -64,14 +64,6 @@ def test_only_at_large_timesteps(models, views, z, monkeypatch):
 
 
 @pytest.mark.usefixtures("everywhere")
-def test_guidance_is_added_to_it(models, views, z):
-    guide, cond, uncond = predictions(models, views, z, **ALL)
-    condition = guide.condition(views, **BATCH)
-    guided = guide.predict_noise(z, tiny.TIMESTEPS, condition)
-    torch.testing.assert_close(guided, uncond + 4.0 * (cond - uncond))
-
-
-@pytest.mark.usefixtures("everywhere")
 def test_each_view_keeps_its_opposite_in_a_guidance_interval(models, views, z):
     """Views inside of the interval are those above timestep 500."""
     guide, _, _ = predictions(models, views, z, **ALL, guidance_interval=(0.5, 1.0))

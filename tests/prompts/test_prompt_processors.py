@@ -217,8 +217,8 @@ def test_a_cache_folder_is_checked_before_the_encoder_is_loaded(fox, tmp_path, m
             preflight({"cache_dir": folder})
         preflight({"cache_dir": folder, "use_cache": False})
     assert not (tmp_path / "a").exists()
-    fox(cache_dir="new", use_cache=False)
-    assert not (tmp_path / "new").exists()
+    fox(cache_dir="other", use_cache=False)
+    assert not (tmp_path / "other").exists()
     fox(cache_dir="cache")
     monkeypatch.setattr(
         text_encoders, "load_network", lambda *args, **options: pytest.fail("loaded")
