@@ -99,25 +99,18 @@ def test_one_pass_over_the_pixels_gives_the_bits_of_the_general_path(
         torch.testing.assert_close(*pair, rtol=1e-5, atol=0)
 
 
-@pytest.mark.parametrize(
-    "options",
-    [
+def test_other_options_and_renders_take_the_general_path(mesh_path):
+    rgb, views = uniform(3, 16, 16, 3), batch(*VIEWS)
+    for options in (
         {"mode": "view-agnostic"},
         {"guidance_scale": 3.0},
         {"space": "latent", "latent_size": 4},
         {"image_size": 8},
         {"grad_clip": 0.1},
-        {"variant_type": "csd-variant", "mode": "direction-bins"},
-    ],
-    ids=lambda options: next(iter(options)),
-)
-def test_other_options_take_the_general_path(mesh_path, options):
-    exact, rgb = guidance(mesh_path, **options), uniform(3, 16, 16, 3)
-    assert exact._in_one_pass(rgb, **batch(*VIEWS)) is None
-
-
-def test_a_background_of_pixels_and_a_render_that_is_not_finite_take_the_general_path(mesh_path):
-    exact, rgb, views = guidance(mesh_path), uniform(3, 16, 16, 3), batch(*VIEWS)
+        {"variant_type": "vsd-variant"},
+    ):
+        assert guidance(mesh_path, **options)._in_one_pass(rgb, **views) is None, options
+    exact = guidance(mesh_path)
     assert exact._in_one_pass(rgb, **views, comp_rgb_bg=uniform(3, 16, 16, 3)) is None
     rgb[1, 0, 0, 0] = torch.inf
     assert exact._in_one_pass(rgb, **views) is None
@@ -199,12 +192,16 @@ def test_the_cameras_own_view_is_one_of_the_modes(mesh_path, mode, modes):
 def test_evaluation_shows_the_truth(mesh_path):
     exact, views = guidance(mesh_path), batch(*VIEWS) | {"comp_rgb_bg": BACKGROUNDS}
     out = exact(uniform(3, 16, 16, 3), None, guidance_eval=True, **views)["eval"]
+    target = exact.truth.render(views, BACKGROUNDS)
     for name in ("imgs_1step", "imgs_1orig", "imgs_final"):  # float32 noise times sigma/a
-        target = exact.truth.render(views, BACKGROUNDS)
         torch.testing.assert_close(out[name], target, rtol=0, atol=1e-4)
 
 
 def test_sizes_that_do_not_fit_are_named(mesh_path):
+    with pytest.raises(UserError, match="pictures of 64x64 can't be pooled to a latent 33 high"):
+        ExactScoreGuidance(
+            {"mesh": "no.glb", "space": "latent", "latent_size": 33, "image_size": 64}
+        )
     latent = guidance(mesh_path, space="latent", latent_size=5)
     large = guidance(mesh_path, mode="view-agnostic", bank_views=2000)
     for exact, size, said in ((latent, 16, "latent_size"), (large, 512, "GiB")):
@@ -235,17 +232,3 @@ def test_one_of_the_two_predictions_counts_as_one_evaluation(mesh_path):
     assert torch.equal(guide.conditional(z, t, condition), both[0])
     assert torch.equal(guide.unconditional(z, t, condition), both[1])
     assert guide.evaluations == 8
-
-
-# Options that are refused because they have no effect, or contradict
-# --------------------------------------------------------------------------------------------------
-
-
-BANK = {"mesh": "toy.glb", "mode": "direction-bins", "guidance_scale": 7.5}
-
-
-def test_a_picture_that_cant_be_pooled_to_the_latent_is_refused_before_the_mesh_is_read():
-    options = BANK | {"mesh": "no.glb", "space": "latent", "latent_size": 33}
-    with pytest.raises(UserError, match="pictures of 64x64 can't be pooled to a latent 33 high"):
-        ExactScoreGuidance(options | {"image_size": 64})
-    ExactScoreGuidance.preflight(options | {"mesh": "toy.glb", "image_size": 66})

@@ -120,15 +120,12 @@ def in_double(guide):
     return guide
 
 
-@pytest.mark.parametrize(
-    "options",
-    [{"enable_attention_slicing": True}, {"enable_sequential_cpu_offload": True}],
-    ids=lambda options: next(iter(options)),
-)
-def test_memory_savers_keep_the_views_together(model, prompts, options):
-    if "enable_sequential_cpu_offload" in options:
-        pytest.importorskip("accelerate")
-    rgb = renders()
+def test_memory_savers_keep_the_views_together(model, prompts):
+    pytest.importorskip("accelerate")
+    options, rgb = (
+        {"enable_attention_slicing": True, "enable_sequential_cpu_offload": True},
+        renders(),
+    )
     plain, saving = (
         gradient(in_double(tiny.guidance(KIND, model, **chosen)), prompts, rgb)[0]
         for chosen in ({}, options)

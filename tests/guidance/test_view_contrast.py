@@ -5,13 +5,12 @@ import torch
 
 from tests.helpers import tiny_guidance as tiny
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.guidance import mvdream, text_to_image  # noqa: F401
+from threestudio_gaussiandreamer.guidance import mvdream  # noqa: F401
 from threestudio_gaussiandreamer.host import find
 
 pytest.importorskip("diffusers")
 
 CONTRAST = 0.75
-ALL = {"view_contrast": CONTRAST}
 BATCH = tiny.BATCH | {"elevation": torch.tensor([0.0, 10.0, 20.0, -5.0])}
 """Front, left, back and right."""
 TURNED = BATCH | {"azimuth": BATCH["azimuth"] + 180}
@@ -27,50 +26,31 @@ def z():
     return torch.randn(4, 4, 8, 8, generator=torch.Generator().manual_seed(0))
 
 
-@pytest.fixture
-def everywhere(monkeypatch):
-    """Apply view contrast at all timesteps."""
-    monkeypatch.setattr(text_to_image, "CONTRAST_FROM", 0.0)
-
-
-def predictions(models, prompt_utils, z, batch=BATCH, **options):
-    """Return the conditional and the unconditional prediction of four views."""
-    guide = tiny.guidance(models, guidance_scale=4.0, **options)
-    guide.evaluations = 0
-    return guide, *guide.predict(z, tiny.TIMESTEPS, guide.condition(prompt_utils, **batch))
-
-
-@pytest.mark.usefixtures("everywhere")
 def test_the_conditional_prediction_moves_away_from_the_opposite_views(models, views, z):
-    _, plain, uncond = predictions(models, views, z)
-    _, other, _ = predictions(models, views, z, TURNED)
-    guide, cond, same = predictions(models, views, z, **ALL)
-    torch.testing.assert_close(cond, plain + CONTRAST * (plain - other))
-    torch.testing.assert_close(same, uncond)
-    assert guide.evaluations == 12
-    assert all(tiny.relative(*pair) > 1e-3 for pair in zip(cond, plain, strict=True))
+    """Of timesteps 40, 400, 700 and 950 of 1000 at those from 400 on."""
 
+    def predictions(batch, contrast):
+        guide = tiny.guidance(models, guidance_scale=4.0, view_contrast=contrast)
+        guide.evaluations = 0
+        return guide, *guide.predict(z, tiny.TIMESTEPS, guide.condition(views, **batch))
 
-def test_only_at_large_timesteps(models, views, z, monkeypatch):
-    """TIMESTEPS are 40, 400, 700 and 950 of 1000."""
-    _, plain, _ = predictions(models, views, z)
-    with monkeypatch.context() as change:
-        change.setattr(text_to_image, "CONTRAST_FROM", 0.0)
-        _, everywhere, _ = predictions(models, views, z, **ALL)
-    guide, cond, _ = predictions(models, views, z, view_contrast=CONTRAST)
-    assert guide.evaluations == 8 + 3
+    _, plain, uncond = predictions(BATCH, 0.0)
+    _, other, _ = predictions(TURNED, 0.0)
+    guide, cond, same = predictions(BATCH, CONTRAST)
+    torch.testing.assert_close(cond[1:], (plain + CONTRAST * (plain - other))[1:])
     torch.testing.assert_close(cond[0], plain[0])
-    torch.testing.assert_close(cond[1:], everywhere[1:])
+    torch.testing.assert_close(same, uncond)
+    assert guide.evaluations == 8 + 3
+    assert all(tiny.relative(*pair) > 1e-3 for pair in zip(cond[1:], plain[1:], strict=True))
 
 
-@pytest.mark.usefixtures("everywhere")
 def test_each_view_keeps_its_opposite_in_a_guidance_interval(models, views, z):
     """Views inside of the interval are those above timestep 500."""
-    guide, _, _ = predictions(models, views, z, **ALL, guidance_interval=(0.5, 1.0))
+    options = {"guidance_scale": 4.0, "view_contrast": CONTRAST}
+    guide = tiny.guidance(models, **options, guidance_interval=(0.5, 1.0))
     condition = guide.condition(views, **BATCH)
     got = guide.predict_noise(z, tiny.TIMESTEPS, condition)
-    everywhere = tiny.guidance(models, guidance_scale=4.0, **ALL)
-    expected = everywhere.predict_noise(z, tiny.TIMESTEPS, condition)
+    expected = tiny.guidance(models, **options).predict_noise(z, tiny.TIMESTEPS, condition)
     torch.testing.assert_close(got[2:], expected[2:])
     plain = guide.conditional(z, tiny.TIMESTEPS, condition)
     torch.testing.assert_close(got[:2], plain[:2])
