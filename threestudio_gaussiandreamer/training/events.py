@@ -14,7 +14,7 @@ from torch import Tensor
 from ..core.host_copies import DelayedReads
 from ..core.images import read as read_image
 from ..guidance.base import ScoreDistillation
-from ..guidance.known_truth import truth_of
+from ..guidance.external import truth_of
 from ..host import info
 from .data import GaussianDreamerDataModule
 
