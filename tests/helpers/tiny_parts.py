@@ -96,7 +96,6 @@ class TinySystem(BaseLift3DSystem):
         pid_file: Optional[str] = None
 
     cfg: Config
-    LOSSES = ("fit", "sparsity")
 
     def configure(self) -> None:
         super().configure()

@@ -10,7 +10,6 @@ default of a field. Every number must be representable in float32 or int64."""
 
 import dataclasses
 import re
-import string
 import types
 import typing
 from collections.abc import Callable, Collection, Mapping, MutableMapping, Sequence
@@ -35,7 +34,6 @@ SWITCHES = {
 FLOAT32_MAX = 3.4028234663852886e38
 FLOAT32_TINY = 1.1754943508222875e-38
 """Smallest normal float32: smaller positive options could be rounded to zero."""
-NAME_CHARACTERS = string.ascii_letters + string.digits + "_"
 INT64_MAX = 2**63 - 1
 SHOWN = 80
 """Maximum length of a value in a message, characters."""
@@ -266,22 +264,24 @@ def _converted(path: str, value: Any, annotation: Any) -> Any:
 
 
 def _scalar(path: str, value: Any, kind: type) -> Any:
-    wrong = f"{path}: expected {SCALARS[kind]}, got {'null' if value is None else shown(value)}"
+    wrong = UserError(
+        f"{path}: expected {SCALARS[kind]}, got {'null' if value is None else shown(value)}"
+    )
     if is_list(value) or isinstance(value, Mapping) or value is None:
-        raise UserError(wrong)
+        raise wrong
     require_representable(path, value)
     if kind is str:
         return str(value)
     if kind is bool:
         if (switch := str(value).lower()) not in SWITCHES:
-            raise UserError(wrong)
+            raise wrong
         return SWITCHES[switch]
-    if isinstance(value, bool) or (kind is int and isinstance(value, float)):
-        raise UserError(wrong)
     try:
         number = kind(value)
     except (TypeError, ValueError) as error:
-        raise UserError(wrong) from error
+        raise wrong from error
+    if isinstance(value, bool) or (kind is int and isinstance(value, float)):
+        raise wrong
     require_representable(path, number)
     return number
 
@@ -311,21 +311,19 @@ def require_mapping(path: str, values: Any) -> None:
 
 
 def drop_removed(config_class: Any, values: MutableMapping, prefix: str = "") -> None:
-    """Drop the options that a part had in earlier versions from its section, in place.
+    """Drop the options that a part had in earlier versions from its section, in place, with a line
+    for each, a warning if it did something.
 
     ``Config.REMOVED`` has their names, each with the value that did nothing, or a function that
-    says whether a value did, and with what is the case now. Each that is given is named in a line,
-    a warning if it did something.
+    says whether a value did, and with what is the case now.
     """
     options = {option.name: option for option in dataclasses.fields(config_class)}
     removed = getattr(config_class, "REMOVED", {})
     for key in list(values):
         if key in removed and key not in options:  # a derived part may have its own
-            neutral, now = removed[key]
-            did_nothing = neutral(values[key]) if callable(neutral) else values[key] == neutral
-            tell = info if did_nothing else warn
-            tell(f"{prefix}{key} is no option any more: {now}")
-            values.pop(key)
+            (neutral, now), value = removed[key], values.pop(key)
+            did_nothing = neutral(value) if callable(neutral) else value == neutral
+            (info if did_nothing else warn)(f"{prefix}{key} is no option any more: {now}")
         elif key in options and dataclasses.is_dataclass(options[key].type):
             if isinstance(values[key], Mapping):
                 drop_removed(options[key].type, values[key], f"{prefix}{key}.")
@@ -368,7 +366,9 @@ def check_options(config_class: type, cfg: Any, prefix: str = "") -> None:
         UserError: the first value out of range; the message begins with its path.
     """
     for option in dataclasses.fields(config_class):
-        path, value = prefix + _written(option.name, prefix), getattr(cfg, option.name)
+        # as users write it: on a command line with hyphens
+        written = option.name.replace("_", "-") if prefix == "--" else option.name
+        path, value = prefix + written, getattr(cfg, option.name)
         if dataclasses.is_dataclass(option.type):
             check_options(option.type, value, f"{path}.")
             continue
@@ -385,11 +385,6 @@ def check_options(config_class: type, cfg: Any, prefix: str = "") -> None:
             raise UserError(_located(str(error), prefix, names)) from error
 
 
-def _written(name: str, prefix: str) -> str:
-    """Return the name of an option as users write it: on a command line with hyphens."""
-    return name.replace("_", "-") if prefix == "--" else name
-
-
 def require_defaults(
     config_class: type,
     cfg: Any,
@@ -399,12 +394,10 @@ def require_defaults(
     prefix: str = "",
     neutral: Mapping[str, Any] = MappingProxyType({}),
 ) -> None:
-    """Check that options without effect are at their defaults.
+    """Check that the options ``names``, which have no effect, are at their defaults.
 
     Args:
-        names: the options that have no effect.
         reason: when that is so, such as "with pose=A".
-        prefix: see :func:`check_options`.
         neutral: values by name that do nothing, where the default does something.
 
     Raises:
@@ -422,7 +415,7 @@ def _located(message: str, prefix: str, names: Collection[str]) -> str:
     """Prepend the option's path to ``message``, unless the message begins with it already."""
     if message.startswith(prefix):
         return message
-    begins_with_option = message[: len(message) - len(message.lstrip(NAME_CHARACTERS))] in names
+    begins_with_option = re.match(r"\w*", message, re.ASCII)[0] in names
     return prefix + message if begins_with_option else f"{prefix.rstrip('.')}: {message}"
 
 

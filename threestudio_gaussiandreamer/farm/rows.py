@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, Optional
 
 from ..core.errors import UserError, unknown
 from ..core.files import existing_file
-from ..launch.config import protect
+from ..launch.config import verbatim
 from ..launch.run_folder import safe_name
 
 COLUMNS = ("prompt", "name", "seed", "config", "overrides")
@@ -96,7 +96,7 @@ def make_row(values: Mapping[str, Any], line: int = 0) -> Row:
         raise UserError(f"the prompt is {prompt!r}; expected a text, such as 'a fox'")
     if any(unicodedata.category(character) in NOT_TEXT for character in prompt):
         raise UserError(f"the prompt {prompt[:80]!r} has a line break or a control character")
-    protect(prompt := prompt.strip())  # refuses "???", which means that a value is missing
+    verbatim(prompt := prompt.strip())  # refuses "???", which means that a value is missing
     if seed in (None, ""):
         seed = None
     else:

@@ -8,7 +8,7 @@ interpolation. What the options mean is checked in ``config_check.py``."""
 import contextlib
 import os
 import re
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, Optional
@@ -37,8 +37,8 @@ TEXTS = re.compile(
 PATH_ENDINGS = ("path", "mesh", "_file", "_dir", "resume", "weights")
 """Keys whose values are paths, which may contain "#" or ": "; only null and interpolations have a
 meaning."""
-PROTECTED = "$\ue000{"
-"""Replaces "${" in texts while interpolations are resolved; U+E000 is for private use."""
+REFERENCE = re.compile(r"(?<!\\)(\\\\)*\$\{")
+"""Begins an interpolation, unless it is escaped."""
 MOST_DEPTH = 32
 MOST_NODES = 10_000
 MOST_BYTES = 1 << 20
@@ -110,14 +110,15 @@ def load_config(*paths: str | os.PathLike, cli_args: Sequence[str] = (), n_gpus:
         _read_prompt_file(source)
         merged = _overlaid(merged, source, final=source is sources[-1])
     merged = _overlaid(merged, _own_object(merged, sources))
-    _require_sections(merged)
+    # YAML reads "trainer:" without content as null
+    merged |= {name: {} for name in SECTIONS if merged.get(name, {}) is None}
     if missing := sorted(_missing_keys(merged)):
         example = "a corgi" if TEXTS.fullmatch(missing[0]) else "..."
         raise UserError(
             f"no value for {', '.join(missing)}: set it in the YAML or as {missing[0]}={example!r}"
         )
     resolved = _resolved(merged, n_gpus)
-    loss = (resolved.get("system") or {}).get("loss")
+    loss = _value_at(resolved, "system.loss")
     if isinstance(loss, dict):  # null is no loss, too
         loss |= {name: 0 for name, weight in loss.items() if weight is None}
     cfg = OmegaConf.structured(parse_structured(ExperimentConfig, escape(resolved)))
@@ -163,8 +164,9 @@ def read_yaml(path: str | os.PathLike) -> dict[str, Any]:
     if not isinstance(values, DictConfig):
         raise UserError(f"{what} must hold sections and keys, such as 'name: demo'")
     values = OmegaConf.to_container(values)
+    _require_words(values, what)
     _restore_texts(values, node)
-    return _mapped(values, _protect_escaped, what)
+    return values
 
 
 def parse_overrides(arguments: Iterable[str]) -> dict[str, Any]:
@@ -193,14 +195,16 @@ def parse_overrides(arguments: Iterable[str]) -> dict[str, Any]:
             raise UserError("resume= has no value: write resume=auto, a file, or resume=null")
         with _yaml_errors(f"the value of {key}"):
             if TEXTS.fullmatch(key):
-                OmegaConf.update(overrides, key, protect(value), force_add=True)
+                OmegaConf.update(overrides, key, verbatim(value), force_add=True)
             elif key.endswith(PATH_ENDINGS):
                 path = None if value in ("", "null", "~") else value
                 OmegaConf.update(overrides, key, path, force_add=True)
             else:
                 _bounded(f"the value of {key}", value)
                 overrides.merge_with_dotlist([argument])
-    return _mapped(OmegaConf.to_container(overrides), str, "the command line")
+    values = OmegaConf.to_container(overrides)
+    _require_words(values, "the command line")
+    return values
 
 
 @contextlib.contextmanager
@@ -263,9 +267,8 @@ def _restore_texts(values: dict[str, Any], node: Any, section: str = "") -> None
             values[name] = value_node.value
 
 
-def protect(text: str) -> str:
-    """Replace ``${`` in a text, so that it isn't resolved as an interpolation, also where another
-    value refers to this one; it is restored when all are resolved.
+def verbatim(text: str) -> str:
+    """Return the value with which OmegaConf gives this text, also where another value refers to it.
 
     Raises:
         UserError: the text is ``???``, OmegaConf's marker of a missing value.
@@ -275,35 +278,19 @@ def protect(text: str) -> str:
             f"{MISSING!r} can't be a text: in configurations it means that a value is missing; "
             "add a word"
         )
-    return text.replace("${", PROTECTED)
+    return escape(text)
 
 
-def _protect_escaped(text: str) -> str:
-    """Unescape and protect a YAML string in which every ``${`` is escaped, as in a ``parsed.yaml``;
-    return other strings unchanged.
-    """
-    if "${" not in text or re.search(r"(?<!\\)(\\\\)*\$\{", text):
-        return text
-    half = lambda match: "\\" * (len(match[1]) // 2) + PROTECTED  # noqa: E731
-    return re.sub(r"(?<!\\)(\\+)\$\{", half, text)
-
-
-def _mapped(value: Any, change: Callable[[str], str], what: str) -> Any:
-    """Return a copy of dictionaries and lists in which every string is ``change(string)``.
-
-    Raises:
-        UserError: a key isn't a string, such as ``on``, which is ``true`` in YAML.
-    """
-    if isinstance(value, dict):
-        if wrong := [key for key in value if not isinstance(key, str)]:
+def _require_words(value: Any, what: str) -> None:
+    """Raise UserError for a key that isn't a string, such as ``on``, which is ``true`` in YAML."""
+    for key, child in value.items() if isinstance(value, dict) else enumerate(value):
+        if isinstance(value, dict) and not isinstance(key, str):
             raise UserError(
-                f"{what} has the key {wrong[0]!r}, which isn't a word: put it in quotes if it is "
-                "meant so"
+                f"{what} has the key {key!r}, which isn't a word: put it in quotes if it is meant "
+                "so"
             )
-        return {key: _mapped(child, change, what) for key, child in value.items()}
-    if isinstance(value, list):
-        return [_mapped(child, change, what) for child in value]
-    return change(value) if isinstance(value, str) else value
+        if isinstance(child, (dict, list)):
+            _require_words(child, what)
 
 
 # -- overlays --------------------------------------------------------------------------------------
@@ -379,7 +366,7 @@ def _read_prompt_file(source: dict[str, Any]) -> None:
             raise UserError(
                 "system.prompt_processor has both prompt and prompt_file: give one of them"
             )
-        section["prompt"] = protect(read_prompt(section.pop("prompt_file")))
+        section["prompt"] = verbatim(read_prompt(section.pop("prompt_file")))
 
 
 def _own_object(merged: dict[str, Any], sources: list[dict[str, Any]]) -> dict[str, Any]:
@@ -394,7 +381,7 @@ def _own_object(merged: dict[str, Any], sources: list[dict[str, Any]]) -> dict[s
         if prompt is not None:
             break
         if path := next(filter(None, files), None):
-            return {"system": {"prompt_processor": {"prompt": protect(Path(path).stem)}}}
+            return {"system": {"prompt_processor": {"prompt": verbatim(Path(path).stem)}}}
     return {}
 
 
@@ -407,20 +394,7 @@ def _value_at(source: Any, key: str) -> Any:
 
 def _is_plain_text(value: Any) -> bool:
     """Return whether a value is a text that is neither missing nor refers to another value."""
-    return isinstance(value, str) and value != MISSING and "${" not in value
-
-
-def _require_sections(merged: dict[str, Any]) -> None:
-    for name in SECTIONS:
-        if merged.get(name, {}) is None:  # YAML reads "trainer:" without content as null
-            merged[name] = {}
-        section = merged.get(name, {})
-        # what is missing or a reference is reported later
-        if not isinstance(section, (dict, str)) or _is_plain_text(section):
-            raise UserError(
-                f"{name} must be a section of keys and values, got {section!r}: set a key, such "
-                f"as {name}.<key>=<value>"
-            )
+    return isinstance(value, str) and value != MISSING and not REFERENCE.search(value)
 
 
 def _missing_keys(values: dict[str, Any], section: str = "") -> Iterator[str]:
@@ -442,11 +416,11 @@ def _resolved(merged: dict[str, Any], n_gpus: int) -> dict[str, Any]:
     register_resolvers()
     try:
         cfg = OmegaConf.create(merged)
-        asked = {
-            name: OmegaConf.select(cfg, f"trainer.{name}") for name in ("devices", "num_nodes")
-        }
-        cfg.n_gpus = planned_processes(n_gpus, asked).total
-        values = OmegaConf.to_container(cfg, resolve=True)
+        trainer = cfg.get("trainer")
+        cfg.n_gpus = planned_processes(
+            n_gpus, trainer if isinstance(trainer, DictConfig) else {}
+        ).total
+        return OmegaConf.to_container(cfg, resolve=True)
     except OmegaConfBaseException as error:
         key, message = getattr(error, "full_key", None), str(error).splitlines()[0]
         raise UserError(
@@ -458,7 +432,6 @@ def _resolved(merged: dict[str, Any], n_gpus: int) -> dict[str, Any]:
         raise
     except (TypeError, ValueError, ArithmeticError, AttributeError) as error:
         raise UserError(f"a resolver failed: {error}") from error
-    return _mapped(values, lambda text: text.replace(PROTECTED, "${"), "the configuration")
 
 
 def register_resolvers() -> None:

@@ -26,7 +26,7 @@ from ..core.options import (
     satisfies,
     shown,
 )
-from ..host import find, pl, validate_schedule
+from ..host import find, pl
 from ..training.data import sizes_of_stages
 from .live_viewer import ViewerConfig
 from .parts import check_kind, find_part
@@ -96,7 +96,6 @@ def check_config(cfg: Any) -> None:
     parse_structured(ViewerConfig, cfg.viewer, "viewer.")
     check_part("data", cfg.data_type, cfg.data)
     check_part("system", cfg.system_type, cfg.system)
-    _check_loss(cfg.system.get("loss"), getattr(find(cfg.system_type), "LOSSES", None))
     check_sections(cfg)
     _check_arguments("checkpoint", cfg.checkpoint, pl.callbacks.ModelCheckpoint, {})
     if cfg.checkpoint.get("every_n_train_steps") == cfg.trainer.get("max_steps") == -1:
@@ -138,20 +137,6 @@ def check_part(path: str, type_name: Any, values: Any) -> None:
         if typed[key]:
             given = values.get(section)
             check_part(f"{path}.{section}", typed[key], typed[section] if given is None else given)
-
-
-def _check_loss(loss: Any, known: Any) -> None:
-    for key, weight in (loss or {}).items():
-        if not key.startswith("lambda_"):
-            raise UserError(
-                f"unknown key 'system.loss.{key}': weights of losses are called lambda_<loss>, "
-                "such as lambda_sds"
-            )
-        if known is not None:
-            weights = [name if name.startswith("lambda_") else f"lambda_{name}" for name in known]
-            if key not in weights and weight != 0:
-                raise unknown("key", key, weights, prefix="system.loss.")
-        validate_schedule(weight, f"system.loss.{key}")
 
 
 def _check_arguments(section: str, values: Any, owner: type, rules: Mapping[str, Rule]) -> None:

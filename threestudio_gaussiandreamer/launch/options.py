@@ -47,7 +47,24 @@ def parse_arguments(argv: Sequence[str]) -> argparse.Namespace:
         allow_abbrev=False,
     )
     add_config(parser)
-    _add_options(parser)
+    parser.add_argument("--version", action="version", version=__version__)
+    flags = {
+        LIST_PARTS: "list the registered parts, with those in custom/",
+        "--verbose": "more messages, and tracebacks of errors",
+        "--typecheck": "check shapes and types of all calls (slow; for development)",
+    }
+    for flag, text in flags.items():
+        parser.add_argument(flag, action="store_true", help=text)
+    stages = parser.add_mutually_exclusive_group(required=True)
+    for stage, text in STAGES.items():
+        stages.add_argument(
+            f"--{stage}", dest="stage", action="store_const", const=stage, help=text
+        )
+    parser.add_argument(
+        "--gpu",
+        help="0, or cpu, or 0,1 for a process on each; default: GPU 0 if there is one. Ignored "
+        "where CUDA_VISIBLE_DEVICES is set",
+    )
     return parse_with_overrides(parser, argv)
 
 
@@ -75,31 +92,6 @@ def parse_with_overrides(
         if override.startswith("-"):
             parser.error(f"unrecognized option {override}")
     return args
-
-
-def _add_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--version", action="version", version=__version__)
-    parser.add_argument(
-        LIST_PARTS, action="store_true", help="list the registered parts, with those in custom/"
-    )
-    stages = parser.add_mutually_exclusive_group(required=True)
-    for stage, text in STAGES.items():
-        stages.add_argument(
-            f"--{stage}", dest="stage", action="store_const", const=stage, help=text
-        )
-    parser.add_argument(
-        "--gpu",
-        help="0, or cpu, or 0,1 for a process on each; default: GPU 0 if there is one. Ignored "
-        "where CUDA_VISIBLE_DEVICES is set",
-    )
-    parser.add_argument(
-        "--verbose", action="store_true", help="more messages, and tracebacks of errors"
-    )
-    parser.add_argument(
-        "--typecheck",
-        action="store_true",
-        help="check shapes and types of all calls (slow; for development)",
-    )
 
 
 def choose_gpu(gpu: Optional[str], overrides: Sequence[str] = ()) -> None:
@@ -154,18 +146,15 @@ def announce_device(gpu: Optional[str]) -> int:
     count = torch.cuda.device_count() if torch.cuda.is_available() else 0
     if gpu is None and not count:
         info("no GPU found: running on the CPU")
-    if gpu not in (None, "cpu"):
-        _require_gpus(gpu, count, torch.__version__, built_for=torch.version.cuda)
-    return count
-
-
-def _require_gpus(gpu: str, count: int, version: str, built_for: Optional[str]) -> None:
-    visible = os.environ["CUDA_VISIBLE_DEVICES"]
+    if gpu in (None, "cpu"):
+        return count
     if not count:
-        why = "sees no CUDA device" if built_for else "is a build without CUDA"
-        raise UserError(f"--gpu {gpu}: torch {version} {why}; run with --gpu cpu")
+        why = "sees no CUDA device" if torch.version.cuda else "is a build without CUDA"
+        raise UserError(f"--gpu {gpu}: torch {torch.__version__} {why}; run with --gpu cpu")
+    visible = os.environ["CUDA_VISIBLE_DEVICES"]
     if count < len(visible.split(",")):
         raise UserError(f"--gpu {gpu}: only {count} of the GPUs {visible} can be used")
+    return count
 
 
 def find_config(name: str) -> Path:
@@ -177,19 +166,15 @@ def find_config(name: str) -> Path:
     """
     try:
         path = Path(name).expanduser()
-        candidates = [path]
-        if path.name == name:
-            candidates += [
-                folder / file for folder in config_folders() for file in (name, f"{name}.yaml")
-            ]
-        found = next((candidate for candidate in candidates if candidate.is_file()), None)
+        folders = config_folders() if path.name == name else []
+        places = [folder / file for folder in folders for file in (name, f"{name}.yaml")]
+        if found := next((place for place in (path, *places) if place.is_file()), None):
+            return found
     except (OSError, ValueError, RuntimeError) as error:
         # a name too long, a NUL inside, the home folder of an unknown user
         raise UserError(
             f"configuration {name[:200]!r}: not a usable file name ({error})"
         ) from error
-    if found:
-        return found
     known = sorted({file.name for folder in config_folders() for file in folder.glob("*.yaml")})
     raise unknown("configuration", name, known)
 

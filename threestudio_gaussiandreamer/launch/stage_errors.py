@@ -53,11 +53,8 @@ def lightning_errors(checkpoint: Optional[str], changes: Sequence[str] = ()) -> 
             ) from error
         if isinstance(error, ValueError) and raised_in(error, pl.__name__):
             raise UserError(f"trainer: {str(error).strip()}") from error
-        if (
-            checkpoint is None
-            or isinstance(error, UserError)
-            or not (is_mismatch(error) or raised_in(error, pl.__name__))
-        ):
+        of_state = any(part in str(error) for part in MISMATCHES) or raised_in(error, pl.__name__)
+        if checkpoint is None or isinstance(error, UserError) or not of_state:
             raise
         raise UserError(
             f"the checkpoint {checkpoint} was made by another configuration: "
@@ -104,7 +101,7 @@ def write_errors(folder: Path) -> Iterator[None]:
     try:
         yield
     except FileNotFoundError as error:
-        if not _is_below(error.filename, folder):
+        if folder.absolute() not in Path(str(error.filename or "/")).absolute().parents:
             raise
         raise UserError(
             f"{error.filename} has been removed or replaced while it was needed: another command "
@@ -118,14 +115,5 @@ def write_errors(folder: Path) -> Iterator[None]:
         threading.excepthook = earlier
 
 
-def _is_below(path: Any, folder: Path) -> bool:
-    return isinstance(path, (str, Path)) and folder.absolute() in Path(path).absolute().parents
-
-
 def _is_write_error(error: Optional[BaseException]) -> bool:
     return isinstance(error, OSError) and error.errno in WRITE_ERRORS
-
-
-def is_mismatch(error: Exception) -> bool:
-    """Return whether this is an error of torch or Lightning about a state that doesn't match."""
-    return any(part in str(error) for part in MISMATCHES)
