@@ -37,11 +37,6 @@ def test_what_ends_a_command_is_one_message(error, code, message, capsys, monkey
     assert message in capsys.readouterr().err
 
 
-def test_an_internal_error_keeps_its_traceback_in_verbose_mode():
-    with pytest.raises(ZeroDivisionError):
-        run_command(len, raising(ZeroDivisionError()), [])
-
-
 def test_nobody_reads_the_message_about_a_closed_pipe_either(monkeypatch):
     """As after ``command 2>&1 | head``."""
     read_end, write_end = os.pipe()
@@ -71,10 +66,6 @@ def module(tmp_path, monkeypatch):
 
     yield write
     sys.modules.pop("command_of_a_test", None)
-
-
-def test_a_command_is_imported_and_run(module):
-    assert run_main(module("def main():\n    return 7")) == 7
 
 
 @pytest.mark.parametrize("lost", [False, True])

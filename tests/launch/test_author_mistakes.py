@@ -107,11 +107,6 @@ MISTAKES = {
         [OWN_REGULARISER],
         "mine-regulariser returned a tensor of shape (300,); expected one number",
     ),
-    "regulariser: no gradient": (
-        REGULARISER + "def own(out): return out['opacities'].detach().mean()",
-        [OWN_REGULARISER],
-        "mine-regulariser returned a tensor of shape () without a gradient",
-    ),
     "regulariser: number of arguments": (
         REGULARISER + "def own(out, cloud): return out['opacities'].mean()",
         [OWN_REGULARISER],
@@ -121,11 +116,6 @@ MISTAKES = {
         REGULARISER + "class own:\n    def __call__(self, out): return out['opacities'].mean()",
         [OWN_REGULARISER],
         "mine-regulariser is the class own; register a function of (out)",
-    ),
-    "regulariser: a name that is taken": (
-        REGULARISER.replace("mine-", "tv-") + "def own(out): return out['opacities'].mean()",
-        [OWN_REGULARISER],
-        "the name 'tv-regulariser' is taken by threestudio_gaussiandreamer.training.losses.",
     ),
     "regulariser: registered under another name": (
         REGULARISER.replace("mine-regulariser", "smooth") + "def own(out): return 0",
@@ -191,12 +181,6 @@ MISTAKES = {
 """,
         ["system.geometry.prior_type=own-prior"],
         "Ownprior gave no points",
-    ),
-    "prior: no cloud": (
-        PART.format("prior", "priors.base", "Prior")
-        + "    def generate(self, prompt, generator): pass",
-        ["system.geometry.prior_type=own-prior"],
-        "Ownprior returned NoneType; expected a PointCloud",
     ),
     "exporter: returns nothing": (
         PART.format("exporter", "host", "Exporter") + "    def __call__(self): pass",

@@ -140,7 +140,6 @@ def demo():
         ("system.loggers.wandb={enabled: true}", "unknown key 'system.loggers.wandb.enabled'"),
         ("trainer.max_steps=many", "trainer.max_steps: expected a whole number, got 'many'"),
         ("trainer.max_steps=2.5", "trainer.max_steps: expected a whole number, got 2.5"),
-        ("trainer.max_steps=-1", "checkpoint.every_n_train_steps is -1, as trainer.max_st"),
         ("trainer.limit_val_batches=many", "limit_val_batches: expected a whole number or a num"),
         ("trainer.precision=17", "trainer: Precision 17 is invalid"),
         ("trainer.limit_train_batches=0", "set trainer.max_steps for a short run, got 0"),
@@ -182,6 +181,7 @@ def test_a_valid_configuration_passes_and_its_numbers_become_numbers(demo):
         ("system.geometry.lr_means=1e39", "system.geometry.lr_means: expected a finite number"),
         ("system.loss.lambda_sds=[0,1,1e300,9]", "system.loss.lambda_sds[2]: expected a finite"),
         ("trainer=", "trainer is empty, which would remove its"),
+        ("trainer.max_steps=-1", "checkpoint.every_n_train_steps is -1, as trainer.max_st"),
         ("exp_root_dir=a\0b", "no folder's name has a NUL"),
         ("exp_root_dir=s3://a/b", "a single run writes to a folder, and only the farm to a URL"),
     ],
@@ -290,7 +290,7 @@ def test_a_part_that_cannot_be_called_is_refused(kind, part, message):
 def test_a_broken_extension_is_named(folder, file, source, message):
     (folder / "custom" / file).parent.mkdir(parents=True)
     (folder / "custom" / file).write_text(source)
-    with pytest.raises(UserError, match=f"the extension custom/.*{message}"):
+    with pytest.raises(UserError, match=f"the extension .*{message}"):
         load_extensions()
 
 

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.promises.test_configurations import FILES, PROMPT, stack
 from threestudio_gaussiandreamer import host, register_parts
 from threestudio_gaussiandreamer.launch.config import load_config
 from threestudio_gaussiandreamer.launch.config_check import check_config
@@ -12,40 +13,11 @@ from threestudio_gaussiandreamer.priors.base import Prior
 register_parts()
 ROOT = Path(__file__).parents[2]
 CONFIGS = sorted(path.name for path in (ROOT / "configs").glob("*.yaml"))
-OVERLAYS = (
-    {f"demo-{name}.yaml": "demo.yaml" for name in ("small", "draft", "best")}
-    | {
-        f"gaussiandreamer-{name}.yaml": "gaussiandreamer.yaml"
-        for name in (
-            *("if", "sdxl", "sd3", "mvdream", "pointe"),
-            *("avatar", "avatar-smpl", "ground", "lowmem", "paper"),
-        )
-    }
-    | {"polish.yaml": "gaussiandreamer.yaml"}
-    | {f"toybox-{name}.yaml": "toybox.yaml" for name in ("draft", "paper")}
-)
-"""What each is laid over."""
-MANDATORY = {
-    "gaussiandreamer-pointe.yaml": [
-        "system.geometry.prior.checkpoint=base.pt",
-        "system.geometry.prior.upsampler=upsample.pt",
-    ],
-    "gaussiandreamer-avatar-smpl.yaml": [
-        "system.geometry.prior.motion=results.npz",
-        "system.geometry.prior.body_model=body.npz",
-    ],
-    "polish.yaml": ["system.geometry.prior.path=fox.ply"],
-}
-"""The user's files where a configuration leaves them open."""
 
 
 def loaded(name, tmp_path):
-    paths = [ROOT / "configs" / part for part in (OVERLAYS.get(name), name) if part]
-    overrides = [
-        "system.prompt_processor.prompt=a fox",
-        f"exp_root_dir={tmp_path}",
-        *MANDATORY.get(name, []),
-    ]
+    paths = [ROOT / "configs" / word for word in stack(name) if word != "--config"]
+    overrides = [PROMPT, f"exp_root_dir={tmp_path}", *FILES.get(name, [])]
     cfg = load_config(*paths, cli_args=overrides)
     check_config(cfg)
     return cfg
@@ -66,7 +38,7 @@ def test_a_shipped_configuration_is_valid_and_its_parts_can_be_built(name, tmp_p
 def stacked(*names, overrides=()):
     """Load and check overlays of the paper's configuration."""
     paths = [ROOT / "configs" / f"gaussiandreamer{name}.yaml" for name in ("", *names)]
-    cfg = load_config(*paths, cli_args=["system.prompt_processor.prompt=a fox", *overrides])
+    cfg = load_config(*paths, cli_args=[PROMPT, *overrides])
     check_config(cfg)
     return cfg
 
@@ -80,7 +52,7 @@ def test_a_body_may_be_chosen_among_meshes_instead():
 
 @pytest.mark.parametrize("other", ["if", "pointe", "avatar-smpl"])
 def test_the_lowmem_overlay_combines_with_others_in_either_order(other):
-    files = MANDATORY.get(f"gaussiandreamer-{other}.yaml", [])
+    files = FILES.get(f"gaussiandreamer-{other}.yaml", [])
     for names in (["-lowmem", f"-{other}"], [f"-{other}", "-lowmem"]):
         cfg = stacked(*names, overrides=files)
         assert cfg.data.width == 512 and cfg.system.renderer.downsample == 1

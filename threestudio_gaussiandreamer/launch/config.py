@@ -20,7 +20,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from ..core.errors import UserError
 from ..core.files import atomic_file
-from ..core.options import escape, parse_structured, satisfies
+from ..core.options import escape, parse_structured, require_mapping, satisfies
 from ..core.schedule import C_max
 from ..host import find, info, names
 from ..prompts.prompts import read_prompt
@@ -110,8 +110,11 @@ def load_config(*paths: str | os.PathLike, cli_args: Sequence[str] = (), n_gpus:
         _read_prompt_file(source)
         merged = _overlaid(merged, source, final=source is sources[-1])
     merged = _overlaid(merged, _own_object(merged, sources))
-    # YAML reads "trainer:" without content as null
-    merged |= {name: {} for name in SECTIONS if merged.get(name, {}) is None}
+    for name in SECTIONS:
+        if merged.get(name) is None:  # as YAML reads "trainer:" without content
+            merged[name] = {}
+        if not isinstance(merged[name], str) or _is_plain_text(merged[name]):
+            require_mapping(name, merged[name])
     if missing := sorted(_missing_keys(merged)):
         example = "a corgi" if TEXTS.fullmatch(missing[0]) else "..."
         raise UserError(
