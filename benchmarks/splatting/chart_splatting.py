@@ -29,8 +29,7 @@ from benchmarks.figures import pyplot
 from benchmarks.splatting.bench_scenes import Scene, make_camera
 from benchmarks.splatting.bench_splatting import describe_machine
 from benchmarks.splatting.scenes import scenes
-from threestudio_gaussiandreamer.splatting import rasterize, reference
-from threestudio_gaussiandreamer.splatting.options import RasterizeOptions
+from threestudio_gaussiandreamer.splatting import RasterizeOptions, rasterize, reference
 from threestudio_gaussiandreamer.splatting.projection import project
 from threestudio_gaussiandreamer.splatting.validation import as_scene, named
 

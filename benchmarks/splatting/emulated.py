@@ -22,9 +22,8 @@ from benchmarks.splatting.bench_scenes import Scene, make_scene
 from benchmarks.splatting.pairs import cameras_around, stacked
 from benchmarks.splatting.scenes import needles, trained
 from threestudio_gaussiandreamer.core.streams import generator
-from threestudio_gaussiandreamer.splatting import rasterize
+from threestudio_gaussiandreamer.splatting import RasterizeOptions, rasterize
 from threestudio_gaussiandreamer.splatting.cpu import backend as cpu
-from threestudio_gaussiandreamer.splatting.options import RasterizeOptions
 from threestudio_gaussiandreamer.splatting.validation import as_scene, named
 
 COMPILER, EMULATOR = "aarch64-linux-gnu-g++", "qemu-aarch64"
@@ -95,7 +94,7 @@ def emulated(
     viewmats, Ks = cameras
     scene = as_scene(named(*cloud, viewmats, Ks, None), SIZE, SIZE)
     options = RasterizeOptions()
-    settings = cpu.CpuKernel(options, True, 2, cpu.library())._settings()
+    settings = options.struct(options.kernel_alpha_min, threads=2)
     sizes = (ctypes.c_longlong * 3)(len(cloud.means), VIEWS, SIZE)
     arrays = b"".join(x.numpy().tobytes() for x in (*scene.tensors, *loss))
     content = bytes(sizes) + bytes(settings) + arrays

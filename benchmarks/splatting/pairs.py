@@ -31,8 +31,8 @@ from benchmarks.splatting.bench_splatting import processor
 from benchmarks.splatting.scenes import trained
 from threestudio_gaussiandreamer.core.streams import generator
 from threestudio_gaussiandreamer.gaussians.densify import clone_and_split
+from threestudio_gaussiandreamer.splatting import RasterizeOptions
 from threestudio_gaussiandreamer.splatting.cpu import backend as cpu
-from threestudio_gaussiandreamer.splatting.options import RasterizeOptions
 from threestudio_gaussiandreamer.splatting.validation import smallest_alpha
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -114,33 +114,30 @@ def package_of(checkout: Path) -> str:
 
 
 def kernel_passes(checkout: Path, build: str, case: Case, threads: int) -> tuple[Pass, Pass]:
-    """Return a forward and a backward pass of a checkout's kernel, without torch's autograd. The
-    gradient of the background isn't asked for, as few trainings need it; kernels up to cb299c3
-    compute it all the same.
+    """Return a forward and a backward pass of a checkout's kernel. The gradients of the background
+    and the cameras aren't asked for, as few trainings need them.
     """
     package = package_of(checkout)
-    backend, autograd, scenes = (
-        importlib.import_module(f"{package}.splatting.{name}")
-        for name in ("cpu.backend", "autograd", "scene")
+    backend, scenes = (
+        importlib.import_module(f"{package}.splatting.{name}") for name in ("cpu.backend", "scene")
     )
-    views = len(case.viewmats)
-    cloud, background = case.cloud, torch.zeros(views, 3)
+    views, library = len(case.viewmats), backend._load(build)
+    leaves = [x.detach().clone().requires_grad_() for x in case.cloud]
+    background = torch.zeros(views, 3)
     scene = scenes.Scene(
-        *cloud[:4], case.viewmats, cloud.colors, background, case.Ks, case.size, case.size
+        *leaves[:4], case.viewmats, leaves[4], background, case.Ks, case.size, case.size
     )
-    image, depth, alpha = (
-        x.expand(views, -1, -1, -1).contiguous() for x in make_cotangents(case.size)
-    )
-    upstream = autograd.Upstream(image, alpha, depth)
-    wanted = autograd.Wanted(False, False) if hasattr(autograd, "Wanted") else False
-    kernel = backend.CpuKernel(case.options, True, threads, backend._load(build))
-    means2d, saved = torch.zeros(views, len(cloud.means), 2), []
+    upstream = [x.expand(views, -1, -1, -1).contiguous() for x in make_cotangents(case.size)]
+    drawn = []
 
     def forward() -> None:
-        saved[:] = kernel.forward(scene, means2d)[1]
+        backend.library = lambda: library
+        torch.set_num_threads(threads)
+        out = backend.rasterize(scene, case.options)
+        drawn[:] = out.image, out.depth, out.alpha
 
     def backward() -> object:
-        return kernel.backward(scene, means2d, tuple(saved), None, upstream, wanted)
+        return torch.autograd.grad(drawn, leaves, upstream)
 
     return forward, backward
 

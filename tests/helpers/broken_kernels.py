@@ -6,7 +6,8 @@ from typing import NamedTuple
 import torch
 
 from tests.helpers.cuda_shim.device import HostDevice
-from threestudio_gaussiandreamer.splatting.cuda import proof, stages
+from threestudio_gaussiandreamer.splatting.cuda import proof
+from threestudio_gaussiandreamer.splatting.scene import Settings
 
 DEFAULT, HALVED, ABSOLUTE = proof.OPTIONS
 
@@ -21,8 +22,8 @@ def other_constants(*arguments, eps2d: float = 0.4) -> None:
     settings.eps2d, settings.alpha_max = eps2d, 0.5
 
 
-def settings_of(arguments) -> stages.Settings:
-    (settings,) = (x for x in arguments if isinstance(x, stages.Settings))
+def settings_of(arguments) -> Settings:
+    (settings,) = (x for x in arguments if isinstance(x, Settings))
     return settings
 
 
@@ -37,7 +38,7 @@ def other_constants_if_halved(*arguments) -> None:
 
 def alpha_for_depth_if_halved(scene, settings, lists, images, contribution) -> None:
     if settings.downsample == 2:
-        images.alpha, images.depth = images.depth, images.alpha
+        images[1], images[2] = images[2], images[1]
 
 
 class Fault(NamedTuple):

@@ -128,8 +128,8 @@ def test_backward_frees_its_memory(monkeypatch):
     """The buffers of a backward pass are freed with the saved tensors, not with the graph's last
     tensor.
     """
-    states, as_tensor = weakref.WeakSet(), cpu._State.as_tensor
-    monkeypatch.setattr(cpu._State, "as_tensor", lambda self: states.add(self) or as_tensor(self))
+    states, create = weakref.WeakSet(), cpu._State
+    monkeypatch.setattr(cpu, "_State", lambda *x: states.add(state := create(*x)) or state)
     out = rasterize(
         *random_cloud(30).to(torch.float32).leaves(),
         *cameras(1, 12, 12, dtype=torch.float32),
@@ -222,16 +222,16 @@ def test_more_memory_than_there_is_is_a_named_error():
 def test_the_limit_is_the_memory_of_the_container(monkeypatch, tmp_path):
     cloud = random_cloud(50_000).to(torch.float32)
     scene = *cloud, *cameras(4, 256, 256, dtype=torch.float32), 256, 256
-    build = cpu._path(os.environ.get("GAUSSIANDREAMER_ISA") or cpu.usable_builds()[0])
+    build = os.environ.get("GAUSSIANDREAMER_ISA") or cpu.usable_builds()[0]
     monkeypatch.setattr(memory, "CGROUP_LIMIT", tmp_path / "memory.max")
     (tmp_path / "memory.max").write_text(str(1 << 20))
     try:
-        cpu.load_library(build)
+        cpu._load(build)
         with pytest.raises(UserError, match="GiB"):
             rasterize(*scene, backend="cpu")
     finally:
         monkeypatch.undo()
-        cpu.load_library(build)
+        cpu._load(build)
     rasterize(*scene, backend="cpu")
 
 

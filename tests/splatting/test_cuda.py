@@ -5,6 +5,8 @@ specification.
 around it is the package's own.
 """
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 
@@ -24,7 +26,6 @@ from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.splatting import backends
 from threestudio_gaussiandreamer.splatting.cuda import backend as cuda
 from threestudio_gaussiandreamer.splatting.cuda import driver as cuda_driver
-from threestudio_gaussiandreamer.splatting.cuda import memory as cuda_memory
 
 SLOW = pytest.mark.slow
 pytestmark = pytest.mark.skipif(unavailable() is not None, reason=str(unavailable()))
@@ -39,7 +40,7 @@ def device(monkeypatch):
     monkeypatch.setitem(
         backends.BACKENDS,
         "cuda",
-        backends.Backend("cuda.backend", devices=("cpu",), dtypes=(torch.float32,)),
+        backends.Backend(cuda, ("cpu",), (torch.float32,)),
     )
     monkeypatch.setattr(cuda_driver, "unavailable", lambda: None)
     monkeypatch.setattr(cuda_driver, "device", lambda device: devices[-1])
@@ -140,7 +141,7 @@ def test_a_picture_that_needs_more_room_than_expected_is_right_to_the_bit(
     """Rendered without lists, differentiated with complete ones; when the count has arrived, the
     capacity suffices.
     """
-    monkeypatch.setattr(cuda_memory, "STEP", 64)
+    monkeypatch.setattr(cuda, "STEP", 64)
     known = scene(device)
     for estimate in cuda._estimates.values():
         estimate.per_gaussian = 0.5  # as if earlier pictures had needed less
@@ -171,7 +172,7 @@ def test_only_the_first_picture_of_a_size_waits(device):
 
 def test_capacity_follows_the_count():
     """Up at once, down slowly, and proportional to the Gaussians."""
-    estimate, host = cuda_memory.CapacityEstimate(views=2), HostDevice()
+    estimate, host = cuda.CapacityEstimate(views=2), HostDevice()
 
     def room(*totals, gaussians=1000):
         return estimate.capacity(host.read_async(torch.tensor(totals).cumsum(0)), gaussians)
@@ -180,7 +181,7 @@ def test_capacity_follows_the_count():
     assert 3_000_000 * 0.99 < room(10, 10, gaussians=500) < 3_000_000
     for _ in range(1000):
         small = room(10, 10)
-    assert small <= 2 * cuda_memory.STEP
+    assert small <= 2 * cuda.STEP
 
 
 @pytest.mark.parametrize("most", [1500, 900])
@@ -188,7 +189,7 @@ def test_short_memory_means_fewer_views_at_a_time(device, monkeypatch, most):
     """Three views have 1904 intersections, about 600 each. The bits are the same, and the second
     call doesn't try all at once.
     """
-    monkeypatch.setattr(cuda_memory, "STEP", 64)
+    monkeypatch.setattr(cuda, "STEP", 64)
     known, tries = scene(device), []
     for _ in range(2):
         short = scene(device, most_intersections=most)
@@ -200,7 +201,7 @@ def test_short_memory_means_fewer_views_at_a_time(device, monkeypatch, most):
 
 
 def test_memory_that_is_short_in_the_backward_pass_only(device, monkeypatch):
-    monkeypatch.setattr(cuda_memory, "STEP", 64)
+    monkeypatch.setattr(cuda, "STEP", 64)
     known, host = scene(device), device()
     cloud, camera = (
         random_cloud(300, seed=8, size=0.1).to(torch.float32).leaves(),
@@ -234,6 +235,6 @@ def test_without_memory_for_one_view_there_is_a_picture_but_no_gradient(device, 
 
 def test_more_splats_than_can_be_numbered_are_refused():
     with pytest.raises(UserError, match="fewer views"):
-        cuda._check_count(5000, 500_000)
+        cuda.rasterize(SimpleNamespace(shape=(5000, 500_000)), None)
     with pytest.raises(UserError, match="fewer views"):
-        cuda._check_count(70_000, 1)
+        cuda.rasterize(SimpleNamespace(shape=(70_000, 1)), None)

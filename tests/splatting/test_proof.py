@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from tests.helpers.broken_kernels import DEFAULT, FAULTS, BrokenDevice, Fault, other_constants
-from tests.helpers.cuda_shim.device import HostDevice, library, unavailable
+from tests.helpers.cuda_shim.device import HostDevice, library, needs_nvrtc, unavailable
 from tests.helpers.splatting_scenes import cameras, random_cloud, rasterize
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.splatting import backends
@@ -18,7 +18,6 @@ from threestudio_gaussiandreamer.training.renderer import check_backend
 
 pytestmark = pytest.mark.skipif(unavailable() is not None, reason=str(unavailable()))
 CPU = torch.device("cpu")
-needs_nvrtc = pytest.mark.skipif(nvrtc.unavailable() is not None, reason=str(nvrtc.unavailable()))
 
 
 class CompilingDevice(HostDevice):
@@ -42,9 +41,7 @@ def use(monkeypatch, tmp_path):
     device.
     """
     monkeypatch.setenv("GAUSSIANDREAMER_CACHE", str(tmp_path / "cubins"))
-    cuda = backends.Backend(
-        "cuda.backend", devices=("cpu",), dtypes=(torch.float32,), proof="cuda.proof"
-    )
+    cuda = backends.Backend(proof.kernels, ("cpu",), (torch.float32,), proof)
     found = {"cuda": cuda, "torch": backends.BACKENDS["torch"]}
     monkeypatch.setattr(backends, "BACKENDS", found)
     monkeypatch.setattr(driver, "unavailable", lambda: None)

@@ -24,8 +24,7 @@ from tests.helpers.splatting_scenes import (
     run,
     scene_of,
 )
-from threestudio_gaussiandreamer.splatting import reference
-from threestudio_gaussiandreamer.splatting.options import RasterizeOptions
+from threestudio_gaussiandreamer.splatting import RasterizeOptions, reference
 from threestudio_gaussiandreamer.splatting.projection import project
 
 SPECIFICATION = {"backend": "reference"}

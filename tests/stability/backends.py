@@ -40,7 +40,7 @@ def cuda_on_the_host(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(
         backends.BACKENDS,
         "cuda",
-        backends.Backend("cuda.backend", devices=("cpu",), dtypes=(torch.float32,)),
+        backends.Backend(cuda, ("cpu",), (torch.float32,)),
     )
     monkeypatch.setattr(cuda_driver, "unavailable", lambda: None)
     monkeypatch.setattr(cuda_driver, "device", lambda device: host)

@@ -14,8 +14,7 @@ from ..cameras import intrinsics, orbit_c2w, to_opencv
 from ..core.errors import UserError
 from ..core.streams import generator
 from ..metrics import MAX_PSNR, psnr
-from ..splatting import rasterize
-from ..splatting.output import Rasterized
+from ..splatting import Rasterized, rasterize
 from .gaussians import Gaussians
 from .sh import sh_to_colors
 

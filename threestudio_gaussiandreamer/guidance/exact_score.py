@@ -53,7 +53,7 @@ from ..host import parse_structured, register
 from ..meshes.load import AXES, load_mesh, mesh_file
 from ..meshes.raycast import MeshCaster
 from ..prompts.view_prompts import direction_indices, view_directions
-from ..splatting.cpu import known_picture
+from ..splatting.cpu import backend as cpu_kernel
 from .base import GUIDANCE_SCALE, ScoreDistillation, needs_unconditional, variant_class
 from .picture_bank import (
     Bank,
@@ -192,14 +192,14 @@ class ExactScoreGuidance(ScoreDistillation):
             and self.grad_clip is None
             and not (self.needs_unconditional or rgb_as_latents or guidance_eval)
         )
-        if not is_one_picture or not known_picture.is_available(rgb.device):
+        if not is_one_picture or rgb.device.type != "cpu" or cpu_kernel.unavailable():
             return None
         self._size = size
         pictures = self.truth.pictures.planes(c2w, fovy, *size)
         _, abar = self.draw_timesteps(rgb)
         weight = sds.WEIGHTS[self.cfg.weighting_strategy](abar).float()
         background, scale = background[:, 0, 0].contiguous(), (abar / (1 - abar)).sqrt().float()
-        found = known_picture.known_gradient(rgb, pictures, background, scale, weight)
+        found = cpu_kernel.known_gradient(rgb, pictures, background, scale, weight)
         # the latents' gradient is 2 weight scale (render - picture); plain numbers are faster
         squares = [] if found is None else found[1].tolist()
         if not squares or not math.isfinite(sum(squares)):

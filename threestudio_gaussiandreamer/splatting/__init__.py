@@ -2,8 +2,7 @@
 
 from .api import rasterize
 from .backends import available_backends
-from .options import RasterizeOptions
-from .output import Rasterized
+from .scene import Rasterized, RasterizeOptions
 from .validation import PRESETS
 
 __all__ = ["PRESETS", "Rasterized", "RasterizeOptions", "available_backends", "rasterize"]

@@ -7,8 +7,7 @@ from torch import Tensor
 
 from ..core.devices import without_autocast
 from .backends import choose_backend
-from .options import RasterizeOptions
-from .output import Rasterized
+from .scene import Rasterized, RasterizeOptions
 from .validation import as_scene, check, named, smallest_alpha
 
 
@@ -81,4 +80,4 @@ def rasterize(
     check(tensors, width, height, options, non_finite)
     with without_autocast(means.device.type):
         scene = as_scene(tensors, width, height)
-        return choose_backend(backend, scene.means).load().rasterize(scene, options)
+        return choose_backend(backend, scene.means).module.rasterize(scene, options)

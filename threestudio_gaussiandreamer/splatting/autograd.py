@@ -9,9 +9,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from . import torch_backend
-from .options import RasterizeOptions
-from .output import Rasterized
-from .scene import TENSORS, Scene
+from .scene import TENSORS, Rasterized, RasterizeOptions, Scene
 
 CHANNELS = 3
 
@@ -25,18 +23,17 @@ class Drawn(NamedTuple):
     radii: Tensor  # (B, N)
     contribution: Tensor  # (B, N)
 
-
-class Upstream(NamedTuple):
-    """Gradients of the loss with respect to the images, contiguous; None means zero."""
-
-    image: Optional[Tensor]
-    alpha: Optional[Tensor]
-    depth: Optional[Tensor]
+    @classmethod
+    def empty(cls, scene: Scene, downsample: int) -> "Drawn":
+        new, (views, gaussians) = scene.means.new_empty, scene.shape
+        size = (views, scene.height // downsample, scene.width // downsample)
+        images = (new(*size, channels) for channels in (CHANNELS, 1, 1))
+        return cls(*images, new(views, gaussians), new(views, gaussians))
 
 
 class SceneGradients(NamedTuple):
     """Gradients of the loss with respect to the fields of a Scene, but for the background, and to
-    means2d (B, N, 2).
+    means2d (B, N, 2); None for viewmats that need none.
     """
 
     means: Tensor
@@ -48,30 +45,23 @@ class SceneGradients(NamedTuple):
     means2d: Tensor
 
 
+Upstream = tuple[Optional[Tensor], ...]
+"""Gradients of the loss with respect to image, alpha and depth, contiguous; None means zero."""
+
+
 class Kernel(Protocol):
     """One call of a compiled backend, with its options and device."""
 
-    def forward(self, scene: Scene, means2d: Tensor) -> tuple[Drawn, tuple[Tensor, ...], Any]:
-        """Draw a scene of three channels.
-
-        Args:
-            means2d: (B, N, 2), to be filled.
-
-        Returns:
-            The images, the tensors to save for backward, and any other state for backward.
+    def forward(self, scene: Scene, means2d: Tensor, out: Drawn) -> tuple[tuple[Tensor, ...], Any]:
+        """Draw a scene of three channels into ``out``, and fill ``means2d`` (B, N, 2); return the
+        tensors to save for backward, and any other state for it.
         """
 
     def backward(
-        self,
-        scene: Scene,
-        means2d: Tensor,
-        saved: tuple[Tensor, ...],
-        state: Any,
-        upstream: Upstream,
-        wants_viewmats: bool,
-    ) -> SceneGradients:
-        """Differentiate; ``saved`` and ``state`` are what `forward` returned. If the options ask
-        for it, add the sums over pixels of absolute gradients to ``means2d.absgrad``.
+        self, scene: Scene, means2d: Tensor, saved, state: Any, upstream: Upstream, out
+    ) -> None:
+        """Fill the `SceneGradients` ``out``, given what `forward` returned; add the sums over
+        pixels of absolute gradients to ``means2d.absgrad`` if it is there.
         """
 
 
@@ -84,10 +74,8 @@ def rasterize(kernel: Kernel, scene: Scene, options: RasterizeOptions) -> Raster
     means2d = scene.means.new_zeros(*scene.shape, 2).requires_grad_(tracked)
     if tracked and options.absgrad:
         means2d.absgrad = torch.zeros_like(means2d, requires_grad=False)
-    drawn = [
-        Drawn(*_Rasterize.apply(kernel, scene.size, means2d, *part.tensors))
-        for part in groups(scene)
-    ]
+    call = kernel, options.downsample, scene.size, means2d
+    drawn = [Drawn(*_Rasterize.apply(*call, *part.tensors)) for part in groups(scene)]
     image = torch.cat([part.image for part in drawn], -1) if len(drawn) > 1 else drawn[0].image
     return Rasterized(image, *drawn[0][1:3], means2d, *drawn[0][3:])
 
@@ -98,11 +86,12 @@ class _Rasterize(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx, kernel: Kernel, size: tuple[int, int], means2d: Tensor, *tensors: Tensor):
+    def forward(ctx, kernel: Kernel, downsample: int, size, means2d: Tensor, *tensors: Tensor):
         scene = Scene(*tensors, *size)
         ctx.kernel, ctx.size, ctx.means2d, ctx.channels = kernel, size, means2d, scene.channels
         scene = scene._replace(colors=widen(scene.colors), background=widen(scene.background))
-        drawn, saved, ctx.state = kernel.forward(scene, means2d)
+        drawn = Drawn.empty(scene, downsample)
+        saved, ctx.state = kernel.forward(scene, means2d, drawn)
         alpha = drawn.alpha if _needed(ctx).background else None
         ctx.save_for_backward(*scene.tensors, alpha, *saved)
         ctx.set_materialize_grads(False)
@@ -115,18 +104,15 @@ class _Rasterize(torch.autograd.Function):
         saved = ctx.saved_tensors  # hooks run at each reading
         scene, needed = Scene(*saved[:TENSORS], *ctx.size), _needed(ctx)
         alpha, *of_kernel = saved[TENSORS:]
-        channels = (CHANNELS, 1, 1)
-        upstream = Upstream(
-            *(None if d is None else widen(d, n) for d, n in zip(grads[:3], channels, strict=True))
-        )
-        found = ctx.kernel.backward(
-            scene, ctx.means2d, tuple(of_kernel), ctx.state, upstream, needed.viewmats
-        )
+        sizes = zip(grads[:3], (CHANNELS, 1, 1), strict=True)
+        upstream = tuple(None if grad is None else widen(grad, n) for grad, n in sizes)
+        found = SceneGradients(*map(torch.empty_like, (*scene[:6], ctx.means2d)))
+        found = found if needed.viewmats else found._replace(viewmats=None)
+        ctx.kernel.backward(scene, ctx.means2d, of_kernel, ctx.state, upstream, found)
         colors, background = narrow(found.colors, ctx.channels), None
         if needed.background:
-            background = narrow(_background_gradient(upstream.image, alpha, scene), ctx.channels)
-        per_input = (*found[:4], found.viewmats, colors, background, None)
-        return None, None, found.means2d, *per_input
+            background = narrow(_background_gradient(upstream[0], alpha, scene), ctx.channels)
+        return None, None, None, found.means2d, *found[:5], colors, background, None
 
 
 def _needed(ctx: Any) -> Scene:
@@ -162,6 +148,6 @@ def widen(x: Tensor, channels: int = CHANNELS) -> Tensor:
     return torch.nn.functional.pad(x, (0, missing)) if missing else x
 
 
-def narrow(x: Optional[Tensor], channels: int) -> Optional[Tensor]:
+def narrow(x: Tensor, channels: int) -> Tensor:
     """Remove the channels that `widen` added."""
-    return x if x is None or channels == CHANNELS else x[..., :channels]
+    return x if channels == CHANNELS else x[..., :channels]

@@ -1,7 +1,6 @@
 """The table of backends, which of them are available, and the choice of one."""
 
 import functools
-import importlib
 import logging
 from dataclasses import dataclass
 from types import ModuleType
@@ -11,56 +10,58 @@ import torch
 from torch import Tensor
 
 from ..core.errors import UserError, unknown
+from . import reference, torch_backend
+from .cpu import backend as cpu
+from .cuda import backend as cuda
+from .cuda import proof
 
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class Backend:
-    """A module of this package with ``rasterize(scene, options)`` and ``unavailable()``, and the
-    devices and types of tensors that it supports.
+    """A module with ``rasterize(scene, options)`` and, unless it runs everywhere,
+    ``unavailable()``; the devices and types of tensors that it supports.
 
     ``proof`` is a module with ``failure(device)``, which compares the backend with plain torch on
     a device before it is first used there.
     """
 
-    module: str
+    module: ModuleType
     devices: Optional[tuple[str, ...]] = None  # None: any
     dtypes: tuple[torch.dtype, ...] = (torch.float32, torch.float64)
-    proof: Optional[str] = None
+    proof: Optional[ModuleType] = None
 
-    def load(self) -> ModuleType:
-        return _import(self.module)
+    def unavailable(self) -> Optional[str]:
+        """Return why the backend can't run on this machine, or None if it can."""
+        return None if self.devices is None else self.module.unavailable()
+
+    def takes(self, tensor: Tensor) -> bool:
+        of_device = self.devices is None or tensor.device.type in self.devices
+        return of_device and tensor.dtype in self.dtypes
 
     def refuses(self, tensor: Tensor) -> Optional[str]:
         """Return why the backend can't be used with tensors like this one, or None if it can."""
-        if self.devices is not None and tensor.device.type not in self.devices:
-            return f"it takes tensors on {' or '.join(self.devices)}, these are on {tensor.device}"
-        if tensor.dtype not in self.dtypes:
-            return f"it takes {' or '.join(map(str, self.dtypes))}, these are {tensor.dtype}"
-        unavailable = self.load().unavailable()
-        if unavailable is not None or self.proof is None:
-            return unavailable
-        return _import(self.proof).failure(tensor.device)
-
-
-@functools.cache
-def _import(module: str) -> ModuleType:
-    return importlib.import_module(f".{module}", __package__)
+        if not self.takes(tensor):
+            devices, dtypes = " or ".join(self.devices or ()), " or ".join(map(str, self.dtypes))
+            on = f" on {devices}" if devices else ""
+            return f"it takes {dtypes}{on}, these are {tensor.dtype} on {tensor.device}"
+        reason = self.unavailable()
+        return self.proof.failure(tensor.device) if reason is None and self.proof else reason
 
 
 # In order of preference for "auto", which never gets to "reference", since "torch" always runs.
 BACKENDS = {
-    "cpu": Backend("cpu.backend", devices=("cpu",), dtypes=(torch.float32,)),
-    "cuda": Backend("cuda.backend", devices=("cuda",), dtypes=(torch.float32,), proof="cuda.proof"),
-    "torch": Backend("torch_backend"),
-    "reference": Backend("reference"),
+    "cpu": Backend(cpu, ("cpu",), (torch.float32,)),
+    "cuda": Backend(cuda, ("cuda",), (torch.float32,), proof),
+    "torch": Backend(torch_backend),
+    "reference": Backend(reference),
 }
 
 
 def available_backends() -> dict[str, Optional[str]]:
     """Map the name of each backend to None, or to the reason why it can't run on this machine."""
-    return {name: backend.load().unavailable() for name, backend in BACKENDS.items()}
+    return {name: backend.unavailable() for name, backend in BACKENDS.items()}
 
 
 def refusal(name: str, device: torch.device) -> Optional[str]:
@@ -71,7 +72,8 @@ def refusal(name: str, device: torch.device) -> Optional[str]:
 
 
 def choose_backend(name: str, tensor: Tensor) -> Backend:
-    """Return the backend with this name, or for "auto" the first one that supports the tensor.
+    """Return the backend with this name, or for "auto" the first one that supports the tensor;
+    warn, once per reason, if a compiled one that supports it can't run.
 
     Raises:
         UserError: there is no backend with this name, or it can't run or doesn't support the
@@ -79,32 +81,25 @@ def choose_backend(name: str, tensor: Tensor) -> Backend:
     """
     if name not in ("auto", *BACKENDS):
         raise unknown("backend", name, ["auto", *BACKENDS])
-    usable = (known for known, backend in BACKENDS.items() if backend.refuses(tensor) is None)
     if name == "auto":
-        name = next(usable)
-        _report_slow_path(name, tensor)
-        return BACKENDS[name]
-    refusal = BACKENDS[name].refuses(tensor)
-    if refusal is not None:
+        for known, backend in BACKENDS.items():
+            if not backend.takes(tensor):
+                continue
+            reason = backend.refuses(tensor)
+            if reason is None:
+                return backend
+            _warn_once(
+                f"splatting in plain torch, many times slower than backend {known!r}, which "
+                f"can't run: {reason}."
+            )
+    reason = BACKENDS[name].refuses(tensor)
+    if reason is not None:
+        usable = (known for known, other in BACKENDS.items() if other.refuses(tensor) is None)
         raise UserError(
-            f"the backend {name!r} can't run: {refusal}. Use backend='auto', or one of "
+            f"the backend {name!r} can't run: {reason}. Use backend='auto', or one of "
             f"{', '.join(usable)}."
         )
     return BACKENDS[name]
-
-
-def _report_slow_path(chosen: str, tensor: Tensor) -> None:
-    """Warn, once per reason, that a compiled backend which supports the tensor isn't available."""
-    for name, backend in BACKENDS.items():
-        if (
-            name != chosen
-            and tensor.device.type in (backend.devices or ())
-            and tensor.dtype in backend.dtypes
-        ):
-            _warn_once(
-                f"splatting in plain torch, many times slower than backend {name!r}, which "
-                f"can't run: {backend.refuses(tensor)}."
-            )
 
 
 @functools.cache

@@ -13,8 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..core.quaternions import rotation_rows
-from .options import RasterizeOptions
-from .scene import Scene
+from .scene import RasterizeOptions, Scene
 
 SMALLEST_QUATERNION = 1e-12
 FRUSTUM_MARGIN = 0.3

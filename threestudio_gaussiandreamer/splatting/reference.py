@@ -1,27 +1,22 @@
 """The specification of the image model: every pixel evaluates every visible Gaussian, and autograd
 differentiates.
 
-Three stages: `project` (projection.py), `sort`, `blend`. Written for readability and as the
-reference in tests, in float32 and float64. There are no tiles; pixels are processed in chunks to
-bound the memory. ``alpha_min=0, alpha_max=1, stop=0`` disable the cut-offs."""
+Four stages: `project` (projection.py), `sort`, `blend`, `compose`. Written for readability and as
+the reference in tests, in float32 and float64. There are no tiles; pixels are processed in chunks
+to bound the memory. ``alpha_min=0, alpha_max=1, stop=0`` disable the cut-offs."""
 
 from typing import NamedTuple, Optional
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from .options import RasterizeOptions
-from .output import Rasterized, compose, track_means2d
 from .projection import Splats, project
-from .scene import Scene
+from .scene import Rasterized, RasterizeOptions, Scene
 
 CHUNK_BYTES = 2**29
 TENSORS_PER_PAIR = 24
-
-
-def unavailable() -> Optional[str]:
-    """Return None: plain torch runs everywhere."""
 
 
 def rasterize(scene: Scene, options: RasterizeOptions) -> Rasterized:
@@ -120,3 +115,35 @@ def _blend_in_bounded_memory(bounded: bool, *arguments) -> tuple[Tensor, Tensor]
 def _pixels_per_chunk(splats: Sorted) -> int:
     per_pixel = TENSORS_PER_PAIR * splats.opacities.element_size() * max(1, len(splats.ids))
     return max(1, CHUNK_BYTES // per_pixel)
+
+
+def track_means2d(splats: Splats, others: tuple[Tensor, ...], absgrad: bool) -> Tensor:
+    """Return ``splats.means2d`` set up to retain its gradient if any input requires one."""
+    means2d = splats.means2d
+    if torch.is_grad_enabled() and any(x.requires_grad for x in (*splats, *others)):
+        means2d = means2d if means2d.requires_grad else means2d.requires_grad_()
+        means2d.retain_grad()
+        if absgrad:
+            means2d.absgrad = torch.zeros_like(means2d, requires_grad=False)
+    return means2d
+
+
+def compose(
+    sums: Float[Tensor, "B H W C+2"],
+    splats: Splats,
+    contribution: Tensor,
+    background: Tensor,
+    options: RasterizeOptions,
+) -> Rasterized:
+    """Composite the sums of (colour, depth, 1), weighted by ``alpha_i T_i``, over the background,
+    after downsampling them with a box filter.
+
+    ``alpha = sum_i alpha_i T_i = 1 - T_end``, so ``image = colour + (1 - alpha) background``.
+    """
+    if options.downsample > 1:
+        (batch, height, width, channels), size = sums.shape, options.downsample
+        boxes = sums.reshape(batch, height // size, size, width // size, size, channels)
+        sums = boxes.mean((2, 4))
+    image, depth, alpha = sums[..., :-2], sums[..., -2:-1], sums[..., -1:]
+    image = image + (1 - alpha) * background[:, None, None]
+    return Rasterized(image, alpha, depth, splats.means2d, splats.radii, contribution)

@@ -12,7 +12,7 @@ threads.
 """
 
 from collections.abc import Iterator
-from typing import NamedTuple, Optional
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -21,10 +21,9 @@ from torch.nn.functional import pad, threshold, threshold_
 from torch.utils.checkpoint import checkpoint
 
 from ..core.devices import without_autocast
-from .options import RasterizeOptions
-from .output import Rasterized, compose, track_means2d
 from .projection import Splats, project
-from .scene import Scene
+from .reference import compose, track_means2d
+from .scene import Rasterized, RasterizeOptions, Scene
 from .tiles import TILE, Bounds, Grid, Lists, bound, list_splats, make_grid, slices
 
 PIXELS = TILE * TILE
@@ -35,10 +34,6 @@ KEPT_SLICES = 4
 PROJECTED_AT_ONCE = 2**18
 SHAPE_COLUMNS = 6
 GAUSSIANS = ("means", "quats", "scales", "opacities", "colors")
-
-
-def unavailable() -> Optional[str]:
-    """Return None: plain torch runs everywhere."""
 
 
 def rasterize(scene: Scene, options: RasterizeOptions) -> Rasterized:

@@ -8,8 +8,7 @@ import torch
 from torch import Tensor
 
 from ..core.errors import UserError, unknown
-from .options import RasterizeOptions
-from .scene import Scene
+from .scene import RasterizeOptions, Scene
 
 PRESETS = {"fast": 1 / 255, "balanced": 1 / 1024, "accurate": 1 / 65536}
 LARGEST_SIDE = 16 * (2**16 - 1)  # pixels; kernels number tiles and their ends with 16 bits

@@ -24,8 +24,7 @@ from ..formats.spz import SPZ_UP, spz_bytes
 from ..gaussians.axes import AXES, WORLD_UP, rotation_between
 from ..gaussians.gaussians import Gaussians, finite
 from ..gaussians.views import NEAR, bounds
-from ..splatting import PRESETS
-from ..splatting.options import RasterizeOptions
+from ..splatting import PRESETS, RasterizeOptions
 from .render import (
     WHITE,
     Color,

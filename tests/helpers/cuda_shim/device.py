@@ -9,10 +9,10 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from itertools import pairwise
 from pathlib import Path
 from typing import Optional
 
+import pytest
 import torch
 from torch import Tensor
 
@@ -36,6 +36,15 @@ def unavailable() -> Optional[str]:
     return None if shutil.which("g++") else "needs g++ to compile the kernels for the host"
 
 
+def _no_compiler() -> str:
+    try:
+        nvrtc.version()
+    except OSError as error:
+        return str(error)
+    return ""
+
+
+needs_nvrtc = pytest.mark.skipif(bool(_no_compiler()), reason=_no_compiler())
 ORDERS = {"forward": 0, "backward": 1, "shuffled": 2}
 
 
@@ -64,9 +73,9 @@ class Now:
     def ready(self) -> bool:
         return self.device.arrived
 
-    def values(self) -> list[int]:
+    def values(self) -> Tensor:
         self.device.waits += 1
-        return [end - begin for begin, end in pairwise([0, *self.ends.tolist()])]
+        return self.ends
 
 
 class HostDevice:

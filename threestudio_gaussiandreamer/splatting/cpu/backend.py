@@ -9,18 +9,18 @@ import ctypes
 import functools
 import os
 import pathlib
+from collections.abc import Sequence
 from typing import NamedTuple, Optional
 
 import torch
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from ...core.errors import UserError, unknown
 from ...core.memory import main_memory
 from .. import autograd
-from ..autograd import CHANNELS, Drawn, SceneGradients, Upstream
-from ..options import RasterizeOptions
-from ..output import Rasterized
-from ..scene import Scene, SceneStruct, address
+from ..autograd import Drawn, SceneGradients, Upstream
+from ..scene import Rasterized, RasterizeOptions, Scene, SceneStruct, Settings, pointers
 
 FOLDER = pathlib.Path(__file__).parent
 BUILDS = ("v4", "v3", "base")  # best first
@@ -37,98 +37,54 @@ def unavailable() -> Optional[str]:
 
 def rasterize(scene: Scene, options: RasterizeOptions) -> Rasterized:
     """Draw all views of a validated scene."""
-    kernel = CpuKernel(options, scene.tracked, torch.get_num_threads(), library())
-    return autograd.rasterize(kernel, scene, options)
+    settings = options.struct(options.kernel_alpha_min, torch.get_num_threads())
+    return autograd.rasterize(CpuKernel(library(), settings, scene.tracked), scene, options)
 
 
 class CpuKernel(NamedTuple):
-    """One call of the library; see :class:`..autograd.Kernel`."""
+    """One call of the library; see :class:`..autograd.Kernel`. The structs are those of scene.h."""
 
-    options: RasterizeOptions
-    tracked: bool
-    threads: int
     library: ctypes.CDLL
+    settings: Settings
+    tracked: bool
 
-    def forward(self, scene: Scene, means2d: Tensor) -> tuple[Drawn, tuple[Tensor, ...], None]:
-        """Render; the only tensor to save is a handle of the library's state."""
-        views, gaussians = scene.shape
-        new, scale = scene.means.new_empty, self.options.downsample
-        size = (views, scene.height // scale, scene.width // scale)
-        images = [new(*size, channels) for channels in (CHANNELS, 1, 1)]
-        drawn = Drawn(*images, new(views, gaussians), new(views, gaussians))
-        handle = ctypes.c_void_p()
-        keep = ctypes.byref(handle) if self.tracked else None
-        out = _Pictures(*map(address, (*images, means2d, *drawn[3:])))
-        _check(self.library.splat_forward(scene.struct(), self._settings(), out, keep))
-        return drawn, (_State(self.library, handle).as_tensor(),), None
+    def forward(self, scene: Scene, means2d: Tensor, out: Drawn) -> tuple[tuple[Tensor, ...], None]:
+        """Render. The tensor to save refers to the library's state: autograd frees saved tensors
+        right after backward, earlier than the context.
+        """
+        kept = torch.empty(0)
+        kept.state = _State(self.library)
+        keep = ctypes.byref(kept.state.handle) if self.tracked else None
+        pictures = pointers(*out[:3], means2d, *out[3:])
+        _check(self.library.splat_forward(scene.struct(), self.settings, pictures, keep))
+        return (kept,), None
 
     def backward(
         self,
         scene: Scene,
         means2d: Tensor,
-        saved: tuple[Tensor, ...],
-        state: None,
+        saved: Sequence[Tensor],
+        _: None,
         upstream: Upstream,
-        wants_viewmats: bool,
-    ) -> SceneGradients:
+        out: SceneGradients,
+    ) -> None:
         """Differentiate; render again if hooks on saved tensors (checkpointing, offloading) have
-        replaced the tensor that owns the state.
+        replaced the tensor that refers to the state.
         """
-        saved = saved if hasattr(saved[0], "owner") else self.forward(scene, means2d)[1]
-        owner = saved[0].owner
-        found = SceneGradients(*map(torch.empty_like, (*scene[:6], means2d)))
-        found = found if wants_viewmats else found._replace(viewmats=None)
-        absgrad = torch.empty_like(means2d) if self.options.absgrad else None
-        out = _Gradients(*map(address, (*found, absgrad)))
-        inputs = (scene.struct(), self._settings(), _Upstream(*map(address, upstream)))
-        _check(owner.library.splat_backward(owner.handle, *inputs, out))
+        if not hasattr(saved[0], "state"):
+            saved, _ = self.forward(scene, means2d, Drawn.empty(scene, self.settings.downsample))
+        absgrad = torch.empty_like(means2d) if hasattr(means2d, "absgrad") else None
+        inputs = saved[0].state.handle, scene.struct(), self.settings, pointers(*upstream)
+        _check(self.library.splat_backward(*inputs, pointers(*out, absgrad)))
         if absgrad is not None:
             means2d.absgrad += absgrad
-        return found
-
-    def _settings(self) -> "_Settings":
-        o, alpha_min = self.options, self.options.kernel_alpha_min
-        limits = (o.near, o.far, o.eps2d, alpha_min, o.alpha_max, o.stop)
-        return _Settings(*limits, o.antialias, o.downsample, self.threads)
-
-
-# ---- the C interface: scene.h --------------------------------------------------------------------
-
-
-class _Settings(ctypes.Structure):
-    _fields_ = [
-        (name, ctypes.c_float) for name in "near far eps2d alpha_min alpha_max stop".split()
-    ]
-    _fields_ += [(name, ctypes.c_int32) for name in "antialias downsample threads".split()]
-
-
-class _Pictures(ctypes.Structure):
-    _fields_ = [
-        (name, ctypes.c_void_p) for name in "image alpha depth means2d radii contribution".split()
-    ]
-
-
-class _Upstream(ctypes.Structure):
-    _fields_ = [(name, ctypes.c_void_p) for name in Upstream._fields]
-
-
-class _Gradients(ctypes.Structure):
-    _fields_ = [(name, ctypes.c_void_p) for name in (*SceneGradients._fields, "absgrad")]
 
 
 class _State:
     """Owns what a backward pass needs from its forward pass."""
 
-    def __init__(self, library: ctypes.CDLL, handle: ctypes.c_void_p):
-        self.library, self.handle = library, handle
-
-    def as_tensor(self) -> Tensor:
-        """Return an empty tensor with a reference to this object, to be saved for backward:
-        autograd frees saved tensors right after backward, earlier than the context.
-        """
-        tensor = torch.empty(0)
-        tensor.owner = self
-        return tensor
+    def __init__(self, library: ctypes.CDLL):
+        self.library, self.handle = library, ctypes.c_void_p()
 
     def __del__(self):
         self.library.splat_release(self.handle)
@@ -141,6 +97,61 @@ def _check(needed: int) -> None:
             f"these Gaussians cover so many tiles that drawing them needs {size}: use fewer "
             "views per call, fewer or smaller Gaussians."
         )
+
+
+# ---- score distillation towards one known picture per render -------------------------------------
+
+
+class _KnownPictures(ctypes.Structure):
+    """``SplatKnownPictures`` of scene.h."""
+
+    _fields_ = [
+        *((n, ctypes.c_void_p) for n in "render pictures background scale weight".split()),
+        *((n, ctypes.c_int64) for n in "items height width".split()),
+        ("threads", ctypes.c_int32),
+        ("slope", ctypes.c_float),
+    ]
+
+
+def known_gradient(
+    render: Float[Tensor, "B H W 3"],
+    pictures: Sequence[UInt8[Tensor, "4 H W"]],
+    background: Float[Tensor, "B 3"],
+    scale: Float[Tensor, " B"],
+    weight: Float[Tensor, " B"],
+) -> Optional[tuple[Float[Tensor, "B H W 3"], Float[Tensor, " B"]]]:
+    """Compute, on a CPU with the library, the gradient of the loss 0.5 sum g^2 / B with respect to
+    the renders, where
+    g = w s (x - x_1) is the gradient of score distillation with respect to the latent
+    x = 2 render - 1, and x_1 the latent of a picture on the background.
+
+    Args:
+        pictures: one per render, premultiplied.
+        scale: s, of the error of the latent.
+        weight: w.
+
+    Returns:
+        the gradient, 2 g / B, bit for bit that of plain torch, and the sum of g^2 per item,
+        float64; None for tensors that the library doesn't take.
+    """
+    float32 = (render, background, scale, weight)
+    taken = all(x.dtype == torch.float32 and x.is_contiguous() for x in float32)
+    taken = taken and all(picture.is_contiguous() for picture in pictures)
+    if not taken:
+        return None
+    items, height, width, _ = render.shape
+    gradient = torch.empty_like(render)
+    squares = torch.empty(items, height, dtype=torch.float64)
+    planes = pointers(*pictures)
+    addresses = pointers(render, None, background, scale, weight)
+    addresses[1] = ctypes.addressof(planes)
+    rest = (items, height, width, torch.get_num_threads(), 2 / max(items, 1))
+    known = _KnownPictures(*addresses, *rest)
+    failed = library().splat_gradients_to_pictures(known, pointers(gradient, squares))
+    return None if failed else (gradient, squares.sum(1))  # out of memory
+
+
+# ---- the library ---------------------------------------------------------------------------------
 
 
 def usable_builds() -> list[str]:
@@ -181,33 +192,26 @@ def _path(build: str) -> pathlib.Path:
 
 
 def _load(build: str) -> ctypes.CDLL:
-    return load_library(_path(build))
-
-
-def load_library(path: pathlib.Path) -> ctypes.CDLL:
     """Load one build and declare its functions.
 
     Raises:
         OSError: there is no such file, it needs another system library, or it is of an earlier
             version.
     """
-    library = ctypes.CDLL(str(path))
-    if not hasattr(library, "splat_interface") or library.splat_interface() != INTERFACE:
+    path, struct = _path(build), ctypes.c_void_p
+    library, scene, settings = ctypes.CDLL(str(path)), *map(ctypes.POINTER, (SceneStruct, Settings))
+    known = hasattr(library, "splat_gradients_to_pictures")  # added last
+    if not known or library.splat_interface() != INTERFACE:
         raise OSError(f"{path} is of an earlier version: install the package again")
-    library.splat_forward.restype = library.splat_backward.restype = ctypes.c_int64
-    library.splat_forward.argtypes = [
-        ctypes.POINTER(SceneStruct),
-        ctypes.POINTER(_Settings),
-        ctypes.POINTER(_Pictures),
-        ctypes.POINTER(ctypes.c_void_p),
-    ]
-    library.splat_backward.argtypes = [
-        ctypes.c_void_p,
-        *map(ctypes.POINTER, (SceneStruct, _Settings, _Upstream, _Gradients)),
-    ]
-    library.splat_release.argtypes = [ctypes.c_void_p]
-    library.splat_best_isa.restype = ctypes.c_char_p
-    library.splat_set_memory.argtypes = [ctypes.c_int64]
-    library.splat_set_memory.restype = None
+    for name, result, *arguments in (
+        ("forward", ctypes.c_int64, scene, settings, struct, ctypes.POINTER(struct)),
+        ("backward", ctypes.c_int64, struct, scene, settings, struct, struct),
+        ("release", None, struct),
+        ("best_isa", ctypes.c_char_p),
+        ("set_memory", None, ctypes.c_int64),
+        ("gradients_to_pictures", ctypes.c_int64, ctypes.POINTER(_KnownPictures), struct),
+    ):
+        function = getattr(library, f"splat_{name}")
+        function.restype, function.argtypes = result, arguments
     library.splat_set_memory(main_memory())
     return library

@@ -9,42 +9,45 @@ larger capacity. If memory is short, fewer views are processed at a time."""
 
 import functools
 import logging
-from typing import NamedTuple, Optional
+import math
+import threading
+from collections import deque
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, Optional, TypeVar
 
 import torch
 from torch import Tensor
 
 from ...core.errors import UserError
-from .. import autograd
-from ..autograd import CHANNELS, Drawn, SceneGradients, Upstream
-from ..options import RasterizeOptions
-from ..output import Rasterized
-from ..scene import Scene
+from ...core.host_copies import HostCopy
+from .. import autograd, torch_backend
+from ..autograd import Drawn, SceneGradients, Upstream
+from ..scene import Rasterized, RasterizeOptions, Scene, Settings
 from . import driver
-from .memory import CapacityEstimate, halve_on_oom, round_up_capacity, too_large
 from .stages import (
-    AsyncReadback,
     Batch,
-    BlendUpstream,
     Images,
-    LaunchContext,
     Lists,
     Splats,
     blend,
     blend_backward,
-    empty_gradients,
     list_intersections,
-    make_batch,
-    make_context,
     no_lists,
     project,
     project_backward,
-    sum_cameras,
 )
 
 MOST_SPLATS = 2**31 - 1  # views times Gaussians; kernels number them with 32 bits
 MOST_VIEWS = 2**16 - 1  # the second side of a grid
-_estimates: dict[tuple, CapacityEstimate] = {}
+HEADROOM = 1.5
+STEP = 8192
+"""Intersections. Rounding up makes torch's caching allocator reuse blocks; up to 4096 numbers are
+sorted by another kernel of torch, which would have to be loaded too."""
+MAX_INTERSECTIONS = 2**31 - 1 - STEP  # torch's sort and the kernels use 32-bit indices
+DECAY = 0.99  # of the estimate, per call
+# per intersection: tile, owner, sorted tile, position, temporaries of the sort, and a row of sums
+BACKWARD_BYTES = (4 + 4 + 4 + 8 + 20) + 4 * 12
+Result = TypeVar("Result")
 log = logging.getLogger(__name__)
 
 
@@ -55,67 +58,59 @@ def unavailable() -> Optional[str]:
 
 def rasterize(scene: Scene, options: RasterizeOptions) -> Rasterized:
     """Draw all views of a validated scene."""
-    _check_count(*scene.shape)
-    context = make_context(options, scene.tracked, driver.device(scene.means.device))
-    return autograd.rasterize(CudaKernel(context), scene, options)
-
-
-def _check_count(views: int, gaussians: int) -> None:
+    views, gaussians = scene.shape
     if views * gaussians > MOST_SPLATS or views > MOST_VIEWS:
         raise UserError(
             f"{views} views of {gaussians} Gaussians are too many for one call: draw fewer "
             "views at a time."
         )
+    if not gaussians:  # nothing to launch
+        return torch_backend.rasterize(scene, options)
+    settings = options.struct(math.log2(options.kernel_alpha_min))
+    kernel = CudaKernel(driver.device(scene.means.device), settings, scene.tracked)
+    return autograd.rasterize(kernel, scene, options)
 
 
 class CudaKernel(NamedTuple):
     """One call of the kernels; see :class:`..autograd.Kernel`."""
 
-    context: LaunchContext
+    device: Any
+    settings: Settings
+    tracked: bool
 
     def forward(
-        self, scene: Scene, means2d: Tensor
-    ) -> tuple[Drawn, tuple[Tensor, ...], Optional[AsyncReadback]]:
-        """Render; the state for backward is the number of intersections of each view."""
-        if not len(scene.means):
-            images = _background_alone(scene, self.context)
-            return Drawn(*images[:3], *means2d.new_zeros(2, *scene.shape)), (), None
-        batch = make_batch(scene, self.context)
-        splats, radii, contribution = project(batch, means2d)
-        totals = self.context.device.read_async(splats.ends[:, -1])
-        images = _empty_images(scene, self.context)
-        lists = _draw(batch, splats, totals, images, contribution)
-        kept = (*splats, *lists, *images[3:]) if self.context.tracked else ()
-        return Drawn(*images[:3], radii, contribution), kept, totals
+        self, scene: Scene, means2d: Tensor, out: Drawn
+    ) -> tuple[tuple[Tensor, ...], HostCopy]:
+        """Render; the state for backward is the number of intersections up to each view's last."""
+        batch = Batch(scene, scene.struct(), self.settings, self.device)
+        splats = project(batch, means2d, out)
+        totals = self.device.read_async(splats.ends[:, -1])
+        size, new = (batch.views, scene.height, scene.width), scene.means.new_empty
+        kept = (new(*size, 4), new(size)) if self.tracked else (None, None)
+        lists = _draw(batch, splats, totals, (*out[:3], *kept, out.contribution))
+        return (*splats, *lists, *kept) if self.tracked else (), totals
 
     def backward(
         self,
         scene: Scene,
         means2d: Tensor,
-        saved: tuple[Tensor, ...],
-        state: Optional[AsyncReadback],
+        saved: Sequence[Tensor],
+        totals: HostCopy,
         upstream: Upstream,
-        wants_viewmats: bool,
-    ) -> SceneGradients:
+        out: SceneGradients,
+    ) -> None:
         """Differentiate; waits for the numbers of intersections."""
-        absgrad = means2d.absgrad if self.context.options.absgrad else None
-        found = empty_gradients(scene, absgrad, wants_viewmats)
-        viewmats = torch.zeros_like(scene.viewmats) if wants_viewmats and not saved else None
-        if saved:
-            splats, lists = Splats(*saved[:5]), Lists(*saved[5:8])
-            blended = BlendUpstream(*upstream, *saved[8:])
-            batch = make_batch(scene, self.context)
-            sums = _sums_of_rows(batch, splats, lists, state.values(), blended)
-            project_backward(batch, splats, sums, found)
-            if found.camera_parts is not None:
-                viewmats = sum_cameras(batch, found.camera_parts)
-        return SceneGradients(*found[:4], viewmats, found.colors, found.means2d)
+        batch = Batch(scene, scene.struct(), self.settings, self.device)
+        splats, lists = Splats(*saved[:5]), Lists(*saved[5:8])
+        absgrad = getattr(means2d, "absgrad", None)
+        upstream = (*upstream, *saved[8:])
+        sums = _sums_of_rows(batch, splats, lists, totals.values(), upstream, absgrad is not None)
+        project_backward(batch, splats.depth_keys, sums, out, absgrad)
 
 
-def _draw(
-    batch: Batch, splats: Splats, totals: AsyncReadback, images: Images, contribution: Tensor
-) -> Lists:
-    """Fill the images; return the lists, which are incomplete if the capacity was too small.
+def _draw(batch: Batch, splats: Splats, totals: HostCopy, images: Images) -> Lists:
+    """Fill the images, the last of which are the contributions; return the lists, which are
+    incomplete if the capacity was too small.
 
     The capacity is estimated from earlier calls. If there is no memory for it, the views are halved
     until each part fits; a part's lists have the exact size, and are freed after it is rendered. A
@@ -124,25 +119,23 @@ def _draw(
     key = (batch.scene.means.device, views, *batch.scene.size)
     estimate = _estimates.setdefault(key, CapacityEstimate(views))
 
-    def draw(first: int, last: int) -> Lists:
-        part = (batch.of_views(first, last), splats.of_views(first, last))
+    def draw(part: Batch, splats: Splats, images: Images) -> Lists:
         try:
-            if last - first == views:
+            if part is batch:
                 capacity = estimate.capacity(totals, gaussians)
             else:
-                capacity = round_up_capacity(sum(totals.values()[first:last]))
-            lists = list_intersections(*part, capacity)
+                capacity = round_up_capacity(int(splats.ends[-1, -1]))
+            lists = list_intersections(part, splats, capacity)
         except torch.cuda.OutOfMemoryError:
-            if last - first > 1:
+            if part.views > 1:
                 estimate.record_failure(gaussians)
                 raise
             _report_short_memory()
-            lists = no_lists(*part)
-        pictures = _of_views(images, first, last, views)
-        blend(*part, lists, pictures, contribution[first:last])
+            lists = no_lists(part, splats)
+        blend(part, splats, lists, images[:-1], images[-1])
         return lists
 
-    parts = halve_on_oom(draw, 0, views)
+    parts = _halve_on_oom(draw, batch, splats, images)
     return parts[0] if len(parts) == 1 else no_lists(batch, splats)
 
 
@@ -155,7 +148,7 @@ def _report_short_memory() -> None:
 
 
 def _sums_of_rows(
-    batch: Batch, splats: Splats, lists: Lists, totals: list[int], upstream: BlendUpstream
+    batch: Batch, splats: Splats, lists: Lists, ends: Tensor, upstream: Images, absolute: bool
 ) -> Tensor:
     """Run `blend_backward` on all views, or on fewer at a time if memory is short; lists that are
     incomplete are made again.
@@ -163,47 +156,113 @@ def _sums_of_rows(
     Raises:
         UserError: there is no memory for a single view.
     """
-    views = len(totals)
 
-    def sums(first: int, last: int) -> Tensor:
-        total = sum(totals[first:last])
-        part = (batch.of_views(first, last), splats.of_views(first, last))
-        whole = last - first == views and total <= lists.capacity
-        own = lists if whole else list_intersections(*part, round_up_capacity(total))
-        return blend_backward(*part, own, total, _of_views(upstream, first, last, views))
+    def sums(part: Batch, splats: Splats, upstream: Images) -> Tensor:
+        whole = part is batch
+        total = int(ends[-1] if whole else splats.ends[-1, -1])
+        own = lists
+        if not whole or total > lists.capacity:
+            own = list_intersections(part, splats, round_up_capacity(total))
+        return blend_backward(part, splats, own, total, upstream, absolute)
 
     try:
-        parts = halve_on_oom(sums, 0, views)
+        parts = _halve_on_oom(sums, batch, splats, upstream)
     except torch.cuda.OutOfMemoryError as error:
-        raise too_large(max(totals)) from error
+        raise _too_large(int(ends.diff(prepend=ends.new_zeros(1)).max())) from error
     return parts[0] if len(parts) == 1 else torch.cat(parts)
 
 
-# ---- tensors -------------------------------------------------------------------------------------
+# ---- room for the lists --------------------------------------------------------------------------
 
 
-def _of_views(tensors, first: int, last: int, views: int):
-    """Select some of all views of every tensor of a named tuple."""
-    if last - first == views:
-        return tensors
-    return type(tensors)(*(None if x is None else x[first:last] for x in tensors))
+def _halve_on_oom(
+    work: Callable[[Batch, Splats, Images], Result], batch: Batch, splats: Splats, images: Images
+) -> list[Result]:
+    """Call ``work`` with these; if memory is short, call it for each half of the views instead,
+    recursively. Return the results in order.
+
+    Raises:
+        torch.cuda.OutOfMemoryError: a single view doesn't fit.
+    """
+    try:
+        return [work(batch, splats, images)]
+    except torch.cuda.OutOfMemoryError:
+        if batch.views == 1:
+            raise
+    # Outside the except block, where the traceback would keep the attempt's tensors alive.
+    results, middle = [], batch.views // 2
+    for first, last in ((0, middle), (middle, batch.views)):
+        some = tuple(None if x is None else x[first:last] for x in images)
+        part = batch.of_views(first, last), splats.of_views(first, last), some
+        results += _halve_on_oom(work, *part)
+    return results
 
 
-def _empty_images(scene: Scene, context: LaunchContext) -> Images:
-    size, new = (len(scene.viewmats), scene.height, scene.width), scene.means.new_empty
-    kept = (new(*size, 4), new(size)) if context.tracked else (None, None)
-    shown = _shown_size(scene, context)
-    return Images(*(new(*shown, channels) for channels in (CHANNELS, 1, 1)), *kept)
+def round_up_capacity(intersections: int) -> int:
+    """Round a number of intersections up to the next capacity.
+
+    Raises:
+        torch.cuda.OutOfMemoryError: the number exceeds 32-bit indices.
+    """
+    if intersections > MAX_INTERSECTIONS:
+        raise torch.cuda.OutOfMemoryError(f"{intersections} intersections")
+    return (intersections // STEP + 1) * STEP
 
 
-def _shown_size(scene: Scene, context: LaunchContext) -> tuple[int, int, int]:
-    """Return the number of views, rows and columns after downsampling."""
-    scale = context.options.downsample
-    return len(scene.viewmats), scene.height // scale, scene.width // scale
+class CapacityEstimate:
+    """Estimates the intersections per Gaussian from earlier calls with the same size.
+
+    Numbers arrive from the GPU asynchronously. Methods are thread-safe.
+    """
+
+    def __init__(self, views: int):
+        self.views = views
+        self.per_gaussian: Optional[float] = None
+        self.failed_capacity = math.inf  # smallest capacity that didn't fit into memory
+        self.pending: deque[tuple[HostCopy, int]] = deque()
+        self.lock = threading.Lock()
+
+    def capacity(self, totals: HostCopy, gaussians: int) -> int:
+        """Return the capacity for a call, given its own number of intersections, still being copied
+        from the GPU, as the last value of ``totals``.
+
+        Raises:
+            torch.cuda.OutOfMemoryError: this capacity has failed before, and there are several
+                views, so that parts of them can be tried instead.
+        """
+        with self.lock:
+            self.pending.append((totals, gaussians))
+            while self.pending and (self.per_gaussian is None or self.pending[0][0].ready()):
+                earlier, count = self.pending.popleft()
+                found = int(earlier.values()[-1]) / count
+                # at once to a larger number, slowly to a smaller one
+                self.per_gaussian = max(DECAY * (self.per_gaussian or 0.0), found)
+            capacity = self._capacity(gaussians)
+        if self.views > 1 and capacity >= self.failed_capacity:
+            raise torch.cuda.OutOfMemoryError(f"{capacity} intersections")
+        return capacity
+
+    def record_failure(self, gaussians: int) -> None:
+        """Record that the capacity for this many Gaussians didn't fit into memory."""
+        with self.lock:
+            self.failed_capacity = min(self.failed_capacity, self._capacity(gaussians))
+
+    def _capacity(self, gaussians: int) -> int:
+        expected = math.ceil(self.per_gaussian * gaussians)
+        most = min(math.ceil(HEADROOM * expected), MAX_INTERSECTIONS)
+        return round_up_capacity(max(expected, most))
 
 
-def _background_alone(scene: Scene, context: LaunchContext) -> Images:
-    """Return the images of an empty scene; no kernel is launched."""
-    size, new = _shown_size(scene, context), scene.means.new_zeros
-    image = new(*size, CHANNELS) + scene.background[:, None, None]
-    return Images(image, new(*size, 1), new(*size, 1), None, None)
+_estimates: dict[tuple, CapacityEstimate] = {}
+
+
+def _too_large(intersections: int) -> UserError:
+    """Make the error for a single view that doesn't fit into the GPU's memory."""
+    needed = intersections * BACKWARD_BYTES / 2**30
+    free = torch.cuda.mem_get_info()[0] / 2**30 if torch.cuda.is_available() else 0.0
+    return UserError(
+        f"one view's Gaussians overlap {intersections} tiles of the image; their gradients need "
+        f"about {needed:.1f} GiB on the GPU, of which {free:.1f} GiB are free. Views are already "
+        "rendered one at a time: use fewer or smaller Gaussians, a smaller image or preset='fast', "
+        "or free memory of other programs."
+    )

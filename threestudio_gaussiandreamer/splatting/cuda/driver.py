@@ -8,9 +8,8 @@ import ctypes
 import functools
 import re
 import sys
-from itertools import pairwise
 from pathlib import Path
-from typing import Optional
+from typing import Any, Optional
 
 import torch
 from torch import Tensor
@@ -19,7 +18,6 @@ from ...core.errors import UserError
 from ...core.host_copies import HostCopy
 from . import nvrtc
 from .nvrtc import release
-from .stages import Argument
 
 # The .cu file of each kernel.
 UNITS = {
@@ -40,12 +38,24 @@ VERSION_FILE = Path("/proc/driver/nvidia/version")
 
 @functools.cache
 def unavailable() -> Optional[str]:
-    """Return why no GPU can be used, or None if one can; the answer is cached."""
+    """Return why no GPU can be used, or None if one can; the answer is cached.
+
+    Machine code runs on drivers of the same major CUDA release or a later one."""
     if torch.version.cuda is None:
         return f"this torch ({torch.__version__}) is built without CUDA; install a CUDA build of it"
     if not torch.cuda.is_available():
         return f"torch finds no NVIDIA GPU, or no driver that its CUDA {torch.version.cuda} can use"
-    return nvrtc.unavailable() or _unsuitable()
+    try:
+        nvrtc.target_for(torch.cuda.get_device_capability())
+        knows, compiler = driver_version(), nvrtc.version()
+    except (OSError, AttributeError, UserError) as error:  # a library may lack a function
+        return str(error)
+    if knows[0] < compiler[0]:
+        advice = f"update the driver, or install a torch built for CUDA {knows[0]}"
+        return (
+            f"the NVIDIA driver knows CUDA up to {release(knows)}, the compiler is of CUDA "
+            f"{release(compiler)}: {advice}"
+        )
 
 
 def device(device: torch.device) -> "Gpu":
@@ -61,9 +71,15 @@ class Gpu:
     def __init__(self, index: int):
         self.index = index
         self.target = nvrtc.target_for(torch.cuda.get_device_capability(index))
-        self.context = _primary_context(index)
-        self.modules: dict[str, ctypes.c_void_p] = {}
         self.functions: dict[str, ctypes.c_void_p] = {}
+        torch.cuda.init()
+        device, self.context = ctypes.c_int(), ctypes.c_void_p()
+        _call("starting the driver", "cuInit", 0)
+        # torch and the driver both number the devices in CUDA_VISIBLE_DEVICES
+        _call("finding the GPU", "cuDeviceGet", ctypes.byref(device), index)
+        # the primary context, which torch uses too
+        context = ctypes.byref(self.context)
+        _call("using the GPU", "cuDevicePrimaryCtxRetain", context, device)
 
     def describe(self) -> str:
         """Return the names and releases that the kernels' results may depend on."""
@@ -72,58 +88,36 @@ class Gpu:
             f"CUDA {release(driver_version())}, NVRTC of CUDA {release(nvrtc.version())}"
         )
 
-    def launch(self, name: str, grid: tuple[int, int], threads: int, *arguments: Argument) -> None:
+    def launch(self, name: str, grid: tuple[int, int], threads: int, *arguments: Any) -> None:
         """Queue a kernel on torch's current stream of the device; ``arguments`` are tensors,
         structures and C numbers.
         """
         values = [ctypes.c_void_p(x.data_ptr()) if isinstance(x, Tensor) else x for x in arguments]
         pointers = (ctypes.c_void_p * len(values))(*(ctypes.addressof(x) for x in values))
         with torch.cuda.device(self.index):
-            function = self._function(name)
+            # a new thread, such as autograd's, has no current context
+            _call("using the GPU", "cuCtxSetCurrent", self.context)
+            if name not in self.functions:
+                self._load(UNITS[name])
             stream = ctypes.c_void_p(torch.cuda.current_stream().cuda_stream)
-            sizes = (*grid, 1, threads, 1, 1, 0)
-            status = _driver().cuLaunchKernel(function, *sizes, stream, pointers, None)
-        _check(status, f"launching the kernel {name}")
+            sizes, doing = (*grid, 1, threads, 1, 1, 0), f"launching the kernel {name}"
+            _call(doing, "cuLaunchKernel", self.functions[name], *sizes, stream, pointers, None)
 
-    def read_async(self, ends: Tensor) -> "Readback":
+    def read_async(self, numbers: Tensor) -> HostCopy:
         with torch.cuda.device(self.index):
-            return Readback(ends)
+            return HostCopy(numbers.contiguous())
 
-    def _function(self, name: str) -> ctypes.c_void_p:
-        """Return a kernel, and make its context current, since a new thread, such as autograd's,
-        has no current context.
-        """
-        _check(_driver().cuCtxSetCurrent(self.context), "using the GPU")
-        if name not in self.functions:
-            function, module = ctypes.c_void_p(), self._module(UNITS[name])
-            status = _driver().cuModuleGetFunction(ctypes.byref(function), module, name.encode())
-            _check(status, f"finding the kernel {name}")
+    def _load(self, unit: str) -> None:
+        """Load the kernels of a .cu file."""
+        module, code = ctypes.c_void_p(), nvrtc.machine_code(unit, self.target)
+        compiler, driver = release(nvrtc.version()), release(driver_version())
+        releases = f"NVRTC of CUDA {compiler}, driver of CUDA {driver}"
+        doing = f"loading {unit}.cu for {self.target} ({releases})"
+        _call(doing, "cuModuleLoadData", ctypes.byref(module), code)
+        for name in (name for name, file in UNITS.items() if file == unit):
+            function, doing = ctypes.c_void_p(), f"finding the kernel {name}"
+            _call(doing, "cuModuleGetFunction", ctypes.byref(function), module, name.encode())
             self.functions[name] = function
-        return self.functions[name]
-
-    def _module(self, unit: str) -> ctypes.c_void_p:
-        if unit not in self.modules:
-            module, code = ctypes.c_void_p(), nvrtc.machine_code(unit, self.target)
-            status = _driver().cuModuleLoadData(ctypes.byref(module), code)
-            compiler, driver = release(nvrtc.version()), release(driver_version())
-            releases = f"NVRTC of CUDA {compiler}, driver of CUDA {driver}"
-            _check(status, f"loading {unit}.cu for {self.target} ({releases})")
-            self.modules[unit] = module
-        return self.modules[unit]
-
-
-class Readback:
-    """Integers that are copied from the GPU asynchronously, given as cumulative sums."""
-
-    def __init__(self, ends: Tensor):
-        self.copy = HostCopy(ends.contiguous())
-
-    def ready(self) -> bool:
-        return self.copy.ready()
-
-    def values(self) -> list[int]:
-        """Wait for the copy, and return the differences of the cumulative sums."""
-        return [end - begin for begin, end in pairwise([0, *self.copy.values().tolist()])]
 
 
 @functools.cache
@@ -134,7 +128,7 @@ def _gpu(index: int) -> Gpu:
 def driver_version() -> tuple[int, int]:
     """Return (major, minor) of the newest CUDA release that the driver supports."""
     found = ctypes.c_int()
-    _check(_driver().cuDriverGetVersion(ctypes.byref(found)), "asking for the driver's version")
+    _call("asking for the driver's version", "cuDriverGetVersion", ctypes.byref(found))
     return found.value // 1000, found.value % 1000 // 10
 
 
@@ -149,35 +143,6 @@ def driver_build() -> str:
     return f"{found[0]} " if found else ""
 
 
-def _unsuitable() -> Optional[str]:
-    """Return why the GPU or the driver can't run the kernels, or None.
-
-    Machine code runs on drivers of the same major CUDA release or a later one.
-    """
-    try:
-        nvrtc.target_for(torch.cuda.get_device_capability())
-        knows, compiler = driver_version(), nvrtc.version()
-    except (OSError, AttributeError, UserError) as error:  # a library may lack a function
-        return str(error)
-    if knows[0] < compiler[0]:
-        advice = f"update the driver, or install a torch built for CUDA {knows[0]}"
-        return (
-            f"the NVIDIA driver knows CUDA up to {release(knows)}, the compiler is of CUDA "
-            f"{release(compiler)}: {advice}"
-        )
-
-
-def _primary_context(index: int) -> ctypes.c_void_p:
-    """Return the device's primary context, which torch uses too."""
-    torch.cuda.init()
-    device, context = ctypes.c_int(), ctypes.c_void_p()
-    _check(_driver().cuInit(0), "starting the driver")
-    # torch and the driver both number the devices in CUDA_VISIBLE_DEVICES
-    _check(_driver().cuDeviceGet(ctypes.byref(device), index), "finding the GPU")
-    _check(_driver().cuDevicePrimaryCtxRetain(ctypes.byref(context), device), "using the GPU")
-    return context
-
-
 @functools.cache
 def _driver() -> ctypes.CDLL:
     driver = ctypes.CDLL(LIBRARY)
@@ -190,7 +155,13 @@ def _driver() -> ctypes.CDLL:
     return driver
 
 
-def _check(status: int, doing: str) -> None:
+def _call(doing: str, name: str, *arguments: Any) -> None:
+    """Call a function of the driver.
+
+    Raises:
+        UserError: it failed at ``doing``.
+    """
+    status = getattr(_driver(), name)(*arguments)
     if status:
         text = ctypes.c_char_p()
         _driver().cuGetErrorString(status, ctypes.byref(text))

@@ -8,7 +8,6 @@ options and compiler version.
 
 import ctypes
 import functools
-import glob
 import hashlib
 import logging
 import os
@@ -16,7 +15,7 @@ import re
 import sys
 import sysconfig
 from pathlib import Path
-from typing import NamedTuple, Optional
+from typing import Optional
 
 import torch
 
@@ -33,19 +32,6 @@ UNIT_OPTIONS = {name: ("--ftz=true", "--prec-div=false") for name in ("blend", "
 OLDEST_ARCHITECTURE = 75
 DIGEST = hashlib.sha256().digest_size
 log = logging.getLogger(__name__)
-
-
-class Compiled(NamedTuple):
-    code: bytes  # cubin, or PTX with its NUL
-    log: str  # registers, shared memory and spills of each kernel
-
-
-def unavailable() -> Optional[str]:
-    """Return why the compiler can't be used, or None if it can."""
-    try:
-        _library()
-    except OSError as error:
-        return str(error)
 
 
 def version() -> tuple[int, int]:
@@ -96,13 +82,14 @@ def machine_code(unit: str, target: str) -> bytes:
     found = read_cached(name)
     if found is None:
         log.info("compiling the CUDA kernels of %s.cu for %s", unit, target)
-        found = compile_unit(unit, target).code
+        found, _ = compile_unit(unit, target)
         write_cached(name, found)
     return found
 
 
-def compile_unit(unit: str, target: str) -> Compiled:
-    """Compile ``<unit>.cu``.
+def compile_unit(unit: str, target: str) -> tuple[bytes, str]:
+    """Compile ``<unit>.cu``; return the cubin, or PTX with its NUL, and the compiler's log of
+    registers, shared memory and spills of each kernel.
 
     Raises:
         UserError: the compiler rejects it.
@@ -121,7 +108,7 @@ def compile_unit(unit: str, target: str) -> Compiled:
                 f"{_error(status)}\n{messages}"
             )
         code = _bytes("CUBIN" if target.startswith("sm_") else "PTX", program)
-        return Compiled(code, messages)
+        return code, messages
     finally:
         nvrtc.nvrtcDestroyProgram(ctypes.byref(program))
 
@@ -166,15 +153,10 @@ def _key(unit: str, target: str) -> str:
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:24]
 
 
-def cached_path(name: str) -> Path:
-    """Return the path of a file in the cache; see :func:`cache_folder`."""
-    return cache_folder() / name
-
-
 def read_cached(name: str) -> Optional[bytes]:
     """Return the content if it is whole: the file ends with a digest of what comes before."""
     try:
-        data = cached_path(name).read_bytes()
+        data = (cache_folder() / name).read_bytes()
     except (OSError, RuntimeError):
         return None
     content, digest = data[:-DIGEST], data[-DIGEST:]
@@ -184,7 +166,7 @@ def read_cached(name: str) -> Optional[bytes]:
 def write_cached(name: str, content: bytes) -> None:
     """Write to the cache; log a failure and go on, since kernels can be compiled again."""
     try:
-        path = cached_path(name)
+        path = cache_folder() / name
         path.parent.mkdir(parents=True, exist_ok=True)
         with atomic_file(path) as file:
             file.write(content + hashlib.sha256(content).digest())
@@ -198,18 +180,17 @@ def write_cached(name: str, content: bytes) -> None:
 @functools.cache
 def _library() -> ctypes.CDLL:
     """Load the first candidate that can be loaded."""
-    failures = []
+    failure = ""
     for candidate in _candidates():
         try:
             library = ctypes.CDLL(candidate)
             library.nvrtcGetErrorString.restype = ctypes.c_char_p
+            return library
         except (OSError, AttributeError) as error:  # AttributeError: it is another library
-            failures.append(str(error))
-            continue
-        return library
+            failure = str(error)
     raise OSError(
         "NVRTC, CUDA's run-time compiler, isn't there: install a CUDA build of torch, or "
-        f"nvidia-cuda-nvrtc ({failures[-1]})"
+        f"nvidia-cuda-nvrtc ({failure})"
     )
 
 
@@ -217,25 +198,18 @@ def _candidates() -> list[str]:
     """List paths or names to load: only the one in GAUSSIANDREAMER_NVRTC if it is set; otherwise
     those that pip installed, beginning with torch's CUDA release, then those of the system.
     """
-    named = os.environ.get("GAUSSIANDREAMER_NVRTC")
-    if named:
+    if named := os.environ.get("GAUSSIANDREAMER_NVRTC"):
         return [named]
     release = (torch.version.cuda or "13").split(".")[0]
     pattern = "nvrtc64_*.dll" if sys.platform == "win32" else "libnvrtc*.so*"
-    folders = [Path(torch.__file__).parent / "lib"]
-    for root in dict.fromkeys([sysconfig.get_paths()["purelib"], *sys.path]):
-        folders += [
-            Path(root) / "nvidia" / place
-            for place in (f"cu{release}/lib", "cuda_nvrtc/lib", "cuda_nvrtc/bin", "cu13/lib")
-        ]
-    toolkit = os.environ.get("CUDA_HOME")
-    folders += [Path(toolkit) / "lib64"] if toolkit else []
-    found = [
-        path
-        for folder in folders
-        for path in sorted(glob.glob(str(folder / pattern)))
-        if not re.search(r"builtins|\.alt\.", path)
-    ]
+    places = (f"cu{release}/lib", "cuda_nvrtc/lib", "cuda_nvrtc/bin", "cu13/lib")
+    roots = [sysconfig.get_paths()["purelib"], *sys.path]
+    folders = [Path(root, "nvidia", place) for root in roots for place in places]
+    folders.insert(0, Path(torch.__file__).parent / "lib")
+    if toolkit := os.environ.get("CUDA_HOME"):
+        folders.append(Path(toolkit, "lib64"))
+    paths = (str(path) for folder in folders for path in sorted(folder.glob(pattern)))
+    found = [path for path in paths if not re.search(r"builtins|\.alt\.", path)]
     return [*dict.fromkeys(found), f"libnvrtc.so.{release}", "libnvrtc.so.12", "libnvrtc.so"]
 
 

@@ -5,11 +5,9 @@ by plain torch in float64 on the CPU: on the GPU torch's many small kernels woul
 which takes many times longer. The result is cached beside the compiled kernels; it is computed
 again for another GPU, driver, compiler, torch version or source text of the CUDA backend."""
 
-import contextlib
 import functools
 import hashlib
 import math
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from types import ModuleType
 from typing import Optional
@@ -20,8 +18,7 @@ from torch import Tensor
 from ...core.devices import torch_threads
 from ...core.errors import UserError
 from .. import torch_backend
-from ..options import RasterizeOptions
-from ..scene import Scene
+from ..scene import RasterizeOptions, Scene
 from . import backend as kernels
 from . import driver, nvrtc
 
@@ -41,7 +38,6 @@ OPTIONS = {
 }
 """The options of each draw; all kernels and all their branches on options run."""
 DIFFERENTIATED = ("means", "quats", "scales", "opacities", "viewmats", "colors")
-LIBRARY_ERRORS = (OSError, AttributeError)  # of ctypes: no such library, or no such function in it
 Results = dict[str, dict[str, Tensor]]
 """Outputs and gradients by name, of each draw."""
 
@@ -54,38 +50,26 @@ def failure(device: torch.device) -> Optional[str]:
         UserError, RuntimeError: the GPU has no memory left, or fails without the kernels too;
             nothing is cached.
     """
+    request = f"[unknown GPU, torch {torch.__version__}]. Please report this message"
     try:
-        gpu = driver.device(device).describe()
-    except UserError as error:
-        return str(error)
-    except LIBRARY_ERRORS as error:
-        return _unusable(error, "unknown GPU")
-    name = f"proof-{_key(gpu)}"
-    stored = nvrtc.read_cached(name)
-    if stored is None:
         try:
+            gpu = driver.device(device).describe()
+        except UserError as error:  # another GPU than `unavailable` looked at, and an older one
+            return str(error)
+        request = request.replace("unknown GPU", gpu)
+        name = f"proof-{_key(gpu)}"
+        stored = nvrtc.read_cached(name)
+        if stored is None:
             stored = compare(device).encode()
-        except LIBRARY_ERRORS as error:
-            return _unusable(error, gpu)
-        nvrtc.write_cached(name, stored)
+            nvrtc.write_cached(name, stored)
+    except (OSError, AttributeError) as error:  # of ctypes: no such library, or function in it
+        # not cached: a library may be mended, which the key doesn't tell
+        found = f"{type(error).__name__}: {error} {request}; the next start tries again"
+        return f"its compiler or the driver can't be used: {found}"
     if not stored:
         return None
-    return (
-        f"{stored.decode()} {_request(gpu)}; delete {nvrtc.cached_path(name)} and start again to "
-        "repeat the comparison"
-    )
-
-
-def _unusable(error: Exception, gpu: str) -> str:
-    """Return a reason that isn't cached: a library may be mended, which the key doesn't tell."""
-    return (
-        f"its compiler or the driver can't be used: {type(error).__name__}: {error} "
-        f"{_request(gpu)}; the next start tries again"
-    )
-
-
-def _request(gpu: str) -> str:
-    return f"[{gpu}, torch {torch.__version__}]. Please report this message"
+    path = nvrtc.cache_folder() / name
+    return f"{stored.decode()} {request}; delete {path} and start again to repeat the comparison"
 
 
 def _key(gpu: str) -> str:
@@ -105,15 +89,25 @@ def compare(device: torch.device) -> str:
         OSError, AttributeError: a library can't be loaded, or lacks a function.
     """
     require_torch(device)
-    with _default_algorithms(), torch_threads(1), ThreadPoolExecutor(1) as pool:
-        expected = pool.submit(reference)
-        try:
-            found = drawn_on(device)
-        except (UserError, RuntimeError) as error:
-            if isinstance(error, torch.cuda.OutOfMemoryError) or "out of memory" in str(error):
-                raise
-            return f"its kernels fail on a small scene: {error}"
-        errors = relative_errors(found, expected.result())
+    # what deterministic algorithms refuse is no failure of the kernels; switching them imports
+    # torch's compiler
+    strict = torch.are_deterministic_algorithms_enabled()
+    warns = torch.is_deterministic_algorithms_warn_only_enabled()
+    if strict:
+        torch.use_deterministic_algorithms(False)
+    try:
+        with torch_threads(1), ThreadPoolExecutor(1) as pool:
+            expected = pool.submit(reference)
+            try:
+                found = drawn_on(device)
+            except (UserError, RuntimeError) as error:
+                if isinstance(error, torch.cuda.OutOfMemoryError) or "out of memory" in str(error):
+                    raise
+                return f"its kernels fail on a small scene: {error}"
+            errors = relative_errors(found, expected.result())
+    finally:
+        if strict:
+            torch.use_deterministic_algorithms(True, warn_only=warns)
     wrong = []
     for draw, sizes in errors.items():  # "not <=", so that NaN counts as wrong
         names = [f"{name} by {size:.1e}" for name, size in sizes.items() if not size <= TOLERANCE]
@@ -124,22 +118,6 @@ def compare(device: torch.device) -> str:
         f"on a small scene its kernels differ from plain torch: {'; '.join(wrong)} (rounding is "
         f"at most {TOLERANCE:.0e})"
     )
-
-
-@contextlib.contextmanager
-def _default_algorithms() -> Iterator[None]:
-    """Let torch use its default algorithms: an operation that the deterministic ones refuse is no
-    failure of the kernels. Switching them imports torch's compiler, so only if they are on.
-    """
-    if not torch.are_deterministic_algorithms_enabled():
-        yield
-        return
-    warns = torch.is_deterministic_algorithms_warn_only_enabled()
-    torch.use_deterministic_algorithms(False)
-    try:
-        yield
-    finally:
-        torch.use_deterministic_algorithms(True, warn_only=warns)
 
 
 def require_torch(device: torch.device) -> None:
@@ -167,50 +145,43 @@ def drawn_on(device: torch.device) -> Results:
 
 
 def relative_errors(found: Results, expected: Results) -> dict[str, dict[str, float]]:
-    """Return the relative error of each output and gradient, for each draw."""
+    """Return the largest error of each output and gradient, relative to the largest entry, for each
+    draw; what only the kernels were given, the last Gaussians, must be zero.
+    """
+
+    def error(value: Tensor, true: Tensor) -> float:
+        difference = value.to("cpu", torch.float64, copy=True)
+        difference[tuple(slice(size) for size in true.shape)] -= true
+        return float(difference.abs().max() / true.abs().max())
+
     return {
-        draw: {name: _relative(value, expected[draw][name]) for name, value in values.items()}
+        draw: {name: error(value, expected[draw][name]) for name, value in values.items()}
         for draw, values in found.items()
     }
-
-
-def _relative(found: Tensor, true: Tensor) -> float:
-    """Return the largest error relative to the largest entry; what only the kernels were given, the
-    last Gaussians, must be zero.
-    """
-    difference = found.to("cpu", torch.float64, copy=True)
-    difference[tuple(slice(size) for size in true.shape)] -= true
-    return float(difference.abs().max() / true.abs().max())
 
 
 def _drawn(
     backend: ModuleType, device: torch.device, dtype: torch.dtype, options: RasterizeOptions
 ) -> dict[str, Tensor]:
-    """Render and differentiate the scene, a second time with one view, and wait for the results, so
-    that errors of the GPU are raised here.
+    """Render the scene, with options of downsampling its first view, differentiate a fixed weighted
+    sum of the images, and wait for the results, so that errors of the GPU are raised here.
     """
     with torch.inference_mode(False), torch.enable_grad():
         views = 1 if options.downsample > 1 else len(ANGLES)
-        scene = _scene(device, dtype, CULLED if backend is kernels else 0)
-        results = _draw(backend, scene.of_views(0, views), options)
+        scene = _scene(device, dtype, CULLED if backend is kernels else 0).of_views(0, views)
+        leaves = {name: getattr(scene, name).requires_grad_() for name in DIFFERENTIATED}
+        out = backend.rasterize(scene, options)
+        found = {name: getattr(out, name) for name in ("image", "alpha", "depth")}
+        # no arguments of ``backward``: given gradients, torch imports all of its symbolic shapes
+        sum(map(_weighted_sum, found.values())).backward()
+    found |= {"contribution": out.contribution}
+    leaves["means2d"] = out.means2d
+    found |= {f"gradient of {name}": leaf.grad for name, leaf in leaves.items()}
+    if options.absgrad:
+        found["absolute gradient of means2d"] = out.means2d.absgrad
     if device.type == "cuda":
         torch.cuda.synchronize(device)
-    return results
-
-
-def _draw(backend: ModuleType, scene: Scene, options: RasterizeOptions) -> dict[str, Tensor]:
-    """Render a scene; return the images and the gradients of a fixed weighted sum of them."""
-    leaves = {name: getattr(scene, name).requires_grad_() for name in DIFFERENTIATED}
-    out = backend.rasterize(scene, options)
-    images = {name: getattr(out, name) for name in ("image", "alpha", "depth")}
-    # no arguments of ``backward``: given gradients, torch imports all of its symbolic shapes
-    sum(_weighted_sum(image) for image in images.values()).backward()
-    leaves["means2d"] = out.means2d
-    gradients = {f"gradient of {name}": leaf.grad for name, leaf in leaves.items()}
-    if options.absgrad:
-        gradients["absolute gradient of means2d"] = out.means2d.absgrad
-    detached = {name: image.detach() for name, image in images.items()}
-    return detached | {"contribution": out.contribution.detach()} | gradients
+    return {name: value.detach() for name, value in found.items()}
 
 
 def _weighted_sum(image: Tensor) -> Tensor:
@@ -236,13 +207,12 @@ def _scene(device: torch.device, dtype: torch.dtype, culled: int) -> Scene:
     numbers = torch.arange(GAUSSIANS + culled, device="cpu") % GAUSSIANS
     cloud = [x[numbers] for x in (means, quats, scales, opacities, colors)]
     cloud[0][GAUSSIANS:, 2] -= 20
-    *attributes, colors, background = (x.to(device, dtype) for x in (*cloud, background))
-    viewmats = torch.tensor([_viewmat(angle) for angle in ANGLES], device=device, dtype=dtype)
+    turns = ((math.cos(angle), math.sin(angle)) for angle in ANGLES)
+    viewmats = torch.tensor(
+        [[[c, 0, s, 0], [0, 1, 0, 0], [-s, 0, c, 3.0], [0, 0, 0, 1]] for c, s in turns]
+    )
     focal = [[WIDTH, 0.0, WIDTH / 2], [0.0, WIDTH, HEIGHT / 2], [0.0, 0.0, 1.0]]
-    Ks = torch.tensor([focal] * len(ANGLES), device=device, dtype=dtype)
+    Ks = torch.tensor([focal] * len(ANGLES))
+    tensors = (*cloud, viewmats, background, Ks)
+    *attributes, colors, viewmats, background, Ks = (x.to(device, dtype) for x in tensors)
     return Scene(*attributes, viewmats, colors, background, Ks, WIDTH, HEIGHT)
-
-
-def _viewmat(angle: float) -> list[list[float]]:
-    cos, sin = math.cos(angle), math.sin(angle)
-    return [[cos, 0.0, sin, 0.0], [0.0, 1.0, 0.0, 0.0], [-sin, 0.0, cos, 3.0], [0.0, 0.0, 0.0, 1.0]]
