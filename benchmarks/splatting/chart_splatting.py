@@ -30,8 +30,8 @@ from benchmarks.splatting.bench_scenes import Scene, make_camera
 from benchmarks.splatting.bench_splatting import describe_machine
 from benchmarks.splatting.scenes import scenes
 from threestudio_gaussiandreamer.splatting import RasterizeOptions, rasterize, reference
+from threestudio_gaussiandreamer.splatting import scene as kernel_scene
 from threestudio_gaussiandreamer.splatting.projection import project
-from threestudio_gaussiandreamer.splatting.validation import as_scene, named
 
 ROOT = Path(__file__).resolve().parents[2]
 CSV = ROOT / "docs/charts/rasteriser.csv"
@@ -114,7 +114,10 @@ def at_pixels(
     """
     viewmat, K = (x[None].double() for x in make_camera(size))
     options = RasterizeOptions(alpha_min=0.0, stop=0.0)
-    splats = project(as_scene(named(*leaves, viewmat, K, background=None), size, size), options)
+    *attributes, colors = leaves
+    background = torch.zeros(1, 3, dtype=torch.float64)
+    view = kernel_scene.Scene(*attributes, viewmat, colors, background, K, size, size)
+    splats = project(view, options)
     ordered = reference.sort(splats, leaves[4][None], 0)
     return options, ordered, reference.pixel_centres(size, size, splats.depths)[pixels]
 

@@ -24,7 +24,7 @@ from benchmarks.splatting.scenes import needles, trained
 from threestudio_gaussiandreamer.core.streams import generator
 from threestudio_gaussiandreamer.splatting import RasterizeOptions, rasterize
 from threestudio_gaussiandreamer.splatting.cpu import backend as cpu
-from threestudio_gaussiandreamer.splatting.validation import as_scene, named
+from threestudio_gaussiandreamer.splatting.scene import Scene as splat_scene
 
 COMPILER, EMULATOR = "aarch64-linux-gnu-g++", "qemu-aarch64"
 FLAGS = (
@@ -92,7 +92,8 @@ def emulated(
 ) -> list[Tensor]:
     """Draw and differentiate with the program; return pictures, then gradients."""
     viewmats, Ks = cameras
-    scene = as_scene(named(*cloud, viewmats, Ks, None), SIZE, SIZE)
+    background = torch.zeros(VIEWS, 3)
+    scene = splat_scene(*cloud[:4], viewmats, cloud.colors, background, Ks, SIZE, SIZE)
     options = RasterizeOptions()
     settings = options.struct(options.kernel_alpha_min, threads=2)
     sizes = (ctypes.c_longlong * 3)(len(cloud.means), VIEWS, SIZE)

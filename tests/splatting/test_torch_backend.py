@@ -22,7 +22,7 @@ from tests.helpers.splatting_scenes import (
     run,
 )
 from threestudio_gaussiandreamer.core.devices import torch_threads
-from threestudio_gaussiandreamer.splatting import tiles, torch_backend
+from threestudio_gaussiandreamer.splatting import torch_backend
 
 # float64 against float64: the same formula in another order, so rounding only; 1e-9 leaves room for
 # sums of 1e5 terms.
@@ -150,11 +150,11 @@ def test_small_budgets_change_nothing(monkeypatch):
     cloud, camera = random_cloud(120, seed=7, size=0.3), cameras(2, 37, 29)
     splits = []
     monkeypatch.setattr(torch_backend, "PROJECTED_AT_ONCE", 50)
-    monkeypatch.setattr(tiles, "CANDIDATES_PER_SLICE", 200)
-    monkeypatch.setattr(tiles, "CANDIDATES_PER_TEST", 37)
+    monkeypatch.setattr(torch_backend, "CANDIDATES_PER_SLICE", 200)
+    monkeypatch.setattr(torch_backend, "CANDIDATES_PER_TEST", 37)
     monkeypatch.setattr(torch_backend, "SPLATS_PER_STEP", 4)
     monkeypatch.setattr(torch_backend, "ELEMENTS_PER_BLOCK", 3 * 4 * 64)
-    original = tiles.slices
+    original = torch_backend.slices
     monkeypatch.setattr(
         torch_backend, "slices", lambda *a: splits.append(original(*a)) or splits[-1]
     )

@@ -47,7 +47,7 @@ from threestudio_gaussiandreamer.gaussians.densify import PARAMETERS, Rules, Sta
 from threestudio_gaussiandreamer.gaussians.grow import grow, nearest_distance_scales
 from threestudio_gaussiandreamer.gaussians.point_cloud import PointCloud
 from threestudio_gaussiandreamer.guidance.base import NonFiniteScore
-from threestudio_gaussiandreamer.splatting import tiles
+from threestudio_gaussiandreamer.splatting import torch_backend
 from threestudio_gaussiandreamer.splatting.projection import quats_to_rotations
 from threestudio_gaussiandreamer.training.density import DensityControl
 from threestudio_gaussiandreamer.training.geometry import (
@@ -245,8 +245,8 @@ def test_f8_tile_intersections_are_counted_in_64_bits(fault):
 
     def ours(side):
         rectangles = torch.tensor([[0], [0], [side], [side]]).expand(4, n)
-        bounds = tiles.Bounds(torch.empty(6, 0), rectangles, torch.zeros(n).long())
-        return sum((last - first) * side * side for first, last in tiles.slices(bounds))
+        bounds = torch_backend.Bounds(torch.empty(6, 0), rectangles, torch.zeros(n).long())
+        return sum((last - first) * side * side for first, last in torch_backend.slices(bounds))
 
     def in_32_bits(side):
         with np.errstate(over="ignore"):

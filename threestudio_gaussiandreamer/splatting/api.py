@@ -8,7 +8,7 @@ from torch import Tensor
 from ..core.devices import without_autocast
 from .backends import choose_backend
 from .scene import Rasterized, RasterizeOptions
-from .validation import as_scene, check, named, smallest_alpha
+from .validation import SHAPES, checked_scene, smallest_alpha
 
 
 def rasterize(
@@ -76,8 +76,8 @@ def rasterize(
     options = RasterizeOptions(
         near, far, eps2d, antialias, alpha_min, alpha_max, stop, downsample, absgrad
     )
-    tensors = named(means, quats, scales, opacities, colors, viewmats, Ks, background)
-    check(tensors, width, height, options, non_finite)
+    given = means, quats, scales, opacities, colors, viewmats, Ks, background
+    tensors = {name: x for name, x in zip(SHAPES, given, strict=True) if x is not None}
+    scene = checked_scene(tensors, width, height, options, non_finite)
     with without_autocast(means.device.type):
-        scene = as_scene(tensors, width, height)
         return choose_backend(backend, scene.means).module.rasterize(scene, options)

@@ -13,7 +13,17 @@ from .scene import RasterizeOptions, Scene
 PRESETS = {"fast": 1 / 255, "balanced": 1 / 1024, "accurate": 1 / 65536}
 LARGEST_SIDE = 16 * (2**16 - 1)  # pixels; kernels number tiles and their ends with 16 bits
 ROUNDING = 1e-4  # how far scales and opacities may lie outside their ranges
-GAUSSIANS = ("means", "quats", "scales", "opacities", "colors")
+SHAPES = {
+    "means": ["N 3"],
+    "quats": ["N 4"],
+    "scales": ["N 3"],
+    "opacities": ["N"],
+    "colors": ["N C", "B N C"],
+    "viewmats": ["B 4 4"],
+    "Ks": ["B 3 3"],
+    "background": ["C", "B C"],
+}
+GAUSSIANS = list(SHAPES)[:5]
 
 
 def smallest_alpha(preset: str, alpha_min: Optional[float]) -> float:
@@ -27,21 +37,17 @@ def smallest_alpha(preset: str, alpha_min: Optional[float]) -> float:
     return PRESETS[preset] if alpha_min is None else alpha_min
 
 
-def named(means, quats, scales, opacities, colors, viewmats, Ks, background) -> dict[str, Tensor]:
-    """Return the tensors by name, the Gaussians' first; a background of None is left out."""
-    gaussians = (means, quats, scales, opacities, colors)
-    tensors = dict(zip(GAUSSIANS, gaussians, strict=True)) | {"viewmats": viewmats, "Ks": Ks}
-    return tensors if background is None else tensors | {"background": background}
-
-
-def check(
+def checked_scene(
     tensors: dict[str, Tensor], width: int, height: int, options: RasterizeOptions, policy: str
-) -> None:
-    """Check all arguments of `rasterize` except the backend.
+) -> Scene:
+    """Check all arguments of `rasterize` except the backend. Convert the tensors, named as in
+    `SHAPES`, to contiguous float32, or to float64 if all Gaussians' tensors are; cameras and
+    background, which may be left out, may have another type.
 
     Raises:
-        UserError: a tensor has the wrong type, device or shape, a number is out of its range, or,
-            with the policy "error", a value isn't finite.
+        UserError: a tensor has the wrong type, device or shape, a number is out of its range, some
+            Gaussians' tensors are float64 and others aren't, or, with the policy "error", a value
+            isn't finite.
     """
     _check_tensors(tensors)
     _check_shapes(tensors)
@@ -51,16 +57,6 @@ def check(
     if policy == "error":
         _check_finite(tensors)
     check_ranges(tensors)
-
-
-def as_scene(tensors: dict[str, Tensor], width: int, height: int) -> Scene:
-    """Convert checked tensors to contiguous float32, or to float64 if all Gaussians' tensors are.
-
-    Cameras and background may have another type than the Gaussians.
-
-    Raises:
-        UserError: some Gaussians' tensors are float64 and others aren't.
-    """
     wide = [name for name in GAUSSIANS if tensors[name].dtype == torch.float64]
     if wide and len(wide) < len(GAUSSIANS):
         raise UserError(
@@ -101,21 +97,18 @@ def _check_shapes(tensors: dict[str, Tensor]) -> None:
     if views == 0 or channels == 0:
         got = f"viewmats {shapes['viewmats']}, colors {shapes['colors']}"
         raise UserError(f"at least one view and one colour channel are needed; got {got}.")
-    expected = {
-        "means": {"(N, 3)": (n, 3)},
-        "quats": {"(N, 4)": (n, 4)},
-        "scales": {"(N, 3)": (n, 3)},
-        "opacities": {"(N,)": (n,)},
-        "colors": {"(N, C)": (n, channels), "(B, N, C)": (views, n, channels)},
-        "viewmats": {"(B, 4, 4)": (views, 4, 4)},
-        "Ks": {"(B, 3, 3)": (views, 3, 3)},
-        "background": {"(C,)": (channels,), "(B, C)": (views, channels)},
-    }
+    sizes = {"N": n, "B": views, "C": channels, "3": 3, "4": 4}
     for name, shape in shapes.items():
-        if shape not in expected[name].values():
-            wanted = " or ".join(f"{words} = {known}" for words, known in expected[name].items())
-            sizes = f"N={n} is from means, B={views} from viewmats, C={channels} from colors"
-            raise UserError(f"{name} must have the shape {wanted}; got {shape}. {sizes}.")
+        known = {text: tuple(sizes[size] for size in text.split()) for text in SHAPES[name]}
+        if shape not in known.values():
+            wanted = (
+                f"({text.replace(' ', ', ')}{',' * (len(one) == 1)}) = {one}"
+                for text, one in known.items()
+            )
+            raise UserError(
+                f"{name} must have the shape {' or '.join(wanted)}; got {shape}. N={n} is from "
+                f"means, B={views} from viewmats, C={channels} from colors."
+            )
 
 
 def _check_numbers(width: int, height: int, options: RasterizeOptions) -> None:
@@ -146,11 +139,8 @@ def _is_whole(number: Any) -> bool:
 
 def check_ranges(tensors: dict[str, Tensor]) -> None:
     """Check that scales and opacities aren't their logarithms and logits: on a CPU in every call,
-    elsewhere in the first one on each device, since looking waits for it.
-
-    Raises:
-        UserError: a scale is below 0, or an opacity outside [0, 1]. Values that aren't finite are
-            left to the policy.
+    elsewhere in the first one on each device, since looking waits for it. Values that aren't finite
+    are left to the policy.
     """
     device = tensors["means"].device
     if device in _looked_at or not len(tensors["means"]):
