@@ -296,7 +296,7 @@ def _block(table: Table, lists: Lists, part: Tensor, depth: int, length: int) ->
     return Block(tiles, splats, mean_x - middle_x, mean_y - middle_y, *conic_and_opacity, features)
 
 
-# ---- lists of the splats that may reach a pixel of each tile, in bounded memory -------------------
+# ---- lists of the splats of each tile, in bounded memory -----------------------------------------
 
 
 def bound(means2d, conics, opacities, extents, views, grid: Grid, alpha_min: float) -> Bounds:
