@@ -8,6 +8,7 @@ with pixel centres at +0.5. Images are (B, H, W, C) with row 0 at the top."""
 
 import functools
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple, Optional
 
 import torch
@@ -46,15 +47,8 @@ def orbit_positions(
 ) -> Float[Tensor, "B 3"]:
     """Convert spherical to Cartesian coordinates, both in world units."""
     elevation, azimuth = torch.deg2rad(elevation_deg), torch.deg2rad(azimuth_deg)
-    horizontal = distance * torch.cos(elevation)
-    return torch.stack(
-        [
-            horizontal * torch.cos(azimuth),
-            horizontal * torch.sin(azimuth),
-            distance * torch.sin(elevation),
-        ],
-        -1,
-    )
+    along, z = distance * torch.cos(elevation), distance * torch.sin(elevation)
+    return torch.stack([along * torch.cos(azimuth), along * torch.sin(azimuth), z], -1)
 
 
 def look_at(
@@ -66,21 +60,17 @@ def look_at(
     along -x.
     """
     offset = center - position
+    x_axis = torch.tensor([1.0, 0, 0], dtype=up.dtype, device=up.device).expand_as(up)
     nowhere = offset.norm(dim=-1, keepdim=True) < 1e-12
-    forward = F.normalize(torch.where(nowhere, _x_axis(offset).neg(), offset), dim=-1)
+    forward = F.normalize(torch.where(nowhere, -x_axis, offset), dim=-1)
     right = torch.linalg.cross(forward, up)
     degenerate = right.norm(dim=-1, keepdim=True) < 1e-6
-    right = F.normalize(
-        torch.where(degenerate, torch.linalg.cross(forward, _x_axis(up)), right), dim=-1
-    )
+    instead = torch.linalg.cross(forward, x_axis)
+    right = F.normalize(torch.where(degenerate, instead, right), dim=-1)
     up = torch.linalg.cross(right, forward)
     c2w = torch.eye(4, dtype=position.dtype, device=position.device).repeat(len(position), 1, 1)
     c2w[:, :3] = torch.stack([right, up, -forward, position], -1)
     return c2w
-
-
-def _x_axis(like: Float[Tensor, "B 3"]) -> Float[Tensor, "B 3"]:
-    return torch.tensor([1.0, 0.0, 0.0], dtype=like.dtype, device=like.device).expand_as(like)
 
 
 def orbit_c2w(
@@ -101,13 +91,7 @@ def orbit_c2w(
     """
     position = orbit_positions(elevation_deg, azimuth_deg, distance)
     center = torch.zeros_like(position) if center is None else center
-    up = (
-        torch.tensor([0.0, 0.0, 1.0], dtype=position.dtype, device=position.device).expand_as(
-            position
-        )
-        if up is None
-        else up
-    )
+    up = position.new_tensor([0.0, 0.0, 1.0]).expand_as(position) if up is None else up
     return look_at(position, center, up)
 
 
@@ -167,13 +151,12 @@ def ray_directions(
     Args:
         normalize: scale to unit length; otherwise the component along the view axis is 1.
     """
-    rows = torch.arange(height, dtype=c2w.dtype, device=c2w.device) + 0.5 - 0.5 * height
-    columns = torch.arange(width, dtype=c2w.dtype, device=c2w.device) + 0.5 - 0.5 * width
+    like = {"dtype": c2w.dtype, "device": c2w.device}
+    rows, columns = (torch.arange(n, **like) + 0.5 - 0.5 * n for n in (height, width))
     y, x = torch.meshgrid(rows, columns, indexing="ij")
     focal = focal_length(fovy, height)[:, None, None]
-    directions = torch.stack(
-        [x / focal, -y / focal, torch.full_like(x, -1.0).expand(len(c2w), -1, -1)], -1
-    )
+    axial = torch.full_like(x, -1.0).expand(len(c2w), -1, -1)
+    directions = torch.stack([x / focal, -y / focal, axial], -1)
     directions = directions @ c2w[:, None, :3, :3].transpose(-1, -2)
     return F.normalize(directions, dim=-1) if normalize else directions
 
@@ -222,12 +205,9 @@ def projection(
     """Return threestudio's projection matrices (y negated: the top row has NDC y = -1)."""
     tan = torch.tan(0.5 * fovy)
     matrix = torch.zeros(len(fovy), 4, 4, dtype=fovy.dtype, device=fovy.device)
-    matrix[:, 0, 0], matrix[:, 1, 1] = 1.0 / (tan * aspect), -1.0 / tan
-    matrix[:, 2, 2], matrix[:, 2, 3] = (
-        -(far + near) / (far - near),
-        -2.0 * far * near / (far - near),
-    )
-    matrix[:, 3, 2] = -1.0
+    matrix[:, 0, 0], matrix[:, 1, 1], matrix[:, 3, 2] = 1.0 / (tan * aspect), -1.0 / tan, -1.0
+    matrix[:, 2, 2] = -(far + near) / (far - near)
+    matrix[:, 2, 3] = -2.0 * far * near / (far - near)
     return matrix
 
 
@@ -257,12 +237,10 @@ def sample_orbit(
     each."""
     drawn, u = _draw_by_angle(rng), torch.rand(4, batch, generator=rng)
     by_angle = drawn if by_angle is None else by_angle
-    low, high = (math.sin(math.radians(e)) for e in ranges.elevation)
-    elevation = (
-        _lerp(ranges.elevation, u[0])
-        if by_angle
-        else torch.rad2deg(torch.asin((low + (high - low) * u[0]).clamp(-1.0, 1.0)))
-    )
+    elevation = _lerp(ranges.elevation, u[0])
+    if not by_angle:
+        sines = [math.sin(math.radians(e)) for e in ranges.elevation]
+        elevation = torch.rad2deg(torch.asin(_lerp(sines, u[0]).clamp(-1.0, 1.0)))
     sector = (u[1] + torch.arange(batch)) / batch if uniform_azimuth else u[1]
     fovy = torch.deg2rad(_lerp(ranges.fovy_deg, u[3]))
     return Orbit(elevation, _lerp(ranges.azimuth, sector), _lerp(ranges.distance, u[2]), fovy)
@@ -288,7 +266,7 @@ def _draw_by_angle(rng: torch.Generator) -> bool:
     return bool(torch.rand(1, generator=rng) < 0.5)
 
 
-def _lerp(ends: tuple[float, float], u: Tensor) -> Tensor:
+def _lerp(ends: Sequence[float], u: Tensor) -> Tensor:
     return ends[0] + (ends[1] - ends[0]) * u
 
 
@@ -301,9 +279,8 @@ def held_out_orbit(count: int = 24) -> Orbit:
     index = torch.arange(count)
     elevation = torch.tensor([0.0, 15.0, 30.0, 45.0])[index % 4]
     distance = torch.tensor([2.0, 2.6, 3.2])[index % 3]
-    return Orbit(
-        elevation, 360.0 * index / count, distance, torch.full((count,), math.radians(50.0))
-    )
+    fovy = torch.full((count,), math.radians(50.0))
+    return Orbit(elevation, 360.0 * index / count, distance, fovy)
 
 
 def camera_pool(count: int, ranges: OrbitRanges, seed: int, stream: str = "camera-pool") -> Orbit:

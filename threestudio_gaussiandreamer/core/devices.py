@@ -11,9 +11,8 @@ def get_device() -> torch.device:
     """Return where parts are built: this process's GPU, or the CPU when none is visible."""
     if not torch.cuda.is_available():
         return torch.device("cpu")
-    return torch.device(
-        "cuda", int(os.environ.get("LOCAL_RANK", os.environ.get("SLURM_LOCALID", 0)))
-    )
+    rank = os.environ.get("LOCAL_RANK", os.environ.get("SLURM_LOCALID", 0))
+    return torch.device("cuda", int(rank))
 
 
 @contextmanager

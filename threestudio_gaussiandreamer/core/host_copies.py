@@ -1,7 +1,6 @@
-"""Copies between the host and a GPU that don't make the host wait for the GPU's earlier work.
-
-Training queues a step's work while the GPU computes; the host waits only where it must decide by a
-number. Numbers that are logged or counted are therefore read when they have arrived."""
+"""Copies between the host and a GPU that don't make the host wait for the GPU's earlier work:
+numbers that are logged or counted are read when they have arrived.
+"""
 
 from collections import deque
 from collections.abc import Callable
@@ -42,8 +41,8 @@ class DelayedReads:
         self._pending: deque[tuple[HostCopy, Callable[[Tensor], None]]] = deque()
 
     def submit(self, values: Tensor, use: Callable[[Tensor], None]) -> None:
-        """Call ``use`` with these values, now or in a later call of a method. What it raises is
-        raised there.
+        """Call ``use`` with these values, now or in a later call of a method, which raises what it
+        raises.
         """
         self._pending.append((HostCopy(values), use))
         self.poll()
@@ -65,13 +64,10 @@ class DelayedReads:
 
 def flush_reads(*parts: Any) -> None:
     """Wait for the values that parts have submitted to their ``reads``; other parts are left out.
-
-    Raises:
-        whatever the use of a value raises.
+    Raises what the use of a value raises.
     """
     for part in parts:
-        reads = getattr(part, "reads", None)
-        if isinstance(reads, DelayedReads):
+        if isinstance(reads := getattr(part, "reads", None), DelayedReads):
             reads.flush()
 
 

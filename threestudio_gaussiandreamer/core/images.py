@@ -96,7 +96,9 @@ def grid(cells: list, *, align: Any = "max") -> np.ndarray:
         return np.concatenate([_padded(row, 0, width - row.shape[1]) for row in rows], axis=0)
     makers = {"rgb": rgb, "grayscale": grayscale}
     images = [makers[cell["type"]](cell["img"], **cell.get("kwargs", {})) for cell in cells]
-    height, width = _cell_size(images, align)
+    if align in ("max", "min"):
+        align = getattr(np, align)([image.shape[:2] for image in images], axis=0).tolist()
+    height, width = (align, align) if isinstance(align, int) else align
     return np.concatenate([_resize(image, height, width) for image in images], axis=1)
 
 
@@ -194,19 +196,15 @@ def write_animation(path: Path, frames: list[Path], size: int, seconds: float) -
 
 
 def _require_whole_mp4(path: Path) -> None:
-    """Raise OSError unless the boxes of the MP4 fill the file and its index (moov) is among them.
-
-    imageio doesn't report when ffmpeg ends early, for instance on a full disk."""
-    names, place, size = [], 0, path.stat().st_size
-    with open(path, "rb") as file:
-        while place + 8 <= size:
-            file.seek(place)
-            length, name = struct.unpack(">I4s", file.read(8))
-            if length == 1:  # a 64-bit length follows
-                (length,) = struct.unpack(">Q", file.read(8))
-            names.append(name)
-            place += length or size - place  # length 0: the box extends to the end of the file
-    if place != size or b"moov" not in names:
+    """Raise OSError unless the boxes of the MP4, of less than 4 GB, fill the file and its index
+    (moov) is among them: imageio doesn't report when ffmpeg ends early, as on a full disk.
+    """
+    names, place, content = [], 0, path.read_bytes()
+    while place + 8 <= len(content):
+        length, name = struct.unpack_from(">I4s", content, place)
+        names.append(name)
+        place += max(length, 8)
+    if place != len(content) or b"moov" not in names:
         raise OSError("ffmpeg ended before the file was complete; is the disk full?")
 
 
@@ -222,15 +220,6 @@ def _to_bytes(values: np.ndarray) -> np.ndarray:
 
 def _padded(image: np.ndarray, rows: int, columns: int, mode: str = "constant") -> np.ndarray:
     return np.pad(image, ((0, rows), (0, columns), (0, 0)), mode=mode)
-
-
-def _cell_size(images: list[np.ndarray], align: Any) -> tuple[int, int]:
-    heights, widths = np.array([image.shape[:2] for image in images]).T
-    if align == "max":
-        return int(heights.max()), int(widths.max())
-    if align == "min":
-        return int(heights.min()), int(widths.min())
-    return (align, align) if isinstance(align, int) else tuple(align)
 
 
 def _resize(image: np.ndarray, height: int, width: int) -> np.ndarray:

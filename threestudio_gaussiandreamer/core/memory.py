@@ -32,11 +32,10 @@ def main_memory() -> int:
 
 
 def require_memory(options: str, needed: float, what: str) -> None:
-    """Check that ``needed`` bytes fit into memory.
+    """Check that approximately ``needed`` bytes fit into memory.
 
     Args:
-        options: the names of the options that determine the size; the message begins with them.
-        needed: approximate size, bytes.
+        options: the names of the options that determine the size, for the message.
         what: names the data in the message, such as "24 pictures of 256 x 256 pixels".
 
     Raises:
@@ -50,11 +49,8 @@ def require_memory(options: str, needed: float, what: str) -> None:
 
 
 def count_of(things: str, low: int, bytes_each: int) -> Rule:
-    """Return a rule for counts: whole numbers of at least ``low``, limited by the memory.
-
-    Args:
-        things: what is counted, for messages.
-        bytes_each: memory that one of them takes.
+    """Return a rule for counts of ``things``: whole numbers of at least ``low``, limited by the
+    memory, of which each takes ``bytes_each``.
     """
 
     def check(path: str, value: Any) -> None:

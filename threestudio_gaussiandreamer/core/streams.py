@@ -1,10 +1,7 @@
-"""Stateless randomness: every draw comes from a generator that is a function of (seed, stream,
-step, item).
-
-No generator state is kept, saved or restored. A run that is stopped and resumed therefore draws the
-same numbers as an uninterrupted one, and additional draws in one place (for instance for more
-validation views) don't change those elsewhere. Numbers are drawn on the CPU and then moved, so they
-don't depend on the device."""
+"""Stateless random numbers: every draw comes from a generator that is a function of (seed, stream,
+step, item), so a resumed run draws the same numbers as an uninterrupted one, and additional draws
+in one place don't change those elsewhere. Numbers are drawn on the CPU, so they don't depend on the
+device."""
 
 import hashlib
 

@@ -26,23 +26,21 @@ def check(function: Callable) -> Callable:
     """
     signature = inspect.signature(function)
 
+    def require(value: Any, annotation: Any, what: str) -> None:
+        if not matches(value, annotation):
+            kind = f"{type(value).__name__} {getattr(value, 'dtype', '')}"
+            found = f"{function.__qualname__}: {what} is {kind} {getattr(value, 'shape', ())}"
+            raise TypeError(f"{found}; expected {annotation}")
+
     @functools.wraps(function)
     def checked(*args: Any, **kwargs: Any) -> Any:
-        bound = signature.bind(*args, **kwargs)
-        for name, value in bound.arguments.items():
-            annotation = signature.parameters[name].annotation
-            _require(value, annotation, f"{function.__qualname__}: {name}")
+        for name, value in signature.bind(*args, **kwargs).arguments.items():
+            require(value, signature.parameters[name].annotation, name)
         result = function(*args, **kwargs)
-        _require(result, signature.return_annotation, f"{function.__qualname__}: result")
+        require(result, signature.return_annotation, "result")
         return result
 
     return checked
-
-
-def _require(value: Any, annotation: Any, what: str) -> None:
-    if not matches(value, annotation):
-        found = f"{getattr(value, 'dtype', '')} {tuple(getattr(value, 'shape', ()))}"
-        raise TypeError(f"{what} is {type(value).__name__} {found}; expected {annotation}")
 
 
 def matches(value: Any, annotation: Any) -> bool:
@@ -51,10 +49,9 @@ def matches(value: Any, annotation: Any) -> bool:
         return True
     origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
     if origin in (typing.Union, types.UnionType):
-        arrays = [argument for argument in arguments if _speaks_of_arrays(argument)]
-        others = tuple(typing.get_origin(a) or a for a in arguments if a not in arrays)
+        others = (typing.get_origin(a) or a for a in arguments if not _speaks_of_arrays(a))
         known = any(other is Any or isinstance(value, other) for other in others)
-        return known or any(matches(value, argument) for argument in arrays)
+        return known or any(matches(value, a) for a in filter(_speaks_of_arrays, arguments))
     if origin is tuple and Ellipsis not in arguments:
         same_length = isinstance(value, tuple) and len(value) == len(arguments)
         return same_length and all(map(matches, value, arguments))
