@@ -1,11 +1,14 @@
-"""Clouds and cameras for the splatting tests, and comparisons of results."""
+"""Clouds and cameras for the splatting tests; renders by a backend, compared with those of the
+specification in float64.
+"""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import NamedTuple
 from unittest import mock
 
 import torch
+from hypothesis import HealthCheck, settings
 from torch import Tensor
 
 from threestudio_gaussiandreamer import splatting
@@ -16,6 +19,10 @@ from threestudio_gaussiandreamer.splatting.scene import Scene
 SINGLE = 2e-5
 NO_CUTOFFS = {"alpha_min": 0.0, "alpha_max": 1.0, "stop": 0.0}
 NAMES = ("means", "quats", "scales", "opacities", "colors")
+BACKGROUND = torch.tensor([0.2, 0.5, 0.9])
+repeatable = settings(
+    derandomize=True, deadline=None, max_examples=25, suppress_health_check=list(HealthCheck)
+)
 
 
 def rasterize(*arguments, **options) -> Rasterized:
@@ -102,25 +109,6 @@ def stacks_on_one_pixel(n: int = 10_000) -> Iterator[Cloud]:
         yield random_cloud(n, seed=5)._replace(means=means, opacities=opacities.double())
 
 
-def require_backward_twice_adds_up(
-    cloud: Cloud, camera: Sequence[Tensor], backend: str, *, exact: bool
-) -> None:
-    """Fail unless a second backward pass adds the first one's gradients again.
-
-    Args:
-        camera: view matrix and intrinsics of a view of 12 x 12 pixels.
-        exact: to the bit, else up to rounding.
-    """
-    out = rasterize(*cloud, *camera, 12, 12, backend=backend, absgrad=True)
-    gradients = cotangents(out)
-    torch.autograd.backward([out.image, out.alpha, out.depth], gradients, retain_graph=True)
-    once = cloud.means.grad.clone(), out.means2d.grad.clone(), out.means2d.absgrad.clone()
-    torch.autograd.backward([out.image, out.alpha, out.depth], gradients)
-    twice = cloud.means.grad, out.means2d.grad, out.means2d.absgrad
-    same = torch.equal if exact else torch.allclose
-    assert all(same(2 * first, both) for first, both in zip(once, twice, strict=True))
-
-
 def cameras(
     views: int, width: int, height: int, distance: float = 3.0, fov=50.0, dtype=torch.float64
 ) -> tuple[Tensor, Tensor]:
@@ -142,14 +130,12 @@ def cameras(
     return viewmats, Ks.contiguous()
 
 
-def front_camera(
-    width: int, height: int, focal: float, dtype=torch.float64
-) -> tuple[Tensor, Tensor]:
+def front_camera(width: int, height: int, focal: float) -> tuple[Tensor, Tensor]:
     """Return a camera at the origin that looks along +z, so that camera and world coordinates are
     equal.
     """
-    Ks = torch.tensor([[[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]], dtype=dtype)
-    return torch.eye(4, dtype=dtype)[None], Ks
+    Ks = torch.tensor([[[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]]]).double()
+    return torch.eye(4, dtype=torch.float64)[None], Ks
 
 
 def one_gaussian(mean=(0.0, 0.0, 2.0), scale=0.1, opacity=0.5, color=(1.0, 0.5, 0.25)) -> Cloud:
@@ -159,13 +145,11 @@ def one_gaussian(mean=(0.0, 0.0, 2.0), scale=0.1, opacity=0.5, color=(1.0, 0.5, 
     return Cloud(*(torch.tensor([row], dtype=torch.float64) for row in rows))
 
 
-def cotangents(out: Rasterized, seed: int = 1) -> tuple[Tensor, ...]:
+def cotangents(out: Rasterized) -> tuple[Tensor, ...]:
     """Return fixed random gradients of image, alpha and depth, equal for every precision."""
-    g = torch.Generator().manual_seed(seed)
-    return tuple(
-        torch.randn(x.shape, generator=g, dtype=torch.float64).to(x.dtype)
-        for x in (out.image, out.alpha, out.depth)
-    )
+    g, images = torch.Generator().manual_seed(1), (out.image, out.alpha, out.depth)
+    drawn = (torch.randn(x.shape, generator=g, dtype=torch.float64) for x in images)
+    return tuple(gradient.to(x.dtype) for gradient, x in zip(drawn, images, strict=True))
 
 
 class Run(NamedTuple):
@@ -214,24 +198,51 @@ def psnr(a: Tensor, b: Tensor) -> float:
     return -10 * math.log10(max(((a.double() - b.double()) ** 2).mean().item(), 1e-30))
 
 
-def assert_close(ours: Run, truth: Run, tolerance: float = SINGLE, radii: bool = True) -> None:
-    """Assert that images and gradients of a float32 kernel are within rounding of the specification
-    in float64.
+def equal(a: Run, b: Run) -> bool:
+    """Return whether all bits are equal."""
+    outputs = all(torch.equal(x, y) for x, y in zip(a.out, b.out, strict=True))
+    return outputs and all(torch.equal(grad, b.grads[name]) for name, grad in a.grads.items())
+
+
+def draw(
+    backend: str, cloud: Cloud, camera, width: int, height: int, background=None, **options
+) -> Run:
+    """Run forward and backward in float32."""
+    view = *(x.to(torch.float32) for x in camera), width, height, background
+    return run(cloud.to(torch.float32), *view, backend=backend, **options)
+
+
+_specified: dict[tuple, Run] = {}
+
+
+def specified(cloud: Cloud, *view, **options) -> Run:
+    """Return what the specification, or the ``backend`` of the options, draws in float64; computed
+    once for all kernels.
     """
+    options = {"backend": "reference"} | options
+    values = [*cloud, *view, *options.values()]
+    key = *options, *(x.numpy().tobytes() if isinstance(x, Tensor) else x for x in values)
+    if key not in _specified:
+        _specified[key] = run(cloud, *view, **options)
+    return _specified[key]
+
+
+def compare(backend: str, cloud: Cloud, camera, *view, tolerance: float = SINGLE, **options) -> Run:
+    """Assert that images and gradients, those of the cameras included, are within float32 rounding
+    of the specification in float64; ``view`` is width, height and perhaps a background.
+    """
+    truth = specified(cloud, *camera, *view, camera_gradient=True, **options)
+    ours = draw(backend, cloud, camera, *view, camera_gradient=True, **options)
     for name in ("image", "alpha", "depth", "means2d", "contribution"):
         picture, true = getattr(ours.out, name), getattr(truth.out, name)
         assert error(picture, true) < SINGLE or (picture - true).abs().max() < 1e-7, name
-    assert not radii or torch.allclose(ours.out.radii.double(), truth.out.radii, rtol=1e-5)
+    radii = ours.out.radii.double(), truth.out.radii
+    assert options.get("alpha_min") == 0 or torch.allclose(*radii, rtol=1e-5)
     for name, grad in truth.grads.items():
         pair = ours.grads[name], grad
         by_gaussian = [x.transpose(0, 1) if name == "means2d" else x for x in pair]
         near = trimmed_error(*by_gaussian) < tolerance or (pair[0] - grad).abs().max() < 1e-7
         assert near, name
-    if hasattr(truth.out.means2d, "absgrad"):
+    if options.get("absgrad"):
         assert error(ours.out.means2d.absgrad, truth.out.means2d.absgrad) < SINGLE
-
-
-def equal(a: Run, b: Run) -> bool:
-    """Return whether all bits are equal."""
-    outputs = all(torch.equal(x, y) for x, y in zip(a.out, b.out, strict=True))
-    return outputs and all(torch.equal(grad, b.grads[name]) for name, grad in a.grads.items())
+    return ours

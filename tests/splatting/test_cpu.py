@@ -2,11 +2,13 @@
 images, gradients and bits.
 """
 
+import functools
 import os
 import pathlib
 import shutil
 import subprocess
 import sys
+import tempfile
 import textwrap
 import weakref
 from concurrent.futures import ThreadPoolExecutor
@@ -15,12 +17,13 @@ from unittest import mock
 import pytest
 import torch
 
-from tests.helpers import avx512_emulated
 from tests.helpers.splatting_contract import KernelContract
-from tests.helpers.splatting_draws import compare, draw
 from tests.helpers.splatting_scenes import (
+    BACKGROUND,
     Cloud,
     cameras,
+    compare,
+    draw,
     equal,
     front_camera,
     one_gaussian,
@@ -35,8 +38,25 @@ from threestudio_gaussiandreamer.splatting.cpu import backend as cpu
 from threestudio_gaussiandreamer.splatting.validation import LARGEST_SIDE
 
 EMULATED, SLOW = "v4 emulated", pytest.mark.slow
+HEADER = pathlib.Path(__file__).parents[1] / "helpers" / "avx512_emulated.h"
+EMULATION = (
+    "-std=c++17 -O1 -march=x86-64-v3 -fPIC -shared -pthread -fvisibility=hidden "
+    "-ffp-contract=off -fno-math-errno -fno-trapping-math -Wno-psabi"
+).split()
 
 pytestmark = pytest.mark.skipif(cpu.unavailable() is not None, reason=str(cpu.unavailable()))
+
+
+@functools.cache
+def emulated() -> tempfile.TemporaryDirectory:
+    """Compile the build of 16 lanes for processors without AVX-512, whose intrinsics are emulated,
+    once per process, into a folder that lives as long as the result.
+    """
+    target, source = tempfile.TemporaryDirectory(), cpu.FOLDER / "rasterize.cpp"
+    includes = ["-include", str(HEADER), f"-I{cpu.FOLDER.parent / 'shared'}"]
+    library = str(pathlib.Path(target.name, "libsplat_v4.so"))
+    subprocess.run(["g++", *EMULATION, *includes, str(source), "-o", library], check=True)
+    return target
 
 
 @pytest.fixture
@@ -45,7 +65,7 @@ def force(monkeypatch):
 
     def force(name):
         if name == EMULATED:
-            name, folder = "v4", pathlib.Path(avx512_emulated.folder().name)
+            name, folder = "v4", pathlib.Path(emulated().name)
             monkeypatch.setattr(cpu, "usable_builds", lambda: [name])
             monkeypatch.setattr(cpu, "_path", lambda build: folder / f"libsplat_{build}.so")
         monkeypatch.setenv("GAUSSIANDREAMER_ISA", name)
@@ -55,7 +75,9 @@ def force(monkeypatch):
     cpu.library.cache_clear()
 
 
-BUILDS = cpu.usable_builds() + [EMULATED] * avx512_emulated.is_needed()
+BUILDS = cpu.usable_builds()
+if "v3" in BUILDS and "v4" not in BUILDS and shutil.which("g++"):
+    BUILDS.append(EMULATED)
 
 
 @pytest.fixture(params=BUILDS)
@@ -112,12 +134,10 @@ def test_both_passes_stop_at_the_same_gaussian(isa):
 def test_the_number_of_threads_changes_no_bit(isa):
     """Also with more Gaussians than one task takes, and more threads than views."""
     cloud, camera = random_cloud(9000, seed=10, size=0.03), cameras(3, 150, 90)
-    background, results = torch.tensor([0.2, 0.5, 0.9]), []
+    options, results = {"camera_gradient": True, "absgrad": True}, []
     for count in (1, 2, 4, 4):
         with torch_threads(count):
-            results.append(
-                draw("cpu", cloud, camera, 150, 90, background, camera_gradient=True, absgrad=True)
-            )
+            results.append(draw("cpu", cloud, camera, 150, 90, BACKGROUND, **options))
     assert all(equal(results[0], other) for other in results[1:])
 
 
@@ -130,13 +150,8 @@ def test_backward_frees_its_memory(monkeypatch):
     """
     states, create = weakref.WeakSet(), cpu._State
     monkeypatch.setattr(cpu, "_State", lambda *x: states.add(state := create(*x)) or state)
-    out = rasterize(
-        *random_cloud(30).to(torch.float32).leaves(),
-        *cameras(1, 12, 12, dtype=torch.float32),
-        12,
-        12,
-        backend="cpu",
-    )
+    cloud, camera = random_cloud(30).to(torch.float32), cameras(1, 12, 12, dtype=torch.float32)
+    out = rasterize(*cloud.leaves(), *camera, 12, 12, backend="cpu")
     assert len(states) == 1
     out.image.sum().backward()
     assert len(states) == 0 and out.image.grad_fn is not None
@@ -211,10 +226,8 @@ def test_without_more_threads_those_that_there_are_do_the_work():
 
 def test_more_memory_than_there_is_is_a_named_error():
     """At least 2.6e9 pairs of Gaussian and tile: beyond 32 bits and the memory of any machine."""
-    cloud, camera = (
-        random_cloud(40_000).to(torch.float32)._replace(scales=torch.full((40_000, 3), 1e3)),
-        cameras(1, 8192, 8192, dtype=torch.float32),
-    )
+    cloud, camera = random_cloud(40_000), cameras(1, 8192, 8192, dtype=torch.float32)
+    cloud = cloud._replace(scales=torch.full((40_000, 3), 1e3)).to(torch.float32)
     with pytest.raises(UserError, match="GiB"), torch.no_grad():
         rasterize(*cloud, *camera, 8192, 8192, backend="cpu")
 

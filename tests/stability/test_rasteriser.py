@@ -11,13 +11,14 @@ from pathlib import Path
 import pytest
 import torch
 
-from tests.helpers.splatting_draws import BACKGROUND, draw
 from tests.helpers.splatting_scenes import (
+    BACKGROUND,
     NAMES,
     NO_CUTOFFS,
     Cloud,
     cameras,
     cotangents,
+    draw,
     equal,
     error,
     front_camera,
