@@ -12,12 +12,13 @@ import torch
 
 from tests.helpers.cuda_shim.device import ORDERS, HostDevice, unavailable
 from tests.helpers.splatting_contract import KernelContract
-from tests.helpers.splatting_draws import BACKGROUND, draw
 from tests.helpers.splatting_scenes import (
+    BACKGROUND,
     NAMES,
     Cloud,
     cameras,
     cotangents,
+    draw,
     equal,
     random_cloud,
     rasterize,
@@ -37,11 +38,8 @@ def device(monkeypatch):
     from earlier calls.
     """
     devices = [HostDevice()]
-    monkeypatch.setitem(
-        backends.BACKENDS,
-        "cuda",
-        backends.Backend(cuda, ("cpu",), (torch.float32,)),
-    )
+    on_the_cpu = backends.Backend(cuda, ("cpu",), (torch.float32,))
+    monkeypatch.setitem(backends.BACKENDS, "cuda", on_the_cpu)
     monkeypatch.setattr(cuda_driver, "unavailable", lambda: None)
     monkeypatch.setattr(cuda_driver, "device", lambda device: devices[-1])
     monkeypatch.setattr(cuda, "_estimates", {})
@@ -67,9 +65,8 @@ def scene(device, cloud=None, **options):
     """Render 3 x 2 tiles per view with all features, on a new device."""
     device(**options)
     cloud = random_cloud(300, seed=8, size=0.1) if cloud is None else cloud
-    return draw(
-        "cuda", cloud, cameras(3, 40, 24), 40, 24, BACKGROUND, camera_gradient=True, absgrad=True
-    )
+    view = cameras(3, 40, 24), 40, 24, BACKGROUND
+    return draw("cuda", cloud, *view, camera_gradient=True, absgrad=True)
 
 
 def same(a, b) -> bool:
@@ -129,9 +126,7 @@ def test_the_emulation_detects_faults(kernel):
 def lists(monkeypatch):
     """Record the lists of every render."""
     drawn, draw = [], cuda._draw
-    monkeypatch.setattr(
-        cuda, "_draw", lambda *arguments: drawn.append(draw(*arguments)) or drawn[-1]
-    )
+    monkeypatch.setattr(cuda, "_draw", lambda *args: drawn.append(draw(*args)) or drawn[-1])
     return drawn
 
 
@@ -150,9 +145,8 @@ def test_a_picture_that_needs_more_room_than_expected_is_right_to_the_bit(
     assert same(known, scene(device, arrived=False))
     host.arrived = True
     assert same(known, scene(device))
-    assert [x.capacity >= 1904 for x in lists] == [True, False, False, True], (
-        "the scene has 1904 intersections"
-    )
+    # the scene has 1904 intersections
+    assert [x.capacity >= 1904 for x in lists] == [True, False, False, True]
 
 
 def test_only_the_first_picture_of_a_size_waits(device):
@@ -203,38 +197,31 @@ def test_short_memory_means_fewer_views_at_a_time(device, monkeypatch, most):
 def test_memory_that_is_short_in_the_backward_pass_only(device, monkeypatch):
     monkeypatch.setattr(cuda, "STEP", 64)
     known, host = scene(device), device()
-    cloud, camera = (
-        random_cloud(300, seed=8, size=0.1).to(torch.float32).leaves(),
-        [x.float() for x in cameras(3, 40, 24)],
-    )
+    cloud = random_cloud(300, seed=8, size=0.1).to(torch.float32).leaves()
+    camera = cameras(3, 40, 24, dtype=torch.float32)
     out = rasterize(*cloud, *camera, 40, 24, background=BACKGROUND, backend="cuda")
     host.most_intersections = 1500
     torch.autograd.backward([out.image, out.alpha, out.depth], cotangents(out))
     assert host.launched.count("blend_backward") > 1
-    assert all(
-        torch.equal(leaf.grad, known.grads[name]) for name, leaf in zip(NAMES, cloud, strict=True)
-    )
+    for name, leaf in zip(NAMES, cloud, strict=True):
+        assert torch.equal(leaf.grad, known.grads[name])
 
 
 def test_without_memory_for_one_view_there_is_a_picture_but_no_gradient(device, caplog):
-    cloud, camera = (
-        random_cloud(300, seed=8, size=0.1).to(torch.float32).leaves(),
-        cameras(1, 40, 24, dtype=torch.float32),
-    )
+    cloud = random_cloud(300, seed=8, size=0.1).to(torch.float32).leaves()
+    camera = cameras(1, 40, 24, dtype=torch.float32)
     known = rasterize(*cloud, *camera, 40, 24, backend="cuda")
     device(most_intersections=10)
     cuda._report_short_memory.cache_clear()
     short = rasterize(*cloud, *camera, 40, 24, backend="cuda")
     assert "memory is too short" in caplog.text
-    assert torch.equal(known.image, short.image) and torch.equal(
-        known.contribution, short.contribution
-    )
+    assert torch.equal(known.image, short.image)
+    assert torch.equal(known.contribution, short.contribution)
     with pytest.raises(UserError, match=r"overlap \d+ tiles .* GiB .* fewer or smaller Gaussians"):
         short.image.sum().backward()
 
 
 def test_more_splats_than_can_be_numbered_are_refused():
-    with pytest.raises(UserError, match="fewer views"):
-        cuda.rasterize(SimpleNamespace(shape=(5000, 500_000)), None)
-    with pytest.raises(UserError, match="fewer views"):
-        cuda.rasterize(SimpleNamespace(shape=(70_000, 1)), None)
+    for shape in ((5000, 500_000), (70_000, 1)):
+        with pytest.raises(UserError, match="fewer views"):
+            cuda.rasterize(SimpleNamespace(shape=shape), None)

@@ -45,10 +45,8 @@ def test_one_gaussian_is_the_pinhole_image_of_its_ellipse():
     cloud = one_gaussian((0.0, 0.0, z), (0.1, 0.2, 0.3), 0.6)
     out = draw(cloud, front_camera(16, 12, focal), 16, 12, **NO_CUTOFFS)
     y, x = np.mgrid[:12, :16] + 0.5
-    exponent = (x - 8) ** 2 / ((focal * 0.1 / z) ** 2 + 0.3) + (y - 6) ** 2 / (
-        (focal * 0.2 / z) ** 2 + 0.3
-    )
-    alpha = 0.6 * np.exp(-0.5 * exponent)
+    var_x, var_y = ((focal * s / z) ** 2 + 0.3 for s in (0.1, 0.2))
+    alpha = 0.6 * np.exp(-0.5 * ((x - 8) ** 2 / var_x + (y - 6) ** 2 / var_y))
     np.testing.assert_allclose(out.alpha[0, ..., 0], alpha, rtol=1e-12)
     np.testing.assert_allclose(out.image[0], alpha[..., None] * [1, 0.5, 0.25], rtol=1e-12)
     np.testing.assert_allclose(out.depth[0, ..., 0], alpha * z, rtol=1e-12)
@@ -69,12 +67,9 @@ def test_the_jacobian_is_clamped_30_percent_beyond_the_image(side, beyond):
     splats = project(scene_of(cloud, viewmats, Ks, width, 10), RasterizeOptions(**NO_CUTOFFS))
     variance_x = (focal / z) ** 2 * (0.1**2 + (min(beyond, 1) * limit) ** 2 * 3.0**2) + 0.3
     variance_y = (focal / z) ** 2 * 0.2**2 + 0.3
-    assert splats.conics[0, 0].tolist() == pytest.approx(
-        [1 / variance_x, 0, 1 / variance_y], rel=1e-12
-    )
-    assert splats.means2d[0, 0, 0].item() == pytest.approx(
-        centre + side * beyond * limit * focal, rel=1e-12
-    )
+    conic, x = [1 / variance_x, 0, 1 / variance_y], centre + side * beyond * limit * focal
+    assert splats.conics[0, 0].tolist() == pytest.approx(conic, rel=1e-12)
+    assert splats.means2d[0, 0, 0].item() == pytest.approx(x, rel=1e-12)
 
 
 def by_hand(cloud: Cloud, viewmat, K, width, height, alpha_min, alpha_max, stop, eps2d=0.3):
@@ -87,14 +82,11 @@ def by_hand(cloud: Cloud, viewmat, K, width, height, alpha_min, alpha_max, stop,
         x, y, z = t = viewmat[:3, :3] @ means[i] + viewmat[:3, 3]
         w, axis = quats[i, 0], quats[i, 1:]
         angle, length = 2 * math.atan2(np.linalg.norm(axis), w), np.linalg.norm(axis)
-        k = (
-            np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
-            / length
-        )
+        a, b, c = axis / length
+        k = np.array([[0, -c, b], [c, 0, -a], [-b, a, 0]])
         rotation = np.eye(3) + math.sin(angle) * k + (1 - math.cos(angle)) * k @ k
-        sigma = (
-            viewmat[:3, :3] @ rotation @ np.diag(scales[i] ** 2) @ rotation.T @ viewmat[:3, :3].T
-        )
+        axes = viewmat[:3, :3] @ rotation @ np.diag(scales[i])
+        sigma = axes @ axes.T
         J = np.array([[K[0, 0] / z, 0, -K[0, 0] * x / z**2], [0, K[1, 1] / z, -K[1, 1] * y / z**2]])
         splats.append((z, i, (K @ t)[:2] / z, np.linalg.inv(J @ sigma @ J.T + eps2d * np.eye(2))))
     image = np.zeros((height, width, 5))
@@ -131,24 +123,16 @@ def test_downsampling_is_the_mean_of_boxes():
     for name in ("image", "alpha", "depth"):
         boxes = getattr(full, name).reshape(2, 5, 2, 6, 2, -1).mean((2, 4))
         assert torch.allclose(getattr(half, name), boxes, atol=1e-14), name
-    assert torch.equal(half.means2d, full.means2d) and torch.equal(
-        half.contribution, full.contribution
-    )
+    assert torch.equal(half.means2d, full.means2d)
+    assert torch.equal(half.contribution, full.contribution)
 
 
 def test_radii_bound_what_is_drawn():
     """All pixels with alpha >= alpha_min are within the radius, which is tight along one axis."""
-    out = draw(
-        one_gaussian((0.1, -0.05, 2.0), (0.3, 0.1, 0.1), 0.9),
-        front_camera(64, 64, 40.0),
-        64,
-        64,
-        alpha_min=1 / 255,
-    )
-    rows, columns = out.alpha[0, ..., 0].nonzero().T + 0.5
-    reach = max(
-        (columns - out.means2d[0, 0, 0]).abs().max(), (rows - out.means2d[0, 0, 1]).abs().max()
-    ).item()
+    cloud = one_gaussian((0.1, -0.05, 2.0), (0.3, 0.1, 0.1), 0.9)
+    out = draw(cloud, front_camera(64, 64, 40.0), 64, 64, alpha_min=1 / 255)
+    places = out.alpha[0, ..., 0].nonzero().flip(1) + 0.5
+    reach = (places - out.means2d[0, 0]).abs().max().item()
     assert reach <= out.radii.item() <= reach + 1
 
 
@@ -164,17 +148,14 @@ def test_gradients_of_all_inputs_equal_finite_differences(n, antialias, fast):
     and depth.
     """
     cloud, (viewmats, Ks) = random_cloud(n, seed=n, size=0.3), cameras(2, 5, 4)
-    background = torch.tensor(
-        [[0.1, 0.6, 0.3], [0.9, 0.2, 0.5]], dtype=torch.float64, requires_grad=True
-    )
+    background = torch.tensor([[0.1, 0.6, 0.3], [0.9, 0.2, 0.5]], dtype=torch.float64)
 
     def f(*inputs):
-        out = rasterize(
-            *inputs[:5], inputs[5], Ks, 5, 4, background=inputs[6], antialias=antialias, **TRUTH
-        )
+        options = {"background": inputs[6], "antialias": antialias} | TRUTH
+        out = rasterize(*inputs[:6], Ks, 5, 4, **options)
         return out.image, out.alpha, out.depth
 
-    inputs = (*cloud.leaves(), viewmats.requires_grad_(), background)
+    inputs = (*cloud.leaves(), viewmats.requires_grad_(), background.requires_grad_())
     assert torch.autograd.gradcheck(f, inputs, eps=1e-6, atol=1e-7, rtol=1e-5, fast_mode=fast)
 
 
@@ -187,29 +168,24 @@ def test_means2d_gradient_is_per_view_and_in_pixels_before_downsampling():
 
     def loss(Ks):
         out = rasterize(*cloud, viewmats, Ks, 12, 10, downsample=2, **TRUTH)
-        return sum(
-            (x * g).sum()
-            for x, g in zip((out.image, out.alpha, out.depth), cotangents(out), strict=True)
-        )
+        pairs = zip((out.image, out.alpha, out.depth), cotangents(out), strict=True)
+        return sum((x * g).sum() for x, g in pairs)
 
     for view in range(2):
         for axis in range(2):
             step = torch.zeros_like(Ks)
             step[view, axis, 2] = 1e-5
-            slope = (loss(Ks + step) - loss(Ks - step)) / 2e-5
+            slope = (loss(Ks + step) - loss(Ks - step)).item() / 2e-5
             # Central differences of a loss of order 10 with this step are good to 1e-8.
-            assert grads[view, :, axis].sum().item() == pytest.approx(
-                slope.item(), rel=1e-5, abs=1e-7
-            )
+            found = grads[view, :, axis].sum().item()
+            assert found == pytest.approx(slope, rel=1e-5, abs=1e-7)
 
 
 def test_absgrad_adds_up_absolute_values_over_pixels():
     cloud, camera = random_cloud(6, seed=10, size=0.3), cameras(2, 4, 3)
     leaves = cloud.leaves()
     out = rasterize(*leaves, *camera, 4, 3, absgrad=True, **SPECIFICATION)
-    g = torch.randn(
-        out.image.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64
-    )
+    g = cotangents(out)[0]
     expected = torch.zeros_like(out.means2d)
     for pixel in np.ndindex(*out.image.shape[:3]):
         alone = torch.zeros_like(g)
@@ -242,10 +218,8 @@ def test_a_non_finite_camera_affects_its_own_view_only():
     background = torch.tensor([0.3, 0.5, 0.7], dtype=torch.float64)
     broken = viewmats.clone()
     broken[0, 1, 2] = math.nan
-    bad, good = (
-        run(cloud, broken, Ks, 6, 5, background, **SPECIFICATION),
-        run(cloud, viewmats, Ks, 6, 5, background, **SPECIFICATION),
-    )
+    views = (broken, Ks, 6, 5, background), (viewmats, Ks, 6, 5, background)
+    bad, good = (run(cloud, *view, **SPECIFICATION) for view in views)
     assert torch.equal(bad.out.image[1], good.out.image[1])
     assert torch.equal(bad.out.image[0], background.expand(5, 6, 3))
     assert all(g.isfinite().all() for g in bad.grads.values())
@@ -254,10 +228,8 @@ def test_a_non_finite_camera_affects_its_own_view_only():
 @pytest.mark.parametrize("backend", ["reference", "torch"])
 @pytest.mark.parametrize("place", [(0, 0), (0, 2)])
 def test_a_camera_that_overflows_affects_its_own_view_only(place, backend):
-    cloud, (viewmats, Ks) = (
-        random_cloud(10, seed=13).to(torch.float32),
-        cameras(2, 6, 5, dtype=torch.float32),
-    )
+    cloud = random_cloud(10, seed=13).to(torch.float32)
+    viewmats, Ks = cameras(2, 6, 5, dtype=torch.float32)
     elsewhere, absurd = Ks.clone(), Ks.clone()
     elsewhere[0, 0, 2], absurd[0][place] = 1e6, 1e30
     good, bad = (
@@ -300,16 +272,12 @@ def test_gsplat_draws_the_same_and_has_the_same_gradients(gsplat, antialias):
     )
     opacities = leaves.opacities.expand(views, -1) * (compensation if antialias else 1)
     features = torch.cat([leaves.colors.expand(views, -1, -1), depths[..., None]], -1)
-    ids = pairs_of_gsplat(
-        means2d.detach(), conics.detach(), opacities.detach(), depths.detach(), width, height
-    )
+    drawn = (x.detach() for x in (means2d, conics, opacities, depths))
+    ids = pairs_of_gsplat(*drawn, width, height)
     image, alpha = gsplat.accumulate(means2d, conics, opacities, features, *ids, width, height)
-    assert error(ours.out.means2d, means2d) < ROUNDING
-    assert (
-        error(ours.out.image, image[..., :3]) < ROUNDING
-        and error(ours.out.depth, image[..., 3:]) < ROUNDING
-    )
-    assert error(ours.out.alpha, alpha) < ROUNDING
+    theirs = {"means2d": means2d, "image": image[..., :3], "depth": image[..., 3:], "alpha": alpha}
+    for name, value in theirs.items():
+        assert error(getattr(ours.out, name), value) < ROUNDING, name
     torch.autograd.backward([image[..., :3], alpha, image[..., 3:]], list(cotangents(ours.out)))
     for name, leaf in zip(NAMES, leaves, strict=True):
         assert error(ours.grads[name], leaf.grad) < ROUNDING, name
@@ -322,11 +290,9 @@ def pairs_of_gsplat(means2d, conics, opacities, depths, width, height):
     y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
     d = torch.stack([x, y], -1).reshape(1, -1, 1, 2) - means2d[:, None]
     a, b, c = conics[:, None].unbind(-1)
-    alphas = opacities[:, None] * torch.exp(
-        -0.5 * (a * d[..., 0] ** 2 + c * d[..., 1] ** 2) - b * d[..., 0] * d[..., 1]
-    )
+    x, y = d.unbind(-1)
+    alphas = opacities[:, None] * torch.exp(-0.5 * (a * x**2 + c * y**2) - b * x * y)
     order = depths.argsort(-1)
-    image, pixel, place = (
-        (torch.gather(alphas, 2, order[:, None].expand_as(alphas)) >= 1 / 255).nonzero().unbind(1)
-    )
+    drawn = torch.gather(alphas, 2, order[:, None].expand_as(alphas)) >= 1 / 255
+    image, pixel, place = drawn.nonzero().unbind(1)
     return order[image, place], pixel, image
