@@ -5,7 +5,6 @@ Weights are random except where results must be predictable: Shap-E's renderer g
 for any latents, and the body's joints and limbs are at a person's positions.
 """
 
-import itertools
 from pathlib import Path
 
 import numpy as np
@@ -137,51 +136,21 @@ def _shap_e_renderer():
 
 def marching_cubes_tables() -> tuple[torch.Tensor, torch.Tensor]:
     """Return triangles (256, 5, 3) of edges and a mask (256, 5) of the used ones, for each set of
-    positive corners.
-
-    Corner x + 2y + 4z; edges 0-3 along x, 4-7 along y, 8-11 along z. Loops of crossed edges are cut
-    into fans.
+    positive corners. Corner x + 2y + 4z; edges 0-3 along x, 4-7 along y, 8-11 along z.
     """
-    edges = [(c, c | 1 << axis) for axis in range(3) for c in range(8) if not c >> axis & 1]
+    from skimage.measure import marching_cubes
+
+    places = np.array([(c & 1, c >> 1 & 1, c >> 2) for c in range(8)])
+    ends = [(c, c | 1 << axis) for axis in range(3) for c in range(8) if not c >> axis & 1]
+    middles = np.array([places[list(pair)].mean(0) for pair in ends])
     cases, masks = torch.zeros(256, 5, 3, dtype=torch.long), torch.zeros(256, 5, dtype=torch.bool)
-    for case in range(256):
-        triangles = [triangle for loop in _loops(case, edges) for triangle in _fan(loop)][:5]
-        for index, triangle in enumerate(triangles):
-            cases[case, index], masks[case, index] = torch.tensor(triangle), True
+    for case in range(1, 255):
+        values = np.array([case >> c & 1 for c in range(8)], float).reshape(2, 2, 2)
+        vertices, faces, *_ = marching_cubes(values, 0.5, method="lorensen")
+        distances = np.abs(vertices[:, None, ::-1] - middles).sum(-1)
+        triangles = torch.from_numpy(distances.argmin(1)[faces])
+        cases[case, : len(triangles)], masks[case, : len(triangles)] = triangles, True
     return cases, masks
-
-
-def _loops(case: int, edges: list[tuple[int, int]]) -> list[list[int]]:
-    positive = [bool(case >> corner & 1) for corner in range(8)]
-    links: dict[int, list[int]] = {}
-    for axis, side in itertools.product(range(3), range(2)):
-        a, b = (1 << other for other in range(3) if other != axis)
-        ring = [(side << axis) | corner for corner in (0, a, a | b, b)]
-        crossed = [
-            edges.index(tuple(sorted((ring[i], ring[(i + 1) % 4]))))
-            for i in range(4)
-            if positive[ring[i]] != positive[ring[(i + 1) % 4]]
-        ]
-        if len(crossed) == 4 and not positive[ring[0]]:
-            crossed = crossed[1:] + crossed[:1]  # cut off the positive corners
-        if len(crossed) == 4:
-            crossed = [crossed[3], crossed[0], crossed[1], crossed[2]]
-        for first, second in zip(crossed[::2], crossed[1::2], strict=True):
-            links.setdefault(first, []).append(second)
-            links.setdefault(second, []).append(first)
-    loops = []
-    while links:
-        loop = [next(iter(links))]
-        while following := [edge for edge in links.get(loop[-1], []) if edge not in loop]:
-            loop.append(following[0])
-        for edge in loop:
-            links.pop(edge)
-        loops.append(loop)
-    return loops
-
-
-def _fan(loop: list[int]) -> list[tuple[int, int, int]]:
-    return [(loop[0], loop[i], loop[i + 1]) for i in range(1, len(loop) - 1)]
 
 
 # ---- Point-E -------------------------------------------------------------------------------------

@@ -53,18 +53,12 @@ def stable_diffusion_xl(folder: Path, *, seed: int = 0, force_upcast: bool = Tru
     clip_text_encoder(folder, CLIP_WIDTHS[1], suffix="_2", projection=POOLED)
     betas = {"beta_start": 0.00085, "beta_end": 0.012, "beta_schedule": "scaled_linear"}
     EulerDiscreteScheduler(**betas, steps_offset=1).save_pretrained(folder / "scheduler")
-    return write_index(
-        folder,
-        "StableDiffusionXLPipeline",
-        unet=["diffusers", "UNet2DConditionModel"],
-        vae=["diffusers", "AutoencoderKL"],
-        text_encoder=["transformers", "CLIPTextModel"],
-        text_encoder_2=["transformers", "CLIPTextModelWithProjection"],
-        tokenizer=["transformers", "CLIPTokenizer"],
-        tokenizer_2=["transformers", "CLIPTokenizer"],
-        scheduler=["diffusers", "EulerDiscreteScheduler"],
-        force_zeros_for_empty_prompt=True,
-    )
+    components = {"unet": "UNet2DConditionModel", "vae": "AutoencoderKL"}
+    components |= {"text_encoder": "CLIPTextModel", "text_encoder_2": "CLIPTextModelWithProjection"}
+    components |= dict.fromkeys(("tokenizer", "tokenizer_2"), "CLIPTokenizer")
+    components |= {"scheduler": "EulerDiscreteScheduler"}
+    zeros = {"force_zeros_for_empty_prompt": True}
+    return write_index(folder, "StableDiffusionXLPipeline", components, **zeros)
 
 
 def stable_diffusion_3(folder: Path, *, seed: int = 0) -> Path:
@@ -85,20 +79,12 @@ def stable_diffusion_3(folder: Path, *, seed: int = 0) -> Path:
         clip_text_encoder(folder, width, suffix=suffix, projection=POOLED)
     t5_text_encoder(folder, T5_WIDTH, suffix="_3")
     FlowMatchEulerDiscreteScheduler(shift=3.0).save_pretrained(folder / "scheduler")
-    clip = ["transformers", "CLIPTextModelWithProjection"]
-    return write_index(
-        folder,
-        "StableDiffusion3Pipeline",
-        transformer=["diffusers", "SD3Transformer2DModel"],
-        vae=["diffusers", "AutoencoderKL"],
-        text_encoder=clip,
-        text_encoder_2=clip,
-        text_encoder_3=["transformers", "T5EncoderModel"],
-        tokenizer=["transformers", "CLIPTokenizer"],
-        tokenizer_2=["transformers", "CLIPTokenizer"],
-        tokenizer_3=["transformers", "T5Tokenizer"],
-        scheduler=["diffusers", "FlowMatchEulerDiscreteScheduler"],
-    )
+    components = {"transformer": "SD3Transformer2DModel", "vae": "AutoencoderKL"}
+    clip = ("text_encoder", "text_encoder_2"), "CLIPTextModelWithProjection"
+    components |= dict.fromkeys(*clip) | {"text_encoder_3": "T5EncoderModel"}
+    components |= dict.fromkeys(("tokenizer", "tokenizer_2"), "CLIPTokenizer")
+    components |= {"tokenizer_3": "T5Tokenizer", "scheduler": "FlowMatchEulerDiscreteScheduler"}
+    return write_index(folder, "StableDiffusion3Pipeline", components)
 
 
 def mvdream(folder: Path, *, seed: int = 0, **settings: Any) -> Path:

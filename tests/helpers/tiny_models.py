@@ -9,17 +9,13 @@ differ.
 import json
 from io import BytesIO
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Optional
 
 import torch
 
 TEXT_WIDTH = 32
-PUBLISHED_VAE_NAMES = {
-    "to_q.": "query.",
-    "to_k.": "key.",
-    "to_v.": "value.",
-    "to_out.0.": "proj_attn.",
-}
+PUBLISHED_VAE_NAMES = {"to_q.": "query.", "to_k.": "key.", "to_v.": "value."}
+PUBLISHED_VAE_NAMES |= {"to_out.0.": "proj_attn."}
 """The attention's names in Stable Diffusion's VAE files, which are older than today's."""
 CORPUS = (
     "a photo of an iron man fox corgi in the snow, side view front back overhead kicks "
@@ -85,29 +81,19 @@ def stable_diffusion(
     clip_text_encoder(folder, sizes.text_width)
     scheduler = _stable_diffusion_scheduler(prediction)
     scheduler.save_pretrained(folder / "scheduler")
-    return write_index(
-        folder,
-        "StableDiffusionPipeline",
-        unet=["diffusers", "UNet2DConditionModel"],
-        vae=["diffusers", "AutoencoderKL"],
-        text_encoder=["transformers", "CLIPTextModel"],
-        tokenizer=["transformers", "CLIPTokenizer"],
-        scheduler=["diffusers", type(scheduler).__name__],
-        safety_checker=[None, None],
-        feature_extractor=[None, None],
-        requires_safety_checker=False,
-    )
+    components = {"unet": "UNet2DConditionModel", "vae": "AutoencoderKL"}
+    components |= {"text_encoder": "CLIPTextModel", "tokenizer": "CLIPTokenizer"}
+    components |= {"scheduler": type(scheduler).__name__, **NO_CHECKER}
+    return write_index(folder, "StableDiffusionPipeline", components, requires_safety_checker=False)
 
 
 def vae(folder: Path, sizes: dict[str, Any] = TINY.vae, **options: Any) -> None:
     """Write ``vae``, 64 x 64 pixels to 8 x 8 latents by default."""
     from diffusers import AutoencoderKL
 
-    blocks = {
-        "down_block_types": ("DownEncoderBlock2D",) * 4,
-        "up_block_types": ("UpDecoderBlock2D",) * 4,
-    }
-    AutoencoderKL(**sizes, **blocks, **options).save_pretrained(folder / "vae")
+    options |= {"down_block_types": ("DownEncoderBlock2D",) * 4}
+    options |= {"up_block_types": ("UpDecoderBlock2D",) * 4}
+    AutoencoderKL(**sizes, **options).save_pretrained(folder / "vae")
 
 
 def _stable_diffusion_scheduler(prediction: str) -> Any:
@@ -128,34 +114,10 @@ def deep_floyd(folder: Path, *, seed: int = 0) -> Path:
     """Write a tiny DeepFloyd IF, stage 1: UNet on 16x16 pixels with six output channels, T5
     encoder.
     """
-    from diffusers import DDPMScheduler
+    from diffusers import DDPMScheduler, UNet2DConditionModel
 
     torch.manual_seed(seed)
-    unet = _deep_floyd_unet()
-    listen_to_text(unet)
-    unet.save_pretrained(folder / "unet")
-    t5_text_encoder(folder)
-    options = {"beta_schedule": "squaredcos_cap_v2", "prediction_type": "epsilon"}
-    options |= {"variance_type": "learned_range", "thresholding": True, "sample_max_value": 1.5}
-    DDPMScheduler(**options).save_pretrained(folder / "scheduler")
-    return write_index(
-        folder,
-        "IFPipeline",
-        unet=["diffusers", "UNet2DConditionModel"],
-        text_encoder=["transformers", "T5EncoderModel"],
-        tokenizer=["transformers", "T5Tokenizer"],
-        scheduler=["diffusers", "DDPMScheduler"],
-        safety_checker=[None, None],
-        feature_extractor=[None, None],
-        watermarker=[None, None],
-        requires_safety_checker=False,
-    )
-
-
-def _deep_floyd_unet() -> torch.nn.Module:
-    from diffusers import UNet2DConditionModel
-
-    return UNet2DConditionModel(
+    unet = UNet2DConditionModel(
         sample_size=16, in_channels=3, out_channels=6, block_out_channels=(16, 32),
         layers_per_block=1, mid_block_type="UNetMidBlock2DSimpleCrossAttn",
         down_block_types=("ResnetDownsampleBlock2D", "SimpleCrossAttnDownBlock2D"),
@@ -165,6 +127,16 @@ def _deep_floyd_unet() -> torch.nn.Module:
         cross_attention_norm="group_norm", resnet_time_scale_shift="scale_shift",
         norm_num_groups=8, act_fn="gelu",
     )  # fmt: skip
+    listen_to_text(unet)
+    unet.save_pretrained(folder / "unet")
+    t5_text_encoder(folder)
+    options = {"beta_schedule": "squaredcos_cap_v2", "prediction_type": "epsilon"}
+    options |= {"variance_type": "learned_range", "thresholding": True, "sample_max_value": 1.5}
+    DDPMScheduler(**options).save_pretrained(folder / "scheduler")
+    components = {"unet": "UNet2DConditionModel", "text_encoder": "T5EncoderModel"}
+    components |= {"tokenizer": "T5Tokenizer", "scheduler": "DDPMScheduler"}
+    components |= {"watermarker": None, **NO_CHECKER}
+    return write_index(folder, "IFPipeline", components, requires_safety_checker=False)
 
 
 def listen_to_text(unet: torch.nn.Module) -> None:
@@ -242,11 +214,8 @@ def _publish_clip(path: Path) -> None:
     tensors = load_file(path)
     prefix = "" if any(name.startswith("text_model.") for name in tensors) else "text_model."
     tensors = {prefix + name: tensor for name, tensor in tensors.items()}
-    save_file(
-        tensors | {"text_model.embeddings.position_ids": torch.arange(77)[None]},
-        path,
-        metadata={"format": "pt"},
-    )
+    tensors["text_model.embeddings.position_ids"] = torch.arange(77)[None]
+    save_file(tensors, path, metadata={"format": "pt"})
 
 
 def _rename(path: Path, names: dict[str, str]) -> None:
@@ -280,8 +249,17 @@ def _sentencepiece() -> bytes:
     return model.getvalue()
 
 
-def write_index(folder: Path, pipeline: str, **components) -> Path:
-    index = {"_class_name": pipeline, "_diffusers_version": "0.8.0", **components}
+NO_CHECKER = {"safety_checker": None, "feature_extractor": None}
+
+
+def write_index(
+    folder: Path, pipeline: str, components: dict[str, Optional[str]], **options: Any
+) -> Path:
+    """Write ``model_index.json``; ``components`` are the classes by name."""
+    index = {"_class_name": pipeline, "_diffusers_version": "0.8.0", **options}
+    for name, kind in components.items():
+        library = "transformers" if name.startswith(("text_encoder", "tokenizer")) else "diffusers"
+        index[name] = [kind and library, kind]
     write_json(folder / "model_index.json", index)
     return folder
 
