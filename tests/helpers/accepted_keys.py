@@ -10,25 +10,23 @@ PACKAGE = Path(__file__).parents[2] / "threestudio_gaussiandreamer"
 
 
 def config_classes():
-    """Return (part, Config) of everything registered by this package, nested dataclasses
+    """Return the Config of everything registered by this package by name, nested dataclasses
     included.
     """
     found = {}
     for name in host.names():
         part = host.find(name)
-        if part.__module__.startswith(PACKAGE.name) and dataclasses.is_dataclass(
-            getattr(part, "Config", None)
-        ):
-            found[f"{name}"] = part.Config
-            for field in dataclasses.fields(part.Config):
-                if dataclasses.is_dataclass(field.type):
-                    found[f"{name}.{field.name}"] = field.type
+        config = getattr(part, "Config", None)
+        if part.__module__.startswith(PACKAGE.name) and dataclasses.is_dataclass(config):
+            found[name] = config
+            nested = (f for f in dataclasses.fields(config) if dataclasses.is_dataclass(f.type))
+            found |= {f"{name}.{field.name}": field.type for field in nested}
     return found
 
 
 def names_that_are_read():
-    """Return attributes, strings, keywords and parameters in the package's code, except in
-    dataclass bodies.
+    """Return attributes, words of strings, and parameters in the package's code, except in
+    docstrings.
     """
     read = set()
     for path in PACKAGE.rglob("*.py"):
@@ -37,12 +35,8 @@ def names_that_are_read():
         for node in ast.walk(tree):
             if isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Load):
                 read.add(node.attr)
-            elif (
-                isinstance(node, ast.Constant)
-                and isinstance(node.value, str)
-                and id(node) not in docstrings
-            ):
-                read |= set(node.value.replace(".", " ").split())
             elif isinstance(node, ast.arg):
                 read.add(node.arg)
+            elif isinstance(getattr(node, "value", None), str) and id(node) not in docstrings:
+                read |= set(node.value.replace(".", " ").split())
     return read

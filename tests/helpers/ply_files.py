@@ -45,18 +45,9 @@ def header(
     encoding="ascii", count=2, properties=("float x", "float y", "float z"), before="", after=""
 ):
     """Return the header of a PLY file as other programs write it."""
-    lines = [f"property {entry}" for entry in properties]
-    return "\n".join(
-        [
-            "ply",
-            f"format {encoding} 1.0",
-            *filter(None, [before]),
-            f"element vertex {count}",
-            *lines,
-            after,
-            "end_header\n",
-        ]
-    )
+    lines = ["ply", f"format {encoding} 1.0", *filter(None, [before]), f"element vertex {count}"]
+    lines += [f"property {entry}" for entry in properties]
+    return "\n".join([*lines, after, "end_header\n"])
 
 
 def saved(folder, content, name="file.ply"):

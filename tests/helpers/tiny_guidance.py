@@ -26,41 +26,42 @@ def make_models(folder):
     }
 
 
+def part(kind, folder, **options):
+    """Make a part of this package with a tiny model, such as "stable-diffusion-guidance"."""
+    options |= {"pretrained_model_name_or_path": str(folder)}
+    return find(f"gaussiandreamer-{kind}")(options)
+
+
 def guidance(models, prediction="epsilon", **options):
-    return find("gaussiandreamer-stable-diffusion-guidance")(
-        {"pretrained_model_name_or_path": str(models[prediction]), **options}
-    )
+    return part("stable-diffusion-guidance", models[prediction], **options)
+
+
+def prompts_of(kind, folder, **options):
+    """Make the embeddings of one prompt."""
+    options = {"prompt": "a fox", "use_cache": False} | options
+    return part(f"{kind}-prompt-processor", folder, **options)()
 
 
 def make_prompts(models):
     """Make embeddings of one prompt, without and with Perp-Neg; they don't depend on the prediction
     type.
     """
-    options = {
-        "pretrained_model_name_or_path": str(models["epsilon"]),
-        "prompt": "a fox",
-        "negative_prompt": "ugly",
-        "use_cache": False,
-    }
-    processor = find("gaussiandreamer-stable-diffusion-prompt-processor")
-    return {perp: processor({**options, "use_perp_neg": perp})() for perp in (False, True)}
+    folder, found = models["epsilon"], {}
+    for perp in (False, True):
+        options = {"negative_prompt": "ugly", "use_perp_neg": perp}
+        found[perp] = prompts_of("stable-diffusion", folder, **options)
+    return found
 
 
 def left_and_right(models):
     """Make embeddings of one prompt that tells the left side from the right one."""
-    options = {
-        "pretrained_model_name_or_path": str(models["epsilon"]),
-        "prompt": "a fox",
-        "use_cache": False,
-        "view_dependent_left_and_right": True,
-    }
-    return find("gaussiandreamer-stable-diffusion-prompt-processor")(options)()
+    sides = {"view_dependent_left_and_right": True}
+    return prompts_of("stable-diffusion", models["epsilon"], **sides)
 
 
 def renders(batch=4, size=64, seed=0):
-    return torch.rand(
-        batch, size, size, 3, generator=torch.Generator().manual_seed(seed)
-    ).requires_grad_()
+    rng = torch.Generator().manual_seed(seed)
+    return torch.rand(batch, size, size, 3, generator=rng).requires_grad_()
 
 
 def gradient(guide, prompt_utils, rgb, **options):

@@ -6,27 +6,17 @@ from typing import Any, Callable
 import torch
 from torch import Tensor, nn
 
-from tests.helpers.tiny_guidance import BATCH
+from tests.helpers.tiny_guidance import BATCH, part, prompts_of
 from threestudio_gaussiandreamer.cameras import orbit_c2w
-from threestudio_gaussiandreamer.host import find
 from threestudio_gaussiandreamer.launch import parts  # noqa: F401
 
 
 def guidance(kind: str, folder: Any, **options: Any) -> Any:
-    return find(f"gaussiandreamer-{kind}-guidance")(
-        {"pretrained_model_name_or_path": str(folder), **options}
-    )
+    return part(f"{kind}-guidance", folder, **options)
 
 
 def prompts(kind: str, folder: Any, **options: Any) -> Any:
-    """Make the embeddings of one prompt."""
-    options = {
-        "pretrained_model_name_or_path": str(folder),
-        "prompt": "a fox",
-        "negative_prompt": "ugly",
-        "use_cache": False,
-    } | options
-    return find(f"gaussiandreamer-{kind}-prompt-processor")(options)()
+    return prompts_of(kind, folder, **{"negative_prompt": "ugly"} | options)
 
 
 def views(**changes: Tensor) -> dict[str, Tensor]:

@@ -121,10 +121,8 @@ class TinySystem(BaseLift3DSystem):
             os.kill(os.getpid(), getattr(signal, self.cfg.signal_name))
         self.seen.append(step)
         target = torch.randn(3, generator=generator(run_seed(), "target", step))
-        loss = (
-            self.C(self.cfg.loss.get("lambda_fit", 1.0))
-            * (self.geometry.means - target).square().sum()
-        )
+        weight = self.C(self.cfg.loss.get("lambda_fit", 1.0))
+        loss = weight * (self.geometry.means - target).square().sum()
         optimizer = self.optimizers()
         optimizer.zero_grad()
         self.manual_backward(loss)
@@ -132,14 +130,10 @@ class TinySystem(BaseLift3DSystem):
         self.log("loss", loss.detach(), prog_bar=True)
 
     def validation_step(self, batch: dict[str, Any], batch_idx: int) -> None:
-        self.save_image_grid(
-            f"it{self.true_global_step}-{int(batch['index'])}.png", [self._picture()]
-        )
+        self._save_picture_of(f"it{self.true_global_step}-{int(batch['index'])}.png")
 
     def test_step(self, batch: dict[str, Any], batch_idx: int) -> None:
-        self.save_image_grid(
-            f"it{self.true_global_step}-test/{int(batch['index'])}.png", [self._picture()]
-        )
+        self._save_picture_of(f"it{self.true_global_step}-test/{int(batch['index'])}.png")
 
     def on_test_epoch_end(self) -> None:
         folder = f"it{self.true_global_step}-test"
@@ -148,8 +142,8 @@ class TinySystem(BaseLift3DSystem):
     def summary(self) -> str:
         return f"results are in {self.get_save_dir()}"
 
-    def _picture(self) -> dict[str, Any]:
-        return {"type": "rgb", "img": self.renderer()["comp_rgb"][0], "kwargs": {}}
+    def _save_picture_of(self, name: str) -> None:
+        self.save_image_grid(name, [{"type": "rgb", "img": self.renderer()["comp_rgb"][0]}])
 
 
 class Steps(IterableDataset, Updateable):
