@@ -82,7 +82,7 @@ def rasterize(kernel: Kernel, scene: Scene, options: RasterizeOptions) -> Raster
 
 class _Rasterize(torch.autograd.Function):
     """Runs a kernel on up to three channels. ``means2d`` is an input that is filled in place, so
-    that autograd stores its gradient in the caller's tensor.
+    that its gradient is stored in the caller's tensor.
     """
 
     @staticmethod
@@ -121,19 +121,15 @@ def _needed(ctx: Any) -> Scene:
 
 
 def _background_gradient(d_image: Optional[Tensor], alpha: Tensor, scene: Scene) -> Tensor:
-    """Return d loss / d background (B, 3); by rows first, so that the sum doesn't depend on the
-    number of threads.
-    """
+    """Return d loss / d background (B, 3), summed by rows first, as threads can't change it."""
     if d_image is None:
         return torch.zeros_like(scene.background)
     return (d_image * (1 - alpha)).sum(2).sum(1)
 
 
 def groups(scene: Scene) -> list[Scene]:
-    """Split a scene into scenes of at most three channels.
-
-    A Gaussian with a channel that isn't finite becomes NaN in every group, so that all groups drop
-    it.
+    """Split a scene into scenes of at most three channels. A Gaussian with a channel that isn't
+    finite becomes NaN in every group, so that all drop it.
     """
     if scene.channels <= CHANNELS:
         return [scene]

@@ -85,9 +85,7 @@ def quats_to_rotations(quats: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batc
 
 
 def _to_camera(means, quats, scales, viewmats) -> tuple[Tensor, Tensor]:
-    """Return the means ``t`` (B, N, 3) in camera coordinates, and ``axes`` (B, N, 3, 3), whose
-    columns are the scaled axes in camera coordinates.
-    """
+    """Return the means (B, N, 3) and scaled axes, columns (B, N, 3, 3), in camera coordinates."""
     rotations, translations = viewmats[:, None, :3, :3], viewmats[:, None, :3, 3]
     axes = quats_to_rotations(quats) * scales[:, None, :]
     # Explicit sums, because the rounding of a library's matrix product may depend on the number of
@@ -97,9 +95,7 @@ def _to_camera(means, quats, scales, viewmats) -> tuple[Tensor, Tensor]:
 
 
 def _to_screen(t, axes, opacities, Ks, width, height, options) -> tuple[Tensor, ...]:
-    """Return the fields of `Splats` up to ``extents``; they aren't finite where a Gaussian can't be
-    projected.
-    """
+    """Return the fields of `Splats` up to ``extents``, not finite where there is no projection."""
     u0, u1 = _project_axes(t, axes, Ks, width, height)
     conics, variances, compensation = _invert_covariance(u0, u1, options.eps2d)
     depths = t[..., 2]
@@ -141,9 +137,7 @@ def _invert_covariance(u0, u1, eps2d) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _compensation(area, dilation) -> Tensor:
-    """Compute ``area / sqrt(area^2 + dilation)``, by one formula below and another above
-    ``area^2 = dilation``, so that neither has cancellation in its gradient.
-    """
+    """Compute ``area / sqrt(area^2 + dilation)``, so that no gradient has cancellation."""
     small = area * area < dilation
     ratio = area * torch.where(small, dilation, 1).rsqrt()
     inverse_square = dilation / torch.where(small, 1, area) ** 2
@@ -151,18 +145,14 @@ def _compensation(area, dilation) -> Tensor:
 
 
 def _extents(variances, opacities, alpha_min) -> Tensor:
-    """Compute the half sizes of the box around ``opacity exp(-q/2) >= alpha_min``:
-    ``sqrt(2 ln(opacity / alpha_min) variance)``.
-    """
+    """Compute half the box around ``opacity exp(-q/2) >= alpha_min``."""
     if alpha_min == 0:
         return torch.full_like(variances, torch.inf)
     return (2 * torch.log(opacities / alpha_min)[..., None] * variances).sqrt()
 
 
 def _visible(means2d, conics, opacities, depths, extents, width, height, options) -> Tensor:
-    """Return which Gaussians are between the near and far planes, finite, have an opacity of at
-    least ``alpha_min``, and a box that overlaps the image.
-    """
+    """Return which are in range, finite, not too faint, and overlap the image by their box."""
     in_range = (depths > options.near) & (depths < options.far)
     finite = conics.isfinite().all(-1) & means2d.isfinite().all(-1)
     positive = (conics[..., 0] > 0) & (conics[..., 2] > 0)

@@ -59,14 +59,12 @@ def _project(scene: Scene, options: RasterizeOptions) -> Splats:
     size = max(1, PROJECTED_AT_ONCE // len(scene.viewmats))
     if len(scene.means) <= size:
         return project(scene, options)
-    gaussians = {name: getattr(scene, name) for name in GAUSSIANS}
-    split = (x.split(size, -1 if x.dim() == 1 else -2) for x in gaussians.values())
-    parts = [
-        scene._replace(**dict(zip(gaussians, part, strict=True)))
-        for part in zip(*split, strict=True)
-    ]
-    again = {"use_reentrant": False, "preserve_rng_state": False}
-    projected = [checkpoint(project, part, options, **again) for part in parts]
+    gaussians = (*scene[:4], scene.colors)
+    split = (x.split(size, -1 if x.dim() == 1 else -2) for x in gaussians)
+    again, projected = {"use_reentrant": False, "preserve_rng_state": False}, []
+    for part in zip(*split, strict=True):
+        some = scene._replace(**dict(zip(GAUSSIANS, part, strict=True)))
+        projected.append(checkpoint(project, some, options, **again))
     return Splats(*(torch.cat(x, 1) for x in zip(*projected, strict=True)))
 
 
@@ -89,11 +87,9 @@ class Grid(NamedTuple):
 class Bounds(NamedTuple):
     """Data of S splats, front to back, that the overlap tests need."""
 
-    # (6, S): mean x, y in pixels of the view; conic a, k, c; the largest q at which alpha >=
-    # alpha_min
+    # (6, S): mean x, y in pixels of the view; conic a, k, c; largest q at which alpha >= alpha_min
     shapes: Tensor
-    # (4, S): left, top, right, bottom in tiles of the grid, the last two exclusive
-    rectangles: Tensor
+    rectangles: Tensor  # (4, S): left, top, right, bottom, exclusive, in tiles of the grid
     first_rows: Tensor  # (S,) the row of the grid where the splat's view starts
 
 
@@ -109,9 +105,7 @@ class Lists(NamedTuple):
 
 
 class Table(NamedTuple):
-    """The visible splats of all views, front to back, one column each; the last column is padding,
-    a splat with opacity 0.
-    """
+    """The visible splats of all views, front to back, one column each; the last has opacity 0."""
 
     ids: Tensor  # (S,) view * N + Gaussian
     # (8 + C, S + 1): mean x, y, conic a, k, c, opacity, then the features: colour, depth, 1
@@ -124,9 +118,7 @@ class Table(NamedTuple):
 
 
 class Block(NamedTuple):
-    """Part of a step: G tiles with K splats each; shorter lists are padded with a splat of opacity
-    0.
-    """
+    """Part of a step: G tiles with K splats each, the last of which may have opacity 0."""
 
     tiles: Tensor  # (G,)
     splats: Tensor  # (G * K,)
@@ -159,10 +151,9 @@ class _Blend(torch.autograd.Function):
     @once_differentiable
     def backward(ctx, grad, _):
         with without_autocast(grad.device.type):
-            columns, absolute = _backward(
-                ctx.table, *ctx.saved_tensors, grad, ctx.absgrad is not None, ctx.options
-            )
-        if ctx.absgrad is not None:
+            wanted = ctx.absgrad is not None
+            columns, absolute = _backward(ctx.table, *ctx.saved_tensors, grad, wanted, ctx.options)
+        if wanted:
             ctx.absgrad.view(-1, 2).index_add_(0, ctx.table.ids, absolute[:, :-1].t())
         full = columns.new_zeros(ctx.shape.numel(), len(columns))
         full = full.index_copy_(0, ctx.table.ids, columns[:, :-1].t())
@@ -244,9 +235,7 @@ def _start(table: Table, width: int, height: int) -> Tensor:
 
 
 def _march(table: Table, transmittances: Tensor, options: RasterizeOptions) -> Iterator[Block]:
-    """Yield blocks front to back; the caller updates the transmittances with each (`composite`)
-    before it takes the next.
-    """
+    """Yield blocks front to back; the caller `composite`s each before it takes the next."""
     for lists in _lists(table, transmittances, options):
         active, depth = torch.arange(len(lists.tiles), device=lists.tiles.device), 0
         while len(active):
@@ -260,9 +249,7 @@ def _march(table: Table, transmittances: Tensor, options: RasterizeOptions) -> I
 
 
 def _lists(table: Table, transmittances: Tensor, options: RasterizeOptions) -> Iterator[Lists]:
-    """Yield the tile lists of each slice in turn, for the tiles that are unfinished by then; those
-    of the first slices are kept for backward.
-    """
+    """Yield the lists of each slice for unfinished tiles; the first are kept for backward."""
     for i, (first, last) in enumerate(table.slices):
         if i < len(table.lists):
             yield table.lists[i]
@@ -280,9 +267,7 @@ def _unfinished(transmittances: Tensor, options: RasterizeOptions) -> Tensor:
 
 
 def _block(table: Table, lists: Lists, part: Tensor, depth: int, length: int) -> Block:
-    """Return the intersections ``depth`` to ``depth + length - 1`` of the lists named by
-    ``part``.
-    """
+    """Return the intersections ``depth`` to ``depth + length - 1`` of the lists ``part``."""
     places = depth + torch.arange(length, device=part.device)
     positions = (lists.starts[part, None] + places).clamp(max=len(lists.splats) - 1)
     nothing = table.columns.shape[1] - 1
@@ -300,9 +285,7 @@ def _block(table: Table, lists: Lists, part: Tensor, depth: int, length: int) ->
 
 
 def bound(means2d, conics, opacities, extents, views, grid: Grid, alpha_min: float) -> Bounds:
-    """Compute the rectangle of tiles around alpha >= alpha_min for each splat; ``views`` (S,) are
-    the indices of their views.
-    """
+    """Compute the rectangle of tiles around alpha >= alpha_min for each splat of ``views`` (S,)."""
     limit = means2d.new_tensor([grid.columns, grid.rows])
     extents = extents * (1 + SLACK) + SLACK
     low = torch.minimum(((means2d - extents - 0.5) / TILE).floor().clamp(min=0), limit)
@@ -317,9 +300,7 @@ def bound(means2d, conics, opacities, extents, views, grid: Grid, alpha_min: flo
 
 
 def slices(bounds: Bounds) -> list[tuple[int, int]]:
-    """Split the splats, front to back, into ranges (first, last + 1) with a bounded number of
-    candidate tiles each.
-    """
+    """Split the splats into ranges (first, last + 1) of a bounded number of candidate tiles."""
     size = bounds.rectangles[2:] - bounds.rectangles[:2]
     part = size.clamp(min=0).prod(0).cumsum(0) // CANDIDATES_PER_SLICE
     ends = part.unique_consecutive(return_counts=True)[1].cumsum(0).tolist()
@@ -327,10 +308,8 @@ def slices(bounds: Bounds) -> list[tuple[int, int]]:
 
 
 def list_splats(bounds: Bounds, first: int, last: int, unfinished: Tensor, grid: Grid) -> Lists:
-    """List the splats ``first`` to ``last - 1`` for each tile of which they reach a pixel centre.
-
-    Args:
-        unfinished: (tiles,) bool; other tiles get no list.
+    """List the splats ``first`` to ``last - 1`` for each ``unfinished`` tile (tiles,) of which they
+    reach a pixel centre.
     """
     left, top, right, bottom = bounds.rectangles[:, first:last]
     width, height = (right - left).clamp(min=0), (bottom - top).clamp(min=0)
@@ -353,9 +332,7 @@ def list_splats(bounds: Bounds, first: int, last: int, unfinished: Tensor, grid:
 def _test(
     shapes: Tensor, boxes: Tensor, splats: Tensor, first: int, unfinished: Tensor, grid: Grid
 ) -> tuple[Tensor, Tensor]:
-    """Return tiles and splats of those candidates that pass :func:`_reaches`; candidates are
-    numbered from ``first``.
-    """
+    """Return tiles and splats of those candidates, numbered from ``first``, that `_reaches`."""
     left, top, width, first_candidate, first_row = boxes.index_select(1, splats)
     within = torch.arange(first, first + len(splats), device=splats.device) - first_candidate
     row = torch.div(within, width, rounding_mode="floor")
@@ -423,9 +400,7 @@ def composite(
 
 
 def subtract_one_by_one(gains: Tensor, left: Tensor, tiles: Tensor) -> Tensor:
-    """Subtract the gains from ``left`` one after another, front to back; return the remainder
-    behind each splat, (G, PIXELS, K), and update ``left``.
-    """
+    """Return what is left behind each splat, (G, PIXELS, K), and update ``left``."""
     rest = torch.cat([left.index_select(0, tiles)[..., None], gains.neg()], -1)
     torch.cumsum(rest, -1, out=rest)
     left.index_copy_(0, tiles, rest[..., -1])
@@ -463,16 +438,12 @@ def absolute_gradients(block: Block, slopes: Tensor) -> Tensor:
 
 
 def product(a: Tensor, b: Tensor) -> Tensor:
-    """Multiply batches of matrices. A batch of one is duplicated: the product of a single pair may
-    be split among threads, so that its rounding would depend on their number.
-    """
+    """Multiply batches of matrices; one of one is duplicated, since threads may share its sums."""
     return a @ b if len(b) > 1 else (a @ b.repeat(2, 1, 1))[:1]
 
 
 def _offsets(means: Tensor) -> Tensor:
-    """Subtract the means (G, K) from the pixel centres of a row or column, both relative to the
-    tile's centre: (G, TILE, K).
-    """
+    """Subtract the means (G, K) from the pixel centres of a row or column: (G, TILE, K)."""
     return _centres(means)[:, None] - means[:, None]
 
 
@@ -488,9 +459,7 @@ def _monomials(like: Tensor) -> Tensor:
 
 
 def _just_below(bound: float, like: Tensor) -> float:
-    """Return the largest number below ``bound`` in the type of ``like``, since torch's
-    ``threshold`` keeps only values strictly above its bound.
-    """
+    """Return the largest number below ``bound``, since ``threshold`` drops values equal to it."""
     bound = torch.tensor(bound, dtype=like.dtype)
     return torch.nextafter(bound, torch.tensor(-torch.inf, dtype=like.dtype)).item()
 
