@@ -198,7 +198,7 @@ def test_memory_that_is_short_in_the_backward_pass_only(device, monkeypatch):
     monkeypatch.setattr(cuda, "STEP", 64)
     known, host = scene(device), device()
     cloud = random_cloud(300, seed=8, size=0.1).to(torch.float32).leaves()
-    camera = cameras(3, 40, 24, dtype=torch.float32)
+    camera = [x.float() for x in cameras(3, 40, 24)]
     out = rasterize(*cloud, *camera, 40, 24, background=BACKGROUND, backend="cuda")
     host.most_intersections = 1500
     torch.autograd.backward([out.image, out.alpha, out.depth], cotangents(out))
