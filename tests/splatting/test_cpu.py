@@ -9,7 +9,6 @@ import shutil
 import subprocess
 import sys
 import tempfile
-import textwrap
 import weakref
 from concurrent.futures import ThreadPoolExecutor
 from unittest import mock
@@ -170,57 +169,46 @@ def test_the_library_is_used_from_several_threads_at_once():
             assert all(equal(a, b) for a, b in zip(alone, together, strict=True))
 
 
-def run_python(text):
-    """Run code that may end the process, or changes its limits, in another one."""
-    scene = """
-        import os, resource, signal, sys, torch
-        from tests.helpers.splatting_scenes import cameras, random_cloud
-        from threestudio_gaussiandreamer.splatting import rasterize
+SCENE = """
+import os, resource, signal, sys, torch
+from tests.helpers.splatting_scenes import cameras, random_cloud
+from threestudio_gaussiandreamer.splatting import rasterize
 
-        def draw():
-            camera = cameras(1, 96, 96, dtype=torch.float32)
-            return rasterize(*cloud, *camera, 96, 96, backend="cpu").image
+def draw():
+    camera = cameras(1, 96, 96, dtype=torch.float32)
+    return rasterize(*cloud, *camera, 96, 96, backend="cpu").image
 
-        cloud = random_cloud(3000).to(torch.float32)
-        torch.set_num_threads(1)
-        alone = draw()
-        torch.set_num_threads(4)
-    """
-    code = textwrap.dedent(scene) + textwrap.dedent(text)
-    return subprocess.run(
-        [sys.executable, "-c", code],
-        env=os.environ | {"PYTHONPATH": str(pathlib.Path(__file__).parents[2])},
-        capture_output=True,
-        text=True,
-    )
-
-
-@pytest.mark.slow
-def test_a_forked_process_draws_with_threads_of_its_own():
-    """The parent's threads don't exist in it, and locks that they held are never released."""
-    done = run_python("""
-        for _ in range(100):
-            draw()
-            child = os.fork()
-            if child == 0:
-                signal.alarm(10)
-                os._exit(not all(torch.equal(draw(), alone) for _ in range(5)))
-            if os.waitpid(child, 0)[1]:
-                sys.exit("a child hung, or drew something else")
-    """)
-    assert done.returncode == 0, done.stderr
+cloud = random_cloud(3000).to(torch.float32)
+torch.set_num_threads(1)
+alone = draw()
+torch.set_num_threads(4)
+"""
+FORKED = """
+for _ in range(100):
+    draw()
+    child = os.fork()
+    if child == 0:
+        signal.alarm(10)
+        os._exit(not all(torch.equal(draw(), alone) for _ in range(5)))
+    if os.waitpid(child, 0)[1]:
+        sys.exit("a child hung, or drew something else")
+"""
+LIMITED = """
+pages = int(open("/proc/self/statm").read().split()[0])
+resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + 6 * 2**20,) * 2)
+if not torch.equal(draw(), alone):
+    sys.exit("another picture")
+"""
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
-def test_without_more_threads_those_that_there_are_do_the_work():
-    """With a limit on processes or on address space, which the stack of a thread needs."""
-    done = run_python("""
-        pages = int(open("/proc/self/statm").read().split()[0])
-        resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + 6 * 2**20,) * 2)
-        if not torch.equal(draw(), alone):
-            sys.exit("another picture")
-    """)
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="forks, and reads /proc")
+@pytest.mark.parametrize("text", [FORKED, LIMITED], ids=["forked", "limited"])
+def test_threads_that_are_not_there(text):
+    """Of the parent, whose locks are never released; those whose stacks find no address space."""
+    environment = os.environ | {"PYTHONPATH": str(pathlib.Path(__file__).parents[2])}
+    command = [sys.executable, "-c", SCENE + text]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
 
 

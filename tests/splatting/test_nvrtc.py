@@ -78,6 +78,14 @@ def test_every_kernel_compiles_without_spills(architecture):
     assert seen == set(cuda_driver.UNITS)
 
 
+@needs_nvrtc
+def test_what_the_compiler_rejects_is_named(monkeypatch):
+    monkeypatch.setattr(nvrtc, "source", lambda unit: "void f() { undeclared = 1; }")
+    rejected = r"NVRTC of CUDA .* can't compile blend.cu for sm_90: (.|\n)*\"undeclared\" is undef"
+    with pytest.raises(UserError, match=rejected):
+        nvrtc.compile_unit("blend", "sm_90")
+
+
 @pytest.mark.parametrize(
     "capability, target",
     [((7, 5), "sm_75"), ((9, 0), "sm_90"), ((13, 0), "compute_120"), ((8, 7), "compute_86")],
