@@ -11,7 +11,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tests.helpers.object_clouds import assert_close, ball
-from tests.helpers.usd_reader import read_with_pxr
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.formats.gaussian_files import StoredCloud, read_cloud, write_cloud
 from threestudio_gaussiandreamer.formats.usda import (
@@ -22,8 +21,30 @@ from threestudio_gaussiandreamer.formats.usda import (
     write_usdz,
 )
 from threestudio_gaussiandreamer.gaussians.axes import rotate
+from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
 from threestudio_gaussiandreamer.gaussians.sh import rgb_to_sh0, sh0_colors
 from threestudio_gaussiandreamer.meshes.mesh import srgb_to_linear
+
+
+def read_with_pxr(path):
+    """The stage and the Gaussians that OpenUSD finds in a file."""
+    pytest.importorskip("pxr", reason="usd-core isn't installed")
+    from pxr import Usd, UsdVol
+
+    stage = Usd.Stage.Open(str(path))
+    field = UsdVol.ParticleField3DGaussianSplat(stage.GetDefaultPrim())
+    quats = field.GetOrientationsAttr().Get()
+    count = field.GetRadianceSphericalHarmonicsDegreeAttr().Get()
+    sh = np.array(field.GetRadianceSphericalHarmonicsCoefficientsAttr().Get(), np.float32)
+    opacities = np.array(field.GetOpacitiesAttr().Get(), np.float64)
+    gaussians = Gaussians(
+        means=np.array(field.GetPositionsAttr().Get(), np.float32),
+        quats=np.array([[q.GetReal(), *q.GetImaginary()] for q in quats], np.float32),
+        log_scales=np.log(np.array(field.GetScalesAttr().Get(), np.float32)),
+        logit_opacities=np.log(opacities / (1 - opacities)).astype(np.float32),
+        sh=sh.reshape(-1, (count + 1) ** 2, 3),
+    )
+    return stage, field, gaussians
 
 
 @pytest.mark.parametrize("degree", [0, 3])

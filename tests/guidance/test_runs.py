@@ -1,13 +1,16 @@
 """Whole runs with guidances of other packages and with tiny diffusion models."""
 
+from pathlib import Path
+
 import pytest
 import torch
+import yaml
 
 import tests.guidance.test_external  # noqa: F401  registers test-learning-guidance
 from tests.helpers import tiny_models
-from tests.helpers.guidance_runs import assert_resumes, config, diffusion, run
 from threestudio_gaussiandreamer import register_parts
 from threestudio_gaussiandreamer.host import BaseObject, register
+from threestudio_gaussiandreamer.launch.experiment import main
 from threestudio_gaussiandreamer.priors.random import RandomPrior
 
 register_parts()
@@ -34,6 +37,81 @@ class MultiviewDouble(BaseObject):
         looks = {"timesteps": torch.full((len(rgb),), 400), "rgb": rgb.detach(), "eval": {"bs": 1}}
         losses = {"loss_sds": (rgb - 0.2).square().sum(), "loss_recon": rgb.mean()}
         return losses | looks | {"grad_norm": rgb.detach().norm()}
+
+
+PARTS = ("state_dict", "guidance", "optimizer_states")
+"""Sections of a checkpoint that must not depend on interruptions."""
+
+
+def config(path, **system):
+    """Return the configuration of three steps from random points; tests vary ``system``."""
+    cfg = yaml.safe_load((Path(__file__).parents[2] / "configs" / "demo.yaml").read_text())
+    cfg |= {"tag": "t", "use_timestamp": False}
+    sizes = dict.fromkeys(("width", "height", "eval_width", "eval_height"), 16)
+    cfg["data"] |= sizes | {"n_test_views": 2, "train_views": 0}
+    start = {"prior_type": "random-prior", "prior": {"num_points": 60}}
+    cfg["system"]["geometry"] |= start | {"grow": {"num_candidates": 100}}
+    cfg["system"] |= {"evaluation": {"views": 2, "size": 16, "every": 0}, **system}
+    often = {"max_steps": 3, "val_check_interval": 3, "log_every_n_steps": 1}
+    cfg["trainer"] |= often | {"enable_progress_bar": False}
+    path.write_text(yaml.safe_dump(cfg))
+    return path
+
+
+def diffusion(model, family="stable-diffusion"):
+    """Return the options that a user gives for the real weights."""
+    return {
+        "prompt_processor_type": f"{family}-prompt-processor",
+        "prompt_processor": {
+            "pretrained_model_name_or_path": "${system.guidance.pretrained_model_name_or_path}",
+            "prompt": "a fox",
+            "negative_prompt": "ugly",
+            "use_perp_neg": True,
+        },
+        "guidance_type": f"{family}-guidance",
+        "guidance": {
+            "pretrained_model_name_or_path": str(model),
+            "guidance_scale": 20.0,
+            "max_step_percent": [2, 0.98, 0.55, 3],
+            "grad_clip": [0, 1.5, 2.0, 1000],
+        },
+    }
+
+
+def run(path, folder, *options):
+    arguments = ["--config", str(path), "--train", "--gpu", "cpu", f"exp_root_dir={folder}"]
+    return main([*arguments, *options])
+
+
+def checkpoint(folder):
+    return torch.load(folder / "demo" / "t" / "ckpts" / "last.ckpt", weights_only=True)
+
+
+def flat(content, name=""):
+    """Return every tensor of a part of a checkpoint by its path."""
+    if isinstance(content, torch.Tensor):
+        return {name: content}
+    if isinstance(content, (list, tuple)):
+        content = dict(enumerate(content))
+    found = {}
+    for key, value in content.items() if isinstance(content, dict) else ():
+        found |= flat(value, f"{name}/{key}")
+    return found
+
+
+def assert_resumes(path, folder, *options):
+    """Assert that five steps at once, and three and two with more validation, end with the same
+    checkpoint bit for bit.
+    """
+    assert run(path, folder / "whole", *options, "trainer.max_steps=5") == 0
+    assert run(path, folder / "parts", *options, "trainer.val_check_interval=1") == 0
+    last = folder / "parts" / "demo" / "t" / "ckpts" / "last.ckpt"
+    assert run(path, folder / "parts", *options, "trainer.max_steps=5", f"resume={last}") == 0
+    contents = (checkpoint(folder / name) for name in ("whole", "parts"))
+    whole, parts = (flat({key: content[key] for key in PARTS}) for content in contents)
+    assert whole.keys() == parts.keys()
+    assert not [name for name in whole if not torch.equal(whole[name], parts[name])]
+    return whole
 
 
 # Whole runs
