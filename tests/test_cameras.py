@@ -34,9 +34,8 @@ def test_azimuth_0_is_plus_x_90_is_plus_y_and_z_is_up(elevation, azimuth, positi
 
 def test_the_front_camera_sees_y_to_the_right_and_z_up():
     pixel, depth = project([0.0, 0.5, 0.0], view(), 100, 200)
-    assert (
-        pixel[0] > 100 and pixel[1] == pytest.approx(50, abs=1e-4) and depth == pytest.approx(2.0)
-    )
+    assert pixel[0] > 100 and pixel[1] == pytest.approx(50, abs=1e-4)
+    assert depth == pytest.approx(2.0)
     pixel, _ = project([0.0, 0.0, 0.5], view(), 100, 200)
     assert pixel[0] == pytest.approx(100, abs=1e-4) and pixel[1] < 50  # row 0 is on top
 
@@ -46,9 +45,7 @@ def test_the_vertical_field_of_view_spans_the_height_and_pixels_are_square():
     pixel, _ = project([0.0, 0.0, half], view(), 100, 200)
     assert pixel[1] == pytest.approx(0.0, abs=1e-3)
     pixel, _ = project([0.0, half, 0.0], view(), 100, 200)
-    assert pixel[0] == pytest.approx(
-        150.0, abs=1e-3
-    )  # as many pixels sideways as upwards: f is the same for both axes
+    assert pixel[0] == pytest.approx(150.0, abs=1e-3)  # as many pixels sideways as upwards
 
 
 def test_rays_through_pixel_centres_agree_with_the_projection():
@@ -62,11 +59,8 @@ def test_rays_through_pixel_centres_agree_with_the_projection():
 
 def test_the_host_projection_matrix_puts_the_top_row_at_minus_one():
     orbit = view()
-    clip = (
-        cameras.projection(orbit.fovy, 2.0)[0]
-        @ torch.linalg.inv(orbit.c2w)[0]
-        @ torch.tensor([0.0, 0.0, 2 * math.tan(math.radians(30)), 1.0])
-    )
+    top = torch.tensor([0.0, 0.0, 2 * math.tan(math.radians(30)), 1.0])
+    clip = cameras.projection(orbit.fovy, 2.0)[0] @ torch.linalg.inv(orbit.c2w)[0] @ top
     assert (clip[1] / clip[3]).item() == pytest.approx(-1.0, abs=1e-5)
 
 
@@ -81,11 +75,12 @@ def test_sampled_views_stay_in_the_papers_ranges_and_cover_the_circle():
     ranges = OrbitRanges()
     for step in range(50):
         orbit = cameras.sample_orbit(4, ranges, generator(0, "camera", step))
-        assert (orbit.elevation >= -10.001).all() and (orbit.elevation <= 60.001).all()
-        assert (orbit.distance >= 1.5).all() and (orbit.distance <= 4.0).all()
-        assert (torch.rad2deg(orbit.fovy) >= 40).all() and (
-            torch.rad2deg(orbit.fovy) <= 70.001
-        ).all()
+        for values, low, high in (
+            (orbit.elevation, -10.001, 60.001),
+            (orbit.distance, 1.5, 4.0),
+            (torch.rad2deg(orbit.fovy), 40, 70.001),
+        ):
+            assert (values >= low).all() and (values <= high).all()
         assert sorted(((orbit.azimuth + 180) // 90).tolist()) == [0, 1, 2, 3]
 
 
@@ -107,22 +102,17 @@ def test_every_pool_mixes_both_elevation_rules(seed):
 
 def test_the_pool_covers_all_azimuths():
     pool = cameras.camera_pool(200, OrbitRanges(), 3)
-    assert (
-        (pool.azimuth.diff() > -2).all() and pool.azimuth.min() < -175 and pool.azimuth.max() > 175
-    )
+    assert (pool.azimuth.diff() > -2).all()
+    assert pool.azimuth.min() < -175 and pool.azimuth.max() > 175
     assert torch.equal(pool.distance, cameras.camera_pool(200, OrbitRanges(), 3).distance)
     assert not torch.equal(pool.distance, cameras.camera_pool(200, OrbitRanges(), 4).distance)
 
 
 def test_the_inverse_of_a_camera_is_exact_and_an_invalid_one_affects_only_itself():
-    c2w = cameras.orbit_c2w(
-        torch.tensor([10.0, 90.0, 0.0]),
-        torch.tensor([20.0, 0.0, 0.0]),
-        torch.tensor([2.0, 3.0, 4.0]),
-    )
-    torch.testing.assert_close(
-        cameras.world_to_camera(c2w), torch.linalg.inv(c2w), rtol=0, atol=1e-5
-    )
+    orbits = torch.tensor([[10.0, 90.0, 0.0], [20.0, 0.0, 0.0], [2.0, 3.0, 4.0]])
+    c2w = cameras.orbit_c2w(*orbits)
+    inverse = torch.linalg.inv(c2w)
+    torch.testing.assert_close(cameras.world_to_camera(c2w), inverse, rtol=0, atol=1e-5)
     whole = cameras.world_to_camera(c2w[:1])
     c2w[1], c2w[2] = torch.nan, 0.0  # torch.linalg.inv raises, for all of them
     assert torch.equal(cameras.world_to_camera(c2w)[:1], whole)

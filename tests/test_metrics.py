@@ -79,9 +79,8 @@ def test_multi_face_rate_counts_views_of_the_wrong_side():
     bank, azimuths = images(8, 32, 32, 3), torch.arange(8) * 45.0
     assert multi_face_rate(bank, bank, azimuths, azimuths) == 0
     everywhere_the_back = bank[4].expand(8, -1, -1, -1)
-    assert (
-        multi_face_rate(everywhere_the_back, bank, azimuths, azimuths) == 5 / 8
-    )  # 180 and its two neighbours at 45 are right
+    # 180 and its two neighbours at 45 are right
+    assert multi_face_rate(everywhere_the_back, bank, azimuths, azimuths) == 5 / 8
 
 
 def test_floater_mass_is_weighted_by_opacity():

@@ -37,7 +37,7 @@ POINTS = torch.zeros(5, 3)
         (3, Any, True),
     ],
 )
-def test_a_size_that_fits_into_memory(value, annotation, fits):
+def test_arrays_match_their_annotations_and_all_else_does(value, annotation, fits):
     assert matches(value, annotation) is fits
 
 
