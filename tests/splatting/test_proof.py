@@ -200,7 +200,7 @@ def test_the_verdict_about_broken_kernels_is_cached_until_its_file_is_removed(us
     """And they are refused before a run begins; NaN is a difference."""
     nan = functools.partial(other_constants, eps2d=float("nan"))
     use(BrokenDevice(Fault("project_backward", nan)))
-    with pytest.raises(UserError, match="a.backend: cuda can't be used here: .*differ from plain"):
+    with pytest.raises(UserError, match="a.backend: .*cuda' can't run: .*differ from plain"):
         check_backend("a.backend", "cuda")
     check_backend("a.backend", "auto")
     with pytest.raises(UserError, match="'cuda' can't run: .*gradient of means by nan"):

@@ -42,11 +42,10 @@ class Backend:
 
     def refuses(self, tensor: Tensor) -> Optional[str]:
         """Return why the backend can't be used with tensors like this one, or None if it can."""
-        if not self.takes(tensor):
-            devices, dtypes = " or ".join(self.devices or ()), " or ".join(map(str, self.dtypes))
-            on = f" on {devices}" if devices else ""
-            return f"it takes {dtypes}{on}, these are {tensor.dtype} on {tensor.device}"
         reason = self.unavailable()
+        if reason is None and not self.takes(tensor):
+            places, kinds = (" or ".join(map(str, x or ())) for x in (self.devices, self.dtypes))
+            reason = f"it takes {kinds} on {places}, these are {tensor.dtype} on {tensor.device}"
         return self.proof.failure(tensor.device) if reason is None and self.proof else reason
 
 
@@ -62,13 +61,6 @@ BACKENDS = {
 def available_backends() -> dict[str, Optional[str]]:
     """Map the name of each backend to None, or to the reason why it can't run on this machine."""
     return {name: backend.unavailable() for name, backend in BACKENDS.items()}
-
-
-def refusal(name: str, device: torch.device) -> Optional[str]:
-    """Return why a backend can't draw on a device, or None if it can. Where that is due, it is
-    compared with plain torch there.
-    """
-    return BACKENDS[name].refuses(torch.empty(0, device=device))
 
 
 def choose_backend(name: str, tensor: Tensor) -> Backend:

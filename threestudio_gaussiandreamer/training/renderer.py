@@ -27,27 +27,23 @@ from torch import Tensor
 
 from .. import cameras
 from ..core.devices import get_device, without_autocast
-from ..core.errors import UserError, unknown
+from ..core.errors import UserError
 from ..core.lazy_mapping import LazyMapping
 from ..core.options import at_least, in_range, one_of, positive, rule
 from ..gaussians.gaussians import require_attributes
 from ..host import Rasterizer, register
-from ..splatting import PRESETS, Rasterized, available_backends, rasterize
-from ..splatting.backends import refusal
+from ..splatting import PRESETS, Rasterized, rasterize
+from ..splatting.backends import choose_backend
 from .background import FlatBackground
 
 
 def check_backend(option: str, name: str) -> None:
     """Raise UserError, which names the option's path, unless the backend exists and runs here."""
-    if name == "auto":
-        return
-    reasons = available_backends()
-    if name not in reasons:
-        raise unknown(option, name, ["auto", *reasons])
-    if reason := reasons[name] or refusal(name, get_device()):
-        raise UserError(
-            f"{option}: {name} can't be used here: {reason} (auto takes the fastest that can)"
-        )
+    try:
+        if name != "auto":
+            choose_backend(name, torch.empty(0, device=get_device()))
+    except UserError as error:
+        raise UserError(f"{option}: {error}") from error
 
 
 DRAWING = ("near", "far", "eps2d", "antialias", "preset", "downsample", "backend")
