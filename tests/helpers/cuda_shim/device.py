@@ -4,11 +4,11 @@ launch code unchanged.
 
 import ctypes
 import functools
+import hashlib
 import os
 import shutil
 import subprocess
 import sys
-import tempfile
 from pathlib import Path
 from typing import Optional
 
@@ -50,16 +50,18 @@ ORDERS = {"forward": 0, "backward": 1, "shuffled": 2}
 
 @functools.cache
 def library() -> ctypes.CDLL:
-    """Return the kernels compiled for the host, once per process."""
-    folder = tempfile.TemporaryDirectory()
-    includes = [f"-I{path}" for path in (FOLDER, nvrtc.KERNELS, nvrtc.SHARED)]
-    target = os.path.join(folder.name, "kernels.so")
-    subprocess.run(
-        ["g++", *FLAGS, *WARNINGS, *includes, *map(str, FOLDER.glob("*.cpp")), "-o", target],
-        check=True,
-    )
-    kernels = ctypes.CDLL(target)
-    kernels.folder = folder
+    """Return the kernels compiled for the host; the file is kept for other processes and runs."""
+    folders = FOLDER, nvrtc.KERNELS, nvrtc.SHARED
+    sources = [path for folder in folders for path in sorted(folder.glob("*.[ch]*"))]
+    key = hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()[:16]
+    target = FOLDER.parents[2] / ".pytest_cache" / f"kernels-{key}.so"
+    if not target.exists():
+        target.parent.mkdir(exist_ok=True)
+        part = target.with_suffix(f".{os.getpid()}")
+        files = [*(f"-I{folder}" for folder in folders), *map(str, FOLDER.glob("*.cpp"))]
+        subprocess.run(["g++", *FLAGS, *WARNINGS, *files, "-o", str(part)], check=True)
+        part.replace(target)
+    kernels = ctypes.CDLL(str(target))
     kernels.shim_error.restype = ctypes.c_char_p
     return kernels
 
@@ -91,12 +93,8 @@ class HostDevice:
     def __init__(
         self, order: str = "forward", most_intersections: int = NOWHERE, arrived: bool = True
     ):
-        self.order, self.most_intersections, self.arrived, self.waits = (
-            ORDERS[order],
-            most_intersections,
-            arrived,
-            0,
-        )
+        self.order, self.most_intersections = ORDERS[order], most_intersections
+        self.arrived, self.waits = arrived, 0
         self.launched: list[str] = []
 
     def describe(self) -> str:
@@ -104,10 +102,8 @@ class HostDevice:
 
     def launch(self, name: str, grid: tuple[int, int], threads: int, *arguments) -> None:
         self.launched.append(name)
-        if (
-            name in ("list_tiles", "blend_backward", "blend_backward_absolute")
-            and max(map(_length, arguments)) > self.most_intersections
-        ):
+        limited = name in ("list_tiles", "blend_backward", "blend_backward_absolute")
+        if limited and max(map(_length, arguments)) > self.most_intersections:
             raise torch.cuda.OutOfMemoryError("no memory, says the test")
         values = [ctypes.c_void_p(x.data_ptr()) if isinstance(x, Tensor) else x for x in arguments]
         pointers = (ctypes.c_void_p * len(values))(*(ctypes.addressof(x) for x in values))
@@ -120,7 +116,5 @@ class HostDevice:
 
 def _length(argument) -> int:
     """Return how many intersections, or rows of them, it has room for."""
-    is_list = isinstance(argument, Tensor) and (
-        argument.dim() == 1 or argument.dim() == 2 and argument.shape[1] == 12
-    )
+    is_list = isinstance(argument, Tensor) and (argument.dim() == 1 or argument.shape[1:] == (12,))
     return len(argument) if is_list else 0
