@@ -33,6 +33,20 @@ from tests.helpers.splatting_scenes import (
 )
 
 TWO_BACKGROUNDS = torch.tensor([[0.1, 0.2, 0.3], [0.9, 0.8, 0.7]])
+each_options = pytest.mark.parametrize(
+    "options",
+    [
+        {"preset": "fast"},
+        {"preset": "accurate", "antialias": True},
+        {"absgrad": True, "downsample": 2},
+        {"absgrad": True, "antialias": True, "eps2d": 0.1},
+        {"alpha_max": 0.6, "absgrad": True},
+        {"stop": 0.2},
+        NO_CUTOFFS,
+        {"near": 2.9, "far": 3.2, "background": TWO_BACKGROUNDS},
+    ],
+    ids=str,
+)
 TILTED = torch.tensor([[0.9, 0.2, 0.1, 0.4]], dtype=torch.float64)
 
 
@@ -48,20 +62,7 @@ class KernelContract:
     def test_sizes_that_are_no_multiple_of_a_tile(self, backend, size):
         compare(backend, random_cloud(60, seed=size[0]), cameras(2, *size), *size, BACKGROUND)
 
-    @pytest.mark.parametrize(
-        "options",
-        [
-            {"preset": "fast"},
-            {"preset": "accurate", "antialias": True},
-            {"absgrad": True, "downsample": 2},
-            {"absgrad": True, "antialias": True, "eps2d": 0.1},
-            {"alpha_max": 0.6, "absgrad": True},
-            {"stop": 0.2},
-            NO_CUTOFFS,
-            {"near": 2.9, "far": 3.2, "background": TWO_BACKGROUNDS},
-        ],
-        ids=str,
-    )
+    @each_options
     def test_options(self, backend, options):
         compare(backend, random_cloud(150, seed=1, size=0.2), cameras(2, 34, 18), 34, 18, **options)
 

@@ -7,6 +7,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.helpers.splatting_contract import each_options
 from tests.helpers.splatting_scenes import (
     EXTREMES,
     NO_CUTOFFS,
@@ -49,24 +50,7 @@ def compare(cloud, camera, width, height, **options):
     return ours, truth
 
 
-@pytest.mark.parametrize(
-    "options",
-    [
-        {"preset": "fast"},
-        {"preset": "accurate", "antialias": True},
-        {"absgrad": True, "downsample": 2},
-        {"alpha_max": 0.6, "absgrad": True},
-        {"stop": 0.2},
-        NO_CUTOFFS,
-        NO_CUTOFFS | {"antialias": True, "eps2d": 0.1, "absgrad": True},
-        {
-            "near": 2.9,
-            "far": 3.2,
-            "background": torch.tensor([[0.1, 0.2, 0.3], [0.9, 0.8, 0.7]], dtype=torch.float64),
-        },
-    ],
-    ids=str,
-)
+@each_options
 def test_options(options):
     compare(random_cloud(150, seed=1, size=0.2), cameras(2, 22, 18), 22, 18, **options)
 
