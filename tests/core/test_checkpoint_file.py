@@ -4,10 +4,6 @@ import os
 import pickle
 import random
 import resource
-import tracemalloc
-import zipfile
-from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 import torch
@@ -20,7 +16,7 @@ from threestudio_gaussiandreamer.core.checkpoint_file import (
     save_file,
 )
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.launch.checkpoints import AtomicCheckpointIO
+from threestudio_gaussiandreamer.launch.callbacks import AtomicCheckpointIO
 
 
 def content(step: int = 7, size: int = 2000) -> dict:
@@ -128,7 +124,7 @@ def test_code_in_a_pickle_is_not_executed(tmp_path, monkeypatch):
     (tmp_path / "bare.ckpt").write_bytes(pickle.dumps(Bomb()))
     for name, message in (
         ("bomb.ckpt", "could run code"),
-        ("bare.ckpt", "doesn't end as torch.save"),
+        ("bare.ckpt", "isn't a checkpoint"),
     ):
         with pytest.raises(UserError, match=message):
             AtomicCheckpointIO().load_checkpoint(name, weights_only=False)
@@ -166,62 +162,13 @@ def test_a_full_disk_leaves_the_earlier_file_and_no_temporary_one(tmp_path):
     )
 
 
-# -- memory ----------------------------------------------------------------------------------------
-
-
-def repacked(path: Path, change: Callable[[str, bytes], bytes], compression: int) -> None:
-    """Rewrite the records of an archive with checksums that fit."""
-    with zipfile.ZipFile(path) as archive:
-        records = {name: archive.read(name) for name in archive.namelist()}
-    with zipfile.ZipFile(path, "w", compression) as archive:
-        for name, content in records.items():
-            archive.writestr(name, change(name, content))
-
-
-def refused(path: Path, message: str, most_bytes: int = 8 << 20) -> None:
-    """Assert that the file is rejected with little memory."""
-    tracemalloc.start()
-    try:
-        with pytest.raises(UserError, match=message):
-            load_file(path)
-        assert tracemalloc.get_traced_memory()[1] < most_bytes
-    finally:
-        tracemalloc.stop()
-
-
-def test_compressed_records_are_refused_before_they_are_unpacked(tmp_path):
-    path = tmp_path / "a.ckpt"
-    torch.save({"x": torch.zeros(1 << 24)}, path)
-    repacked(path, lambda name, content: content, zipfile.ZIP_DEFLATED)
-    assert os.path.getsize(path) < 100_000
-    refused(path, "its records are compressed")
-
-
-@pytest.mark.parametrize(
-    "call", [b"cbuiltins\nbytearray\n", b"ctorch\nFloatTensor\n", b"ctorch\nTensor\n"]
-)
-def test_a_call_that_allocates_is_refused(tmp_path, call):
-    path = tmp_path / "a.ckpt"
-    torch.save({"x": torch.zeros(3)}, path)
-    pickled = b"\x80\x02" + call + b"J\x00\x00\x00\x7f\x85R."
-    repacked(
-        path, lambda name, old: pickled if name.endswith("data.pkl") else old, zipfile.ZIP_STORED
-    )
-    refused(path, "which no checkpoint needs")
-
-
-def test_many_tensors_that_share_a_storage_are_refused(tmp_path):
-    """The total may be twice the file's size, as with a weight that two layers share."""
+def test_a_tensor_that_repeats_a_number_is_refused(tmp_path):
+    """Copying it to a contiguous tensor would exhaust the memory; a weight that two layers share
+    is fine.
+    """
     base = torch.zeros(1000)
     torch.save({str(i): base[:] for i in range(2)}, tmp_path / "two.ckpt")
     assert load_file(tmp_path / "two.ckpt").keys() == {"0", "1"}
-    torch.save({str(i): base[:] for i in range(200)}, tmp_path / "a.ckpt")
-    refused(tmp_path / "a.ckpt", "bytes can't hold")
-
-
-def test_containers_that_repeat_themselves_are_walked_once(tmp_path):
-    nested: list = [1]
-    for _ in range(60):
-        nested = [nested, nested]
-    torch.save(content() | {"x": nested}, tmp_path / "a.ckpt")
-    assert load_checkpoint(tmp_path / "a.ckpt")["global_step"] == 7
+    torch.save({"x": [torch.zeros(1).expand(10**12)]}, tmp_path / "a.ckpt")
+    with pytest.raises(UserError, match="bytes can't hold"):
+        load_file(tmp_path / "a.ckpt")

@@ -7,7 +7,6 @@ from typing import Any
 
 import pytest
 import torch
-from omegaconf import OmegaConf
 
 from threestudio_gaussiandreamer import host
 from threestudio_gaussiandreamer.core.checkpoint_file import save_file
@@ -23,11 +22,7 @@ from threestudio_gaussiandreamer.host.builtin.models import (
     Renderer,
     SolidColorBackground,
 )
-from threestudio_gaussiandreamer.host.builtin.system import (
-    BaseLift3DSystem,
-    BaseSystem,
-    optimizer_from,
-)
+from threestudio_gaussiandreamer.host.builtin.system import BaseSystem
 
 # -- registry --------------------------------------------------------------------------------------
 
@@ -179,34 +174,6 @@ def test_the_step_of_a_resumed_checkpoint_is_the_true_one():
     system.set_resume_status(2, 1200)
     assert (system.true_current_epoch, system.true_global_step) == (2, 1200)
     assert system.C([0, 0.0, 1.0, 2400]) == 0.5
-
-
-def test_an_exporter_output_that_nobody_can_save_is_named(own_registry, tmp_path):
-    from threestudio_gaussiandreamer.host.builtin.models import Exporter, ExporterOutput
-
-    class System(BaseLift3DSystem):
-        def configure(self) -> None:
-            self.exporter = Exporter({}, geometry=None, material=None, background=None)
-            self.exporter.__class__ = type(
-                "Odd", (Exporter,), {"__call__": lambda self: [ExporterOutput("a", "hologram", {})]}
-            )
-
-    with pytest.raises(UserError, match="has no save_hologram, which Odd asks for"):
-        System({}).on_predict_epoch_end()
-
-
-def test_optimizer_groups_are_named_attributes_with_their_own_options():
-    module = torch.nn.Module()
-    module.geometry = Points()
-    config = OmegaConf.create(
-        {"name": "Adam", "args": {"lr": 0.1}, "params": {"geometry.means": {"lr": 0.5}}}
-    )
-    groups = optimizer_from(config, module).param_groups
-    assert [(group["name"], group["lr"]) for group in groups] == [("geometry.means", 0.5)]
-    with pytest.raises(UserError, match="system.optimizer.params.geometry.maens"):
-        optimizer_from(OmegaConf.create({"name": "Adam", "params": {"geometry.maens": {}}}), module)
-    with pytest.raises(UserError, match="system.optimizer.name is 'Adma'"):
-        optimizer_from(OmegaConf.create({"name": "Adma"}), module)
 
 
 # -- which host ------------------------------------------------------------------------------------

@@ -154,9 +154,6 @@ def test_a_harmful_tag_becomes_a_slug_with_a_hash():
         "..",
         ".hidden",
         "-rf",
-        "con",
-        "NUL.txt",
-        "com\u00b9",
         "a ",
         65 * "x",
         "\n",
@@ -168,8 +165,6 @@ def test_a_harmful_tag_becomes_a_slug_with_a_hash():
 @settings(max_examples=30)
 @given(st.text(), st.integers(0, 30))
 @example("a fox " * 20, 1)
-@example("NUL.txt", 1)
-@example("con .x", 1)
 @example("a" * 55 + "\U0001f98a-0123abcd", 1)
 @example("\ud800", 1)
 def test_the_name_of_a_name_is_itself(text, times):
@@ -265,13 +260,6 @@ def test_resume_auto_takes_the_newest_run_of_the_tag(folder):
     save_file(cfg.resume, checkpoint)
     Path(cfg.resume).write_bytes(b"damaged")
     assert load("resume=auto").resume == cfg.trial_dir + "/ckpts/last-prev.ckpt"
-
-
-def test_resume_auto_names_the_checkpoints_of_an_earlier_run(folder, caplog):
-    save_file("outputs/tiny/run/ckpts-2/epoch=0-step=3.ckpt", {"epoch": 0, "global_step": 3})
-    with caplog.at_level("INFO"):
-        assert load("resume=auto", "use_timestamp=false", "tag=run").resume is None
-    assert "resume=outputs/tiny/run/ckpts-2/epoch=0-step=3.ckpt" in caplog.text
 
 
 def test_the_parsed_file_does_not_resume_again(folder):

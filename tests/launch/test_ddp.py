@@ -129,8 +129,6 @@ TASK = dict.fromkeys(launcher.SLURM, "1")
         (SLURM | {k: "0" for k in TASK if k != "SLURM_NODEID"}, "set, but not SLURM_NODEID: start"),
         (TORCHRUN, "TORCHELASTIC_RUN_ID is set, but not RANK, LOCAL_RANK: start .* with torchrun"),
         ({"TORCHELASTIC_RUN_ID": "1"}, "not RANK, LOCAL_RANK, WORLD_SIZE, LOCAL_WORLD_SIZE: "),
-        (TORCHRUN | RANKS | {"WORLD_SIZE": "3"}, "WORLD_SIZE is 3, no multiple of LOCAL_WORLD_"),
-        (TASK | SLURM | {"SLURM_NTASKS": "3"}, "SLURM_NTASKS is 3, no multiple of SLURM_NNODES"),
         ({"RANK": "1", "WORLD_SIZE": "2"}, "RANK is 1, but nothing says how many .* torchrun"),
         (TASK | SLURM | {"SLURM_JOB_NAME": "bash"}, "SLURM_PROCID is 1, but nothing says"),
         ({"SLURM_NTASKS": "0"}, "SLURM_NTASKS is '0'; expected a whole number from 1 on"),
@@ -295,16 +293,10 @@ def test_four_processes_of_torchrun_on_two_machines(alone, mesh, tmp_path):
         command(tmp_path, mesh, "trainer.max_steps=6", launcher=machine) for machine in machines
     ]
     require_success(*(started(tmp_path, line) for line in lines))
-    require_same_training(runs.run_folder(tmp_path), alone)
-    assert written(runs.run_folder(tmp_path)) == written(alone)
-
-
-@pytest.mark.slow
-def test_two_tasks_of_slurm_on_two_machines(alone, mesh, tmp_path):
-    require_success(*two_tasks(tmp_path, command(tmp_path, mesh, "trainer.max_steps=6")))
-    require_same_training(runs.run_folder(tmp_path), alone)
-    assert written(runs.run_folder(tmp_path)) == written(alone)
-    assert (runs.run_folder(tmp_path) / "cmd.txt").read_text().count("\n") == 1
+    run = runs.run_folder(tmp_path)
+    require_same_training(run, alone)
+    assert written(run) == written(alone)
+    assert (run / "cmd.txt").read_text().count("\n") == 1
 
 
 def written(folder):
@@ -342,12 +334,3 @@ def test_a_process_that_has_lost_another_one_says_so(mesh, tmp_path):
         assert second.wait(timeout=60) == -9
     finally:
         first.kill(), second.kill()
-
-
-@pytest.mark.slow
-def test_fewer_views_than_processes(mesh, tmp_path):
-    line = command(tmp_path, mesh, "trainer.devices=2", "data.batch_size=1")
-    process = started(tmp_path, line)
-    said = process.communicate(timeout=900)[0]
-    assert process.returncode == 2, said[-3000:]
-    assert "data.batch_size is 1, fewer than the 2 processes" in said

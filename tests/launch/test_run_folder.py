@@ -1,7 +1,6 @@
 """The folder of a run that is resumed: its own, also if it was moved, copied or renamed."""
 
 import json
-import os
 import shutil
 from datetime import datetime
 from pathlib import Path
@@ -21,31 +20,6 @@ def test_paths_of_one_file_are_no_change(folder):
     assert run_folder._is_same("my.glb", "./my.glb") and run_folder._is_same(3, 3)
     assert run_folder._is_same("my.glb", str(Path("my.glb").absolute()))
     assert not run_folder._is_same("my.glb", "other.glb") and not run_folder._is_same(3, "3")
-
-
-def test_a_checkpoint_of_another_working_folder_is_continued_in_its_own(folder, monkeypatch):
-    dump_config("parsed.yaml", load())
-    first = load_config("parsed.yaml")
-    last, parsed = (
-        os.path.abspath(name) for name in (f"{first.trial_dir}/ckpts/last.ckpt", "parsed.yaml")
-    )
-    (folder / "elsewhere").mkdir()
-    monkeypatch.chdir("elsewhere")
-    cfg = load_config(parsed, cli_args=[f"resume={last}"])
-    assert cfg.trial_dir == str(folder / first.trial_dir) and cfg.trial_name == first.trial_name
-    assert cfg.exp_dir == str(folder / "outputs/tiny")
-
-
-def test_a_run_that_is_moved_on_purpose_is_named_with_the_folder_of_its_checkpoint(
-    folder, monkeypatch
-):
-    messages: list[str] = []
-    monkeypatch.setattr(run_folder, "warn", messages.append)
-    dump_config("parsed.yaml", load())
-    last = f"{load_config('parsed.yaml').trial_dir}/ckpts/last.ckpt"
-    cfg = load_config("parsed.yaml", cli_args=[f"resume={last}", "exp_root_dir=moved"])
-    assert cfg.trial_dir.startswith("moved/tiny/a_red_ball@")
-    assert str(folder / "outputs/tiny") in messages[0] and str(folder / "moved") in messages[0]
 
 
 @pytest.fixture

@@ -17,7 +17,7 @@ from tests.helpers import tiny_parts
 from tests.helpers.tiny_runs import assert_same_training, files, only_run
 from threestudio_gaussiandreamer.core.checkpoint_file import load_file
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.launch import callbacks, checkpoints
+from threestudio_gaussiandreamer.launch import callbacks
 from threestudio_gaussiandreamer.launch.config import load_config
 from threestudio_gaussiandreamer.launch.experiment import main
 
@@ -182,7 +182,7 @@ def test_checkpoints_take_a_hundredth_of_the_time_at_most(launch, monkeypatch):
     training_step = tiny_parts.TinySystem.training_step
     monkeypatch.setattr(tiny_parts.TinySystem, "training_step", step_of_100_seconds)
     monkeypatch.setattr(callbacks.time, "monotonic", lambda: clock[0])
-    monkeypatch.setattr(checkpoints, "save_file", slow_save)
+    monkeypatch.setattr(callbacks, "save_file", slow_save)
     options = ["trainer.max_steps=12", "trainer.limit_val_batches=0", "checkpoint.save_last=false"]
     assert launch("--train", *options)[0] == 0
     assert [step for step in saved if step < 12] == [1, 6, 11]

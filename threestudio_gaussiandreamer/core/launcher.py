@@ -39,12 +39,15 @@ def require_launcher(environment: Mapping[str, str] = os.environ) -> None:
     """
     require_numbers(environment)
     by_torchrun, by_slurm = "TORCHELASTIC_RUN_ID" in environment, many_tasks(environment)
+    first, names, program = "SLURM_NTASKS", SLURM, "srun"
     if by_torchrun:
-        _require_all("TORCHELASTIC_RUN_ID", TORCHRUN, "torchrun", environment)
-        _require_multiple("WORLD_SIZE", "LOCAL_WORLD_SIZE", environment)
-    elif by_slurm:
-        _require_all("SLURM_NTASKS", SLURM, "srun", environment)
-        _require_multiple("SLURM_NTASKS", "SLURM_NNODES", environment)
+        first, names, program = "TORCHELASTIC_RUN_ID", TORCHRUN, "torchrun"
+    missing = [name for name in names if name not in environment]
+    if missing and (by_torchrun or by_slurm):
+        raise UserError(
+            f"the environment variable {first} is set, but not {', '.join(missing)}: start the "
+            f"command with {program}, or `unset {first}` for a single process"
+        )
     for name, started, hint in (
         ("RANK", by_torchrun, "start the command with torchrun"),
         ("SLURM_PROCID", by_slurm or by_torchrun, "give srun --job-name and --ntasks-per-node"),
@@ -70,23 +73,3 @@ def train_alone() -> None:
     """Let later runs of this process be single ones, whatever program has started it."""
     for name in ("TORCHELASTIC_RUN_ID", *INDICES, *SIZES):
         os.environ.pop(name, None)
-
-
-def _require_all(
-    first: str, names: tuple[str, ...], program: str, environment: Mapping[str, str]
-) -> None:
-    missing = [name for name in names if name not in environment]
-    if missing:
-        raise UserError(
-            f"the environment variable {first} is set, but not {', '.join(missing)}: start the "
-            f"command with {program}, or `unset {first}` for a single process"
-        )
-
-
-def _require_multiple(total: str, part: str, environment: Mapping[str, str]) -> None:
-    size, step = (int(environment.get(name, 1)) for name in (total, part))
-    if size % step:
-        raise UserError(
-            f"the environment variable {total} is {size}, no multiple of {part}, which is {step}: "
-            "give each machine as many processes"
-        )

@@ -32,9 +32,9 @@ def set_handlers(handler: Handler) -> dict[int, Any]:
 
 
 def restore_handlers(handlers: dict[int, Any]) -> None:
-    """Restore the handlers that :func:`set_handlers` returned."""
-    for signum, handler in handlers.items():
-        signal.signal(signum, handler)
+    """Restore the handlers that :func:`set_handlers` returned, once: the mapping is emptied."""
+    while handlers:
+        signal.signal(*handlers.popitem())
 
 
 def interrupt(signum: int) -> NoReturn:

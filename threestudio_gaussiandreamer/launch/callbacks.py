@@ -1,5 +1,5 @@
-"""Lightning callbacks of the launcher: the record of the run, the progress bar, and checkpoints
-when a signal stops training.
+"""Lightning callbacks of the launcher: the record of the run, the progress bar, and checkpoints,
+also when a signal stops training.
 """
 
 import contextlib
@@ -7,25 +7,17 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from itertools import count
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, Optional
+from typing import Any
 
-import torch
-
+from ..core.checkpoint_file import load_file, save_file
 from ..core.files import atomic_file
 from ..core.host_copies import flush_reads
 from ..core.signals import interrupt, restore_handlers, set_handlers
 from ..host import info, pl, warn
-from .checkpoints import AtomicCheckpointIO
 from .config import dump_config
-from .folder_lock import (
-    free_number,
-    has_checkpoints,
-    set_checkpoints_aside,
-    set_results_aside,
-)
 from .run_folder import PARSED
 
 SECONDS_BETWEEN = 60.0
@@ -34,8 +26,6 @@ SHARE_OF_TIME = 0.01
 """Largest share of the running time that is spent on writing checkpoints."""
 SECONDS_SHOWN = 0.5
 """Time from one drawing of the progress bar to the next, seconds: one costs as much as a log."""
-DATA_BYTES = 2**22
-"""Total size up to which files beside the code of parts are copied with it."""
 SOURCE_ENDINGS = (".py", ".yaml", ".h", ".cpp", ".cu", ".html", ".css", ".js", ".glsl")
 
 
@@ -51,9 +41,9 @@ class Stopped(BaseException):
 
 class RunRecord(pl.Callback):
     """Write ``configs/raw.yaml``, ``configs/parsed.yaml``, ``code/`` and ``cmd.txt`` when the first
-    stage starts, before the prior. If the folder has record and checkpoints of an earlier run, they
-    are replaced together, with the first checkpoint of this one, so that a start that is refused or
-    stopped leaves the earlier run as it was.
+    stage starts, before the prior. Files of an earlier run in the folder are replaced when there
+    are others: its results are renamed when the prior's cloud is there, its checkpoints and record
+    with the first checkpoint, so that a start that fails leaves them in their place.
 
     Args:
         folder: the run's folder.
@@ -61,6 +51,7 @@ class RunRecord(pl.Callback):
         sources: the YAML files that were merged, and their content.
         command: the command line.
         records_code: write ``code/`` too.
+        at_zero: whether training starts at step 0.
     """
 
     def __init__(
@@ -69,11 +60,12 @@ class RunRecord(pl.Callback):
         cfg: Any,
         sources: Sequence[tuple[Path, bytes]],
         command: str,
-        records_code: bool = True,
+        records_code: bool,
+        at_zero: bool,
     ) -> None:
         self.folder, self.cfg, self.sources, self.command = folder, cfg, sources, command
-        self.records_code = records_code
-        self._code: dict[Path, bytes] = {}
+        self.records_code, self.at_zero = records_code, at_zero
+        self._files: dict[Path, bytes] = {}
         self._is_due = self._is_read = False
 
     def setup(self, trainer: Any, pl_module: Any, stage: str) -> None:
@@ -81,116 +73,82 @@ class RunRecord(pl.Callback):
             return
         self._is_read = self._is_due = True
         if self.records_code:  # now, since the files may change before they are written
-            self._code = self.read_code()
-        if not (has_checkpoints(self.folder) and (self.folder / PARSED).is_file()):
+            package, code = Path(__file__).parents[1], self.folder / "code"
+            self._files = read_sources(package, code / package.name)
+            self._files |= read_sources(Path("custom"), code / "custom")
+        if not (self._has_checkpoints() and (self.folder / PARSED).is_file()):
             self.write()
+
+    def on_fit_start(self, trainer: Any, pl_module: Any) -> None:
+        if not (self.at_zero and trainer.is_global_zero):
+            return
+        taken = {path.name for path in self.folder.glob("*-*")}
+        self.number = next(n for n in count(2) if not taken & {f"ckpts-{n}", f"save-{n}"})
+        save, aside = self.folder / "save", self.folder / f"save-{self.number}"
+        if any(save.glob("it*")):
+            aside.mkdir()
+            for path in save.iterdir():
+                if path.name != "prior":  # its points may serve again
+                    path.rename(aside / path.name)
+            info(f"started at step 0: files of an earlier run are now in {aside}")
+
+    @contextlib.contextmanager
+    def first_checkpoint(self) -> Iterator[None]:
+        """Replace the record of an earlier run while the first checkpoint is written in this
+        context. At no time does the folder have a checkpoint beside the record of another start: of
+        a run from step 0, the earlier checkpoints are renamed first; of a resumed run, the record
+        follows its checkpoint.
+        """
+        if self.at_zero:
+            if self._has_checkpoints():
+                aside = (self.folder / "ckpts").rename(self.folder / f"ckpts-{self.number}")
+                info(f"started at step 0: checkpoints of an earlier run are now in {aside}")
+            self.write()
+        yield
+        self.write()
 
     def write(self) -> None:
         """Write the record, unless it has been written."""
         if not self._is_due:
             return
         self._is_due = False
-        self.save_configs()
-        for path, content in self._code.items():
+        configs = self.folder / "configs"
+        for i, (path, content) in enumerate(self.sources):
+            # not if the run is resumed from its own parsed.yaml: keep the original raw.yaml
+            if path.resolve().parent != configs.resolve():
+                self._files[configs / (f"raw-{i}.yaml" if i else "raw.yaml")] = content
+        for path, content in self._files.items():
             path.parent.mkdir(parents=True, exist_ok=True)
-            write_copy(path, content)
-        self._code = {}
+            with atomic_file(path, durable=False) as file:
+                file.write(content)
+        self._files = {}
+        configs.mkdir(parents=True, exist_ok=True)
+        dump_config(self.folder / PARSED, self.cfg)
         # append, since a resumed run has several command lines
         # surrogateescape: paths on the command line may be no UTF-8
         log = self.folder / "cmd.txt"
         with open(log, "a", encoding="utf-8", errors="surrogateescape") as file:
             file.write(self.command + "\n")
 
-    def save_configs(self) -> None:
-        """Write the configuration before and after merging and resolving."""
-        configs = self.folder / "configs"
-        configs.mkdir(parents=True, exist_ok=True)
-        for i, (path, content) in enumerate(self.sources):
-            # not if the run is resumed from its own parsed.yaml: keep the original raw.yaml
-            if path.resolve().parent != configs.resolve():
-                write_copy(configs / (f"raw-{i}.yaml" if i else "raw.yaml"), content)
-        dump_config(self.folder / PARSED, self.cfg)
-
-    def read_code(self) -> dict[Path, bytes]:
-        """Read the sources of this package and of the extensions.
-
-        Returns:
-            the content of the copies, by their paths.
-        """
-        package, copies = Path(__file__).parents[1], self.folder / "code"
-        found = dict(read_sources(package, copies / package.name))
-        if Path("custom").is_dir():
-            found |= read_sources(Path("custom"), copies / "custom", DATA_BYTES)
-        return found
+    def _has_checkpoints(self) -> bool:
+        return any((self.folder / "ckpts").glob("*.ckpt"))
 
 
-def read_sources(
-    source: Path, destination: Path, data_bytes: int = 0
-) -> Iterator[tuple[Path, bytes]]:
-    """Yield path and content of the copies of the source files below a folder, leaving out hidden
-    files and folders, and, with a warning, what can't be read.
-
-    Args:
-        destination: the folder of the copies.
-        data_bytes: copy other files too, which a part may read, up to so many bytes in total; a
-            warning says if there are more.
+def read_sources(source: Path, destination: Path) -> dict[Path, bytes]:
+    """Read the source files below a folder, leaving out hidden files and folders, and, with a
+    warning, what can't be read; return them by the paths of their copies.
     """
-    has_data, left_out = data_bytes > 0, []
-    for path in _visible_files(source):
-        is_source = path.name.endswith(SOURCE_ENDINGS)
-        if not is_source and not has_data:
-            continue
-        try:
-            if not is_source and path.stat().st_size > data_bytes:
-                left_out.append(path)
-                continue
-            content = path.read_bytes()
-        except OSError as error:
-            warn(f"{path} isn't copied to {destination}: {error.strerror}")
-            continue
-        data_bytes -= 0 if is_source else len(content)
-        yield destination / path.relative_to(source), content
-    if left_out:
-        warn(
-            f"{len(left_out)} files below {source}, such as {left_out[0]}, aren't copied to "
-            f"{destination}, since they are large"
-        )
-
-
-def _visible_files(source: Path) -> Iterator[Path]:
-    for folder, folders, names in os.walk(source):
-        folders[:] = [name for name in folders if not name.startswith((".", "__pycache__"))]
-        for name in names:
-            path = Path(folder, name)
-            if not name.startswith(".") and path.is_file():
-                yield path  # an editor's lock (a broken link) or a FIFO is no file
-
-
-def write_copy(path: Path, content: bytes) -> None:
-    """Write a file atomically: whatever has its name, such as a link or a FIFO, is replaced."""
-    with atomic_file(path, durable=False) as file:
-        file.write(content)
-
-
-class EarlierRunAside(pl.Callback):
-    """Rename the results of an earlier run in the folder when the prior's cloud is there, and its
-    checkpoints before the first one of this run, so that a start that fails leaves them in their
-    place. Parts may read weights from there when they are built.
-    """
-
-    def __init__(self, folder: Path) -> None:
-        self.folder, self.number = folder, 0
-
-    def on_fit_start(self, trainer: Any, pl_module: Any) -> None:
-        self.number = free_number(self.folder)
-        self._say(set_results_aside(self.folder, self.number))
-
-    def set_checkpoints_aside(self) -> None:
-        self._say(set_checkpoints_aside(self.folder, self.number))
-
-    def _say(self, aside: Optional[Path]) -> None:
-        if aside is not None:
-            info(f"started at step 0: files of an earlier run are now in {aside}")
+    found = {}
+    for path in source.rglob("*"):
+        name = path.relative_to(source)
+        # an editor's lock (a broken link) or a FIFO is no file
+        if path.suffix in SOURCE_ENDINGS and path.is_file():
+            if not any(part.startswith((".", "__pycache__")) for part in name.parts):
+                try:
+                    found[destination / name] = path.read_bytes()
+                except OSError as error:
+                    warn(f"{path} isn't copied to {destination}: {error.strerror}")
+    return found
 
 
 class ProgressBar(pl.callbacks.TQDMProgressBar):
@@ -218,48 +176,41 @@ class ProgressBar(pl.callbacks.TQDMProgressBar):
         return metrics
 
     def on_exception(self, trainer: Any, pl_module: Any, exception: BaseException) -> None:
-        # end the bar's line, so that the next message starts on its own
-        print(file=sys.stderr)
+        print(file=sys.stderr)  # end the bar's line, so that the next message starts on its own
 
 
-class NoProfiler(pl.profilers.PassThroughProfiler):
-    """Lightning's profiler that measures nothing, without a generator around each call of a hook:
-    there are dozens in a step.
+class AtomicCheckpointIO(pl.plugins.CheckpointIO):
+    """Write checkpoints atomically, with a checksum, and load them with ``weights_only``, so that
+    they can't run code; see :mod:`.core.checkpoint_file` for the errors.
+
+    Args:
+        first: returns a context in which the first checkpoint is written.
+
+    Attributes:
+        steps: the step of the last checkpoint at each path.
+        seconds: duration of the last write.
     """
 
-    _nothing = contextlib.nullcontext()
+    def __init__(self, first: Callable[[], Any] = contextlib.nullcontext) -> None:
+        self.first, self.seconds = first, 0.0
+        self.steps: dict[str, int] = {}
 
-    def profile(self, action_name: str) -> contextlib.AbstractContextManager:
-        return self._nothing
+    def save_checkpoint(
+        self, checkpoint: dict[str, Any], path: str | os.PathLike, storage_options: Any = None
+    ) -> None:
+        started = time.monotonic()
+        with contextlib.nullcontext() if self.steps else self.first():
+            save_file(path, checkpoint)
+        self.seconds = time.monotonic() - started
+        self.steps[os.path.abspath(path)] = checkpoint["global_step"]
 
+    def load_checkpoint(
+        self, path: str | os.PathLike, map_location: Any = None, weights_only: Any = True
+    ) -> dict[str, Any]:
+        return load_file(path, "cpu" if map_location is None else map_location)
 
-class LastNumbers(pl.callbacks.Callback):
-    """Log the numbers of the last steps if an exception ends training."""
-
-    def on_exception(self, trainer: Any, pl_module: Any, exception: BaseException) -> None:
-        with contextlib.suppress(RuntimeError):  # of a GPU that has failed
-            flush_reads(getattr(pl_module, "step_log", None))
-
-
-class LearningRates(pl.callbacks.LearningRateMonitor):
-    """Lightning's monitor, but the rates stay on the host: a copy of each to the GPU would wait for
-    the GPU.
-    """
-
-    def on_train_batch_start(self, trainer: Any, *args: Any, **kwargs: Any) -> None:
-        super().on_train_batch_start(_OnHost(trainer), *args, **kwargs)
-
-
-class _OnHost:
-    """A trainer whose parameters seem to be on the CPU."""
-
-    strategy = SimpleNamespace(root_device=torch.device("cpu"))
-
-    def __init__(self, trainer: Any) -> None:
-        self._trainer = trainer
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._trainer, name)
+    def remove_checkpoint(self, path: str | os.PathLike) -> None:
+        Path(path).unlink(missing_ok=True)
 
 
 class LastCheckpoint(pl.callbacks.Checkpoint):
@@ -294,15 +245,17 @@ class LastCheckpoint(pl.callbacks.Checkpoint):
 
     def on_train_end(self, trainer: Any, pl_module: Any) -> None:
         self._save(trainer)  # where max_time or max_epochs ended the run
-        self._restore_handlers()
+        restore_handlers(self._earlier)
         self._stop_if_asked(trainer)
 
     def on_exception(self, trainer: Any, pl_module: Any, exception: BaseException) -> None:
-        self._restore_handlers()
+        restore_handlers(self._earlier)
+        with contextlib.suppress(RuntimeError):  # of a GPU that has failed
+            flush_reads(getattr(pl_module, "step_log", None))  # the numbers of the last steps
 
     def _ask(self, signum: int, frame: Any) -> None:
         if self.signum:
-            self._restore_handlers()
+            restore_handlers(self._earlier)
             interrupt(signum)
         self.signum = signum
         # not print(), which isn't reentrant in signal handlers; OSError if the terminal is closed
@@ -321,17 +274,13 @@ class LastCheckpoint(pl.callbacks.Checkpoint):
         """Write the checkpoint, and schedule the next one so that saving takes at most
         :data:`SHARE_OF_TIME` of the running time.
         """
-        is_new = self.checkpoint_io.saved_step(self.last) != trainer.global_step
+        is_new = self.checkpoint_io.steps.get(os.path.abspath(self.last)) != trainer.global_step
         # only the first process writes and knows the step, but all take part in saving
         if _any_process(trainer, trainer.is_global_zero and is_new):
             trainer.save_checkpoint(self.last)
         # not the time of save_checkpoint(), in which the system scores the prior once
         pause = max(SECONDS_BETWEEN, self.checkpoint_io.seconds / SHARE_OF_TIME)
         self._due = time.monotonic() + pause
-
-    def _restore_handlers(self) -> None:
-        restore_handlers(self._earlier)
-        self._earlier = {}
 
 
 def _any_process(trainer: Any, decision: bool) -> bool:

@@ -13,10 +13,11 @@ import shutil
 import socket
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from itertools import count
 from pathlib import Path
-from typing import NamedTuple, Optional
+from typing import Optional
 
 try:
     import fcntl
@@ -27,71 +28,57 @@ from ..core.errors import UserError
 
 SUBFOLDERS = ("ckpts", "configs", "code", "save", "tb_logs", "csv_logs")
 FILES = ("ckpts/last.ckpt", "configs/parsed.yaml", "cmd.txt")
-LONGEST_RESULT = 80
-"""Upper bound of the length of paths that a run writes below its folder, bytes."""
 LOCK_FILE = ".lock"
-"""Name of the lock file."""
 
 
-class Lock(NamedTuple):
-    """A lock on a folder."""
-
-    release: Callable[[], None]
-    by_file: bool = False
-    """Whether the file in the folder is the lock."""
+class FolderInUse(UserError):
+    """Raised if another process has locked the folder."""
 
 
+@dataclass
 class RunFolder:
     """The folder of a run, created by this process or found.
 
     Attributes:
         path: the folder.
-        first_made: the topmost folder that :func:`make_folder` made on the way to it; None if the
-            folder was there before.
-        lock: None where it isn't locked.
+        first_made: the topmost folder that was created on the way to it; None if it was there.
+        release: releases the lock, which also ends with the process.
     """
 
-    def __init__(
-        self, path: Path, first_made: Optional[Path] = None, lock: Optional[Lock] = None
-    ) -> None:
-        self.path, self.first_made, self.lock = path, first_made, lock
+    path: Path
+    first_made: Optional[Path] = None
+    release: Callable[[], None] = field(default=lambda: None)
 
     def discard(self) -> None:
         """Remove the folder if this process created it, and the parents that were created with it
-        if they are empty. If the folder isn't locked, it is removed only if it is empty.
+        if they are empty.
         """
-        if self.first_made is None:
+        first, self.first_made = self.first_made, None
+        if first is None:
             return
-        with contextlib.suppress(OSError):  # not empty: another run has put something there
-            if self.lock is not None:
-                unused = self.path
-                if self.lock.by_file:  # Windows removes no open file
-                    self.release()
-                    unused = unused.rename(unused.with_name(f".{unused.name}-{os.getpid()}"))
-                shutil.rmtree(unused, ignore_errors=True)
-            for folder in (self.path, *self.path.parents):
-                if folder == self.first_made.parent:
+        with contextlib.suppress(OSError):  # another run has put something there
+            if fcntl is None:  # Windows renames no folder of open files
+                self.release()
+            unused = self.path.rename(self.path.with_name(f".{self.path.name}-{os.getpid()}"))
+            self.release()
+            shutil.rmtree(unused, ignore_errors=True)
+            for folder in self.path.parents:
+                if not folder.is_relative_to(first):
                     break
-                if folder.exists():
-                    folder.rmdir()
-
-    def release(self) -> None:
-        """Release the lock. The operating system's lock also ends with the process."""
-        if self.lock is not None:
-            self.lock.release()
-            self.lock = None
+                folder.rmdir()
 
 
 def claim_new(path: Path) -> tuple[RunFolder, int]:
-    """Make and lock the first of ``path``, ``path-2``, ``path-3``, ... that doesn't exist.
+    """Create and lock the first of ``path``, ``path-2``, ``path-3``, ... that doesn't exist.
 
     Returns:
         the folder, and the number in its name; 1 for none.
 
     Raises:
-        UserError: no folder can be made there.
+        UserError: no folder can be created there.
     """
-    for number, candidate in enumerate(numbered(path), 1):
+    for number in count(1):
+        candidate = path.with_name(f"{path.name}-{number}") if number > 1 else path
         first_made = make_folder(candidate)
         if first_made is not None:
             with contextlib.suppress(FolderInUse):  # another run has locked it in the meantime
@@ -99,16 +86,8 @@ def claim_new(path: Path) -> tuple[RunFolder, int]:
     raise AssertionError("unreachable")
 
 
-def numbered(path: Path) -> Iterator[Path]:
-    """Yield ``path``, ``path-2``, ``path-3``, ..."""
-    yield path
-    yield from (path.with_name(f"{path.name}-{number}") for number in count(2))
-
-
 def claim(
-    path: Path,
-    busy: str = "another run is training",
-    advice: str = ", or choose another tag",
+    path: Path, busy: str = "another run is training", advice: str = ", or choose another tag"
 ) -> RunFolder:
     """Create ``path`` unless it exists, and lock it.
 
@@ -118,7 +97,7 @@ def claim(
 
     Raises:
         FolderInUse: another process uses it.
-        UserError: no folder can be made there.
+        UserError: no folder can be created there.
     """
     while True:
         first_made = make_folder(path)
@@ -130,61 +109,6 @@ def claim(
             raise FolderInUse(
                 f"{busy} in {path}{_holder(path)}: wait until it ends{advice}{error}"
             ) from error
-
-
-def free_number(folder: Path) -> int:
-    """Return the smallest number from 2 on with which no folder of earlier results is named."""
-    taken = {path.name for path in folder.glob("*-*")}
-    return next(n for n in count(2) if not taken & {f"ckpts-{n}", f"save-{n}"})
-
-
-def set_results_aside(folder: Path, number: int) -> Optional[Path]:
-    """Rename ``save`` to ``save-<number>`` if it has results: the page of a run shows the cloud of
-    the latest step. The prior's points, which may serve again, are copied.
-
-    Returns:
-        the new path; None if it wasn't renamed.
-
-    Raises:
-        UserError: the points can't be copied, for instance since the disk is full; everything is
-            left in its place.
-    """
-    save, fresh = folder / "save", folder / "save-new"
-    if not any(save.glob("it*")):
-        return None
-    try:
-        shutil.rmtree(fresh, ignore_errors=True)  # of a process that was killed here
-        if (save / "prior").is_dir():
-            shutil.copytree(save / "prior", fresh / "prior")
-    except OSError as error:
-        shutil.rmtree(fresh, ignore_errors=True)
-        # copytree lists the files that it couldn't copy
-        listed = error.args[0] if isinstance(error, shutil.Error) else ()
-        why = listed[0][2] if listed else error.strerror
-        raise UserError(
-            f"cannot copy the prior's points from {save / 'prior'}: {why}; make room, or choose "
-            "another exp_root_dir or tag. The earlier run's results are in their place."
-        ) from error
-    aside = save.rename(folder / f"save-{number}")
-    if fresh.is_dir():
-        fresh.rename(save)
-    return aside
-
-
-def set_checkpoints_aside(folder: Path, number: int) -> Optional[Path]:
-    """Rename ``ckpts`` to ``ckpts-<number>`` if it has checkpoints, which resume=auto could take.
-
-    Returns:
-        the new path; None if it wasn't renamed.
-    """
-    if not has_checkpoints(folder):
-        return None
-    return (folder / "ckpts").rename(folder / f"ckpts-{number}")
-
-
-def has_checkpoints(folder: Path) -> bool:
-    """Return whether a run's folder has checkpoints."""
-    return any((folder / "ckpts").glob("*.ckpt"))
 
 
 def make_folder(path: Path) -> Optional[Path]:
@@ -199,24 +123,12 @@ def make_folder(path: Path) -> Optional[Path]:
     """
     try:
         missing = [folder for folder in (path, *path.parents) if not folder.exists()]
-        _make_parent(path)
-        path.mkdir()
+        path.mkdir(parents=True)
         return missing[-1] if missing else path
-    except FileExistsError as error:
-        if path.is_dir():
+    except (OSError, ValueError) as error:
+        if isinstance(error, FileExistsError) and path.is_dir():
             return None
         raise unwritable(path, error) from error
-    except (OSError, ValueError) as error:
-        raise unwritable(path, error) from error
-
-
-def _make_parent(path: Path, attempts: int = 10) -> None:
-    for attempt in range(attempts):
-        try:
-            return path.parent.mkdir(parents=True, exist_ok=True)
-        except FileNotFoundError:  # another run has just removed a parent that it had created
-            if attempt == attempts - 1:
-                raise
 
 
 def require_writable(folder: Path, option: str = "exp_root_dir") -> None:
@@ -226,74 +138,39 @@ def require_writable(folder: Path, option: str = "exp_root_dir") -> None:
         option: what chooses the folder, for the message.
 
     Raises:
-        UserError: the nearest existing folder can't be written, a file or folder that a run writes
-            can't be replaced, or the paths would be too long.
+        UserError: the nearest existing folder can't be written, or something is in the place of a
+            file or folder of the results.
     """
-    existing: Optional[Path] = None
     try:
-        existing = next(
-            parent for parent in (folder, *folder.absolute().parents) if parent.exists()
-        )
-        with tempfile.TemporaryFile(dir=existing) as file:
+        parents = (folder, *folder.absolute().parents)
+        with tempfile.TemporaryFile(dir=next(p for p in parents if p.exists())) as file:
             file.write(b"0")
-        _require_replaceable(folder)
-        _require_short(folder.absolute(), existing)
+        for name in (*SUBFOLDERS, *FILES):
+            path, wanted = folder / name, "folder" if name in SUBFOLDERS else "file"
+            fits = path.is_dir() if name in SUBFOLDERS else path.is_file()  # no FIFO
+            if os.path.lexists(path) and not (fits and os.access(path, os.W_OK)):
+                raise OSError(errno.EEXIST, f"{path} is no writable {wanted}")
     except (OSError, ValueError) as error:
-        if isinstance(error, UserError):
-            raise
-        raise unwritable(folder, error, f" ({existing})" if existing else "", option) from error
+        raise unwritable(folder, error, option) from error
 
 
-def _require_replaceable(folder: Path) -> None:
-    """Raise OSError if a path that a run writes exists, but can't be replaced.
-
-    A path for a folder must be a writable folder, and a path for a file a regular file: writing to
-    a FIFO waits for a reader.
-    """
-    for name in SUBFOLDERS:
-        path = folder / name
-        if path.is_dir() and not os.access(path, os.W_OK | os.X_OK):
-            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
-        if (path.exists() or path.is_symlink()) and not path.is_dir():
-            raise NotADirectoryError(errno.ENOTDIR, f"{path} is no folder")
-    for name in FILES:
-        if (folder / name).exists() and not (folder / name).is_file():
-            raise IsADirectoryError(errno.EISDIR, f"{folder / name} is no file")
-
-
-def _require_short(folder: Path, existing: Path) -> None:
-    """Raise OSError if paths of files in the folder would exceed the system's limits."""
-    longest = os.pathconf(existing, "PC_PATH_MAX") if hasattr(os, "pathconf") else 260
-    if len(os.fsencode(folder)) + LONGEST_RESULT > longest:
-        raise OSError(errno.ENAMETOOLONG, os.strerror(errno.ENAMETOOLONG))
-
-
-def unwritable(
-    folder: Path, error: Exception, where: str = "", option: str = "exp_root_dir"
-) -> UserError:
+def unwritable(folder: Path, error: Exception, option: str = "exp_root_dir") -> UserError:
     """Make the error for a folder into which the results can't be written."""
     why = getattr(error, "strerror", None) or str(error)
-    return UserError(
-        f"the output folder {folder} can't be written: {why}{where}; choose another {option}"
-    )
-
-
-class FolderInUse(UserError):
-    """Raised if another process has locked the folder."""
+    return UserError(f"the output folder {folder} can't be written: {why}; choose another {option}")
 
 
 def _holder(folder: Path) -> str:
     """Return, in brackets, which process has locked a folder; "" if that isn't known."""
-    with contextlib.suppress(OSError):
+    with contextlib.suppress(OSError, ValueError):
         text = (folder / LOCK_FILE).read_text(encoding="utf-8", errors="replace")
-        host, process, command = [*text.split(" ", 2), "", "", ""][:3]
-        if process.isdecimal() and command:
-            return f" (process {process} on {host}: {command})"
+        host, process, command = text.split(" ", 2)
+        return f" (process {process} on {host}: {command})"
     return ""
 
 
-def _lock(path: Path) -> Lock:
-    """Lock a folder.
+def _lock(path: Path) -> Callable[[], None]:
+    """Lock a folder, and return what releases it.
 
     Raises:
         FolderInUse: another process has locked it; the message is further advice.
@@ -301,43 +178,28 @@ def _lock(path: Path) -> Lock:
         UserError: it can't be opened, or no lock file can be written.
     """
     file = path / LOCK_FILE
-    if fcntl is None:
-        return _lock_by_file(file)
-    try:
-        descriptor = os.open(path, os.O_RDONLY)
-    except PermissionError as error:
-        raise unwritable(path, error) from error
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    with contextlib.ExitStack() as opened:
+        try:
+            descriptor = os.open(path, os.O_RDONLY)
+            opened.callback(os.close, descriptor)
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise FolderInUse("") from error
+        except FileNotFoundError:
+            raise
+        except OSError:  # a file system without locks; Windows, which opens no folder
+            return _lock_by_file(file)
         if not os.path.samestat(os.fstat(descriptor), os.stat(path)):
             raise FileNotFoundError(errno.ENOENT, "replaced by another folder", str(path))
-    except OSError as error:
-        os.close(descriptor)
-        if isinstance(error, FileNotFoundError):
-            raise
-        if isinstance(error, BlockingIOError):
-            raise FolderInUse("") from error
-        return _lock_by_file(file)  # a file system without locks
-    with contextlib.suppress(OSError):  # it is only for messages
-        owner = f"{socket.gethostname()} {os.getpid()} {shlex.join(sys.argv)[:500]}"
-        file.write_text(owner, encoding="utf-8")
-
-    def release() -> None:
-        with contextlib.suppress(OSError):
-            file.unlink()
-        os.close(descriptor)
-
-    return Lock(release)
+        with contextlib.suppress(OSError):  # it is only for messages
+            owner = f"{socket.gethostname()} {os.getpid()} {shlex.join(sys.argv)[:500]}"
+            file.write_text(owner, encoding="utf-8")
+        opened.callback(file.unlink, missing_ok=True)
+        return opened.pop_all().close
 
 
-def _lock_by_file(file: Path) -> Lock:
-    """Create the lock file, which exactly one process can.
-
-    Raises:
-        FolderInUse: another process has created it, and may still run.
-        FileNotFoundError: the folder was removed.
-        UserError: the file can't be created.
-    """
+def _lock_by_file(file: Path) -> Callable[[], None]:
+    """Create the lock file, which exactly one process can."""
     from filelock import SoftFileLock, Timeout
 
     lock = SoftFileLock(file, timeout=0)
@@ -349,4 +211,4 @@ def _lock_by_file(file: Path) -> Lock:
         raise
     except OSError as error:
         raise unwritable(file.parent, error) from error
-    return Lock(lock.release, by_file=True)
+    return lock.release

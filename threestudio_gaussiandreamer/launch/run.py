@@ -6,10 +6,12 @@ cmd.txt}``"""
 import argparse
 import contextlib
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import Any, Optional
+
+import torch
 
 from ..core.checkpoint_file import load_checkpoint
 from ..core.errors import UserError
@@ -18,29 +20,17 @@ from ..core.options import parse_structured
 from ..host import find, info, pl, warn
 from ..view.live import LiveView, serve_until_stopped
 from ..view.run_index import note_time, write_index
-from .callbacks import (
-    EarlierRunAside,
-    LastCheckpoint,
-    LastNumbers,
-    LearningRates,
-    NoProfiler,
-    ProgressBar,
-    RunRecord,
-    Stopped,
-)
-from .checkpoints import AtomicCheckpointIO
+from .callbacks import AtomicCheckpointIO, LastCheckpoint, ProgressBar, RunRecord, Stopped
 from .config_check import build, check_shared_views, plain
 from .ddp import environment_plugins, planned_processes, trainer_options
 from .folder_lock import RunFolder, claim, claim_new, require_writable
 from .live_viewer import LiveViewer, ViewerConfig
 from .run_folder import PARSED, SIZES, changes_since, renumber, resume_command
 from .stage_errors import lightning_errors, write_errors
-from .training_state import check_training_state
 
 # Lightning refuses a checkpoint without the first key; without the others it would resume at step 0
 # or with a new optimiser
-LIGHTNINGS_KEY = "pytorch-lightning_version"
-TRAINING_KEYS = (LIGHTNINGS_KEY, "loops", "optimizer_states")
+LIGHTNINGS_KEYS = ("pytorch-lightning_version", "loops", "optimizer_states")
 
 
 class Run:
@@ -70,11 +60,9 @@ class Run:
         self.cfg, self.args, self.n_gpus = cfg, args, n_gpus
         self.callbacks, self.records_code = list(callbacks), records_code
         self.sources, self.command = sources, command
-        self.claimed = RunFolder(Path(cfg.trial_dir))
-        self.stage_lock: Optional[RunFolder] = None
-        self.checkpoint_io = AtomicCheckpointIO(self.first_checkpoint)
+        self.training = args.stage == "train"
+        self.claimed = RunFolder(self.folder)
         self.resumed_step = -1
-        self.has_trained = False
         self.size_changes: list[str] = []
         self.trainer: Any = None
         self.viewer = parse_structured(ViewerConfig, cfg.viewer)
@@ -82,7 +70,7 @@ class Run:
 
     @property
     def folder(self) -> Path:
-        return self.claimed.path
+        return Path(self.cfg.trial_dir)
 
     @property
     def last(self) -> Path:
@@ -101,8 +89,13 @@ class Run:
             with lightning_errors(self.cfg.resume, self.size_changes), write_errors(self.folder):
                 began, start = datetime.now(), time.perf_counter()
                 getattr(self, self.args.stage)()
-                self.write_index(began, time.perf_counter() - start)
-            self.summarize()
+                if self.trainer.is_global_zero and self.cfg.system.get("pages", True):
+                    seconds = time.perf_counter() - start
+                    note_time(self.folder, self.args.stage, began, seconds)
+                    info(f"the run at a glance: {write_index(self.folder)}")
+            summary = self.system.summary() if hasattr(self.system, "summary") else None
+            if summary and self.trainer.is_global_zero:
+                print(summary, flush=True)
             if self.view is not None and self.viewer.keep_serving:
                 serve_until_stopped(self.view)
         except Stopped as stop:
@@ -110,14 +103,13 @@ class Run:
             print(f"stopped at step {stop.step}; to resume: {command}", flush=True)
             return 128 + stop.signum
         except BaseException:
-            self.report_training()
             self.discard_if_unused()
             self.print_resume_command()
             raise
         finally:
+            if self.claimed.path != self.folder:  # that of a stage
+                self.claimed.discard()
             self.claimed.release()
-            if self.stage_lock is not None:
-                self.stage_lock.discard()
             if self.view is not None:
                 self.view.close()
         return 0
@@ -125,10 +117,10 @@ class Run:
     def start(self) -> None:
         """Check the checkpoint and the folder, create the folder, build the parts and trainer."""
         checkpoint = self.read_resume()
-        if self.args.stage == "train":
+        if self.training:
             check_shared_views(self.cfg)
         require_writable(self.folder)
-        if self.viewer.enabled and self.args.stage == "train" and not get_rank():
+        if self.viewer.enabled and self.training and not get_rank():
             self.view = LiveView(self.viewer.host, self.viewer.port, self.cfg.tag or self.cfg.name)
         self.claim_folder()
         # the same seed in all processes; streams that must differ also depend on the rank
@@ -137,63 +129,47 @@ class Run:
         self.system = find(self.cfg.system_type)(
             self.cfg.system, resumed=self.cfg.resume is not None
         )
-        if checkpoint is not None and self.args.stage != "train":
+        if checkpoint is not None and not self.training:
             self.system.set_resume_status(*checkpoint)
         self.system.set_save_dir(str(self.folder / "save"))
-        with_code = self.records_code and self.args.stage == "train"
-        self.record = RunRecord(self.folder, self.cfg, self.sources, self.command, with_code)
-        at_zero = self.args.stage == "train" and self.cfg.resume is None and not get_rank()
-        self.aside = EarlierRunAside(self.folder) if at_zero else None
         self.trainer = self.build_trainer()
 
     def read_resume(self) -> Optional[tuple[int, int]]:
         """Return the epoch and step of the checkpoint to resume from; None without one. The file is
         read completely, so that damage is found before any work.
         """
-        if self.cfg.resume is None:
-            if self.args.stage != "train":
-                if "resume=auto" in self.args.overrides:
-                    raise UserError(
-                        f"resume=auto: there is no checkpoint to --{self.args.stage}; train "
-                        "first, or check name and tag"
-                    )
+        path, stage = self.cfg.resume, self.args.stage
+        if path is None:
+            if not self.training and "resume=auto" in self.args.overrides:
+                raise UserError(
+                    f"resume=auto: there is no checkpoint to --{stage}; train first, or check name "
+                    "and tag"
+                )
+            if not self.training:
                 warn(
-                    f"no checkpoint given (resume=...): --{self.args.stage} shows what "
-                    "training would start from"
+                    f"no checkpoint given (resume=...): --{stage} shows what training would start "
+                    "from"
                 )
             return None
-        checkpoint = load_checkpoint(self.cfg.resume)
-        missing = [
-            key
-            for key in (TRAINING_KEYS if self.args.stage == "train" else (LIGHTNINGS_KEY,))
-            if key not in checkpoint
-        ]
+        checkpoint = load_checkpoint(path)
+        needed = LIGHTNINGS_KEYS if self.training else LIGHTNINGS_KEYS[:1]
+        missing = [key for key in needed if key not in checkpoint]
         if missing:
-            # without its own key Lightning didn't write the file at all
-            exception = " unless checkpoint.save_weights_only=true"
             raise UserError(
-                f"{self.cfg.resume} isn't a training checkpoint: it has no {', '.join(missing)}, "
-                f"which Lightning writes{exception if LIGHTNINGS_KEY in checkpoint else ''}"
+                f"{path} isn't a training checkpoint: it has no {', '.join(missing)}, which "
+                "Lightning writes unless checkpoint.save_weights_only=true"
             )
         for change in changes_since(self.cfg):  # they may explain what is found next
-            warn(f"{self.cfg.resume} is of another run: {change}")
-        self.check_content(checkpoint)
+            warn(f"{path} is of another run: {change}")
+        check_checkpoint = getattr(find(self.cfg.system_type), "check_checkpoint", None)
+        if check_checkpoint is not None:
+            check_checkpoint(checkpoint, path)
+        if self.training:
+            name = (self.cfg.system.get("optimizer") or {}).get("name", "Adam")
+            check_optimizer(name, checkpoint["optimizer_states"], path)
         self.size_changes = changes_since(self.cfg, SIZES)
         self.resumed_step = checkpoint["global_step"]
         return checkpoint["epoch"], self.resumed_step
-
-    def check_content(self, checkpoint: dict[str, Any]) -> None:
-        """Check the content that the system and Lightning will restore.
-
-        Raises:
-            UserError: a run can't have written the content, such as a cloud without Gaussians.
-        """
-        check_checkpoint = getattr(find(self.cfg.system_type), "check_checkpoint", None)
-        if check_checkpoint is not None:
-            check_checkpoint(checkpoint, self.cfg.resume)
-        if self.args.stage == "train":
-            optimizer = self.cfg.system.get("optimizer") or {}
-            check_training_state(checkpoint, optimizer, self.cfg.resume)
 
     # -- the stages --------------------------------------------------------------------------------
 
@@ -204,7 +180,6 @@ class Run:
                 f"{self.cfg.trainer.max_steps}: nothing is left to train"
             )
         self.trainer.fit(self.system, datamodule=self.data, ckpt_path=self.cfg.resume)
-        self.has_trained = True
         self.trainer.test(self.system, datamodule=self.data)
 
     def validate(self) -> None:
@@ -216,34 +191,6 @@ class Run:
     def export(self) -> None:
         self.trainer.predict(self.system, datamodule=self.data, ckpt_path=self.cfg.resume)
 
-    @property
-    def has_index(self) -> bool:
-        """Whether this process writes ``index.html``."""
-        return self.trainer.is_global_zero and self.cfg.system.get("pages", True)
-
-    def write_index(self, began: datetime, seconds: float) -> None:
-        """Note how long the stage has taken, and write ``index.html``."""
-        if self.has_index:
-            note_time(self.folder, self.args.stage, began, seconds)
-            info(f"the run at a glance: {write_index(self.folder)}")
-
-    def report_training(self) -> None:
-        """Write the index and print the summary after an error in a finished training's turntable
-        or exports.
-        """
-        if not self.has_trained:
-            return
-        with contextlib.suppress(Exception):  # it would hide the first error
-            if self.has_index:
-                write_index(self.folder)
-            self.summarize()
-
-    def summarize(self) -> None:
-        """Print the system's summary, which lists its results."""
-        summary = self.system.summary() if hasattr(self.system, "summary") else None
-        if summary and self.trainer.is_global_zero:
-            print(summary, flush=True)
-
     # -- the trainer -------------------------------------------------------------------------------
 
     def build_trainer(self) -> Any:
@@ -251,16 +198,22 @@ class Run:
         options = {
             "enable_model_summary": False,
             "enable_progress_bar": True,
-            "profiler": NoProfiler(),
             **plain(self.cfg.trainer),
         }
-        training = self.args.stage == "train"
+        at_zero = self.training and self.cfg.resume is None
+        with_code = self.records_code and self.training
+        record = RunRecord(self.folder, self.cfg, self.sources, self.command, with_code, at_zero)
+        self.checkpoint_io = AtomicCheckpointIO(record.first_checkpoint)
         callbacks = self.callbacks + ([ProgressBar()] if options["enable_progress_bar"] else [])
+        if self.training:
+            callbacks += [record, *self.training_callbacks()]
+        elif not (self.folder / PARSED).is_file():
+            callbacks.append(record)
         processes = planned_processes(self.n_gpus, options)
         required = {
             "accelerator": "gpu" if self.n_gpus else "cpu",
-            "logger": self.build_loggers() if training else False,
-            "callbacks": callbacks + (self.training_callbacks() if training else self.records()),
+            "logger": self.build_loggers() if self.training else False,
+            "callbacks": callbacks,
             "plugins": [self.checkpoint_io, *environment_plugins(processes)],
             "inference_mode": False,
             "default_root_dir": str(self.folder),
@@ -276,10 +229,6 @@ class Run:
         ]
         return loggers + list(self.system.get_loggers())
 
-    def records(self) -> list:
-        """Return what records a stage other than training, unless the folder has a run's record."""
-        return [] if (self.folder / PARSED).is_file() else [self.record]
-
     def training_callbacks(self) -> list:
         # without the version counter a resumed run overwrites last.ckpt instead of adding
         # last-v1.ckpt
@@ -287,30 +236,14 @@ class Run:
         if checkpointing.get("save_weights_only"):
             checkpointing["save_last"] = False  # last.ckpt is LastCheckpoint's, always complete
         last = LastCheckpoint(self.last, self.checkpoint_io)
-        callbacks = [] if self.aside is None else [self.aside]
-        callbacks += [
+        callbacks = [
             pl.callbacks.ModelCheckpoint(dirpath=str(self.last.parent), **checkpointing),
-            LearningRates(logging_interval="step"),
-            LastNumbers(),
-            self.record,
+            pl.callbacks.LearningRateMonitor(logging_interval="step"),
             last,
         ]
         if self.view is not None:
             callbacks.append(LiveViewer(self.view, self.viewer, lambda: bool(last.signum)))
         return callbacks
-
-    @contextlib.contextmanager
-    def first_checkpoint(self) -> Iterator[None]:
-        """Replace the record of an earlier run while the first checkpoint is written in this
-        context. At no time does the folder have a checkpoint beside the record of another start: of
-        a run from step 0, the earlier checkpoints are renamed first; of a resumed run, the record
-        follows its checkpoint.
-        """
-        if self.aside is not None:
-            self.aside.set_checkpoints_aside()
-            self.record.write()
-        yield
-        self.record.write()
 
     # -- the folder --------------------------------------------------------------------------------
 
@@ -327,9 +260,8 @@ class Run:
         stage = self.args.stage
         if get_rank():
             return
-        if stage != "train" and self.folder.is_dir():
-            busy = f"another --{stage} is at work"
-            self.stage_lock = claim(self.folder / f".{stage}", busy, "")
+        if not self.training and self.folder.is_dir():
+            self.claimed = claim(self.folder / f".{stage}", f"another --{stage} is at work", "")
         elif self.cfg.new_folder:
             self.claimed, number = claim_new(self.folder)
             if number > 1:
@@ -339,19 +271,35 @@ class Run:
 
     def discard_if_unused(self) -> None:
         """Remove the folder if this run created it, has made no step and has written no results."""
-        if self.claimed.first_made is None:
-            return
         trained = self.trainer is not None and self.trainer.global_step > max(self.resumed_step, 0)
         kept = ("save/it*", "save/prior/points.npz", "ckpts/*.ckpt")
-        results = [path for pattern in kept for path in self.folder.glob(pattern)]
-        if not trained and not results:
+        if not trained and not any(path for name in kept for path in self.folder.glob(name)):
             self.claimed.discard()
 
     def print_resume_command(self) -> None:
         """Print how to go on after an error, if this run has trained and has a checkpoint."""
-        training = self.args.stage == "train" and self.trainer is not None
+        if not self.training or self.trainer is None or not self.trainer.global_step or get_rank():
+            return
         # not the checkpoint of an earlier run, of which this one has replaced none yet
-        own = self.cfg.resume is not None or self.checkpoint_io.saved_steps
-        if training and self.trainer.global_step and own and self.last.is_file() and not get_rank():
+        if self.last.is_file() and (self.cfg.resume is not None or self.checkpoint_io.steps):
             with contextlib.suppress(OSError):  # of a closed pipe, which would hide the first error
                 print(f"to resume: {resume_command(self.folder, self.args.gpu)}", flush=True)
+
+
+def check_optimizer(name: str, states: Sequence[dict[str, Any]], path: str) -> None:
+    """Raise UserError if the states in a checkpoint are those of another optimiser than
+    ``torch.optim.<name>``, which torch's restoring doesn't notice.
+    """
+    kind = getattr(torch.optim, name, None)
+    for state in states if kind is not None else ():
+        try:
+            sizes = [len(group["params"]) for group in state["param_groups"]]
+            restored = kind([{"params": list(torch.zeros(n, 1))} for n in sizes], lr=0.0)
+            restored.load_state_dict(state)
+            for group in restored.param_groups:
+                _ = [group[option] for option in restored.defaults]
+        except Exception as error:  # torch doesn't check keys and types
+            raise UserError(
+                f"{path}: {name} can't resume from its optimizer_states, which may be another "
+                f"optimiser's: {type(error).__name__} {error}"
+            ) from error

@@ -52,13 +52,6 @@ SLUG_SOURCE = 1024
 a run of combining characters.
 """
 SLUG_CHARACTERS = "-_.,+=()'! "
-WINDOWS_DEVICES = {
-    "con",
-    "prn",
-    "aux",
-    "nul",
-    *(f"{port}{i}" for port in ("com", "lpt") for i in range(1, 10)),
-}
 
 
 def name_folders(cfg: Any, paths: Sequence[str | os.PathLike] = ()) -> None:
@@ -89,9 +82,12 @@ def name_folders(cfg: Any, paths: Sequence[str | os.PathLike] = ()) -> None:
         _resume_newest(cfg, tag)
     elif cfg.resume is not None:
         cfg.resume = escape(os.path.expanduser(cfg.resume))
-        _require_no_misspelling(cfg.resume)
-        if not cfg.new_folder:
-            _follow_checkpoint(cfg)
+        if get_close_matches(cfg.resume.lower(), [AUTO], cutoff=0.75):
+            if not os.path.exists(cfg.resume):
+                raise UserError(
+                    f"resume={cfg.resume}: there is no such checkpoint; did you mean "
+                    f"resume={AUTO}, the newest one of this run?"
+                )
 
 
 def _follow_config(cfg: Any, paths: Sequence[str | os.PathLike]) -> None:
@@ -103,36 +99,17 @@ def _follow_config(cfg: Any, paths: Sequence[str | os.PathLike]) -> None:
         if path != run / PARSED or _is_same(str(run), cfg.trial_dir):
             continue
         stored = _run_files(run).config
-        if any(stored.get(name) != cfg.get(name) for name in NAMING):
-            continue
-        if cfg.resume == AUTO or _is_same(str(_run_of(cfg.resume)), str(run)):
-            _continue_in(run, cfg)
+        is_own = cfg.resume == AUTO or _is_same(str(_run_of(cfg.resume)), str(run))
+        if is_own and all(stored.get(name) == cfg.get(name) for name in NAMING):
+            cfg.exp_dir, cfg.trial_name = escape(str(run.parent)), run.name
+            cfg.trial_dir = escape(str(run))
+            info(f"the run continues in {run}")
             return
 
 
 def _run_of(checkpoint: str) -> Path:
     """Return the folder of the run that a checkpoint is of."""
     return Path(os.path.abspath(os.path.expanduser(checkpoint))).parent.parent
-
-
-def _continue_in(run: Path, cfg: Any) -> None:
-    cfg.exp_dir, cfg.trial_name = escape(str(run.parent)), run.name
-    cfg.trial_dir = escape(str(run))
-    info(f"the run continues in {run}")
-
-
-def _follow_checkpoint(cfg: Any) -> None:
-    """Let a run continue in the folder of its checkpoint if only the working folder has changed,
-    that is, if the checkpoint's folder has the same relative path in another working folder.
-    """
-    here, run = Path(cfg.trial_dir), _run_of(cfg.resume)
-    if run.name != cfg.trial_name or os.path.realpath(run) == os.path.realpath(here):
-        return
-    parts = Path(os.path.normpath(here)).parts
-    if run.parts[-len(parts) :] == parts:
-        _continue_in(run, cfg)
-    else:
-        warn(f"the checkpoint is of the run in {run}; this one writes to {os.path.abspath(here)}")
 
 
 def changes_since(cfg: Any, options: Mapping[str, Any] = SAME) -> list[str]:
@@ -210,8 +187,6 @@ def _home_expanded(path: str) -> str:
             f"exp_root_dir is {path!r}; a single run writes to a folder, and only the farm to a "
             "URL (docs/farm.md)"
         )
-    if "\0" in expanded:
-        raise UserError(f"exp_root_dir is {path!r}; no folder's name has a NUL")
     return expanded
 
 
@@ -230,12 +205,12 @@ def _require_folder_name(tag: str, timestamp: str) -> None:
 
 
 def safe_name(text: str) -> str:
-    """Convert ``text`` to a valid folder name: unchanged if it is valid on all systems and at most
-    64 bytes long, else a slug of at most 64 bytes and a hash of the text. A name that this function
-    has returned stays as it is, since a farm's worker passes its asset's name as a run's tag.
+    """Convert ``text`` to a valid folder name: unchanged if it is valid and at most 64 bytes long,
+    else a slug of at most 64 bytes and a hash of the text. A name that this function has returned
+    stays as it is, since a farm's worker passes its asset's name as a run's tag.
 
     Valid characters are letters, digits, ``-_.,+=()'!`` and inner spaces. A name may not begin with
-    a dot or hyphen or end with a dot, or be that of a Windows device."""
+    a dot or hyphen or end with a dot."""
     hashed = re.search(HASH, text)
     if text and _slug(text, SLUG_BYTES + len(hashed[0]) if hashed else SLUG_BYTES) == text:
         return text
@@ -249,24 +224,12 @@ def _slug(text: str, most_bytes: int) -> str:
         c if c.isalnum() or c in SLUG_CHARACTERS else "_"
         for c in unicodedata.normalize("NFC", text[:SLUG_SOURCE])
     )
-    slug = slug.encode()[:most_bytes].decode(errors="ignore").lstrip("-. ").rstrip(". ")
-    # Windows ignores what follows a dot, and reads a raised digit as that digit
-    device = unicodedata.normalize("NFKC", slug.split(".")[0]).strip().lower()
-    return f"_{slug}"[:most_bytes] if device in WINDOWS_DEVICES else slug
+    return slug.encode()[:most_bytes].decode(errors="ignore").lstrip("-. ").rstrip(". ")
 
 
 def _set_trial(cfg: Any, trial_name: str) -> None:
     cfg.trial_name = trial_name
     cfg.trial_dir = escape(os.path.join(cfg.exp_dir, trial_name))
-
-
-def _require_no_misspelling(resume: str) -> None:
-    """Raise UserError for something like ``resume=atuo``, unless there is such a file."""
-    if get_close_matches(resume.lower(), [AUTO], cutoff=0.75) and not os.path.exists(resume):
-        raise UserError(
-            f"resume={resume}: there is no such checkpoint; did you mean resume={AUTO}, the newest "
-            "one of this run?"
-        )
 
 
 def _resume_newest(cfg: Any, tag: str) -> None:
@@ -289,15 +252,6 @@ def _resume_newest(cfg: Any, tag: str) -> None:
             info(f"resume=auto: resuming from {path} (step {step})")
             return
     info(
-        f"resume=auto: no checkpoint of {os.path.join(cfg.exp_dir, tag)} to resume; "
-        "starting from the prior" + _earlier_checkpoints(Path(cfg.trial_dir))
+        f"resume=auto: no checkpoint of {os.path.join(cfg.exp_dir, tag)} to resume; starting from "
+        "the prior"
     )
-
-
-def _earlier_checkpoints(run: Path) -> str:
-    """Name the last checkpoint of earlier runs in a folder, see
-    ``callbacks.EarlierRunAside``; an empty text if there is none.
-    """
-    aside = run.glob("ckpts-*/*.ckpt")
-    latest = max(aside, key=lambda path: path.stat().st_mtime, default=None)
-    return f" (an earlier run's last one: {shlex.quote(f'resume={latest}')})" if latest else ""

@@ -9,7 +9,6 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor, nn
 
-from ..core.checkpoint_file import require_plain_archive
 from ..core.errors import UserError
 from ..core.files import existing_file
 
@@ -28,8 +27,6 @@ def read_state_dict(path: str, kind: str) -> dict[str, Tensor]:
         UserError: the file is missing, unreadable, refused, or holds no tensors by name.
     """
     file = existing_file(path, kind)
-    if zipfile.is_zipfile(file):
-        require_plain_archive(file)
     try:
         if file.suffix == ".safetensors":
             from safetensors.torch import load_file

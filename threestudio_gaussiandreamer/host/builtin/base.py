@@ -72,18 +72,6 @@ def load_parameters(
         ) from error
 
 
-def update_if_possible(part: Any, epoch: int, global_step: int) -> None:
-    """Call ``part.do_update_step`` if it has one."""
-    if isinstance(part, Updateable):
-        part.do_update_step(epoch, global_step)
-
-
-def update_end_if_possible(part: Any, epoch: int, global_step: int) -> None:
-    """Call ``part.do_update_step_end`` if it has one."""
-    if isinstance(part, Updateable):
-        part.do_update_step_end(epoch, global_step)
-
-
 class Part(Updateable):
     """What :class:`BaseObject` and :class:`BaseModule` have in common: a typed configuration and a
     device.

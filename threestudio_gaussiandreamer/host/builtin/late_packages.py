@@ -1,118 +1,60 @@
 """Import Lightning without most of torchmetrics and torch's compiler, which a run doesn't use: they
-take 4.5 of 7 CPU seconds of a start. Their source runs at the first use of anything but the few
-names that Lightning and torch's optimisers need."""
+take 5 of 9 CPU seconds of a start. Their source runs at the first use of a name that isn't here."""
 
-import functools
-import importlib
 import logging
 import sys
-import threading
-from importlib import metadata
+from importlib import import_module, metadata
 from importlib.machinery import ModuleSpec
 from importlib.util import find_spec, module_from_spec
 from types import ModuleType, SimpleNamespace
 from typing import Any, Optional
 
 METRICS, COMPILER = "torchmetrics", "torch._dynamo"
-LOCK = threading.RLock()
-EARLY = {"Metric": "metric", "MetricCollection": "collections", "": "utilities"}
-"""Names of torchmetrics that Lightning uses, and the modules that define them."""
 
 
 class Late(ModuleType):
     """A package whose source hasn't run yet."""
 
+    def __init__(self, name: str, **names: Any) -> None:
+        vars(self).update(vars(module_from_spec(find_spec(name))), **names)
+        sys.modules[name] = self
+
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__") and name != "__all__":
             raise AttributeError(name)
-        if name in EARLY and self.__name__ == METRICS:
-            importlib.import_module(f"{METRICS}.utilities")
-            return getattr(importlib.import_module(f"{METRICS}.{EARLY[name]}"), name)
-        run(self)
+        self.__class__ = ModuleType
+        self.__spec__.loader.exec_module(self)
         return getattr(self, name)
-
-
-def run(package: Any) -> None:
-    """Run a package's source, once; other threads wait for it."""
-    with LOCK:
-        if type(package) is not Late:
-            return
-        package.__class__ = ModuleType
-        try:
-            package.__spec__.loader.exec_module(package)
-        except BaseException:
-            sys.modules.pop(package.__name__, None)
-            raise
-
-
-def compiler() -> Any:
-    """Return torch's compiler; None as long as it hasn't run."""
-    found = sys.modules.get(COMPILER)
-    return None if type(found) is Late else found
-
-
-class Compiled(type):
-    """Of a class that stands for the compiler's class of compiled modules."""
-
-    def __instancecheck__(cls, module: Any) -> bool:
-        return compiler() is not None and isinstance(module, compiler().OptimizedModule)
-
-
-def disable(function: Any = None, *args: Any, **options: Any) -> Any:
-    """Return a function that the compiler leaves as it is, once it has run."""
-    if function is None:
-        return functools.partial(disable, **options)
-
-    @functools.cache
-    def disabled(found: Any) -> Any:
-        return function if found is None else found.disable(function, *args, **options)
-
-    return functools.wraps(function)(lambda *a, **named: disabled(compiler())(*a, **named))
-
-
-class Submodules:
-    """Finder that runs a late package before a submodule of it is imported."""
 
     @staticmethod
     def find_spec(name: str, path: Any = None, target: Any = None) -> Optional[ModuleSpec]:
-        parent, _, own = name.rpartition(".")
-        package = sys.modules.get(parent)
-        if type(package) is Late and own not in EARLY.values():
-            run(package)
-            if known := sys.modules.get(name):  # imported by the package: it mustn't run again
-                spec = known.__spec__
-                restore = lambda module: setattr(module, "__spec__", spec)  # noqa: E731
-                loader = SimpleNamespace(create_module=lambda _: known, exec_module=restore)
-                return ModuleSpec(name, loader)
-        return None
+        """Run the compiler before a submodule of it is imported, as a finder of modules."""
+        if not name.startswith(f"{COMPILER}.") or type(sys.modules[COMPILER]) is not Late:
+            return None
+        _ = sys.modules[COMPILER].optimize
+        if (known := sys.modules.get(name)) is None:
+            return None
+        # imported by the package: it mustn't run again
+        loader = SimpleNamespace(create_module=lambda _: known, exec_module=lambda _: None)
+        return ModuleSpec(name, loader)
 
 
 def import_lightning() -> None:
     """Import ``lightning.pytorch``, as usual where a release needs more than is defined here."""
-    try:
-        if not {"lightning", METRICS, COMPILER} & sys.modules.keys():
-            sys.meta_path.insert(0, Submodules)
-            late(METRICS, __version__=metadata.version(METRICS), _logger=logging.getLogger(METRICS))
-            vars(sys.modules["torch"])["_dynamo"] = late(
-                COMPILER,
-                OptimizedModule=Compiled("OptimizedModule", (), {}),
-                disable=disable,
-                graph_break=lambda *_, **__: None,
-            )
-        importlib.import_module("lightning.pytorch")
-    except Exception:
-        packages = ["lightning.", f"{METRICS}."]
-        if compiler() is None:  # once it has run, it can't be imported again
-            vars(sys.modules["torch"]).pop("_dynamo", None)
-            packages.append(f"{COMPILER}.")
-        for name in [*sys.modules]:
-            if f"{name}.".startswith(tuple(packages)):
-                del sys.modules[name]
-        importlib.import_module("lightning.pytorch")
-
-
-def late(name: str, **names: Any) -> Any:
-    module = sys.modules[name] = module_from_spec(find_spec(name))
-    module.__class__ = Late
-    vars(module).update(names)
-    return module
+    if not {"lightning", METRICS, COMPILER} & sys.modules.keys():
+        try:
+            sys.meta_path.insert(0, Late)
+            names = {"disable": lambda function, *_, **__: function, "graph_break": lambda: None}
+            names["OptimizedModule"] = type("OptimizedModule", (), {})
+            vars(sys.modules["torch"])["_dynamo"] = Late(COMPILER, **names)
+            names = {"__version__": metadata.version(METRICS), "_logger": logging.getLogger()}
+            package = Late(METRICS, **names)
+            import_module(f"{METRICS}.utilities")  # before metric, which it imports
+            package.Metric = import_module(f"{METRICS}.metric").Metric
+            package.MetricCollection = import_module(f"{METRICS}.collections").MetricCollection
+            import_module("lightning.pytorch")
+        except Exception:
+            for name in [*sys.modules]:
+                if name.partition(".")[0] in ("lightning", METRICS):
+                    del sys.modules[name]
+    import_module("lightning.pytorch")

@@ -24,14 +24,6 @@ class BaseGeometry(BaseModule):
 
     cfg: Config
 
-    @staticmethod
-    def create_from(other: "BaseGeometry", cfg: Any = None, **kwargs: Any) -> "BaseGeometry":
-        """Make a geometry from another one; raise TypeError if that isn't possible."""
-        raise TypeError(f"a {type(other).__name__} can't be converted to this geometry")
-
-    def export(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
-        return {}
-
 
 class BaseMaterial(BaseModule):
     """Base class of materials, which turn features into colours; Gaussians have their own
@@ -46,9 +38,6 @@ class BaseMaterial(BaseModule):
 
     def forward(self, *args: Any, **kwargs: Any) -> Tensor:
         raise NotImplementedError(f"{type(self).__name__}.forward")
-
-    def export(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
-        return {}
 
 
 COLOR_ACTIVATIONS = {"sigmoid": torch.sigmoid, "none": lambda x: x}
@@ -131,9 +120,12 @@ class SubModules(NamedTuple):
 
 
 class HasSubModules:
-    """Access to the system's parts under the names that threestudio gives them."""
+    """Refers to the system's parts, under the names that threestudio gives them."""
 
-    sub_modules: SubModules
+    def configure(
+        self, geometry: BaseGeometry, material: BaseMaterial, background: BaseBackground
+    ) -> None:
+        self.sub_modules = SubModules(geometry, material, background)
 
     @property
     def geometry(self) -> BaseGeometry:
@@ -162,7 +154,7 @@ class Renderer(HasSubModules, BaseModule):
     def configure(
         self, geometry: BaseGeometry, material: BaseMaterial, background: BaseBackground
     ) -> None:
-        self.sub_modules = SubModules(geometry, material, background)
+        super().configure(geometry, material, background)
         self.register_buffer(
             "bbox", self.cfg.radius * torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
         )
@@ -192,11 +184,6 @@ class Exporter(HasSubModules, BaseObject):
         save_video: bool = False
 
     cfg: Config
-
-    def configure(
-        self, geometry: BaseGeometry, material: BaseMaterial, background: BaseBackground
-    ) -> None:
-        self.sub_modules = SubModules(geometry, material, background)
 
     def __call__(self, *args: Any, **kwargs: Any) -> list[ExporterOutput]:
         raise NotImplementedError(f"{type(self).__name__}.__call__")

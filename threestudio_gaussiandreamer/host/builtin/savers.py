@@ -10,7 +10,6 @@ import numpy as np
 from torch import Tensor
 
 from ...core import images as pictures
-from ...core.checkpoint_file import save_file as save_checked
 from ...core.errors import UserError
 from ...core.files import atomic_file, json_text
 
@@ -68,43 +67,6 @@ class SaverMixin:
             f"expected an array, a tensor, or a list or dict of them, got {type(data).__name__}"
         )
 
-    def save_rgb_image(
-        self,
-        filename: str,
-        img: Any,
-        data_format: str = "HWC",
-        data_range: tuple[float, float] = (0, 1),
-        name: Optional[str] = None,
-        step: Optional[int] = None,
-    ) -> str:
-        """Save an image (H,W,C) or (C,H,W) whose values span ``data_range``.
-
-        With more than three channels, each three of them become one RGB image, side by side.
-        """
-        picture = pictures.rgb(
-            self.convert_data(img), data_format=data_format, data_range=data_range
-        )
-        return self._save_picture(filename, picture, name, step)
-
-    def save_grayscale_image(
-        self,
-        filename: str,
-        img: Any,
-        data_range: Optional[tuple[float, float]] = None,
-        cmap: Optional[str] = "jet",
-        name: Optional[str] = None,
-        step: Optional[int] = None,
-    ) -> str:
-        """Save values (H,W) with a colour map.
-
-        Args:
-            data_range: the values at the ends of the colour map; by default the smallest and the
-                largest value.
-            cmap: "jet", "magma", or None for grey.
-        """
-        picture = pictures.grayscale(self.convert_data(img), data_range=data_range, cmap=cmap)
-        return self._save_picture(filename, picture, name, step)
-
     def save_image_grid(
         self,
         filename: str,
@@ -118,18 +80,17 @@ class SaverMixin:
 
         Args:
             imgs: a row of ``{"type": "rgb"|"grayscale", "img": ..., "kwargs": {...}}``, or a list
-                of rows; ``kwargs`` as for :meth:`save_rgb_image` and :meth:`save_grayscale_image`.
+                of rows; ``kwargs`` as for ``core.images.rgb`` and ``core.images.grayscale``.
             align: the size of every cell, see ``core.images.grid``.
             texts: one line of text per row.
         """
         picture = pictures.grid(self._converted(imgs), align=align)
         if texts:
             picture = pictures.with_texts(picture, texts)
-        return self._save_picture(filename, picture, name, step)
-
-    def save_image(self, filename: str, img: Any) -> str:
-        """Save an 8 bit or 16 bit picture as it is: (H,W), (H,W,3) or (H,W,4)."""
-        return self._save_picture(filename, self.convert_data(img), None, None)
+        path = self.get_save_path(filename)
+        pictures.write(path, picture)
+        self._log_file("Image", path, name, step)
+        return path
 
     def save_img_sequence(
         self,
@@ -168,25 +129,6 @@ class SaverMixin:
             np.savez(file, **data) if isinstance(data, dict) else np.save(file, data)
         return path
 
-    def save_state_dict(self, filename: str, data: Any) -> str:
-        path = self.get_save_path(filename)
-        save_checked(path, data)
-        return path
-
-    def save_mesh(
-        self, filename: str, v_pos: Any, t_pos_idx: Any, v_tex: Any = None, t_tex_idx: Any = None
-    ) -> str:
-        """Save vertices (V,3) and triangles (F,3) in the format of the file name's extension."""
-        import trimesh
-
-        path = self.get_save_path(filename)
-        vertices, faces = self.convert_data(v_pos), self.convert_data(t_pos_idx)
-        mesh = trimesh.Trimesh(vertices=vertices, faces=faces, process=False)
-        with atomic_file(path) as file:
-            content = mesh.export(file_type=Path(path).suffix.removeprefix("."))
-            file.write(content.encode() if isinstance(content, str) else content)
-        return path
-
     def save_obj(
         self, filename: str, mesh: Any, save_vertex_color: bool = False, **unused: Any
     ) -> list[str]:
@@ -219,14 +161,6 @@ class SaverMixin:
         if imgs and isinstance(imgs[0], list):
             return [self._converted(row) for row in imgs]
         return [{**cell, "img": self.convert_data(cell["img"])} for cell in imgs]
-
-    def _save_picture(
-        self, filename: str, picture: np.ndarray, name: Optional[str], step: Optional[int]
-    ) -> str:
-        path = self.get_save_path(filename)
-        pictures.write(path, picture)
-        self._log_file("Image", path, name, step)
-        return path
 
     def _log_file(self, kind: str, path: str, name: Optional[str], step: Optional[int]) -> None:
         if name and self._wandb_logger:

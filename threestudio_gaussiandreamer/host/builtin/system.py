@@ -2,7 +2,6 @@
 ...), update them at every step, and export the result.
 """
 
-import inspect
 from dataclasses import dataclass, field
 from typing import Any, List, Optional
 
@@ -10,16 +9,9 @@ import lightning.pytorch as pl
 import torch
 
 from ...core.checkpoint_file import load_module_weights
-from ...core.errors import UserError
-from ...core.logs import info, warn
 from ...core.options import parse_structured
 from ...core.schedule import C
-from .base import (
-    Updateable,
-    load_parameters,
-    update_end_if_possible,
-    update_if_possible,
-)
+from .base import Updateable, load_parameters
 from .models import Exporter
 from .registry import find
 from .savers import SaverMixin
@@ -46,11 +38,6 @@ class BaseSystem(pl.LightningModule, Updateable, SaverMixin):
         cleanup_after_test_step: bool = False
 
     cfg: Config
-
-    def __init_subclass__(cls, **options: Any) -> None:
-        super().__init_subclass__(**options)
-        if "training_step" in vars(cls):  # Lightning asks for its signature in each step
-            cls.training_step.__signature__ = inspect.signature(cls.training_step)
 
     def __init__(self, cfg: Any, resumed: bool = False) -> None:
         super().__init__()
@@ -103,31 +90,6 @@ class BaseSystem(pl.LightningModule, Updateable, SaverMixin):
         """Return the value of a schedule at the current epoch and step."""
         return C(value, self.true_current_epoch, self.true_global_step)
 
-    def __setattr__(self, name: str, value: Any) -> None:
-        if name == "_current_fx_name":  # Lightning sets it before and after each of its hooks
-            self.__dict__[name] = value
-        else:
-            super().__setattr__(name, value)
-
-    def configure_optimizers(self) -> Any:
-        """Build the optimiser of the option ``optimizer``; see :func:`optimizer_from`."""
-        return optimizer_from(self.cfg.optimizer, self)
-
-    def training_step(self, batch: dict, batch_idx: int) -> Any:
-        raise NotImplementedError(f"{type(self).__name__}.training_step")
-
-    def validation_step(self, batch: dict, batch_idx: int) -> Any:
-        raise NotImplementedError(f"{type(self).__name__}.validation_step")
-
-    def test_step(self, batch: dict, batch_idx: int) -> Any:
-        raise NotImplementedError(f"{type(self).__name__}.test_step")
-
-    def predict_step(self, batch: dict, batch_idx: int) -> Any:
-        raise NotImplementedError(f"{type(self).__name__}.predict_step")
-
-    def on_validation_epoch_end(self) -> None:
-        """Do nothing: there are no results to gather."""
-
     def preprocess_data(self, batch: dict, stage: str) -> None:
         """Change a batch in place before it is used; ``stage`` is "train", "validation", "test" or
         "predict".
@@ -168,11 +130,13 @@ class BaseSystem(pl.LightningModule, Updateable, SaverMixin):
     def _before_batch(self, batch: dict, stage: str, loader: Any) -> None:
         self.preprocess_data(batch, stage)
         self.dataset = loader.dataset
-        update_if_possible(self.dataset, self.true_current_epoch, self.true_global_step)
+        if isinstance(self.dataset, Updateable):
+            self.dataset.do_update_step(self.true_current_epoch, self.true_global_step)
         self.do_update_step(self.true_current_epoch, self.true_global_step)
 
     def _after_batch(self, cleanup: bool = False) -> None:
-        update_end_if_possible(self.dataset, self.true_current_epoch, self.true_global_step)
+        if isinstance(self.dataset, Updateable):
+            self.dataset.do_update_step_end(self.true_current_epoch, self.true_global_step)
         self.do_update_step_end(self.true_current_epoch, self.true_global_step)
         if cleanup and torch.cuda.is_available():
             torch.cuda.empty_cache()
@@ -215,16 +179,6 @@ class BaseLift3DSystem(BaseSystem):
             background=self.background,
         )
 
-    def on_fit_start(self) -> None:
-        if self._save_dir is None:
-            warn("the save folder isn't set: no pictures will be saved")
-        else:
-            info(f"Validation results will be saved to {self._save_dir}")
-
-    def on_test_end(self) -> None:
-        if self._save_dir is not None:
-            info(f"Test results saved to {self._save_dir}")
-
     def on_predict_start(self) -> None:
         self.exporter: Exporter = find(self.cfg.exporter_type)(
             self.cfg.exporter,
@@ -241,51 +195,5 @@ class BaseLift3DSystem(BaseSystem):
         if self.exporter.cfg.save_video:
             self.on_test_epoch_end()
         for output in self.exporter():
-            save = getattr(self, f"save_{output.save_type}", None)
-            if save is None:
-                raise UserError(
-                    f"{type(self).__name__} has no save_{output.save_type}, which "
-                    f"{type(self.exporter).__name__} asks for"
-                )
+            save = getattr(self, f"save_{output.save_type}")
             save(f"it{self.true_global_step}-export/{output.save_name}", **output.params)
-
-    def on_predict_end(self) -> None:
-        if self._save_dir is not None:
-            info(f"Export assets saved to {self._save_dir}")
-
-
-def optimizer_from(config: Any, module: torch.nn.Module) -> torch.optim.Optimizer:
-    """Build an optimiser of ``torch.optim``.
-
-    Args:
-        config: ``name``, the class; ``args``, its keyword arguments; and optionally ``params``, a
-            mapping from attributes of ``module`` ("geometry.means") to the options of their
-            parameter groups. Without ``params`` all parameters are optimised.
-
-    Raises:
-        UserError: no such optimiser, or no such attribute.
-    """
-    optimizer_class = getattr(torch.optim, config.get("name", ""), None)
-    if optimizer_class is None:
-        raise UserError(
-            f"system.optimizer.name is {config.get('name')!r}; expected an optimiser of "
-            "torch.optim, such as Adam"
-        )
-    params = module.parameters()
-    if "params" in config:
-        params = [
-            {"params": _parameters(module, name), "name": name, **options}
-            for name, options in config["params"].items()
-        ]
-    return optimizer_class(params, **config.get("args", {}))
-
-
-def _parameters(module: Any, name: str) -> list[torch.nn.Parameter]:
-    found = module
-    for attribute in name.split("."):
-        if not hasattr(found, attribute):
-            raise UserError(
-                f"system.optimizer.params.{name}: {type(found).__name__} has no {attribute!r}"
-            )
-        found = getattr(found, attribute)
-    return list(found.parameters()) if isinstance(found, torch.nn.Module) else [found]
