@@ -116,9 +116,11 @@ def test_updates_take_at_most_their_share_of_the_time(viewer, monkeypatch):
     assert made._show_if_due(trainer, system)
 
 
-def test_nothing_is_read_without_a_browser(viewer):
+def test_nothing_is_read_without_a_browser_and_no_cameras_that_are_switched_off(viewer):
     made, trainer, system = viewer
-    made.view.watched = False
+    made.controls.cameras.value = False
+    assert made._show_if_due(trainer, system, {}) and not made.view.cameras
+    made.view.watched, made._due = False, 0.0
     del system.geometry
     assert not made._show_if_due(trainer, system)
 
@@ -134,20 +136,3 @@ def test_a_pause_ends_with_one_step_or_with_a_signal(viewer, monkeypatch):
     made.stopping = lambda: len(waits) == 5
     made.on_train_batch_start(trainer, system, {}, 1)
     assert len(waits) == 5
-
-
-def test_the_picture_is_shown_in_a_pause(viewer, monkeypatch):
-    made, trainer, system = viewer
-    monkeypatch.setattr(live_viewer.time, "sleep", lambda seconds: None)
-    monkeypatch.setattr(live_viewer, "score_picture", lambda system, batch: batch["picture"])
-    made.controls.paused = True
-    made.stopping = lambda: len(made.view.pictures) == 2
-    made.on_train_batch_start(trainer, system, {"picture": "of the next views"}, 0)
-    assert made.view.pictures == ["of the next views"] * 2
-
-
-def test_cameras_that_are_switched_off_are_not_sent(viewer):
-    made, trainer, system = viewer
-    made.controls.cameras.value = False
-    assert made._show_if_due(trainer, system, {})
-    assert not made.view.cameras

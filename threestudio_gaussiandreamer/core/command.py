@@ -26,26 +26,42 @@ def run_command(
 
     Args:
         parse: parses the arguments; None means those of this process.
-        run: does the work; its argument is what ``parse`` returned.
+        run: does the work; its argument is what ``parse`` returned. It may return an exit code.
 
     Returns:
-        the exit code: 0 for success, 2 for wrong input, 130 for Ctrl-C, 141 for a closed pipe, that
-        of the signal if ``run`` raises ``Terminated``.
+        the exit code: 0 for success, 2 for wrong input, 141 for a closed pipe, 128 and the number
+        of a stop signal, even if other code has caught or replaced the exception that it raised.
     """
     try:
         args = parse(argv)
     except SystemExit as stop:  # --help, or a mistake that argparse has printed
         return int(stop.code or 0)
+    received: Sequence[int] = ()
     with tolerant_output():
         try:
-            run(args)
-            sys.stdout.flush()
-        except (KeyboardInterrupt, Terminated) as stop:
-            print("stopped", file=sys.stderr)
-            return stop.code if isinstance(stop, Terminated) else 128 + signal.SIGINT
+            with raised_signals() as received:
+                code = run(args)
+                sys.stdout.flush()
+                if not received:
+                    return code if isinstance(code, int) else 0
+        except KeyboardInterrupt:  # also raised by handlers that a caller has installed
+            received = received or [signal.SIGINT]
         except Exception as error:
-            return exit_code(error)
-    return 0
+            if not received:
+                return exit_code(error, getattr(args, "verbose", False))
+        except SystemExit as stop:
+            if isinstance(stop, Terminated):
+                received = received or [stop.code - 128]
+            if not received:
+                return exit_code(foreign_exit(stop), getattr(args, "verbose", False))
+        print("stopped", file=sys.stderr)
+    return 128 + received[0]
+
+
+def foreign_exit(stop: SystemExit) -> UserError:
+    """Make the error for a ``sys.exit()`` in a library or extension, whose code may be 0."""
+    *_, place = traceback.extract_tb(stop.__traceback__)
+    return UserError(f"{place.filename}:{place.lineno} ended the run with sys.exit({stop.code!r})")
 
 
 def joined_values(

@@ -12,7 +12,6 @@ from ..core.command import run_command
 from ..core.errors import UserError
 from ..core.launcher import train_alone
 from ..core.options import RULE, at_least, positive
-from ..core.signals import raised_signals
 from ..launch.experiment import configure_logging
 from ..launch.folder_lock import claim, require_writable
 from ..launch.options import add_config, parse_with_overrides
@@ -35,13 +34,7 @@ def main(argv: Optional[Sequence[str]] = None) -> int:
     """Run one command line and return the exit code: 0 if all assets are finished, 1 if some aren't
     (with ``--report``: have failed), 2 for invalid input, 130 for Ctrl-C.
     """
-    codes = [0]
-
-    def run(args: argparse.Namespace) -> None:
-        with raised_signals():
-            codes[0] = run_farm(args)
-
-    return run_command(parse_arguments, run, argv) or codes[0]
+    return run_command(parse_arguments, run_farm, argv)
 
 
 def parse_arguments(argv: Optional[Sequence[str]] = None) -> argparse.Namespace:

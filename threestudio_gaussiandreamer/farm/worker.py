@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, Optional
 
 from .. import __version__, register_parts
+from ..core.command import foreign_exit
 from ..core.errors import UserError, raised_in
 from ..core.launcher import train_alone
 from ..core.options import is_number
@@ -101,8 +102,6 @@ class Worker:
         except SystemExit as stop:
             if raised_in(stop, "ray."):  # which ends this process
                 raise
-            from ..launch.experiment import foreign_exit
-
             return outcome_of(foreign_exit(stop))
         except Exception as error:
             return outcome_of(error)

@@ -12,17 +12,14 @@ import gc
 import logging
 import os
 import shlex
-import signal
 import sys
-import traceback
 import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Optional
 
-from ..core.command import exit_code, run_command, tolerant_output
-from ..core.errors import Terminated, UserError
-from ..core.signals import raised_signals
+from ..core.command import run_command
+from ..core.errors import UserError
 from .options import (
     LIST_PARTS,
     PROGRAM,
@@ -62,15 +59,7 @@ def main(argv: Optional[Sequence[str]] = None) -> int:
     argv = list(sys.argv[1:] if argv is None else argv)
     if LIST_PARTS in argv:
         return run_command(lambda _: None, lambda _: list_parts())
-    try:
-        args = parse_arguments(argv)
-    except SystemExit as stop:
-        return int(stop.code or 0)
-    with tolerant_output():
-        try:
-            return run_until_signal(args, argv)
-        except Exception as error:
-            return exit_code(error, args.verbose)
+    return run_command(parse_arguments, lambda args: run(args, argv), argv)
 
 
 def list_parts() -> None:
@@ -83,37 +72,6 @@ def list_parts() -> None:
     load_extensions()
     for kind, parts in parts_by_kind().items():
         print(kind, *(f"  {part}" for part in parts), sep="\n")
-
-
-def run_until_signal(args: argparse.Namespace, argv: Sequence[str]) -> int:
-    """Run the stages. After a stop signal the exit code is that of the signal, even if other code
-    has caught or replaced the exception that the handler raised.
-    """
-    received: Sequence[int] = ()
-    try:
-        with raised_signals() as received:
-            code = run(args, argv)
-            sys.stdout.flush()
-            if not received:
-                return code
-    except KeyboardInterrupt:  # also raised by handlers that a caller has installed
-        received = received or [signal.SIGINT]
-    except Terminated as stop:
-        received = received or [stop.code - 128]
-    except SystemExit as stop:
-        if not received:
-            raise foreign_exit(stop) from stop
-    except Exception:
-        if not received:
-            raise
-    print("stopped", file=sys.stderr)
-    return 128 + received[0]
-
-
-def foreign_exit(stop: SystemExit) -> UserError:
-    """Make the error for a ``sys.exit()`` in a library or extension, whose code may be 0."""
-    *_, place = traceback.extract_tb(stop.__traceback__)
-    return UserError(f"{place.filename}:{place.lineno} ended the run with sys.exit({stop.code!r})")
 
 
 def run(args: argparse.Namespace, argv: Sequence[str]) -> int:
