@@ -83,22 +83,17 @@ def grayscale(
     return np.stack(channels, axis=-1).round().astype(np.uint8)
 
 
-def grid(cells: list, *, align: Any = "max") -> np.ndarray:
-    """Compose a row of ``{"type", "img", "kwargs"}``, or a list of rows, into one image.
-
-    Args:
-        align: the size of every cell: "max" or "min" of the cells, a number of pixels, or
-            (height, width).
+def grid(cells: list) -> np.ndarray:
+    """Compose a row of ``{"type", "img", "kwargs"}``, or a list of rows, into one image; all cells
+    of a row get the size of the largest.
     """
     if isinstance(cells[0], list):
-        rows = [grid(row, align=align) for row in cells]
+        rows = [grid(row) for row in cells]
         width = max(row.shape[1] for row in rows)
         return np.concatenate([_padded(row, 0, width - row.shape[1]) for row in rows], axis=0)
     makers = {"rgb": rgb, "grayscale": grayscale}
     images = [makers[cell["type"]](cell["img"], **cell.get("kwargs", {})) for cell in cells]
-    if align in ("max", "min"):
-        align = getattr(np, align)([image.shape[:2] for image in images], axis=0).tolist()
-    height, width = (align, align) if isinstance(align, int) else align
+    height, width = np.max([image.shape[:2] for image in images], axis=0).tolist()
     return np.concatenate([_resize(image, height, width) for image in images], axis=1)
 
 

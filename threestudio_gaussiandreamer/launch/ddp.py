@@ -9,7 +9,6 @@ processes, so that they make the same changes.
 The processes are started by ``torchrun``, by SLURM's ``srun`` with one task each, or by Lightning,
 for ``--gpu 0,1`` or ``trainer.devices=2`` (without a GPU: processes on the CPU)."""
 
-import importlib
 import os
 import re
 from collections.abc import Mapping
@@ -113,11 +112,6 @@ def _started_processes() -> Optional[Processes]:
     return Processes(tasks // nodes, nodes, SLURM) if launcher.many_tasks() else None
 
 
-def _environments() -> Any:
-    """Return Lightning's classes of cluster environments."""
-    return importlib.import_module(f"{pl.__name__}.plugins.environments")
-
-
 def environment_plugins(processes: Processes) -> list[Any]:
     """Return the plugin that lets Lightning start the processes inside of a SLURM job with a single
     task, where it would wait for SLURM to start them, or miss what only ``srun`` sets.
@@ -129,10 +123,11 @@ def environment_plugins(processes: Processes) -> list[Any]:
             f"{os.environ['SLURM_JOB_NAME']}) doesn't start: the number of processes that train "
             f"is {processes.total}; for all: srun --job-name train --ntasks-per-node ..."
         )
-    in_job = _environments().SLURMEnvironment.detect()
+    environments = pl.plugins.environments
+    in_job = environments.SLURMEnvironment.detect()
     by_srun = all(name in os.environ for name in launcher.SLURM)
     alone = processes.started_by is None and (processes.total > 1 or not by_srun)
-    return [_environments().LightningEnvironment()] if in_job and alone else []
+    return [environments.LightningEnvironment()] if in_job and alone else []
 
 
 def trainer_options(processes: Processes, strategy: Any) -> dict[str, Any]:

@@ -54,41 +54,22 @@ class SaverMixin:
         return [self._wandb_logger] if self._wandb_logger else []
 
     def convert_data(self, data: Any) -> Any:
-        """Convert tensors to numpy arrays, also inside lists and dicts."""
-        if isinstance(data, Tensor):
-            return data.detach().cpu().numpy()
-        if isinstance(data, list):
-            return [self.convert_data(item) for item in data]
+        """Convert tensors to numpy arrays, also inside a dict."""
         if isinstance(data, dict):
             return {key: self.convert_data(item) for key, item in data.items()}
-        if data is None or isinstance(data, np.ndarray):
-            return data
-        raise TypeError(
-            f"expected an array, a tensor, or a list or dict of them, got {type(data).__name__}"
-        )
+        return data.detach().cpu().numpy() if isinstance(data, Tensor) else data
 
     def save_image_grid(
-        self,
-        filename: str,
-        imgs: list,
-        align: Any = "max",
-        name: Optional[str] = None,
-        step: Optional[int] = None,
-        texts: Optional[list] = None,
+        self, filename: str, imgs: list, name: Optional[str] = None, step: Optional[int] = None
     ) -> str:
         """Save a grid of images.
 
         Args:
             imgs: a row of ``{"type": "rgb"|"grayscale", "img": ..., "kwargs": {...}}``, or a list
                 of rows; ``kwargs`` as for ``core.images.rgb`` and ``core.images.grayscale``.
-            align: the size of every cell, see ``core.images.grid``.
-            texts: one line of text per row.
         """
-        picture = pictures.grid(self._converted(imgs), align=align)
-        if texts:
-            picture = pictures.with_texts(picture, texts)
         path = self.get_save_path(filename)
-        pictures.write(path, picture)
+        pictures.write(path, pictures.grid(self._converted(imgs)))
         self._log_file("Image", path, name, step)
         return path
 
@@ -160,7 +141,7 @@ class SaverMixin:
     def _converted(self, imgs: list) -> list:
         if imgs and isinstance(imgs[0], list):
             return [self._converted(row) for row in imgs]
-        return [{**cell, "img": self.convert_data(cell["img"])} for cell in imgs]
+        return [self.convert_data(cell) for cell in imgs]
 
     def _log_file(self, kind: str, path: str, name: Optional[str], step: Optional[int]) -> None:
         if name and self._wandb_logger:
