@@ -10,12 +10,14 @@ from types import ModuleType, SimpleNamespace
 from typing import Any, Optional
 
 METRICS, COMPILER = "torchmetrics", "torch._dynamo"
+LOGGER = logging.getLogger(METRICS)
 
 
 class Late(ModuleType):
     """A package whose source hasn't run yet."""
 
     def __init__(self, name: str, **names: Any) -> None:
+        super().__init__(name)
         vars(self).update(vars(module_from_spec(find_spec(name))), **names)
         sys.modules[name] = self
 
@@ -32,11 +34,9 @@ class Late(ModuleType):
         if not name.startswith(f"{COMPILER}.") or type(sys.modules[COMPILER]) is not Late:
             return None
         _ = sys.modules[COMPILER].optimize
-        if (known := sys.modules.get(name)) is None:
-            return None
-        # imported by the package: it mustn't run again
+        known = sys.modules.get(name)  # imported by the package: it mustn't run again
         loader = SimpleNamespace(create_module=lambda _: known, exec_module=lambda _: None)
-        return ModuleSpec(name, loader)
+        return ModuleSpec(name, loader) if known else None
 
 
 def import_lightning() -> None:
@@ -47,8 +47,7 @@ def import_lightning() -> None:
             names = {"disable": lambda function, *_, **__: function, "graph_break": lambda: None}
             names["OptimizedModule"] = type("OptimizedModule", (), {})
             vars(sys.modules["torch"])["_dynamo"] = Late(COMPILER, **names)
-            names = {"__version__": metadata.version(METRICS), "_logger": logging.getLogger()}
-            package = Late(METRICS, **names)
+            package = Late(METRICS, __version__=metadata.version(METRICS), _logger=LOGGER)
             import_module(f"{METRICS}.utilities")  # before metric, which it imports
             package.Metric = import_module(f"{METRICS}.metric").Metric
             package.MetricCollection = import_module(f"{METRICS}.collections").MetricCollection
