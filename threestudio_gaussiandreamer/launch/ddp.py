@@ -9,6 +9,7 @@ processes, so that they make the same changes.
 The processes are started by ``torchrun``, by SLURM's ``srun`` with one task each, or by Lightning,
 for ``--gpu 0,1`` or ``trainer.devices=2`` (without a GPU: processes on the CPU)."""
 
+import importlib
 import os
 import re
 from collections.abc import Mapping
@@ -123,7 +124,7 @@ def environment_plugins(processes: Processes) -> list[Any]:
             f"{os.environ['SLURM_JOB_NAME']}) doesn't start: the number of processes that train "
             f"is {processes.total}; for all: srun --job-name train --ntasks-per-node ..."
         )
-    environments = pl.plugins.environments
+    environments = importlib.import_module(f"{pl.__name__}.plugins.environments")
     in_job = environments.SLURMEnvironment.detect()
     by_srun = all(name in os.environ for name in launcher.SLURM)
     alone = processes.started_by is None and (processes.total > 1 or not by_srun)
