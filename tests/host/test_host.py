@@ -60,14 +60,6 @@ def test_an_unknown_name_lists_the_near_ones(own_registry):
         own_registry.find("mesh-piror")
 
 
-def test_mixins_come_before_the_main_class(own_registry):
-    main, mixin = type("Main", (), {"kind": "main"}), type("Mixin", (), {"kind": "mixin"})
-    own_registry.register("main")(main)
-    own_registry.register("mixin")(mixin)
-    assert own_registry.find("main:mixin").kind == "mixin"
-    assert issubclass(own_registry.find("main:mixin"), main)
-
-
 # -- parts -----------------------------------------------------------------------------------------
 
 

@@ -29,28 +29,19 @@ def register(name: str) -> Callable[[type], type]:
 
 
 def find(name: str) -> type:
-    """Return the class registered as ``name``; ``"main:mixin1,mixin2"`` makes a class of ``main``
-    with the mixins before it.
+    """Return the class registered as ``name``.
 
     Raises:
         UserError: no part has that name; the message lists the near ones.
     """
-    main, _, mixins = name.partition(":")
-    if not mixins:
-        return _lookup(main)
-    bases = [_lookup(part) for part in [*mixins.split(","), main]]
-    return type(f"{main}.{mixins}", tuple(bases), {})
+    if name not in _parts:
+        raise unknown("part", name, _parts)
+    return _parts[name]
 
 
 def names() -> list[str]:
     """Return all registered names, sorted."""
     return sorted(_parts)
-
-
-def _lookup(name: str) -> type:
-    if name not in _parts:
-        raise unknown("part", name, _parts)
-    return _parts[name]
 
 
 def _identity(cls: type) -> str:
