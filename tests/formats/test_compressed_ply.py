@@ -95,9 +95,9 @@ def test_the_two_layouts_are_told_apart(tmp_path):
 @pytest.mark.parametrize(
     ("data", "said"),
     [
-        (BY_HAND[:-1], "'vertex' are announced, but 15 bytes follow"),
-        (header(count=2) + BOUNDS + WORDS, "2 rows of 'vertex' are announced"),
-        (header(10**12, 256 * 10**12), "rows of 'chunk' are announced"),
+        (BY_HAND[:-1], "ends before the 1 rows of 'vertex'"),
+        (header(count=2) + BOUNDS + WORDS, "ends before the 2 rows of 'vertex'"),
+        (header(10**12, 256 * 10**12), "ends before the 1000000000000 rows of 'chunk'"),
         (header(chunks=2) + BOUNDS + WORDS, "'chunk' has other .* rows"),
         (header(rest=10) + BOUNDS + WORDS, "'sh' has other properties"),
         (header(limits=LIMITS[::-1]) + BOUNDS + WORDS, "'chunk' has other properties"),

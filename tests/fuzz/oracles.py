@@ -46,25 +46,21 @@ class _Rows:
     def __init__(self, encoding: str, body: bytes):
         self.order = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}[encoding]
         self.at, self.body = 0, body
-        lines = [] if self.order else body.decode("latin-1").split("\n")
-        self.lines = [line.split() for line in lines if line.split()]
+        self.words = [] if self.order else body.decode("latin-1").split()
+        self.first = len(body.lstrip().partition(b"\n")[0].split())
 
     def row(self, properties: list[tuple[str, str, str]]) -> list[float]:
-        if not self.order and not self.lines:
-            raise Illegal("truncated")
-        words, values = [] if self.order else self.lines.pop(0), []
+        values = []
         for _, kind, count_kind in properties:
-            length = self._number(count_kind, words) if count_kind else 1
+            length = self._number(count_kind) if count_kind else 1
             if not (0 <= length <= len(self.body) and length == int(length)):
                 raise Illegal("length of a list")
-            values += [self._number(kind, words) for _ in range(int(length))]
-        if words:
-            raise Illegal("more numbers than properties")
+            values += [self._number(kind) for _ in range(int(length))]
         return values
 
-    def _number(self, kind: str, words: list[str]) -> float:
+    def _number(self, kind: str) -> float:
         if not self.order:
-            return _text_number(words, kind)
+            return _text_number(self.words)
         size = struct.calcsize("<" + kind)
         if self.at + size > len(self.body):
             raise Illegal("truncated")
@@ -72,24 +68,24 @@ class _Rows:
         return struct.unpack_from(self.order + kind, self.body, self.at - size)[0]
 
     def rest(self) -> bool:
-        return bool(self.body[self.at :].strip()) if self.order else any(self.lines)
+        return bool(self.body[self.at :].strip()) if self.order else bool(self.words)
 
 
-def _text_number(words: list[str], kind: str) -> float:
+def _text_number(words: list[str]) -> float:
     try:
-        value = float(words.pop(0))
+        return float(words.pop(0))
     except (IndexError, ValueError) as error:
         raise Illegal("not a number") from error
-    if kind in "bBhHiI" and np.isfinite(value):
-        if not np.iinfo(kind).min <= value <= np.iinfo(kind).max:
-            raise Illegal("an integer out of its type's range")
-    return value
 
 
 def ply_vertices(data: bytes) -> PlyVertices:
     """The vertices of a PLY file (Turk 1994)."""
     encoding, elements, body = ply_header(data)
     rows, vertices = _Rows(encoding, body), None
+    name, count, properties = elements[0] if elements else ("", 0, [])
+    listed = any(count_kind for _, _, count_kind in properties)
+    if encoding == "ascii" and count and not listed and rows.first != len(properties):
+        raise Illegal("more or fewer numbers than properties")
     for name, count, properties in elements:
         if properties and count > len(data):
             raise Illegal("more rows than bytes")

@@ -334,7 +334,7 @@ def test_textures_and_instances_count_together(many, saved, monkeypatch):
     """A small file whose two images, or 2,000 nodes of one mesh, are refused before they are made;
     one image, or 500 nodes, are read.
     """
-    monkeypatch.setattr(budget, "FIXED_BYTES", 1 << 20 if many else 700_000)
+    monkeypatch.setattr(budget, "FIXED_BYTES", 1 << 20 if many else 1_200_000)
     monkeypatch.setattr(budget, "BYTES_PER_FILE_BYTE", 0)
     flat = np.zeros((64, 64, 3) if many else (256, 256, 3), np.uint8)
     made = textured_quad(flat)

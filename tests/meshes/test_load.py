@@ -185,7 +185,7 @@ def test_objects_as_programs_write_them_are_read(tmp_path):
     (tmp_path / "a.obj").write_bytes(text.encode())
     assert len(load_mesh(tmp_path / "a.obj").faces) == 2
     (tmp_path / "b.obj").write_text(
-        "v 0 0 0\nv 1 0 0\nv 0 1 0\nf -3 -2 -1\nf 1//1 2//1 3//1\nvn 0 0 1\n"
+        "  v\t0 0 0\nv 1 0 0\nV 0 1 0\nf -3 -2 -1\n\tF 1//1 2//1 3//1\nvn 0 0 1\n"
     )
     assert len(load_mesh(tmp_path / "b.obj").faces) == 2
 
@@ -219,8 +219,8 @@ def test_a_binary_stl_may_begin_like_text_and_have_more_bytes(tmp_path, header):
         ("empty.glb", b"", "isn't a GLB file, which begins with glTF"),
         ("page.glb", b"<!doctype html>", "is a web page, not the file itself"),
         ("flat.obj", b"v 1 1 1\nv 1 1 1\nv 1 1 1\nf 1 2 3\n", "zero area"),
-        ("zero.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 0 2 3\n", "line 4 is no vertex or face: 'f"),
-        ("two.obj", b"v 0 0\nv 1 0\nv 0 1\nf 1 2 3\n", "line 1 is no vertex or face"),
+        ("zero.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 0 2 3\n", "vertices are counted from 1: b'f 0"),
+        ("two.obj", b"v 0 0\nv 1 0\nv 0 1\nf 1 2 3\n", "damaged"),
         ("back.obj", b"v 0 0 0\nv 1 0 0\nf -3 -2 -1\nv 0 0 1\n", "names number -3 of 2 vertices"),
         ("cut.stl", bytes(80) + b"\2\0\0\0" + bytes(60), "184 bytes were expected, not 144"),
         ("a.gltf", b'{"asset": {"version": "2.0"}, "scenes": [{}]}', "no faces"),
@@ -236,25 +236,11 @@ def test_what_cannot_be_used_is_named(tmp_path, name, content, message):
         load_mesh(tmp_path / name)
 
 
-@pytest.mark.parametrize(
-    "line",
-    [
-        b"v 0 0 %b" % (b"1" * 64_000 + b"x"),
-        b"v 0 0 1.%b" % (b"1" * 64_000 + b"x"),
-        b"v 0 0 1e%b" % (b"1" * 64_000 + b"x"),
-        b"v" + b" 1" * 32_000 + b" x",
-        b"v 0 0" + b" " * 64_000 + b"x",
-        b"f" + b" 1/1/1" * 16_000 + b" x",
-        b"f" + b" " * 64_000 + b"x",
-        b"f 1 2 " + b"3" * 64_000 + b"x",
-    ],
-    ids=lambda line: line[:8].decode(),
-)
+@pytest.mark.parametrize("line", ["v 0 0 1%sx", "f 1 2 %sx", "f" + " 0/1/1" * 9000 + "%sx"])
 def test_a_long_line_takes_linear_time(tmp_path, line):
-    """64 kB, of numbers that a regular expression could split in two ways."""
-    (tmp_path / "a.obj").write_bytes(b"v 0 0 0\n" + line + b"\n")
+    (tmp_path / "a.obj").write_text("v 0 0 0\n" + line % ("1" * 64_000) + "\n")
     started = time.process_time()
-    with pytest.raises(UserError, match="line 2 is no vertex or face"):
+    with pytest.raises(UserError, match="a.obj"):
         load_mesh(tmp_path / "a.obj")
     assert time.process_time() - started < 2  # a quadratic search takes minutes
 
@@ -298,25 +284,12 @@ def test_colours_of_an_off_files_vertices(tmp_path, head, colors):
 
 
 @pytest.mark.parametrize(
-    ("head", "of_vertices", "of_faces", "warned"),
-    [
-        ("OFF", "", " 255 0 0", "faces"),
-        ("OFF", "", "", None),
-        ("NOFF", " 0 0 1", "", None),
-        ("CNOFF", " 0 0 1 255 0 0", "", "vertices"),
-        ("COFF", " 1 0 red", "", "vertices"),
-        ("COFF", " nan 0 0 1", "", "vertices"),
-    ],
+    ("head", "more"), [("OFF", ""), ("NOFF", " 0 0 1"), ("COFF", " 1 0 red"), ("COFF", " nan 0 0")]
 )
-def test_other_colours_of_an_off_file_are_reported(
-    tmp_path, caplog, head, of_vertices, of_faces, warned
-):
-    path = tmp_path / "a.off"
-    vertices = "".join(f"{corner}{of_vertices}\n" for corner in CORNERS)
-    path.write_text(f"{head}\n4 4 6\n" + vertices + OFF_FACES.replace("\n", f"{of_faces}\n"))
-    assert not load_mesh(path).has_colors
-    found = f"colours of its {warned} aren't read" in caplog.text
-    assert found if warned else "colours" not in caplog.text
+def test_other_numbers_of_an_off_file_are_no_colours(tmp_path, head, more):
+    vertices = "".join(f"{corner}{more}\n" for corner in CORNERS)
+    (tmp_path / "a.off").write_text(f"{head}\n4 4 6\n" + vertices + OFF_FACES)
+    assert not load_mesh(tmp_path / "a.off").has_colors
 
 
 # Real meshes

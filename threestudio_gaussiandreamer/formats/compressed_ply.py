@@ -154,29 +154,27 @@ def _word(fractions: Float[np.ndarray, "N F"], bits: Sequence[int]) -> Integer[n
 def _read_elements(path: Path) -> dict[str, np.ndarray]:
     """Read each element as an array (rows, columns), after checking the header."""
     with open(path, "rb") as file:
-        header = read_header(file)
-        elements = {entry.name: entry for entry in header.elements}
-        known = {(*elements,)} & {("chunk", "vertex"), ("chunk", "vertex", "sh")}
-        require(
-            bool(known) and header.encoding != "ascii", "it isn't binary, or has other elements"
-        )
-        count = elements["vertex"].count
-        rest = [tuple(f"f_rest_{i}" for i in range(3 * (k - 1))) for k in COEFFICIENTS[1:]]
-        layouts = {
-            "chunk": ((LIMITS, LIMITS[:WITHOUT_COLORS]), "f4", ceil(count / CHUNK)),
-            "vertex": ((PACKED,), "u4", count),
-            "sh": (rest, "u1", count),
-        }
-        found = {}
-        for element in header.elements:
-            layouts_known, kind, rows = layouts[element.name]
-            names = tuple(entry.name for entry in element.properties)
-            usual = all(entry.type == kind and not entry.count_type for entry in element.properties)
-            said = f"{element.name!r} has other properties than those of the format, or other rows"
-            require(usual and names in layouts_known and element.count == rows, said)
-            columns = read_rows(file, element, header.encoding).values()
-            found[element.name] = np.stack(list(columns), axis=1)
-        return found
+        header, data = read_header(file), file.read()
+    elements = {entry.name: entry for entry in header.elements}
+    known = {(*elements,)} & {("chunk", "vertex"), ("chunk", "vertex", "sh")}
+    require(bool(known) and header.encoding != "ascii", "it isn't binary, or has other elements")
+    count = elements["vertex"].count
+    rest = [tuple(f"f_rest_{i}" for i in range(3 * (k - 1))) for k in COEFFICIENTS[1:]]
+    layouts = {
+        "chunk": ((LIMITS, LIMITS[:WITHOUT_COLORS]), "f4", ceil(count / CHUNK)),
+        "vertex": ((PACKED,), "u4", count),
+        "sh": (rest, "u1", count),
+    }
+    found, at = {}, 0
+    for element in header.elements:
+        layouts_known, kind, rows = layouts[element.name]
+        names = tuple(entry.name for entry in element.properties)
+        usual = all(entry.type == kind and not entry.count_type for entry in element.properties)
+        said = f"{element.name!r} has other properties than those of the format, or other rows"
+        require(usual and names in layouts_known and element.count == rows, said)
+        columns, at = read_rows(data, at, element, header.encoding)
+        found[element.name] = np.stack([column.values for column in columns.values()], axis=1)
+    return found
 
 
 def _fractions(words: Integer[np.ndarray, " N"], bits: Sequence[int]) -> np.ndarray:

@@ -14,10 +14,7 @@ allocated than the file's size accounts for, whatever count the header states.""
 import logging
 import os
 import re
-import struct
-import warnings
-from collections.abc import Collection, Iterator, Sequence
-from itertools import islice
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import BinaryIO, NamedTuple, Optional
 
@@ -107,37 +104,28 @@ class PlyTable:
     """
 
     def __init__(self, path: Path, faces: bool = False) -> None:
-        self.path, self.faces = path, {}
-        found: Optional[dict[str, np.ndarray]] = None
         with open(path, "rb") as file:
-            header = read_header(file)
-            self.comments = header.comments
-            once = [element.name for element in header.elements].count("vertex") == 1
-            for element in header.elements:
-                if element.name == "vertex":
-                    readable = once and not element.has_lists
-                    said = "its vertices have lists, or are there twice; neither is read"
-                    require(readable, said)
-                    found = read_rows(file, element, header.encoding)
-                    self._types = {x.name: np.dtype(x.type) for x in element.properties}
-                    rest = _remaining(file)
-                    if header.elements[-1] is element and rest and file.read(4096).strip():
-                        said = "PLY file %r: %d bytes follow the %d vertices that it announces"
-                        logger.warning(said, str(path), rest, element.count)
-                    if not faces:
-                        break
-                elif element.name == "face" and faces:
-                    last = found is not None
-                    self.faces = _read_lists(file, element, header.encoding, last)
-                    if last:
-                        break
-                elif element.has_lists:
-                    _read_lists(file, element, header.encoding)
-                else:
-                    read_rows(file, element, header.encoding)
-        names = ", ".join(element.name for element in header.elements)[:200]
-        require(found is not None, f"there are no vertices: its elements are {names or 'none'}")
-        self.columns: dict[str, np.ndarray] = found
+            header, data = read_header(file), file.read()
+        names, at = [element.name for element in header.elements], 0
+        said = ", ".join(names)[:200] or "none"
+        said = f"one element of vertices without lists was expected; its elements are {said}"
+        vertices = [element for element in header.elements if element.name == "vertex"]
+        require(len(vertices) == 1 and not vertices[0].has_lists, said)
+        if header.encoding == "ascii":
+            data = _packed(data, header)
+        wanted = {"vertex", "face"} & {*names} if faces else {"vertex"}
+        found: dict[str, dict[str, Lists]] = {}
+        for element in header.elements:
+            found[element.name], at = read_rows(data, at, element, header.encoding)
+            if wanted <= found.keys() and header.encoding != "ascii":
+                break
+        if element is header.elements[-1] and data[at : at + 4096].strip():
+            said = "PLY file %r: more data follows than the %d rows of %r that it announces"
+            logger.warning(said, str(path), element.count, element.name)
+        self.path, self.comments = path, header.comments
+        self.columns = {name: column.values for name, column in found["vertex"].items()}
+        self.faces = found.get("face", {})
+        self._types = {entry.name: np.dtype(entry.type) for entry in vertices[0].properties}
 
     def has(self, names: Collection[str]) -> bool:
         return all(name in self.columns for name in names)
@@ -502,134 +490,77 @@ def _property(words: list[str], element: Element) -> Property:
     return Property(name, codes[-1], codes[0] if is_list else None)
 
 
-def _remaining(file: BinaryIO) -> int:
-    return os.fstat(file.fileno()).st_size - file.tell()
+def _packed(text: bytes, header: Header) -> bytes:
+    """Return the numbers of a text as float64."""
+    numbers = np.fromiter(map(float, text.split()), np.float64)
+    first, row = header.elements[0], text.lstrip().partition(b"\n")[0].split()
+    said = f"the first row of {first.name!r} has {len(row)} numbers, "
+    usual = not first.count or first.has_lists or len(row) == len(first.properties)
+    require(usual, said + f"{len(first.properties)} are announced")
+    return numbers.tobytes()
 
 
-def _require_room(file: BinaryIO, element: Element, encoding: str) -> None:
-    remaining, text = _remaining(file), encoding == "ascii"
-    kinds = [entry.count_type or entry.type for entry in element.properties]
-    least = 2 * len(kinds) if text else sum(np.dtype(kind).itemsize for kind in kinds)
-    said = f"{element.count} rows of {element.name!r} are announced, but {remaining} bytes follow"
-    fits = element.count * least <= remaining + text
-    require(fits, f"{said}: it is truncated or damaged")
-
-
-def read_rows(file: BinaryIO, element: Element, encoding: str) -> dict[str, np.ndarray]:
-    """Read the columns of an element without lists; those of text are float64."""
-    _require_room(file, element, encoding)
-    if not element.properties:
-        return {}
-    if encoding == "ascii":
-        return _read_text_rows(file, element)
-    order = BYTE_ORDERS[encoding]
-    layout = np.dtype([(entry.name, order + entry.type) for entry in element.properties])
-    size = element.count * layout.itemsize
-    rows = np.frombuffer(file.read(size), layout) if size else np.empty(0, layout)
-    return {name: rows[name] for name in layout.names}
-
-
-def _lines(file: BinaryIO, count: int) -> Iterator[bytes]:
-    """Yield the next lines that aren't blank."""
-    return islice(filter(bytes.strip, iter(file.readline, b"")), count)
-
-
-def _read_text_rows(file: BinaryIO, element: Element) -> dict[str, np.ndarray]:
-    """Read one row per line, also integers as float64, so that a NaN among them is kept."""
-    shape = (element.count, len(element.properties))
-    rows = np.empty((0, shape[1]))
-    if element.count:
-        with warnings.catch_warnings():  # NumPy warns about missing rows, which are reported below
-            warnings.simplefilter("ignore", UserWarning)
-            lines = _lines(file, element.count)
-            rows = np.loadtxt(lines, np.float64, comments=None, ndmin=2, encoding="latin-1")
-    said = f"{shape[0]} rows of {shape[1]} numbers are announced, but {rows.shape[0]} of"
-    require(rows.shape == shape, f"{said} {rows.shape[1]} are there")
-    for entry, values in zip(element.properties, rows.T, strict=True):
-        if entry.type[0] != "f":
-            limits = np.iinfo(entry.type)
-            beyond = ((values < limits.min) | (values > limits.max)).any()
-            require(not beyond, f"{entry.name} is beyond the range of its type")
-    return {entry.name: column for entry, column in zip(element.properties, rows.T, strict=True)}
-
-
-def _read_lists(
-    file: BinaryIO, element: Element, encoding: str, last: bool = False
-) -> dict[str, Lists]:
-    """Read the properties of an element with lists, by name, and go to its end.
+def read_rows(
+    data: bytes, at: int, element: Element, encoding: str
+) -> tuple[dict[str, Lists], int]:
+    """Read the properties of an element whose rows begin at the byte ``at``, as views of ``data``
+    where all lists are as long as those of the first row; also return where the rows end.
 
     Args:
-        last: text is read to the end of the file, also rows of several lines.
+        encoding: a key of ``BYTE_ORDERS``; the numbers of a text are float64.
     """
-    _require_room(file, element, encoding)
-    if encoding == "ascii":  # as float64, lengths too
-        text = file.read() if last else b"".join(_lines(file, element.count))
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", DeprecationWarning)  # of text after the numbers
-            data = np.fromstring(text, np.float64, sep=" ").tobytes()
-        entries = [entry._replace(type="f8", count_type=entry.count_type and "f8")
-                   for entry in element.properties]  # fmt: skip
-        found, end = _parse_lists(data, entries, element.count, "=")
-        require(last or end == len(data), f"a line of {element.name!r} holds other numbers")
-        return found
-    start, data = file.tell(), file.read()
-    found, end = _parse_lists(data, element.properties, element.count, BYTE_ORDERS[encoding])
-    file.seek(start + end)
-    return found
-
-
-def _parse_lists(
-    data: bytes, entries: list[Property], count: int, order: str
-) -> tuple[dict[str, Lists], int]:
-    """Return the properties of ``count`` packed rows, and the byte after the last one."""
+    count, order, text = element.count, BYTE_ORDERS[encoding], encoding == "ascii"
+    names = [entry.name for entry in element.properties]
     kinds = [
-        (entry.count_type and struct.Struct(order + np.dtype(entry.count_type).char),
-         np.dtype(order + entry.type)) for entry in entries
-    ]  # fmt: skip
+        [
+            code and np.dtype("f8" if text else order + code)
+            for code in (entry.count_type, entry.type)
+        ]
+        for entry in element.properties
+    ]
+    if not count or not names:
+        return {name: Lists(np.zeros(0, np.int64), np.zeros(0)) for name in names}, at
 
     def row(at: int) -> tuple[list[int], list[int], int]:
         """Return where each property begins, its length, and where the row ends."""
         starts, lengths = [], []
-        for reader, kind in kinds:
-            length = int(reader.unpack_from(data, at)[0]) if reader else 1
-            require(length >= 0, "it has a list of negative length")
-            at += reader.size if reader else 0
+        for of_length, kind in kinds:
+            length = 1
+            if of_length:
+                length, at = int(np.frombuffer(data, of_length, 1, at)[0]), at + of_length.itemsize
+                require(length >= 0, "it has a list of negative length")
             starts.append(at)
             lengths.append(length)
             at += length * kind.itemsize
         return starts, lengths, at
 
-    if not count or not entries:
-        return {entry.name: Lists(np.zeros(0, np.int64), np.zeros(0)) for entry in entries}, 0
-    starts, lengths, stride = row(0)
-    if count * stride <= len(data):  # are all as the first?
-        columns = [
-            np.ndarray((count,), order + entry.count_type, data, start - reader.size, (stride,))
-            for entry, start, (reader, _) in zip(entries, starts, kinds, strict=True) if reader
-        ]  # fmt: skip
-        if all((column == column[0]).all() for column in columns):
-            views = [
-                np.ndarray((count, length), kind, data, start, (stride, kind.itemsize))
-                for (_, kind), start, length in zip(kinds, starts, lengths, strict=True)
-            ]
+    least = count * sum((of_length or kind).itemsize for of_length, kind in kinds)
+    said = f"it ends before the {count} rows of {element.name!r} that it announces: it is truncated"
+    require(at + least <= len(data), said)
+    _, lengths, end = row(at)
+    if at + count * (end - at) <= len(data):  # are all as the first?
+        fields = [
+            [(f"length {i}", of_length)] * bool(of_length) + [(str(i), kind, (length,))]
+            for i, ((of_length, kind), length) in enumerate(zip(kinds, lengths, strict=True))
+        ]
+        rows = np.frombuffer(data, sum(fields, []), count, at)
+        listed = [i for i, (of_length, _) in enumerate(kinds) if of_length]
+        if all((rows[f"length {i}"] == lengths[i]).all() for i in listed):
             return {
-                entry.name: Lists(np.full(count, length), view.astype(np.float64).ravel())
-                for entry, length, view in zip(entries, lengths, views, strict=True)
-            }, count * stride
-    at, rows = 0, []
+                name: Lists(np.broadcast_to(length, count), rows[str(i)].reshape(-1))
+                for i, (name, length) in enumerate(zip(names, lengths, strict=True))
+            }, at + rows.nbytes
+    found = []
     for _ in range(count):
         starts, lengths, at = row(at)
-        rows.append((starts, lengths))
+        found.append((starts, lengths))
     require(at <= len(data), "a list is longer than the file: it is truncated or damaged")
-    places, sizes = np.array(rows).transpose(1, 2, 0)
+    places, sizes = np.array(found).transpose(1, 2, 0)
     return {
-        entry.name: Lists(
+        name: Lists(
             length,
-            np.concatenate(
-                [np.frombuffer(data, kind, n, start) if n else np.zeros(0, kind)
-                 for n, start in zip(length.tolist(), place.tolist(), strict=True)],
-                dtype=np.float64,
-            ),
+            np.concatenate([np.frombuffer(data, kind, n, start) if n else np.zeros(0, kind)
+                            for n, start in zip(length.tolist(), place.tolist(), strict=True)]),
         )
-        for entry, (_, kind), place, length in zip(entries, kinds, places, sizes, strict=True)
+        for name, (_, kind), place, length in zip(names, kinds, places, sizes, strict=True)
     }, at  # fmt: skip

@@ -5,18 +5,17 @@ Scales and opacities are linear, quaternions (w, x, y, z), coefficients of a Gau
 other, all float32 with 9 digits. Axes: y up, front +z; one unit is one metre. USD has no attribute
 for antialiasing: it and the notes are in the layer's ``customLayerData``.
 
-Text of one such prim at the top of its layer, with one line for each attribute, as this module,
-OpenUSD and NVIDIA's converter write it, is read here, also inside a USDZ; all else by OpenUSD where
-it is installed: binary layers, scenes with transforms, references and several prims, half
-precision, and the first of time samples. Other attributes are ignored, and so is the unit of the
-layer."""
+Text of one such prim, with one line for each attribute, as this module, OpenUSD and NVIDIA's
+converter write it, is read here, also inside a USDZ; all else by OpenUSD where it is installed:
+binary layers, scenes with transforms, references and several prims, half precision, and the first
+of time samples. Other attributes are ignored, and so is the unit of the layer."""
 
 import io
 import os
 import re
 import struct
 import zipfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -58,14 +57,14 @@ PADDING, PADDING_ID = struct.Struct("<HH"), 0x1986
 """The extra field that aligns the content, and OpenUSD's mark of it."""
 ROWS = 4096
 """Values that are formatted at once."""
-PRIM_LINE = re.compile(rb'def %b "\w+"( \()?' % SCHEMA.encode())
-HEAD = re.compile(rb"(?:custom )?(?:uniform )?([\w\[\]]+) ([\w:]+)")
-LONG_QUOTES = (b'"""', b"'''")
-"""Marks at both ends of texts of several lines."""
+PRIMS = re.compile(rb"^[ \t]*(?:def|over|class|variantSet)\b.*", re.MULTILINE)
+HEAD = rb"^[ \t]*(?:custom )?(?:uniform )?([\w\[\]]+) ([\w:]+) = (.*)"
+ATTRIBUTE = re.compile(HEAD, re.MULTILINE)
+COMMENT = re.compile(rb"^[ \t]*#.*", re.MULTILINE)
 COLOR_SPACE = "colorSpace:name"
 """The attribute by which a prim names the colour space of its harmonics."""
-COLOR_SPACE_OF_ARRAY = re.compile(rb"^colorSpace = (.*)", re.MULTILINE)
-TRANSFORM = "xformOpOrder"
+COLOR_SPACES = re.compile(rb"^.*\bcolorSpace(?::name)? = (.*)", re.MULTILINE)
+"""Of a prim, or of an array."""
 UP_AXIS = re.compile(rb'upAxis = "(\w+)"')
 NOTES = re.compile(rb'string\[\] notes = \[((?:"[^"\\]*"(?:, )?)*)\]')
 WIDTHS = {"point3f[]": 3, "float3[]": 3, "color3f[]": 3, "quatf[]": 4, "float[]": 1}
@@ -193,43 +192,52 @@ def read_usda(path: str | os.PathLike) -> tuple[Gaussians, list[str]]:
         UserError: there is no such file, it has another content or layout, or it is damaged.
     """
     with reading(path, "USD file") as file:
-        lines = _lines(_text(file))
-        begins = next(lines, b"") == MAGIC.encode()
+        text = _text(file)
+        begins = text.startswith(MAGIC.encode())
         require(begins, f"this is not a USDA file, which begins with {MAGIC!r}")
-        line, metadata = next(lines), b""
-        if line == b"(":
-            metadata, line = b"\n".join(_metadata(lines)), next(lines)
-        prim = PRIM_LINE.fullmatch(line)
-        require(prim is not None, f"expected one prim 'def {SCHEMA} \"name\"', got {_shown(line)}")
-        if prim[1]:
-            _metadata(lines)
-        require(next(lines) == b"{", "expected the '{' of the prim")
+        metadata, _, body = text.partition(f"def {SCHEMA}".encode())
+        prims = [line.decode("ascii", "replace")[:60] for line in PRIMS.findall(text)]
+        whole = text.rstrip().endswith(b"\n}") and len(prims) == 1 and body
+        require(whole, f"expected one prim 'def {SCHEMA} \"name\"' and its '}}', got {prims[:3]}")
         axes = UP_AXIS.findall(metadata)
         require(set(axes) <= {b"Y", b"Z"}, f"only y or z up is read, and its upAxis is {axes}")
-        types, values = _attributes(lines)
-        require({"positions", "scales"} <= values.keys(), "the prim has no positions or no scales")
+        found = {
+            name.decode(): (kind.decode(), value.rstrip().removesuffix(b" ("))
+            for kind, name, value in ATTRIBUTE.findall(body)
+        }
+        require({"positions", "scales"} <= found.keys(), "the prim has no positions or no scales")
+        moved = found.get("xformOpOrder", ("", b"[]"))[1] != b"[]"
+        require(not moved, "the prim has a transform")
         for name, kind in TYPES.items():
-            found = types.get(name, kind)
-            require(found == kind, f"{name} should be {kind}, not {found}")
-        arrays = {name: _array(values.get(name, b"[]"), name) for name in ARRAYS}
-        degree = values.get(DEGREE, b"3").decode("ascii", "replace")
-        gaussians = _built(degree, arrays, is_linear(values.get(COLOR_SPACE)), str(file))
+            other = found.get(name, (kind,))[0]
+            require(other == kind, f"{name} should be {kind}, not {other}")
+        arrays = {name: _array(found.get(name, ("", b"[]"))[1], name) for name in ARRAYS}
+        degree = found.get(DEGREE, ("", b"3"))[1].decode("ascii", "replace")
+        linear = any(map(is_linear, COLOR_SPACES.findall(body)))
+        gaussians = _built(degree, arrays, linear, str(file))
         up = axes[0].decode().lower() if axes else USDA_UP
-        found = NOTES.search(metadata)
-        notes = re.findall(rb'"([^"]*)"', found[1]) if found else []
+        said = NOTES.search(metadata)
+        notes = re.findall(rb'"([^"]*)"', said[1]) if said else []
         return _upright(gaussians, up), [note.decode("ascii", "replace") for note in notes]
 
 
 def _text(path: Path) -> bytes:
-    """Return the content of a layer, in a USDZ that of its first file."""
+    """Return the content of a layer, in a USDZ that of its first file, without comments and texts
+    of several lines.
+    """
     data = path.read_bytes()
-    if data[:2] != b"PK":
-        return data
-    with zipfile.ZipFile(io.BytesIO(data)) as archive:
-        first = archive.infolist()[0]
-        stored = first.compress_type == zipfile.ZIP_STORED  # or it may be larger than the file
-        require(stored, "it is a compressed zip archive, which no USDZ may be")
-        return archive.read(first)
+    if data[:2] == b"PK":
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            first = archive.infolist()[0]
+            stored = first.compress_type == zipfile.ZIP_STORED  # or it may be larger than the file
+            require(stored, "it is a compressed zip archive, which no USDZ may be")
+            data = archive.read(first)
+    for quotes in (b'"""', b"'''"):
+        parts = data.split(quotes)
+        require(len(parts) % 2 == 1, "it has a text without an end: it is truncated")
+        data = b'""'.join(parts[::2])
+    magic, _, rest = data.partition(b"\n")
+    return magic + b"\n" + COMMENT.sub(b"", rest)
 
 
 def _upright(gaussians: Gaussians, up: str) -> Gaussians:
@@ -276,60 +284,6 @@ def _of_prim(prim: Any, now: Any, path: Path) -> Gaussians:
     spaces = [space.Get() if space else "", harmonics.GetColorSpace() if harmonics else ""]
     degree, arrays = prim.GetAttribute(DEGREE).Get(), {name: array(name) for name in ARRAYS}
     return _built(str(degree), arrays, any(map(is_linear, spaces)), str(path))
-
-
-# ---- text ----------------------------------------------------------------------------------------
-
-
-def _lines(data: bytes) -> Iterator[bytes]:
-    """Yield the lines of a layer, stripped, without empty ones, comments and the content of texts
-    of several lines.
-    """
-    for quotes in LONG_QUOTES:
-        parts = data.split(quotes)
-        parts[1::2] = [b'""'] * len(parts[1::2])
-        data = b"".join(parts)
-    first, *lines = map(bytes.strip, data.split(b"\n"))
-    yield first
-    yield from (line for line in lines if line and not line.startswith(b"#"))
-
-
-def _attributes(lines: Iterator[bytes]) -> tuple[dict[str, str], dict[str, bytes]]:
-    """Return types and values of the attributes, by name; the prim has to be the last one."""
-    types: dict[str, str] = {}
-    values: dict[str, bytes] = {}
-    while (line := next(lines, b"")) != b"}":
-        declared, _, value = line.partition(b" = ")
-        head = HEAD.fullmatch(declared)
-        said = f"expected an attribute on one line or the prim's '}}', got {_shown(line)}"
-        require(head is not None, said)
-        name = head[2].decode()
-        require(not value or name not in values, f"{name} is given twice")
-        if value:
-            types[name], values[name] = head[1].decode(), value.removesuffix(b" (")
-        if line.endswith(b" ("):
-            metadata = b"\n".join(_metadata(lines))
-            if name == HARMONICS and (space := COLOR_SPACE_OF_ARRAY.search(metadata)):
-                values[COLOR_SPACE] = space[1]
-    require(values.get(TRANSFORM, b"[]") == b"[]", "the prim has a transform")
-    rest = next(lines, b"")
-    require(not rest, f"expected one prim, but after it there is {_shown(rest)}")
-    return types, values
-
-
-def _metadata(lines: Iterator[bytes]) -> list[bytes]:
-    """Return the lines up to the closing parenthesis, none of which may be an attribute."""
-    taken = []
-    while (line := next(lines)) != b")":
-        head = HEAD.fullmatch(line.partition(b" = ")[0])
-        usual = head is None or head[2].decode() not in TYPES
-        require(usual, f"metadata has {_shown(line)}, an attribute of the prim")
-        taken.append(line)
-    return taken
-
-
-def _shown(line: bytes) -> str:
-    return repr(line[:60].decode("ascii", "replace")) if line else "the end of the file"
 
 
 def _built(

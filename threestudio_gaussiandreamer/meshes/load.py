@@ -16,7 +16,6 @@ numbers of corners, colours of vertices or faces, and texture coordinates of ver
 of the corners of faces (MeshLab). There is no standard for its textures: their names are in
 comments ``TextureFile``, which Blender doesn't write."""
 
-import functools
 import io
 import logging
 import re
@@ -61,14 +60,10 @@ END_OF_NAME = re.compile(r"(?<=\.mtl)[\"']?\s+", re.IGNORECASE)
 """Between the names of libraries on one line; names may have spaces."""
 MATERIAL = re.compile(rb"^[ \t]*newmtl[ \t]+(.*?)\s*$", re.MULTILINE)
 MATERIAL_USED = re.compile(rb"^[ \t]*usemtl\b", re.MULTILINE)
-# No text matches one of these patterns in two ways: backtracking on a long line would take
-# quadratic time.
-NUMBER = rb"[-+]?(?:\d+(?:\.\d*)?(?:[eE][-+]?\d+)?|\.\d+(?:[eE][-+]?\d+)?|nan|inf)"
-CORNER = rb"-?[1-9]\d*(?:/(?:-?[1-9]\d*)?){0,2}"
-ENTRY = rb"(?:[ \t]+%b)" % NUMBER
-FIRST_VERTEX = re.compile(rb"^v (.*)$", re.MULTILINE)
+LINE = re.compile(rb"^[ \t]*(v|vt|vn|f)[ \t]+", re.MULTILINE | re.IGNORECASE)
 ROWS_AND_FACES = re.compile(rb"^(v|vt|vn|f) (.*)$", re.MULTILINE)
 RELATIVE_FACE = re.compile(rb"^f .*-", re.MULTILINE)
+ZERO_CORNER = re.compile(rb"^f (?:.*[ /])?0+(?!\d).*", re.MULTILINE)
 
 
 def load_mesh(
@@ -337,7 +332,7 @@ def _parts(path: Path, budget: Budget) -> list[Mesh]:
 
     files, content = _Resolver(path, budget), path.read_bytes()
     if path.suffix.lower() == ".obj":
-        content = files.with_libraries(_checked_obj(utf8(content)))
+        content = files.with_libraries(_plain_obj(utf8(content)))
     elif path.suffix.lower() == ".stl":
         content = _exact_stl(content)
     kind = path.suffix.lower().lstrip(".")
@@ -348,7 +343,10 @@ def _parts(path: Path, budget: Budget) -> list[Mesh]:
         if files.refused:
             raise files.refused
     if path.suffix.lower() == ".off":
-        _add_off_colors(scene, content.decode("utf-8-sig", errors="replace"), path)
+        colors = _off_colors(content.decode("utf-8-sig", errors="replace"))
+        if colors is not None:
+            (geometry,) = scene.geometry.values()
+            geometry.visual.vertex_colors = colors
     parts = []
     for node in scene.graph.nodes_geometry:
         world, name = scene.graph[node]
@@ -357,20 +355,22 @@ def _parts(path: Path, budget: Budget) -> list[Mesh]:
             part = _colored(_surface(geometry, budget), geometry, files)
             if not np.array_equal(world, np.eye(4)):
                 part = part._replace(vertices=part.vertices @ world[:3, :3].T + world[:3, 3])
-            parts.append(_require_fitting(part))
+            of_vertices = [len(x) for x in (part.uv, part.vertex_colors) if x is not None]
+            of_faces = [] if part.face_colors is None else [len(part.face_colors)]
+            usual = {*of_vertices} <= {len(part.vertices)} and {*of_faces} <= {len(part.faces)}
+            require(usual, "it is damaged: its colours don't fit its vertices or faces")
+            parts.append(part)
     return parts
 
 
-def _checked_obj(data: bytes) -> bytes:
-    """Return an OBJ whose lines of vertices and faces are valid, since trimesh stops reading at the
-    first text that isn't a number, and whose faces count from the first vertex.
+def _plain_obj(data: bytes) -> bytes:
+    """Return an OBJ in which lines of vertices and faces begin as trimesh expects it, and whose
+    faces count from the first vertex, as trimesh reads relative numbers from the last one.
     """
     text = data.replace(b"\\\r\n", b"").replace(b"\\\n", b"")
-    first = FIRST_VERTEX.search(text)
-    if wrong := _wrong_obj_line(len(first[1].split()) if first else 3).search(text):
-        number = text.count(b"\n", 0, wrong.start()) + 1
-        shown = repr(wrong[0][:80].decode(errors="replace"))
-        raise Unreadable(f"line {number} is no vertex or face: {shown}")
+    text = LINE.sub(lambda found: found[1].lower() + b" ", text)
+    wrong = ZERO_CORNER.search(text)
+    require(wrong is None, f"vertices are counted from 1: {wrong and wrong[0][:80]!r}")
     if not RELATIVE_FACE.search(text):
         return text
     counts = {b"v": 0, b"vt": 0, b"vn": 0}
@@ -391,20 +391,6 @@ def _checked_obj(data: bytes) -> bytes:
     return ROWS_AND_FACES.sub(line, text)
 
 
-@functools.cache
-def _wrong_obj_line(width: int) -> re.Pattern[bytes]:
-    """Return a pattern of lines that begin like a vertex or face but are not valid.
-
-    A vertex has 3 numbers, or 6 with its colour. If the first vertex has 4 (with a weight) or 7
-    (with alpha), all must have as many: trimesh splits the numbers of all vertices into rows of the
-    first one's width without checking each line."""
-    vertex = b"%b{%d}" % (ENTRY, width) if width in (4, 7) else b"%b{3}(?:%b{3})?" % (ENTRY, ENTRY)
-    right = rb"v(?= )%b|vt(?= )%b{2,3}|vn(?= )%b{3}|vp .*|f(?= )(?:[ \t]+%b){3,}"
-    right %= vertex, ENTRY, ENTRY, CORNER
-    line = rb"^(?=[ \t]*[vf])(?!(?:%b)[ \t]*\r?$).*$" % right
-    return re.compile(line, re.MULTILINE | re.IGNORECASE)
-
-
 def _exact_stl(data: bytes) -> bytes:
     """Return a binary STL without what follows its last triangle, and an STL of text as it is."""
     if b"facet" in data[:1024] or b"endsolid" in data[:1024]:
@@ -415,32 +401,19 @@ def _exact_stl(data: bytes) -> bytes:
     return data[:size]
 
 
-def _add_off_colors(scene: Any, text: str, path: Path) -> None:
-    """Set the colours of an OFF file's vertices, which trimesh doesn't read; log a warning for
-    others, such as those of faces.
+def _off_colors(text: str) -> Optional[np.ndarray]:
+    """Return the colours of an OFF file's vertices as bytes, written from 0 to 1 or to 255, which
+    trimesh doesn't read; None if not every vertex has one.
     """
     words = (line.partition("#")[0].split() for line in text.splitlines())
     (kind, *counts), *lines = filter(None, words)
-    (vertices, faces, *_), *lines = [counts, *lines] if counts else lines
-    rows, polygons = lines[: int(vertices)], lines[int(vertices) :][: int(faces)]
-    colors = _rgb_of([row[3:] for row in rows]) if kind.upper() in ("OFF", "COFF") else None
-    has_more = "C" in kind.upper() or kind.upper() == "OFF" and any(len(row) > 3 for row in rows)
-    of_faces = any(len(polygon) > int(polygon[0]) + 1 for polygon in polygons)
-    if of_faces or has_more and colors is None:
-        said = "%s: the colours of its %s aren't read; convert it to PLY to keep them"
-        log.warning(said, path, "faces" if of_faces else "vertices")
-    if colors is not None:
-        (geometry,) = scene.geometry.values()
-        geometry.visual.vertex_colors = colors
-
-
-def _rgb_of(rows: list[list[str]]) -> Optional[np.ndarray]:
-    """Return colours, written from 0 to 1 or to 255, as bytes; None if not every row has one."""
+    (vertices, *_), *lines = [counts, *lines] if counts else lines
     try:
-        colors = np.array([row[:3] for row in rows], float).reshape(-1, 3)
+        rows = [row[3:6] for row in lines[: int(vertices)]]
+        colors = np.array(rows, float).reshape(len(rows), 3)
     except ValueError:  # of other lengths, or no numbers
         return None
-    if len(colors) < len(rows) or not np.isfinite(colors).all():
+    if kind.upper() not in ("OFF", "COFF") or not np.isfinite(colors).all():
         return None
     return (colors * (255 if colors.max() <= 1 else 1)).round().clip(0, 255).astype(np.uint8)
 
@@ -542,17 +515,3 @@ def _with_material(part: Mesh, visual: Any, files: _Resolver) -> Mesh:
         return part
     uv = np.nan_to_num(np.asarray(visual.uv, dtype=np.float32)[:, :2])
     return part._replace(uv=uv.clip(-LARGEST_UV, LARGEST_UV), texture=texture)
-
-
-def _require_fitting(part: Mesh) -> Mesh:
-    """Return the part after checking that its colours have one row per vertex or face."""
-    count = {
-        "uv": (len(part.vertices), 2),
-        "vertex_colors": (len(part.vertices), 3),
-        "face_colors": (len(part.faces), 3),
-    }
-    for name, shape in count.items():
-        found = np.shape(shape if (values := getattr(part, name)) is None else values)
-        usual = values is None or found == shape
-        require(usual, f"it is damaged: its {name} are {found}, {shape} was expected")
-    return part

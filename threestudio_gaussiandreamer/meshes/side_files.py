@@ -25,19 +25,15 @@ from ..formats.reading import BYTES_PER_FILE_BYTE, Unreadable, require
 
 log = logging.getLogger(__name__)
 
-FIXED_BYTES = 640 << 20
+FIXED_BYTES = 1 << 30
 """Budget of every file: one texture of 8192 x 8192, or three million triangles. There are
 ``BYTES_PER_FILE_BYTE`` per byte of the file in addition.
 """
-BYTES_PER_TEXEL = 8
+BYTES_PER_TEXEL = 14
 BYTES_PER_VERTEX = 200
 BYTES_PER_FACE = 150
 """Peak memory while a part is decoded, merged, cleaned and transformed."""
 FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "GIF", "TGA", "TIFF")
-ROWS_AT_ONCE = 256
-"""Rows converted at a time, which limits the peak memory to two copies of the image, not four."""
-ENCODINGS = ("latin-1", "cp1252", "cp1250", "cp1251", "gb18030", "shift_jis", "cp949", "big5")
-"""Of names in files that aren't UTF-8."""
 consulted: dict[str, Optional[tuple[int, int]]] = {}
 """The ``stamp`` of every file that a mesh has named, by path; the prior's cache reads and clears
 it."""
@@ -82,28 +78,19 @@ def stamp(path: str | Path) -> Optional[tuple[int, int]]:
 
 
 def utf8(text: bytes) -> bytes:
-    """Return a text in UTF-8, without a byte order mark; one in an encoding without a mark becomes
-    one character per byte, from which ``SideFiles`` finds the files that it names.
+    """Return a text in UTF-8, without a byte order mark; one that is neither UTF-8 nor UTF-16 is
+    read as Latin-1.
     """
     if text[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE):
         return text.decode("utf-16", "replace").encode()
     try:
-        text.decode()
+        return text.decode("utf-8-sig").encode()
     except UnicodeDecodeError:
         return text.decode("latin-1").encode()
-    return text.removeprefix(codecs.BOM_UTF8)
 
 
 def _plain(name: str) -> str:
     return unicodedata.normalize("NFC", urllib.parse.unquote(name)).casefold()
-
-
-def _spellings(name: str) -> set[str]:
-    """Return how a mesh file may spell the name of a file, apart from case and accents' form."""
-    name = unicodedata.normalize("NFC", name)
-    raw = [name.encode(encoding, "backslashreplace") for encoding in ENCODINGS]
-    texts = (x.decode(y, "backslashreplace") for x in raw for y in ("latin-1", "utf-8"))
-    return {_plain(x) for x in (name, *texts)}
 
 
 class SideFiles:
@@ -118,7 +105,7 @@ class SideFiles:
 
         Names are relative to the mesh's folder and may have the separators of Windows, quotes and
         escaped spaces. If there is no such file, one with the same base name next to the mesh is
-        read, else one whose name differs in case, accents' form, percent-encoding or encoding.
+        read, else one whose name differs in case, accents' form or percent-encoding.
 
         Raises:
             Unreadable: it is no regular file (a FIFO would block), or can't be read.
@@ -142,7 +129,7 @@ class SideFiles:
         for place in found:
             with contextlib.suppress(OSError, ValueError):
                 beside = sorted(place.parent.iterdir())
-                yield from (x for x in beside if _plain(place.name) in _spellings(x.name))
+                yield from (x for x in beside if _plain(place.name) == _plain(x.name))
 
     def _content(self, path: Path) -> bytes:
         consulted[str(path)] = stamp(path)
@@ -197,18 +184,9 @@ def decode_image(image: Any, name: str, budget: Budget) -> UInt8[np.ndarray, "H 
     """Decode an image that Pillow has opened but not yet loaded."""
     size = f"the texture {name} of {image.width} x {image.height} texels"
     budget.spend(BYTES_PER_TEXEL * image.width * image.height, size)
-    texels = np.empty((image.height, image.width, 3), np.uint8)
     with _pillow_errors(name):
-        image.load()
-        for top in range(0, image.height, ROWS_AT_ONCE):
-            bottom = min(top + ROWS_AT_ONCE, image.height)
-            texels[top:bottom] = _rgb(image.crop((0, top, image.width, bottom)))
-    return texels
-
-
-def _rgb(image: Any) -> np.ndarray:
-    """Return (H, W, 3), or (H, W, 1) for one channel of 16 bits, which Pillow would clip at 255."""
-    if image.mode.startswith("I"):
-        values = np.asarray(image).astype(np.int64).clip(0, 65535)
-        return ((values * 255 + 32767) // 65535)[..., None]
-    return np.asarray(image.convert("RGB"))
+        if not image.mode.startswith("I"):
+            return np.array(image.convert("RGB"))
+        values = np.asarray(image).astype(np.int64).clip(0, 65535)  # Pillow would clip at 255
+        texels = ((values * 255 + 32767) // 65535).astype(np.uint8)
+        return np.repeat(texels[..., None], 3, axis=2)
