@@ -10,7 +10,6 @@ import torch
 from threestudio_gaussiandreamer.cameras import orbit_c2w, to_opencv
 from threestudio_gaussiandreamer.core.streams import generator
 from threestudio_gaussiandreamer.gaussians import importance
-from threestudio_gaussiandreamer.gaussians.densify import Rules, Statistics, densify_and_prune
 from threestudio_gaussiandreamer.splatting import rasterize
 from threestudio_gaussiandreamer.training.density import DensityControl
 from threestudio_gaussiandreamer.training.geometry import GaussianCloud
@@ -206,33 +205,6 @@ def test_a_gaussian_over_its_own_colour_has_no_removal_error():
     assert removal[0] < 1e-3 * removal[2]
 
 
-def test_pruning_after_densifying_keeps_track_of_rows():
-    geometry = cloud(10)
-    params = geometry.parameters_by_name()
-    stats = Statistics(torch.ones(10), geometry.contribution)
-    first = densify_and_prune(params, stats, Rules(min_opacity=0.0), generator(0, "s"))
-    both = importance.keep_highest(first.values, geometry.contribution[first.parents], 7, first)
-    assert len(both.parents) == len(both.is_new) == 7
-    untouched = ~both.is_new
-    assert torch.equal(both.values["sh0"][untouched], params["sh0"][both.parents[untouched]])
-    assert (both.parents[both.is_new] < 10).all()
-
-
-@pytest.mark.parametrize("needed", [1, 79, 80, 81, 90, 99, 100])
-def test_bisection_finds_the_smallest_count_that_holds(needed):
-    contribution = torch.linspace(0.0, 0.4, 100)
-    asked = []
-
-    def holds(kept):
-        asked.append(int(kept.sum()))
-        assert kept[-asked[-1] :].all()  # the best ones
-        return asked[-1] >= needed
-
-    count = importance.smallest_count(contribution, 80, holds)
-    assert max(needed, 80) <= count <= max(needed, 80) + 20 / 2**importance.BISECTIONS + 1
-    assert len(asked) <= importance.BISECTIONS + 1
-
-
 @pytest.mark.parametrize(
     ("saved", "count"),
     [(0.0, 80), (0.5, 80), (0.95, 95), (1.5, 100)],
@@ -255,15 +227,6 @@ def test_auto_drops_idle_gaussians_also_where_a_round_costs_too_much():
     assert importance.needed_count(torch.arange(100.0), removal, 7.0, 0.5, 0.8).count == 90
     removal[:50] = 1e-4
     assert importance.needed_count(torch.arange(100.0), removal, 7.0, 0.5, 0.8).count == 80
-
-
-def test_a_smaller_gain_keeps_more():
-    removal = torch.linspace(1e-3, 1e-1, 100)
-    counts = [
-        importance.needed_count(removal, removal, 100.0, gain, 0.5).count
-        for gain in (0.01, 0.25, 0.5, 1.0, 5.0)
-    ]
-    assert counts == sorted(counts, reverse=True) and counts[0] > counts[-1]
 
 
 @pytest.mark.parametrize(("count", "keep"), [(1, 0.8), (2, 0.99), (3, 1e-6)])

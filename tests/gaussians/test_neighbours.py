@@ -1,13 +1,10 @@
-"""The nearest neighbours are those of all distances, in memory of a chunk at a time."""
-
-import tracemalloc
+"""The nearest neighbours are those of all distances."""
 
 import numpy as np
 import pytest
 
 from threestudio_gaussiandreamer.gaussians import neighbours
-from threestudio_gaussiandreamer.gaussians.grow import nearest_distance_scales
-from threestudio_gaussiandreamer.gaussians.neighbours import NeighbourSearch, spatial_order
+from threestudio_gaussiandreamer.gaussians.neighbours import NeighbourSearch
 
 
 def cloud(count, dimensions=3, seed=0):
@@ -46,21 +43,3 @@ def test_queries_beyond_the_reach_have_no_neighbour(monkeypatch):
     assert np.allclose(found[near], apart.min(axis=1)[near])
     assert np.isinf(found[~near]).all() and (rows[~near] == -1).all()
     assert len(NeighbourSearch(points).nearest(queries[:0], 0.5)[0]) == 0
-
-
-def test_points_in_order_are_near_each_other():
-    """Also if a few of them lie far away, which stretches their box."""
-    points = np.concatenate([cloud(20_000), 1e6 * cloud(20)])
-    order = spatial_order(points)
-    assert sorted(order.tolist()) == list(range(len(points)))
-    steps = np.linalg.norm(np.diff(points[order], axis=0), axis=1)
-    assert np.median(steps) < 0.3 * np.median(np.linalg.norm(np.diff(points, axis=0), axis=1))
-
-
-def test_initial_scales_take_memory_of_a_few_copies_of_the_points():
-    points = cloud(400_000)
-    tracemalloc.start()
-    nearest_distance_scales(points)
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert peak < 8 * points.nbytes

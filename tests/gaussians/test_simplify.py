@@ -115,11 +115,21 @@ def test_a_large_cloud_that_no_view_shows_is_a_named_error(monkeypatch):
         simplify(hidden, Budget(count=200), recovery(hidden, 48))
 
 
-def test_a_large_cloud_keeps_what_its_images_need(monkeypatch):
+@pytest.mark.parametrize("needed", [1, 79, 81, 400, 600])
+def test_a_large_cloud_is_pruned_at_once_to_what_its_images_need(monkeypatch, needed):
     monkeypatch.setattr(simplifying, "LARGE", 100)
-    monkeypatch.setattr(simplifying, "LOSSLESS", 200.0)  # beyond what any change leaves
-    cloud, tried = ball(), []
-    kept = recovery(cloud, 48)
-    monkeypatch.setattr(kept, "quality", lambda fewer: tried.append(len(fewer.means)) or 0.0)
-    assert len(simplify(cloud, Budget(psnr=99.0), kept).means) == len(cloud.means)
-    assert min(tried) == 1
+    cloud, asked, least = ball(), [], max(needed, 80)
+    kept = recovery(cloud, 16)
+
+    def quality(fewer):
+        asked.append(len(fewer.means))
+        return 99.0 if asked[-1] >= needed else 0.0
+
+    def rank(cloud, views, seed):
+        assert least <= len(cloud.means) <= least + 520 / 2**simplifying.BISECTIONS + 1
+        raise StopIteration
+
+    monkeypatch.setattr(kept, "quality", quality)
+    with pytest.raises(StopIteration):
+        simplify(cloud, Budget(count=80), kept, rank=rank)
+    assert len(asked) <= simplifying.BISECTIONS + 1

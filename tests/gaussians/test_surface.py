@@ -1,13 +1,10 @@
-"""The mesh of a cloud: closed, oriented outwards, at the Gaussians, with their colours; and as
-exported by a run.
-"""
+"""The mesh of a cloud: closed, oriented outwards, at the Gaussians, with their colours."""
 
 import numpy as np
 import pytest
 
 from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
 from threestudio_gaussiandreamer.gaussians.surface import gaussian_surface, surface_nets
-from threestudio_gaussiandreamer.meshes.write import write_obj
 
 trimesh = pytest.importorskip("trimesh")
 CENTER = np.array([0.3, 0.0, -0.2])
@@ -102,12 +99,3 @@ def test_turned_and_flat_gaussians_lie_along_their_axes():
     along, across = (np.sqrt(0.5) * np.array([1, 0, sign]) for sign in (1, -1))
     assert np.abs(vertices @ along).max() == pytest.approx(reach[0], abs=0.02)
     assert np.abs(vertices @ across).max() == pytest.approx(reach[1], abs=0.01)
-
-
-def test_other_programs_read_the_file(tmp_path):
-    surface = gaussian_surface(ball(count=500), resolution=16)
-    write_obj(tmp_path / "model.obj", surface)
-    mesh = trimesh.load(tmp_path / "model.obj", process=False)
-    assert isinstance(mesh, trimesh.Trimesh) and len(mesh.faces) == len(surface.faces)
-    np.testing.assert_allclose(mesh.vertices, surface.vertices, rtol=1e-5, atol=1e-5)
-    np.testing.assert_allclose(mesh.visual.vertex_colors[:, :3] / 255, surface.colors, atol=1 / 255)

@@ -95,22 +95,21 @@ def _rotate_sh(
 ) -> Float[np.ndarray, "N K 3"]:
     """Rotate harmonics: the result has in direction R d the value of ``sh`` in direction d."""
     degree = round(sh.shape[1] ** 0.5) - 1
-    if degree == 0:
-        return sh
     if degree > MAX_DEGREE:
         raise UserError(
             f"spherical harmonics of degree {degree} can't be converted to other axes: degree "
             f"{MAX_DEGREE} is the highest"
         )
+    if degree == 0:
+        return sh
     matrix = _sh_rotation(tuple(map(tuple, rotation.tolist())), degree)
     return np.einsum("lk,nkc->nlc", matrix, sh).astype(np.float32)
 
 
 @cache
 def _sh_rotation(rotation: tuple[tuple[float, ...], ...], degree: int) -> Float[np.ndarray, "K K"]:
-    """Compute the matrix that rotates coefficients, by least squares over random directions.
-
-    The fit is exact: rotated harmonics of a degree are linear combinations of that degree's.
+    """Compute the matrix that rotates coefficients, by least squares over random directions, which
+    is exact: rotated harmonics of a degree are linear combinations of that degree's.
     """
     directions = np.random.default_rng(0).normal(size=(64, 3))
     rotated, original = (

@@ -2,8 +2,7 @@
 and its statistics.
 
 A :class:`Change` gives for every new row the old row that it comes from and whether the Gaussian is
-new. Parameters, optimiser moments and statistics are then updated by one gather each, so a
-Gaussian keeps its moments.
+new, so that a Gaussian keeps its moments.
 
 Statistics are per view and unscaled. ``gradient`` is the norm of the loss's gradient with respect
 to the projected centre in normalised device units (half the image is 1), of the loss of one view
@@ -88,30 +87,16 @@ def densify_and_prune(
     low opacities are dropped, and ``min_gaussians``.
     """
     faint = torch.sigmoid(params["logit_opacities"].detach()) < rules.min_opacity
-    above_threshold = (stats.gradient > rules.grad_threshold) & ~faint
-    room = rules.max_gaussians - int((~faint).sum())
-    above_threshold &= _affordable(above_threshold, stats.gradient, room)
+    chosen = (stats.gradient > rules.grad_threshold) & ~faint
+    # each clone or split adds one; where there is no room for all, those with the largest gradients
+    room = max(rules.max_gaussians - int((~faint).sum()), 0)
+    ranked = torch.where(chosen, stats.gradient, torch.full_like(stats.gradient, -1.0))
+    chosen[torch.argsort(ranked, descending=True, stable=True)[room:]] = False
     large = params["log_scales"].exp().amax(-1) > rules.split_scale
-    selected = {"clone": above_threshold & ~large, "split": above_threshold & large}
-    change = clone_and_split(params, **selected, rng=rng)
+    change = clone_and_split(params, clone=chosen & ~large, split=chosen & large, rng=rng)
     huge = change.values["log_scales"].exp().amax(-1) > rules.max_scale
     rows = change.parents
     return keep(change, ~(faint[rows] | huge), stats.contribution[rows], rules)
-
-
-def _affordable(
-    above_threshold: Bool[Tensor, " N"], gradient: Float[Tensor, " N"], room: int
-) -> Bool[Tensor, " N"]:
-    """Select at most ``room`` of the rows above the threshold, those with the largest gradients;
-    each clone or split adds one Gaussian.
-    """
-    if int(above_threshold.sum()) <= room:
-        return above_threshold
-    ranked = torch.where(above_threshold, gradient, torch.full_like(gradient, -1.0))
-    order = torch.argsort(ranked, descending=True, stable=True)
-    chosen = torch.zeros_like(above_threshold)
-    chosen[order[: max(room, 0)]] = True
-    return chosen
 
 
 def clone_and_split(
@@ -141,8 +126,7 @@ def keep(
     """Drop the unwanted rows, but keep at least ``min_gaussians`` and at most ``max_gaussians``,
     those with the largest contribution.
     """
-    # two stable sorts: every wanted row before every unwanted one, so that the floor is filled from
-    # the best unwanted rows
+    # every wanted row before every unwanted one, so that the floor is filled from the best of these
     rank = torch.argsort(contribution, descending=True, stable=True)
     rank = rank[torch.argsort(wanted[rank].int(), descending=True, stable=True)]
     left, floor = int(wanted.sum()), min(rules.min_gaussians, len(wanted))
@@ -150,16 +134,23 @@ def keep(
         few = "only %d of %d Gaussians would be left: the %d that contribute most stay (%s)"
         logger.warning(few, left, len(wanted), floor, "min_gaussians")
     count = min(max(left, floor), rules.max_gaussians)
-    rows = rank[:count].sort().values
+    return select(change, rank[:count].sort().values)
+
+
+def highest(scores: Float[Tensor, " N"], count: int) -> Int[Tensor, " M"]:
+    """Return the rows with the ``count`` highest scores, in ascending order."""
+    return torch.argsort(scores, descending=True, stable=True)[:count].sort().values
+
+
+def select(change: Change, rows: Int[Tensor, " M"]) -> Change:
+    """Keep some rows of a change."""
     values = {name: value[rows] for name, value in change.values.items()}
     return Change(change.parents[rows], change.is_new[rows], values)
 
 
 def prune_to(params: Mapping[str, Tensor], scores: Float[Tensor, " N"], count: int) -> Change:
     """Keep the ``count`` Gaussians with the highest scores, in their order."""
-    everything = unchanged(params)
-    rules = Rules(max_gaussians=count, min_gaussians=min(count, len(scores)))
-    return keep(everything, torch.ones_like(everything.is_new), scores, rules)
+    return select(unchanged(params), highest(scores, count))
 
 
 def unchanged(params: Mapping[str, Tensor]) -> Change:
@@ -204,17 +195,10 @@ def update_optimizer(
         for param in group["params"]:
             if id(param) in replaced and param in optimizer.state:
                 state = optimizer.state.pop(param)
-                moved = {key: _rows(value, param, change) for key, value in state.items()}
-                optimizer.state[replaced[id(param)]] = moved
+                for key, value in state.items():
+                    # others, such as Adam's step and Adafactor's mean over Gaussians, stay
+                    if isinstance(value, Tensor) and value.shape[:1] == param.shape[:1]:
+                        state[key] = value[change.parents]
+                        state[key][change.is_new] = 0
+                optimizer.state[replaced[id(param)]] = state
         group["params"] = [replaced.get(id(param), param) for param in group["params"]]
-
-
-def _rows(value: object, old: nn.Parameter, change: Change) -> object:
-    """Gather the rows of a state tensor with a row per Gaussian; anything else (Adam's step,
-    Adafactor's mean over Gaussians) stays.
-    """
-    if not isinstance(value, Tensor) or value.shape[:1] != old.shape[:1]:
-        return value
-    rows = value[change.parents]
-    rows[change.is_new] = 0
-    return rows

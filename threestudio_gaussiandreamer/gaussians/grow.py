@@ -2,15 +2,14 @@
 Algorithm 1.
 
 Stage 1 draws points uniformly in the bounding box of the prior's points; stage 2 keeps those nearer
-than a radius to one of them and gives each the colour of that point plus noise; stage 3 takes the
-distance to the nearest point as the size of the Gaussian. Lengths are relative to the size of the
-cloud, so the result doesn't depend on its unit."""
+than a radius to one of them, with that point's colour plus noise; stage 3 takes the distance to the
+nearest point as the size of the Gaussian. Lengths are relative to the size of the cloud."""
 
 import logging
 from typing import Optional
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from .neighbours import NeighbourSearch
 from .point_cloud import PointCloud
@@ -21,16 +20,11 @@ SCALE_RULES = {"nearest": 1, "rms3": 3}
 """Number of neighbours over which each rule for the initial scales averages."""
 ISOLATED_FACTOR = 10.0
 """A point is isolated if its nearest neighbour is farther away than this many times the 99th
-percentile of such distances; its scale is capped at that length.
-"""
+percentile of such distances; its scale is capped at that length."""
 FLOOR_FRACTION = 1e-4
-"""Distances below this fraction of the median are taken for rounding errors between copies of a
-point.
-"""
+"""Distances below this fraction of the median are rounding errors between copies of a point."""
 FEW_POINTS_FRACTION = 0.1
-"""Scale of each Gaussian, in units of the bounding radius, if there are fewer than four distinct
-points.
-"""
+"""Scale, in units of the bounding radius, of the Gaussians on fewer than four distinct points."""
 
 
 def grow(
@@ -58,11 +52,15 @@ def grow(
     """
     points = np.asarray(cloud.points, np.float64)
     first, group, _ = distinct(points)  # trees are slow with many copies of one point
-    search = NeighbourSearch(points[first])
-    # One isolated point far away would stretch the box, and the radius with it.
-    typical = points[~_isolated(search)[group]]
+    search, typical = NeighbourSearch(points[first]), points
+    if len(first) >= 4:  # one isolated point far away would stretch the box, and the radius with it
+        apart = _neighbour_distances(search, 1)
+        typical = points[(apart <= _isolation_cap(apart))[group]]
     reach = radius * (longest_side(typical) or 1.0)  # a single point has no size: one world unit
-    candidates = generator.uniform(*growing_box(typical, reach), size=(num_candidates, 3))
+    low, high = typical.min(axis=0), typical.max(axis=0)
+    # each side is at least twice the reach, so that points also grow off the plane of a flat cloud
+    padding = np.maximum(reach - (high - low) / 2, 0.0)
+    candidates = generator.uniform(low - padding, high + padding, size=(num_candidates, 3))
     distances, nearest = search.nearest(candidates, reach)
     kept = np.flatnonzero(distances < reach)
     found = "growing: %d of %d candidates lie within %.4g of %d points"
@@ -80,17 +78,6 @@ def grow(
 def longest_side(points: Float[np.ndarray, "P 3"]) -> float:
     """Return the longest side of the bounding box, in the unit of the points."""
     return float(np.ptp(np.asarray(points, np.float64), axis=0).max())
-
-
-def growing_box(
-    points: Float[np.ndarray, "P 3"], reach: float
-) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
-    """Return the bounding box (low, high), with each side at least ``2 * reach``, so that points
-    also grow off the plane of a flat cloud.
-    """
-    low, high = points.min(axis=0), points.max(axis=0)
-    padding = np.maximum(reach - (high - low) / 2, 0.0)
-    return low - padding, high + padding
 
 
 def nearest_distance_scales(
@@ -115,8 +102,12 @@ def nearest_distance_scales(
         radius = np.linalg.norm(points - middle, axis=1).max() or 1.0  # in one place: the unit
         scales = np.full(len(points), FEW_POINTS_FRACTION * radius)
     else:
-        search = NeighbourSearch(points[first])
-        distances = _bounded(_neighbour_distances(search, SCALE_RULES[rule]))
+        distances = _neighbour_distances(NeighbourSearch(points[first]), SCALE_RULES[rule])
+        cap = _isolation_cap(distances)
+        if count := int((distances > cap).sum()):
+            isolated = "%d of %d points are isolated: the size of their Gaussians is capped at %.4g"
+            logger.warning(isolated, count, len(distances), cap)
+        distances = distances.clip(FLOOR_FRACTION * np.median(distances), cap)
         distances[copies > 1] = np.median(distances)
         scales = distances[group]
     limits = np.finfo(np.float32)
@@ -147,27 +138,6 @@ def _neighbour_distances(search: NeighbourSearch, neighbours: int) -> Float[np.n
         others = found.distances[:, 1:]  # column 0 is the point itself
         distances[found.rows] = np.sqrt(np.mean(others**2, axis=1))
     return distances
-
-
-def _isolated(search: NeighbourSearch) -> Bool[np.ndarray, " D"]:
-    """Mark the distinct points whose nearest other point is beyond ``ISOLATED_FACTOR`` times the
-    99th percentile of such distances; none of fewer than four.
-    """
-    if len(search.order) < 4:
-        return np.zeros(len(search.order), bool)
-    distances = _neighbour_distances(search, 1)
-    return distances > _isolation_cap(distances)
-
-
-def _bounded(distances: Float[np.ndarray, " D"]) -> Float[np.ndarray, " D"]:
-    """Clamp distances to the cap for isolated points, and from below for points that are copies up
-    to rounding.
-    """
-    cap = _isolation_cap(distances)
-    if count := int((distances > cap).sum()):
-        capped = "%d of %d points are isolated: the first size of their Gaussians is capped at %.4g"
-        logger.warning(capped, count, len(distances), cap)
-    return distances.clip(FLOOR_FRACTION * np.median(distances), cap)
 
 
 def _isolation_cap(distances: Float[np.ndarray, " D"]) -> float:

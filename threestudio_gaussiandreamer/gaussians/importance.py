@@ -18,17 +18,15 @@ ground truth than they are worth: :func:`needed_count`.
 """
 
 import math
-from collections.abc import Callable, Mapping
 from typing import NamedTuple, Optional
 
 import torch
-from jaxtyping import Bool, Float, Int8
+from jaxtyping import Float, Int8
 from torch import Tensor
 
 from ..core.distributed import all_sum, draw_shared
 from ..core.given_gradient import given_gradient
 from ..core.host_copies import to_device
-from .densify import Change, prune_to
 
 SAMPLES = 12
 """Approximate number of samples of the removal error per round; each costs a backward pass."""
@@ -39,15 +37,6 @@ recovers any of it; and the power of that cost with which the gain grows. Measur
 """
 IDLE = 0.01
 """Share of an equal part of the error, E / N, that a Gaussian must save to be worth keeping."""
-BISECTIONS = 4
-"""Bisection steps of :func:`smallest_count`: the count is found to within 1/16 of its range."""
-
-
-class VisibilityStats(NamedTuple):
-    """Statistics of the views since the last round, per Gaussian."""
-
-    contribution: Float[Tensor, " N"]
-    removal: Float[Tensor, " N"]
 
 
 class AddedBackground(NamedTuple):
@@ -59,11 +48,12 @@ class AddedBackground(NamedTuple):
     """May be negative."""
 
 
-def importance(stats: VisibilityStats) -> Float[Tensor, " N"]:
+def importance(
+    contribution: Float[Tensor, " N"], removal: Float[Tensor, " N"]
+) -> Float[Tensor, " N"]:
     """Return the importance of each Gaussian; the lowest are pruned first."""
-    if not stats.removal.any():  # no step has sampled the removal error
-        return stats.contribution
-    return stats.removal.sqrt() * stats.contribution
+    # of the contribution alone where no step has sampled the removal error
+    return removal.sqrt() * contribution if removal.any() else contribution
 
 
 def removal_error(
@@ -86,8 +76,13 @@ def removal_error(
         opacities: the tensor that they were rendered with.
         added: a background that the views had but ``images`` don't show.
     """
-    signs = draw_shared(len(images), lambda count: _draw_signs((count, *images.shape[1:]), rng))
-    signs = to_device(signs, images.device).to(images)
+
+    def draw(count: int) -> Int8[Tensor, "count H W C"]:
+        # the numbers of 2 * torch.randint(0, 2, shape) - 1 in less time
+        bits = torch.empty((count, *images.shape[1:]), dtype=torch.bool).random_(generator=rng)
+        return bits.view(torch.int8).mul_(2).sub_(1)
+
+    signs = to_device(draw_shared(len(images), draw), images.device).to(images)
     # of the sum of signed pixels only the gradient is needed
     zero = images.new_zeros(())
     total = given_gradient(images, signs, zero)
@@ -99,12 +94,6 @@ def removal_error(
     return (opacities.detach() * gradients).square().nan_to_num(nan=0.0)
 
 
-def _draw_signs(shape: tuple[int, ...], rng: torch.Generator) -> Int8[Tensor, "*shape"]:
-    """Draw -1 and 1: the numbers of ``2 * torch.randint(0, 2, shape) - 1`` in less time."""
-    bits = torch.empty(shape, dtype=torch.bool).random_(generator=rng)
-    return bits.view(torch.int8).mul_(2).sub_(1)
-
-
 def _sum_of_products(
     a: Float[Tensor, "B H W C"], b: Float[Tensor, "B #H #W C"]
 ) -> Float[Tensor, "B H W 1"]:
@@ -114,13 +103,6 @@ def _sum_of_products(
         at = slice(channel, channel + 1)
         total.addcmul_(a[..., at], b[..., at])
     return total
-
-
-def next_count(count: int, keep: float, budget: int) -> int:
-    """Return the count after a round that keeps the fraction ``keep``, but not fewer than
-    ``budget`` or more than ``count``.
-    """
-    return min(count, max(budget, int(keep * count)))
 
 
 class Need(NamedTuple):
@@ -170,51 +152,3 @@ def needed_count(
     share = min(max(cost / wanted, keep), 1.0)
     count = max(here - drop, min(int(share * here), busy))
     return Need(count, 0.5 * (cost / SLOPE) ** POWER, share == 1.0)
-
-
-def smallest_count(
-    scores: Float[Tensor, " N"], least: int, acceptable: Callable[[Bool[Tensor, " N"]], bool]
-) -> int:
-    """Find by bisection the smallest count, at least ``least``, with acceptable quality.
-
-    Args:
-        scores: the Gaussians with the highest scores are kept.
-        acceptable: returns whether the quality is acceptable when only the marked Gaussians are
-            drawn; assumed to be monotone in the count, called at most ``BISECTIONS + 1`` times.
-    """
-    order = torch.argsort(scores, descending=True, stable=True)
-    high = len(scores)
-    low = min(high, least)
-    if low == high or acceptable(mark_first(order, low)):
-        return low
-    for _ in range(BISECTIONS):
-        middle = (low + high) // 2
-        low, high = (low, middle) if acceptable(mark_first(order, middle)) else (middle, high)
-    return high
-
-
-def mark_first(order: Tensor, count: int) -> Bool[Tensor, " N"]:
-    """Return a mask of the first ``count`` rows in ``order``."""
-    marked = torch.zeros_like(order, dtype=torch.bool)
-    marked[order[:count]] = True
-    return marked
-
-
-def keep_highest(
-    params: Mapping[str, Tensor],
-    scores: Float[Tensor, " N"],
-    count: int,
-    first: Change | None = None,
-) -> Change:
-    """Return the change that keeps the ``count`` rows of ``params`` with the highest scores, in
-    their order.
-
-    Args:
-        first: an earlier change that resulted in ``params``; the two are composed.
-    """
-    change = prune_to(params, scores, count)
-    return (
-        change
-        if first is None
-        else Change(first.parents[change.parents], first.is_new[change.parents], change.values)
-    )

@@ -51,9 +51,8 @@ class _Shapes(NamedTuple):
     log_scales: Float[Tensor, "N 3"]
     """At least ``LOG_THINNEST`` below the largest."""
     quats: Float[Tensor, "N 4"]
-    traces: Float[Tensor, " N"]
-    """Of the covariances."""
     log_determinants: Float[Tensor, " N"]
+    """Of the covariances."""
     opacities: Float[Tensor, " N"]
     areas: Float[Tensor, " N"]
     """The mean cross-sections, without a common factor."""
@@ -113,11 +112,8 @@ def _shapes(params: Mapping[str, Tensor]) -> _Shapes:
     harmonics = params["sh0"] if "sh0" in params else params["sh"]
     colors = C0 * harmonics[:, 0].detach().cpu().double()
     areas = (log_scales.sum(1) * (2 / 3)).exp()
-    weights = opacities * areas
-    traces = (2 * log_scales).exp().sum(1)
-    log_determinants = 2 * log_scales.sum(1)
-    sizes = (traces, log_determinants)
-    return _Shapes(means, log_scales, quats, *sizes, opacities, areas, weights, colors)
+    opaque = opacities, areas, opacities * areas
+    return _Shapes(means, log_scales, quats, 2 * log_scales.sum(1), *opaque, colors)
 
 
 def _covariances(shapes: _Shapes, rows: Int[Tensor, " P"]) -> Float[Tensor, "P 3 3"]:
@@ -131,7 +127,7 @@ def _cheap_pairs(shapes: _Shapes) -> tuple[Int[Tensor, "P 2"], Float[Tensor, " P
     """
     keys, costs, count = [], [], len(shapes.means)
     for pairs in _neighbours(shapes.means):
-        found = _costs_of_duplicates(shapes, pairs)
+        found = _costs(shapes, pairs)
         low, high = pairs[found <= DUPLICATE].unbind(1)
         keys.append(low * count + high)
         costs.append(found[found <= DUPLICATE])
@@ -185,34 +181,6 @@ def _moments(
     return means, within + weight * (1 - weight) * apart[:, :, None] * apart[:, None]
 
 
-def _costs_of_duplicates(shapes: _Shapes, pairs: Int[Tensor, "P 2"]) -> Float[Tensor, " P"]:
-    """Return the cost of each pair; of those that are no duplicates, a lower bound above
-    ``DUPLICATE``, which needs no covariances.
-    """
-    costs = _least_costs(shapes, pairs)
-    near = costs <= 1.001 * DUPLICATE  # the determinants' rounding errors are smaller
-    costs[near] = _costs(shapes, pairs[near])
-    return costs
-
-
-def _least_costs(shapes: _Shapes, pairs: Int[Tensor, "P 2"]) -> Float[Tensor, " P"]:
-    """Bound the cost from below: log |S| is concave in S, and for the mean covariance W of a pair,
-    |W + g d d^T| >= |W| (1 + g |d|^2 / trace W).
-    """
-    i, j = pairs.unbind(1)
-    f = _shares(shapes, pairs, LEAST_SHARE)
-    within = f * shapes.traces[i] + (1 - f) * shapes.traces[j]
-    growth = torch.log1p(f * (1 - f) * (shapes.means[i] - shapes.means[j]).square().sum(1) / within)
-    return 0.5 * (growth + _color_cost(shapes, pairs, f))
-
-
-def _color_cost(
-    shapes: _Shapes, pairs: Int[Tensor, "P 2"], f: Float[Tensor, " P"]
-) -> Float[Tensor, " P"]:
-    apart = (shapes.colors[pairs[:, 0]] - shapes.colors[pairs[:, 1]]).square().sum(1)
-    return torch.log1p(f * (1 - f) * apart / COLOR_TOLERANCE**2)
-
-
 def _costs(shapes: _Shapes, pairs: Int[Tensor, "P 2"]) -> Float[Tensor, " P"]:
     i, j = pairs.unbind(1)
     f = _shares(shapes, pairs, LEAST_SHARE)
@@ -222,7 +190,8 @@ def _costs(shapes: _Shapes, pairs: Int[Tensor, "P 2"]) -> Float[Tensor, " P"]:
         - f * shapes.log_determinants[i]
         - (1 - f) * shapes.log_determinants[j]
     )
-    return 0.5 * (growth + _color_cost(shapes, pairs, f))
+    apart = (shapes.colors[i] - shapes.colors[j]).square().sum(1)
+    return 0.5 * (growth + torch.log1p(f * (1 - f) * apart / COLOR_TOLERANCE**2))
 
 
 def _merged(

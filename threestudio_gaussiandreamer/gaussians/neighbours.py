@@ -1,9 +1,8 @@
 """Nearest neighbours among millions of points.
 
-A k-d tree (SciPy's) is several times faster if points that are stored or looked up one after the
-other are near each other, since most of what a query reads is then in the caches. So points and
-queries are sorted by the cells of a grid first. Queries run in chunks, which bounds the memory of
-their results."""
+SciPy's k-d tree is several times faster if points that are stored or looked up one after the other
+are near each other, so points and queries are sorted by the cells of a grid first. Queries run in
+chunks, which bounds the memory of their results."""
 
 from collections.abc import Iterator
 from typing import NamedTuple

@@ -83,12 +83,12 @@ class Recovery:
         self.first_scale = 0  # index into LR_SCALES
 
     def __call__(self, cloud: Gaussians, round_number: int) -> Round:
-        """Recover with the largest learning rates that don't lower the validation PSNR.
-
-        If all rates that are tried lower it, the Gaussians are returned without a recovery.
-        Successive rounds need similar rates, so the search starts one step above the previous
-        round's."""
-        cloud = best = clamp_constant_sh(cloud, self.sh_reach)
+        """Recover with the largest learning rates that don't lower the validation PSNR; not at all
+        if all do. Successive rounds need similar rates, so the search starts one step above the
+        previous round's.
+        """
+        constant = cloud.sh[:, :1].clamp(-self.sh_reach, self.sh_reach)
+        cloud = best = cloud._replace(sh=torch.cat([constant, cloud.sh[:, 1:]], 1))
         reached = self.quality(cloud)
         steps = math.ceil(self.steps * min(1.0, MOST / len(cloud.means)))
         for tried in range(self.first_scale, len(LR_SCALES)):
@@ -106,11 +106,6 @@ class Recovery:
         return psnr_lower_bound(self.as_stored(cloud), self.val_views, self.val_images)
 
 
-def clamp_constant_sh(cloud: Gaussians, limit: float) -> Gaussians:
-    """Clamp the constant harmonics to [-limit, limit]."""
-    return cloud._replace(sh=torch.cat([cloud.sh[:, :1].clamp(-limit, limit), cloud.sh[:, 1:]], 1))
-
-
 @torch.enable_grad()
 def recover(
     cloud: Gaussians,
@@ -121,10 +116,9 @@ def recover(
     sh_reach: float = math.inf,
     lr_scale: float = 1.0,
 ) -> Gaussians:
-    """Fit Gaussians to images; return new ones.
+    """Fit Gaussians to the images of views; return new ones.
 
     Args:
-        views: the views of the images.
         steps: Adam steps, each on four views; the rates fall linearly to zero.
         seed: for the order of the views.
         sh_reach: largest absolute value of the constant harmonics.
@@ -146,12 +140,12 @@ def recover(
     return leaves.map(Tensor.detach)
 
 
-def _batches(count: int, steps: int, seed: int, size: int = VIEWS_PER_STEP) -> Iterator[Tensor]:
+def _batches(count: int, steps: int, seed: int) -> Iterator[Tensor]:
     """Yield the rows of the views of each step: every view once before any comes twice."""
     order, epoch = torch.empty(0, dtype=torch.long), 0
     for _ in range(steps):
-        if len(order) < size:
+        if len(order) < VIEWS_PER_STEP:
             shuffled = torch.randperm(count, generator=generator(seed, "simplify", epoch))
             order, epoch = torch.cat([order, shuffled]), epoch + 1
-        rows, order = order[:size], order[size:]
-        yield rows
+        yield order[:VIEWS_PER_STEP]
+        order = order[VIEWS_PER_STEP:]

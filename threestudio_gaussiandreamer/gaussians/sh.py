@@ -17,7 +17,6 @@ from ..core.errors import UserError
 C0 = sqrt(1 / (4 * pi))
 COEFFICIENTS = (1, 4, 9, 16)  # by degree
 MAX_DEGREE = len(COEFFICIENTS) - 1
-SHORTEST_DIRECTION = 1e-12
 Colors = Float[Tensor, "*batch C"] | Float[np.ndarray, "*batch C"]
 
 
@@ -65,8 +64,6 @@ def sh_to_unclamped_colors(
 
 
 class _Bounded(torch.autograd.Function):
-    """Clamp to [0, 1]; outside, pass on gradients whose descent leads back into the range."""
-
     @staticmethod
     def forward(ctx: Any, colors: Tensor) -> Tensor:
         ctx.save_for_backward(colors)
@@ -82,9 +79,8 @@ class _Bounded(torch.autograd.Function):
 def bounded_colors(colors: Float[Tensor, "*batch C"]) -> Float[Tensor, "*batch C"]:
     """Clamp colours to [0, 1], the range that viewers show.
 
-    At a bound and beyond it, a gradient is passed on if a descent step leads towards the range, and
-    is 0 otherwise. The gradient of ``torch.clamp`` is always 0 beyond a bound, so that colours
-    outside could never return.
+    At a bound and beyond it, a gradient is passed on if a descent step leads towards the range, so
+    that colours outside can return, and is 0 otherwise.
     """
     return _Bounded.apply(colors)
 
@@ -95,7 +91,10 @@ def sh_basis(dirs: Float[Tensor, "*batch 3"], degree: int) -> list[Float[Tensor,
 
     Normalisation sqrt((2l + 1) / 4 pi (l - |m|)! / (l + |m|)!), times sqrt(2) for m != 0 (Sloan
     2008, Stupid Spherical Harmonics Tricks, appendix A2)."""
-    x, y, z = _normalize(dirs).unbind(-1)
+    length = torch.linalg.vector_norm(dirs, dim=-1, keepdim=True)
+    usable = length > 1e-12  # otherwise +z with zero gradient, since 0 / 0 is NaN
+    up = dirs.new_tensor([0.0, 0.0, 1.0])
+    x, y, z = torch.where(usable, dirs / torch.where(usable, length, 1), up).unbind(-1)
     basis = [torch.full_like(x, C0)]
     if degree >= 1:
         c1 = sqrt(3 / (4 * pi))
@@ -107,22 +106,7 @@ def sh_basis(dirs: Float[Tensor, "*batch 3"], degree: int) -> list[Float[Tensor,
     if degree >= 3:
         c33, c32 = sqrt(35 / (32 * pi)), sqrt(105 / (4 * pi))
         c31, c30 = sqrt(21 / (32 * pi)), sqrt(7 / (16 * pi))
-        basis += [
-            -c33 * y * (3 * x * x - y * y),
-            c32 * x * y * z,
-            -c31 * y * (5 * z * z - 1),
-            c30 * z * (5 * z * z - 3),
-        ]
-        basis += [
-            -c31 * x * (5 * z * z - 1),
-            0.5 * c32 * z * (x * x - y * y),
-            -c33 * x * (x * x - 3 * y * y),
-        ]
+        basis += [-c33 * y * (3 * x * x - y * y), c32 * x * y * z, -c31 * y * (5 * z * z - 1)]
+        basis += [c30 * z * (5 * z * z - 3), -c31 * x * (5 * z * z - 1)]
+        basis += [0.5 * c32 * z * (x * x - y * y), -c33 * x * (x * x - 3 * y * y)]
     return basis
-
-
-def _normalize(dirs: Tensor) -> Tensor:
-    """Scale to length 1; a zero vector becomes +z with zero gradient, since 0 / 0 is NaN."""
-    length = torch.linalg.vector_norm(dirs, dim=-1, keepdim=True)
-    usable = length > SHORTEST_DIRECTION
-    return torch.where(usable, dirs / torch.where(usable, length, 1), dirs.new_tensor([0.0, 0, 1]))

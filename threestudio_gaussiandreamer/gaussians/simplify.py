@@ -4,9 +4,8 @@ recover after each round by fitting images of the original.
 A large cloud is first pruned at once to the fewest Gaussians with the same images, by the
 contribution of each, which rendering the images to be kept has given, and then by importance. Then
 duplicates are merged (``merge.py``). Then each round computes the importance in the training views
-(``importance.py``), keeps the best 80 %, and fits them to images of the
-original (``recover.py``). Pruning many more at once gives worse results than training with the
-smaller number from the start."""
+(``importance.py``), keeps the best 80 %, and fits them to images of the original (``recover.py``).
+"""
 
 import functools
 import math
@@ -14,13 +13,14 @@ from collections.abc import Callable
 from typing import NamedTuple, Optional
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from ..core.errors import UserError
 from ..core.streams import generator
+from .densify import highest
 from .gaussians import Gaussians
-from .importance import VisibilityStats, importance, removal_error, smallest_count
+from .importance import importance, removal_error
 from .merge import merge_duplicates
 from .recover import Recovery, Round
 from .views import Views, draw, row_batches
@@ -36,6 +36,8 @@ LOSSLESS = 50.0
 """PSNR to the original that the first pruning of a large cloud keeps, dB."""
 RESERVE = 10.0
 """How far that is above the PSNR of the budget, dB, so that a tenth of the error is spent."""
+BISECTIONS = 4
+"""Steps that find how far a large cloud can be pruned at once, to within 1/16 of the range."""
 
 Ranking = Callable[[Gaussians, Views, int], Float[Tensor, " N"]]
 
@@ -73,7 +75,7 @@ def view_importance(cloud: Gaussians, views: Views, seed: int = 0) -> Float[Tens
         image, contributed = draw(cloud, views, rows, opacities)
         contribution = torch.maximum(contribution, contributed.amax(0))
         removal = removal + removal_error(image, opacities, rng)
-    return importance(VisibilityStats(contribution, removal))
+    return importance(contribution, removal)
 
 
 def simplify(
@@ -95,8 +97,7 @@ def simplify(
     Raises:
         UserError: no Gaussian is visible in any view, so that they can't be ranked.
     """
-    search = _Search(budget, recovery, report, rank)
-    return search.run(cloud)
+    return _Search(budget, recovery, report, rank).run(cloud)
 
 
 class _Search:
@@ -105,11 +106,7 @@ class _Search:
     """
 
     def __init__(
-        self,
-        budget: Budget,
-        recovery: Recovery,
-        report: Callable[[Round], None],
-        rank: Ranking,
+        self, budget: Budget, recovery: Recovery, report: Callable[[Round], None], rank: Ranking
     ) -> None:
         self.budget, self.recovery, self.report, self.rank = budget, recovery, report, rank
         self.rounds = 0
@@ -122,7 +119,8 @@ class _Search:
                 f"none of the {len(cloud.means)} Gaussians is visible in any view, so they "
                 "can't be ranked"
             )
-        self._fit_within_reach()
+        if float(self.cloud.sh[:, 0].abs().amax()) > self.recovery.sh_reach:
+            self._take(self.recovery(self.cloud, self.rounds))  # colours exceed the file's range
         self._reduce(self.scores)
         self._merge()
         self._prune()
@@ -145,22 +143,23 @@ class _Search:
         self.best = best
         self.__dict__.pop("scores", None)
 
-    def _fit_within_reach(self) -> None:
-        """Run a recovery before the first round if some colours exceed the file's range."""
-        if float(self.cloud.sh[:, 0].abs().amax()) > self.recovery.sh_reach:
-            self._take(self.recovery(self.cloud, self.rounds))
-
     def _reduce(self, scores: Float[Tensor, " N"]) -> None:
         """Prune a large cloud at once, as far as its images stay the same without a recovery."""
         if len(self.cloud.means) <= LARGE:
             return
         least = max(LOSSLESS, (self.budget.psnr or 0.0) + RESERVE)
 
-        def same(kept: Bool[Tensor, " N"]) -> bool:
-            return self.recovery.quality(self.cloud.rows(kept.nonzero()[:, 0])) >= least
+        def same(count: int) -> bool:
+            return self.recovery.quality(keep_best(self.cloud, scores, count)) >= least
 
-        count = smallest_count(scores, self.budget.count or 1, same)
-        self._take(self._unfitted(keep_best(self.cloud, scores, count)))
+        high = len(scores)
+        low = min(high, self.budget.count or 1)
+        if low < high and same(low):
+            high = low
+        for _ in range(BISECTIONS if low < high else 0):
+            middle = (low + high) // 2
+            low, high = (low, middle) if same(middle) else (middle, high)
+        self._take(self._unfitted(keep_best(self.cloud, scores, high)))
 
     def _merge(self) -> None:
         values = self.cloud._asdict()
@@ -211,5 +210,4 @@ def rounds_to(count: int, here: int) -> int:
 
 def keep_best(cloud: Gaussians, scores: Float[Tensor, " N"], count: int) -> Gaussians:
     """Select the ``count`` Gaussians with the highest scores, in their order."""
-    rows = torch.argsort(scores, descending=True, stable=True)[:count].sort().values
-    return cloud.rows(rows)
+    return cloud.rows(highest(scores, count))

@@ -5,12 +5,10 @@ The opacity is summed on a grid of cells of side h,
     d(x) = sum_i o_i exp(-1/2 (x - m_i)^T (S_i + h^2 I)^-1 (x - m_i)),
 
 where h^2 widens Gaussians smaller than a cell enough to be sampled by the grid. The surface is the
-level set of d at a fraction of its median over the centres of the Gaussians, so that it doesn't
-depend on how many of them overlap. Surface nets (Gibson 1998) give one vertex for each cell that
-the surface crosses, at the mean of the crossings of its edges, and one quad around each edge that
-is crossed.
-The mesh is closed, and thicker than the object by about sqrt(s^2 + h^2), where s is the Gaussians'
-standard deviation across it."""
+level set of d at a fraction of its median over the centres of the Gaussians. Surface nets (Gibson
+1998) give one vertex for each cell that it crosses, at the mean of the crossings of its edges, and
+one quad around each edge that is crossed. The mesh is closed, and thicker than the object by about
+sqrt(s^2 + h^2), where s is the Gaussians' standard deviation across it."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -27,14 +25,10 @@ REACH = 3.0
 MIN_OPACITY = 0.02
 """Gaussians with a lower opacity are left out."""
 HALF_HEIGHT = 1.25
-"""Standard deviations within which the surface of a single Gaussian lies: its opacity falls to half
-at 1.18.
-"""
+"""Standard deviations within which the surface of a single Gaussian lies: half is at 1.18."""
 NODES_AT_ONCE = 4_000_000
 SMALL = 8
-"""Reach of a Gaussian, in cells, up to which many are added at once; larger ones are added one by
-one.
-"""
+"""Reach of a Gaussian, in cells, up to which many are added at once, larger ones one by one."""
 MARGIN = 3
 """Cells around the cloud, of which the outermost are empty, so that the surface closes."""
 
@@ -89,10 +83,6 @@ def surface_nets(
     number[tuple(cells.T)] = np.arange(len(cells))
     quads = np.concatenate([_quads(inside, number, axis) for axis in range(3)])
     return cells + _crossings(values, cells, level), quads[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
-
-
-# The grid
-# --------------------------------------------------------------------------------------------------
 
 
 def _summed(
@@ -188,10 +178,6 @@ def covariance_matrices(gaussians: Gaussians) -> Float[np.ndarray, "N 3 3"]:
     axes = np.moveaxis(np.array(rotation_rows(*unit)), -1, 0)
     scaled = axes * np.exp(gaussians.log_scales.astype(np.float64))[:, None]
     return scaled @ scaled.transpose(0, 2, 1)
-
-
-# Surface nets
-# --------------------------------------------------------------------------------------------------
 
 
 def _corner(bits: int) -> tuple[slice, ...]:

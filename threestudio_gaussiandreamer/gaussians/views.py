@@ -65,10 +65,8 @@ Ball = tuple[Float[Tensor, "3"], float]
 
 
 def bounds(cloud: Gaussians) -> Ball:
-    """Return the centre and the radius of the visible Gaussians.
-
-    The centre is the opacity-weighted median of the positions. The ball of that radius around it
-    holds 99 % of the opacity, where the distance of each Gaussian is that of its mean plus one
+    """Return the opacity-weighted median of the positions, and the radius of the ball around it
+    that holds 99 % of the opacity, where the distance of each Gaussian is that of its mean plus one
     standard deviation along its longest axis.
     """
     weights = cloud.logit_opacities.sigmoid()
@@ -100,9 +98,7 @@ def views_around(
     have a removal error and opacities are observed.
 
     Args:
-        cloud: the Gaussians to look at.
-        count: number of views.
-        size: width and height of their images, pixels.
+        size: width and height of the images, pixels.
         turn: azimuth of the first view, degrees.
         to_z_up: rotation from the cloud's axes to axes with z up.
         ball: ``bounds(cloud)`` if it is already known.
@@ -168,16 +164,11 @@ def rasterize_views(
     colors = sh_to_colors(cloud.sh, _directions(cloud, views, rows))
     if channels is not None:
         colors = torch.cat([colors.expand(len(rows), -1, -1), channels], dim=-1)
+    if opacities is None:
+        opacities = cloud.logit_opacities.sigmoid()
     return rasterize(
-        cloud.means,
-        cloud.quats,
-        cloud.log_scales.exp(),
-        cloud.logit_opacities.sigmoid() if opacities is None else opacities,
-        colors,
-        views.viewmats[rows],
-        views.Ks[rows],
-        views.size,
-        views.size,
+        *(cloud.means, cloud.quats, cloud.log_scales.exp(), opacities, colors),
+        *(views.viewmats[rows], views.Ks[rows], views.size, views.size),
         background=background,
         near=views.near,
         far=math.inf,
@@ -195,9 +186,8 @@ def _directions(cloud: Gaussians, views: Views, rows: Tensor) -> Float[Tensor, "
     return torch.nn.functional.normalize(cloud.means.detach() - views.positions[rows, None], dim=-1)
 
 
-@torch.no_grad()
 def render_all(cloud: Gaussians, views: Views) -> Float[Tensor, "V H W 3"]:
-    """Render the images of all views."""
+    """Render the images of all views, without gradients."""
     return render_with_contribution(cloud, views)[0]
 
 
@@ -226,9 +216,9 @@ def psnr_to_original(cloud: Gaussians, views: Views, images: Float[Tensor, "V H 
 
 
 def psnr_lower_bound(cloud: Gaussians, views: Views, images: Float[Tensor, "V H W 3"]) -> float:
-    """Estimate a lower bound of the PSNR in views other than these, dB.
-
-    It is the PSNR at the mean squared error of the views plus two standard errors."""
+    """Estimate a lower bound of the PSNR in views other than these, dB: the PSNR at the mean
+    squared error of the views plus two standard errors.
+    """
     errors = (render_all(cloud, views) - images).square().mean((1, 2, 3))
     errors = errors.nan_to_num(nan=MOST_ERROR).clamp_max(MOST_ERROR)
     upper = float(errors.mean() + 2 * errors.std() / math.sqrt(len(errors)))

@@ -400,19 +400,19 @@ class DensityControl(DensityRule):
             the combined change of the current cloud, and what ``auto`` has found.
         """
         cloud, cfg = self.cloud, self.cloud.cfg.prune
-        values = cloud.parameters_by_name() if first is None else first.values
-        rows = slice(None) if first is None else first.parents
-        stats = importance.VisibilityStats(cloud.contribution[rows], cloud.removal[rows])
-        scores = importance.importance(stats)
-        share = self.kept_share(len(scores), step)
-        count, needed = importance.next_count(len(scores), share, min_count(self.cloud.cfg)), None
-        if self.cloud.cfg.budget == AUTO:
+        change = densify.unchanged(cloud.parameters_by_name()) if first is None else first
+        removal = cloud.removal[change.parents]
+        scores = importance.importance(cloud.contribution[change.parents], removal)
+        here, needed = len(scores), None
+        share = self.kept_share(here, step)
+        count = min(here, max(min_count(cloud.cfg), int(share * here)))
+        if cloud.cfg.budget == AUTO:
             error = float(cloud.error)
-            needed = importance.needed_count(scores, stats.removal, error, cfg.gain, cfg.keep)
+            needed = importance.needed_count(scores, removal, error, cfg.gain, cfg.keep)
             count = max(count, needed.count)
             if needed.gain >= 0 and not needed.enough:
                 cloud.gain.fill_(needed.gain)
-        return importance.keep_highest(values, scores, count, first), needed
+        return densify.select(change, densify.highest(scores, count)), needed
 
     def summary(self) -> str:
         budget, gain = self.cloud.cfg.budget, float(self.cloud.gain)

@@ -74,12 +74,11 @@ from ..core.schedule import parse_schedule
 from ..core.streams import numpy_generator
 from ..gaussians import densify, sh
 from ..gaussians.densify import LOG_SCALE_RANGE, PARAMETERS, Change
-from ..gaussians.gaussians import Gaussians
+from ..gaussians.gaussians import SHAPES, Gaussians, require_cloud
 from ..gaussians.grow import SCALE_RULES, grow, nearest_distance_scales
 from ..gaussians.merge import merge_duplicates
 from ..gaussians.point_cloud import PointCloud
 from ..gaussians.simplify import keep_best, view_importance
-from ..gaussians.stored_state import SHAPES, require_cloud
 from ..gaussians.views import views_around
 from ..host import BaseGeometry, C, find, register, run_seed, warn
 from .density import AUTO, DensifyConfig, PruneConfig, min_count

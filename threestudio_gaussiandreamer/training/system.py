@@ -40,7 +40,7 @@ from ..core.distributed import average_gradients, from_first, rank
 from ..core.errors import UserError
 from ..core.host_copies import flush_reads
 from ..core.methods import require_class_method
-from ..gaussians.stored_state import SHAPES, require_cloud
+from ..gaussians.gaussians import SHAPES, require_cloud
 from ..guidance.external import (
     call_guidance,
     learnt_weights,

@@ -27,8 +27,7 @@ from ..formats.gaussian_files import (
     suffix_of,
 )
 from ..gaussians.axes import WORLD_UP
-from ..gaussians.gaussians import Gaussians, drawable
-from ..gaussians.stored_state import require_cloud
+from ..gaussians.gaussians import Gaussians, drawable, require_cloud
 from .render import RenderSettings
 
 T = TypeVar("T", dict, list)
