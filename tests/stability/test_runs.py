@@ -173,7 +173,7 @@ def test_a_disk_that_is_full_by_then(hook, tmp_path, monkeypatch, measured):
     """While the prior is cached, the cloud evaluated, views and video written, or the cloud
     exported: a partial file never counts as success.
     """
-    owner = system if hook == "export" else GaussianDreamerSystem
+    owner = system.export if hook == "export" else GaussianDreamerSystem
     original = getattr(owner, hook)
     with contextlib.ExitStack() as full:
 

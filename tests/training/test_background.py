@@ -4,7 +4,6 @@ import pytest
 import torch
 
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.host.builtin.models import SolidColorBackground
 from threestudio_gaussiandreamer.training.background import FlatBackground
 
 
@@ -24,18 +23,6 @@ def test_random_depends_on_the_step_alone_and_rests_in_evaluation():
     background.update_step(0, 8)
     assert not torch.equal(background.color(4), first)
     assert torch.equal(background.eval().color(4), torch.ones(4, 3))
-
-
-def test_the_hosts_random_colour_depends_on_the_step_alone():
-    background = SolidColorBackground({"random_aug": True, "random_aug_prob": 0.5})
-    dirs, colors = torch.zeros(2, 1, 1, 3), []
-    for _ in range(2):
-        for step in range(20):
-            background.update_step(0, step)
-            colors.append(background(dirs))
-    assert all(torch.equal(*pair) for pair in zip(colors[:20], colors[20:], strict=True))
-    plain = [torch.equal(color, torch.ones(2, 1, 1, 3)) for color in colors]
-    assert any(plain) and not all(plain)
 
 
 def test_learned_starts_at_the_colour_stays_in_range_and_learns():

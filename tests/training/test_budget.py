@@ -7,13 +7,14 @@ from tests.training.runs import PRUNE, SMALL, cloud_of, launch, length, mocked_c
 from threestudio_gaussiandreamer.launch.experiment import main
 
 
-def test_auto_says_what_more_would_gain(tmp_path, painted_box, capsys):
+def test_auto_says_what_more_would_gain_and_a_background_is_learned(tmp_path, painted_box, capsys):
     """In each round, and at the end of the run; here without a ground truth."""
     options = ["budget=auto", "min_gaussians=20"]
     options += [f"prune.{x}" for x in "start=2 stop=6 every=2 gain=5.9 likeness=1".split()]
     options = [f"system.geometry.{option}" for option in options]
     options += [f"exp_root_dir={tmp_path}", *length(6)]
-    config = mocked_config(tmp_path, painted_box)
+    background = {"mode": "learned", "color": [0.5, 0.5, 0.5], "lr": 0.1}
+    config = mocked_config(tmp_path, painted_box, background=background)
     assert main(["--config", str(config), "--train", "--gpu", "cpu", *SMALL, *options]) == 0
     said = "".join(capsys.readouterr())
     rounds = re.findall(r"step (2|4): (\d+) -> (\d+) Gaussians: .* would (gain|lose) \d", said)
@@ -21,6 +22,8 @@ def test_auto_says_what_more_would_gain(tmp_path, painted_box, capsys):
     assert re.search(rf"{int(rounds[1][2]):,} of [\d,]+ Gaussians: twice as many would gain", said)
     rows = csv.DictReader(open(run_folder(tmp_path) / "csv_logs" / "version_0" / "metrics.csv"))
     assert any(row.get("prune/gain") for row in rows)
+    color = cloud_of(run_folder(tmp_path) / "ckpts" / "last.ckpt")["background.logit"].sigmoid()
+    assert color[0] > 0.55 and (color[1:] < 0.45).all()  # on its way to the mock's (0.9, 0.2, 0.1)
 
 
 def test_a_budget_that_needs_larger_rounds_is_met_with_a_message(tmp_path, painted_box, capsys):

@@ -1,6 +1,4 @@
-"""The outcome of a round of density control. Which rounds take place: ``test_geometry.py``,
-``tests/gaussians/test_importance.py`` and ``tests/stability/test_densification.py``.
-"""
+"""The outcome of a round of density control."""
 
 import math
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from tests.training.runs import launch, length, run_folder
-from threestudio_gaussiandreamer.training import system
+from threestudio_gaussiandreamer.training import finite
 from threestudio_gaussiandreamer.training.finite import (
     NonFiniteParameters,
     optimizer_tensors,
@@ -75,7 +75,7 @@ def test_renders_that_are_all_empty_are_named_in_the_first_step(caplog):
 def test_a_run_that_turns_non_finite_stops_and_saves_nothing_of_it(
     tmp_path, painted_box, monkeypatch, capsys, options, said
 ):
-    monkeypatch.setattr(system, "CHECK_EVERY", 4)
+    monkeypatch.setattr(finite, "CHECK_EVERY", 4)
     assert launch(tmp_path, painted_box, *options, "system.pages=false") == 2
     errors = capsys.readouterr().err
     assert all(errors.count(words) == 1 for words in said)

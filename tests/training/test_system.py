@@ -1,31 +1,16 @@
-"""Whole runs of a few steps: with a mock guidance, against a known ground truth, killed and
-resumed.
-"""
+"""Whole runs of a few steps against a known ground truth."""
 
 import csv
 import json
 
 import numpy as np
 import pytest
-import torch
 
-from tests.training.runs import (
-    DENSIFY,
-    PRUNE,
-    SMALL,
-    cloud_of,
-    launch,
-    length,
-    mocked_config,
-    run_folder,
-    same,
-)
+from tests.training.runs import launch, length, run_folder
 from threestudio_gaussiandreamer.formats.ply import read_gaussians
 from threestudio_gaussiandreamer.gaussians.sh import sh0_to_rgb
 from threestudio_gaussiandreamer.guidance.picture_bank import MeshTruth
-from threestudio_gaussiandreamer.launch.experiment import main
-from threestudio_gaussiandreamer.training import held_out as evaluate
-from threestudio_gaussiandreamer.training import system as system_module
+from threestudio_gaussiandreamer.training import events, held_out
 from threestudio_gaussiandreamer.training.system import GaussianDreamerSystem
 
 
@@ -99,61 +84,16 @@ def test_a_long_run_has_the_pictures_of_its_pool_cast_at_once_and_pages_can_be_s
 
 def test_looking_at_pictures_is_no_training_time(tmp_path, painted_box, monkeypatch):
     clock = np.zeros(2)
-    monkeypatch.setattr(evaluate, "_now", clock.copy)
+    monkeypatch.setattr(held_out, "_now", clock.copy)
 
     def taking(hours, body):
         return lambda *args: (clock.__iadd__(hours), body(*args))[1]
 
     for owner, name, hours in (
         (GaussianDreamerSystem, "training_step", 1),
-        (system_module, "save_pictures", 100),
+        (events, "save_pictures", 100),
     ):
         monkeypatch.setattr(owner, name, taking(hours, getattr(owner, name)))
     options = ["trainer.max_steps=2", "trainer.val_check_interval=1"]
     assert launch(tmp_path, painted_box, *options, "system.exporter.save_video=false") == 0
     assert json.loads((run_folder(tmp_path) / "save" / "metrics.json").read_text())["seconds"] == 2
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("changes", "stop"), [(DENSIFY, 3), (DENSIFY, 4), (PRUNE, 4)])
-def test_a_stopped_and_resumed_run_equals_the_run_that_never_stopped(
-    tmp_path, painted_box, changes, stop
-):
-    """Bit for bit: Gaussians, moments, statistics; with stops before, at and after a change of the
-    cloud, and more validation.
-    """
-    options = [*changes, "checkpoint.every_n_train_steps=1"]
-
-    def train(name, steps, val_interval, *more):
-        lengths = f"trainer.max_steps={steps}", f"trainer.val_check_interval={val_interval}"
-        assert launch(tmp_path / name, painted_box, *options, *lengths, *more) == 0
-
-    train("whole", 9, 9)
-    train("parts", stop, 1)
-    last = run_folder(tmp_path / "parts") / "ckpts" / "last.ckpt"
-    assert changes is DENSIFY or cloud_of(last)["geometry.removal"].any()  # stopped between samples
-    train("parts", 9, 2, f"resume={last}")
-    whole, parts = (
-        torch.load(run_folder(tmp_path / name) / "ckpts" / "last.ckpt", weights_only=True)
-        for name in ("whole", "parts")
-    )
-    assert whole["global_step"] == parts["global_step"] == 9
-    count = len(whole["state_dict"]["geometry.means"])
-    assert count > 250 if changes is DENSIFY else count == 130
-    assert same(whole["state_dict"], parts["state_dict"])
-    states = [c["optimizer_states"][0]["state"] for c in (whole, parts)]
-    assert all(
-        torch.equal(states[0][i][k], states[1][i][k])
-        for i in states[0]
-        for k in ("exp_avg", "exp_avg_sq", "step")
-    )
-
-
-def test_a_learned_background_learns_and_is_in_the_checkpoint(tmp_path, painted_box):
-    background = {"mode": "learned", "color": [0.5, 0.5, 0.5], "lr": 0.1}
-    config = mocked_config(tmp_path, painted_box, background=background)
-    overrides = [f"exp_root_dir={tmp_path}", *SMALL, *length(20)]
-    assert main(["--config", str(config), "--train", "--gpu", "cpu", *overrides]) == 0
-    logit = cloud_of(run_folder(tmp_path) / "ckpts" / "last.ckpt")["background.logit"]
-    color = torch.sigmoid(logit)  # on its way from grey to the mock's (0.9, 0.2, 0.1)
-    assert color[0] > 0.7 and color[1] < 0.35 and color[2] < 0.3

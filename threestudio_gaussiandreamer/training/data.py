@@ -154,9 +154,7 @@ def make_batch(
     rays: bool = False,
     normalize: bool = True,
 ) -> dict[str, Any]:
-    """Make the host's batch of B views: tensors in the host's conventions, ``height`` and ``width``
-    as plain ints.
-    """
+    """Make the host's batch of B views; ``height`` and ``width`` are plain ints."""
     proj = cameras.projection(orbit.fovy, width / height)
     batch = {
         "c2w": c2w,
@@ -184,9 +182,7 @@ def orbit_batch(orbit: Orbit, height: int, width: int, *rays: bool) -> dict[str,
 
 
 class TrainCameras(IterableDataset, Updateable):
-    """An endless stream of training batches, each epoch's from the step that ``next_step``
-    returns.
-    """
+    """An endless stream of training batches, each epoch's from ``next_step()`` on."""
 
     def __init__(self, cfg: CameraConfig) -> None:
         self.cfg = cfg
@@ -232,18 +228,14 @@ class TrainCameras(IterableDataset, Updateable):
         return cameras.sample_view_groups(batch_size, self.cfg.n_view, ranges, rng, uniform)
 
     def _pick(self, batch_size: int, rng: torch.Generator) -> Int[Tensor, " B"]:
-        """Draw ``batch_size`` views of the pool, one from each azimuth sector (the pool is ordered
-        by azimuth).
-        """
+        """Draw views of the pool, which is ordered by azimuth, one from each sector."""
         share, views = torch.rand(batch_size, generator=rng), len(self.pool.azimuth)
         if self.cfg.batch_uniform_azimuth:
             share = (share + torch.arange(batch_size)) / batch_size
         return (share * views).long().clamp_max(views - 1)
 
     def _ranges(self, step: int) -> OrbitRanges:
-        """Widen elevation and azimuth from the evaluation view to the full range over
-        ``progressive_until`` steps.
-        """
+        """Widen the angles from the evaluation view over ``progressive_until`` steps."""
         r = 1.0 if self.cfg.progressive_until <= 0 else min(1.0, step / self.cfg.progressive_until)
         start = self.cfg.eval_elevation_deg
         return self.ranges._replace(
@@ -267,7 +259,6 @@ class TrainCameras(IterableDataset, Updateable):
         count, (low, high) = len(c2w), self.cfg.light_distance_range
         noise = torch.randn(count, 3, generator=rng) * self.cfg.light_position_perturb
         towards = c2w[:, :3, 3] + noise
-        # as torch's normalize, which takes several times longer on so few numbers
         towards = towards / torch.linalg.vector_norm(towards, dim=-1, keepdim=True).clamp_min(1e-12)
         return towards * (low + (high - low) * torch.rand(count, 1, generator=rng))
 

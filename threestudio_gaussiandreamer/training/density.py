@@ -121,14 +121,8 @@ class DensityOutcome(NamedTuple):
 
 class DensityRule:
     """Base class of density rules, whose hooks are called around every optimiser step; ``cfg`` are
-    its options, ``system.geometry.density``.
-
-    Args:
-        cloud: a :class:`.geometry.GaussianCloud`, which :meth:`after_step` may change, by
-            ``cloud.apply_change`` where the number of Gaussians changes.
-
-    Raises:
-        UserError: an option isn't valid, or a hook takes other arguments.
+    its options, ``system.geometry.density``. ``cloud`` is a :class:`.geometry.GaussianCloud`, which
+    :meth:`after_step` may change, by ``cloud.apply_change`` where the number of Gaussians changes.
     """
 
     @dataclass
@@ -162,7 +156,9 @@ class DensityRule:
     def after_backward(
         self, out: Rasterized, width: int, height: int, loss_scale: float = 1.0
     ) -> None:
-        """Look at the gradients of a step, see :meth:`DensityControl.after_backward`."""
+        """Look at the output of the rasteriser, with gradients at ``means2d``, for renders of
+        ``width`` by ``height`` pixels; mixed precision multiplies gradients by ``loss_scale``.
+        """
 
     def after_step(self, optimizer: torch.optim.Optimizer, step: int) -> Optional[DensityOutcome]:
         """Change the cloud after ``step`` finished optimiser steps."""
@@ -177,11 +173,7 @@ HOOKS = ("schedule_problem", "before_backward", "after_backward", "after_step", 
 
 
 def density_rule(cloud: Any) -> DensityRule:
-    """Build the rule that ``density_type`` of a cloud names.
-
-    Raises:
-        UserError: there is none of that name, or it can't be used as one.
-    """
+    """Build the rule that ``density_type`` of a cloud names; raise UserError if it can't be one."""
     rule = find(cloud.cfg.density_type)
     if not (isinstance(rule, type) and issubclass(rule, DensityRule)):
         raise UserError(
@@ -196,38 +188,28 @@ def density_rule(cloud: Any) -> DensityRule:
 
 @register("gaussiandreamer-density")
 class DensityControl(DensityRule):
-    """Densification and pruning of one cloud, by the options ``densify``, ``prune``, ``budget``,
-    ``min_gaussians`` and ``max_gaussians`` of the cloud, whose buffers are the statistics.
-    """
+    """Densification and pruning by the options of the cloud, whose buffers are the statistics."""
 
     # -- schedules ---------------------------------------------------------------------------------
-
-    @property
-    def prune_rounds(self) -> range:
-        """The steps after which a round of pruning takes place."""
-        return rounds_of(self.cloud.cfg.prune)
 
     def kept_share(self, count: int, step: int) -> float:
         """Return the fraction of ``count`` Gaussians that the round at ``step`` keeps:
         ``prune.keep``, or less if the remaining rounds couldn't meet the budget otherwise.
         """
-        left = sum(later >= step for later in self.prune_rounds)
+        left = sum(later >= step for later in rounds_of(self.cloud.cfg.prune))
         if self.cloud.cfg.budget in (None, AUTO) or not left:
             return self.cloud.cfg.prune.keep
         to_least = (min_count(self.cloud.cfg) / max(count, 1)) ** (1 / left)
         return min(self.cloud.cfg.prune.keep, to_least)
 
     def pruning_at(self, step: int) -> bool:
-        """Return whether the step after ``step`` finished ones is before a round of pruning, or
-        between two.
-        """
-        rounds = self.prune_rounds
+        """Return whether the next step is before a round of pruning, or between two."""
+        rounds = rounds_of(self.cloud.cfg.prune)
         return bool(rounds) and rounds[0] - self.cloud.cfg.prune.every <= step < rounds[-1]
 
     def schedule_problem(self, step: int, max_steps: int) -> Optional[str]:
-        """Describe why the rounds between ``step`` and ``max_steps`` (-1: unlimited) can't meet the
-        budget, or can meet it only by keeping less than ``prune.keep``, and why densification can't
-        do what it is to. Return None if there is no such problem.
+        """Describe why the remaining rounds can't meet the budget, or only by keeping less than
+        ``prune.keep``, and why densification can't do what it is to.
         """
         end = max_steps if max_steps > 0 else math.inf
         problems = self._densification_problem(step, end), self._pruning_problem(step, end)
@@ -256,7 +238,9 @@ class DensityControl(DensityRule):
         budget, keep, count = self.cloud.cfg.budget, self.cloud.cfg.prune.keep, len(self.cloud)
         if budget is None:
             return None
-        if problem := round_problem("pruning", "prune", rounds := self.prune_rounds, end):
+        if problem := round_problem(
+            "pruning", "prune", rounds := rounds_of(self.cloud.cfg.prune), end
+        ):
             return problem
         if budget == AUTO and rounds.step < importance.SAMPLES:
             return (
@@ -286,14 +270,8 @@ class DensityControl(DensityRule):
         self, pictures: dict[str, Any], step: int, error: Optional[MeanError] = None
     ) -> None:
         """Add a sample of the removal error in these renders to the statistics, if the next round
-        of pruning uses it.
-
-        Args:
-            pictures: output of the renderer.
-            step: number of finished optimiser steps.
-            error: computes the mean squared error of the renders to the ground truth, with which
-                ``budget: auto`` compares the removal error; where there is none,
-                ``prune.likeness`` stands for it.
+        of pruning uses it, and of the ``error`` with which ``budget: auto`` compares it; where
+        there is none, ``prune.likeness`` stands for it.
         """
         if not self.samples_removal(step):
             return
@@ -325,13 +303,8 @@ class DensityControl(DensityRule):
     def after_backward(
         self, out: Rasterized, width: int, height: int, loss_scale: float = 1.0
     ) -> None:
-        """Add one step's contributions, and for densification its screen-space gradients, to the
-        statistics.
-
-        Args:
-            out: output of the rasteriser, with gradients at ``means2d``.
-            width, height: pixels.
-            loss_scale: the factor of automatic mixed precision on the gradients.
+        """Add one step's contributions, and for densification its screen-space gradients, which
+        mixed precision has multiplied by ``loss_scale``, to the statistics.
         """
         cloud = self.cloud
         if out.means2d.grad is not None and cloud.cfg.densify.enabled:
@@ -344,11 +317,8 @@ class DensityControl(DensityRule):
     # -- changes of the cloud ----------------------------------------------------------------------
 
     def after_step(self, optimizer: torch.optim.Optimizer, step: int) -> DensityOutcome:
-        """Densify and prune if the schedules have a round at ``step``.
-
-        Args:
-            optimizer: its parameters and rows of its state are updated with the Gaussians.
-            step: number of finished optimiser steps.
+        """Densify and prune if the schedules have a round at ``step``; the parameters and rows of
+        the optimiser's state are updated with the Gaussians.
         """
         before, change, needed = len(self.cloud), None, None
         if self.cloud.cfg.budget == AUTO and self.pruning_at(step - 1):
@@ -359,7 +329,7 @@ class DensityControl(DensityRule):
             self.cloud.gradient_count.zero_()
             if not change.is_new.any() and len(change.parents) == before:
                 change = None
-        if self.cloud.cfg.budget is not None and step in self.prune_rounds:
+        if self.cloud.cfg.budget is not None and step in rounds_of(self.cloud.cfg.prune):
             change, needed = self._prune(step, change)
         if change is not None:
             self.cloud.apply_change(change, optimizer)
@@ -391,13 +361,8 @@ class DensityControl(DensityRule):
         )
 
     def _prune(self, step: int, first: Optional[Change]) -> tuple[Change, Optional[Need]]:
-        """Prune once towards the budget.
-
-        Args:
-            first: the change by densification at the same step, to which pruning is applied.
-
-        Returns:
-            the combined change of the current cloud, and what ``auto`` has found.
+        """Prune once towards the budget, after the change ``first`` by densification at the same
+        step; return the combined change, and what ``auto`` has found.
         """
         cloud, cfg = self.cloud, self.cloud.cfg.prune
         change = densify.unchanged(cloud.parameters_by_name()) if first is None else first

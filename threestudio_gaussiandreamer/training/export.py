@@ -60,9 +60,7 @@ CLOUDS = ("ply", "spz", "gaussians")
 
 
 class GaussianSavers:
-    """The ``save_<save_type>`` that our exporters name, for a system of the host; each writes
-    below the system's folder.
-    """
+    """The ``save_<save_type>`` that our exporters name, for a system of the host."""
 
     def save_ply(self, filename: str, stored: StoredCloud, pruned_to: Spent = None) -> None:
         self.save_gaussians(filename, stored, ".ply", pruned_to)
@@ -73,16 +71,11 @@ class GaussianSavers:
         self.save_gaussians(filename, stored, ".spz", pruned_to, spz_version=version)
 
     def save_gaussians(
-        self,
-        filename: str,
-        stored: StoredCloud,
-        suffix: str,
-        pruned_to: Spent = None,
-        **options: Any,
+        self, filename: str, stored: StoredCloud, suffix: str, pruned_to: Spent = None, **more: Any
     ) -> None:
         antialiased = settings_of(self).antialias
         stored = stored._replace(pruned_to=pruned_to, antialiased=antialiased)
-        write_cloud(self.get_save_path(filename), stored, suffix, **options)
+        write_cloud(self.get_save_path(filename), stored, suffix, **more)
 
     def save_points(self, filename: str, cloud: PointCloud) -> None:
         write_points(self.get_save_path(filename), cloud)
@@ -111,11 +104,8 @@ def prompt_of(system: Any) -> str:
 
 
 def export(system: Any) -> None:
-    """Write the files of the exporter, the page, and the pruned cloud; a training run ends with it,
-    and so does ``--export``, after the video.
-
-    Raises:
-        Exception: the first error of one of these, after all others are written.
+    """Write the files of the exporter, the page, and the pruned cloud: the end of a training run
+    and of ``--export``. Raises the first error of one of these, after all others are written.
     """
     folder = f"it{system.true_global_step}-export"
     calls = writers(system, system.geometry, folder)
@@ -143,11 +133,7 @@ def writers(
     system: Any, geometry: Any, folder: str, pruned_to: Spent = None
 ) -> dict[str, Callable[[], None]]:
     """Return a function for each format of the exporter of ``system`` that writes its files of a
-    geometry.
-
-    Args:
-        folder: below the system's folder of results.
-        pruned_to: PSNR in dB, noted in files of Gaussians.
+    geometry into ``folder``; ``pruned_to``, dB, is noted in files of Gaussians.
     """
     parts = {"geometry": geometry, "material": system.material, "background": system.background}
     exporter = find(system.cfg.exporter_type)(system.cfg.exporter, **parts)
@@ -174,10 +160,8 @@ def writers(
 
 
 def save(system: Any, out: ExporterOutput, path: str, noted: Mapping[str, Any]) -> None:
-    """Write one output of an exporter.
-
-    Raises:
-        UserError: the system can't save its type, or the type has other params.
+    """Write one output of an exporter; raise UserError if the system can't save its type, or the
+    type has other params.
     """
     write, params = getattr(system, f"save_{out.save_type}", None), {**noted, **out.params}
     if write is None:
@@ -289,9 +273,8 @@ def discard_turntable(system: Any) -> None:
 
 
 def write_turntable(system: Any) -> None:
-    """Write the pictures ``it<step>-test/<number>.png`` as a video, and fewer of them as WebP.
-
-    A video that can't be written is a warning, since the exports follow.
+    """Write the test pictures as a video, and fewer of them as WebP. A video that can't be written
+    is a warning, since the exports follow.
     """
     name = turntable_name(system)
     options = {"save_format": "mp4", "fps": 30, "name": "test", "step": system.true_global_step}

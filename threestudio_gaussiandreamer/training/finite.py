@@ -1,8 +1,6 @@
 """Stop a run whose parameters or optimiser state aren't finite, or whose parameters the optimiser
-doesn't have, before they are saved; warn of one whose first renders are empty.
-
-Adam's moments stay NaN once they are, and the rasteriser skips Gaussians with NaN. Without this
-check such a run would end without an error, and with holes in the object.
+doesn't have, before they are saved: the rasteriser skips Gaussians with NaN, so that such a run
+would end without an error. Warn of one whose first renders are empty.
 """
 
 from collections.abc import Iterable, Iterator, Mapping
@@ -89,9 +87,7 @@ def require_finite(
 def require_optimised(
     geometry: torch.nn.Module, optimizers: Iterable[torch.optim.Optimizer]
 ) -> None:
-    """Raise UserError if a parameter of the cloud was replaced without the optimiser, if there is
-    one: it wouldn't be trained.
-    """
+    """Raise UserError if a parameter of the cloud was replaced without the optimiser."""
     groups = [group for optimizer in optimizers for group in optimizer.param_groups]
     trained = {id(parameter) for group in groups for parameter in group["params"]}
     for name, parameter in geometry.named_parameters():

@@ -183,9 +183,7 @@ class GaussianCloud(BaseGeometry):
         return len(self.means)
 
     def update_step(self, epoch: int, global_step: int, on_load_weights: bool = False) -> None:
-        """Refuse a cloud that no one has filled, as in another package's system: nothing would be
-        trained.
-        """
+        """Refuse a cloud that no one has filled, as in another package's system."""
         super().update_step(epoch, global_step, on_load_weights=on_load_weights)
         if not (len(self) or on_load_weights):
             raise UserError(
@@ -268,21 +266,15 @@ class GaussianCloud(BaseGeometry):
     # -- start -------------------------------------------------------------------------------------
 
     def prior(self) -> Any:
-        """Build the prior of the configuration, without running it.
-
-        Raises:
-            UserError: the part isn't called with a prompt.
-        """
+        """Build the prior; raise UserError if the part isn't called with a prompt."""
         part = find(self.cfg.prior_type)
         require_method(part, "__call__", "prompt")
         return part(self.cfg.prior)
 
     def initialize(self, prompt: str, make_cloud: Any = None) -> PointCloud:
-        """Run the prior, grow and perturb its points, and start one Gaussian on each; returns the
-        prior's points.
-
-        ``make_cloud(prior, prompt)`` may stand in for ``prior(prompt)``, for instance to read a
-        cached result."""
+        """Run the prior, grow and perturb its points, and start one Gaussian on each; return the
+        prior's points. ``make_cloud(prior, prompt)``, if given, stands in for ``prior(prompt)``.
+        """
         prior = self.prior()
         if self.cfg.keep_attributes and hasattr(prior, "gaussians"):
             arrays = prior.gaussians(prompt)
@@ -346,9 +338,7 @@ class GaussianCloud(BaseGeometry):
 
     @torch.no_grad()
     def warn_of_clamped_sizes(self) -> None:
-        """Warn once if some Gaussians have scales at the bounds of ``LOG_SCALE_RANGE``; on a GPU
-        when it is known, see ``reads``.
-        """
+        """Warn once if scales are beyond ``LOG_SCALE_RANGE``; on a GPU when it is known."""
         low, high = LOG_SCALE_RANGE
 
         def tell(clamped: Bool[Tensor, " N"]) -> None:
@@ -370,9 +360,7 @@ class GaussianCloud(BaseGeometry):
     # -- optimisation ------------------------------------------------------------------------------
 
     def parameter_groups(self) -> list[dict[str, Any]]:
-        """Return one optimiser group per attribute, named after it; the rates are set every step by
-        :meth:`set_learning_rates`.
-        """
+        """Return one optimiser group per attribute, named after it, without learning rates."""
         return [
             {"params": [parameter], "name": name, "lr": 0.0}
             for name, parameter in self.parameters_by_name().items()
@@ -399,10 +387,7 @@ class GaussianCloud(BaseGeometry):
 
     def apply_change(self, change: Change, optimizer: torch.optim.Optimizer) -> None:
         """Apply ``change`` to the cloud and to the rows of the optimiser's state, and reset the
-        statistics.
-
-        Raises:
-            UserError: no Gaussian is left, or parents and values don't fit the cloud.
+        statistics; raise UserError if no Gaussian is left, or parents and values don't fit.
         """
         old = self.parameters_by_name()
         self._require_fit(change)

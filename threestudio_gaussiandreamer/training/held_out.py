@@ -1,10 +1,8 @@
-"""Held-out scores: compare the cloud with ray-cast views of the mesh that aren't used in training.
-
-The ground truth is ray cast, independently of the splatting rasteriser, and composited over the
-background of the render. Scores: PSNR and SSIM, averaged over the views; fraction of views that
-show another side of the object (multi-face); fraction of the opacity far from the surface (floater
-mass); fraction of pixels with a colour outside [0, 1] (out of gamut); mean saturation of the
-colours relative to the ground truth's."""
+"""Held-out scores: compare the cloud with ray-cast views of the mesh that aren't used in training,
+composited over the background of the render. PSNR and SSIM, averaged over the views; fraction of
+views that show another side of the object (multi-face); fraction of the opacity far from the
+surface (floater mass); fraction of pixels with a colour outside [0, 1] (out of gamut); mean
+saturation of the colours relative to the ground truth's."""
 
 import time
 from collections.abc import Iterator
@@ -34,9 +32,9 @@ from .data import MAX_SIDE, orbit_batch
 from .renderer import require_outputs
 
 VIEW_BYTES = 40
-"""Memory per pixel, bytes: ground truth with coverage (16), ground truth over the background (12)
-and render (12), in float32.
-"""
+"""Memory per pixel, bytes: ground truth (16), over the background (12), and render (12)."""
+RING, RING_SIZE = 24, 32
+"""Azimuths that the multi-face rate compares with, and their pixels each way."""
 
 
 @dataclass
@@ -48,16 +46,12 @@ class EvaluationConfig:
 
     @staticmethod
     def check(cfg: Any) -> None:
-        pixels = cfg.views * cfg.size**2
         what = f"{cfg.views} pictures of {cfg.size} x {cfg.size} pixels, twice"
-        require_memory("size", VIEW_BYTES * pixels, what)
+        require_memory("size", VIEW_BYTES * cfg.views * cfg.size**2, what)
 
 
 class HeldOut:
     """The held-out views and their ground truth, which a :class:`raycast.MeshCaster` casts."""
-
-    RING = 24  # number of azimuths that the multi-face rate compares with
-    RING_SIZE = 32
 
     def __init__(self, cfg: EvaluationConfig, caster: Any) -> None:
         self.cfg, self.caster = cfg, caster
@@ -77,20 +71,18 @@ class HeldOut:
         """For each distinct pair of elevation and distance: the indices of its held-out views,
         ``RING`` azimuths in degrees, and the ground truth at those, (R, h, w, 4).
         """
-        azimuth, rings = 360.0 * torch.arange(self.RING) / self.RING, []
+        azimuth, same, rings = 360.0 * torch.arange(RING) / RING, torch.ones(RING), []
         places = torch.stack([self.orbit.elevation, self.orbit.distance], 1)
         for place in places.unique(dim=0):
             rows = (places == place).all(1).nonzero()[:, 0]
-            same = torch.ones(self.RING)
             ring = Orbit(same * place[0], azimuth, same * place[1], same * self.orbit.fovy[0])
-            rings.append((rows, azimuth, self._cast(ring, self.RING_SIZE, 4)))
+            rings.append((rows, azimuth, self._cast(ring, RING_SIZE, 4)))
         return rings
 
     def _cast(self, orbit: Orbit, size: int, supersample: int) -> Float[Tensor, "V H W 4"]:
         cameras = zip(orbit.c2w.numpy(), orbit.fovy.tolist(), strict=True)
-        return torch.from_numpy(
-            self.caster.render_views(cameras, size, size, supersample=supersample)
-        )
+        views = self.caster.render_views(cameras, size, size, supersample=supersample)
+        return torch.from_numpy(views)
 
     @torch.no_grad()
     def render(self, renderer: Any, chunk: int = 4) -> tuple[Tensor, Tensor]:
@@ -113,9 +105,7 @@ class HeldOut:
     def multi_face(
         self, images: Float[Tensor, "V H W 3"], backgrounds: Float[Tensor, "V 3"]
     ) -> float:
-        """Return the fraction of views that are most similar to a ground-truth view more than 45
-        degrees of azimuth away.
-        """
+        """Return the fraction of views most similar to a true one over 45 degrees away."""
         wrong = 0.0
         for rows, azimuth, ring in self.rings:
             bank = over_background(ring, backgrounds[rows[0]])
@@ -124,9 +114,7 @@ class HeldOut:
         return wrong / len(images)
 
     def floaters(self, means: Float[Tensor, "N 3"], opacities: Float[Tensor, " N"]) -> float:
-        """Return the opacity-weighted fraction of Gaussians whose distance from the surface exceeds
-        2 % of the longest side of its bounding box.
-        """
+        """Return the share of the opacity further than 2 % of the longest side from the surface."""
         distances = torch.from_numpy(self.surface_distance(means.double().cpu().numpy()))
         extent = float(np.ptp(self.caster.mesh.vertices, axis=0).max())
         return metrics.floater_mass(distances, opacities.double().cpu(), extent=extent)
@@ -180,8 +168,7 @@ class Measurements:
     @torch.no_grad()
     def score(self, key: str, renderer: Any, step: int) -> dict[str, dict[str, Any]]:
         """Score the renderer's cloud after ``step`` optimiser steps, and before it the postponed
-        ones; store the scores in ``metrics.json``, and return them by key: "prior" or "result", or
-        "curve", a list to which they are appended.
+        one; store and return the scores by key, "prior", "result", or "curve", which is a list.
         """
         scores = self.score_postponed()
         with self.paused_clock():

@@ -37,10 +37,8 @@ def regularisers() -> dict[str, Callable[[Mapping[str, Any]], Tensor]]:
 def weighted_losses(
     guided: Mapping[str, Any], out: Mapping[str, Any], weights: Mapping[str, float]
 ) -> dict[str, Tensor]:
-    """Compute the weighted ``loss_*`` of a guidance, and the weighted regularisers.
-
-    Args:
-        out: what the regularisers see: the renderer's outputs, and the cloud as it is drawn.
+    """Compute the weighted ``loss_*`` of a guidance, and the weighted regularisers of ``out``, the
+    renderer's outputs and the cloud as it is drawn.
 
     Raises:
         UserError: there is no loss, a weight without a loss, or a loss without a weight.
@@ -62,12 +60,7 @@ class _Outputs(ChainMap):
 
 
 def _of_renders(name: str, call: Any, out: Mapping[str, Any]) -> Float[Tensor, ""]:
-    """Return a regulariser of a step's outputs.
-
-    Raises:
-        UserError: it reads an output that there isn't, or doesn't return one finite number with a
-            gradient.
-    """
+    """Return a regulariser of a step's outputs, one finite number with a gradient."""
     seen, name = _Outputs(out), name + SUFFIX
     seen.reader = name
     value = call(seen)
@@ -105,8 +98,8 @@ def total(losses: Mapping[str, Tensor], guidance: str) -> Float[Tensor, ""]:
 
 
 def require_gradients(geometry: torch.nn.Module, losses: Mapping[str, Tensor]) -> None:
-    """Raise UserError if no gradient of the losses has reached the cloud, as when a guidance
-    computes its loss from a copy of the renders, or from parameters of its own alone.
+    """Raise UserError if no gradient of the losses has reached the cloud, as from a loss of copies
+    of the renders, or of a guidance's own parameters alone.
     """
     gradients = [parameter.grad for parameter in geometry.parameters()]
     if gradients and all(gradient is None for gradient in gradients):
@@ -137,9 +130,7 @@ def loggable(guided: Mapping[str, Any], losses: Mapping[str, Tensor]) -> dict[st
 
 
 def logged_names(guidance: type, options: Iterable[str]) -> Optional[set[str]]:
-    """Return the names that a run with the loss weights ``options`` logs; None if the class of the
-    guidance doesn't declare what it returns.
-    """
+    """Return the names that a run with these loss weights logs; None if that isn't known."""
     if not issubclass(guidance, ScoreDistillation):
         return None
     guided = [name.replace("lambda_", "loss_", 1) for name in options]
@@ -150,11 +141,7 @@ def logged_names(guidance: type, options: Iterable[str]) -> Optional[set[str]]:
 
 def check_losses(guidance: type, options: Mapping[str, Any]) -> None:
     """Check the keys of ``system.loss``, and if the class of the guidance declares its losses, that
-    they fit those: see :func:`check_weights`.
-
-    Raises:
-        UserError: a key isn't ``lambda_*``, every weight is 0, a regulariser isn't a function of
-            one argument, or the losses are declared by a string.
+    they fit those. Raises UserError, also for a regulariser that isn't a function of one argument.
     """
     for name in options:
         if not name.startswith("lambda_"):

@@ -121,22 +121,15 @@ def _check_rates(params: Any) -> None:
 
 
 class PartRates:
-    """Learning rates of the parts beside the geometry.
-
-    Args:
-        options: the section ``system.optimizer``.
-    """
+    """Learning rates of the parts beside the geometry; ``options`` is ``system.optimizer``."""
 
     def __init__(self, options: Any) -> None:
         params = options.get("params") or {}
         self.rates = {GROUP.format(name): parse_schedule(params[name]["lr"]) for name in params}
 
     def groups(self, system: Any) -> Groups:
-        """Return the groups of our background, and of other packages' parts that have parameters.
-
-        Raises:
-            UserError: such a part has no learning rate, there is a rate without such a part, or a
-                class that is derived from our geometry has parameters in none of its groups.
+        """Return the groups of our background, and of other packages' parts that have parameters;
+        raise UserError for parameters without a learning rate, and for a rate without parameters.
         """
         geometry = system.geometry
         for name, parameter in _without_group(geometry, geometry.parameter_groups()).items():
@@ -175,7 +168,7 @@ class PartRates:
 
 
 def _without_group(part: torch.nn.Module, groups: Groups) -> dict[str, torch.nn.Parameter]:
-    """Return the trainable parameters of a part, by name, that are in none of these groups."""
+    """Return the trainable parameters of a part that are in none of these groups."""
     grouped = {id(parameter) for group in groups for parameter in group["params"]}
     return {
         name: parameter

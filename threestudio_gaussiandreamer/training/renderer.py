@@ -53,11 +53,7 @@ OUTPUTS = ("comp_rgb", "comp_rgb_bg", "opacity", "depth", "rasterized")
 
 
 def require_outputs(renderer: Any, out: Any) -> Mapping[str, Any]:
-    """Return the outputs of a renderer, which may be a subclass outside this package.
-
-    Raises:
-        UserError: some of ``OUTPUTS`` aren't among them.
-    """
+    """Return the outputs of a renderer; raise UserError if some of ``OUTPUTS`` are missing."""
     missing = [name for name in OUTPUTS if name not in out] if isinstance(out, Mapping) else OUTPUTS
     if missing:
         raise UserError(
@@ -171,10 +167,8 @@ def normals_from_depth(
     fovy: Float[Tensor, " B"],
 ) -> Float[Tensor, "B H W 3"]:
     """Compute world-space normals of the depth surface, mapped from [-1, 1] to [0, 1]; 0.5 where
-    nothing is drawn.
-
-    ``depth`` is along the optical axis; the normal is the cross product of the surface's
-    differences along rows and columns."""
+    nothing is drawn. ``depth`` is along the optical axis.
+    """
     focal = cameras.focal_length(fovy, depth.shape[1])
     points = cameras.surface_points(depth[..., 0], c2w, focal)
     padded = F.pad(points, (1, 1, 1, 1), mode="replicate")

@@ -3,9 +3,8 @@ then render, measure and export them.
 
 In the host's order: ``configure_optimizers`` builds prompt processor and guidance and runs the
 prior; ``training_step`` renders, gets the losses from the guidance, steps the optimiser, then
-densifies and prunes (after the step, so that no update is lost and a checkpoint written after it
-holds the cloud that the next step starts from); validation saves a grid of pictures, test a
-turntable. If the guidance knows a mesh as ground truth, held-out views are scored.
+densifies and prunes; validation saves a row of pictures, test a turntable. If the guidance knows a
+mesh as ground truth, held-out views are scored.
 
 =============  =====================================================================================
 option         meaning
@@ -20,8 +19,8 @@ evaluation     views, size (pixels), supersample, every (steps; 0: only at start
 prune          options of a second, pruned export. Its budget is one of count; bytes (of the SPZ
                file if it is exported, else of the PLY); psnr (dB, to the unpruned cloud); within
                (dB that may be lost against the ground truth); auto (dB: twice as many would gain
-               less). quality, size and steps are as in
-               the prune command; eps2d and antialias by default the renderer's
+               less). quality, size and steps are as in the prune command; eps2d and antialias by
+               default the renderer's
 pages          write a page that shows the cloud in a browser, and more: see ``export.py``
 =============  =====================================================================================
 """
@@ -40,48 +39,17 @@ from ..core.distributed import average_gradients, from_first, rank
 from ..core.errors import UserError
 from ..core.host_copies import flush_reads
 from ..core.methods import require_class_method
+from ..core.schedule import validate_schedule
 from ..gaussians.gaussians import SHAPES, require_cloud
-from ..guidance.external import (
-    call_guidance,
-    learnt_weights,
-    own_randomness,
-    restore_learnt,
-    trainable_groups,
-    truth_of,
-)
-from ..host import (
-    BaseLift3DSystem,
-    C,
-    find,
-    info,
-    parse_structured,
-    register,
-    validate_schedule,
-    warn,
-)
+from ..guidance import external
+from ..guidance.external import truth_of
+from ..host import BaseLift3DSystem, C, find, info, parse_structured, register, warn
 from ..metrics import psnr_of_error
 from ..priors.base import preflight_prior
 from ..priors.cache import cached_cloud
 from ..prune import PruneOptions
+from . import events, export, finite
 from .density import DensityOutcome, MeanError, density_rule
-from .events import StepLog, log_scores, prefetch_truth, rgb_panel, save_pictures, true_views
-from .export import (
-    GaussianSavers,
-    discard_turntable,
-    export,
-    exported_files,
-    save_first_cloud,
-    turntable_name,
-    write_turntable,
-)
-from .finite import (
-    CHECK_EVERY,
-    LossScale,
-    optimizer_tensors,
-    require_finite,
-    require_optimised,
-    warn_if_invisible,
-)
 from .held_out import EvaluationConfig, HeldOut, Measurements
 from .losses import (
     check_losses,
@@ -103,7 +71,7 @@ OURS = {"geometry": "gaussiandreamer-cloud", "renderer": "gaussiandreamer-splatt
 
 
 @register("gaussiandreamer-system")
-class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
+class GaussianDreamerSystem(export.GaussianSavers, BaseLift3DSystem):
     @dataclass
     class Config(BaseLift3DSystem.Config):
         exporter_type: str = "gaussiandreamer-exporter"
@@ -152,9 +120,9 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         self.density = density_rule(self.geometry)
         self.automatic_optimization = False
         self.__dict__["guidance"] = self.measurements = self.prompt_utils = None
-        self.loss_scale = LossScale()
-        self.step_log = StepLog()
-        self.recent_losses: deque[tuple[int, Losses]] = deque(maxlen=CHECK_EVERY)
+        self.loss_scale = finite.LossScale()
+        self.step_log = events.StepLog()
+        self.recent_losses: deque[tuple[int, Losses]] = deque(maxlen=finite.CHECK_EVERY)
         self._learnt: Optional[dict[str, Tensor]] = None
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
@@ -162,20 +130,18 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         preflight_parts(self.geometry, self.cfg)
         self.prepare_guidance()
         self.ensure_cloud()
-        of_guidance = trainable_groups(self.guidance, GUIDANCE_LR)
+        of_guidance = external.trainable_groups(self.guidance, GUIDANCE_LR)
         groups = self.geometry.parameter_groups() + of_parts + of_guidance
         return make_optimizer(self.cfg.optimizer, groups)
 
     def prepare_guidance(self) -> None:
-        """Build prompt processor and guidance. Called before the prior runs, so that missing
-        weights are reported first.
-        """
+        """Build prompt processor and guidance; before the prior runs, to report missing weights."""
         self.prompt_processor = find(self.cfg.prompt_processor_type)(self.cfg.prompt_processor)
         self.prompt_utils = self.prompt_processor()
         # not registered as a submodule, so that its frozen weights stay out of the checkpoint
         self.__dict__["guidance"] = find(self.cfg.guidance_type)(self.cfg.guidance)
         if self._learnt is not None:
-            restore_learnt(self.guidance, self._learnt)
+            external.restore_learnt(self.guidance, self._learnt)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         # before the file of an earlier, good state is replaced
@@ -183,9 +149,9 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         self.require_finite()
         if self.measurements:  # the prior's cloud isn't in this file, so score it now
             scores = self.measurements.score_postponed()
-            log_scores(self.loggers, scores, self.cfg.evaluation.views)
+            events.log_scores(self.loggers, scores, self.cfg.evaluation.views)
         super().on_save_checkpoint(checkpoint)
-        checkpoint["guidance"] = learnt_weights(self.guidance)
+        checkpoint["guidance"] = external.learnt_weights(self.guidance)
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         super().on_load_checkpoint(checkpoint)
@@ -194,31 +160,31 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
 
     def require_finite(self) -> None:
         """Check parameters and optimiser state; see :mod:`.finite`."""
-        require_optimised(self.geometry, self.trainer.optimizers)
+        finite.require_optimised(self.geometry, self.trainer.optimizers)
         tensors = list(self.named_parameters())
         for optimizer in self.trainer.optimizers:
-            tensors += optimizer_tensors(optimizer)
-        require_finite(tensors, self.true_global_step, self.recent_losses)
+            tensors += finite.optimizer_tensors(optimizer)
+        finite.require_finite(tensors, self.true_global_step, self.recent_losses)
 
     def ensure_cloud(self) -> None:
         """Run the prior, unless the cloud has been loaded from a checkpoint."""
         if len(self.geometry):
             return
+
+        def first_state() -> dict[str, Tensor]:
+            make = find(self.cfg.prompt_processor_type)
+            prompt = self.prompt_utils or make(self.cfg.prompt_processor)
+            self.geometry.initialize(
+                str(getattr(prompt, "prompt", "")),
+                lambda prior, text: cached_cloud(prior, text, self._save_dir),
+            )
+            return {name: value.cpu() for name, value in self.geometry.state_dict().items()}
+
         # one process runs the prior: on a GPU two runs may differ in their last bits
-        state = from_first(self.first_state)
+        state = from_first(first_state)
         if rank():
             self.geometry.load_state_dict(state)
         info(f"the cloud starts with {len(self.geometry)} Gaussians")
-
-    def first_state(self) -> dict[str, Tensor]:
-        """Run the prior; return the state of the cloud, on the CPU."""
-        make = find(self.cfg.prompt_processor_type)
-        prompt = self.prompt_utils or make(self.cfg.prompt_processor)
-        self.geometry.initialize(
-            str(getattr(prompt, "prompt", "")),
-            lambda prior, text: cached_cloud(prior, text, self._save_dir),
-        )
-        return {name: value.cpu() for name, value in self.geometry.state_dict().items()}
 
     def on_fit_start(self) -> None:
         super().on_fit_start()
@@ -233,12 +199,12 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         if problem := self.density.schedule_problem(self.global_step, self.trainer.max_steps):
             warn(problem)
         if self.global_step == 0 and self._save_dir is not None:
-            save_first_cloud(self)
+            export.save_first_cloud(self)
         if self.measurements:
             if self.global_step == 0:
                 self.measurements.begin(self.renderer)
             self.measurements.start_clock()
-        prefetch_truth(self)
+        events.prefetch_truth(self)
 
     # -- one step ----------------------------------------------------------------------------------
 
@@ -262,7 +228,7 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         self, optimizer: torch.optim.Optimizer, out: Outputs, batch: Batch, losses: Losses
     ) -> None:
         """Reduce the gradients over the processes, and step the optimiser."""
-        warn_if_invisible(out["opacity"], self.global_step)
+        finite.warn_if_invisible(out["opacity"], self.global_step)
         require_gradients(self.geometry, losses)
         average_gradients(p for group in optimizer.param_groups for p in group["params"])
         loss_scale = self.loss_scale.value(self.trainer)
@@ -273,14 +239,13 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         if self.loss_scale.has_skipped(self.trainer, loss_scale):
             skipped = {"train/skipped_steps": self.loss_scale.skipped_steps}
             self.step_log.write(self.trainer, skipped)
-        if self.global_step % CHECK_EVERY == 0:
+        if self.global_step % finite.CHECK_EVERY == 0:
             self.require_finite()
         optimizer.zero_grad()
 
     def control_density(self, optimizer: torch.optim.Optimizer) -> None:
         """Densify and prune on schedule; log what a round of ``budget: auto`` found."""
-        # The rows of the optimiser's state are changed with the Gaussians, so pass the torch
-        # optimiser in Lightning's wrapper.
+        # the torch optimiser in Lightning's wrapper, since the rows of its state are changed
         outcome = self.density.after_step(optimizer.optimizer, self.global_step)
         if not isinstance(outcome, DensityOutcome | None):
             found = f"{type(self.density).__name__}.after_step returned {type(outcome).__name__}"
@@ -290,15 +255,13 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
             info(f"step {self.global_step}: {outcome}")
 
     def error_of(self, out: Outputs, batch: Batch, guided: dict[str, Any]) -> Optional[MeanError]:
-        """Return what computes the mean squared error of renders to the ground truth; None if there
-        is none.
-        """
+        """Return what computes the mean squared error to the ground truth, if there is one."""
         if "error_to_truth" in guided:
             return lambda: torch.tensor(guided["error_to_truth"], dtype=torch.float64)
         if truth_of(self.guidance) is None:
             return None
         rgb = out["comp_rgb"].detach()
-        return lambda: (rgb - true_views(self.guidance, batch, out)).square().mean()
+        return lambda: (rgb - events.true_views(self.guidance, batch, out)).square().mean()
 
     def set_learning_rates(self, optimizer: torch.optim.Optimizer) -> None:
         now = self.true_current_epoch, self.true_global_step
@@ -306,9 +269,7 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         self.part_rates.set(self, optimizer, *now)
 
     def losses(self, guided: dict[str, Any], out: Outputs) -> Losses:
-        """Return the weighted losses of the guidance and the regularisers, which see the renders
-        and the cloud.
-        """
+        """Return the weighted losses of the guidance, and of regularisers of renders and cloud."""
         now = self.true_current_epoch, self.true_global_step
         weights = {name: C(weight, *now) for name, weight in self.loss_weights.items()}
         losses = weighted_losses(guided, ChainMap(out, self.geometry.drawn()), weights)
@@ -317,18 +278,16 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         return losses
 
     def guide(self, out: Outputs, batch: Batch, **options: Any) -> dict[str, Any]:
-        """Call the guidance with these renders, the whole batch, the renders' background, and the
-        further outputs of the renderer that it names.
-        """
+        """Call the guidance with renders, batch, background, and the outputs that it names."""
         options |= {name: out[name].detach() for name in getattr(self.guidance, "renders", ())}
         options["comp_rgb_bg"] = out["comp_rgb_bg"]
-        with own_randomness(self.true_global_step):
-            inputs = out["comp_rgb"], self.prompt_utils, batch
-            return call_guidance(self.guidance, *inputs, **options)
+        inputs = self.guidance, out["comp_rgb"], self.prompt_utils, batch
+        with external.own_randomness(self.true_global_step):
+            return external.call_guidance(*inputs, **options)
 
     def report(self, out: Outputs, batch: Batch, guided: dict[str, Any], losses: Losses) -> None:
-        """Log what the guidance returned, the weighted losses and their sum, the number of
-        Gaussians and, if there is a ground truth, PSNR, every ``log_every_n_steps``.
+        """Log what the guidance returned, the losses, the number of Gaussians and, if there is a
+        ground truth, the PSNR, every ``log_every_n_steps``.
         """
         every = self.trainer.log_every_n_steps
         if not every or self.global_step % every:
@@ -354,7 +313,7 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         if self.measurements:
             flush_reads(self.step_log)
             scores = self.measurements.score(key, self.renderer, self.global_step)
-            log_scores(self.loggers, scores, self.cfg.evaluation.views)
+            events.log_scores(self.loggers, scores, self.cfg.evaluation.views)
 
     def on_train_end(self) -> None:
         flush_reads(self.step_log, self.geometry, self.guidance)
@@ -369,7 +328,7 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
 
     def summary(self) -> str:
         """List the files of results and the scores; printed at the end of a run."""
-        lines = [*exported_files(Path(self._save_dir or ".")), "", self.density.summary()]
+        lines = [*export.exported_files(Path(self._save_dir or ".")), "", self.density.summary()]
         return "\n".join([*lines, *(["", self.measurements.table()] if self.measurements else [])])
 
     # -- pictures ----------------------------------------------------------------------------------
@@ -378,22 +337,22 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
         if rank():  # only the first process renders, scores and exports results
             return
         with self.measurements.paused_clock() if self.measurements else contextlib.nullcontext():
-            save_pictures(self, batch)
+            events.save_pictures(self, batch)
 
     def on_validation_epoch_end(self) -> None:
         pass
 
     def test_step(self, batch: dict[str, Any], batch_idx: int) -> None:
         if not rank():
-            name = f"{turntable_name(self)}/{int(batch['index'][0])}.png"
-            panels = [rgb_panel(self(batch)["comp_rgb"][0])]
+            name = f"{export.turntable_name(self)}/{int(batch['index'][0])}.png"
+            panels = [events.rgb_panel(self(batch)["comp_rgb"][0])]
             self.save_image_grid(name, panels, name="test_step", step=self.true_global_step)
 
     def on_test_epoch_end(self) -> None:
         if not rank():
-            write_turntable(self)
+            export.write_turntable(self)
             if self.guidance is not None:
-                export(self)
+                export.export(self)
 
     def on_validation_start(self) -> None:
         self.ensure_cloud()
@@ -402,19 +361,19 @@ class GaussianDreamerSystem(GaussianSavers, BaseLift3DSystem):
     def on_test_start(self) -> None:
         self.on_validation_start()
         if not rank():
-            discard_turntable(self)
+            export.discard_turntable(self)
 
     def on_predict_start(self) -> None:
         self.on_validation_start()
         super().on_predict_start()
         if not rank() and self.exporter.cfg.save_video:
-            discard_turntable(self)
+            export.discard_turntable(self)
 
     def on_predict_epoch_end(self) -> None:
         if not rank():
             if self.exporter.cfg.save_video:
                 self.on_test_epoch_end()
-            export(self)
+            export.export(self)
 
 
 # -- the parts of a configuration ------------------------------------------------------------------
