@@ -32,13 +32,6 @@ def test_tensors_and_arrays_convert_back_and_forth_without_gradients():
     assert all(values.dtype == torch.float32 for values in halves.tensors())
 
 
-def test_of_collects_the_attributes_of_these_names():
-    class Geometry:
-        means, quats, log_scales, logit_opacities, sh, other = range(6)
-
-    assert Gaussians.of(Geometry) == (0, 1, 2, 3, 4)
-
-
 def test_usable_lets_infinite_logarithms_pass_where_they_mean_zero_or_one():
     gaussians = some(8)
     gaussians.means[0, 0] = np.nan

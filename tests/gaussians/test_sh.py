@@ -31,18 +31,6 @@ def by_scipy(dirs, degree):
     return np.stack(basis, -1)
 
 
-def test_basis_is_orthonormal():
-    """Gauss-Legendre in z times a regular grid in phi integrates products of degree 6 exactly."""
-    z, weights = np.polynomial.legendre.leggauss(8)
-    phi = np.arange(16) * 2 * np.pi / 16
-    z, phi = np.meshgrid(z, phi, indexing="ij")
-    across = np.sqrt(1 - z**2)
-    dirs = torch.from_numpy(np.stack([across * np.cos(phi), across * np.sin(phi), z], -1))
-    basis = torch.stack(sh.sh_basis(dirs, 3), -1).numpy()
-    gram = np.einsum("i,ijk,ijl->kl", weights * 2 * np.pi / 16, basis, basis)
-    np.testing.assert_allclose(gram, np.eye(16), atol=1e-13)
-
-
 @pytest.mark.parametrize("degree", range(4))
 def test_basis_and_colors_equal_scipys_of_one_or_several_views(degree):
     ours = torch.stack(sh.sh_basis(directions(), degree), -1)

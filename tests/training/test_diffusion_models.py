@@ -54,8 +54,6 @@ def models(tmp_path_factory):
         "point_e": prior(checkpoint=base, upsampler=upsampler, num_steps=2, num_points=64)
         | prior(clip=clip),
         "motion": prior(motion=motion(folder), body_model=body, clip=clip, num_points=400),
-        "candidates": prior(candidates=f"[{bodies(folder)}]", motion="''", body_model="''")
-        | prior(clip=clip, num_points=400),
         "anny": prior(num_points=400, pose="walking"),
     }
 
@@ -73,18 +71,6 @@ def motion(folder):
     texts, lengths = np.array(["Someone waves"]), np.array([4])
     np.savez(folder / "results.npz", motion=frames, text=texts, lengths=lengths)
     return folder / "results.npz"
-
-
-def bodies(folder):
-    """Write two mesh files of the body, one of them squeezed."""
-    import trimesh
-
-    arrays = tiny_3d_models.body_arrays()
-    for name, width in (("a.obj", 1.0), ("b.obj", 0.5)):
-        trimesh.Trimesh(
-            arrays["v_template"] * [width, 1, 1], arrays["f"].astype(np.int64), process=False
-        ).export(folder / name)
-    return ",".join(str(folder / name) for name in ("a.obj", "b.obj"))
 
 
 @pytest.fixture
@@ -156,12 +142,10 @@ RUNS = {
     "pointe": ("-pointe", "point_e epsilon"),
     "avatar": ("-avatar", "anny epsilon"),
     "avatar of smpl": ("-avatar-smpl", "motion epsilon"),
-    "avatar of candidates": ("-avatar-smpl", "candidates epsilon"),
     "ground": ("-ground", "shap_e epsilon"),
     "sdxl": ("-sdxl", "shap_e sdxl"),
     "sd3": ("-sd3", "shap_e sd3"),
     "mvdream": ("-mvdream", "shap_e mvdream"),
-    "mvdream, lowmem": ("-mvdream -lowmem", "shap_e mvdream"),
     "lowmem": ("-lowmem", "shap_e epsilon"),
     "without pruning": ("-paper", "shap_e epsilon"),
 }

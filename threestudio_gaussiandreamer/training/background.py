@@ -23,17 +23,13 @@ from ..core.options import each, in_range, one_of, schedule
 from ..core.streams import generator
 from ..host import BaseBackground, C, register, run_seed
 
-MODES = ("fixed", "random", "learned")
-
 
 @register("gaussiandreamer-background")
 class FlatBackground(BaseBackground):
     @dataclass
     class Config(BaseBackground.Config):
-        mode: str = field(default="fixed", metadata=one_of(MODES))
-        color: Tuple[float, float, float] = field(
-            default=(0.0, 0.0, 0.0), metadata=each(in_range(0, 1))
-        )
+        mode: str = field(default="fixed", metadata=one_of(("fixed", "random", "learned")))
+        color: Tuple[float, float, float] = field(default=(0, 0, 0), metadata=each(in_range(0, 1)))
         lr: Any = field(default=1e-2, metadata=schedule(min=0))
 
         REMOVED: ClassVar[dict[str, Any]] = {"hold_steps": (1, "each step has its own colours")}
@@ -53,11 +49,9 @@ class FlatBackground(BaseBackground):
 
     def parameter_groups(self) -> list[dict[str, Any]]:
         """Return the optimiser's group of the learned colour; none for the other modes."""
-        return (
-            [{"params": [self.logit], "name": "background", "lr": 0.0}]
-            if self.cfg.mode == "learned"
-            else []
-        )
+        if self.cfg.mode != "learned":
+            return []
+        return [{"params": [self.logit], "name": "background", "lr": 0.0}]
 
     def set_learning_rates(self, optimizer: torch.optim.Optimizer, epoch: int, step: int) -> None:
         for group in optimizer.param_groups:

@@ -303,10 +303,9 @@ class GaussianDreamerDataModule(pl.LightningDataModule):
         self.test_dataset = EvalCameras(self.cfg, "test")
 
     def train_dataloader(self) -> DataLoader:
-        trainer = self.trainer
+        trainer, cameras = self.trainer, self.train_dataset
         if trainer is not None:  # which is at a later step in a resumed run or a later epoch
-            self.train_dataset.next_step = lambda: trainer.global_step
-        cameras = self.train_dataset
+            cameras.next_step = lambda: trainer.global_step
         return DataLoader(cameras, batch_size=None, collate_fn=cameras.collate)
 
     def views_to_prefetch(self, steps: float) -> Optional[dict[str, Any]]:
@@ -323,12 +322,9 @@ class GaussianDreamerDataModule(pl.LightningDataModule):
         return {"c2w": orbit.c2w, "fovy": orbit.fovy, "height": height, "width": width}
 
     def val_dataloader(self) -> DataLoader:
-        return self._in_order(self.val_dataset)
+        return DataLoader(self.val_dataset, collate_fn=self.val_dataset.collate)
 
     def test_dataloader(self) -> DataLoader:
-        return self._in_order(self.test_dataset)
-
-    def _in_order(self, views: EvalCameras) -> DataLoader:
-        return DataLoader(views, batch_size=self.cfg.eval_batch_size, collate_fn=views.collate)
+        return DataLoader(self.test_dataset, collate_fn=self.test_dataset.collate)
 
     predict_dataloader = test_dataloader

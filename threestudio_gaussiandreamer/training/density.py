@@ -238,9 +238,8 @@ class DensityControl(DensityRule):
         budget, keep, count = self.cloud.cfg.budget, self.cloud.cfg.prune.keep, len(self.cloud)
         if budget is None:
             return None
-        if problem := round_problem(
-            "pruning", "prune", rounds := rounds_of(self.cloud.cfg.prune), end
-        ):
+        rounds = rounds_of(self.cloud.cfg.prune)
+        if problem := round_problem("pruning", "prune", rounds, end):
             return problem
         if budget == AUTO and rounds.step < importance.SAMPLES:
             return (
@@ -286,9 +285,8 @@ class DensityControl(DensityRule):
         random = draw_shared(len(image), lambda count: torch.rand(count, 1, 1, 3, generator=rng))
         random = to_device(random, image.device).to(image)
         added = AddedBackground(pictures["opacity"], random - pictures["comp_rgb_bg"].detach())
-        self.cloud.removal += importance.removal_error(
-            image, pictures["gaussian_opacities"], rng, added
-        )
+        opacities = pictures["gaussian_opacities"]
+        self.cloud.removal += importance.removal_error(image, opacities, rng, added)
         if self.cloud.wants_absgrad:
             # removal_error has added its gradients to absgrad, which is for those of the loss only
             pictures["rasterized"].means2d.absgrad.zero_()
@@ -381,9 +379,7 @@ class DensityControl(DensityRule):
 
     def summary(self) -> str:
         budget, gain = self.cloud.cfg.budget, float(self.cloud.gain)
-        needed = (
-            str(Need(len(self.cloud), gain)) if gain >= 0 else "a round would have lost too much"
-        )
+        needed = Need(len(self.cloud), gain) if gain >= 0 else "a round would have lost too much"
         why = {None: "no budget", AUTO: needed}
         return f"{super().summary()}: {why.get(budget, f'the budget is {budget}')}"
 

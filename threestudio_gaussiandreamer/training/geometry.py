@@ -389,8 +389,8 @@ class GaussianCloud(BaseGeometry):
         """Apply ``change`` to the cloud and to the rows of the optimiser's state, and reset the
         statistics; raise UserError if no Gaussian is left, or parents and values don't fit.
         """
-        old = self.parameters_by_name()
         self._require_fit(change)
+        old = self.parameters_by_name()
         new = {name: nn.Parameter(value) for name, value in change.values.items()}
         densify.update_optimizer(optimizer, old, new, change)
         for name, parameter in new.items():

@@ -143,7 +143,7 @@ class Measurements:
         self.values: dict[str, Any] = read_json(self.path, dict)
         self.seconds = np.array([self.values.get(name, 0.0) for name in CLOCKS], np.float64)
         self._started: Optional[np.ndarray] = None
-        self._postponed: dict[str, Snapshot] = {}
+        self._prior: Optional[Snapshot] = None
 
     def start_clock(self) -> None:
         self._started = _now()
@@ -181,14 +181,14 @@ class Measurements:
         """
         self.values, self.seconds = {}, np.zeros(len(CLOCKS))
         with self.paused_clock():
-            self._postponed["prior"] = self._snapshot(renderer, 0)
+            self._prior = self._snapshot(renderer, 0)
 
     @torch.no_grad()
     def score_postponed(self) -> dict[str, dict[str, Any]]:
-        """Score what was postponed; return the scores by key."""
-        postponed, self._postponed = self._postponed, {}
+        """Score the prior's cloud, if it was postponed; return the scores by key."""
+        prior, self._prior = self._prior, None
         with self.paused_clock():
-            return {key: self._score(key, cloud) for key, cloud in postponed.items()}
+            return {"prior": self._score("prior", prior)} if prior else {}
 
     def _snapshot(self, renderer: Any, step: int) -> Snapshot:
         cloud = renderer.geometry
@@ -235,9 +235,9 @@ class Measurements:
         for name, images in ((key, renders), ("truth", truth)):
             write_image(folder / f"{name}.png", _row(images))
         pictures = []
-        for path in (folder / f"{name}.png" for name in ("prior", "result", "truth")):
+        for name in ("prior", "result", "truth"):
             with suppress(UserError):  # an earlier run's picture is missing or damaged
-                pictures.append(read_image(path))
+                pictures.append(read_image(folder / f"{name}.png"))
         if len({picture.shape for picture in pictures}) == 1:
             write_image(folder / "compare.png", np.concatenate(pictures, 0))
 

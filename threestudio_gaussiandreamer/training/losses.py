@@ -80,13 +80,8 @@ def _of_renders(name: str, call: Any, out: Mapping[str, Any]) -> Float[Tensor, "
 
 
 def total(losses: Mapping[str, Tensor], guidance: str) -> Float[Tensor, ""]:
-    """Return the sum of the weighted losses of a guidance and the regularisers.
-
-    Raises:
-        UserError: one that isn't a plain 0 has no gradient.
-    """
+    """Return the sum of the losses; raise UserError if one that isn't a plain 0 has no gradient."""
     loss = sum(losses.values())
-    # a plain 0 is a loss that is switched off; only one without a gradient has to be looked at
     constant = [name for name, value in losses.items() if not value.requires_grad and value != 0]
     if constant or not loss.requires_grad:
         names = ", ".join(f"loss_{name}" for name in (constant if loss.requires_grad else losses))
@@ -145,18 +140,25 @@ def check_losses(guidance: type, options: Mapping[str, Any]) -> None:
     """
     for name in options:
         if not name.startswith("lambda_"):
-            raise UserError(
-                f"unknown key 'system.loss.{name}': weights of losses are called "
-                "lambda_<loss>, such as lambda_sds"
-            )
+            called = "weights of losses are called lambda_<loss>, such as lambda_sds"
+            raise UserError(f"unknown key 'system.loss.{name}': {called}")
     if options and not any(options.values()):
         raise UserError(
             "system.loss: every weight is 0, so that nothing would be trained: give one, such as "
             "system.loss.lambda_sds=1"
         )
     for name, function in regularisers().items():
-        if options.get(f"lambda_{name}"):
-            _require_function(name + SUFFIX, function)
+        if not options.get(f"lambda_{name}"):
+            continue
+        name += SUFFIX
+        if isinstance(function, type):
+            found = f"{name} is the class {function.__name__}"
+            raise UserError(f"{found}; register a function of (out)")
+        try:
+            (signature := inspect.signature(function)).bind("out")
+        except TypeError as error:
+            found = f"{name} is a function of {signature}"
+            raise UserError(f"{found}, which is called as (out): {error}") from error
     known = getattr(guidance, "LOSSES", None)  # also of guidances that aren't ScoreDistillation
     if isinstance(known, str):
         raise UserError(f"{guidance.__name__}.LOSSES is a string: write ({known!r},), a tuple")
@@ -200,19 +202,6 @@ def foreign_weights(options: Iterable[str], guidance: Any) -> list[str]:
         return []
     known = {f"lambda_{name}" for name in (*losses, *regularisers())}
     return [key for key in options if key.startswith("lambda_") and key not in known]
-
-
-def _require_function(name: str, function: Any) -> None:
-    """Raise UserError unless a regulariser is a function that is called with one argument."""
-    if isinstance(function, type):
-        raise UserError(f"{name} is the class {function.__name__}; register a function of (out)")
-    try:
-        inspect.signature(function).bind("out")
-    except TypeError as error:
-        raise UserError(
-            f"{name} is a function of {inspect.signature(function)}, which is called as (out): "
-            f"{error}"
-        ) from error
 
 
 @register("sparsity-regulariser")

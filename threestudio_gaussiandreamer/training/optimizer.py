@@ -20,8 +20,6 @@ DEFAULTS = {"betas": (0.9, 0.99), "eps": 1e-15}
 Groups = list[dict[str, Any]]
 PARTS = ("background", "material", "renderer")
 """Parts that may have parameters, beside the geometry."""
-GROUP = "{}.parameters"
-"""Name of the group of a part's parameters; our background's own group is ``background``."""
 RATE = schedule(min=0)
 
 
@@ -58,18 +56,14 @@ def foreign_arguments(name: str, arguments: Mapping[str, Any]) -> list[str]:
     """Return the arguments that an optimiser lacks, or that are a pair in one and a number in the
     other, as ``eps`` of Adafactor; none if there is no such optimiser.
     """
-    accepted = accepted_arguments(name)
-    return [
-        key
-        for key, value in arguments.items()
-        if accepted and (key not in accepted or is_list(accepted[key]) != is_list(value))
-    ]
+    if not (accepted := accepted_arguments(name)):
+        return []
+    given = arguments.items()
+    return [k for k, v in given if k not in accepted or is_list(accepted[k]) != is_list(v)]
 
 
 def check_optimizer(options: Any, scheduler: Any = None) -> None:
-    """Raise UserError for a name that ``torch.optim`` lacks, arguments that it refuses, or a
-    scheduler.
-    """
+    """Raise UserError for a name or arguments that ``torch.optim`` refuses, or a scheduler."""
     if scheduler is not None:
         raise UserError(
             "scheduler isn't used: learning rates are schedules themselves, for instance "
@@ -124,8 +118,8 @@ class PartRates:
     """Learning rates of the parts beside the geometry; ``options`` is ``system.optimizer``."""
 
     def __init__(self, options: Any) -> None:
-        params = options.get("params") or {}
-        self.rates = {GROUP.format(name): parse_schedule(params[name]["lr"]) for name in params}
+        params = (options.get("params") or {}).items()
+        self.rates = {f"{name}.parameters": parse_schedule(part["lr"]) for name, part in params}
 
     def groups(self, system: Any) -> Groups:
         """Return the groups of our background, and of other packages' parts that have parameters;
@@ -143,7 +137,7 @@ class PartRates:
         return [group for name in PARTS for group in self._groups_of(name, getattr(system, name))]
 
     def _groups_of(self, name: str, part: Optional[torch.nn.Module]) -> Groups:
-        ours, own = isinstance(part, FlatBackground), GROUP.format(name)
+        ours, own = isinstance(part, FlatBackground), f"{name}.parameters"
         groups = part.parameter_groups() if ours else []
         trained = [] if part is None else [*_without_group(part, groups).values()]
         if trained and own not in self.rates:

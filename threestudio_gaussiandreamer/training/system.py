@@ -27,8 +27,9 @@ pages          write a page that shows the cloud in a browser, and more: see ``e
 
 import contextlib
 from collections import ChainMap, deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Optional
 
@@ -398,28 +399,22 @@ def check_parts(cfg: Any) -> None:
 def preflight_parts(geometry: Any, cfg: Any) -> None:
     """Check what the parts of a run need from outside, such as files, before any long work: call
     ``preflight`` of the prior, if the cloud is empty, and of the classes of prompt processor and
-    guidance with their options.
-
-    Raises:
-        UserError: something is missing; the message names the part's section.
+    guidance with their options. The UserError for what is missing names the part's section.
     """
+    checks: dict[str, Callable[[], None]] = {}
     if not len(geometry):
-        with _named("system.geometry.prior"):
-            preflight_prior(geometry.prior(), geometry.cfg.keep_attributes)
+        keep = geometry.cfg.keep_attributes
+        checks["geometry.prior"] = lambda: preflight_prior(geometry.prior(), keep)
     for name in ("prompt_processor", "guidance"):
         part = find(getattr(cfg, f"{name}_type"))
         if hasattr(part, "preflight"):
             require_class_method(part, "preflight")
-            with _named(f"system.{name}"):
-                part.preflight(parse_structured(part.Config, getattr(cfg, name)))
-
-
-@contextlib.contextmanager
-def _named(section: str) -> Iterator[None]:
-    """Put a section of the configuration in front of errors that don't name it."""
-    try:
-        yield
-    except UserError as error:
-        if section in str(error):
-            raise
-        raise UserError(f"{section}: {error}") from error
+            options = parse_structured(part.Config, getattr(cfg, name), f"system.{name}.")
+            checks[name] = partial(part.preflight, options)
+    for name, check in checks.items():
+        try:
+            check()
+        except UserError as error:
+            if f"system.{name}" in str(error):
+                raise
+            raise UserError(f"system.{name}: {error}") from error
