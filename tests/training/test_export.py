@@ -6,9 +6,7 @@ import shutil
 import numpy as np
 import pytest
 
-from tests.helpers.painted_ball import painted_ball
 from tests.training.runs import cloud_of, launch, length, run_folder
-from threestudio_gaussiandreamer.exporters import files as mesh_exporter
 from threestudio_gaussiandreamer.formats.gaussian_files import read_cloud
 from threestudio_gaussiandreamer.formats.ply import read_gaussians
 from threestudio_gaussiandreamer.host import Exporter, ExporterOutput, register
@@ -117,25 +115,3 @@ def test_formats_that_fail_leave_the_others(tmp_path, painted_box, capsys):
     with pytest.raises(RuntimeError, match="no memory for that"):
         launch(tmp_path, painted_box, options[0], f"resume={last}", stage="--export")
     assert {path.name for path in export.iterdir()} >= wanted
-
-
-def test_a_mesh_is_exported_beside_the_cloud_as_the_run_draws(tmp_path, painted_box, monkeypatch):
-    seen = []
-    convert = mesh_exporter.mesh_from_gaussians
-    monkeypatch.setattr(
-        mesh_exporter,
-        "mesh_from_gaussians",
-        lambda gaussians, options: seen.append(options) or convert(painted_ball(200), options),
-    )
-    small = "{faces: 200, texture: 64, views: 8, view_size: 64, resolution: 16}"
-    options = ["system.exporter.formats=[ply,mesh]", f"system.exporter.options={{mesh: {small}}}"]
-    steps = [*length(1)]
-    drawn = ["system.renderer.antialias=true", "system.renderer.eps2d=0.2"]
-    assert launch(tmp_path, painted_box, *options, *steps, *drawn) == 0
-    export = run_folder(tmp_path) / "save" / "it1-export"
-    files = {"gaussians.ply", "mesh.glb", "mesh.obj", "mesh.mtl", "mesh.png"}
-    assert files <= {path.name for path in export.iterdir()}
-    assert (seen[0].eps2d, seen[0].antialias, seen[0].faces) == (0.2, True, 200)
-    name = (export / "mesh.obj").read_text("utf-8").splitlines()[1].removeprefix("o ")
-    assert f'"name":"{name}"' in (export / "mesh.glb").read_bytes().decode(errors="ignore")
-    assert name not in ("", "mesh")  # but the prompt's

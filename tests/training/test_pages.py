@@ -11,11 +11,14 @@ from PIL import Image
 
 from benchmarks.viewers.browser import chromium
 from benchmarks.viewers.devtools import open_page
+from tests.helpers.painted_ball import painted_ball
 from tests.training.runs import launch, length, run_folder
 from threestudio_gaussiandreamer.core.images import read
+from threestudio_gaussiandreamer.exporters import files
 from threestudio_gaussiandreamer.training.export import discard_turntable
 
 SHORT = [*length(2)]
+MESH = "{faces: 200, texture: 64, views: 8, view_size: 64, resolution: 16}"
 
 
 def meta(path) -> dict:
@@ -23,16 +26,41 @@ def meta(path) -> dict:
 
 
 @pytest.fixture(scope="module")
-def save(tmp_path_factory, painted_box):
-    """The results of a run of two steps, and of ``--export`` after it."""
+def meshes():
+    """The options with which meshes were made; each is that of a ball instead of the cloud."""
+    seen, convert = [], files.mesh_from_gaussians
+
+    def converted(gaussians, options):
+        seen.append(options)
+        return convert(painted_ball(200), options)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(files, "mesh_from_gaussians", converted)
+        yield seen
+
+
+@pytest.fixture(scope="module")
+def save(tmp_path_factory, painted_box, meshes):
+    """The results of a run of two steps."""
     folder = tmp_path_factory.mktemp("pages")
     options = [
         "system.prompt_processor.prompt=a <painted> box",
         "system.renderer.eps2d=0.2",
         "system.renderer.antialias=true",
+        "system.exporter.formats=[ply,mesh]",
+        f"system.exporter.options={{mesh: {MESH}}}",
     ]
     assert launch(folder, painted_box, *options, *SHORT) == 0
     return run_folder(folder) / "save"
+
+
+def test_a_mesh_is_exported_beside_the_cloud_as_the_run_draws(save, meshes):
+    export = save / "it2-export"
+    written = {"gaussians.ply", "mesh.glb", "mesh.obj", "mesh.mtl", "mesh.png"}
+    assert written <= {path.name for path in export.iterdir()}
+    assert (meshes[0].eps2d, meshes[0].antialias, meshes[0].faces) == (0.2, True, 200)
+    name = (export / "mesh.obj").read_text("utf-8").splitlines()[1].removeprefix("o ")
+    assert f'"name":"{name}"' in (export / "mesh.glb").read_bytes().decode(errors="ignore")
 
 
 def test_a_run_ends_with_a_page_of_its_cloud(save):
@@ -43,14 +71,8 @@ def test_a_run_ends_with_a_page_of_its_cloud(save):
     for shown, label in zip(found["clouds"], ("result", "prior"), strict=True):
         assert shown["label"] == label and shown["count"] == 200
         assert shown["quality"] == f"{scores[label]['psnr']:.1f} dB on held-out views"
-
-
-def test_the_page_saves_the_ply_file_of_the_export(save):
-    header = meta(save / "it2-export" / "view.html")["plyHeader"].encode()
+    header = found["plyHeader"].encode()
     assert (save / "it2-export" / "gaussians.ply").read_bytes().startswith(header)
-
-
-def test_the_poster_has_a_transparent_background(save):
     poster = np.asarray(Image.open(save / "it2-export" / "poster.png"))
     assert poster.shape == (512, 512, 4)
     assert poster[0, 0, 3] == 0 and poster[..., 3].max() > 60

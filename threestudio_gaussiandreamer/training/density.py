@@ -66,7 +66,7 @@ class DensifyConfig:
     @staticmethod
     def check(cfg: Any) -> None:
         if cfg.enabled:
-            require_order(cfg)
+            PruneConfig.check(cfg)
 
 
 @dataclass
@@ -84,13 +84,8 @@ class PruneConfig:
 
     @staticmethod
     def check(cfg: Any) -> None:
-        require_order(cfg)
-
-
-def require_order(cfg: Any) -> None:
-    """Raise UserError unless a schedule of rounds starts before it stops."""
-    if cfg.start >= cfg.stop:
-        raise UserError(f"stop: expected more than start ({cfg.start}), got {cfg.stop}")
+        if cfg.start >= cfg.stop:
+            raise UserError(f"stop: expected more than start ({cfg.start}), got {cfg.stop}")
 
 
 def min_count(cfg: Any) -> int:

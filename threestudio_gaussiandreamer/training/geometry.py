@@ -56,7 +56,6 @@ from torch import Tensor, nn
 
 from ..core.errors import UserError
 from ..core.host_copies import DelayedReads
-from ..core.lazy_mapping import LazyMapping
 from ..core.memory import count_of
 from ..core.methods import require_method
 from ..core.options import (
@@ -229,12 +228,10 @@ class GaussianCloud(BaseGeometry):
     def opacities(self) -> Float[Tensor, " N"]:
         return torch.sigmoid(self.logit_opacities)
 
-    def drawn(self) -> LazyMapping:
-        """Return ``means``, ``quats``, ``scales`` and ``opacities`` as they are drawn, by name;
-        with their gradients, and computed when they are read.
-        """
-        computed = {"scales": self.scales, "opacities": self.opacities}
-        return LazyMapping({"means": self.means, "quats": self.quats}, computed)
+    def drawn(self) -> dict[str, Tensor]:
+        """Return ``means``, ``quats``, ``scales`` and ``opacities`` as they are drawn, by name."""
+        shape = {"means": self.means, "quats": self.quats, "scales": self.scales()}
+        return {**shape, "opacities": self.opacities()}
 
     @property
     def sh(self) -> Float[Tensor, "N K 3"]:

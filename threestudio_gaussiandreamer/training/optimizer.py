@@ -91,8 +91,11 @@ def check_optimizer(options: Any, scheduler: Any = None) -> None:
 
 def _refusal(options: Mapping[str, Any]) -> Optional[Exception]:
     """Make the optimiser of some parameters, and a step; return the error if it can't be done."""
+    parameters = [torch.zeros(1, requires_grad=True) for _ in range(2)]
+    for parameter in parameters:
+        parameter.grad = torch.zeros_like(parameter)
     try:
-        optimizer = make_optimizer(options, [_some_group(), _some_group()])
+        optimizer = make_optimizer(options, [{"params": [p], "lr": 0.0} for p in parameters])
         capturable = (options.get("args") or {}).get("capturable")
         if not (capturable and get_device().type == "cuda"):
             optimizer.step()  # on the CPU, which would refuse what a GPU takes
@@ -169,9 +172,3 @@ def _without_group(part: torch.nn.Module, groups: Groups) -> dict[str, torch.nn.
         for name, parameter in part.named_parameters()
         if parameter.requires_grad and id(parameter) not in grouped
     }
-
-
-def _some_group() -> dict[str, Any]:
-    parameter = torch.zeros(1, requires_grad=True)
-    parameter.grad = torch.zeros_like(parameter)
-    return {"params": [parameter], "lr": 0.0}
