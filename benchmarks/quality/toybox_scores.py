@@ -20,7 +20,7 @@ from threestudio_gaussiandreamer.evaluation.asset_metrics import (
     prior_of,
     result_of,
 )
-from threestudio_gaussiandreamer.evaluation.results import Pictures
+from threestudio_gaussiandreamer.evaluation.results import render_views
 from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
 from threestudio_gaussiandreamer.meshes.mesh import Mesh
 from threestudio_gaussiandreamer.toybox import recognition
@@ -55,7 +55,7 @@ def looks_of(folder: Path, prompt: Prompt) -> dict[str, float]:
 def views_of(folder: Path) -> Float[Tensor, "V H W 3"]:
     """Render a finished run's result from the judge's directions."""
     cloud, orbit = result_of(folder, "").gaussians, recognition.views()
-    pictures = Pictures(cloud, BACKGROUND).render(orbit.c2w, orbit.fovy, SIZE)
+    pictures = render_views(cloud, orbit.c2w, orbit.fovy, SIZE, background=BACKGROUND)
     return torch.from_numpy(np.concatenate(list(pictures)))
 
 
@@ -96,8 +96,9 @@ def haze(cloud: Gaussians) -> dict[str, float]:
     ``faint``, the share of pixels whose alpha is between the values of FAINT.
     """
     orbit = recognition.views()
+    view = orbit.c2w, orbit.fovy, SIZE
     black, white = (
-        np.concatenate(list(Pictures(cloud, color).render(orbit.c2w, orbit.fovy, SIZE)))
+        np.concatenate(list(render_views(cloud, *view, background=color)))
         for color in ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
     )
     alpha = 1 - (white - black).mean(axis=-1)

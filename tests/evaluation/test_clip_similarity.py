@@ -87,8 +87,8 @@ def test_the_score_is_transformers_cosine_of_the_drawn_views(clip, scored):
     protocol, means = Protocol(size=tiny.IMAGE_SIZE), []
     for item, ply in enumerate(plys):
         orbit = protocol.orbit.rows(protocol.draw(1, item))
-        pictures = results.Pictures(results.read_result(results.find_result(ply)))
-        images = np.concatenate(list(pictures.render(orbit.c2w, orbit.fovy, protocol.size)))
+        cloud, view = results.read_result(results.find_result(ply)), (orbit.c2w, orbit.fovy)
+        images = np.concatenate(list(results.render_views(cloud, *view, protocol.size)))
         pixels = ((torch.from_numpy(images) - mean) / std).permute(0, 3, 1, 2)
         with torch.no_grad():
             found = model(pixel_values=pixels, **tokenizer(PROMPT, return_tensors="pt"))
@@ -147,8 +147,9 @@ def test_a_runs_folder_brings_its_prompt_and_background(clip, tmp_path, monkeypa
     result = results.find_result("run")
     assert result.file == Path("run/save/it1-export/gaussians.ply")
     assert result.prompt == prompt and result.background == (0.0, 0.5, 1.0)
-    pictures = results.Pictures(results.read_result(result), result.background)
-    (image,) = pictures.render(Protocol().orbit.c2w[:1], torch.tensor([1.2]), 16)
+    view = Protocol().orbit.c2w[:1], torch.tensor([1.2]), 16
+    cloud = results.read_result(result)
+    (image,) = results.render_views(cloud, *view, background=result.background)
     np.testing.assert_allclose(image[0, 0, 0], [0.0, 0.5, 1.0], atol=1e-6)
     assert main(["run", "--clip", clip, "--seeds", "3", "--size", "24"]) == 0
     found = written("evaluation")
@@ -210,7 +211,7 @@ def test_clouds_are_drawn_with_the_antialiasing_of_their_training(tmp_path, anti
         assert result.antialiased == antialiased
         orbit = module.Protocol().orbit.rows(slice(1))
         drawn, other = (
-            next(results.Pictures(small, antialias=flag).render(orbit.c2w, orbit.fovy, 32))
+            next(results.render_views(small, orbit.c2w, orbit.fovy, 32, antialias=flag))
             for flag in (result.antialiased, not result.antialiased)
         )
         assert (drawn.sum() < other.sum()) == antialiased

@@ -25,7 +25,7 @@ from ..training.geometry import gaussians_on_points
 from . import t3bench
 from .clip_similarity import Protocol, open_clip, protocol_for, score
 from .image_reward import SOURCES, ImageReward
-from .results import Pictures, Result, find_result, read_result
+from .results import Result, find_result, read_result, render_views
 
 Color = tuple[float, float, float]
 
@@ -178,8 +178,9 @@ def rendered(
 ) -> Float[np.ndarray, "V s s 3"]:
     """Render an asset in [0, 1], on the run's background unless another is given."""
     result = asset.result
-    pictures = Pictures(asset.gaussians, background or result.background, result.antialiased)
-    return np.concatenate(list(pictures.render(orbit.c2w, orbit.fovy, size)))
+    how = {"background": background or result.background, "antialias": result.antialiased}
+    views = render_views(asset.gaussians, orbit.c2w, orbit.fovy, size, **how)
+    return np.concatenate(list(views))
 
 
 # ---- the stages of a run by the toybox's judge -------------------------------------------------

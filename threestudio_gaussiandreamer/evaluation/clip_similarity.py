@@ -32,7 +32,7 @@ from ..models.bundled import CLIP, NAME, model_part
 from ..models.clip import PictureText, clip_source
 from ..toybox.views import DISTANCE, FOVY_DEG, SIZE
 from ..training.data import MAX_SIDE
-from .results import Pictures, Result, find_result, read_result
+from .results import Result, find_result, read_result, render_views
 from .t3bench import require_folder_names, write_meshes
 
 FILES = ("clip.json", "clip.png")
@@ -105,8 +105,9 @@ def score(
     orbit = protocol.orbit.rows(needed)
     similarity, thumbnails = np.full(protocol.views, np.nan), {}
     left = iter(needed)
-    pictures = Pictures(read_result(result), result.background, result.antialiased)
-    for images in pictures.render(orbit.c2w, orbit.fovy, protocol.size):
+    how = {"background": result.background, "antialias": result.antialiased}
+    views = orbit.c2w, orbit.fovy, protocol.size
+    for images in render_views(read_result(result), *views, **how):
         rows = list(islice(left, len(images)))
         similarity[rows] = PERCENT * clip.similarities(images, prompt)
         thumbnails |= {row: _thumbnail(image) for row, image in zip(rows, images, strict=True)}

@@ -54,17 +54,9 @@ class RewardNetwork(nn.Module):
 
         self.vision = BlipVisionModel(vision)
         self.text = BlipTextModel(text, add_pooling_layer=False)
-        # dropout keeps the numbers of the layers in the file
-        self.head = nn.Sequential(
-            nn.Linear(text.hidden_size, 1024),
-            nn.Dropout(0.2),
-            nn.Linear(1024, 128),
-            nn.Dropout(0.2),
-            nn.Linear(128, 64),
-            nn.Dropout(0.1),
-            nn.Linear(64, 16),
-            nn.Linear(16, 1),
-        )
+        # with the numbers in the file, which counts dropout
+        sizes = {0: (text.hidden_size, 1024), 2: (1024, 128), 4: (128, 64), 6: (64, 16), 7: (16, 1)}
+        self.head = nn.ModuleDict({str(i): nn.Linear(*size) for i, size in sizes.items()})
 
     def forward(
         self, pixels: Float[Tensor, "B 3 S S"], ids: Tensor, mask: Tensor
@@ -79,8 +71,10 @@ class RewardNetwork(nn.Module):
             attention_mask=mask.expand(count, -1),
             encoder_hidden_states=features,
             encoder_attention_mask=torch.ones(features.shape[:2], dtype=torch.long).to(mask),
-        ).last_hidden_state
-        return (self.head(found[:, 0])[:, 0] - MEAN) / DEVIATION
+        ).last_hidden_state[:, 0]
+        for layer in self.head.values():
+            found = layer(found)
+        return (found[:, 0] - MEAN) / DEVIATION
 
 
 class ImageReward:
@@ -106,17 +100,10 @@ class ImageReward:
     ) -> Float[np.ndarray, " N"]:
         """Return the reward of each picture (values in [0, 1]) for a prompt."""
         tokens = self.tokenizer.encode(prompt)
-        ids, mask = (
-            torch.tensor([values], device=self.device)
-            for values in (tokens.ids, tokens.attention_mask)
-        )
-        found = [
-            self.network(
-                preprocessed(pictures[start : start + batch], self.size).to(self.device), ids, mask
-            )
-            for start in range(0, len(pictures), batch)
-        ]
-        return torch.cat(found).cpu().numpy()
+        ids, mask = torch.tensor([[tokens.ids], [tokens.attention_mask]], device=self.device)
+        parts = np.array_split(pictures, -(-len(pictures) // batch))
+        pixels = (preprocessed(part, self.size).to(self.device) for part in parts)
+        return torch.cat([self.network(part, ids, mask) for part in pixels]).cpu().numpy()
 
 
 def open_tokenizer(vocabulary: Path) -> Any:

@@ -89,34 +89,31 @@ def read_result(result: Result) -> Gaussians:
     return find("gaussians-prior")({"path": str(result.file)}).gaussians("")
 
 
-class Pictures:
-    """Renders a cloud with this package's rasteriser and its default options, without gradients, on
-    a background in [0, 1], with antialiasing if it was trained so.
+def render_views(
+    arrays: Gaussians,
+    c2w: Float[Tensor, "V 4 4"],
+    fovy: Float[Tensor, " V"],
+    size: int,
+    *,
+    background: tuple[float, float, float] = BLACK,
+    antialias: bool = False,
+    chunk: int = 4,
+) -> Iterator[Float[np.ndarray, "B H W 3"]]:
+    """Yield renders in [0, 1] with this package's rasteriser and its default options, ``chunk``
+    views at a time, ``size`` pixels each way.
+
+    Args:
+        fovy: vertical, radians.
+        antialias: whether the cloud was trained with antialiasing.
     """
-
-    def __init__(
-        self,
-        arrays: Gaussians,
-        background: tuple[float, float, float] = BLACK,
-        antialias: bool = False,
-    ) -> None:
-        geometry = find("gaussiandreamer-cloud")({"sh_degree": math.isqrt(arrays.sh.shape[1]) - 1})
-        geometry.set_arrays(**arrays._asdict())
-        backdrop = find("gaussiandreamer-background")({"color": list(background)})
-        renderer = find("gaussiandreamer-splatting")(
-            {"antialias": antialias}, geometry=geometry, material=None, background=backdrop
-        )
-        self._renderer = renderer.to(get_device()).eval()
-        geometry.to(get_device())
-        backdrop.to(get_device()).eval()
-
-    def render(
-        self, c2w: Float[Tensor, "V 4 4"], fovy: Float[Tensor, " V"], size: int, *, chunk: int = 4
-    ) -> Iterator[Float[np.ndarray, "B H W 3"]]:
-        """Yield renders in [0, 1], ``chunk`` views at a time, ``size`` pixels each way; ``fovy`` is
-        in radians, vertical.
-        """
-        for views, angles in zip(c2w.split(chunk), fovy.split(chunk), strict=True):
-            with torch.no_grad():  # no decorator, which --typecheck would hide the generator from
-                found = self._renderer(views, angles, size, size)["comp_rgb"]
-            yield found.clamp(0, 1).cpu().numpy()
+    geometry = find("gaussiandreamer-cloud")({"sh_degree": math.isqrt(arrays.sh.shape[1]) - 1})
+    geometry.set_arrays(**arrays._asdict())
+    backdrop = find("gaussiandreamer-background")({"color": list(background)})
+    parts = {"geometry": geometry, "material": None, "background": backdrop}
+    renderer = find("gaussiandreamer-splatting")({"antialias": antialias}, **parts)
+    for part in (geometry, backdrop, renderer):
+        part.to(get_device()).eval()
+    for views, angles in zip(c2w.split(chunk), fovy.split(chunk), strict=True):
+        with torch.no_grad():  # no decorator, which --typecheck would hide the generator from
+            found = renderer(views, angles, size, size)["comp_rgb"]
+        yield found.clamp(0, 1).cpu().numpy()

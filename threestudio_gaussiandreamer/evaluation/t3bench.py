@@ -21,7 +21,7 @@ from ..core.options import shown
 from ..gaussians.gaussians import Gaussians, opaque
 from ..gaussians.surface import gaussian_surface
 from ..meshes.write import write_obj
-from .results import Pictures, Result, read_result
+from .results import Result, read_result, render_views
 
 RADIUS = 2.2
 FOVY = tuple(math.pi / x for x in (3.0, 4.0, 5.0, 6.0, 7.5))
@@ -72,8 +72,8 @@ def pictures(
     """Render the views for quality of a normalised cloud: those of each vertex together."""
     positions = np.repeat(_icosphere().vertices, len(FOVY), 0)
     angles = torch.tensor(FOVY).repeat(len(positions) // len(FOVY))
-    drawn = Pictures(arrays, antialias=antialias)
-    return drawn.render(towards_origin(positions), angles, SIZE, chunk=8)
+    c2w = towards_origin(positions)
+    return render_views(arrays, c2w, angles, SIZE, antialias=antialias, chunk=8)
 
 
 def quality(rewards: Float[np.ndarray, "162 5"]) -> float:
