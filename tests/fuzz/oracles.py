@@ -145,9 +145,7 @@ def _ply_property(words: list[str]) -> tuple[str, str, str]:
 
 
 def npy_array(data: bytes) -> np.ndarray:
-    """An NPY file of version 1 to 3 that holds one array of plain numbers or text and nothing
-    else.
-    """
+    """An NPY file of version 1 to 3 with one array of plain numbers or text and nothing else."""
     if data[:6] != b"\x93NUMPY" or data[6:7] not in (b"\1", b"\2", b"\3"):
         raise Illegal("no NPY file")
     width = 2 if data[6] == 1 else 4
@@ -179,9 +177,7 @@ def gunzipped(data: bytes) -> bytes:
 
 
 def checked_archive(data: bytes) -> None:
-    """A zip archive all of whose checksums hold: our own of the whole file where it has one, and
-    those of its members.
-    """
+    """A zip archive all of whose checksums hold, our own of the whole file too."""
     digest = hashlib.sha256(data[:-64]).hexdigest().encode()
     if data[-71:-64] == b"sha256:" and digest != data[-64:]:
         raise Illegal("checksum of the file")

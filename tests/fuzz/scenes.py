@@ -96,9 +96,7 @@ def well_posed(scene: Scene) -> Scene:
 
 
 def _of_mixed_depth(means: Tensor, depths: Tensor) -> Tensor:
-    """Mark Gaussians whose depth order depends on rounding; equal positions are ordered by index in
-    every backend.
-    """
+    """Mark Gaussians whose depth order depends on rounding; equal positions are ordered."""
     order = depths.argsort(stable=True)
     near = depths[order].diff() < ROUNDING
     groups = torch.cat([near.new_zeros(len(order[:1]), dtype=torch.long), (~near).cumsum(0)])
@@ -166,9 +164,7 @@ def _corrupt(g: torch.Generator, values: Tensor, extremes: tuple[float, ...], sh
 
 
 def _cameras(g: torch.Generator, views: int, width: int, height: int) -> tuple[Tensor, Tensor]:
-    """Draw cameras around the cloud; in two of five scenes unusual ones: inside or behind it, with
-    any field of view and principal point.
-    """
+    """Draw cameras around the cloud; in two of five scenes unusual ones."""
     viewmats, Ks = torch.eye(4).repeat(views, 1, 1), torch.eye(3).repeat(views, 1, 1)
     viewmats[:, :3, :3] = quats_to_rotations(
         torch.randn(views, 4, generator=g, dtype=torch.float64)
@@ -196,9 +192,7 @@ def _options(g: torch.Generator, size: tuple[int, int]) -> dict[str, Any]:
 
 
 def draw(scene: Scene, backend: str, dtype: torch.dtype = torch.float32) -> Drawn:
-    """Render forward and backward with fixed cotangents; gradients reach SH coefficients and
-    cameras.
-    """
+    """Render forward and backward with fixed cotangents."""
     leaves = scene.cloud.to(dtype).leaves()
     viewmats = scene.viewmats.to(dtype, copy=True).requires_grad_()
     background = scene.background

@@ -190,9 +190,7 @@ class CloudSequence(RuleBasedStateMachine):
             self._check_change(change, old)
 
     def _check_change(self, change: Change, old: dict[str, Tensor]) -> None:
-        """Check that kept Gaussians are unchanged and in order and new ones have no moments; mark
-        the new ones.
-        """
+        """Check kept Gaussians, in order and unchanged, and new ones, which are marked."""
         stays = ~change.is_new
         assert (change.parents[stays].diff() > 0).all(), "the order changed"
         for name, value in self.cloud.parameters_by_name().items():

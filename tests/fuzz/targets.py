@@ -85,9 +85,7 @@ def require(holds: Any, problem: str) -> None:
 
 
 def require_picture(geometry: GaussianCloud) -> None:
-    """Require that no pixel and no gradient of a cloud is NaN; gradients may overflow for extreme
-    colours.
-    """
+    """Require finite pixels and gradients; gradients may overflow for extreme colours."""
     colors = geometry.colors(torch.tensor([[0.0, 0, -3]]))
     gaussians = geometry.means, geometry.quats, geometry.scales(), geometry.opacities(), colors
     out = rasterize(*gaussians, EYE, FOCAL, 12, 12)
@@ -467,9 +465,7 @@ SOG, SPZ_4 = Packing(_unsog, _sog), Packing(_unspz, _spz)
 
 
 def meshes(kind: str) -> Callable[[], list[bytes]]:
-    """Return a writer of a box with a texture, with colours of the vertices, of the faces, and as
-    two objects of a scene.
-    """
+    """Return a writer of a box with a texture, with colours, and as two objects of a scene."""
 
     def write() -> list[bytes]:
         import trimesh
@@ -540,9 +536,7 @@ def checkpoints() -> list[bytes]:
 
 
 def exercise_checkpoint(path: Path) -> None:
-    """Read, put into a cloud and drawn; nothing is read whose checksums don't hold, or that the
-    file is too small for.
-    """
+    """Nothing is read whose checksums don't hold, or that the file is too small for."""
     checkpoint = load_checkpoint(path)
     strictly(oracles.checked_archive, path)
     tensors, size = list(_tensors(checkpoint)), path.stat().st_size
@@ -616,9 +610,7 @@ def exercise_command(path: Path) -> None:
 
 @contextlib.contextmanager
 def no_work() -> Iterator[None]:
-    """Runs end where the work would begin, and leave the process's logging and warnings as they
-    were.
-    """
+    """Runs end where the work would begin; logging and warnings are restored."""
     run, logger = Run.run, logging.getLogger("threestudio_gaussiandreamer")
     handlers, propagate, level = list(logger.handlers), logger.propagate, logger.level
     Run.run = lambda self: 0
@@ -676,9 +668,7 @@ _KNOWN: dict[str, list[bytes]] = {}
 
 
 def seeds(name: str) -> list[bytes]:
-    """Return the valid files; the first one is read once, which imports what it needs, before
-    memory is measured.
-    """
+    """Return the valid files; one is read, which imports, before memory is measured."""
     if name not in _KNOWN:
         _KNOWN[name] = TARGETS[name].seeds()
         outcome_of(TARGETS[name]._replace(traced=False), _KNOWN[name][0])

@@ -18,9 +18,7 @@ if unavailable() is None:
 
 
 def backends_of(*too_slow: str, without: tuple[str, ...] = ()) -> list:
-    """Return the values of a parameter ``backend``; tests in emulation are slow, and those of
-    ``too_slow``.
-    """
+    """Return values of a parameter ``backend``; those in emulation and of ``too_slow`` are slow."""
     marks = {name: pytest.mark.slow for name in ("cuda", *too_slow)}
     names = (name for name in BACKENDS if name not in without)
     return [pytest.param(name, marks=marks.get(name, ())) for name in names]

@@ -67,9 +67,7 @@ def measured(request) -> Measured:
 
 @pytest.fixture
 def said() -> Iterator[list[str]]:
-    """Collect the package's log messages from the start of the test, also if the launcher has its
-    own handler.
-    """
+    """Collect the package's log messages, also if the launcher has its own handler."""
     messages: list[str] = []
     listener, logger = logging.Handler(), logging.getLogger("threestudio_gaussiandreamer")
     listener.emit = lambda record: messages.append(record.getMessage())

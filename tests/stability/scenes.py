@@ -74,9 +74,7 @@ def clamped_slope(x: Tensor, z: Tensor, limit: float) -> Tensor:
 def clamped_alpha(
     mean: Tensor, scales: Tensor, width: int, focal: float, opacity: float, slope_of=clamped_slope
 ) -> Tensor:
-    """Return the alpha (width, width) of an unrotated Gaussian, with J at the clamped slope; the
-    camera looks along z.
-    """
+    """Return the alpha (width, width) of an unrotated Gaussian, with J at the clamped slope."""
     x, y, z = mean
     slopes = [slope_of(a, z, 1.3 * 0.5 * width / focal) for a in (x, y)]
     zero = torch.zeros_like(z)

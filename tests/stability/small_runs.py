@@ -70,9 +70,7 @@ def launch(folder: Path, *overrides: str, stage: str = "--train", config: Path =
 
 
 def training_state(checkpoint: dict[str, Any]) -> dict[str, Tensor]:
-    """Return everything that the next step depends on: parameters, statistics, moments and the
-    step.
-    """
+    """Return parameters, statistics, moments and the step."""
     moments = checkpoint["optimizer_states"][0]["state"]
     found = {
         f"{i}.{name}": torch.as_tensor(value)

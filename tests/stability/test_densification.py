@@ -39,9 +39,7 @@ def started(n: int = 200, seed: int = 0, **options) -> GaussianCloud:
 
 
 class Training:
-    """The system's training step with the package's own parts, fitting renders of another cloud
-    from four fixed cameras.
-    """
+    """The system's training step, fitting renders of another cloud from four fixed cameras."""
 
     def __init__(self, geometry: GaussianCloud, size: int = 32) -> None:
         self.geometry, self.size, self.step = geometry, size, 0
@@ -107,9 +105,7 @@ def test_threshold_zero_fills_the_cap_and_no_more(limit, absgrad, measured):
 
 @row("A3", "Explosion")
 def test_a_trained_cloud_that_is_too_large_keeps_what_contributes(tmp_path, measured, said):
-    """Half of 400 trained Gaussians are hidden or faint; a random choice would keep as many of them
-    as of the others.
-    """
+    """Half of 400 trained Gaussians are hidden or faint."""
     trained, path = started(400), str(tmp_path / "a.ply")
     trained.means.data[::2] *= torch.linspace(0.1, 0.9, 200)[:, None]
     noise = torch.randn(400, generator=generator(0, "o"))
@@ -175,9 +171,7 @@ def test_very_few_keep_their_shapes(n, absgrad, measured):
 @row("A3", "MCMC relocation with no live Gaussian / all-zero opacity")
 @pytest.mark.parametrize("budget", [None, 100, "auto"])
 def test_a_transparent_cloud_shrinks_to_the_floor(budget, measured):
-    """Nothing is relocated, so no distribution without mass is sampled: a transparent cloud shrinks
-    to the floor and training continues.
-    """
+    """Nothing is relocated, so no distribution without mass is sampled."""
     prune = {"start": 1, "stop": 10_000, "every": 1}
     growing = EVERY_STEP | {"start": 5, "grad_threshold": 0.0}
     geometry = started(budget=budget, prune=prune, densify=growing)
@@ -192,17 +186,13 @@ def test_a_transparent_cloud_shrinks_to_the_floor(budget, measured):
 
 
 class Ledger:
-    """Give every Gaussian an id, stored in its colour and in the moments of all its parameters, and
-    check them later.
-    """
+    """Give every Gaussian an id, in its colour and in all its moments, and check them later."""
 
     def __init__(self, geometry: GaussianCloud, optimizer: torch.optim.Optimizer) -> None:
         self.geometry, self.optimizer = geometry, optimizer
 
     def states(self) -> list[tuple[torch.nn.Parameter, dict]]:
-        """Return parameters and their state, of those that have it; spherical harmonics above
-        degree 0 may be empty.
-        """
+        """Return parameters and their state, of those that have it."""
         state = self.optimizer.state
         return [(p, state[p]) for p in self.geometry.parameters() if p.numel() and p in state]
 
@@ -219,9 +209,7 @@ class Ledger:
         return self.geometry.sh0[:, 0, 0].detach().clone()
 
     def is_new(self) -> torch.Tensor:
-        """Return which Gaussians have no moments; the moments of all others must be their own, bit
-        for bit.
-        """
+        """Return which have no moments; those of all others must be their own, bit for bit."""
         held = {id(p) for group in self.optimizer.param_groups for p in group["params"]}
         assert held == {id(p) for p in self.geometry.parameters() if p.numel()}
         assert {id(p) for p in self.optimizer.state} <= held
@@ -241,9 +229,7 @@ def spelt(ids: torch.Tensor, parameter: torch.Tensor) -> torch.Tensor:
 @row("A3", "Optimiser state mismatch")
 @pytest.mark.parametrize("first_seed", [0, *slow(20, 40, 60, 80)])
 def test_moments_follow_their_gaussian(first_seed, measured):
-    """Random rounds of cloning, splitting, dropping, capping and pruning to a budget; in a third of
-    the sequences before any step.
-    """
+    """Random rounds of all operations; in a third of the sequences before any step."""
     for seed in range(first_seed, first_seed + 20):
         new, gone = random_rounds(seed)
         assert new > 5 and gone > 5
@@ -286,9 +272,7 @@ def random_rounds(seed: int) -> tuple[int, int]:
 
 @row("A3", "Lost step")
 def test_a_round_that_selects_no_gaussian_changes_nothing(measured):
-    """Five rounds between three prunings, whose scores must not count them: parameters and moments,
-    bit for bit.
-    """
+    """Five rounds between three prunings, whose scores must not count them."""
     none_selected = EVERY_STEP | NO_LIMITS | {"every": 2, "grad_threshold": 1e9}
     pruned = {"budget": 100, "prune": {"start": 0, "stop": 99, "every": 3}}
     runs = [Training(started(**pruned)), Training(started(**pruned, densify=none_selected))]
@@ -304,9 +288,7 @@ def test_a_round_that_selects_no_gaussian_changes_nothing(measured):
 
 @row("A3", "Lost step")
 def test_a_round_takes_no_step_from_those_that_stay(measured):
-    """All are cloned after the third step; each original is where it would be without
-    densification.
-    """
+    """All are cloned after the third step."""
     everybody = EVERY_STEP | NO_LIMITS | {"start": 3, "grad_threshold": 0.0, "split_scale": 1e9}
     runs = [Training(started()), Training(started(densify=everybody))]
     counts = [training.run(3) for training in runs]
@@ -392,9 +374,7 @@ def middle(geometry: GaussianCloud) -> float:
     ids=str,
 )
 def test_neither_precision_nor_batch_affects_the_selection(other, absgrad, measured):
-    """Half of the Gaussians are above the threshold. The loss is the mean over the batch, like a
-    guidance's.
-    """
+    """Half of the Gaussians are above the threshold; the loss is the mean over the batch."""
     usual = accumulated(absgrad=absgrad)
     threshold = middle(usual)
     expected = selected(usual, threshold)
@@ -408,9 +388,7 @@ def test_neither_precision_nor_batch_affects_the_selection(other, absgrad, measu
 @each_gradient
 @pytest.mark.parametrize("size", [128, 256])
 def test_resolution_hardly_affects_the_selection(size, absgrad, measured):
-    """Twice the resolution, with a loss that does not depend on it; only the effect of the dilation
-    of 0.3 square pixels changes. A pixel is half as large there, so gradients in pixels differ.
-    """
+    """With a loss that doesn't depend on it; only the effect of the dilation changes."""
     usual, finer = accumulated(size, absgrad=absgrad), accumulated(2 * size, absgrad=absgrad)
     threshold = middle(usual)
     first, second = selected(usual, threshold), selected(finer, threshold)
@@ -439,9 +417,7 @@ def test_gaussians_outside_every_view_are_never_selected(absgrad, measured):
 @pytest.mark.slow
 @row("A3", "Opacity reset")
 def test_nothing_resets_the_opacities(measured, monkeypatch):
-    """There is no such option, and 35 rounds (others reset every 3000 steps) leave the opacities
-    unchanged.
-    """
+    """There is no such option, and 35 rounds leave the opacities unchanged."""
     with pytest.raises(UserError, match="opacity_reset"):
         check_config(load_config(DEMO, cli_args=["system.geometry.densify.opacity_reset=3000"]))
     geometry = started(densify=EVERY_STEP | NO_LIMITS | {"every": 100, "grad_threshold": 1e9})

@@ -73,18 +73,14 @@ def slope_of(f, x: float) -> float:
 
 
 def slope_error(f, x: float, truth) -> float:
-    """Return the relative error of the derivative of ``f`` at ``x`` against the finite difference
-    of ``truth``.
-    """
+    """Return the relative error of ``f``'s derivative against ``truth``'s finite difference."""
     expected = central_difference(truth, x)
     return abs(slope_of(f, x) - expected) / abs(expected)
 
 
 @row("A0", "F1")
 def test_f1_the_clamp_of_the_jacobian_depends_on_depth(backend, fault):
-    """At twice the half-width of the image; the emulation treats the clamped x = lim z as a
-    constant, without its derivative by z.
-    """
+    """The emulation treats the clamped x = lim z as a constant, without its derivative by z."""
     scales = (1.5, 0.8, 0.4)
 
     def mean(z):
@@ -128,9 +124,7 @@ def test_f2_no_gaussians_show_the_background(backend, fault):
 
 @row("A0", "F3")
 def test_f3_no_gradient_flows_through_the_cap(backend, fault):
-    """Opacity 0.95 under a cap of 0.5: an increase changes nothing. The emulation caps the value
-    but passes the gradient.
-    """
+    """An increase changes nothing; the emulation caps the value but passes the gradient."""
 
     def ours(opacity):
         cloud = one_gaussian(scale=5.0)._replace(opacities=opacity[None])
@@ -168,9 +162,7 @@ def test_f4_the_gaussian_that_crosses_the_stop_counts(backend, fault):
 @row("A0", "F5")
 @pytest.mark.parametrize("backend", backends_of("reference"))
 def test_f5_the_threshold_of_alpha(backend, fault):
-    """4000 Gaussians of opacity 0.1 on a sphere, like an initial cloud. The emulation uses the
-    common threshold of 1/255.
-    """
+    """A sphere like an initial cloud; the emulation uses the common threshold of 1/255."""
     means = torch.nn.functional.normalize(torch.randn(4000, 3, generator=seeded()), dim=1)
     cloud = random_cloud(4000, seed=1)._replace(
         means=means, scales=torch.full((4000, 3), 0.03), opacities=torch.full((4000,), 0.1)
@@ -191,9 +183,7 @@ def test_f5_the_threshold_of_alpha(backend, fault):
     "attribute, value", [("means", math.nan), ("scales", math.inf), ("opacities", math.nan)]
 )
 def test_f6_what_is_not_finite_is_culled(backend, attribute, value, fault):
-    """The emulation culls what is before the near plane or without area; both comparisons are false
-    for NaN.
-    """
+    """The emulation culls by two comparisons that are false for NaN."""
     scene = random_cloud(6, seed=2)
     scene.means[:, 2] += 3
     corrupted = Cloud(*(torch.cat([x, x[:1].clone()]) for x in scene))
@@ -238,9 +228,7 @@ def test_f7_a_zero_quaternion_is_no_rotation(fault):
 
 @row("A0", "F8")
 def test_f8_tile_intersections_are_counted_in_64_bits(fault):
-    """524 288 Gaussians over all of 1024 x 1024 give 2^31 intersections with tiles of 16 pixels;
-    our tiles are smaller, so the count is larger.
-    """
+    """524 288 Gaussians over all of 1024 x 1024 give 2^31 intersections with 16-pixel tiles."""
     n = 524_288
 
     def ours(side):
@@ -277,9 +265,7 @@ def test_f9_first_scales_of_very_few_points(n, fault):
 
 @row("A0", "F10")
 def test_f10_depth_has_a_gradient(backend, fault):
-    """The derivative of the rendered depth by the Gaussian's depth; the emulation's backward pass
-    ignores it.
-    """
+    """The emulation's backward pass ignores the rendered depth."""
 
     def at(z):
         return one_gaussian(scale=0.2)._replace(means=torch.stack([0 * z, 0 * z, z])[None])
@@ -297,9 +283,7 @@ def test_f10_depth_has_a_gradient(backend, fault):
 
 @row("A0", "F11")
 def test_f11_the_loss_scale_does_not_affect_the_selection(fault):
-    """Half of the gradients are above the threshold; mixed precision multiplies all of them by
-    65 536.
-    """
+    """Half of the gradients are above the threshold; mixed precision multiplies all of them."""
     true = torch.randn(2, 1000, 2, generator=seeded()) * (2e-4 / 64)
 
     def as_they_come(means2d_grad, width, height, loss_scale):
@@ -314,9 +298,7 @@ def test_f11_the_loss_scale_does_not_affect_the_selection(fault):
 
 @row("A0", "F12")
 def test_f12_a_checkpoint_holds_the_cloud_and_its_statistics(fault):
-    """The emulation keeps the cloud in a plain object, which is not in a module's state. Ours does
-    not run the prior on loading.
-    """
+    """The emulation keeps the cloud in a plain object. Ours doesn't run the prior on loading."""
     names = (*PARAMETERS, *STATISTICS)
 
     class PlainCloud(nn.Module):
@@ -356,9 +338,7 @@ def parameters(n: int) -> dict[str, torch.Tensor]:
 
 @row("A0", "F13")
 def test_f13_one_gaussian_keeps_its_shape(fault):
-    """Prunes no Gaussian. The emulation squeezes the (1, 1) mask to a scalar, which adds a
-    dimension to what it indexes.
-    """
+    """The emulation squeezes the (1, 1) mask to a scalar, which adds a dimension."""
 
     def ours(params):
         stats = Statistics(torch.zeros(1), torch.ones(1))
@@ -443,9 +423,7 @@ def test_f16_growing_leaves_the_process_generators_alone(fault):
 
 @row("A0", "F17")
 def test_f17_a_sphere_is_round_on_a_wide_image(backend, fault):
-    """Both axes have one focal length; the emulation uses the vertical field of view for
-    the width.
-    """
+    """The emulation uses the vertical field of view for the width."""
     fovy = torch.tensor([math.radians(50.0)])
 
     def one_angle_for_both(fovy, height, width):
@@ -465,9 +443,7 @@ def test_f17_a_sphere_is_round_on_a_wide_image(backend, fault):
 
 @row("A0", "F18")
 def test_f18_densification_loses_no_step(fault):
-    """Selecting no Gaussian must change nothing. The emulation replaces the rows between backward
-    and step.
-    """
+    """The emulation replaces the rows between backward and step."""
     none_selected = dict(
         enabled=True, start=1, stop=9, every=2, min_opacity=1e-9, grad_threshold=1e9, max_scale=1e9
     )
@@ -534,9 +510,7 @@ def test_f19_a_negative_loss_is_back_propagated(fault):
 
 @row("A0", "F20")
 def test_f20_every_learning_rate_in_the_config_reaches_the_optimiser(fault):
-    """The emulation reads ``scaling_lr`` from a configuration that sets ``scale_lr``, and uses its
-    default.
-    """
+    """The emulation reads ``scaling_lr`` from a configuration that sets ``scale_lr``."""
 
     def ours(rates):
         geometry = started(sh_degree=1, **rates)
@@ -588,9 +562,7 @@ class Stub(TowardsGrey):
 
 @row("A0", "F22")
 def test_f22_a_non_finite_score_is_reported(fault):
-    """The first of three items is NaN in every step; counts the steps of twenty that give no
-    message.
-    """
+    """The first of three items is NaN in every step; counts steps of twenty without a message."""
     rgb = torch.rand(3, 4, 4, 3, generator=seeded())
     guidance, healthy = Stub({"guidance_scale": 1.0}), Stub({"guidance_scale": 1.0})
     healthy.broken_from = 1000
@@ -650,9 +622,7 @@ def test_f23_every_timestep_has_its_entry(percents, fault):
 
 @row("A0", "F24")
 def test_f24_the_guidance_scale_is_in_the_usual_convention(fault):
-    """s = 1 is no guidance, s = 100 is 100 differences from the unconditional score; the emulation
-    starts at the conditional one.
-    """
+    """s = 1 is no guidance; the emulation starts at the conditional score."""
     e_c, e_u = torch.randn(2, 4, 8, 8, generator=seeded())
     exact = {1.0: e_c, 100.0: e_u + 100 * (e_c - e_u)}
 
@@ -670,9 +640,7 @@ def test_f24_the_guidance_scale_is_in_the_usual_convention(fault):
 
 @row("A0", "F25")
 def test_f25_each_preset_has_its_own_values(fault):
-    """Paper: scales 1e-3, rotations 1e-2, positions 5e-5. Released code: 5e-3, 1e-3, 5e-5 times the
-    extent 4 = 2e-4.
-    """
+    """Scales, rotations, positions; the released code's times the extent 4."""
     told = {"paper": (1e-3, 1e-2, 5e-5), "code": (5e-3, 1e-3, 2e-4)}
     files = {"paper": "gaussiandreamer.yaml", "code": "gaussiandreamer-official.yaml"}
 
@@ -714,9 +682,7 @@ def test_f26_nothing_behind_the_camera_and_equal_depths_by_index(backend, fault)
 
 @row("A0", "F27")
 def test_f27_any_size_and_a_gaussian_behind_the_camera(backend, fault):
-    """The emulation masks the means behind the camera but not the covariances, and renders
-    256 x 256.
-    """
+    """The emulation masks the means but not the covariances, and renders 256 x 256."""
     places = (0.0, 0.0, 2.0), (0.0, 0.0, -2.0), (0.3, 0.0, 3.0)
     scene = joined(*(one_gaussian(place, 0.3) for place in places))
 

@@ -120,9 +120,7 @@ def test_duplicate_points_have_a_finite_scale(rule, measured):
 @row("A2", "Duplicate points: distance 0 -> log 0")
 @each_rule
 def test_duplicates_are_not_in_the_search_tree(rule, measured, monkeypatch):
-    """A search tree of distinct points has one point per leaf and finds it in O(N log N); copies
-    can't be separated, so each would visit all others.
-    """
+    """Copies can't be separated, so each would visit all others."""
     copies = []
 
     class Tree(scipy.spatial.cKDTree):
@@ -153,9 +151,7 @@ def test_an_isolated_point_is_capped_and_flagged(rule, measured, said):
 
 @row("A2", "Isolated point: huge scale")
 def test_an_isolated_point_does_not_stretch_the_growing(measured):
-    """The bounding box of all points would make the radius 500 times larger, and every candidate
-    near the object a floater.
-    """
+    """The bounding box of all points would make the radius 500 times larger."""
     usual, stray = (
         grow(colored(points), **GROWING, generator=rng()).points[len(points) :]
         for points in (sphere(), np.concatenate([sphere(), FAR]))
@@ -241,9 +237,7 @@ def write_text(path: Path, points: np.ndarray, colors: np.ndarray) -> Path:
     [*itertools.product(SOURCES, ["vertices"]), *((source, "colours") for source in COLOURED)],
 )
 def test_a_few_bad_rows_are_counted_and_many_refused(source, what, tmp_path, measured, said):
-    """1 % of 642 is 6. If the faces must be kept, a vertex without a colour becomes grey; otherwise
-    its point is dropped.
-    """
+    """A vertex of kept faces without a colour becomes grey; otherwise its point is dropped."""
     prior_type = "mesh-prior" if source.startswith("mesh") else "point-cloud-prior"
     points, faces = ball_mesh()
     arrays = {"vertices": points, "colours": rng().random(points.shape)}
@@ -290,9 +284,7 @@ CUBE = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
 
 
 def initialized_from(path: Path) -> tuple[GaussianCloud, int]:
-    """Return the first cloud of a file in the world's frame, and the number of grown points; a grey
-    cloud on grey would be invisible.
-    """
+    """Return the first cloud of a file in the world's frame, and the number of grown points."""
     points = path.suffix == ".npz"
     prior = {"normalize": True} if points else {"num_points": 2000, "color": "random"}
     geometry = initialized(f"{'point-cloud' if points else 'mesh'}-prior", path, prior, **GROWING)
@@ -363,18 +355,14 @@ def uneven_square() -> tuple[np.ndarray, np.ndarray]:
 
 
 def uniformity(points: np.ndarray) -> float:
-    """Return the smaller p of the Kolmogorov-Smirnov tests that both coordinates are uniform on
-    [-1, 1].
-    """
+    """Return the smaller p of the tests that both coordinates are uniform on [-1, 1]."""
     return min(scipy.stats.kstest(axis, "uniform", (-1, 2)).pvalue for axis in points.T[:2])
 
 
 @row("A2", "Non-manifold, duplicate faces, degenerate triangles")
 @pytest.mark.parametrize("repeated", ["not", "same", "reversed", "with copied vertices"])
 def test_a_surface_is_sampled_uniformly_for_any_triangulation(repeated, tmp_path, measured):
-    """Repeated faces, whose edges are non-manifold, are on one side: counted twice, that side would
-    be denser, which the test would detect.
-    """
+    """Repeated faces are on one side: counted twice, that side would be denser."""
     points, faces = uneven_square()
     again = faces[:40] if repeated != "reversed" else faces[:40, ::-1]
     if repeated == "with copied vertices":
@@ -395,9 +383,7 @@ def test_a_surface_is_sampled_uniformly_for_any_triangulation(repeated, tmp_path
     "color_range, mean", [((0.0, 0.2), 0.1), ((-0.1, 0.1), 0.0)], ids=["the paper's", "zero mean"]
 )
 def test_noise_stays_in_its_range_and_colours_in_theirs(color_range, mean, measured):
-    """Middle grey shows the noise itself, whose histogram is flat to 5 standard errors; nearly
-    white shows the clamp.
-    """
+    """Middle grey shows the noise itself, nearly white the clamp."""
     options = {"num_candidates": 40_000, "radius": 0.05, "color_range": list(color_range)}
     growing = GaussianCloud({"grow": {"enabled": True, **options}}).cfg.grow
 

@@ -87,9 +87,7 @@ def test_near_plane(backend, measured):
 
 @row("A1", "Edge of image, huge Jacobian")
 def test_spill_of_the_clamped_jacobian(backend, measured):
-    """No pixel outside the ellipse of the clamped formula is covered; the formula is
-    repeated here.
-    """
+    """No pixel outside the ellipse of the clamped formula is covered."""
     width, focal, z, spilt = 32, 20.0, 2.0, 0
     limit = 0.5 * width / focal
     for limits, scale in AROUND_THE_CLAMP:
@@ -181,9 +179,7 @@ def test_the_length_of_a_quaternion_changes_nothing(backend, measured):
 
 @row("A1", "Opacity -> 0 and -> 1")
 def test_opacities_near_0_and_1(backend, measured):
-    """Stored logits: 0 and 1 become the bounds when loaded; a Gaussian below the threshold is
-    skipped in both passes.
-    """
+    """Stored logits: 0 and 1 become the bounds when loaded."""
     geometry = GaussianCloud({})
     logits = torch.tensor([-math.inf, -40.0, -8.0, 0.0, 6.0, 40.0, math.inf])
     scene = random_cloud(7, seed=3).to(torch.float32)
@@ -203,9 +199,7 @@ def test_opacities_near_0_and_1(backend, measured):
 
 @functools.cache
 def needles() -> list[Cloud]:
-    """Return every multiset of three scales in five rotations, which cover all orders of the axes,
-    rounded to float32.
-    """
+    """Return every multiset of three scales in five rotations, rounded to float32."""
     scales = itertools.combinations_with_replacement((1e-8, 1e-4, 1e-2, 1.0, 1e2, 1e4), 3)
     quats = torch.randn(5, 4, generator=seeded(2)).double()
     clouds = (
@@ -231,9 +225,7 @@ def needle_gradients(**options) -> list[dict[str, torch.Tensor]]:
 @row("A1", "Needle, disc, scale 1e-8..1e4")
 @pytest.mark.parametrize("backend", backends_of("reference", "torch"))
 def test_needles_and_discs(backend, measured):
-    """The reference uses scales and quaternions rounded to float32; a pixel may fall on the other
-    side of alpha_min.
-    """
+    """A pixel may fall on the other side of alpha_min."""
     worst = 0.0
     for cloud, truth in zip(needles(), needle_alphas(), strict=True):
         with torch.no_grad():
@@ -268,9 +260,7 @@ def test_gradients_of_needles_and_discs(backend, antialias, measured):
 
 @row("A1", "Needle, disc, scale 1e-8..1e4")
 def test_log_scales_are_clamped_in_the_parameterisation(measured, caplog):
-    """To the float32 range of exp, with room for squares: scales stay in [e^-20, e^10], and a
-    warning is logged once.
-    """
+    """To the float32 range of exp, with room for squares."""
     geometry, zeros = GaussianCloud({}), torch.zeros(3, 3)
     arrays = Gaussians(zeros, torch.ones(3, 4), zeros, torch.zeros(3), torch.zeros(3, 1, 3))
     geometry.set_arrays(**arrays._asdict())
@@ -288,9 +278,7 @@ def test_log_scales_are_clamped_in_the_parameterisation(measured, caplog):
 
 @row("A1", "Coincident depths")
 def test_equal_depths_are_ordered_by_index(backend, measured):
-    """64 Gaussians in one plane: the image is that of the permuted indices, computed in float64;
-    equal bits over 10 runs.
-    """
+    """The image is that of the permuted indices, computed in float64."""
     cloud, view = stack([0.9] * 64, scale=1.0), (front_camera(8, 8, 4.0), 8, 8)
     colors = torch.rand(64, 3, generator=seeded(), dtype=torch.float64)
     # offset by half a pixel in both directions, 2 pixels wide
@@ -340,9 +328,7 @@ def test_the_depth_order_is_that_of_floats(backend, measured):
 
 @row("A1", "Fog: thousands of faint Gaussians on a pixel")
 def test_fog(backend, measured):
-    """Each Gaussian of opacity o loses the fraction alpha_min / o, which is below the threshold: at
-    most N alpha_min per pixel.
-    """
+    """Each Gaussian of opacity o loses the fraction alpha_min / o."""
     n, view = 2000, (cameras(1, 12, 12), 12, 12)
     faint = torch.full((n,), 0.0038, dtype=torch.float64)
     cloud = random_cloud(n, seed=8, size=0.4)._replace(opacities=faint)
@@ -388,9 +374,7 @@ def test_interior_gradients_are_those_of_finite_differences(backend, measured):
 @row("A1", "Alpha cap and threshold, gradient discontinuity")
 @pytest.mark.parametrize("backend", backends_of(without=("reference",)))
 def test_few_pixels_cross_the_threshold(backend, measured):
-    """3000 faint Gaussians move by 1e-4 pixels, ten times; a pixel that crosses the threshold
-    changes by more than half of alpha_min.
-    """
+    """A pixel that crosses the threshold changes by more than half of alpha_min."""
     cloud, (viewmats, Ks) = random_cloud(3000, seed=5, size=0.03), cameras(1, 48, 48)
     white = torch.ones(3000, 1).double()
     cloud = cloud._replace(colors=white, opacities=0.01 * cloud.opacities).to(torch.float32)
@@ -408,9 +392,7 @@ def test_few_pixels_cross_the_threshold(backend, measured):
 
 @row("A1", "Alpha cap and threshold, gradient discontinuity")
 def test_the_jump_at_the_threshold_is_alpha_min(backend, measured):
-    """A Gaussian moves away from a pixel until its alpha drops from the smallest one to zero, found
-    by bisection to the last float.
-    """
+    """A Gaussian moves away from a pixel until its alpha drops to zero, found by bisection."""
 
     def alpha(x: float) -> float:
         return drawn(backend, one_gaussian((x, 0.0, 2.0), 0.3, 0.8), 1, 1, 20.0).alpha.item()
@@ -438,9 +420,7 @@ def test_ten_thousand_on_one_pixel(backend, measured):
 @row("A1", "Gradient check")
 @pytest.mark.parametrize("backend", EXACT)
 def test_gradcheck(backend, measured):
-    """20 clouds of 1 to 30 Gaussians; attributes, background and cameras at once, along random
-    directions, of image, alpha and depth.
-    """
+    """Attributes, background and cameras at once, along random directions."""
     for seed in range(20):
         n = 1 + seed * 29 // 19
         cloud, (viewmats, Ks) = random_cloud(n, seed=seed, size=0.3), cameras(2, 6, 5)
@@ -473,9 +453,7 @@ def test_float32_gradients_with_the_cutoffs_on(backend, preset, measured):
 @row("A1", "Determinism of reductions")
 @pytest.mark.parametrize("backend", backends_of("torch", without=("reference", "cuda")))
 def test_the_same_bits_for_any_number_of_threads(backend, measured):
-    """Forward, backward and an optimiser step, 100 times (10 in plain torch); ten runs with 1, 2, 4
-    and 8 threads.
-    """
+    """Forward, backward and an optimiser step, 100 times (10 in plain torch)."""
     target = torch.rand(1, 20, 40, 3, generator=seeded())
     view, results = (*cameras(1, 40, 20, dtype=torch.float32), 40, 20), []
     for _ in with_threads((1, 2, 4, 8, 1, 2, 4, 8, 1, 2)):
@@ -529,9 +507,7 @@ def test_energy_of_a_small_gaussian_with_distance(backend, measured):
 @row("A1", "Anti-aliasing across resolutions")
 @pytest.mark.parametrize("backend", backends_of("reference"))
 def test_antialiasing_of_a_cloud_of_subpixel_gaussians(backend, measured):
-    """A small render, against the box average of one 16 times larger, in which every Gaussian
-    covers pixels.
-    """
+    """Against the box average of a render 16 times larger."""
     cloud = random_cloud(3000, seed=2, size=0.006, stretch=0.3)
     camera = cameras(1, 512, 512, dtype=torch.float32)
     with torch.no_grad():
@@ -546,9 +522,7 @@ def test_antialiasing_of_a_cloud_of_subpixel_gaussians(backend, measured):
 
 @row("A1", "Popping")
 def test_popping_is_one_jump_of_the_analytic_size(backend, measured):
-    """Two crossing discs of opposite colours whose means swap their depth order as the camera turns
-    by 0.01 degrees per frame.
-    """
+    """The means of two crossing discs swap their depth order as the camera turns."""
     a1, a2 = 0.6, 0.7
     flat = random_cloud(2)._replace(
         means=torch.tensor([[0.1, 0.0, 0.0], [-0.1, 0.0, 0.0]]).double(),

@@ -79,9 +79,7 @@ def content(step: int, size: int = 20_000) -> dict:
 
 
 def killed(work, moment: float) -> None:
-    """Run ``work()`` in a child, and kill it after so many seconds; what it calls must not need the
-    threads that a fork loses.
-    """
+    """Run ``work()`` in a child, without the threads that a fork loses, and kill it."""
     child = os.fork()
     if child == 0:
         work()
@@ -93,9 +91,7 @@ def killed(work, moment: float) -> None:
 @pytest.mark.slow
 @row("A5", "Crash mid checkpoint")
 def test_killed_at_random_moments_of_200_saves(tmp_path, measured):
-    """After each kill the file is intact and not older than the last save that the child has
-    reported.
-    """
+    """The file stays intact and not older than the last save that the child has reported."""
     path, rng = tmp_path / "last.ckpt", random.Random(0)
     save_file(path, content(0))
     saved, kills, lost = 0, 0, 0
@@ -126,9 +122,7 @@ def test_killed_at_random_moments_of_200_saves(tmp_path, measured):
 
 @contextlib.contextmanager
 def permissions_count_for_root():
-    """Make permissions effective for root by dropping two capabilities of the thread for
-    a while.
-    """
+    """Drop two capabilities of the thread for a while."""
     if os.geteuid():
         yield
         return
@@ -146,9 +140,7 @@ def permissions_count_for_root():
 
 
 def assert_stopped_cleanly(ended: Ended, message: str) -> None:
-    """One named error; the checkpoint of step 2 is intact and the newest, and no temporary file is
-    left.
-    """
+    """The checkpoint of step 2 is intact and the newest, and no temporary file is left."""
     assert_refused(ended, message)
     assert load_checkpoint(ended.last)["global_step"] == 2
     left = [path.name for path in ended.folder.rglob("*")]
@@ -170,9 +162,7 @@ def test_a_full_disk_in_the_middle_of_a_run(tmp_path, monkeypatch, measured):
     "hook", ["ensure_cloud", "score", "on_test_start", "on_test_epoch_end", "export"]
 )
 def test_a_disk_that_is_full_by_then(hook, tmp_path, monkeypatch, measured):
-    """While the prior is cached, the cloud evaluated, views and video written, or the cloud
-    exported: a partial file never counts as success.
-    """
+    """While the prior is cached, views and video written, or the cloud exported."""
     owner = system.export if hook == "export" else GaussianDreamerSystem
     original = getattr(owner, hook)
     with contextlib.ExitStack() as full:
@@ -193,9 +183,7 @@ def test_a_disk_that_is_full_by_then(hook, tmp_path, monkeypatch, measured):
 @row("A5", "Disk full, read-only")
 @pytest.mark.parametrize("kind", ["mp4", "gif", "png"])
 def test_a_partial_video_is_an_error(kind, tmp_path, measured):
-    """The encoder is a separate process that may end without an error: an mp4 counts as written
-    when it contains its index.
-    """
+    """The encoder may end without an error: an mp4 counts when it contains its index."""
     noise = np.random.default_rng(0).integers(0, 255, (4, 64, 64, 3), dtype=np.uint8)
     frames, path = [tmp_path / f"{i}.png" for i in range(4)], tmp_path / f"out.{kind}"
     for frame, picture in zip(frames, noise, strict=True):
@@ -259,9 +247,7 @@ def test_no_damaged_byte_is_ever_loaded(how, times, tmp_path, measured):
 
 @row("A5", "Corrupted checkpoint")
 def test_a_damaged_checkpoint_is_refused_and_passed_over_by_resume_auto(whole, tmp_path, measured):
-    """After three steps the last checkpoint and its copy are damaged; the previous one is intact.
-    One that was asked for is refused; only the user may take another.
-    """
+    """The last checkpoint and its copy are damaged; only the user may take another."""
     stopped = launch(tmp_path, "checkpoint.every_n_train_steps=1", "trainer.max_steps=3")
     assert stopped.code == 0, stopped.err
     for name in ("last.ckpt", "epoch=0-step=3.ckpt"):
@@ -335,9 +321,7 @@ def test_a_signal_at_a_random_step(stop, whole, tmp_path, monkeypatch, measured)
 
 @row("A5", "Ctrl-C / SIGTERM")
 def test_a_second_signal_stops_at_once(tmp_path, monkeypatch, measured):
-    """In the middle of a step: the checkpoint of the previous step remains, and the run can be
-    resumed.
-    """
+    """In the middle of a step: the checkpoint of the previous step remains."""
 
     def impatient(system):
         os.kill(os.getpid(), signal.SIGINT)
@@ -404,9 +388,7 @@ def refuse(*args, **kwargs):
     "what", ["sockets blocked", "no answer to connecting", "no answer to a name", "HF_HUB_OFFLINE"]
 )
 def test_a_missing_model_is_named_within_seconds(what, tmp_path, monkeypatch, measured):
-    """The message says which files to put where. Name resolution takes longest, because it has no
-    timeout; where nobody answers, a tenth of the users' timeout stands for it.
-    """
+    """Where nobody answers, a tenth of the users' timeout stands for it."""
     pytest.importorskip("huggingface_hub.hf_api")  # not while the time is measured
     constants = pytest.importorskip("huggingface_hub.constants")
     monkeypatch.setattr(constants, "HF_HUB_OFFLINE", what == "HF_HUB_OFFLINE")
@@ -452,9 +434,7 @@ FOX = ["system.prompt_processor.prompt=a fox"]
 
 
 def keys_of(cfg, path=""):
-    """Return every dotted key of a configuration except the sections' part names, whose keys are
-    checked with them.
-    """
+    """Return every dotted key of a configuration except the sections' part names."""
     for key in cfg:
         yield f"{path}{key}"
         if hasattr(cfg._get_node(key), "keys"):
@@ -469,9 +449,7 @@ def misspelt(word: str) -> set[str]:
 
 
 def refusal(cfg, section: str, wrong: str, name: str) -> str:
-    """Return the message about one additional key in a valid configuration; empty if it is
-    accepted.
-    """
+    """Return the message about one additional key; empty if it is accepted."""
     part = OmegaConf.select(cfg, section) if section else cfg
     try:
         if section:
@@ -690,9 +668,7 @@ def bomb_checkpoint(path: Path, bomb: Bomb) -> Path:
 
 
 def refused_by(read, name: str, *arrays: str):
-    """Return a reader test: ``read(path)`` refuses a file of this name, of NumPy arrays, a
-    checkpoint (.pt) or a bare pickle.
-    """
+    """Return a reader test: ``read(path)`` refuses a file of this name."""
 
     def reader(folder: Path, bomb: Bomb) -> None:
         path, array = folder / name, np.array([bomb], object)
@@ -798,9 +774,7 @@ NEVER = set(
 
 @row("A5", "Untrusted pickle")
 def test_every_load_in_the_package_is_the_safe_one(measured):
-    """Calls are named ``torch.load`` and ``np.load``, so that none is hidden by another name;
-    benchmarks and launcher included.
-    """
+    """Benchmarks and launcher included."""
     unsafe, found, root = [], 0, PACKAGE.parent
     hidden = r"from (torch|numpy|numpy\.lib\.format) import .*(load|read_array)\b"
     for path in [*PACKAGE.rglob("*.py"), *(root / "benchmarks").glob("*.py"), root / "launch.py"]:

@@ -110,9 +110,7 @@ def test_bad_steps_end_the_run_also_if_they_are_known_late(
 
 
 def scaled_run(folder, monkeypatch, scale, *options) -> Ended:
-    """Run with Lightning's 16-mixed and this loss scale; on a CPU float16 needs an
-    explicit scaler.
-    """
+    """Run with Lightning's 16-mixed and this loss scale, for which a CPU needs a scaler."""
     plugin = MixedPrecision("16-mixed", "cpu", scaler=torch.amp.GradScaler("cpu", init_scale=scale))
     build = run.build
 
@@ -138,9 +136,7 @@ def three_steps(tmp_path_factory) -> Ended:
 def test_any_loss_scale_trains_the_same_bits_as_float32(
     scale, three_steps, tmp_path, monkeypatch, measured
 ):
-    """Powers of two are exact in float32, so differences could only come from half precision in
-    cameras, colours, rasteriser or score.
-    """
+    """Powers of two are exact: a difference could only come from half precision."""
     ended = scaled_run(tmp_path, monkeypatch, scale, "trainer.max_steps=3")
     assert ended.code == 0, ended.err
     require_equal_ends(measured, three_steps, ended, "different from float32")
@@ -148,9 +144,7 @@ def test_any_loss_scale_trains_the_same_bits_as_float32(
 
 @row("A4", "GradScaler")
 def test_steps_that_are_skipped_are_counted_and_reported(tmp_path, monkeypatch, measured):
-    """At a loss scale of 2^127 gradients overflow until it was halved twice; the log reports the
-    steps that Adam skipped.
-    """
+    """At a loss scale of 2^127 gradients overflow until it was halved twice."""
     options = "trainer.max_steps=5", "system.geometry.densify.enabled=true"
     ended = scaled_run(tmp_path, monkeypatch, 2.0**127, *options)
     assert ended.code == 0 and finite_cloud(ended), ended.err
@@ -217,9 +211,7 @@ def test_a_range_that_is_empty_after_annealing_is_named(measured):
 @row("A4", "t edges")
 @pytest.mark.parametrize("name", sorted(sds.WEIGHTS))
 def test_the_gradient_at_the_first_and_last_timestep_is_finite(name, measured):
-    """t = 0, where a/sigma is 34, is never drawn. Records which fraction of each weighting falls on
-    the first tenth of the timesteps.
-    """
+    """Records which share of each weighting falls on the first tenth of the timesteps."""
     abar, t = sds.sd_alphas_cumprod(), torch.tensor([1, 500, 999])
     pull = sds.WEIGHTS[name](abar) * (abar / (1 - abar)).sqrt()
     x, noise = torch.randn(2, 3, 4, 8, 8, generator=seeded())
@@ -249,9 +241,7 @@ DENSIFYING = [
 
 
 def resumed(folder, whole: Ended, step: int, *options) -> Ended:
-    """Resume, in another folder, from the checkpoint that the uninterrupted run wrote after
-    ``step``.
-    """
+    """Resume, in another folder, from the checkpoint that the whole run wrote at ``step``."""
     ended = launch(folder, *options, f"resume={whole.folder}/ckpts/epoch=0-step={step}.ckpt")
     assert ended.code == 0, ended.err
     return ended
@@ -269,18 +259,14 @@ def over_the_edge(tmp_path_factory) -> Ended:
 @pytest.mark.slow
 @pytest.mark.parametrize("step", [4, 5, 6])
 def test_resumed_at_the_edge_of_every_schedule(step, over_the_edge, tmp_path, measured):
-    """Timesteps, clip, resolution, learning rate and weight all jump from step 5 to step 6, like
-    the paper's from 500 to 501.
-    """
+    """All jump from step 5 to step 6, like the paper's from 500 to 501."""
     ended = resumed(tmp_path, over_the_edge, step, *EDGE, *EVERY_STEP)
     require_equal_ends(measured, over_the_edge, ended, "different")
 
 
 @pytest.fixture(scope="module")
 def random_streams(tmp_path_factory) -> Ended:
-    """A run that draws everything at every step: cameras, their shifts, timesteps, noise,
-    backgrounds, splits.
-    """
+    """A run that draws everything at every step."""
     ended = launch(tmp_path_factory.mktemp("streams"), *DENSIFYING, *EVERY_STEP)
     assert ended.code == 0, ended.err
     assert len(ended.checkpoint()["state_dict"]["geometry.means"]) > 130
@@ -299,9 +285,7 @@ def test_stopped_and_resumed_anywhere(step, random_streams, tmp_path, measured):
 @row("A4", "RNG")
 @pytest.mark.parametrize("views, every", [(1, 3), (3, 1)])
 def test_validation_changes_nothing(views, every, random_streams, tmp_path, monkeypatch, measured):
-    """Neither the number of validation views nor what they draw from the process's own generators
-    matters.
-    """
+    """Neither the views nor what they draw from the process's own generators matters."""
     looked, seen = GaussianDreamerSystem.validation_step, []
 
     def greedy(self, batch, batch_idx):
@@ -340,9 +324,7 @@ RANDOM_START = [f"system.geometry.prior{x}" for x in ("_type=random-prior", ".sh
 
 
 def trained(folder, steps, size, *options) -> Ended:
-    """Train long enough for a result: ``size`` pixels, timesteps up to 0.55 after five twelfths of
-    the run.
-    """
+    """Train long enough for a result, with timesteps up to 0.55 after five twelfths."""
     middle = steps * 5 // 12
     ended = launch(
         folder,
@@ -360,9 +342,7 @@ def trained(folder, steps, size, *options) -> Ended:
 @pytest.mark.slow
 @row("A4", "Guidance 100: over-saturation")
 def test_annealing_helps_and_clipping_helps_more(tmp_path, measured):
-    """The exact score of the toy in a latent, at guidance 100 and, for comparison, without
-    guidance. Over-saturation is measured out of gamut, which bounded colours can't be.
-    """
+    """The exact score of the toy in a latent; over-saturation is measured out of gamut."""
     variants = {
         "as it is": [*STRONG, "system.guidance.max_step_percent=0.98"],
         "annealed": STRONG,
@@ -385,9 +365,7 @@ def test_annealing_helps_and_clipping_helps_more(tmp_path, measured):
 @pytest.mark.slow
 @row("A4", "Janus")
 def test_a_prior_prevents_multiple_faces_and_a_random_start_does_not(tmp_path, measured):
-    """A view-blind score and short runs; measured with the package's metric, which is in every
-    run's metrics.json.
-    """
+    """A view-blind score and short runs, measured with the package's metric."""
     for name, start, bound in (
         ("prior", POINTS, {"at_most": 5}),
         ("random start", [*POINTS, *RANDOM_START], {"at_least": 50}),
@@ -399,9 +377,7 @@ def test_a_prior_prevents_multiple_faces_and_a_random_start_does_not(tmp_path, m
 
 @row("A4", "Janus")
 def test_the_table_of_five_seeds(measured):
-    """Runs of 1200 steps at 128 pixels, by `python -m benchmarks.quality.ablations --table
-    faces`.
-    """
+    """Runs of 1200 steps at 128 pixels, by ``benchmarks.quality.ablations --table faces``."""
     lines = (RESULTS / "faces.csv").read_text().splitlines()
     table = csv.DictReader(line for line in lines if not line.startswith("#"))
     rows = {row["variant"]: row for row in table}
@@ -479,9 +455,7 @@ def test_an_extreme_camera_does_not_affect_the_other_views(name, measured):
 
 
 def with_cameras(monkeypatch, change) -> None:
-    """Replace the cameras of each training batch by ``change(batch)``, an :class:`Orbit` or c2w
-    matrices.
-    """
+    """Replace the cameras of each batch by ``change(batch)``, an Orbit or c2w matrices."""
     collate = TrainCameras.collate
 
     def changed(self, step):
@@ -498,9 +472,7 @@ def with_cameras(monkeypatch, change) -> None:
 @pytest.mark.slow
 @row("A4", "Extreme cameras in a batch")
 def test_training_with_extreme_cameras_logs_each_items_gradient(tmp_path, monkeypatch, measured):
-    """The whole step, with ray-cast targets, on a batch of an ordinary camera and all
-    extreme ones.
-    """
+    """The whole step, on a batch of an ordinary camera and all extreme ones."""
     views, ordinary = [ORDINARY, *EXTREME.values()], []
     options = ["trainer.max_steps=3", f"data.batch_size={len(views)}"]
     for name, batch in (("ordinary", [ORDINARY] * len(views)), ("extreme", views)):
