@@ -96,10 +96,9 @@ def haze(cloud: Gaussians) -> dict[str, float]:
     ``faint``, the share of pixels whose alpha is between the values of FAINT.
     """
     orbit = recognition.views()
-    view = orbit.c2w, orbit.fovy, SIZE
     black, white = (
-        np.concatenate(list(render_views(cloud, *view, background=color)))
-        for color in ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
+        np.concatenate([*render_views(cloud, orbit.c2w, orbit.fovy, SIZE, background=(x,) * 3)])
+        for x in (0.0, 1.0)
     )
     alpha = 1 - (white - black).mean(axis=-1)
     y, x = (2 * (np.indices((SIZE, SIZE)) + 0.5) / SIZE - 1) * math.tan(float(orbit.fovy[0]) / 2)

@@ -6,7 +6,6 @@ The formats are those of the extensions. A .glb or .obj is a textured mesh of th
 import argparse
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Optional
 
@@ -14,7 +13,7 @@ from ..core.command import joined_values, run_command
 from ..core.errors import UserError
 from ..core.files import existing_file, require_other_file, require_writable, through_link
 from ..core.memory import size_text
-from ..core.options import check_options, in_range
+from ..core.options import RULE, check_options, in_range
 from ..formats.gaussian_files import (
     FORMATS,
     WRITTEN,
@@ -37,16 +36,7 @@ from .losses import VIEWS, compare, dropped, losses, reference
 
 SIZE = 256
 """Width and height of the views of ``--check`` unless given, pixels."""
-
-
-@dataclass
-class ConvertOptions:
-    """The numeric options, with their ranges."""
-
-    harmonics: Optional[int] = field(default=None, metadata=in_range(0, MAX_DEGREE))
-    size: Optional[int] = field(default=None, metadata=in_range(16, 4096, "pixels"))
-
-
+RULES = {"harmonics": in_range(0, MAX_DEGREE), "size": in_range(16, 4096, "pixels")}
 MESH_OPTIONS = ("faces", "texture", "views", "view_size", "method", "resolution", "eps2d")
 """Those of :class:`.textured.MeshOptions` that can be given; None unless they are."""
 
@@ -152,7 +142,9 @@ def _check_options(args: argparse.Namespace, suffix: str, mesh: bool) -> None:
             f"--up-out: OUT is a {suffix} file, whose axes are fixed; it is for PLYs, and y or -y "
             "with --spz-version 4"
         )
-    check_options(ConvertOptions, ConvertOptions(args.harmonics, args.size), "--")
+    for name, rule in RULES.items():
+        if (value := getattr(args, name)) is not None:
+            rule[RULE](f"--{name}", value)
     if args.size is not None and not args.check:
         raise UserError("--size: has no effect without --check")
     if args.gaussians and suffix != ".glb":
