@@ -1,15 +1,18 @@
 """Learning rates of other packages' parts, and arguments of the optimiser."""
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 
-from tests.training.runs import CONFIGS, SMALL, launch, mocked_config, run_folder
+from tests.training.runs import CONFIGS, SMALL, mocked_config, run_folder
 from threestudio_gaussiandreamer import register_parts
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.launch.config import load_config
 from threestudio_gaussiandreamer.launch.experiment import main
+from threestudio_gaussiandreamer.training.background import FlatBackground
 from threestudio_gaussiandreamer.training.geometry import GaussianCloud
-from threestudio_gaussiandreamer.training.optimizer import check_optimizer
+from threestudio_gaussiandreamer.training.optimizer import PARTS, PartRates, check_optimizer
 
 COLOR = "background.env_color"
 
@@ -25,7 +28,7 @@ def train(tmp_path, painted_box):
     config = mocked_config(tmp_path, painted_box, **background)
 
     def trained(folder, *options):
-        overrides = [f"exp_root_dir={folder}", *SMALL, *options]
+        overrides = [f"exp_root_dir={folder}", *SMALL, "system.pages=false", *options]
         return main(["--config", str(config), "--train", "--gpu", "cpu", *overrides])
 
     return trained
@@ -63,13 +66,21 @@ def test_parameters_need_a_rate_and_changed_arguments_hold_in_a_resumed_run(
         assert group["weight_decay"] == 0.5 and list(group["betas"]) == [0.5, 0.9]
 
 
+def groups(geometry, params=(), **parts):
+    parts = dict.fromkeys(PARTS) | parts | {"geometry": geometry}
+    return PartRates({"params": dict(params)}).groups(SimpleNamespace(**parts))
+
+
 @pytest.mark.parametrize(
-    ("part", "hint"),
-    [("background", "for it: its rate is system.background.lr"), ("material", "to train")],
+    ("name", "part", "hint"),
+    [
+        ("background", FlatBackground({}), "for it: its rate is system.background.lr"),
+        ("material", None, "to train"),
+    ],
 )
-def test_a_rate_without_parameters_is_refused(tmp_path, painted_box, capsys, part, hint):
-    assert launch(tmp_path, painted_box, f"system.optimizer.params.{part}.lr=0.1") == 2
-    assert f"has no parameters {hint}" in capsys.readouterr().err
+def test_a_rate_without_parameters_is_refused(name, part, hint):
+    with pytest.raises(UserError, match=f"has no parameters {hint}"):
+        groups(GaussianCloud({}), {name: {"lr": 0.1}}, **{name: part})
 
 
 @pytest.mark.parametrize(
@@ -111,21 +122,17 @@ def test_only_optimisers_that_can_train_are_named():
     assert not {"Optimizer", "LBFGS", "SparseAdam", "Muon"} & set(named)
 
 
-def test_a_parameter_of_an_own_geometry_is_not_left_untrained(
-    tmp_path, painted_box, capsys, monkeypatch
-):
-    def configure(self):
-        once(self)
-        self.bright = torch.nn.Parameter(torch.zeros(1))
+def test_a_parameter_of_an_own_geometry_is_not_left_untrained():
+    class Own(GaussianCloud):
+        def configure(self):
+            super().configure()
+            self.bright = torch.nn.Parameter(torch.zeros(1))
 
-    once = GaussianCloud.configure
-    monkeypatch.setattr(GaussianCloud, "configure", configure)
-    assert launch(tmp_path, painted_box, "system.geometry.prior.path=missing.glb") == 2
-    assert "has the parameter bright without a learning rate" in capsys.readouterr().err
-    groups = GaussianCloud.parameter_groups
+    class Grouped(Own):
+        def parameter_groups(self):
+            own = {"name": "bright", "lr": 0.1, "params": [self.bright]}
+            return [*super().parameter_groups(), own]
 
-    def with_own(self):
-        return [*groups(self), {"name": "bright", "lr": 0.1, "params": [self.bright]}]
-
-    monkeypatch.setattr(GaussianCloud, "parameter_groups", with_own)
-    assert launch(tmp_path, painted_box, "trainer.max_steps=1") == 0
+    with pytest.raises(UserError, match="Own has the parameter bright without a learning rate"):
+        groups(Own({}))
+    assert groups(Grouped({})) == []

@@ -53,8 +53,6 @@ TURNTABLE_FRAMES, TURNTABLE_SIZE, TURNTABLE_SECONDS = 40, 256, 4.0
 """Of the animated picture: largest number of frames, longest side in pixels, seconds."""
 SUMMARY = ("held_out/compare.png", "it*-test.*", "it*-export/*.*", "it*-export/pruned/*.*")
 """Files below the folder of results that the last message of a run names."""
-Spent = Optional[float]
-"""PSNR in dB that a cloud has been pruned to."""
 CLOUDS = ("ply", "spz", "gaussians")
 """Types of exports that hold all attributes of the Gaussians."""
 
@@ -62,20 +60,20 @@ CLOUDS = ("ply", "spz", "gaussians")
 class GaussianSavers:
     """The ``save_<save_type>`` that our exporters name, for a system of the host."""
 
-    def save_ply(self, filename: str, stored: StoredCloud, pruned_to: Spent = None) -> None:
-        self.save_gaussians(filename, stored, ".ply", pruned_to)
-
-    def save_spz(
-        self, filename: str, stored: StoredCloud, pruned_to: Spent = None, version: int = VERSION
-    ) -> None:
-        self.save_gaussians(filename, stored, ".spz", pruned_to, spz_version=version)
-
     def save_gaussians(
-        self, filename: str, stored: StoredCloud, suffix: str, pruned_to: Spent = None, **more: Any
+        self,
+        filename: str,
+        stored: StoredCloud,
+        suffix: str,
+        pruned_to: Optional[float] = None,
+        version: int = VERSION,
     ) -> None:
         antialiased = settings_of(self).antialias
         stored = stored._replace(pruned_to=pruned_to, antialiased=antialiased)
-        write_cloud(self.get_save_path(filename), stored, suffix, **more)
+        write_cloud(self.get_save_path(filename), stored, suffix, spz_version=version)
+
+    save_ply = functools.partialmethod(save_gaussians, suffix=".ply")
+    save_spz = functools.partialmethod(save_gaussians, suffix=".spz")
 
     def save_points(self, filename: str, cloud: PointCloud) -> None:
         write_points(self.get_save_path(filename), cloud)
@@ -130,7 +128,7 @@ def _call_each(calls: Mapping[str, Callable[[], Any]]) -> None:
 
 
 def writers(
-    system: Any, geometry: Any, folder: str, pruned_to: Spent = None
+    system: Any, geometry: Any, folder: str, pruned_to: Optional[float] = None
 ) -> dict[str, Callable[[], None]]:
     """Return a function for each format of the exporter of ``system`` that writes its files of a
     geometry into ``folder``; ``pruned_to``, dB, is noted in files of Gaussians.
