@@ -171,7 +171,7 @@ MISTAKES = {
     "density rule: returns something else": (
         DENSITY + "    def after_step(self, optimizer, step): return len(self.cloud)",
         [OWN_DENSITY],
-        "Own.after_step returned int; expected None or a DensityOutcome",
+        "Own.after_step returned int; expected None or a Need",
     ),
     "prior: an empty cloud": (
         PART.format("prior", "priors.base", "Prior")

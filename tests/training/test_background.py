@@ -1,10 +1,14 @@
 """Fixed, random and learned backgrounds."""
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.training.background import FlatBackground
+from threestudio_gaussiandreamer.training.geometry import GaussianCloud
+from threestudio_gaussiandreamer.training.optimizer import PartRates
 
 
 def test_fixed_is_the_colour_in_training_and_evaluation():
@@ -30,8 +34,12 @@ def test_learned_starts_at_the_colour_stays_in_range_and_learns():
         {"mode": "learned", "color": [0.5, 0.5, 0.5], "lr": [0, 0.1, 0.2, 10]}
     )
     optimizer = torch.optim.Adam(background.parameter_groups())
+    rates, cloud = PartRates({}), GaussianCloud({})
+    rates.groups(
+        SimpleNamespace(geometry=cloud, background=background, material=None, renderer=None)
+    )
     for step in range(400):
-        background.set_learning_rates(optimizer, 0, step)
+        rates.set(optimizer, 0, step)
         optimizer.zero_grad()
         ((background.color(2) - torch.tensor([1.0, 0.0, 0.5])) ** 2).sum().backward()
         optimizer.step()

@@ -87,18 +87,6 @@ def test_a_pool_repeats_its_cameras_and_still_covers_the_circle():
     assert all(sorted((b["azimuth"] // 90).tolist()) == [-2, -1, 0, 1] for b in batches(data, 5))
 
 
-def test_the_views_of_a_pool_are_known_beforehand_unless_cameras_move():
-    data = module(train_views=8)
-    assert data.views_to_prefetch(1) is None
-    views = data.views_to_prefetch(2)
-    assert (len(views["fovy"]), views["height"], views["width"]) == (8, 32, 48)
-    known = {tuple(c2w) for c2w in views["c2w"].flatten(1).tolist()}
-    assert {tuple(c2w) for b in batches(data, 20) for c2w in b["c2w"].flatten(1).tolist()} == known
-    milestone = {"train_views": 8, "height": [16, 32], "resolution_milestones": [3]}
-    for changing in ({}, {"train_views": 8, "up_perturb": 0.1}, milestone):
-        assert module(**changing).views_to_prefetch(9) is None
-
-
 def test_progressive_views_widen_from_the_evaluation_view():
     data = module(progressive_until=100)
     (first,), (last,) = batches(data, 1), batches(data, 1, start=100)

@@ -11,6 +11,7 @@ from threestudio_gaussiandreamer.core.host_copies import HostCopy
 from threestudio_gaussiandreamer.metrics import psnr
 from threestudio_gaussiandreamer.splatting.cpu import backend as cpu
 from threestudio_gaussiandreamer.training import events
+from threestudio_gaussiandreamer.training.data import GaussianDreamerDataModule
 from threestudio_gaussiandreamer.training.events import StepLog
 from threestudio_gaussiandreamer.training.system import GaussianDreamerSystem
 
@@ -84,3 +85,27 @@ def test_a_run_logs_each_number_once_and_the_error_that_its_guidance_returns(
         assert [row["step"] for row in rows if row[name]] == ["1", "3"], name
     logged = [float(row["dB"]) for row in rows if row["dB"]]
     assert logged == pytest.approx(expected[1::2], abs=1e-4) and len(expected) == 4
+
+
+@pytest.mark.parametrize(
+    ("options", "steps", "announced"),
+    [
+        ({"train_views": 8}, 2, [(8, 16, 24)]),
+        ({"train_views": 8}, 1, []),
+        ({}, 9, []),
+        ({"train_views": 8, "up_perturb": 0.1}, 9, []),
+        ({"train_views": 8, "height": [16, 32], "resolution_milestones": [3]}, 9, []),
+    ],
+)
+def test_the_views_of_a_pool_are_announced_if_most_are_drawn_and_none_moves(
+    options, steps, announced
+):
+    data = GaussianDreamerDataModule({"batch_size": 4, "height": 32, "width": 48, **options})
+    data.setup("fit")
+    found = []
+    truth = SimpleNamespace(prefetch=lambda c2w, fovy, *size: found.append((len(c2w), *size)))
+    renderer = SimpleNamespace(cfg=SimpleNamespace(downsample=2))
+    own = {"trainer": SimpleNamespace(datamodule=data, max_steps=steps), "renderer": renderer}
+    own |= {"guidance": SimpleNamespace(truth=truth), "global_step": 0, "device": "cpu"}
+    events.prefetch_truth(SimpleNamespace(**own))
+    assert found == announced

@@ -21,7 +21,7 @@ from ..core.distributed import first_item
 from ..core.host_copies import to_device
 from ..core.options import each, in_range, one_of, schedule
 from ..core.streams import generator
-from ..host import BaseBackground, C, register, run_seed
+from ..host import BaseBackground, register, run_seed
 
 
 @register("gaussiandreamer-background")
@@ -52,11 +52,6 @@ class FlatBackground(BaseBackground):
         if self.cfg.mode != "learned":
             return []
         return [{"params": [self.logit], "name": "background", "lr": 0.0}]
-
-    def set_learning_rates(self, optimizer: torch.optim.Optimizer, epoch: int, step: int) -> None:
-        for group in optimizer.param_groups:
-            if group.get("name") == "background":
-                group["lr"] = C(self.cfg.lr, epoch, step)
 
     def color(self, batch_size: int) -> Float[Tensor, "B 3"]:
         """Return a colour per view, in [0, 1]; random ones are a function of (seed, step, view)."""

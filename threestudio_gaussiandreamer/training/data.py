@@ -34,7 +34,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import Any, ClassVar, List, Optional, Tuple
+from typing import Any, ClassVar, List, Tuple
 
 import torch
 from jaxtyping import Int
@@ -307,19 +307,6 @@ class GaussianDreamerDataModule(pl.LightningDataModule):
         if trainer is not None:  # which is at a later step in a resumed run or a later epoch
             cameras.next_step = lambda: trainer.global_step
         return DataLoader(cameras, batch_size=None, collate_fn=cameras.collate)
-
-    def views_to_prefetch(self, steps: float) -> Optional[dict[str, Any]]:
-        """Return ``c2w``, ``fovy``, ``height`` and ``width`` of all views of a fixed pool if
-        ``steps`` more steps will draw about as many; None where those change.
-        """
-        cameras = self.train_dataset
-        if cameras.pool is None or cameras.moves or len(cameras.sizes) > 1:
-            return None
-        ((height, width, batch_size),) = cameras.sizes
-        if steps * batch_size < len(cameras.pool.azimuth):
-            return None
-        orbit = cameras.pool
-        return {"c2w": orbit.c2w, "fovy": orbit.fovy, "height": height, "width": width}
 
     def val_dataloader(self) -> DataLoader:
         return DataLoader(self.val_dataset, collate_fn=self.val_dataset.collate)

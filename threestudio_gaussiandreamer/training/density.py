@@ -20,7 +20,7 @@ import inspect
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, NamedTuple, Optional
+from typing import Any, ClassVar, Optional
 
 import torch
 from jaxtyping import Float
@@ -101,19 +101,6 @@ def rounds_of(schedule: Any) -> range:
     return range(first, schedule.stop, schedule.every)
 
 
-class DensityOutcome(NamedTuple):
-    """What :meth:`DensityControl.after_step` did."""
-
-    before: int
-    after: int
-    """Number of Gaussians after the changes."""
-    needed: Optional[Need]
-    """What a round of ``budget: auto`` found; None for any other."""
-
-    def __str__(self) -> str:
-        return f"{self.before} -> {self.after} Gaussians: {self.needed}"
-
-
 class DensityRule:
     """Base class of density rules, whose hooks are called around every optimiser step; ``cfg`` are
     its options, ``system.geometry.density``. ``cloud`` is a :class:`.geometry.GaussianCloud`, which
@@ -155,7 +142,7 @@ class DensityRule:
         ``width`` by ``height`` pixels; mixed precision multiplies gradients by ``loss_scale``.
         """
 
-    def after_step(self, optimizer: torch.optim.Optimizer, step: int) -> Optional[DensityOutcome]:
+    def after_step(self, optimizer: torch.optim.Optimizer, step: int) -> Optional[Need]:
         """Change the cloud after ``step`` finished optimiser steps."""
 
     def summary(self) -> str:
@@ -309,24 +296,24 @@ class DensityControl(DensityRule):
 
     # -- changes of the cloud ----------------------------------------------------------------------
 
-    def after_step(self, optimizer: torch.optim.Optimizer, step: int) -> DensityOutcome:
+    def after_step(self, optimizer: torch.optim.Optimizer, step: int) -> Optional[Need]:
         """Densify and prune if the schedules have a round at ``step``; the parameters and rows of
-        the optimiser's state are updated with the Gaussians.
+        the optimiser's state are updated with the Gaussians. Returns what ``auto`` has found.
         """
-        before, change, needed = len(self.cloud), None, None
+        change, needed = None, None
         if self.cloud.cfg.budget == AUTO and self.pruning_at(step - 1):
             self.decay_opacities(optimizer)
         if self.cloud.cfg.densify.enabled and step in rounds_of(self.cloud.cfg.densify):
             change = self.densified(step)
             self.cloud.gradient_sum.zero_()
             self.cloud.gradient_count.zero_()
-            if not change.is_new.any() and len(change.parents) == before:
+            if not change.is_new.any() and len(change.parents) == len(self.cloud):
                 change = None
         if self.cloud.cfg.budget is not None and step in rounds_of(self.cloud.cfg.prune):
             change, needed = self._prune(step, change)
         if change is not None:
             self.cloud.apply_change(change, optimizer)
-        return DensityOutcome(before, len(self.cloud), needed)
+        return needed
 
     @torch.no_grad()
     def decay_opacities(self, optimizer: torch.optim.Optimizer) -> None:

@@ -140,9 +140,11 @@ def prefetch_truth(system: Any) -> None:
     truth, trainer = truth_of(system.guidance), system.trainer
     if truth is None or not isinstance(trainer.datamodule, GaussianDreamerDataModule):
         return
-    steps = math.inf if trainer.max_steps < 0 else trainer.max_steps - system.global_step
-    views = trainer.datamodule.views_to_prefetch(steps)
-    if views is None:
+    cameras = trainer.datamodule.train_dataset
+    if cameras.pool is None or cameras.moves or len(cameras.sizes) > 1:
         return
-    size = (views[side] // system.renderer.cfg.downsample for side in ("height", "width"))
-    truth.prefetch(views["c2w"].to(system.device), views["fovy"].to(system.device), *size)
+    ((*size, batch_size),), pool = cameras.sizes, cameras.pool
+    steps = math.inf if trainer.max_steps < 0 else trainer.max_steps - system.global_step
+    if steps * batch_size >= len(pool.azimuth):
+        size = (side // system.renderer.cfg.downsample for side in size)
+        truth.prefetch(pool.c2w.to(system.device), pool.fovy.to(system.device), *size)

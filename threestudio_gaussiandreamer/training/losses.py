@@ -22,7 +22,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..core.errors import UserError, unknown
-from ..core.schedule import Schedule, parse_schedule
 from ..guidance.base import ScoreDistillation
 from ..host import find, names, register
 
@@ -103,11 +102,6 @@ def require_gradients(geometry: torch.nn.Module, losses: Mapping[str, Tensor]) -
             f"no gradient of {names} reaches the Gaussians, so that they wouldn't be trained: "
             "compute it from the renders, without detach() or torch.no_grad()"
         )
-
-
-def weight_schedules(options: Mapping[str, Any]) -> dict[str, Schedule]:
-    """Parse ``lambda_<name>``, the weights of ``system.loss``, to schedules by ``name``."""
-    return {name.removeprefix("lambda_"): parse_schedule(value) for name, value in options.items()}
 
 
 def loggable(guided: Mapping[str, Any], losses: Mapping[str, Tensor]) -> dict[str, Any]:

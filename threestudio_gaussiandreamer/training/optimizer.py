@@ -142,6 +142,8 @@ class PartRates:
     def _groups_of(self, name: str, part: Optional[torch.nn.Module]) -> Groups:
         ours, own = isinstance(part, FlatBackground), f"{name}.parameters"
         groups = part.parameter_groups() if ours else []
+        if ours:
+            self.rates["background"] = parse_schedule(part.cfg.lr)
         trained = [] if part is None else [*_without_group(part, groups).values()]
         if trained and own not in self.rates:
             raise UserError(
@@ -155,10 +157,8 @@ class PartRates:
             )
         return [*groups, {"params": trained, "name": own, "lr": 0.0}] if trained else groups
 
-    def set(self, system: Any, optimizer: torch.optim.Optimizer, epoch: int, step: int) -> None:
+    def set(self, optimizer: torch.optim.Optimizer, epoch: int, step: int) -> None:
         """Set the learning rates of the groups of :meth:`groups`."""
-        if isinstance(system.background, FlatBackground):
-            system.background.set_learning_rates(optimizer, epoch, step)
         for group in optimizer.param_groups:
             if group.get("name") in self.rates:
                 group["lr"] = C(self.rates[group["name"]], epoch, step)

@@ -40,8 +40,9 @@ from ..core.distributed import average_gradients, from_first, rank
 from ..core.errors import UserError
 from ..core.host_copies import flush_reads
 from ..core.methods import require_class_method
-from ..core.schedule import validate_schedule
+from ..core.schedule import parse_schedule, validate_schedule
 from ..gaussians.gaussians import SHAPES, require_cloud
+from ..gaussians.importance import Need
 from ..guidance import external
 from ..guidance.external import truth_of
 from ..host import BaseLift3DSystem, C, find, info, parse_structured, register, warn
@@ -50,7 +51,7 @@ from ..priors.base import preflight_prior
 from ..priors.cache import cached_cloud
 from ..prune import PruneOptions
 from . import events, export, finite
-from .density import DensityOutcome, MeanError, density_rule
+from .density import MeanError, density_rule
 from .held_out import EvaluationConfig, HeldOut, Measurements
 from .losses import (
     check_losses,
@@ -58,7 +59,6 @@ from .losses import (
     logged_names,
     require_gradients,
     total,
-    weight_schedules,
     weighted_losses,
 )
 from .optimizer import PartRates, check_optimizer, make_optimizer, restore_arguments
@@ -115,7 +115,8 @@ class GaussianDreamerSystem(export.GaussianSavers, BaseLift3DSystem):
     # -- start -------------------------------------------------------------------------------------
 
     def configure(self) -> None:
-        self.loss_weights = weight_schedules(self.cfg.loss)
+        weights = self.cfg.loss.items()
+        self.loss_weights = {k.removeprefix("lambda_"): parse_schedule(v) for k, v in weights}
         self.part_rates = PartRates(self.cfg.optimizer)
         super().configure()
         self.density = density_rule(self.geometry)
@@ -246,14 +247,16 @@ class GaussianDreamerSystem(export.GaussianSavers, BaseLift3DSystem):
 
     def control_density(self, optimizer: torch.optim.Optimizer) -> None:
         """Densify and prune on schedule; log what a round of ``budget: auto`` found."""
+        before = len(self.geometry)
         # the torch optimiser in Lightning's wrapper, since the rows of its state are changed
-        outcome = self.density.after_step(optimizer.optimizer, self.global_step)
-        if not isinstance(outcome, DensityOutcome | None):
-            found = f"{type(self.density).__name__}.after_step returned {type(outcome).__name__}"
-            raise UserError(f"{found}; expected None or a DensityOutcome")
-        if outcome and outcome.needed and outcome.needed.gain >= 0:
-            self.step_log.write(self.trainer, {"prune/gain": outcome.needed.gain})
-            info(f"step {self.global_step}: {outcome}")
+        needed = self.density.after_step(optimizer.optimizer, self.global_step)
+        if not isinstance(needed, Need | None):
+            found = f"{type(self.density).__name__}.after_step returned {type(needed).__name__}"
+            raise UserError(f"{found}; expected None or a Need")
+        if needed and needed.gain >= 0:
+            self.step_log.write(self.trainer, {"prune/gain": needed.gain})
+            changed = f"{before} -> {len(self.geometry)} Gaussians"
+            info(f"step {self.global_step}: {changed}: {needed}")
 
     def error_of(self, out: Outputs, batch: Batch, guided: dict[str, Any]) -> Optional[MeanError]:
         """Return what computes the mean squared error to the ground truth, if there is one."""
@@ -267,7 +270,7 @@ class GaussianDreamerSystem(export.GaussianSavers, BaseLift3DSystem):
     def set_learning_rates(self, optimizer: torch.optim.Optimizer) -> None:
         now = self.true_current_epoch, self.true_global_step
         self.geometry.set_learning_rates(optimizer, *now)
-        self.part_rates.set(self, optimizer, *now)
+        self.part_rates.set(optimizer, *now)
 
     def losses(self, guided: dict[str, Any], out: Outputs) -> Losses:
         """Return the weighted losses of the guidance, and of regularisers of renders and cloud."""
