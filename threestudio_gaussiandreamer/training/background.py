@@ -68,9 +68,7 @@ class FlatBackground(BaseBackground):
 
     @classmethod
     def is_flat(cls, background: Any) -> bool:
-        """Whether a background has one colour per view: this class, or one that is derived from it
-        without a ``forward`` of its own.
-        """
+        """Whether a background has one colour per view: ours, unless it has its own ``forward``."""
         return isinstance(background, cls) and type(background).forward is cls.forward
 
     def forward(self, dirs: Float[Tensor, "B H W 3"]) -> Float[Tensor, "B H W 3"]:

@@ -94,9 +94,7 @@ def min_count(cfg: Any) -> int:
 
 
 def rounds_of(schedule: Any) -> range:
-    """Return the steps at which a schedule with ``start``, ``stop`` and ``every`` has a round: the
-    multiples of ``every``.
-    """
+    """Return the steps at which a schedule has a round: the multiples of ``every``."""
     first = math.ceil(schedule.start / schedule.every) * schedule.every
     return range(first, schedule.stop, schedule.every)
 
@@ -190,9 +188,7 @@ class DensityControl(DensityRule):
         return bool(rounds) and rounds[0] - self.cloud.cfg.prune.every <= step < rounds[-1]
 
     def schedule_problem(self, step: int, max_steps: int) -> Optional[str]:
-        """Describe why the remaining rounds can't meet the budget, or only by keeping less than
-        ``prune.keep``, and why densification can't do what it is to.
-        """
+        """Describe why the remaining rounds can't do what they are to."""
         end = max_steps if max_steps > 0 else math.inf
         problems = self._densification_problem(step, end), self._pruning_problem(step, end)
         return "; ".join(filter(None, problems)) or None
@@ -297,9 +293,7 @@ class DensityControl(DensityRule):
     # -- changes of the cloud ----------------------------------------------------------------------
 
     def after_step(self, optimizer: torch.optim.Optimizer, step: int) -> Optional[Need]:
-        """Densify and prune if the schedules have a round at ``step``; the parameters and rows of
-        the optimiser's state are updated with the Gaussians. Returns what ``auto`` has found.
-        """
+        """Densify and prune if it is due at ``step``; return what ``budget: auto`` has found."""
         change, needed = None, None
         if self.cloud.cfg.budget == AUTO and self.pruning_at(step - 1):
             self.decay_opacities(optimizer)
@@ -323,9 +317,7 @@ class DensityControl(DensityRule):
                 self.cloud.logit_opacities.sub_(DECAY * group["lr"])
 
     def densified(self, step: int) -> Change:
-        """Clone, split and drop Gaussians according to the statistics. With a budget that is a
-        number there are then at most the larger of it and the current number.
-        """
+        """Clone, split and drop Gaussians; under a budget up to it, or to the current number."""
         cfg, cloud, budget = self.cloud.cfg.densify, self.cloud, self.cloud.cfg.budget
         most = cloud.cfg.max_gaussians
         if budget not in (None, AUTO):

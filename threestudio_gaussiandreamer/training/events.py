@@ -58,14 +58,11 @@ class StepLog:
 def log_scores(
     loggers: Iterable[Any], scores_by_key: Mapping[str, Mapping[str, Any]], views: int
 ) -> None:
-    """Print the scores on so many held-out views, and log ``held_out/psnr`` (dB) and the others at
-    their ``step``.
-
-    ``LightningModule.log`` isn't allowed where the last score is made, in ``on_fit_end``."""
+    """Print scores on so many held-out views, and log ``held_out/psnr`` (dB) and others."""
     loggers = list(loggers)
     for key, scores in scores_by_key.items():
         values = {f"held_out/{name}": float(scores[name]) for name in LOGGED_SCORES}
-        for logger in loggers:
+        for logger in loggers:  # LightningModule.log isn't allowed in on_fit_end
             logger.log_metrics(values, step=scores["step"])
         info(f"{key}: {scores['psnr']:.2f} dB, SSIM {scores['ssim']:.4f} on {views} held-out views")
 
@@ -134,9 +131,7 @@ def true_views(
 
 
 def prefetch_truth(system: Any) -> None:
-    """Announce all cameras of a fixed pool to the ground truth, if the run of ``system`` will use
-    most of them.
-    """
+    """Announce all cameras of a fixed pool to the ground truth, if a run will use most of them."""
     truth, trainer = truth_of(system.guidance), system.trainer
     if truth is None or not isinstance(trainer.datamodule, GaussianDreamerDataModule):
         return

@@ -158,9 +158,7 @@ def writers(
 
 
 def save(system: Any, out: ExporterOutput, path: str, noted: Mapping[str, Any]) -> None:
-    """Write one output of an exporter; raise UserError if the system can't save its type, or the
-    type has other params.
-    """
+    """Write one output of an exporter; raise UserError if the system can't save its type."""
     write, params = getattr(system, f"save_{out.save_type}", None), {**noted, **out.params}
     if write is None:
         known = [name.removeprefix("save_") for name in dir(system) if name.startswith("save_")]

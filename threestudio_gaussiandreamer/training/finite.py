@@ -27,9 +27,7 @@ class NonFiniteParameters(UserError):
 
 
 def optimizer_tensors(optimizer: torch.optim.Optimizer) -> Iterator[tuple[str, Tensor]]:
-    """Yield every parameter of an optimiser with its group's name, and every tensor of its state
-    with its own, such as ``means.exp_avg``.
-    """
+    """Yield parameters of an optimiser, and tensors of its state, such as ``means.exp_avg``."""
     for group in optimizer.param_groups:
         name = group.get("name", "parameters")
         for parameter in group["params"]:
@@ -121,9 +119,7 @@ class LossScale:
         return 1.0 if scaler is None else float(scaler.get_scale())
 
     def has_skipped(self, trainer: Any, before: float) -> bool:
-        """Return whether the step that began with the scale ``before`` was skipped, with a
-        warning.
-        """
+        """Return whether the step that began with the scale ``before`` was skipped; warn of it."""
         if self.value(trainer) >= before:
             return False
         self.skipped_steps += 1

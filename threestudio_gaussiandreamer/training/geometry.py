@@ -296,9 +296,7 @@ class GaussianCloud(BaseGeometry):
         return cloud
 
     def _most_visible(self, cloud: Gaussians) -> Gaussians:
-        """Select at most ``max_gaussians`` of a trained cloud: those with the largest contribution
-        to views from all around.
-        """
+        """Select at most ``max_gaussians``: those that contribute most to views from around."""
         count, most = len(cloud.means), self.cfg.max_gaussians
         if count <= most:
             return cloud

@@ -105,9 +105,7 @@ def require_gradients(geometry: torch.nn.Module, losses: Mapping[str, Tensor]) -
 
 
 def loggable(guided: Mapping[str, Any], losses: Mapping[str, Tensor]) -> dict[str, Any]:
-    """Return the names and values to log: the scalars of a guidance (which also returns pictures
-    and latents) but ``error_to_truth``, and the weighted losses instead of its own.
-    """
+    """Return what is logged of a step: the guidance's scalars, and the weighted losses."""
     weighted = {f"loss_{name}": value.detach() for name, value in losses.items()}
     scalars = {
         name: value

@@ -44,9 +44,7 @@ def restore_arguments(optimizer: torch.optim.Optimizer) -> None:
 
 
 def accepted_arguments(name: str) -> dict[str, Any]:
-    """Return the defaults of an optimiser's arguments, without those that the system gives; empty
-    if ``torch.optim`` has no such optimiser.
-    """
+    """Return an optimiser's arguments, except those that the system gives, with defaults."""
     kind = getattr(torch.optim, str(name), None)
     parameters = inspect.signature(kind).parameters if isinstance(kind, type) else {}
     return {key: parameters[key].default for key in parameters if key not in ("params", "lr")}

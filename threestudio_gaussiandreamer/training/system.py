@@ -384,9 +384,7 @@ class GaussianDreamerSystem(export.GaussianSavers, BaseLift3DSystem):
 
 
 def check_parts(cfg: Any) -> None:
-    """Raise UserError if a part that the system needs isn't named, or isn't derived from the class
-    that it needs.
-    """
+    """Raise UserError if a part that the system needs is missing or isn't of the needed class."""
     for name in ("geometry", "renderer", "guidance", "prompt_processor"):
         if not getattr(cfg, f"{name}_type"):
             raise UserError(f"{name}_type is empty: name a registered part")
