@@ -67,10 +67,6 @@ def cloud_of(path):
     return torch.load(path, weights_only=True, map_location="cpu")["state_dict"]
 
 
-def same(a, b):
-    return a.keys() == b.keys() and all(torch.equal(a[k], b[k]) for k in a)
-
-
 def mocked_config(folder, mesh, **system):
     """Return the demo's YAML with the mock as its guidance."""
     cfg = yaml.safe_load((CONFIGS / "demo.yaml").read_text())

@@ -50,15 +50,6 @@ def test_each_point_becomes_one_gaussian_as_the_paper_says(sphere_points):
     assert torch.equal(geometry.quats, torch.tensor([1.0, 0, 0, 0]).expand(400, 4))
 
 
-def test_growing_is_configured_and_seeded(sphere_points, monkeypatch):
-    grow = {"num_candidates": 20_000, "radius": 0.05, "max_points": 300}
-    first = started(sphere_points, grow=grow)
-    assert len(first) == 700
-    assert torch.equal(first.means, started(sphere_points, grow=grow).means)
-    monkeypatch.setenv("PL_GLOBAL_SEED", "1")
-    assert not torch.equal(first.means, started(sphere_points, grow=grow).means)
-
-
 def test_the_object_grows_first_and_the_ground_is_added_then():
     """The ground is wider than the object: it would enlarge the box and the radius, and would grow
     itself.
@@ -89,16 +80,6 @@ def test_the_cloud_takes_its_size_from_the_checkpoint_and_never_asks_the_prior(
     for name, value in geometry.state_dict().items():
         assert torch.equal(value, other.state_dict()[name]), name
     assert other.gradient_sum.sum() > 0
-
-
-def test_a_checkpoint_from_before_the_removal_error_loads(sphere_points):
-    geometry = started(sphere_points)
-    state = geometry.state_dict()
-    del state["removal"]
-    other = GaussianCloud({})
-    other.load_state_dict(state)
-    assert torch.equal(other.means, geometry.means)
-    assert torch.equal(other.removal, torch.zeros(len(geometry)))
 
 
 def test_spherical_harmonics_are_padded_and_cut(sphere_points):
