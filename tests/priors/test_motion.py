@@ -128,6 +128,7 @@ def asked(monkeypatch):
 
     monkeypatch.setattr(module, "picture_similarities", scores)
     monkeypatch.setattr(module, "NUM_FRAMES", 2)
+    monkeypatch.setattr(module, "ROUGH", 5)
     return texts
 
 

@@ -34,7 +34,6 @@ def sure(attributes, sides=None):
         ({"second": "black"}, ["colors"]),
         ({"pattern": "dotted"}, ["pattern"]),
         ({"accessory": None, "accessory_color": None}, ["accessory"]),
-        ({"accessory_color": "green"}, ["accessory"]),
         ({"part": "green"}, ["accessory"]),
     ],
 )

@@ -175,7 +175,6 @@ def test_the_judge_has_data_of_its_own(tmp_path):
 @pytest.mark.parametrize(
     ("name", "user", "prefix", "free"),
     [
-        ("text", "points", "text_model.", "heads."),
         ("text", "clip", "text_projection.", "heads."),
         ("autoencoder", "unet", "encoder.", "decoder."),
     ],

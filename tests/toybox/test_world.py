@@ -115,19 +115,10 @@ def share_of(attributes, color):
 
 def test_prompts_name_what_there_is(drawn):
     rng = np.random.default_rng(0)
-    for a in drawn:
-        text = words.describe(a, rng)
-        assert any(noun in text for noun in words.NOUNS[a.kind])
-        for color in (a.color, a.second, a.part, a.accessory_color):
-            names = (color, *words.COLOR_WORDS.get(color, ()))
-            assert color is None or any(word in text for word in names)
-        if a.accessory:
-            assert any(word in text for word in words.ACCESSORY_WORDS[a.accessory])
-        assert " a o" not in f" {text}" and " a e" not in f" {text}"
-    for index in range(500):  # every written prompt is read back
-        attributes = world.draw_attributes(5, index)
-        text = words.describe(attributes, np.random.default_rng(index))
+    for attributes in drawn:  # every written prompt is read back
+        text = words.describe(attributes, rng)
         assert words.attributes_in(text) == attributes, text
+        assert " a o" not in f" {text}" and " a e" not in f" {text}"
     texts = [words.prompt_of(a, 10, 5 * i, rng) for i, a in enumerate(drawn) for _ in range(5)]
     assert np.mean([text == "" for text in texts]) == pytest.approx(0.1, abs=0.02)
     assert np.mean(["view" in text for text in texts]) == pytest.approx(0.7, abs=0.04)
@@ -224,7 +215,7 @@ def test_backgrounds_are_fixed_but_for_the_asked_share(shards):
     random = views.with_backgrounds(rgba, np.random.default_rng(0), random_share=1)
     assert (random[:, :, 0, 0] - fixed[:, :, 0, 0]).abs().amax(dim=1).min() > 0
     inside = rgba[0, :, :, 3] == 255
-    colors = rgba[0, :, :, :3][inside] / np.float32(255)
+    colors = rgba[0, :, :, :3][inside] / 255
     assert np.allclose(random[0].movedim(0, -1).numpy()[inside], colors, atol=1e-6)
 
 
