@@ -6,15 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from tests.priors.cases import (
-    MIXAMO,
-    bvh_text,
-    limb_angles,
-    needs_anny,
-    random_local,
-    rng,
-    walked,
-)
+from tests.priors.cases import MIXAMO, bvh_text, limb_angles, needs_anny, random_local, rng, walked
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.priors.body_pose import (
     BODY_JOINTS,

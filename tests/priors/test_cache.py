@@ -11,10 +11,7 @@ from PIL import Image
 from threestudio_gaussiandreamer.formats.ply import read_points
 from threestudio_gaussiandreamer.gaussians.point_cloud import PointCloud
 from threestudio_gaussiandreamer.host import BaseObject
-from threestudio_gaussiandreamer.priors.cache import (
-    cache_key,
-    cached_cloud,
-)
+from threestudio_gaussiandreamer.priors.cache import cache_key, cached_cloud
 from threestudio_gaussiandreamer.priors.mesh import MeshPrior
 
 

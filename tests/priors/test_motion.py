@@ -14,7 +14,7 @@ from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.meshes.mesh import Mesh
 from threestudio_gaussiandreamer.priors import motion as module
 from threestudio_gaussiandreamer.priors import motion_text
-from threestudio_gaussiandreamer.priors.body_pose import facing, z_up
+from threestudio_gaussiandreamer.priors.body_pose import Z_UP, facing
 from threestudio_gaussiandreamer.priors.motion import (
     MotionPrior,
     Motions,
@@ -193,7 +193,7 @@ def test_a_rotated_body_is_turned_to_face_plus_x(body):
     pose = torch.zeros(4, 24, 3, dtype=torch.float64)
     pose[:, 0, 1] = torch.tensor([0.0, 1.0, 2.5, -1.5])
     for joints in joints_of(body, pose):
-        turned = z_up(joints) @ facing(joints).T
+        turned = joints[:, Z_UP] @ facing(joints).T
         across = turned[[2, 17]] - turned[[1, 16]]  # right of left along -y
         np.testing.assert_allclose(across[:, 0], 0, atol=1e-9)
         assert across[1, 1] < -0.3 and turned[15, 2] > turned[0, 2] > turned[7, 2]  # head up

@@ -41,9 +41,9 @@ from threestudio_gaussiandreamer.launch.config_check import check_config, check_
 from threestudio_gaussiandreamer.models import hub, model_files
 from threestudio_gaussiandreamer.models.text_encoders import EmbeddingCache
 from threestudio_gaussiandreamer.priors.cache import read_cache
+from threestudio_gaussiandreamer.priors.karras import read_state_dict
 from threestudio_gaussiandreamer.priors.motion import load_body_model, read_motions
 from threestudio_gaussiandreamer.priors.point_cloud import load_points
-from threestudio_gaussiandreamer.priors.weights import read_state_dict
 from threestudio_gaussiandreamer.training import system
 from threestudio_gaussiandreamer.training.system import GaussianDreamerSystem
 

@@ -7,13 +7,7 @@ from tests.toybox.test_text_to_3d import PROMPT, run
 from tests.training.runs import CONFIGS
 from threestudio_gaussiandreamer import register_parts
 from threestudio_gaussiandreamer.evaluation.asset_metrics import Scores, result_of
-from threestudio_gaussiandreamer.models.bundled import (
-    FOLDER,
-    NAME,
-    RECORD,
-    digest_of,
-    read_digests,
-)
+from threestudio_gaussiandreamer.models.bundled import FOLDER, NAME, RECORD, digest_of, read_digests
 from threestudio_gaussiandreamer.view.run_index import leaves
 
 register_parts()

@@ -183,8 +183,6 @@ BONES = {joint: [bone] for joint, bone in CENTRAL.items()} | {
     for joint, bones in PAIRED.items()
 }
 """The bones of the rig that begin at each joint of SMPL; later bones move with them."""
-Shares = dict[str, float]
-"""Interpolation weights by name; they sum to 1."""
 Groups = dict[str, Int[np.ndarray, "F 4 2"]]
 """Faces by group; the corners of a face are (vertex, uv) pairs."""
 
@@ -231,7 +229,7 @@ def load_body(person: Person) -> Body:
         ) from error
 
 
-def target_weights(person: Person) -> Shares:
+def target_weights(person: Person) -> dict[str, float]:
     """Return the weights of all targets that a person needs, by file name without extension: the
     products of the interpolation weights of their parameters.
     """
@@ -258,7 +256,7 @@ def target_weights(person: Person) -> Shares:
     return found
 
 
-def shares(value: float, *names: str) -> Shares:
+def shares(value: float, *names: str) -> dict[str, float]:
     """Return the weights of linear interpolation among evenly spaced names, those above 0."""
     place = value * (len(names) - 1)
     weights = {name: 1 - abs(place - i) for i, name in enumerate(names)}

@@ -53,6 +53,8 @@ SPINE = {"lower spine": 1 / 3, "middle spine": 2 / 3, "upper spine": 1.0}
 """How far each joint of the spine turns from the pelvis' orientation to the chest's."""
 NEEDED = [f"{side} {joint}" for side in SIDES for joint in ("hip", "knee", "shoulder", "elbow")]
 """Joints without whose positions there is no pose."""
+Z_UP = [2, 0, 1]
+"""The axes of z up, front +x, among those of y up, front +z."""
 LEAST_EXTENT = 1e-6
 """Smallest width and height of hips and chest, relative to their sum."""
 POSES: dict[str, dict[str, tuple[float, float, float]]] = {
@@ -206,17 +208,12 @@ def _unit(vector: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
     return vector / max(float(np.linalg.norm(vector)), 1e-12)
 
 
-def z_up(points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
-    """Rotate points from y up, front +z, to z up, front +x."""
-    return points[:, [2, 0, 1]]
-
-
 def facing(joints: Float[np.ndarray, "K 3"]) -> Float[np.ndarray, "3 3"]:
     """Return the rotation about the world's z axis after which a body with these joints (y up)
     faces +x: the horizontal direction perpendicular to the sum of the vectors from the left to the
     right hip and shoulder. If that sum is vertical or zero, the body isn't rotated.
     """
-    joints = z_up(joints)
+    joints = joints[:, Z_UP]
     across = (joints[[2, 17]] - joints[[1, 16]]).sum(axis=0)  # hips and shoulders
     forward = np.cross([0.0, 0.0, 1.0], across)[:2]
     length = np.linalg.norm(forward)
@@ -230,7 +227,7 @@ def world_mesh(mesh: Mesh, joints: Float[np.ndarray, "K 3"], scale: float) -> Me
     """Return a body with z up that faces +x, its box centred, and ``scale`` as half the longest
     side; given are mesh and joints with y up, in any unit.
     """
-    vertices = z_up(mesh.vertices) @ facing(joints).T
+    vertices = mesh.vertices[:, Z_UP] @ facing(joints).T
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     return mesh._replace(vertices=scale * (vertices - (low + high) / 2) / ((high - low).max() / 2))
 

@@ -1,5 +1,5 @@
 """What Point-E and Shap-E have in common: their sampler, with Karras noise levels, Heun steps and
-guidance, and the condition and the place of their results.
+guidance, the condition and the place of their results, and files of weights.
 
 ===================  ===============================================================================
 option               meaning (of ``point-e-prior`` and ``shap-e-prior``)
@@ -17,7 +17,9 @@ Karras et al. 2022, "Elucidating the design space of diffusion-based generative 
 conventions of the published samplers (openai/point-e, openai/shap-e, MIT)."""
 
 import math
-from collections.abc import Callable
+import pickle
+import zipfile
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Literal, Optional
@@ -25,8 +27,10 @@ from typing import Any, ClassVar, Literal, Optional
 import numpy as np
 import torch
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
 
+from ..core.errors import UserError
+from ..core.files import existing_file
 from ..core.options import one_of, positive
 from ..gaussians.point_cloud import PointCloud
 from ..meshes.load import AXES
@@ -188,3 +192,60 @@ def sample_heun(
         slope_there = (euler - denoise(euler, sigma_next)) / sigma_next
         x = x + (sigma_next - sigma_hat) * (slope + slope_there) / 2
     return x
+
+
+# Files of weights ---------------------------------------------------------------------------------
+
+WRAPPER = "model_state_dict"
+"""The key of the weights in training checkpoints."""
+
+
+def read_state_dict(path: str, kind: str) -> dict[str, Tensor]:
+    """Return the tensors of a checkpoint by name: of a ``.safetensors`` file, or of a pickle, which
+    is read with ``weights_only``, so that it can't run code.
+
+    Args:
+        kind: what the file is, for messages ("Shap-E checkpoint").
+
+    Raises:
+        UserError: the file is missing, unreadable, refused, or holds no tensors by name.
+    """
+    file = existing_file(path, kind)
+    try:
+        if file.suffix == ".safetensors":
+            from safetensors.torch import load_file
+
+            content = load_file(file)
+        else:  # zip files are memory-mapped, so that unused tensors (optimiser state) aren't read
+            mapped = zipfile.is_zipfile(file)
+            content = torch.load(file, map_location="cpu", weights_only=True, mmap=mapped)
+    except Exception as error:  # torch raises various exceptions for damaged pickles
+        problem = f"can't be read: {type(error).__name__}"
+        if isinstance(error, pickle.UnpicklingError):
+            problem = (
+                "holds more than tensors, or is no file of PyTorch, and is not unpickled, since "
+                "that could run code"
+            )
+        reason = str(error).strip().partition("\n")[0][:200]
+        raise UserError(f"{kind} {path!r} {problem}: {reason}") from error
+    state = content.get(WRAPPER, content) if isinstance(content, Mapping) else {}
+    if not state or not all(isinstance(value, Tensor) for value in state.values()):
+        raise UserError(
+            f"{kind} {path!r} holds no weights by name: a state dict, or a dict with "
+            f"{WRAPPER!r}, was expected"
+        )
+    return dict(state)
+
+
+def load_exactly(module: nn.Module, state: Mapping[str, Tensor], what: str) -> None:
+    """Load ``state`` into ``module``, converted to its dtype.
+
+    Raises:
+        UserError: names are missing or unknown, or shapes differ; the message lists some of them.
+    """
+    try:
+        module.load_state_dict(state)
+    except RuntimeError as error:
+        problems = " ".join(str(error).split()).partition(": ")[2]
+        problems = problems if len(problems) < 400 else f"{problems[:400]} ..."
+        raise UserError(f"{what} does not fit the model: {problems}") from error

@@ -22,9 +22,8 @@ color             null: the mesh's colours; ``grey``, ``random`` (of a body, as 
 ground, ...       see ``priors/base.py``
 ================  ==================================================================================
 
-The points of a body are recentred by their mean. Random colours are uniform in [0, 1]: the released
-code divides its random numbers by 255 before it takes them for spherical harmonics, so that every
-colour is between 0.5000 and 0.5011, a flat grey.
+The points of a body are recentred by their mean. Random colours are uniform in [0, 1]; those of the
+released code are divided by 255, a flat grey.
 
 Limits: the prompt is not read. Few vertices make a sparse start: give ``num_points`` for a
 low-polygon mesh. At ``scale`` above 1.5 the nearest cameras of the paper's range (1.5 to 4.0) are

@@ -48,8 +48,7 @@ from ..models.hub import locate
 from ..models.model_files import free_memory, loaded
 from . import karras
 from .base import points
-from .karras import SampledPrior
-from .weights import load_exactly, read_state_dict
+from .karras import SampledPrior, load_exactly, read_state_dict
 
 UPSAMPLED = 3072
 """Number of points that the upsampler adds."""

@@ -31,8 +31,8 @@ levels from the training schedule (403 to 0.108 in place of 160 to 1e-3), clamps
 rather than before, and the pipeline offers no grid size. As in the published code the signed
 distances around the grid make the surface smaller by ``(grid_size - 1) / (grid_size + 1)``."""
 
-from collections.abc import Collection
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Optional
 
@@ -52,8 +52,7 @@ from ..meshes.mesh import linear_to_srgb
 from ..models.hub import Source, locate
 from ..models.model_files import free_memory, load_network, load_settings, loaded, needed_files
 from . import karras
-from .karras import SampledPrior
-from .weights import load_exactly, read_state_dict
+from .karras import SampledPrior, load_exactly, read_state_dict
 
 COMPONENTS = ("tokenizer", "text_encoder", "prior", "scheduler", "shap_e_renderer")
 SIGMA_MAX, QUERY_BATCH_SIZE = 160.0, 65536
@@ -108,12 +107,10 @@ class ShapEPrior(SampledPrior):
         return self.placed(cloud)
 
     def _source(self) -> Source:
-        def picks(names: Collection[str]) -> list[str]:
-            return needed_files(names, COMPONENTS, allow_bin=self.cfg.allow_bin)
-
         # the folder renderer is that of another pipeline
         download = "--include '*/*' --exclude 'renderer/*'"
         option = "system.geometry.prior.model"
+        picks = partial(needed_files, components=COMPONENTS, allow_bin=self.cfg.allow_bin)
         return Source(self.cfg.model, picks, option, self.cfg.revision, download)
 
     def _sample(self, folder: Path, prompt: str, rng: torch.Generator) -> Float[Tensor, "1 N D"]:
