@@ -2,6 +2,7 @@
 
 import importlib.util
 import os
+import sys
 from dataclasses import dataclass
 
 import numpy as np
@@ -93,20 +94,18 @@ def test_changed_code_runs_the_prior_again(tmp_path):
         spec = importlib.util.spec_from_file_location("parts_of_a_user", path)
         module = importlib.util.module_from_spec(spec)
         with pytest.MonkeyPatch.context() as patch:
-            patch.setitem(importlib.import_module("sys").modules, spec.name, module)
+            patch.setitem(sys.modules, spec.name, module)
             spec.loader.exec_module(module)
             return cache_key(module.Own({}), "")
 
     code = f"from {__name__} import CountingPrior\nclass Own(CountingPrior):\n    pass\n"
-    path, other = tmp_path / "own.py", tmp_path / "shapes.py"
-    path.write_text(code)
-    other.write_text("a = 1\n")
-    first = key_of(path)
-    other.write_text("a = 2\n")
-    assert key_of(path) == first
-    path.write_text(code + "# other\n")
-    second = key_of(path)
+    path, other, keys = tmp_path / "own.py", tmp_path / "shapes.py", []
+    for text, other_text in ((code, "a = 1"), (code, "a = 2"), (f"{code}# other\n", "a = 2")):
+        path.write_text(text)
+        other.write_text(other_text)
+        keys.append(key_of(path))
+    assert keys[0] == keys[1] != keys[2]
     (tmp_path / "__init__.py").touch()
-    third = key_of(path)
-    other.write_text("a = 3\n")
-    assert len({first, second, third, key_of(path)}) == 4
+    keys.append(key_of(path))
+    other.write_text("a = 3")
+    assert len({*keys, key_of(path)}) == 4
