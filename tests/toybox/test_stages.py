@@ -85,6 +85,17 @@ def test_a_smooth_field_has_the_given_deviation_and_no_jumps():
 
 
 @pytest.mark.usefixtures("small_world")
+def test_the_unet_is_measured_with_the_prompts_of_opposite_views(folder):
+    stage = STAGES["unet"](options(folder))
+    (_, own), (_, opposite) = stage.held_out
+    assert all(torch.equal(a, b) for a, b in zip(own[:3], opposite[:3], strict=True))
+    texts = [stage.tokenizer.batch_decode(b.ids, skip_special_tokens=True) for b in (own, opposite)]
+    for text, other in zip(*texts, strict=True):
+        direction = next(name for name in words.OPPOSITE if f"{name} view" in text)
+        assert other == text.replace(f"{direction} view", f"{words.OPPOSITE[direction]} view")
+
+
+@pytest.mark.usefixtures("small_world")
 def test_most_batches_are_all_views_of_objects_at_one_timestep(folder):
     stage = STAGES["unet"](dataclasses.replace(options(folder), batch=2 * views.VIEWS))
     data = stage.data()

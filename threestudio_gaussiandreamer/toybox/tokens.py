@@ -159,7 +159,16 @@ def object_prompts(labels: np.ndarray, rng: np.random.Generator) -> list[str]:
     return [words.describe(attributes_of(row), rng) for row in labels]
 
 
-def view_prompts(shard: Shard, rows: np.ndarray, rng: np.random.Generator) -> list[str]:
-    """Write a prompt with its direction for each picture, as the prompt processors write it."""
-    pairs = zip(object_prompts(shard.labels[rows], rng), _directions(shard, rows), strict=True)
-    return [f"{text}, {name} view" for text, name in pairs]
+def view_prompts(
+    shard: Shard, rows: np.ndarray, rng: np.random.Generator, *, opposite: bool = False
+) -> list[str]:
+    """Write a prompt with its direction for each picture, as the prompt processors write it.
+
+    Args:
+        opposite: name the opposite direction instead.
+    """
+    texts = object_prompts(shard.labels[rows], rng)
+    names = _directions(shard, rows)
+    if opposite:
+        names = [words.OPPOSITE[name] for name in names]
+    return [f"{text}, {name} view" for text, name in zip(texts, names, strict=True)]

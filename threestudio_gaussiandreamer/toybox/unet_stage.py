@@ -149,21 +149,27 @@ class UNetStage(Stage):
 
     @torch.no_grad()
     def evaluate(self, model: nn.Module) -> dict[str, float]:
-        """Return the error of v at a timestep where prompts decide the view."""
-        return {f"mse_at_{HELD_OUT_TIMESTEP}": float(self._errors(model, self.held_out).mean())}
+        """Return the errors of v at a timestep where prompts decide the view, with prompts of the
+        pictures' own directions, and of the opposite ones.
+        """
+        return {name: float(self._errors(model, batch).mean()) for name, batch in self.held_out}
 
     @functools.cached_property
-    def held_out(self) -> UNetBatch:
-        """Return pictures of withheld objects with prompts of their views."""
+    def held_out(self) -> list[tuple[str, UNetBatch]]:
+        """Return pictures of withheld objects with prompts of their own and of opposite views."""
         shard = self.shards.held_out_shard()
         rows = np.flatnonzero(shard.elevation < words.OVERHEAD)[:HELD_OUT]
         rng = numpy_generator(self.options.seed, "unet-held-out")
         latents = self._posteriors(shard.rgba[rows], rng, random_share=0)[0].cpu()
         noise = torch.randn(latents.shape, generator=generator(self.options.seed, "unet-held-out"))
         t = torch.full((len(rows),), HELD_OUT_TIMESTEP)
-        rng = numpy_generator(self.options.seed, "unet-held-out-prompts")
-        ids = token_ids(self.tokenizer, view_prompts(shard, rows, rng))
-        return moved(UNetBatch(latents, noise, t, ids), self.device)
+        found = []
+        for suffix, opposite in (("", False), ("_opposite_view", True)):
+            rng = numpy_generator(self.options.seed, "unet-held-out-prompts")
+            ids = token_ids(self.tokenizer, view_prompts(shard, rows, rng, opposite=opposite))
+            batch = moved(UNetBatch(latents, noise, t, ids), self.device)
+            found.append((f"mse_at_{HELD_OUT_TIMESTEP}{suffix}", batch))
+        return found
 
     def _moments(self, index: int) -> Path:
         """Return the file of a shard's posteriors, float16, which is written on first use."""

@@ -67,6 +67,14 @@ ACCESSORY_WORDS: dict[str, tuple[str, ...]] = {
 }
 OPENINGS = *["a {}"] * 3, "a toy {}", "a small {}", "a photo of a {}", "a 3d model of a {}", "{}"
 """Templates for the object's description; "a {}" is drawn most often."""
+OPPOSITE = {
+    "front": "back",
+    "back": "front",
+    "left side": "right side",
+    "right side": "left side",
+    "overhead": "overhead",
+}
+"""The directions of views, each with the opposite one."""
 FRONT_HALF = BACK_HALF = 45.0
 OVERHEAD = 60.0
 """Thresholds of the prompt processors, degrees."""
@@ -139,9 +147,8 @@ def vocabulary() -> list[str]:
     """Return all words that occur in prompts, sorted."""
     named = [*NOUNS.values(), *COLOR_WORDS.values(), *ACCESSORY_WORDS.values()]
     phrases = [*COLORS, *PARTS.values(), *OPENINGS, *(word for n in named for word in n)]
-    phrases += ["front back left right side overhead backside view of , an with and wearing"]
-    phrases += ["half below above bottom top two tone"]
-    phrases += ["striped stripes dotted dots spots polka spotted checkered checks"]
+    phrases += [*OPPOSITE, "backside view of , an with and wearing half below above bottom top"]
+    phrases += ["two tone striped stripes dotted dots spots polka spotted checkered checks"]
     return sorted(set(re.findall(r"[a-z]+|\d|,", " ".join(phrases))))
 
 
