@@ -270,9 +270,7 @@ def read_target(path: Path) -> tuple[Int[np.ndarray, " N"], Float[np.ndarray, "N
     return values[:, 0].astype(np.int64), values[:, 1:]
 
 
-def read_base_mesh(
-    path: Path,
-) -> tuple[Float[np.ndarray, "V 3"], Float[np.ndarray, "T 2"], Groups]:
+def read_base_mesh(path: Path) -> tuple[Float[np.ndarray, "V 3"], Float[np.ndarray, "T 2"], Groups]:
     """Read an OBJ of quads, in its unit: vertices, texture coordinates, and groups of faces."""
     vertices, uv, groups, group = [], [], {}, ""
     for line in path.read_text("utf-8").splitlines():

@@ -123,14 +123,8 @@ class PointEPrior(SampledPrior):
         key = (kind.title, path, self.device)
         return loaded(key, lambda: load_network(kind, path).to(self.device))
 
-    def _sampled(
-        self,
-        denoise: karras.Denoiser,
-        kind: type["PointTransformer"],
-        count: int,
-        rng: torch.Generator,
-    ) -> Float[Tensor, "1 6 N"]:
-        """Return ``count`` points in Point-E's units: positions, and colours in [0, 255]."""
+    def _sampled(self, denoise: Any, kind: Any, count: int, rng: torch.Generator) -> Tensor:
+        """Return points (1, 6, count) in Point-E's units: positions, and colours in [0, 255]."""
         noise = torch.randn(1, CHANNELS, count, generator=rng).to(self.device)
         sigmas = karras.karras_sigmas(self.cfg.num_steps, kind.sigma_max)
         options = {"churn": kind.churn, "generator": rng, "progress": kind.title}
