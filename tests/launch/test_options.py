@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.launch import experiment
+from threestudio_gaussiandreamer.launch import experiment, options
 from threestudio_gaussiandreamer.launch.options import (
     announce_device,
     choose_gpu,
@@ -76,53 +76,36 @@ def test_a_configuration_is_found_by_path_or_name(tmp_path, monkeypatch):
 
 
 def test_the_installed_package_brings_its_configurations(tmp_path, monkeypatch):
-    from threestudio_gaussiandreamer.launch import options as launch_options
-
-    (tmp_path / "package" / "configs").mkdir(parents=True)
-    (tmp_path / "package" / "configs" / "demo.yaml").touch()
-    monkeypatch.setattr(
-        launch_options, "__file__", str(tmp_path / "package" / "launch" / "options.py")
-    )
+    (tmp_path / "package/configs").mkdir(parents=True)
+    (tmp_path / "package/configs/demo.yaml").touch()
+    monkeypatch.setattr(options, "__file__", str(tmp_path / "package/launch/options.py"))
     monkeypatch.chdir(tmp_path)
-    assert find_config("demo") == tmp_path / "package" / "configs" / "demo.yaml"
+    assert find_config("demo") == tmp_path / "package/configs/demo.yaml"
 
 
 @pytest.mark.parametrize(
-    ("environment", "gpu", "visible"),
+    ("environment", "gpu", "overrides", "visible"),
     [
-        (None, None, "0"),
-        (None, "1,2", "1,2"),
-        (None, "cpu", ""),
-        ("3", None, "3"),
-        ("3", "0", "3"),
-        ("3", "cpu", ""),
-        ("", None, ""),
+        ({}, None, [], "0"),
+        ({}, "1,2", [], "1,2"),
+        ({}, "cpu", [], ""),
+        ({"CUDA_VISIBLE_DEVICES": "3"}, None, [], "3"),
+        ({"CUDA_VISIBLE_DEVICES": "3"}, "0", [], "3"),
+        ({"CUDA_VISIBLE_DEVICES": "3"}, "cpu", [], ""),
+        ({"CUDA_VISIBLE_DEVICES": ""}, None, [], ""),
+        ({"LOCAL_WORLD_SIZE": "2"}, None, [], "0,1"),
+        ({"SLURM_NTASKS_PER_NODE": "4(x2)"}, None, [], "0"),
+        ({"SLURM_NTASKS_PER_NODE": "2"}, None, [], "0,1"),
+        ({}, None, ["trainer.devices=3", "seed=1"], "0,1,2"),
+        ({}, None, ["trainer.devices=x"], "0"),
     ],
 )
-def test_what_cuda_reports(monkeypatch, environment, gpu, visible):
-    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
-    if environment is not None:
-        monkeypatch.setenv("CUDA_VISIBLE_DEVICES", environment)
-    choose_gpu(gpu)
-    assert os.environ["CUDA_VISIBLE_DEVICES"] == visible
-
-
-@pytest.mark.parametrize(
-    ("variables", "overrides", "visible"),
-    [
-        ({"LOCAL_WORLD_SIZE": "2"}, [], "0,1"),
-        ({"SLURM_NTASKS_PER_NODE": "4(x2)"}, [], "0"),
-        ({"SLURM_NTASKS_PER_NODE": "2"}, [], "0,1"),
-        ({}, ["trainer.devices=3", "seed=1"], "0,1,2"),
-        ({}, ["trainer.devices=x"], "0"),
-    ],
-)
-def test_as_many_gpus_as_processes_are_visible(monkeypatch, variables, overrides, visible):
+def test_what_cuda_reports(monkeypatch, environment, gpu, overrides, visible):
     for name in ("CUDA_VISIBLE_DEVICES", "LOCAL_WORLD_SIZE", "SLURM_NTASKS_PER_NODE"):
         monkeypatch.delenv(name, raising=False)
-    for name, value in variables.items():
+    for name, value in environment.items():
         monkeypatch.setenv(name, value)
-    choose_gpu(None, overrides)
+    choose_gpu(gpu, overrides)
     assert os.environ["CUDA_VISIBLE_DEVICES"] == visible
 
 

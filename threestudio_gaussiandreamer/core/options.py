@@ -282,7 +282,6 @@ def _scalar(path: str, value: Any, kind: type) -> Any:
         raise wrong from error
     if isinstance(value, bool) or (kind is int and isinstance(value, float)):
         raise wrong
-    require_representable(path, number)
     return number
 
 

@@ -61,16 +61,13 @@ def C_max(value: Any) -> float:
     return max(parse_schedule(value).values)
 
 
-def validate_schedule(value: Any, name: str = "the schedule", minimum: float = -math.inf) -> Any:
-    """Return ``value`` after checking that it is a schedule with values of ``minimum`` or more.
+def validate_schedule(value: Any, name: str = "the schedule") -> Any:
+    """Return ``value`` after checking that it is a schedule.
 
     Raises:
         UserError: it isn't; the message begins with ``name``.
     """
     schedule = parse_schedule(value, name)
-    lowest = min(schedule.values)
-    if lowest < minimum:
-        raise UserError(f"{name}: expected values of {minimum:g} or more, got {lowest:g}")
     # once for the part and the launcher, which call the option by its name and by its path
     if schedule.in_epochs and (key := (name.rpartition(".")[2], str(value))) not in _warned:
         _warned.add(key)
