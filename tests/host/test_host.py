@@ -156,7 +156,7 @@ def test_a_system_configures_then_loads_weights_then_post_configures(tmp_path):
 
     state = {"geometry.means": torch.tensor([1.0, 2.0]), "x.y": torch.ones(1)}
     save_file(tmp_path / "a.ckpt", {"state_dict": state, "epoch": 0, "global_step": 3})
-    System({"weights": str(tmp_path / "a.ckpt"), "weights_ignore_modules": ["x"]}, resumed=True)
+    System({"weights": str(tmp_path / "a.ckpt")}, resumed=True)
     assert calls == [("configure", True, None), ("post_configure", [1.0, 2.0])]
 
 

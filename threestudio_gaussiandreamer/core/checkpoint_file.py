@@ -152,10 +152,8 @@ def _claimed_step(path: Path) -> float:
         return math.inf
 
 
-def load_module_weights(
-    path: str, module_name: Optional[str] = None, ignore_modules: Optional[list[str]] = None
-) -> tuple[dict, int, int]:
-    """Read the parameters of one module (its prefix removed), or of all but the ignored modules.
+def load_module_weights(path: str, module_name: Optional[str] = None) -> tuple[dict, int, int]:
+    """Read the parameters of one module (its prefix removed), or all.
 
     Returns:
         parameters, epoch and step of the checkpoint.
@@ -168,8 +166,6 @@ def load_module_weights(
     state = checkpoint["state_dict"]
     if module_name:
         state = entries_below(state, f"{module_name}.")
-    for ignored in ignore_modules or []:
-        state = {key: value for key, value in state.items() if not key.startswith(f"{ignored}.")}
     if not state:
         raise UserError(
             f"the checkpoint {path} has no parameters of {module_name!r}; it has "

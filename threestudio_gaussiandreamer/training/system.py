@@ -84,7 +84,10 @@ class GaussianDreamerSystem(export.GaussianSavers, BaseLift3DSystem):
             "image_targets": (
                 lambda stage: not (isinstance(stage, Mapping) and stage.get("stop")),
                 "pictures of the 2D model as targets brought nothing (reports/tried.md)",
-            )
+            ),
+            "weights_ignore_modules": (None, "weights are loaded where names agree"),
+            "cleanup_after_validation_step": (False, "memory is kept for the next step"),
+            "cleanup_after_test_step": (False, "memory is kept for the next step"),
         }
 
         @staticmethod

@@ -3,10 +3,9 @@
 """
 
 from dataclasses import dataclass, field
-from typing import Any, List, Optional
+from typing import Any, Optional
 
 import lightning.pytorch as pl
-import torch
 
 from ...core.checkpoint_file import load_module_weights
 from ...core.options import parse_structured
@@ -33,9 +32,6 @@ class BaseSystem(pl.LightningModule, Updateable, SaverMixin):
         optimizer: dict = field(default_factory=dict)
         scheduler: Optional[dict] = None
         weights: Optional[str] = None
-        weights_ignore_modules: Optional[List[str]] = None
-        cleanup_after_validation_step: bool = False
-        cleanup_after_test_step: bool = False
 
     cfg: Config
 
@@ -48,7 +44,7 @@ class BaseSystem(pl.LightningModule, Updateable, SaverMixin):
         self.create_loggers(self.cfg.loggers)
         self.configure()
         if self.cfg.weights is not None:
-            self.load_weights(self.cfg.weights, self.cfg.weights_ignore_modules)
+            self.load_weights(self.cfg.weights)
         self.post_configure()
 
     def configure(self) -> None:
@@ -57,11 +53,9 @@ class BaseSystem(pl.LightningModule, Updateable, SaverMixin):
     def post_configure(self) -> None:
         """Hook that is called after ``weights`` are loaded."""
 
-    def load_weights(self, weights: str, ignore_modules: Optional[List[str]] = None) -> None:
-        """Load the parameters of a checkpoint, except those of ``ignore_modules``; names that don't
-        exist here are skipped.
-        """
-        state_dict, epoch, global_step = load_module_weights(weights, ignore_modules=ignore_modules)
+    def load_weights(self, weights: str) -> None:
+        """Load the parameters of a checkpoint; names that don't exist here are skipped."""
+        state_dict, epoch, global_step = load_module_weights(weights)
         load_parameters(self, state_dict, weights, strict=False)
         self.do_update_step(epoch, global_step, on_load_weights=True)
 
@@ -109,23 +103,14 @@ class BaseSystem(pl.LightningModule, Updateable, SaverMixin):
     def on_predict_batch_start(self, batch: dict, batch_idx: int, dataloader_idx: int = 0) -> None:
         self._before_batch(batch, "predict", self.trainer.predict_dataloaders)
 
-    def on_train_batch_end(self, outputs: Any, batch: dict, batch_idx: int) -> None:
-        self._after_batch()
-
-    def on_validation_batch_end(
+    def on_train_batch_end(
         self, outputs: Any, batch: dict, batch_idx: int, dataloader_idx: int = 0
     ) -> None:
-        self._after_batch(cleanup=self.cfg.cleanup_after_validation_step)
+        if isinstance(self.dataset, Updateable):
+            self.dataset.do_update_step_end(self.true_current_epoch, self.true_global_step)
+        self.do_update_step_end(self.true_current_epoch, self.true_global_step)
 
-    def on_test_batch_end(
-        self, outputs: Any, batch: dict, batch_idx: int, dataloader_idx: int = 0
-    ) -> None:
-        self._after_batch(cleanup=self.cfg.cleanup_after_test_step)
-
-    def on_predict_batch_end(
-        self, outputs: Any, batch: dict, batch_idx: int, dataloader_idx: int = 0
-    ) -> None:
-        self._after_batch(cleanup=self.cfg.cleanup_after_test_step)
+    on_validation_batch_end = on_test_batch_end = on_predict_batch_end = on_train_batch_end
 
     def _before_batch(self, batch: dict, stage: str, loader: Any) -> None:
         self.preprocess_data(batch, stage)
@@ -133,13 +118,6 @@ class BaseSystem(pl.LightningModule, Updateable, SaverMixin):
         if isinstance(self.dataset, Updateable):
             self.dataset.do_update_step(self.true_current_epoch, self.true_global_step)
         self.do_update_step(self.true_current_epoch, self.true_global_step)
-
-    def _after_batch(self, cleanup: bool = False) -> None:
-        if isinstance(self.dataset, Updateable):
-            self.dataset.do_update_step_end(self.true_current_epoch, self.true_global_step)
-        self.do_update_step_end(self.true_current_epoch, self.true_global_step)
-        if cleanup and torch.cuda.is_available():
-            torch.cuda.empty_cache()
 
 
 class BaseLift3DSystem(BaseSystem):
