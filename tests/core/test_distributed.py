@@ -51,7 +51,7 @@ SCRIPT = """
     system.training_step, module.average_gradients = recorded, averaged
     options = dict(logger=False, enable_checkpointing=False, enable_progress_bar=False)
     options |= dict(limit_val_batches=0, enable_model_summary=False)
-    options |= trainer_options(Processes({ranks}, 1), "auto")
+    options |= trainer_options(Processes({ranks}, 1))
     trainer = pl.Trainer(accelerator="cpu", max_steps=7, **options)
     trainer.fit(system, datamodule=data)
     state = {{"cameras": torch.stack(cameras), "gradient": gradients[0], **system.state_dict()}}

@@ -156,10 +156,9 @@ def test_a_broken_variable_is_one_line_before_a_command_is_imported(monkeypatch,
 
 
 def test_a_single_process_needs_no_strategy():
-    assert trainer_options(Processes(1, 1), None) == {"devices": 1, "num_nodes": 1}
-    strategy = trainer_options(Processes(2, 2), "auto")["strategy"]
+    assert trainer_options(Processes(1, 1)) == {"devices": 1, "num_nodes": 1}
+    strategy = trainer_options(Processes(2, 2))["strategy"]
     assert isinstance(strategy, ReplicatedStrategy) and strategy._timeout == LONGEST_WAIT
-    assert "strategy" not in trainer_options(Processes(2, 1), "deepspeed")
 
 
 def test_lightning_starts_the_processes_in_a_job_with_one_task(environment):

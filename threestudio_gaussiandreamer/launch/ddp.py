@@ -131,17 +131,10 @@ def environment_plugins(processes: Processes) -> list[Any]:
     return [environments.LightningEnvironment()] if in_job and alone else []
 
 
-def trainer_options(processes: Processes, strategy: Any) -> dict[str, Any]:
-    """Return the trainer's options for several processes; none for a single one.
-
-    Args:
-        strategy: the option ``trainer.strategy``, which is kept if it isn't ``auto`` or ``ddp``.
-    """
-    if processes.total == 1:
-        return {"devices": 1, "num_nodes": 1}
+def trainer_options(processes: Processes) -> dict[str, Any]:
+    """Return the trainer's options for the processes."""
     options: dict[str, Any] = {"devices": processes.devices, "num_nodes": processes.nodes}
-    # the first process renders all views of validation and test, since it alone writes results
-    options["use_distributed_sampler"] = False
-    if strategy in (None, "auto", "ddp"):
-        options["strategy"] = ReplicatedStrategy()
+    if processes.total > 1:
+        # the first process renders all views of validation and test, since it alone writes results
+        options |= {"use_distributed_sampler": False, "strategy": ReplicatedStrategy()}
     return options

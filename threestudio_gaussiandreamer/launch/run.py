@@ -218,7 +218,7 @@ class Run:
             "inference_mode": False,
             "default_root_dir": str(self.folder),
         }
-        required |= trainer_options(processes, options.get("strategy"))
+        required |= trainer_options(processes)
         return build("trainer", pl.Trainer, options | required)
 
     def build_loggers(self) -> list:
