@@ -14,6 +14,7 @@ import threading
 from collections.abc import Callable, Collection
 from concurrent.futures import Future, wait
 from difflib import get_close_matches
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, Optional
 
@@ -167,19 +168,15 @@ def find_model(
 
 
 def locate(source: Source, *, download: bool = True) -> Optional[Path]:
-    """Return the folder with the needed files of a model, which are downloaded if necessary.
-
-    With ``download=False`` return None if they would have to be downloaded.
-
-    Raises:
-        UserError: there is no such model, its files are missing or gated, or the hub can't be
-            reached; the message says what to do.
+    """Return the folder with the needed files of a model, which are downloaded if necessary; with
+    ``download=False`` return None then. Raise UserError if there is no such model, its files are
+    missing or gated, or the hub can't be reached; the message says what to do.
     """
     folder = Path(source.name).expanduser()
     if is_folder(folder):
         return _checked(folder, source)
     require_extra("diffusion", "huggingface_hub")
-    from huggingface_hub import snapshot_download
+    from huggingface_hub import HfApi, snapshot_download
     from huggingface_hub.utils import HFValidationError, validate_repo_id
 
     try:
@@ -195,13 +192,17 @@ def locate(source: Source, *, download: bool = True) -> Optional[Path]:
         cached = snapshot_download(source.name, **only, **options)
         source.picks(files_below(Path(cached)))
         return Path(cached)
+    ask = partial(HfApi(endpoint=options["endpoint"]).model_info, source.name, timeout=TIMEOUT)
     try:
-        sizes = _files_on_hub(source)
+        model = _with_timeout(partial(ask, revision=source.revision, files_metadata=True))
+        sizes = {file.rfilename: file.size or 0 for file in model.siblings or ()}
+        needed = _picked(source, sizes)
         if not download:
             return None
-        info(f"downloading {source.name}: up to {sum(sizes.values()) / 1e9:.1f} GB, once")
+        size = sum(sizes[name] for name in needed) / 1e9
+        info(f"downloading {source.name}: up to {size:.1f} GB, once")
         # exactly these files, except those that the cache already has
-        found = snapshot_download(source.name, allow_patterns=list(sizes), **options)
+        found = snapshot_download(source.name, allow_patterns=needed, **options)
     except UserError:
         raise
     except Exception as error:  # from huggingface_hub, its HTTP library, sockets or the file system
@@ -231,17 +232,6 @@ def _near_folders(folder: Path) -> str:
     names = [e.name for e in parent.iterdir() if is_folder(e)] if is_folder(parent) else []
     near = get_close_matches(folder.name, names, n=3, cutoff=0.5)
     return f" (near: {', '.join(str(parent / name) for name in near)})" if near else ""
-
-
-def _files_on_hub(source: Source) -> dict[str, int]:
-    """Return the needed files of a model on the hub and their sizes in bytes."""
-    from huggingface_hub import HfApi
-
-    options = {"revision": source.revision, "timeout": TIMEOUT, "files_metadata": True}
-    api = HfApi(endpoint=os.environ.get("HF_ENDPOINT") or None)
-    model = _with_timeout(lambda: api.model_info(source.name, **options))
-    sizes = {file.rfilename: file.size or 0 for file in model.siblings or ()}
-    return {name: sizes[name] for name in _picked(source, list(sizes))}
 
 
 def _with_timeout(ask: Callable[[], Any]) -> Any:
@@ -279,10 +269,8 @@ def explain(source: Source, error: Exception) -> str:
         what = f"could not be written to the cache: {error}. HF_HOME says where the cache is."
     else:
         reason = [*str(error).strip().splitlines(), type(error).__name__][0][:300]
-        what = (
-            f"is not on this disk, or not all of it, and the hub could not be reached ({reason})."
-        )
-        what += _how_to_get(source)
+        what = f"is not on this disk, or not all of it, and the hub could not be reached ({reason})"
+        what += "." + _how_to_get(source)
     return f"{source} {what}"
 
 

@@ -36,13 +36,11 @@ SAMPLE = 1 << 16
 
 
 class Weights(NamedTuple):
-    """One complete set of weight files of a component."""
+    """One complete set of weight files of a component: safetensors if they are ``safe``."""
 
     files: list[str]
     variant: Optional[str]
-    """None, or one of ``HALF_VARIANTS``."""
     safe: bool
-    """Whether the files are safetensors."""
 
 
 def files_below(folder: Path) -> list[str]:
