@@ -42,7 +42,7 @@ def encode_clip(folder: Path, texts: list[str]) -> list[Float[Tensor, "N F"]]:
     tokens = clip_tokens(folder, texts)
 
     def run(encoder: Any) -> Tensor:
-        # few models, and none of Stable Diffusion's, were trained with a mask that hides the padding
+        # few models, none of Stable Diffusion's, were trained with a mask that hides the padding
         uses_mask = getattr(encoder.config, "use_attention_mask", False)
         return _one_by_one(encoder, tokens, uses_mask=uses_mask)
 
