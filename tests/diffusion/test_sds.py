@@ -35,13 +35,6 @@ def test_timesteps_cover_the_range_with_both_ends():
         assert set(draws.tolist()) == set(range(max(low, 1), last + 1))
 
 
-def test_timesteps_depend_on_step_and_item_but_not_on_the_batch_size():
-    four, two = (sds.timesteps(size, 1, 999, seed=3, step=7) for size in (4, 2))
-    assert torch.equal(four[:2], two)
-    assert not torch.equal(four, sds.timesteps(4, 1, 999, seed=3, step=8))
-    assert not torch.equal(four, sds.timesteps(4, 1, 999, seed=4, step=7))
-
-
 def test_classifier_free_guidance_convention():
     cond, uncond = torch.tensor([2.0]), torch.tensor([1.0])
     assert sds.classifier_free(cond, uncond, 1.0) == cond
