@@ -5,7 +5,7 @@ loadable as an extension.
 import os
 import signal
 from dataclasses import dataclass, field
-from typing import Any, Optional
+from typing import Any
 
 import torch
 from torch import nn
@@ -47,7 +47,6 @@ class TinyGeometry(BaseGeometry):
     @dataclass
     class Config(BaseGeometry.Config):
         size: int = 3
-        radius: float = 1.0
         prior_type: str = "tiny-prior"
         prior: dict = field(default_factory=dict)
 
@@ -73,7 +72,6 @@ class TinyPrompts(BaseObject):
     @dataclass
     class Config(BaseObject.Config):
         prompt: str = ""
-        negative_prompt: str = ""
 
     cfg: Config
 
@@ -93,14 +91,12 @@ class TinySystem(BaseLift3DSystem):
         fail_in: str = ""
         signal_at: int = -1
         signal_name: str = "SIGINT"
-        pid_file: Optional[str] = None
 
     cfg: Config
 
     def configure(self) -> None:
         super().configure()
         self.automatic_optimization = False
-        self.seen: list[int] = []
         self._fail("configure")
 
     def _fail(self, where: str) -> None:
@@ -119,7 +115,6 @@ class TinySystem(BaseLift3DSystem):
         self._fail(f"step {step}")
         if step == self.cfg.signal_at:
             os.kill(os.getpid(), getattr(signal, self.cfg.signal_name))
-        self.seen.append(step)
         target = torch.randn(3, generator=generator(run_seed(), "target", step))
         weight = self.C(self.cfg.loss.get("lambda_fit", 1.0))
         loss = weight * (self.geometry.means - target).square().sum()

@@ -120,10 +120,10 @@ def test_small_budgets_change_nothing(monkeypatch):
     """Many slices, tests, blocks, steps and parts of the projection: code paths that only large
     scenes take.
     """
-    cloud, camera = random_cloud(120, seed=7, size=0.3), cameras(2, 37, 29)
+    cloud, camera = random_cloud(60, seed=7, size=0.3), cameras(2, 37, 29)
     splits = []
-    monkeypatch.setattr(torch_backend, "PROJECTED_AT_ONCE", 50)
-    monkeypatch.setattr(torch_backend, "CANDIDATES_PER_SLICE", 200)
+    monkeypatch.setattr(torch_backend, "PROJECTED_AT_ONCE", 30)
+    monkeypatch.setattr(torch_backend, "CANDIDATES_PER_SLICE", 100)
     monkeypatch.setattr(torch_backend, "CANDIDATES_PER_TEST", 37)
     monkeypatch.setattr(torch_backend, "SPLATS_PER_STEP", 4)
     monkeypatch.setattr(torch_backend, "ELEMENTS_PER_BLOCK", 3 * 4 * 64)
@@ -132,7 +132,7 @@ def test_small_budgets_change_nothing(monkeypatch):
         torch_backend, "slices", lambda *a: splits.append(original(*a)) or splits[-1]
     )
     compare(cloud, camera, 37, 29, absgrad=True)
-    compare(cloud._replace(opacities=torch.full((120,), 0.99).double()), camera, 37, 29)
+    compare(cloud._replace(opacities=torch.full((60,), 0.99).double()), camera, 37, 29)
     assert min(map(len, splits)) > torch_backend.KEPT_SLICES
 
 

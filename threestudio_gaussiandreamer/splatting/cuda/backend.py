@@ -168,7 +168,13 @@ def _sums_of_rows(
     try:
         parts = _halve_on_oom(sums, batch, splats, upstream)
     except torch.cuda.OutOfMemoryError as error:
-        raise _too_large(int(ends.diff(prepend=ends.new_zeros(1)).max())) from error
+        largest = int(ends.diff(prepend=ends.new_zeros(1)).max())
+        raise UserError(
+            f"one view's Gaussians overlap {largest} tiles of the image; their gradients need "
+            f"about {largest * BACKWARD_BYTES / 2**30:.1f} GiB on the GPU. Views are already "
+            "rendered one at a time: use fewer or smaller Gaussians, a smaller image or "
+            "preset='fast', or free memory of other programs."
+        ) from error
     return parts[0] if len(parts) == 1 else torch.cat(parts)
 
 
@@ -254,15 +260,3 @@ class CapacityEstimate:
 
 
 _estimates: dict[tuple, CapacityEstimate] = {}
-
-
-def _too_large(intersections: int) -> UserError:
-    """Make the error for a single view that doesn't fit into the GPU's memory."""
-    needed = intersections * BACKWARD_BYTES / 2**30
-    free = torch.cuda.mem_get_info()[0] / 2**30 if torch.cuda.is_available() else 0.0
-    return UserError(
-        f"one view's Gaussians overlap {intersections} tiles of the image; their gradients need "
-        f"about {needed:.1f} GiB on the GPU, of which {free:.1f} GiB are free. Views are already "
-        "rendered one at a time: use fewer or smaller Gaussians, a smaller image or preset='fast', "
-        "or free memory of other programs."
-    )
