@@ -25,15 +25,9 @@ class Gltf:
     """A document that is built by calls; :meth:`glb` returns the file."""
 
     def __init__(self, **document):
-        self.document = {
-            "asset": {"version": "2.0"},
-            "scene": 0,
-            "scenes": [{"nodes": [0]}],
-            "nodes": [{"mesh": 0}],
-            "meshes": [],
-            "accessors": [],
-            "bufferViews": [],
-        } | document
+        scene = {"scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}]}
+        lists = {"meshes": [], "accessors": [], "bufferViews": []}
+        self.document = {"asset": {"version": "2.0"}, **scene, **lists, **document}
         self.binary = b""
 
     def add(self, kind, **entry):
@@ -89,11 +83,10 @@ class Gltf:
 
     def primitive(self, attributes, **entry):
         """Append a mesh of one primitive; ``attributes`` are arrays or indices of accessors."""
-        attributes = {
-            name: values if isinstance(values, int) else self.accessor(values)
-            for name, values in attributes.items()
-        }
-        return self.add("meshes", primitives=[{"attributes": attributes, **entry}])
+        found = {}
+        for name, values in attributes.items():
+            found[name] = values if isinstance(values, int) else self.accessor(values)
+        return self.add("meshes", primitives=[{"attributes": found, **entry}])
 
     def glb(self):
         """Return the bytes of the file."""

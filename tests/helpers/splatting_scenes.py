@@ -163,8 +163,7 @@ def run(
     camera_gradient=False, **options,
 ) -> Run:  # fmt: skip
     """Run forward and backward in the cloud's precision with fixed cotangents."""
-    dtype = cloud.means.dtype
-    leaves = cloud.leaves()
+    dtype, leaves = cloud.means.dtype, cloud.leaves()
     viewmats = viewmats.detach().to(dtype).requires_grad_(camera_gradient)
     background = None if background is None else background.detach().to(dtype).requires_grad_()
     view = viewmats, Ks.to(dtype), width, height
