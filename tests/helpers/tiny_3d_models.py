@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from tests.helpers.tiny_models import _byte_vocabulary, write_json
+from tests.helpers.tiny_models import clip_text_config, clip_tokenizer
 
 FEATURES = 24
 """Of the tiny CLIP."""
@@ -31,7 +31,7 @@ def clip(folder: Path, seed: int = 0) -> Path:
 
     torch.manual_seed(seed)
     config = CLIPConfig(
-        text_config=_clip_text_config().to_dict(),
+        text_config=clip_text_config(32, FEATURES).to_dict(),
         vision_config=dict(
             image_size=IMAGE_SIZE, patch_size=8, hidden_size=32, intermediate_size=48,
             num_hidden_layers=1, num_attention_heads=2, projection_dim=FEATURES,
@@ -39,27 +39,8 @@ def clip(folder: Path, seed: int = 0) -> Path:
         projection_dim=FEATURES,
     )  # fmt: skip
     CLIPModel(config).save_pretrained(folder)
-    _tokenizer(folder)
+    clip_tokenizer(folder)
     return folder
-
-
-def _clip_text_config():
-    from transformers import CLIPTextConfig
-
-    vocabulary = _byte_vocabulary()
-    ends = {"bos": vocabulary["<|startoftext|>"], "eos": vocabulary["<|endoftext|>"]}
-    sizes = {"hidden_size": 32, "intermediate_size": 48, "projection_dim": FEATURES}
-    sizes |= {"num_hidden_layers": 2, "num_attention_heads": 2, "vocab_size": len(vocabulary)}
-    return CLIPTextConfig(**sizes, **{f"{name}_token_id": value for name, value in ends.items()})
-
-
-def _tokenizer(folder: Path) -> None:
-    folder.mkdir(parents=True, exist_ok=True)
-    write_json(folder / "vocab.json", _byte_vocabulary())
-    (folder / "merges.txt").write_text("#version: 0.2\nf o\nfo x</w>\n", encoding="utf-8")
-    special = dict.fromkeys(("eos_token", "unk_token", "pad_token"), "<|endoftext|>")
-    special |= {"bos_token": "<|startoftext|>", "model_max_length": 77}
-    write_json(folder / "tokenizer_config.json", special | {"tokenizer_class": "CLIPTokenizer"})
 
 
 # ---- Shap-E --------------------------------------------------------------------------------------
@@ -73,14 +54,14 @@ def shap_e(folder: Path, seed: int = 0) -> Path:
     from transformers import CLIPTextModelWithProjection, CLIPTokenizer
 
     torch.manual_seed(seed)
-    _tokenizer(folder / "vocabulary")
+    clip_tokenizer(folder / "vocabulary")
     scheduler = HeunDiscreteScheduler(
         beta_schedule="exp", num_train_timesteps=1024, prediction_type="sample",
         use_karras_sigmas=True, clip_sample=True,
     )  # fmt: skip
     ShapEPipeline(
         prior=shap_e_prior(),
-        text_encoder=CLIPTextModelWithProjection(_clip_text_config()),
+        text_encoder=CLIPTextModelWithProjection(clip_text_config(32, FEATURES)),
         tokenizer=CLIPTokenizer.from_pretrained(folder / "vocabulary"),
         scheduler=scheduler,
         shap_e_renderer=_shap_e_renderer(),

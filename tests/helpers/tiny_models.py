@@ -158,30 +158,38 @@ def clip_text_encoder(
         suffix: of the names of both components.
         projection: width of the pooled embedding; 0 for an encoder without.
     """
-    from transformers import CLIPTextConfig, CLIPTextModel, CLIPTextModelWithProjection
+    from transformers import CLIPTextModel, CLIPTextModelWithProjection
 
-    vocabulary = _byte_vocabulary()
-    start, end = vocabulary["<|startoftext|>"], vocabulary["<|endoftext|>"]
-    config = CLIPTextConfig(
-        vocab_size=len(vocabulary), hidden_size=width, intermediate_size=48, num_hidden_layers=2,
-        num_attention_heads=2, hidden_act="gelu", bos_token_id=start, eos_token_id=end,
-        pad_token_id=0, projection_dim=projection or 512,
-    )  # fmt: skip
+    config = clip_text_config(width, projection or 512, hidden_act="gelu", pad_token_id=0)
     encoder = (CLIPTextModelWithProjection if projection else CLIPTextModel)(config)
     encoder.save_pretrained(folder / f"text_encoder{suffix}")
     _publish_clip(folder / f"text_encoder{suffix}" / "model.safetensors")
-    _clip_tokenizer(folder / f"tokenizer{suffix}", vocabulary)
+    special = clip_tokenizer(folder / f"tokenizer{suffix}")
+    path = folder / f"tokenizer{suffix}" / "special_tokens_map.json"
+    write_json(path, special | {"pad_token": "!"})
 
 
-def _clip_tokenizer(tokenizer: Path, vocabulary: dict[str, int]) -> None:
-    tokenizer.mkdir(parents=True)
-    write_json(tokenizer / "vocab.json", vocabulary)
-    (tokenizer / "merges.txt").write_text("#version: 0.2\nf o\nfo x</w>\n", encoding="utf-8")
+def clip_text_config(width: int, projection: int, **options: Any) -> Any:
+    from transformers import CLIPTextConfig
+
+    vocabulary = _byte_vocabulary()
+    options |= {"bos_token_id": vocabulary["<|startoftext|>"], "projection_dim": projection}
+    options |= {"eos_token_id": vocabulary["<|endoftext|>"], "vocab_size": len(vocabulary)}
+    options |= {"hidden_size": width, "intermediate_size": 48}
+    return CLIPTextConfig(num_hidden_layers=2, num_attention_heads=2, **options)
+
+
+def clip_tokenizer(folder: Path) -> dict[str, str]:
+    """Write CLIP's tokenizer; return its special tokens but for the padding."""
+    folder.mkdir(parents=True, exist_ok=True)
+    write_json(folder / "vocab.json", _byte_vocabulary())
+    (folder / "merges.txt").write_text("#version: 0.2\nf o\nfo x</w>\n", encoding="utf-8")
     start, end = "<|startoftext|>", "<|endoftext|>"
     special = {"bos_token": start, "eos_token": end, "unk_token": end}
-    write_json(tokenizer / "special_tokens_map.json", special | {"pad_token": "!"})
-    special |= {"pad_token": end, "model_max_length": 77, "do_lower_case": True}
-    write_json(tokenizer / "tokenizer_config.json", special | {"tokenizer_class": "CLIPTokenizer"})
+    options = {"pad_token": end, "model_max_length": 77, "do_lower_case": True}
+    options |= {"tokenizer_class": "CLIPTokenizer"}
+    write_json(folder / "tokenizer_config.json", special | options)
+    return special
 
 
 def t5_text_encoder(folder: Path, width: int = TEXT_WIDTH, *, suffix: str = "") -> None:
