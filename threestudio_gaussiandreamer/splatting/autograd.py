@@ -111,20 +111,16 @@ class _Rasterize(torch.autograd.Function):
         ctx.kernel.backward(scene, ctx.means2d, of_kernel, ctx.state, upstream, found)
         colors, background = narrow(found.colors, ctx.channels), None
         if needed.background:
-            background = narrow(_background_gradient(upstream[0], alpha, scene), ctx.channels)
+            background = torch.zeros_like(scene.background)
+            if upstream[0] is not None:  # by rows first: the number of threads must not matter
+                background = (upstream[0] * (1 - alpha)).sum(2).sum(1)
+            background = narrow(background, ctx.channels)
         return None, None, None, found.means2d, *found[:5], colors, background, None
 
 
 def _needed(ctx: Any) -> Scene:
     """Return which of a scene's tensors need a gradient."""
     return Scene(*ctx.needs_input_grad[-TENSORS:], *ctx.size)
-
-
-def _background_gradient(d_image: Optional[Tensor], alpha: Tensor, scene: Scene) -> Tensor:
-    """Return d loss / d background (B, 3), summed by rows first, as threads can't change it."""
-    if d_image is None:
-        return torch.zeros_like(scene.background)
-    return (d_image * (1 - alpha)).sum(2).sum(1)
 
 
 def groups(scene: Scene) -> list[Scene]:

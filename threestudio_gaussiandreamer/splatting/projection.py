@@ -99,7 +99,7 @@ def _to_screen(t, axes, opacities, Ks, width, height, options) -> tuple[Tensor, 
     u0, u1 = _project_axes(t, axes, Ks, width, height)
     conics, variances, compensation = _invert_covariance(u0, u1, options.eps2d)
     depths = t[..., 2]
-    centres = [_focal(Ks, i) * (t[..., i] / depths) + _centre(Ks, i) for i in (0, 1)]
+    centres = [Ks[:, i, i, None] * (t[..., i] / depths) + Ks[:, i, 2, None] for i in (0, 1)]
     opacities = opacities * compensation if options.antialias else opacities.expand_as(depths)
     extents = _extents(variances.detach(), opacities.detach(), options.alpha_min)
     return torch.stack(centres, -1), conics, opacities, depths, extents
@@ -113,7 +113,7 @@ def _project_axes(t, axes, Ks, width, height) -> tuple[Tensor, Tensor]:
     gradient is that of the clamped formula."""
     z, rows = t[..., 2], []
     for i, size in ((0, width), (1, height)):
-        focal, centre = _focal(Ks, i), _centre(Ks, i)
+        focal, centre = Ks[:, i, i, None], Ks[:, i, 2, None]
         margin = FRUSTUM_MARGIN * 0.5 * size / focal
         low, high = -centre / focal - margin, (size - centre) / focal + margin
         slope = torch.clamp(t[..., i] / z, low, high)
@@ -172,11 +172,3 @@ def _finite(x) -> Tensor:
 def _keep(mask, x, otherwise=ZERO) -> Tensor:
     """Select ``x`` where the mask over its leading dimensions is true, else ``otherwise``."""
     return torch.where(mask.reshape(mask.shape + (1,) * (x.dim() - mask.dim())), x, otherwise.to(x))
-
-
-def _focal(Ks, i) -> Tensor:
-    return Ks[:, i, i, None]
-
-
-def _centre(Ks, i) -> Tensor:
-    return Ks[:, i, 2, None]

@@ -57,7 +57,11 @@ def failure(device: torch.device) -> Optional[str]:
         except UserError as error:  # another GPU than `unavailable` looked at, and an older one
             return str(error)
         request = request.replace("unknown GPU", gpu)
-        name = f"proof-{_key(gpu)}"
+        # everything that the result depends on
+        texts = [f"{gpu}\0{torch.__version__}\0".encode()]
+        for folder in (nvrtc.KERNELS, nvrtc.SHARED):
+            texts += [path.read_bytes() for path in sorted(folder.glob("*.*"))]
+        name = f"proof-{hashlib.sha256(b''.join(texts)).hexdigest()[:24]}"
         stored = nvrtc.read_cached(name)
         if stored is None:
             stored = compare(device).encode()
@@ -70,14 +74,6 @@ def failure(device: torch.device) -> Optional[str]:
         return None
     path = nvrtc.cache_folder() / name
     return f"{stored.decode()} {request}; delete {path} and start again to repeat the comparison"
-
-
-def _key(gpu: str) -> str:
-    """Return a hash of everything that the result depends on."""
-    texts = [path.read_bytes() for path in sorted(nvrtc.KERNELS.glob("*.*"))]
-    texts += [text.encode() for text in nvrtc.headers().values()]
-    parts = [gpu.encode(), torch.__version__.encode(), *texts]
-    return hashlib.sha256(b"\0".join(parts)).hexdigest()[:24]
 
 
 def compare(device: torch.device) -> str:
