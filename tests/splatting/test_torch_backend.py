@@ -161,7 +161,7 @@ def test_blocks_and_saved_tensors_are_bounded(monkeypatch):
 
 def test_the_number_of_threads_changes_no_bit_of_a_single_tile():
     """Whose matrix products the threads would otherwise share."""
-    cloud, camera = random_cloud(3000, seed=10, size=0.05).to(torch.float32), cameras(1, 8, 8)
+    cloud, camera = random_cloud(1200, seed=10, size=0.05).to(torch.float32), cameras(1, 8, 8)
     results = []
     for count in (1, 2, 3):
         with torch_threads(count):
