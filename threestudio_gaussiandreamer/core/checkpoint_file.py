@@ -123,10 +123,8 @@ def previous_of(path: str | os.PathLike) -> Path:
 
 
 def newest_readable(folder: str | os.PathLike) -> Optional[tuple[Path, int]]:
-    """Return the intact checkpoint of a folder with the highest step, and that step; None if there
-    is none.
-
-    Among equal steps ``last.ckpt`` is preferred. Damaged files are reported in the log.
+    """Return the intact checkpoint of a folder with the highest step, ``last.ckpt`` among equal
+    ones, and that step; None if there is none. Damaged files are reported in the log.
     """
     by_step = sorted(
         Path(folder).glob("*.ckpt"),

@@ -16,16 +16,15 @@ from .errors import UserError
 
 
 def is_active() -> bool:
+    """Return whether this process is one of several."""
     return dist.is_available() and dist.is_initialized() and dist.get_world_size() > 1
 
 
 def rank() -> int:
-    """Return the rank of this process; 0 in a single-process run."""
     return dist.get_rank() if is_active() else 0
 
 
 def world_size() -> int:
-    """Return the number of processes; 1 in a single-process run."""
     return dist.get_world_size() if is_active() else 1
 
 

@@ -8,10 +8,9 @@ from collections.abc import Iterable
 
 
 class UserError(ValueError):
-    """Report invalid input; the message names it, what was expected, and what to do.
-
-    In library use this is an ordinary ``ValueError``; commands print the message alone and exit
-    with code 2."""
+    """Report invalid input; the message names it, what was expected, and what to do. Commands print
+    the message alone and exit with code 2.
+    """
 
 
 class Terminated(SystemExit):

@@ -24,8 +24,8 @@ def _log(level: int, *args: object, **kwargs: object) -> None:
 
 
 def get_rank() -> int:
-    """Return a number from the environment variables of the process's launcher that is 0 in the
-    first process only: its rank where that is known, before torch.distributed is initialised.
+    """Return a number from the launcher's environment variables that is 0 in the first process
+    only: its rank where that is known, before torch.distributed is initialised.
     """
     for key in ("RANK", "SLURM_PROCID", "JSM_NAMESPACE_RANK"):
         if key in os.environ:

@@ -22,9 +22,8 @@ def stop_signals() -> list[int]:
 
 
 def set_handlers(handler: Handler) -> dict[int, Any]:
-    """Install ``handler`` for the stop signals; return the earlier handlers.
-
-    Outside of the main thread, in which Python doesn't allow this, nothing is changed.
+    """Install ``handler`` for the stop signals and return the earlier handlers; none outside of the
+    main thread, where Python doesn't allow this.
     """
     if threading.current_thread() is not threading.main_thread():
         return {}

@@ -44,14 +44,6 @@ class RunRecord(pl.Callback):
     stage starts, before the prior. Files of an earlier run in the folder are replaced when there
     are others: its results are renamed when the prior's cloud is there, its checkpoints and record
     with the first checkpoint, so that a start that fails leaves them in their place.
-
-    Args:
-        folder: the run's folder.
-        cfg: the merged and resolved configuration.
-        sources: the YAML files that were merged, and their content.
-        command: the command line.
-        records_code: write ``code/`` too.
-        at_zero: whether training starts at step 0.
     """
 
     def __init__(
@@ -94,10 +86,8 @@ class RunRecord(pl.Callback):
 
     @contextlib.contextmanager
     def first_checkpoint(self) -> Iterator[None]:
-        """Replace the record of an earlier run while the first checkpoint is written in this
-        context. At no time does the folder have a checkpoint beside the record of another start: of
-        a run from step 0, the earlier checkpoints are renamed first; of a resumed run, the record
-        follows its checkpoint.
+        """Replace the record of an earlier run, around the first checkpoint: of a run from step 0
+        before it, together with the earlier checkpoints; of a resumed run after it.
         """
         if self.at_zero:
             if self._has_checkpoints():
@@ -124,8 +114,7 @@ class RunRecord(pl.Callback):
         self._files = {}
         configs.mkdir(parents=True, exist_ok=True)
         dump_config(self.folder / PARSED, self.cfg)
-        # append, since a resumed run has several command lines
-        # surrogateescape: paths on the command line may be no UTF-8
+        # a resumed run has several command lines, and paths in them may be no UTF-8
         log = self.folder / "cmd.txt"
         with open(log, "a", encoding="utf-8", errors="surrogateescape") as file:
             file.write(self.command + "\n")
@@ -135,8 +124,8 @@ class RunRecord(pl.Callback):
 
 
 def read_sources(source: Path, destination: Path) -> dict[Path, bytes]:
-    """Read the source files below a folder, leaving out hidden files and folders, and, with a
-    warning, what can't be read; return them by the paths of their copies.
+    """Read the source files below a folder, but for hidden ones; return them by the paths of their
+    copies.
     """
     found = {}
     for path in source.rglob("*"):
@@ -180,15 +169,9 @@ class ProgressBar(pl.callbacks.TQDMProgressBar):
 
 
 class AtomicCheckpointIO(pl.plugins.CheckpointIO):
-    """Write checkpoints atomically, with a checksum, and load them with ``weights_only``, so that
-    they can't run code; see :mod:`.core.checkpoint_file` for the errors.
-
-    Args:
-        first: returns a context in which the first checkpoint is written.
-
-    Attributes:
-        steps: the step of the last checkpoint at each path.
-        seconds: duration of the last write.
+    """Write and read checkpoints by :mod:`.core.checkpoint_file`, the first one in the context that
+    ``first`` returns; ``steps`` has the step of the last one at each path, ``seconds`` is the
+    duration of the last write.
     """
 
     def __init__(self, first: Callable[[], Any] = contextlib.nullcontext) -> None:
@@ -258,12 +241,9 @@ class LastCheckpoint(pl.callbacks.Checkpoint):
             restore_handlers(self._earlier)
             interrupt(signum)
         self.signum = signum
-        # not print(), which isn't reentrant in signal handlers; OSError if the terminal is closed
-        with contextlib.suppress(OSError):
-            os.write(
-                2,
-                b"\nstopping after this step and writing a checkpoint; once more to stop at once\n",
-            )
+        said = b"\nstopping after this step and writing a checkpoint; once more to stop at once\n"
+        with contextlib.suppress(OSError):  # the terminal is closed
+            os.write(2, said)  # print() isn't reentrant
 
     def _stop_if_asked(self, trainer: Any) -> None:
         if _any_process(trainer, bool(self.signum)):

@@ -1,10 +1,8 @@
 """Several processes that train one cloud: how many there are, and Lightning's strategy for them.
 
-Every process has a copy of the cloud, renders its share of a step's views, and gradients are
-averaged without DistributedDataParallel, which ties its buckets to the parameters of its first
-iteration, which densification replaces. The cloud is small, so the system averages the gradients
-itself (``distributed.average_gradients``). The statistics for densification are combined over all
-processes, so that they make the same changes.
+Every process has a copy of the cloud and renders its share of a step's views. The system averages
+the gradients (``distributed.average_gradients``), not DistributedDataParallel, which ties its
+buckets to the parameters of its first iteration, which densification replaces.
 
 The processes are started by ``torchrun``, by SLURM's ``srun`` with one task each, or by Lightning,
 for ``--gpu 0,1`` or ``trainer.devices=2`` (without a GPU: processes on the CPU)."""
@@ -21,6 +19,7 @@ import torch
 from ..core import launcher
 from ..core.distributed import is_active
 from ..core.errors import UserError, raised_in
+from ..core.options import is_whole
 from ..host import pl, warn
 
 LONGEST_WAIT = timedelta(hours=12)
@@ -71,8 +70,9 @@ def planned_processes(n_gpus: int, trainer: Mapping[str, Any]) -> Processes:
         UserError: the options contradict the launcher, or there are too few GPUs.
     """
     devices, nodes = trainer.get("devices"), trainer.get("num_nodes")
-    _require_count("trainer.devices", devices)
-    _require_count("trainer.num_nodes", nodes)
+    for option, value in (("devices", devices), ("num_nodes", nodes)):
+        if value is not None and not (is_whole(value) and value > 0):
+            raise UserError(f"trainer.{option}: expected a whole number from 1 on, got {value!r}")
     found = _started_processes() or Processes(devices or max(n_gpus, 1), nodes or 1)
     for name, asked, there in (
         ("devices", devices, found.devices),
@@ -96,12 +96,6 @@ def is_lost_process(error: Exception) -> bool:
     """Return whether torch.distributed says that another process of this run doesn't answer."""
     from_torch = isinstance(error, RuntimeError) and raised_in(error, "torch.distributed")
     return is_active() and from_torch and bool(LOST_CONNECTION.search(str(error)))
-
-
-def _require_count(option: str, value: Any) -> None:
-    whole = isinstance(value, int) and not isinstance(value, bool) and value > 0
-    if value is not None and not whole:
-        raise UserError(f"{option}: expected a whole number from 1 on, got {value!r}")
 
 
 def _started_processes() -> Optional[Processes]:

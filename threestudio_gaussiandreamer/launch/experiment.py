@@ -114,10 +114,9 @@ def prepare(args: argparse.Namespace, argv: Sequence[str], **options: Any) -> "R
 @contextlib.contextmanager
 def without_garbage_collection() -> Iterator[None]:
     """Import torch, Lightning and the parts without garbage collection, which takes a fifth of the
-    imports' time, and exclude them from later collections.
-
-    Nothing is changed if torch is imported already, as in a notebook: what is garbage by then would
-    never be freed."""
+    imports' time, and exclude them from later ones; not if torch is imported already, as in a
+    notebook, where other garbage would never be freed.
+    """
     if "torch" in sys.modules or not gc.isenabled():
         yield
         return
@@ -130,11 +129,7 @@ def without_garbage_collection() -> Iterator[None]:
 
 
 def read_source(path: Path) -> bytes:
-    """Read the bytes of a configuration file.
-
-    Raises:
-        UserError: it can't be read.
-    """
+    """Read a configuration file; raise UserError if it can't be read."""
     try:
         return path.read_bytes()
     except OSError as error:
@@ -166,11 +161,8 @@ def configure_logging(verbose: bool) -> None:
 
 def limit_openmp_spin() -> None:
     """Let idle OpenMP threads spin for about 0.1 ms before they sleep, unless the user has set it;
-    call it before torch is imported.
-
-    Threads that sleep at once are woken for each small operation (a fifth of the demo's time);
-    threads that spin for milliseconds, OpenMP's default, occupy the cores that our own threads or
-    other programs wait for. LLVM's and Intel's OpenMP count in milliseconds: 0 there."""
+    call it before torch is imported. It saves a fifth of the demo's time (reports/speed.md).
+    """
     waits = {"GOMP_SPINCOUNT": "10000", "KMP_BLOCKTIME": "0"}
     if not os.environ.keys() & {"OMP_WAIT_POLICY", *waits}:
         os.environ.update(waits)

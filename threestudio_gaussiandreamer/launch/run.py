@@ -248,14 +248,8 @@ class Run:
     # -- the folder --------------------------------------------------------------------------------
 
     def claim_folder(self) -> None:
-        """Create the run's folder if it doesn't exist, and lock it against other training runs.
-
-        Only the first process of a run does so. In a folder that is there, stages other than
-        training lock a folder of their own: they may write pictures while another run trains there,
-        but not while the same stage does.
-
-        Raises:
-            UserError: another run trains in the folder, or it can't be created.
+        """Create the run's folder if it doesn't exist, and lock it against other trainings. In one
+        that is there, other stages lock a folder of their own, to run beside a training.
         """
         stage = self.args.stage
         if get_rank():

@@ -48,9 +48,7 @@ SLUG_BYTES = 64
 HASH = r"-[0-9a-f]{8}$"
 """The end of a name that :func:`safe_name` has made."""
 SLUG_SOURCE = 1024
-"""Characters of a text that its slug is made of: normalising takes quadratic time in the length of
-a run of combining characters.
-"""
+"""Characters of a text that its slug is made of: normalising takes quadratic time."""
 SLUG_CHARACTERS = "-_.,+=()'! "
 
 
@@ -113,11 +111,8 @@ def _run_of(checkpoint: str) -> Path:
 
 
 def changes_since(cfg: Any, options: Mapping[str, Any] = SAME) -> list[str]:
-    """Return how some options differ from those of the run whose checkpoint is resumed, as its
-    ``parsed.yaml`` has them; nothing if that can't be read.
-
-    Args:
-        options: dotted keys, and their defaults.
+    """Return how some options, given with their defaults, differ from those in the ``parsed.yaml``
+    of the run whose checkpoint is resumed; nothing if that can't be read.
     """
     earlier = OmegaConf.create(_run_files(_run_of(cfg.resume)).config)
     try:
@@ -235,8 +230,6 @@ def _set_trial(cfg: Any, trial_name: str) -> None:
 def _resume_newest(cfg: Any, tag: str) -> None:
     """Resolve ``resume=auto`` to the checkpoint of this run's own folder, else to that of the
     newest run with the same tag, else to None.
-
-    Of a folder's checkpoints, the readable one with the largest step is chosen.
     """
     cfg.resume = None
     newest_first = sorted(Path(cfg.exp_dir).glob(f"{glob_escape(tag)}@*"), reverse=True)

@@ -53,11 +53,7 @@ def run_seed() -> int:
 def load_parameters(
     module: nn.Module, state: dict[str, Any], source: str, *, strict: bool = True
 ) -> None:
-    """Load parameters into a module.
-
-    Args:
-        source: names the checkpoint in messages.
-        strict: see :meth:`torch.nn.Module.load_state_dict`.
+    """Load parameters into a module; ``source`` names the checkpoint in messages.
 
     Raises:
         UserError: a parameter has another shape here, or names differ with ``strict``.
@@ -102,10 +98,9 @@ class BaseObject(Part):
 
 
 class BaseModule(Part, nn.Module):
-    """A part with parameters: geometry, material, background, renderer.
-
-    ``weights`` is ``path:module``: the entries of a checkpoint under ``module.`` are loaded after
-    ``configure``."""
+    """A part with parameters: geometry, material, background, renderer. Of ``weights``, which is
+    ``path:module``, the entries under ``module.`` are loaded after ``configure``.
+    """
 
     @dataclass
     class Config(Part.Config):
@@ -115,16 +110,13 @@ class BaseModule(Part, nn.Module):
 
     def __init__(self, cfg: Any = None, *args: Any, **kwargs: Any) -> None:
         super().__init__(cfg, *args, **kwargs)
-        if self.cfg.weights is not None:
-            self._load_weights(self.cfg.weights)
-
-    def _load_weights(self, source: str) -> None:
-        path, _, module_name = source.rpartition(":")
-        if not path:
-            raise UserError(
-                "weights: expected <checkpoint>:<module>, such as last.ckpt:geometry, got "
-                f"{source!r}"
-            )
-        state_dict, epoch, global_step = load_module_weights(path, module_name=module_name)
-        load_parameters(self, state_dict, source)
-        self.do_update_step(epoch, global_step, on_load_weights=True)
+        if (source := self.cfg.weights) is not None:
+            path, _, module_name = source.rpartition(":")
+            if not path:
+                raise UserError(
+                    "weights: expected <checkpoint>:<module>, such as last.ckpt:geometry, got "
+                    f"{source!r}"
+                )
+            state_dict, epoch, global_step = load_module_weights(path, module_name)
+            load_parameters(self, state_dict, source)
+            self.do_update_step(epoch, global_step, on_load_weights=True)

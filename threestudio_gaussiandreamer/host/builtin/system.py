@@ -17,10 +17,8 @@ from .savers import SaverMixin
 
 
 class BaseSystem(pl.LightningModule, Updateable, SaverMixin):
-    """Parses its configuration, calls ``configure``, and updates dataset and parts before and after
-    every batch.
-
-    Every data loader must have an attribute ``dataset``.
+    """Parses its configuration, calls ``configure``, and updates the loader's ``dataset`` and the
+    parts before and after every batch.
     """
 
     @dataclass
@@ -60,9 +58,7 @@ class BaseSystem(pl.LightningModule, Updateable, SaverMixin):
         self.do_update_step(epoch, global_step, on_load_weights=True)
 
     def set_resume_status(self, current_epoch: int, global_step: int) -> None:
-        """Set the epoch and step of the checkpoint that is validated, tested or exported;
-        Lightning's own counters are 0 outside of training.
-        """
+        """Set the epoch and step of the checkpoint that is evaluated, for which Lightning has 0."""
         self._resumed_eval = current_epoch, global_step
 
     @property
@@ -89,23 +85,19 @@ class BaseSystem(pl.LightningModule, Updateable, SaverMixin):
         "predict".
         """
 
-    def on_train_batch_start(self, batch: dict, batch_idx: int, unused: int = 0) -> None:
+    def on_train_batch_start(self, batch: dict, *rest: Any) -> None:
         self._before_batch(batch, "train", self.trainer.train_dataloader)
 
-    def on_validation_batch_start(
-        self, batch: dict, batch_idx: int, dataloader_idx: int = 0
-    ) -> None:
+    def on_validation_batch_start(self, batch: dict, *rest: Any) -> None:
         self._before_batch(batch, "validation", self.trainer.val_dataloaders)
 
-    def on_test_batch_start(self, batch: dict, batch_idx: int, dataloader_idx: int = 0) -> None:
+    def on_test_batch_start(self, batch: dict, *rest: Any) -> None:
         self._before_batch(batch, "test", self.trainer.test_dataloaders)
 
-    def on_predict_batch_start(self, batch: dict, batch_idx: int, dataloader_idx: int = 0) -> None:
+    def on_predict_batch_start(self, batch: dict, *rest: Any) -> None:
         self._before_batch(batch, "predict", self.trainer.predict_dataloaders)
 
-    def on_train_batch_end(
-        self, outputs: Any, batch: dict, batch_idx: int, dataloader_idx: int = 0
-    ) -> None:
+    def on_train_batch_end(self, *rest: Any) -> None:
         if isinstance(self.dataset, Updateable):
             self.dataset.do_update_step_end(self.true_current_epoch, self.true_global_step)
         self.do_update_step_end(self.true_current_epoch, self.true_global_step)
@@ -123,9 +115,7 @@ class BaseSystem(pl.LightningModule, Updateable, SaverMixin):
 class BaseLift3DSystem(BaseSystem):
     """Builds geometry, material, background and renderer by their names in the registry; exports
     through an exporter.
-
-    Subclasses build the guidance and the prompt processor, preferably in ``on_fit_start``, since
-    testing and exporting need neither."""
+    """
 
     @dataclass
     class Config(BaseSystem.Config):
