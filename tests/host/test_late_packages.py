@@ -35,11 +35,12 @@ assert isinstance(torchmetrics.MeanMetric(), Metric) and mean_squared_error(x, x
 print("used")
 """
 INCOMPATIBLE = f"""
-import importlib.util, sys
+import importlib.util, torch
 spec = importlib.util.spec_from_file_location("late_packages", {late_packages.__file__!r})
 alone = importlib.util.module_from_spec(spec)  # before the host has imported Lightning
 spec.loader.exec_module(alone)
-alone.Late.__getattr__ = lambda module, name: missing_in_this_release
+missing = f"{{alone.METRICS}}.collections"
+alone.import_module = lambda name: 1 / 0 if name == missing else importlib.import_module(name)
 alone.import_lightning()
 import lightning.pytorch, torchmetrics
 print(type(torchmetrics).__name__, lightning.pytorch.Trainer.__name__)
