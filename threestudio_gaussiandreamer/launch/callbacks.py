@@ -210,13 +210,11 @@ class LastCheckpoint(pl.callbacks.Checkpoint):
         self._due = 0.0
         self._earlier: dict[int, Any] = {}
 
-    def on_train_start(self, trainer: Any, pl_module: Any) -> None:
+    def on_train_start(self, *rest: Any) -> None:
         self._due = time.monotonic() + SECONDS_BETWEEN
         self._earlier = set_handlers(self._ask)
 
-    def on_train_batch_end(
-        self, trainer: Any, pl_module: Any, outputs: Any, batch: Any, batch_idx: int
-    ) -> None:
+    def on_train_batch_end(self, trainer: Any, *rest: Any) -> None:
         is_due = time.monotonic() >= self._due or trainer.global_step == trainer.max_steps
         if _any_process(trainer, is_due or bool(self.signum)):
             self._save(trainer)

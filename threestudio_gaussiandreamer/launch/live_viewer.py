@@ -58,30 +58,32 @@ class LiveViewer(pl.Callback):
         self._due = 0.0
 
     def on_train_start(self, trainer: Any, pl_module: Any) -> None:
-        cloud = current_cloud(pl_module)
-        self.view.look_from_front(first_pose(StoredCloud(cloud)))
-        self.view.show(cloud, status(trainer, cloud))
+        self.view.look_from_front(first_pose(StoredCloud(current_cloud(pl_module))))
+        self._show(trainer, pl_module)
         self.controls = Controls(self.view)
         info(f"the viewer is at {self.view.address}")
 
-    def on_train_batch_start(
-        self, trainer: Any, pl_module: Any, batch: Any, batch_idx: int
-    ) -> None:
+    def on_train_batch_start(self, trainer: Any, pl_module: Any, batch: Any, *rest: Any) -> None:
         while not (self.controls.may_go_on() or self.stopping()):
             self._show_picture_if_asked(pl_module, batch)
             self._show_if_due(trainer, pl_module)
             time.sleep(POLL)
 
     def on_train_batch_end(
-        self, trainer: Any, pl_module: Any, outputs: Any, batch: Any, batch_idx: int
+        self, trainer: Any, pl_module: Any, outputs: Any, batch: Any, *rest: Any
     ) -> None:
         self._show_picture_if_asked(pl_module, batch)
         self._show_if_due(trainer, pl_module, batch)
 
     def on_train_end(self, trainer: Any, pl_module: Any) -> None:
-        cloud = current_cloud(pl_module)
-        self.view.show(cloud, status(trainer, cloud))
+        self._show(trainer, pl_module)
         self.controls.remove()
+
+    def _show(self, trainer: Any, system: Any) -> None:
+        cloud, decibels = current_cloud(system), trainer.callback_metrics.get("dB")
+        quality = "" if decibels is None else f", {float(decibels):.1f} dB"
+        step = f"step {trainer.global_step}, {len(cloud.means):,} Gaussians{quality}"
+        self.view.show(cloud, step)
 
     def _show_picture_if_asked(self, system: Any, batch: dict[str, Any]) -> None:
         if self.controls.picture.is_set():
@@ -97,8 +99,7 @@ class LiveViewer(pl.Callback):
         start = time.monotonic()
         if start < self._due or not self.view.watched:
             return False
-        cloud = current_cloud(pl_module)
-        self.view.show(cloud, status(trainer, cloud))
+        self._show(trainer, pl_module)
         if batch is not None and self.controls.cameras.value:
             pose, fovy = (batch[name].detach().cpu().numpy() for name in ("c2w", "fovy"))
             self.view.show_cameras(pose, fovy, batch["width"] / batch["height"])
@@ -110,13 +111,6 @@ class LiveViewer(pl.Callback):
 def current_cloud(system: Any) -> Gaussians:
     """Return the finite Gaussians of a system as arrays."""
     return drawable(Gaussians.of(system.geometry).arrays(), "viewer")
-
-
-def status(trainer: Any, cloud: Gaussians) -> str:
-    """Return the line below the title: step, number of Gaussians and the logged dB."""
-    decibels = trainer.callback_metrics.get("dB")
-    quality = "" if decibels is None else f", {float(decibels):.1f} dB"
-    return f"step {trainer.global_step}, {len(cloud.means):,} Gaussians{quality}"
 
 
 @torch.no_grad()
