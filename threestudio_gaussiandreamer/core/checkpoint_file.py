@@ -53,10 +53,10 @@ def load_file(path: str | os.PathLike, map_location: Any = "cpu") -> Any:
         UserError: there is no such file, or it is damaged or no checkpoint.
     """
     path = Path(os.path.expanduser(path))
-    if (last := path / "ckpts" / "last.ckpt").is_file():
-        raise UserError(f"{path} is the folder of a run, not a checkpoint: did you mean {last}?")
     if path.is_dir():
-        raise UserError(f"{path} is a folder, not a checkpoint" + _siblings(path / "*"))
+        last = path / "ckpts" / "last.ckpt"
+        meant = f": did you mean {last}?" if last.is_file() else _siblings(path / "*")
+        raise UserError(f"{path} is a folder, not a checkpoint{meant}")
     try:
         _verify(path)
         content = torch.load(path, map_location=map_location, weights_only=True)
@@ -189,11 +189,12 @@ def load_checkpoint(path: str | os.PathLike, map_location: Any = "cpu") -> dict:
     known = checkpoint if isinstance(checkpoint, dict) else {}
     kinds = {"epoch": int, "global_step": int, "state_dict": Mapping}
     wrong = [key for key, kind in kinds.items() if not isinstance(known.get(key), kind)]
-    if wrong:
-        raise UserError(f"{path} isn't a training checkpoint: it has no {', '.join(wrong)}")
-    for name, value in known["state_dict"].items():
+    state = () if wrong else known["state_dict"].items()
+    for name, value in state:
         if not (isinstance(name, str) and isinstance(value, torch.Tensor)):
-            raise UserError(f"{path} isn't a training checkpoint: {name!r} is no tensor")
+            wrong.append(f"tensor {name!r}")
+    if wrong:
+        raise UserError(f"{path} isn't a training checkpoint: it has no {', '.join(wrong[:3])}")
     return known
 
 
