@@ -279,7 +279,7 @@ INCONSISTENT = {
         lambda c: c["optimizer_states"][0]["param_groups"].pop(),
         "another configuration",
     ),
-    "a word": (lambda c: c.update(global_step="three"), "global_step is of type str"),
+    "a word": (lambda c: c.update(global_step="three"), "no valid global_step"),
 }
 
 

@@ -194,7 +194,7 @@ def load_checkpoint(path: str | os.PathLike, map_location: Any = "cpu") -> dict:
         if not (isinstance(name, str) and isinstance(value, torch.Tensor)):
             wrong.append(f"tensor {name!r}")
     if wrong:
-        raise UserError(f"{path} isn't a training checkpoint: it has no {', '.join(wrong[:3])}")
+        raise UserError(f"{path} isn't a training checkpoint: no valid {', '.join(wrong[:3])}")
     return known
 
 
