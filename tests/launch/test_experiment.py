@@ -94,9 +94,12 @@ def test_a_mistake_is_one_message_and_leaves_nothing(launch, arguments, message)
     code, out, err = launch("--train", *arguments)
     assert code == 2 and out == "" and message in err and "Traceback" not in err
     assert os.listdir() == ["tiny.yaml"]
+
+
+def test_a_mistake_has_a_traceback_if_that_is_asked_for(launch):
     Path("outputs/other").mkdir(parents=True)
-    code, _, err = launch("--train", "--verbose", *arguments)
-    assert code == 2 and message in err and "Traceback" in err
+    code, _, err = launch("--train", "--verbose", "system.fail_in=on_fit_start")
+    assert code == 2 and "failed in on_fit_start, as asked" in err and "Traceback" in err
     assert os.listdir("outputs") == ["other"]
 
 

@@ -65,11 +65,12 @@ def sends(signum):
     return lambda self, *arguments: os.kill(os.getpid(), signum)
 
 
-@pytest.mark.parametrize("where", ["configure", "on_fit_start"])
-def test_before_training_a_signal_ends_it_at_once(launch, monkeypatch, where):
-    for name, code in SIGNALS.items():
-        monkeypatch.setattr(tiny_parts.TinySystem, where, sends(getattr(signal, name)))
-        assert launch("--train")[0] == code and os.listdir() == ["tiny.yaml"]
+def test_before_training_a_signal_ends_it_at_once(launch, monkeypatch):
+    places = ("configure", "on_fit_start", "on_fit_start")
+    for where, (name, code) in zip(places, SIGNALS.items(), strict=True):
+        with monkeypatch.context() as patch:
+            patch.setattr(tiny_parts.TinySystem, where, sends(getattr(signal, name)))
+            assert launch("--train")[0] == code and os.listdir() == ["tiny.yaml"]
 
 
 def test_a_resumed_run_keeps_its_first_configuration_and_adds_its_command(launch, trained):
