@@ -19,7 +19,7 @@ from threestudio_gaussiandreamer.host.builtin.base import (
 from threestudio_gaussiandreamer.host.builtin.models import (
     BaseGeometry,
     NoMaterial,
-    Renderer,
+    Rasterizer,
     SolidColorBackground,
 )
 from threestudio_gaussiandreamer.host.builtin.system import BaseSystem
@@ -113,7 +113,7 @@ def test_weights_of_one_module_are_loaded_from_a_checkpoint(tmp_path):
 
 def test_a_renderer_refers_to_its_parts_without_owning_them():
     geometry = Points()
-    renderer = Renderer(
+    renderer = Rasterizer(
         {"radius": 2.0}, geometry=geometry, material=NoMaterial(), background=SolidColorBackground()
     )
     assert renderer.geometry is geometry

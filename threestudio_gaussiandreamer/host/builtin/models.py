@@ -1,7 +1,6 @@
 """Base classes of the parts of a system, and the host's own minimal parts."""
 
 from abc import abstractmethod
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Optional, Tuple
 
@@ -18,26 +17,9 @@ from .registry import register
 class BaseGeometry(BaseModule):
     """Base class of geometries: the optimised parameters."""
 
-    @dataclass
-    class Config(BaseModule.Config):
-        pass
-
-    cfg: Config
-
 
 class BaseMaterial(BaseModule):
-    """Base class of materials, which turn features into colours; Gaussians have their own
-    colours.
-    """
-
-    @dataclass
-    class Config(BaseModule.Config):
-        pass
-
-    cfg: Config
-
-    def forward(self, *args: Any, **kwargs: Any) -> Tensor:
-        raise NotImplementedError(f"{type(self).__name__}.forward")
+    """Base class of materials: features to colours; Gaussians have their own colours."""
 
 
 COLOR_ACTIVATIONS = {"sigmoid": torch.sigmoid, "none": lambda x: x}
@@ -61,12 +43,6 @@ class NoMaterial(BaseMaterial):
 
 class BaseBackground(BaseModule):
     """Base class of backgrounds: ray directions (B,H,W,3) to colours (B,H,W,C) in [0,1]."""
-
-    @dataclass
-    class Config(BaseModule.Config):
-        pass
-
-    cfg: Config
 
     @abstractmethod
     def forward(self, dirs: Tensor) -> Tensor:
@@ -140,7 +116,7 @@ class HasSubModules:
         return self.sub_modules.background
 
 
-class Renderer(HasSubModules, BaseModule):
+class Rasterizer(HasSubModules, BaseModule):
     """Base class of renderers: ``renderer(**batch)`` returns a dict with ``comp_rgb`` (B,H,W,3),
     ``opacity`` (B,H,W,1), ...
     """
@@ -158,13 +134,6 @@ class Renderer(HasSubModules, BaseModule):
         self.register_buffer(
             "bbox", self.cfg.radius * torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
         )
-
-    def forward(self, *args: Any, **kwargs: Any) -> Mapping[str, Any]:
-        raise NotImplementedError(f"{type(self).__name__}.forward")
-
-
-class Rasterizer(Renderer):
-    """A renderer that projects primitives."""
 
 
 @dataclass
