@@ -88,7 +88,7 @@ class Run:
             self.start()
             with lightning_errors(self.cfg.resume, self.size_changes), write_errors(self.folder):
                 began, start = datetime.now(), time.perf_counter()
-                getattr(self, self.args.stage)()
+                self.run_stage()
                 if self.trainer.is_global_zero and self.cfg.system.get("pages", True):
                     seconds = time.perf_counter() - start
                     note_time(self.folder, self.args.stage, began, seconds)
@@ -171,25 +171,19 @@ class Run:
         self.resumed_step = checkpoint["global_step"]
         return checkpoint["epoch"], self.resumed_step
 
-    # -- the stages --------------------------------------------------------------------------------
-
-    def train(self) -> None:
+    def run_stage(self) -> None:
+        inputs = {"datamodule": self.data, "ckpt_path": self.cfg.resume}
+        if not self.training:
+            name = {"export": "predict"}.get(self.args.stage, self.args.stage)
+            getattr(self.trainer, name)(self.system, **inputs)
+            return
         if 0 <= self.cfg.trainer.get("max_steps", -1) <= self.resumed_step:
             info(
                 f"the checkpoint is at step {self.resumed_step} of "
                 f"{self.cfg.trainer.max_steps}: nothing is left to train"
             )
-        self.trainer.fit(self.system, datamodule=self.data, ckpt_path=self.cfg.resume)
+        self.trainer.fit(self.system, **inputs)
         self.trainer.test(self.system, datamodule=self.data)
-
-    def validate(self) -> None:
-        self.trainer.validate(self.system, datamodule=self.data, ckpt_path=self.cfg.resume)
-
-    def test(self) -> None:
-        self.trainer.test(self.system, datamodule=self.data, ckpt_path=self.cfg.resume)
-
-    def export(self) -> None:
-        self.trainer.predict(self.system, datamodule=self.data, ckpt_path=self.cfg.resume)
 
     # -- the trainer -------------------------------------------------------------------------------
 
