@@ -106,6 +106,8 @@ def test_an_error_after_training_prints_the_command_and_stays_as_it_is(
             launch("--train")
         out = capsys.readouterr().out
     assert f"resume={only_run().absolute()}/ckpts/last.ckpt" in out
+    # the results of the training are listed all the same
+    assert f"results are in {only_run()}/save" in out and (only_run() / "index.html").is_file()
 
 
 def test_ctrl_c_during_the_test_ends_with_130(launch, monkeypatch):

@@ -62,7 +62,7 @@ class Run:
         self.sources, self.command = sources, command
         self.training = args.stage == "train"
         self.claimed = RunFolder(self.folder)
-        self.resumed_step = -1
+        self.resumed_step, self.has_trained = -1, False
         self.size_changes: list[str] = []
         self.trainer: Any = None
         self.viewer = parse_structured(ViewerConfig, cfg.viewer)
@@ -89,13 +89,10 @@ class Run:
             with lightning_errors(self.cfg.resume, self.size_changes), write_errors(self.folder):
                 began, start = datetime.now(), time.perf_counter()
                 self.run_stage()
-                if self.trainer.is_global_zero and self.cfg.system.get("pages", True):
+                if self.has_index:
                     seconds = time.perf_counter() - start
                     note_time(self.folder, self.args.stage, began, seconds)
-                    info(f"the run at a glance: {write_index(self.folder)}")
-            summary = self.system.summary() if hasattr(self.system, "summary") else None
-            if summary and self.trainer.is_global_zero:
-                print(summary, flush=True)
+                self.report()
             if self.view is not None and self.viewer.keep_serving:
                 serve_until_stopped(self.view)
         except Stopped as stop:
@@ -103,6 +100,9 @@ class Run:
             print(f"stopped at step {stop.step}; to resume: {command}", flush=True)
             return 128 + stop.signum
         except BaseException:
+            if self.has_trained:  # the turntable or an export has failed
+                with contextlib.suppress(Exception):  # it would hide the first error
+                    self.report()
             self.discard_if_unused()
             self.print_resume_command()
             raise
@@ -183,7 +183,21 @@ class Run:
                 f"{self.cfg.trainer.max_steps}: nothing is left to train"
             )
         self.trainer.fit(self.system, **inputs)
+        self.has_trained = True
         self.trainer.test(self.system, datamodule=self.data)
+
+    @property
+    def has_index(self) -> bool:
+        """Whether this process writes ``index.html``."""
+        return self.trainer.is_global_zero and self.cfg.system.get("pages", True)
+
+    def report(self) -> None:
+        """Write ``index.html``, and print the system's summary, which lists its results."""
+        if self.has_index:
+            info(f"the run at a glance: {write_index(self.folder)}")
+        summary = self.system.summary() if hasattr(self.system, "summary") else None
+        if summary and self.trainer.is_global_zero:
+            print(summary, flush=True)
 
     # -- the trainer -------------------------------------------------------------------------------
 
