@@ -59,7 +59,8 @@ TRAIN_BYTES, EVAL_BYTES, CAMERA_BYTES = 64, 32, 256
 FOVY = 1e-3, 179.999, "degrees"
 DISTANCE = 1e-6, FAR, "world units"
 LENGTH = in_range(0, FAR, "world units")
-ONE_VIEW = satisfies("1: views are evaluated one at a time", lambda count: count == 1)
+LIGHT_DISTANCES = (0.8, 1.5)
+"""World units."""
 PIXELS = in_range(1, MAX_SIDE, "pixels")
 Range = Tuple[float, float]
 
@@ -82,7 +83,6 @@ class CameraConfig:
     resolution_milestones: List[int] = field(default_factory=list)
     eval_height: int = field(default=512, metadata=PIXELS)
     eval_width: int = field(default=512, metadata=PIXELS)
-    eval_batch_size: int = field(default=1, metadata=ONE_VIEW)
     n_val_views: int = field(default=1, metadata=count_of("views", 1, CAMERA_BYTES))
     n_test_views: int = field(default=120, metadata=count_of("views", 1, CAMERA_BYTES))
     elevation_range: Range = field(default=(-10, 60), metadata=interval(-90, 90, "degrees"))
@@ -92,19 +92,25 @@ class CameraConfig:
     camera_perturb: float = field(default=0.0, metadata=LENGTH)
     center_perturb: float = field(default=0.0, metadata=LENGTH)
     up_perturb: float = field(default=0.0, metadata=LENGTH)
-    light_position_perturb: float = field(default=1.0, metadata=LENGTH)
-    light_distance_range: Range = field(default=(0.8, 1.5), metadata=interval(0, *DISTANCE[1:]))
     eval_elevation_deg: float = field(default=15.0, metadata=in_range(-90, 90, "degrees"))
     eval_camera_distance: float = field(default=4.0, metadata=in_range(*DISTANCE))
     eval_fovy_deg: float = field(default=70.0, metadata=in_range(*FOVY))
     batch_uniform_azimuth: bool = True
     progressive_until: int = field(default=0, metadata=at_least(0, "steps"))
-    rays_d_normalize: bool = True
     train_views: int = field(default=0, metadata=count_of("views", 0, CAMERA_BYTES))
     rays: bool = False
     n_view: int = field(default=1, metadata=in_range(1, 64, "views"))
 
-    REMOVED: ClassVar[dict[str, Any]] = {"hold_steps": (1, "each step has its own cameras")}
+    REMOVED: ClassVar[dict[str, Any]] = {
+        "hold_steps": (1, "each step has its own cameras"),
+        "eval_batch_size": (1, "views are evaluated one at a time"),
+        "light_position_perturb": (1.0, "it is 1"),
+        "light_distance_range": (
+            lambda pair: is_list(pair) and tuple(pair) == LIGHT_DISTANCES,
+            "it is 0.8 to 1.5",
+        ),
+        "rays_d_normalize": (True, "rays have unit length"),
+    }
 
     @staticmethod
     def check(cfg: Any) -> None:
@@ -152,7 +158,6 @@ def make_batch(
     height: int,
     width: int,
     rays: bool = False,
-    normalize: bool = True,
 ) -> dict[str, Any]:
     """Make the host's batch of B views; ``height`` and ``width`` are plain ints."""
     proj = cameras.projection(orbit.fovy, width / height)
@@ -170,15 +175,15 @@ def make_batch(
         "width": width,
     }
     if rays:
-        batch["rays_d"] = cameras.ray_directions(c2w, orbit.fovy, height, width, normalize)
+        batch["rays_d"] = cameras.ray_directions(c2w, orbit.fovy, height, width)
         batch["rays_o"] = c2w[:, None, None, :3, 3].expand_as(batch["rays_d"]).clone()
     return batch
 
 
-def orbit_batch(orbit: Orbit, height: int, width: int, *rays: bool) -> dict[str, Any]:
+def orbit_batch(orbit: Orbit, height: int, width: int, rays: bool = False) -> dict[str, Any]:
     """Make the host's batch of the views of ``orbit``, with the lights at the cameras."""
     c2w = orbit.c2w
-    return make_batch(orbit, c2w, c2w[:, :3, 3].clone(), height, width, *rays)
+    return make_batch(orbit, c2w, c2w[:, :3, 3].clone(), height, width, rays)
 
 
 class TrainCameras(IterableDataset, Updateable):
@@ -218,8 +223,8 @@ class TrainCameras(IterableDataset, Updateable):
             orbit = self._sample(batch_size, self._ranges(step), rng)
         c2w = self._perturbed(orbit, rng)
         lights = self._lights(c2w, rng)
-        own, rays = (orbit.rows(rows), c2w[rows], lights[rows]), self.cfg.rays
-        return make_batch(*own, height, width, rays, self.cfg.rays_d_normalize)
+        own = orbit.rows(rows), c2w[rows], lights[rows]
+        return make_batch(*own, height, width, self.cfg.rays)
 
     def _sample(self, batch_size: int, ranges: OrbitRanges, rng: torch.Generator) -> Orbit:
         uniform = self.cfg.batch_uniform_azimuth
@@ -256,9 +261,8 @@ class TrainCameras(IterableDataset, Updateable):
 
     def _lights(self, c2w: Tensor, rng: torch.Generator) -> Tensor:
         """Draw point lights around the camera's direction, as DreamFusion does."""
-        count, (low, high) = len(c2w), self.cfg.light_distance_range
-        noise = torch.randn(count, 3, generator=rng) * self.cfg.light_position_perturb
-        towards = c2w[:, :3, 3] + noise
+        count, (low, high) = len(c2w), LIGHT_DISTANCES
+        towards = c2w[:, :3, 3] + torch.randn(count, 3, generator=rng)
         towards = towards / torch.linalg.vector_norm(towards, dim=-1, keepdim=True).clamp_min(1e-12)
         return towards * (low + (high - low) * torch.rand(count, 1, generator=rng))
 
@@ -283,8 +287,7 @@ class EvalCameras(Dataset, Updateable):
     def collate(self, indices: list[int]) -> dict[str, Any]:
         index = torch.tensor(indices)
         orbit, cfg = self.orbit.rows(index), self.cfg
-        rays = cfg.rays, cfg.rays_d_normalize
-        return {"index": index, **orbit_batch(orbit, cfg.eval_height, cfg.eval_width, *rays)}
+        return {"index": index, **orbit_batch(orbit, cfg.eval_height, cfg.eval_width, cfg.rays)}
 
 
 @register_builtin("random-camera-datamodule")
