@@ -55,7 +55,7 @@ def satisfies(expected: str, holds: Callable[[Any], bool]) -> Rule:
 
     def check(path: str, value: Any) -> None:
         if not holds(value):
-            raise UserError(f"{path}: expected {expected}, got {shown(value)}")
+            raise wrong(path, expected, value)
 
     return rule(check)
 
@@ -123,7 +123,7 @@ def each(item: Rule) -> Rule:
 
     def check(path: str, values: Any) -> None:
         if not is_list(values):
-            raise UserError(f"{path}: expected a list, got {shown(values)}")
+            raise wrong(path, "a list", values)
         for i, value in enumerate(values):
             item[RULE](f"{path}[{i}]", value)
 
@@ -168,11 +168,18 @@ def is_numbers(value: Any, count: int) -> bool:
 
 
 def shown(value: Any) -> str:
-    """Format ``value`` for a message, shortened to ``SHOWN`` characters."""
+    """Format ``value`` for a message, as in YAML if it is null, at most ``SHOWN`` characters."""
+    if value is None:
+        return "null"
     if isinstance(value, int) and value.bit_length() >= 256:  # repr has a limit
         return f"an integer of {value.bit_length()} bits"
     text = repr(list(value) if is_list(value) else value)
     return text if len(text) <= SHOWN else f"{text[: SHOWN - 3]}..."
+
+
+def wrong(path: str, expected: str, value: Any) -> UserError:
+    """Make the error for a value that isn't what is ``expected``."""
+    return UserError(f"{path}: expected {expected}, got {shown(value)}")
 
 
 def require_representable(path: str, value: Any) -> None:
@@ -188,9 +195,9 @@ def require_representable(path: str, value: Any) -> None:
         for i, item in enumerate(value):
             require_representable(f"{path}[{i}]", item)
     elif isinstance(value, int) and abs(value) > INT64_MAX:
-        raise UserError(f"{path}: expected a whole number of at most 64 bits, got {shown(value)}")
+        raise wrong(path, "a whole number of at most 64 bits", value)
     elif isinstance(value, float) and not is_number(value):
-        raise UserError(f"{path}: expected a finite number that float32 can hold, got {value}")
+        raise wrong(path, "a finite number that float32 can hold", value)
 
 
 # -- from values to options -----------------------------------------------------------------------
@@ -241,7 +248,7 @@ def _converted(path: str, value: Any, annotation: Any) -> Any:
         given = float if type(value) is int and float in choices else type(value)
         if SCALARS.keys() >= {*choices} and given not in inner:
             expected = " or ".join(SCALARS[choice] for choice in choices)
-            raise UserError(f"{path}: expected {expected}, got {shown(value)}")
+            raise wrong(path, expected, value)
         return value
     if kind in SCALARS:
         return _scalar(path, value, kind)
@@ -264,39 +271,36 @@ def _converted(path: str, value: Any, annotation: Any) -> Any:
 
 
 def _scalar(path: str, value: Any, kind: type) -> Any:
-    wrong = UserError(
-        f"{path}: expected {SCALARS[kind]}, got {'null' if value is None else shown(value)}"
-    )
+    error = wrong(path, SCALARS[kind], value)
     if is_list(value) or isinstance(value, Mapping) or value is None:
-        raise wrong
+        raise error
     require_representable(path, value)
     if kind is str:
         return str(value)
     if kind is bool:
         if (switch := str(value).lower()) not in SWITCHES:
-            raise wrong
+            raise error
         return SWITCHES[switch]
-    try:
-        number = kind(value)
-    except (TypeError, ValueError) as error:
-        raise wrong from error
     if isinstance(value, bool) or (kind is int and isinstance(value, float)):
-        raise wrong
-    return number
+        raise error
+    try:
+        return kind(value)
+    except (TypeError, ValueError):
+        raise error from None
 
 
 def _sequence(path: str, values: Any, kind: type, items: tuple) -> Any:
     if not is_list(values):
-        raise UserError(f"{path}: expected a list, got {shown(values)}")
+        raise wrong(path, "a list", values)
     if kind is list:
         annotations = items * len(values) or (Any,) * len(values)
         return [_converted(f"{path}[{i}]", v, annotations[i]) for i, v in enumerate(values)]
     if items and Ellipsis not in items:
         if len(values) != len(items):
-            raise UserError(f"{path}: expected a list of {len(items)}, got {list(values)}")
+            raise wrong(path, f"a list of {len(items)}", values)
         for i, (value, annotation) in enumerate(zip(values, items, strict=True)):
             if annotation in (int, float) and isinstance(value, str):
-                raise UserError(f"{path}[{i}]: expected {SCALARS[annotation]}, got {value!r}")
+                raise wrong(f"{path}[{i}]", SCALARS[annotation], value)
             _converted(f"{path}[{i}]", value, annotation)
     return tuple(values)
 
@@ -343,7 +347,7 @@ def _check_table(path: str, values: Any, default: Any) -> None:
             SCALARS.get(float if type(v) is int else type(v)) for v in (value, default[key])
         )
         if None not in (given, expected) and given != expected:
-            raise UserError(f"{path}.{key}: expected {expected}, got {value!r}")
+            raise wrong(f"{path}.{key}", expected, value)
 
 
 def _plain(value: Any) -> Any:
