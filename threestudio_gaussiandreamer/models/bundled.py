@@ -58,9 +58,7 @@ def is_export(folder: Path) -> bool:
 
 @functools.lru_cache
 def require_intact(folder: Path, part: str) -> None:
-    """Compare the files of a part with their digests, once per process; raise UserError if one is
-    missing or differs, or the part isn't in the list of digests.
-    """
+    """Compare the files of a part with their digests, once per process."""
     digests = read_digests(folder)
     names = [name for name in digests if name.partition("/")[0] == part]
     is_needed = folder == FOLDER or (folder / part).exists()  # an export needn't have all parts

@@ -77,8 +77,11 @@ def require_family(family: Optional[Family], folder: Path) -> None:
     """Raise UserError if ``folder`` holds a model of another family than this; None accepts any.
     Folders without the settings of a network pass: what loads them reports it.
     """
-    settings = _network_settings(folder)
-    if family is None or not settings:
+    settings: Any = {}
+    for component in ("unet", "transformer"):
+        with contextlib.suppress(OSError, ValueError):
+            settings = json.loads((folder / component / "config.json").read_text(encoding="utf-8"))
+    if family is None or not settings or not isinstance(settings, dict):
         return
     if (found := family_of(settings)) != family:
         known = ", ".join(each.title for each in FAMILIES)
@@ -111,16 +114,6 @@ def require_names(family: Optional[Family], names: Collection[str]) -> None:
         found = STABLE_DIFFUSION_XL if "text_encoder_2" in components else found
     if family not in (None, found) and not {found, family} <= set(SAME_FILES):
         raise UserError(f"it isn't {family.title}, but {found}")
-
-
-def _network_settings(folder: Path) -> dict[str, Any]:
-    for component in ("transformer", "unet"):
-        # missing or damaged ones are reported by what loads them
-        with contextlib.suppress(OSError, ValueError):
-            settings = json.loads((folder / component / "config.json").read_text(encoding="utf-8"))
-            if isinstance(settings, dict):
-                return settings
-    return {}
 
 
 class Source(NamedTuple):

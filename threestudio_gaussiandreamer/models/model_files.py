@@ -28,7 +28,7 @@ WEIGHTS = re.compile(
     r"(?:diffusion_pytorch_model|model)(?:\.(?P<early>fp16|bf16))?"
     r"(?:-\d{5}-of-(?P<shards>\d{5}))?(?:\.(?P<late>fp16|bf16))?\.safetensors"
 )
-"""Name of a weight file; the variant may precede or follow the number of the shard."""
+"""The variant may precede or follow the number of the shard."""
 HALF_VARIANTS = ("fp16", "bf16")
 PICKLED = ("diffusion_pytorch_model.bin", "pytorch_model.bin")
 SAMPLE = 1 << 16
@@ -52,11 +52,8 @@ def files_below(folder: Path) -> list[str]:
 def needed_files(
     names: Collection[str], components: Iterable[str], *, half=False, allow_bin=None
 ) -> list[str]:
-    """Return the files that are read to load these components; see :func:`component_weights`.
-    The component "" is a network with its tokenizer.
-
-    Raises:
-        UserError: files are missing; the message lists them for each component.
+    """Return the files that are read to load these components, of which "" is a network with its
+    tokenizer; see :func:`component_weights`. Raise UserError with all that are missing.
     """
     needed, problems = ["model_index.json"] if "model_index.json" in names else [], []
     for component in components:
@@ -180,9 +177,7 @@ def load_network(
 
 
 def load_settings(loader: Any, folder: Path, component: str = "", **options: Any) -> Any:
-    """Load a tokenizer or a scheduler with ``from_pretrained`` from local files; raise UserError if
-    the libraries can't.
-    """
+    """Load a tokenizer or a scheduler with ``from_pretrained`` from local files."""
     options |= {"subfolder": component, "local_files_only": True}
     with loading_errors(f"{component or loader.__name__} of the model in {str(folder)!r}"):
         return loader.from_pretrained(str(folder), **options)

@@ -105,16 +105,13 @@ def encode_sd3(
 def _clip(
     folder: Path, suffix: str, texts: list[str], encoder_class: Any
 ) -> tuple[Float[Tensor, "T N F"], Float[Tensor, "T P"]]:
-    """Return the states before the last layer and the pooled embeddings of one CLIP encoder, one
-    text at a time, so that the result doesn't depend on the other texts.
-    """
+    """Return the states before the last layer and the pooled embeddings of one CLIP encoder."""
     ids = clip_tokens(folder, texts, suffix).input_ids
 
     def run(encoder: Any) -> tuple[Tensor, Tensor]:
         found = [encoder(row.to(encoder.device), output_hidden_states=True) for row in ids.split(1)]
         tokens = torch.cat([states.hidden_states[-2] for states in found])
-        # of an encoder without projection, whose pooled embedding isn't used, the first output is
-        # the last layer
+        # without projection, where it isn't used, the first output is the last layer
         pooled = torch.cat([states[0].flatten(1) for states in found])
         return tokens.float().cpu(), pooled.float().cpu()
 
