@@ -239,7 +239,7 @@ def test_the_bundle_gives_the_files_of_every_format_in_order_and_hands_options_o
         ("ply,points", {"ply": {"save_name": "Points.PLY"}}, "is the file of the format ply"),
         ("ply", {"ply": {"save_name": "x\0.ply"}}, "options.ply.*at most 255 bytes and no NUL"),
         ("ply", {"ply": {"save_name": "ü" * 128}}, "options.ply.*at most 255 bytes and no NUL"),
-        ("ply", {"ply": {"save_name": "pruned"}}, "a name that a run doesn't use itself"),
+        ("ply", {"ply": {"save_name": "pruned"}}, "other than pruned"),
         ("ply", {"ply": {"save_name": "a/b.ply"}}, "options.ply.*without folders"),
     ],
 )

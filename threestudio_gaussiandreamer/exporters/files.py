@@ -3,9 +3,8 @@
 An exporter is a subclass of the host's ``Exporter``, registered as ``<format>-exporter``. A call
 returns a list of ``ExporterOutput(save_name, save_type, params)``, and the system writes each with
 its method ``save_<save_type>(name, **params)``. ``gaussiandreamer-exporter`` writes several
-formats: ply, spz, compressed-ply, sog, glb, usda (docs/formats.md), points, surface, which T3Bench
-reads, and gaussiandreamer-mesh (docs/mesh.md); threestudio has a ``mesh-exporter`` too.
-``save_name=x.spz.glb`` has SPZ inside, the only kind that CesiumJS reads; ``x.usdz`` makes a USDZ.
+formats: those of docs/formats.md, points, surface, which T3Bench reads, and gaussiandreamer-mesh
+(docs/mesh.md); threestudio has a ``mesh-exporter`` too.
 
 ==============  ===================================================================================
 option          meaning
@@ -36,7 +35,7 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, make_dataclass
 from pathlib import Path
-from typing import Any, Dict, List, NamedTuple, Optional
+from typing import Any, Dict, List, Optional
 
 import numpy as np
 
@@ -79,10 +78,9 @@ def require_file_name(option: str, name: str) -> None:
     folders = not name or name != os.path.basename(name) or name in (os.curdir, os.pardir)
     long = "\0" in name or len(name.encode(errors="surrogateescape")) > NAME_BYTES
     if folders or long or name.casefold() in RESERVED:
-        expected = f"a name that a run doesn't use itself ({', '.join(RESERVED)})"
-        expected = f"at most {NAME_BYTES} bytes and no NUL" if long else expected
-        expected = "the name of a file, without folders" if folders else expected
-        raise UserError(f"{option}: expected {expected}, got {name[:80]!r}")
+        said = f"{option}: expected the name of a file, without folders, of at most {NAME_BYTES}"
+        others = ", ".join(RESERVED)
+        raise UserError(f"{said} bytes and no NUL, other than {others}, got {name[:80]!r}")
 
 
 SAVE_NAME = rule(require_file_name)
@@ -90,12 +88,9 @@ UP = one_of(AXES)
 """The rule for the option ``up``, the axis of the file that points up."""
 
 
-class Drawing(NamedTuple):
-    """The options of a run's renderer that its exports need."""
-
-    eps2d: float = EPS2D
-    """Screen-space dilation in square pixels of the final image."""
-    antialias: bool = False
+DRAWING = {"eps2d": EPS2D, "antialias": False}
+"""Options of a run's renderer that its exports need: the dilation in square pixels of the final
+image, and whether it antialiases."""
 
 
 class FileExporter(Exporter):
@@ -108,7 +103,7 @@ class FileExporter(Exporter):
     cfg: Config
     shared: Optional[Gaussians] = None
     """Set by the bundle exporter, which reads the Gaussians once for all formats."""
-    drawing: Drawing = Drawing()
+    drawing: Mapping[str, Any] = DRAWING
     """Set by the system before it calls the exporter."""
 
     def gaussians(self) -> Gaussians:
@@ -141,11 +136,12 @@ def outputs_of(exporter: Exporter) -> list[ExporterOutput]:
     """
     found = exporter()
     is_list = isinstance(found, (list, tuple))
-    for entry in found if is_list else [found]:
-        if not isinstance(entry, ExporterOutput):
-            what = f"{'entries of type ' if is_list else ''}{type(entry).__name__}"
-            said = f"{type(exporter).__name__} returned {what}; expected a list of ExporterOutput"
-            raise UserError(said)
+    kinds = {type(entry) for entry in found} if is_list else {type(found)}
+    if not is_list or not all(issubclass(kind, ExporterOutput) for kind in kinds):
+        what = ("entries of type " if is_list else "") + ", ".join(kind.__name__ for kind in kinds)
+        raise UserError(
+            f"{type(exporter).__name__} returned {what}; expected a list of ExporterOutput"
+        )
     return list(found)
 
 
@@ -264,7 +260,7 @@ class MeshExporter(FileExporter):
 
     def __call__(self) -> List[ExporterOutput]:
         given = {option.name: getattr(self.cfg, option.name) for option in fields(MeshOptions)}
-        given |= {key: x for key, x in self.drawing._asdict().items() if given[key] is None}
+        given |= {key: x for key, x in self.drawing.items() if given[key] is None}
         mesh = mesh_from_gaussians(self.gaussians(), MeshOptions(**given))
         files = [(self.cfg.save_name, GLB_UP)]
         files += [(str(Path(self.cfg.save_name).with_suffix(".obj")), self.cfg.up)] * self.cfg.obj
@@ -320,8 +316,7 @@ class BundleExporter(Exporter):
                     )
 
     cfg: Config
-    drawing: Drawing = Drawing()
-    """As in :class:`FileExporter`."""
+    drawing: Mapping[str, Any] = DRAWING
 
     def configure(self, **parts: Any) -> None:
         super().configure(**parts)

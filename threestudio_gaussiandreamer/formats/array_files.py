@@ -22,8 +22,7 @@ from numpy.lib import format as npy
 
 from .reading import Unreadable, reading, require, require_file_memory
 
-MOST_DEFLATE_SAVES = 1032
-"""Bytes that one byte of a deflate stream stands for at most (zlib's technical notes)."""
+MOST_HEADER_BYTES = 1 << 16
 PACKINGS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 CONVERTED_BYTES = 16
 """Memory per number that is added to the budget for callers, which make two float64 copies."""
@@ -52,9 +51,10 @@ def read_arrays(
         file.seek(0)
         size = os.fstat(file.fileno()).st_size
         if start == npy.MAGIC_PREFIX:
-            if _read_header(file, size)[1].hasobject:
+            _, dtype, end = _header_of(file.read(MOST_HEADER_BYTES))
+            file.seek(end if dtype.hasobject else 0)
+            if dtype.hasobject:
                 return _read_pickle(file.read(), required, optional)
-            file.seek(0)
             return {required[0]: _read_array(file, size)}
         if start[:1] == pickle.PROTO or path.suffix.lower() in PICKLES:
             return _read_pickle(file.read(), required, optional)
@@ -75,15 +75,12 @@ def _read_archive(
     archive: zipfile.ZipFile, size: int, required: Sequence[str], optional: Collection[str]
 ) -> dict[str, np.ndarray]:
     members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
-    names = _wanted(members, required, optional)
-    needed, arrays = 0, {}
+    names, needed, arrays = _wanted(members, required, optional), 0, {}
     for name in names:  # the sizes of all, before any is unpacked
-        info = members[name]
-        usual = info.compress_type in PACKINGS
-        usual = usual and info.file_size <= MOST_DEFLATE_SAVES * info.compress_size
-        require(usual, f"it is damaged: {info.filename!r} can't be unpacked")
-        with archive.open(info) as file:
-            shape, dtype = _read_header(file, info.file_size)
+        usual = members[name].compress_type in PACKINGS
+        require(usual, f"{name!r} is packed in a way that NumPy doesn't")
+        with archive.open(members[name]) as file:
+            shape, dtype, _ = _header_of(file.read(MOST_HEADER_BYTES))
         needed += math.prod(shape) * (dtype.itemsize + CONVERTED_BYTES)
     require_file_memory(needed, size, f"the arrays {', '.join(names)}")
     for name in names:
@@ -95,26 +92,22 @@ def _read_archive(
 
 def _read_array(file: IO[bytes], size: int) -> np.ndarray:
     """Read the array in a stream; header and data must have ``size`` bytes together."""
-    shape, dtype = _read_header(file, size)
+    shape, dtype, start = _header_of(file.read(MOST_HEADER_BYTES))
     said = "it holds Python objects as a pickle, which could run code, and isn't opened"
     require(not dtype.hasobject, said)
-    whole = min(shape, default=0) >= 0
-    whole = whole and file.tell() + math.prod(shape) * dtype.itemsize == size
+    whole = min(shape, default=0) >= 0 and start + math.prod(shape) * dtype.itemsize == size
     require(whole, f"it is damaged: an array {shape} of {dtype} doesn't fill it")
     file.seek(0)
     return npy.read_array(file, allow_pickle=False)
 
 
-def _read_header(file: IO[bytes], size: int) -> tuple[tuple[int, ...], np.dtype]:
-    version = npy.read_magic(file)
-    length_bytes = 2 if version == (1, 0) else 4
-    length = int.from_bytes(file.read(length_bytes), "little")
-    require(length <= size, "the header is longer than the file")
-    file.seek(-length_bytes, os.SEEK_CUR)
+def _header_of(start: bytes) -> tuple[tuple[int, ...], np.dtype, int]:
+    """Return shape, type and the place of the numbers from the start of an NPY."""
+    file = io.BytesIO(start)
     # version 3 differs from 2 only in Unicode names of fields, which plain arrays don't have
-    read = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
-    shape, _, dtype = read(file)
-    return shape, dtype
+    first = npy.read_magic(file) == (1, 0)
+    shape, _, dtype = (npy.read_array_header_1_0 if first else npy.read_array_header_2_0)(file)
+    return shape, dtype, file.tell()
 
 
 # ---- pickles -------------------------------------------------------------------------------------

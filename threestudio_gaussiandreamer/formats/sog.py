@@ -31,7 +31,6 @@ JSON and images are checked before they are unpacked. Members are read into memo
 import io
 import json
 import os
-import struct
 import zipfile
 from collections.abc import Sequence
 from contextlib import closing
@@ -252,7 +251,7 @@ class _Archive:
         counted = {"count": shape[0]} if isinstance(shape, list) and shape else self.meta
         self.count, self.bands = self._number(counted, "count"), 0
         if self.meta.get("shN") is not None and self.version == 1:
-            width = _image_size(self._image("shN", 0))[0]
+            width = self._pixels("shN", 0).shape[1]
             self.bands = [PALETTE_COLUMNS * (k - 1) for k in COEFFICIENTS].index(width or -1)
         elif self.meta.get("shN") is not None:
             self.bands = self._number(self.meta["shN"], "bands")
@@ -312,20 +311,16 @@ class _Archive:
         require(fits, f"the palette of {count} entries can't have {width} x {height} pixels")
         return pixels[..., :3].reshape(-1, coefficients, 3)[:count]
 
-    def _image(self, section: str, index: int) -> bytes:
-        return self._member(self.meta[section]["files"][index], self.size)
-
     def _pixels(self, section: str, index: int) -> Integer[np.ndarray, "H W 4"]:
         from PIL import Image
 
-        data = self._image(section, index)
-        width, height = _image_size(data)
-        require_file_memory(
-            BYTES_PER_PIXEL * width * height, self.size, f"{width} x {height} pixels"
-        )
+        data = self._member(self.meta[section]["files"][index], self.size)
+        lossy = data[12:16] == b"VP8 "
+        require(not lossy, "one of its images isn't a lossless WebP image, so its numbers are lost")
         with Image.open(io.BytesIO(data), formats=["WEBP", "PNG"]) as image:
-            same = image.size == (width, height)
-            require(same, f"an image of {section} is of another size than its header says")
+            width, height = image.size
+            size = f"{width} x {height} pixels"
+            require_file_memory(BYTES_PER_PIXEL * width * height, self.size, size)
             return np.asarray(image.convert("RGBA"))
 
     def _member(self, name: str, most: int) -> bytes:
@@ -339,21 +334,6 @@ class _Archive:
         usual = info.compress_type in PACKINGS and info.file_size <= most
         require(usual, f"{name[:40]!r} has more than {most} bytes, or is packed in another way")
         return self._zip.read(info)  # compares the checksum too
-
-
-def _image_size(data: bytes) -> tuple[int, int]:
-    """Return width and height in the header of a PNG, or of a lossless WebP."""
-    if data[:4] == b"\x89PNG":
-        return struct.unpack_from(">II", data, 16)
-    usual = data[:4] == b"RIFF" and data[8:12] == b"WEBP"
-    require(usual, "one of its images isn't a WebP or PNG image")
-    if data[12:16] == b"VP8X":
-        width, height = (int.from_bytes(data[at : at + 3], "little") + 1 for at in (24, 27))
-        return width, height
-    lossless = data[12:16] == b"VP8L"
-    require(lossless, "one of its images isn't a lossless WebP image, so its numbers are lost")
-    bits = int.from_bytes(data[21:25], "little")
-    return (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
 
 
 # ---- codebooks -----------------------------------------------------------------------------------

@@ -25,7 +25,6 @@ from ..core.images import write_animation
 from ..exporters.files import (
     RESERVED,
     BundleExporter,
-    Drawing,
     FileExporter,
     outputs_of,
     read_gaussians,
@@ -137,7 +136,7 @@ def writers(
     exporter = find(system.cfg.exporter_type)(system.cfg.exporter, **parts)
     if isinstance(exporter, (FileExporter, BundleExporter)):
         drawn = settings_of(system)
-        exporter.drawing = Drawing(drawn.eps2d, drawn.antialias)
+        exporter.drawing = {"eps2d": drawn.eps2d, "antialias": drawn.antialias}
     single = {system.cfg.exporter_type: lambda: outputs_of(exporter)}
     formats = exporter.by_format() if isinstance(exporter, BundleExporter) else single
     written: set[str] = set()
