@@ -2,7 +2,7 @@
 
 PlayCanvas' splat-transform and Babylon.js (npm: @playcanvas/splat-transform, @babylonjs/core and
 @babylonjs/loaders in the folder node_modules that the environment variable VIEWER_NODE_MODULES
-names), and from PyPI gaussforge and pygltflib; each is skipped where it isn't installed. OpenUSD's
+names), and from PyPI gaussforge; each is skipped where it isn't installed. OpenUSD's
 parser reads USDA in ``test_usda.py``.
 """
 
@@ -120,30 +120,3 @@ def test_gaussforge_reads_what_we_write(tmp_path, name, degree):
     found = gaussforge.GaussForge().read(path.read_bytes(), suffix_of(name)[1:])
     theirs, ours = from_gaussforge(found["data"]), read_cloud(str(path)).gaussians
     assert_close(in_order_of(ours, theirs), theirs, opacities=2e-3, sh=0.02)
-
-
-# ---- parsers of the containers -------------------------------------------------------------------
-
-
-def test_pygltflib_reads_what_we_write(tmp_path):
-    pygltflib = pytest.importorskip("pygltflib", reason="pygltflib isn't installed")
-    cloud = ball(300, 1)
-    write_cloud(str(tmp_path / "a.glb"), StoredCloud(cloud, "y"))
-    document = pygltflib.GLTF2().load(str(tmp_path / "a.glb"))
-    (primitive,) = document.meshes[0].primitives
-    attributes = vars(primitive.attributes)
-
-    def rows(name, width):
-        accessor = document.accessors[attributes[name]]
-        view = document.bufferViews[accessor.bufferView]
-        data = document.binary_blob()[view.byteOffset : view.byteOffset + view.byteLength]
-        return np.frombuffer(data, "<f4").reshape(-1, width)
-
-    assert primitive.mode == 0 and "KHR_gaussian_splatting" in primitive.extensions
-    np.testing.assert_array_equal(rows("POSITION", 3), cloud.means)
-    np.testing.assert_allclose(rows("KHR_gaussian_splatting:SCALE", 3), np.exp(cloud.log_scales))
-    found = rows("KHR_gaussian_splatting:SH_DEGREE_1_COEF_2", 3)
-    np.testing.assert_array_equal(found, cloud.sh[:, 3])
-    xyzw = rows("KHR_gaussian_splatting:ROTATION", 4)
-    expected = cloud.quats / np.linalg.norm(cloud.quats, axis=1, keepdims=True)
-    np.testing.assert_allclose(xyzw[:, [3, 0, 1, 2]], expected, atol=1e-6)

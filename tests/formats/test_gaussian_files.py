@@ -7,7 +7,7 @@ import tracemalloc
 import numpy as np
 import pytest
 
-from tests.helpers.object_clouds import ball
+from tests.helpers.object_clouds import assert_close, ball, in_order_of
 from tests.helpers.ply_files import gaussians, write_raw_gaussians
 from threestudio_gaussiandreamer import register_parts
 from threestudio_gaussiandreamer.core.errors import UserError
@@ -118,13 +118,32 @@ def test_the_comments_of_brush_and_postshot_about_antialiasing_are_read(
     assert read_cloud(str(tmp_path / "a.ply")).antialiased is antialiased
 
 
+STEPS = {
+    ".ply": {},
+    ".compressed.ply": {"means": 2e-3, "log_scales": 1e-3, "opacities": 3e-3, "sh": 0.016},
+    ".spz": {"means": 1e-3, "log_scales": 0.04, "opacities": 5e-3, "sh": 0.08},
+    ".sog": {"means": 2e-5, "log_scales": 0.01, "opacities": 3e-3, "sh": 0.02, "quats": 1e-4},
+    ".glb": dict.fromkeys(("means", "sh"), 0) | {"log_scales": 1e-6, "opacities": 1e-6},
+    ".usda": dict.fromkeys(("means", "sh"), 0) | {"log_scales": 1e-6, "opacities": 1e-6},
+}
+"""Rounding of each format; those of a variant are its format's."""
+
+
+@pytest.mark.parametrize(("count", "degree"), [(1, 0), (600, 1), (256, 2), (600, 3)])
 @pytest.mark.parametrize("suffix", WRITTEN)
-def test_every_format_that_is_read_starts_a_run(tmp_path, suffix):
-    write_cloud(str(tmp_path / f"a{suffix}"), StoredCloud(cloud(degree=1)))
-    found = find("gaussians-prior")({"path": str(tmp_path / f"a{suffix}")}).gaussians("")
-    means = cloud(degree=1).means
-    nearest = [np.abs(means - mean).sum(axis=1).min() for mean in found.means]
-    assert len(nearest) == 60 and max(nearest) < 0.02
+def test_what_is_read_is_close_to_what_was_written(tmp_path, suffix, count, degree):
+    steps = STEPS.get(suffix) or STEPS.get(suffix[:4] if suffix != ".usdz" else ".usda", {})
+    path, values = str(tmp_path / f"a{suffix}"), ball(count, degree)
+    values.logit_opacities[:3] = [80, -80, 0][:count]
+    write_cloud(path, StoredCloud(values, FORMATS[suffix].up, 40.0, True))
+    read = read_cloud(path)
+    assert (read.up, read.pruned_to, read.antialiased) == (FORMATS[suffix].up, 40, True)
+    assert all(np.isfinite(each).all() and each.dtype == np.float32 for each in read.gaussians)
+    assert_close(in_order_of(values, read.gaussians), read.gaussians, **steps)
+    found = find("gaussians-prior")({"path": path}).gaussians("")
+    assert len(found.means) == count
+    write_cloud(path, StoredCloud(ball(0, degree)))
+    assert FORMATS[suffix].read(tmp_path / f"a{suffix}")[0].means.shape == (0, 3)
 
 
 def test_extensions_are_found_whatever_their_case():

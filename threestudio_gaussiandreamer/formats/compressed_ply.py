@@ -1,16 +1,9 @@
 """Compressed PLY, PlayCanvas' chunked layout: 16.3 bytes for a Gaussian of degree 0, and one byte
-for each further coefficient. Binary little-endian elements, in this order:
+for each further coefficient; described in PlayCanvas' manual, "The Compressed PLY Format".
 
-==========  ========================================================================================
-chunk       18 float32 for 256 Gaussians each: minimum and maximum of positions, logarithms of
-            scales and colours (0.5 + C0 sh); files without the limits of colours are read too
-vertex      4 u32: position and logarithm of the scale as 11, 10, 11 bits between the chunk's
-            limits; quaternion wxyz as the index of its largest component and 10 bits for each
-            other one, (q / sqrt(2) + 0.5); colour between the limits and opacity as 8 bits each
-sh          f_rest as bytes; absent at degree 0: 256 (f_rest / 8 + 0.5)
-==========  ========================================================================================
-
-Described in PlayCanvas' manual, "The Compressed PLY Format"; axes as those of a PLY."""
+Elements, binary little-endian: ``chunk``, minima and maxima of 256 Gaussians' positions, logarithms
+of scales and, but in files of the first version, colours; ``vertex``, four u32 a Gaussian; and
+``sh`` with f_rest as bytes, absent at degree 0. Axes as those of a PLY."""
 
 import os
 from collections.abc import Sequence

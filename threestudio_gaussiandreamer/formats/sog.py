@@ -1,32 +1,17 @@
 """SOG (Spatially Ordered Gaussians), PlayCanvas' format for the web: lossless WebP images
-in a zip archive, about 15 bytes for a Gaussian of degree 0.
+in a zip archive, about 15 bytes for a Gaussian of degree 0 (developer.playcanvas.com, "The SOG
+Format").
 
-Gaussians are sorted along a Morton curve. Gaussian i is pixel i of each image but the palette's.
-The images, with the entries of ``meta.json`` that they use:
-
-=================  =================================================================================
-means_l, means_u   low and high byte of positions: 65535 steps between ``mins`` and ``maxs`` of
-                   sign(x) log(1 + abs(x))
-quats              wxyz without its largest component: 255 (q / sqrt(2) + 0.5); alpha is 252 + the
-                   index of that component
-scales             index into ``scales.codebook`` of the logarithm of each axis' scale
-sh0                indices into ``sh0.codebook`` of the constant harmonics; alpha is 255 opacity
-shN_labels         number of an entry of the palette, low byte and high byte
-shN_centroids      the palette, 64 entries a row, a pixel for each coefficient: indices into
-                   ``shN.codebook``
-=================  =================================================================================
-
-``model`` is "antialiased" where the Gaussians were trained with antialiasing. The axes are those of
-the PLY, as splat-transform writes and reads them (-y up), though the specification says y up
-(developer.playcanvas.com, "The SOG Format").
+Gaussian i, along a Morton curve, is pixel i of each image but the palette's. ``model`` is
+"antialiased" where the Gaussians were trained with antialiasing. The axes are those of the PLY, as
+splat-transform writes and reads them (-y up), though the specification says y up.
 
 Version 2 is written. Also read is version 1, which has no codebooks: the bytes of scales, sh0 and
 shN are steps between ``mins`` and ``maxs``, those of sh0's alpha of the logit of the opacity; and
 files without an archive, by their ``meta.json``.
 
-JSON and images are checked before they are unpacked. Members are read into memory by the names in
-``meta.json``; nothing is written to the disk, and the images of a folder lie beside its
-``meta.json``, so names can't lead anywhere. Codebooks are by Lloyd's algorithm (k-means)."""
+JSON and images are checked before they are unpacked. Nothing is written to the disk, and the images
+of a folder lie beside its ``meta.json``, so names can't lead anywhere."""
 
 import io
 import json

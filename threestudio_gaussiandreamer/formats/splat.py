@@ -1,15 +1,15 @@
 """``.splat`` and ``.ksplat``: read only, since they have less precision than what is written here.
+Axes of both are those of 3D Gaussian splatting's PLY, -y up.
 
-``.splat``, antimatter15's format, is headerless records of 32 bytes without harmonics: position and
-scale (3 float32 each, the scale linear), colour and opacity (4 bytes) and the quaternion wxyz (4
-bytes, 128 + 128 q). Axes of both are those of 3D Gaussian splatting's PLY, -y up.
+``.splat``, antimatter15's format, is headerless records without harmonics, with linear scales and
+quaternions wxyz as 128 + 128 q.
 
 ``.ksplat``, of mkkellogg's GaussianSplats3D, levels 0 to 2: a header of 4096 bytes, a header of
 1024 bytes for each section, then the sections: the counts of their partly filled buckets, the
-centres of all buckets, and a record for each Gaussian: position, scale (linear), quaternion wxyz,
-colour and opacity (a byte each) and the harmonics above the constant one, band by band, and in a
-band channel by channel. Numbers are float32 at level 0. At levels 1 and 2 they are float16,
-positions are steps from the centre of the Gaussian's bucket, and at level 2 harmonics are bytes."""
+centres of all buckets, and a record for each Gaussian, with linear scales, wxyz, and the harmonics
+above the constant one band by band, and in a band channel by channel. At levels 1 and 2 numbers are
+float16, positions are steps from the centre of the Gaussian's bucket, and at level 2 harmonics are
+bytes."""
 
 import os
 

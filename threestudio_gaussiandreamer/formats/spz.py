@@ -2,31 +2,14 @@
 0, where a PLY takes 68.
 
 The format is Niantic's (github.com/nianticlabs/spz, MIT). Versions 3 and 4 are written, 1 to 4 are
-read: a header and one block for each attribute, packed by gzip or, in version 4, by Zstandard.
-Integers are little-endian, quaternions in the order xyzw, axes right, up,
-back unless a record says others (SPZ_ADOBE_coordinate_system), which are turned when read, and
-which version 4 can have when written:
-
-==========  ========================================================================================
-header      ``NGSP``, version u32, N u32, degree of the harmonics u8, fractional bits u8, flags u8
-            (1: antialiased), number of packed blocks u8 (version 4)
-positions   N x 3 fixed point of 24 bits, signed (version 1: float16)
-alphas      N u8: 255 opacity, written up to 254: Niantic's reader takes the logit of the byte over
-            255, which is infinite at 255
-colors      N x 3 u8: 255 (0.15 sh + 0.5)
-scales      N x 3 u8: 16 (log scale + 10), so sizes from e^-10 to e^5.9 world units
-rotations   N u32: the index of the largest component, and sign and 9 bits of each other (versions 1
-            and 2: x y z u8)
-harmonics   N x (K - 1) x 3 u8: 128 sh + 128, of which 5 bits are used at degree 1, 4 above
-==========  ========================================================================================
-
-The size in the header is checked against the file's size before anything is unpacked. The loss by
-rounding is measured in reports/answered.md.
+read: a header and one block for each attribute. Quaternions are xyzw. Axes are right, up, back
+unless a record says others (SPZ_ADOBE_coordinate_system), which are turned when read, and which
+version 4 can have when written.
 
 Versions 1 to 3 are one gzip member around header and blocks. Version 4 has a plain header of 32
 bytes, extensions, of which only the record of the axes is written, a table of the packed and
 unpacked size of each block (u64 each), and the blocks as Zstandard frames; a block without bytes is
-left out."""
+left out. The size in the header is checked against the file's before anything is unpacked."""
 
 import io
 import logging

@@ -1,14 +1,12 @@
 """Triangle meshes and points of glTF 2.0 files (``.glb``, ``.gltf``), in the scene's axes.
 
-Supported: the default scene with its transforms; triangles, strips, fans and points, with or
-without indices; all component types, normalised, strided and sparse; morph targets with their
-default weights; skins in the pose of their joints; base colours with factor, texture, sampler, any
-set of texture coordinates, KHR_texture_transform, and COLOR_0. Files are rejected if they have
-compressed geometry (Draco, meshopt), instances by EXT_mesh_gpu_instancing, basisu or DDS textures,
-or require any other unknown extension. Lines, lights, normals and animations are ignored.
-
-Accessors, scenes and materials are decoded here, since trimesh ignores or misreads most of these
-features, and pygltflib only parses the JSON.
+Supported: the default scene with its transforms; triangles, strips, fans and points; all component
+types, normalised, strided and sparse; morph targets with their default weights; skins in the pose
+of their joints; base colours with factor, texture, sampler, any set of texture coordinates,
+KHR_texture_transform, and COLOR_0. Files are rejected if they have compressed geometry (Draco,
+meshopt), instances by EXT_mesh_gpu_instancing, basisu or DDS textures, or require any other unknown
+extension. Lines, lights, normals and animations are ignored. trimesh ignores or misreads most of
+these features.
 
 What reads a document runs inside :func:`~threestudio_gaussiandreamer.formats.reading.reading`,
 which makes one message of all that a damaged file raises."""
