@@ -14,21 +14,18 @@ options         (gaussiandreamer) options of single formats, such as ``{ply: {pa
 save_video      (all) also render the turntable
 save_name       name of the file in the export folder; a mesh's OBJ, MTL and PNG have its stem
 up              (ply, surface, mesh, and gaussiandreamer for these) the file's up axis: ``-y`` for
-                viewers of PLY, ``y`` (the front faces +z) for programs that read OBJ, or ``z`` for
-                this package's world and T3Bench; a GLB has y up by definition
+                viewers of PLY, ``y`` for readers of OBJ, or ``z`` for this package and T3Bench
 pad_sh_degree   (ply) append zero harmonics up to this degree, for importers that require degree 3
-version         (spz) 3, which all readers know, or 4, which is 4 to 9 % smaller and needs
-                zstandard
+version         (spz) 3, which all readers know, or 4, smaller by 4 to 9 %, which needs zstandard
 min_opacity     (points) skip Gaussians with a lower opacity; 0 keeps all. The order is preserved
 resolution      (surface, mesh) cells along the longest side of the object
-level           (surface) isovalue, as a fraction of the median of the summed opacity at the centres
-                of the Gaussians; lower values make the object thicker
+level           (surface) isovalue, a fraction of the median of the summed opacity at the Gaussians'
+                centres; lower values make the object thicker
 obj             (mesh) also write the OBJ with its MTL and PNG
 unlit           (mesh) ask viewers to show the texture without lighting
 faces, ...      (mesh) the options of ``surface/textured.py``
 ==============  ===================================================================================
-
-A surface can't represent hair, smoke and glass as Gaussians do."""
+"""
 
 import functools
 import os

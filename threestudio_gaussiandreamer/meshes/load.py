@@ -1,20 +1,17 @@
 """Load triangle meshes in the world's pose: z up, front = +x, box centred at the origin, half the
 longest side of the box = ``scale``.
 
-The mesh prior (points on the surface) and the ray caster (target images) both get colours from
-:func:`~threestudio_gaussiandreamer.meshes.mesh.surface_colors`. They are unlit: texture times
-vertex colour, else vertex, face or material colour, else grey 0.5. All values are display values
-(sRGB) in [0, 1]; a texture's alpha channel is ignored.
+Colours are unlit: texture times vertex colour, else vertex, face or material colour, else grey 0.5;
+all are display values (sRGB) in [0, 1]. A texture's alpha channel is ignored.
 
 ``up="auto"`` is +y for glTF, OBJ and other modelling formats and +z for PLY, STL and OFF. The front
 is the axis after the up axis (x -> y -> z -> x), which is +z for y-up files, as glTF says, and +x
 for z-up ones.
 
 glTF is read by ``gltf.py``, PLY here, and other formats (OBJ, STL, OFF, ...) by trimesh, after a
-check of what it would ignore silently or read wrongly. A PLY has polygons of any and of mixed
-numbers of corners, colours of vertices or faces, and texture coordinates of vertices (Blender) or
-of the corners of faces (MeshLab). There is no standard for its textures: their names are in
-comments ``TextureFile``, which Blender doesn't write."""
+check of what it would ignore silently or read wrongly. A PLY has texture coordinates of vertices
+(Blender) or of the corners of faces (MeshLab); the names of its textures are in comments
+``TextureFile``, which Blender doesn't write."""
 
 import io
 import logging

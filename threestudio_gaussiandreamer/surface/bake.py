@@ -1,15 +1,13 @@
 """Texture coordinates of a mesh, and the texture that is baked from renders.
 
-Coordinates are charts by xatlas, or a grid of triangles where there are many: xatlas takes time
-that grows faster than the number of faces, 1 s for 5,000 of them, 23 s for 20,000. In the grid two
-triangles share a square cell, each a right-angled half, with a gap that keeps their texels apart
-when colours are interpolated. Faces that are near each other in space are near each other in it.
+Coordinates are charts by xatlas, or a grid of triangles where there are many: xatlas takes 1 s for
+5,000 faces, 23 s for 20,000. In the grid two triangles share a square cell, each a right-angled
+half, with a gap that keeps their texels apart when colours are interpolated.
 
-Rays through the pixels' centres find the faces that are visible in each render, so hidden faces get
-no colour from it. A pixel is added to the four texels around its uv coordinates, with weights
-proportional to the squares of its opacity and of the cosine between the surface's normal and the
-ray. Faces that no render shows take the colour of the nearest face that is shown; texels outside of
-all faces take the mean of their surroundings."""
+A pixel is added to the four texels around its uv coordinates, with weights proportional to the
+squares of its opacity and of the cosine between the surface's normal and the ray. Faces that no
+render shows take the colour of the nearest face that is shown; texels outside of all faces take the
+mean of their surroundings."""
 
 import math
 import os

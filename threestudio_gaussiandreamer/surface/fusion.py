@@ -1,16 +1,13 @@
 """Render Gaussians from all sides, and fuse their depths to a signed distance on a grid (Curless
 and Levoy 1996).
 
-A render gives each pixel the mean and the standard deviation of the depths of its Gaussians,
-weighted by their blending weights. The surface that a pixel shows is assumed to lie one standard
-deviation in front of the mean, since Gaussians behind the surface contribute to the mean too. Each
-view adds to a grid point the distance to that surface along the optical axis, truncated to ``BAND``
-cells, weighted by the inverse variance of the depth. A view adds nothing to points that lie farther
-behind its surface than ``HIDDEN`` bands.
+The surface that a pixel shows is assumed to lie one standard deviation in front of the mean depth,
+since Gaussians behind the surface contribute to the mean too. Each view adds to a grid point the
+distance to that surface along the optical axis, truncated to ``BAND`` cells, weighted by the
+inverse variance of the depth, but nothing to points farther behind it than ``HIDDEN`` bands.
 
-A point that any view sees in front of mostly background is outside, whatever the depths say, so the
-mesh has the outlines of the renders. Points that no view sees are inside, so the surface has no
-holes."""
+A point that any view sees in front of mostly background is outside, so the mesh has the outlines of
+the renders. Points that no view sees are inside, so the surface has no holes."""
 
 import math
 from typing import NamedTuple, Optional

@@ -24,7 +24,7 @@ from ..core.errors import UserError
 from ..core.extras import require_extra
 from ..core.logs import warn
 from ..core.memory import require_memory
-from ..core.options import Rule, at_least, check_options, in_range, is_whole, one_of, satisfies
+from ..core.options import at_least, check_options, in_range, one_of
 from ..gaussians.gaussians import Gaussians, finite, opaque
 from ..gaussians.surface import MIN_OPACITY, gaussian_surface
 from ..gaussians.views import EPS2D, views_around
@@ -45,21 +45,16 @@ DISTANCE = 1.2
 """
 
 
-def whole(low: int, high: int, unit: str) -> Rule:
-    expected = f"a whole number from {low} to {high} ({unit})"
-    return satisfies(expected, lambda v: is_whole(v) and low <= v <= high)
-
-
 @dataclass
 class MeshOptions:
     """Size of the mesh and of its texture, and the renders of the cloud that both are made from."""
 
-    faces: int = field(default=5000, metadata=whole(100, 100_000, "triangles"))
-    texture: int = field(default=1024, metadata=whole(64, 8192, "texels each way"))
+    faces: int = field(default=5000, metadata=in_range(100, 100_000, "triangles"))
+    texture: int = field(default=1024, metadata=in_range(64, 8192, "texels each way"))
     method: str = field(default="fusion", metadata=one_of(METHODS))
-    resolution: int = field(default=144, metadata=whole(16, 256, "cells"))
-    views: int = field(default=64, metadata=whole(8, 1024, "renders"))
-    view_size: int = field(default=512, metadata=whole(64, 2048, "pixels each way"))
+    resolution: int = field(default=144, metadata=in_range(16, 256, "cells"))
+    views: int = field(default=64, metadata=in_range(8, 1024, "renders"))
+    view_size: int = field(default=512, metadata=in_range(64, 2048, "pixels each way"))
     min_component: float = field(default=0.01, metadata=in_range(0, 0.5))
     eps2d: Optional[float] = field(default=None, metadata=at_least(0, "square pixels"))
     antialias: Optional[bool] = None
