@@ -146,12 +146,3 @@ def test_a_missing_library_is_named_with_its_extra(library, monkeypatch):
     monkeypatch.setattr(textured, "finite", None)
     with pytest.raises(UserError, match=rf"needs {library} .*threestudio-gaussiandreamer\[mesh\]"):
         mesh_from_gaussians(painted_ball(20))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("faces", [5000, 20000])
-def test_the_whole_conversion_at_its_defaults(faces):
-    gaussians = painted_ball(5000)
-    mesh = mesh_from_gaussians(gaussians, MeshOptions(faces=faces))
-    assert closed(mesh) and faces * 0.9 < len(mesh.faces) <= faces
-    assert psnr_to_cloud(mesh, gaussians, 256) > 25
