@@ -120,7 +120,7 @@ def test_the_comments_of_brush_and_postshot_about_antialiasing_are_read(
 
 STEPS = {
     ".ply": {},
-    ".compressed.ply": {"means": 2e-3, "log_scales": 1e-3, "opacities": 3e-3, "sh": 0.016},
+    ".compressed.ply": {"means": 2e-3, "log_scales": 1e-3, "opacities": 5e-3, "sh": 0.016},
     ".spz": {"means": 1e-3, "log_scales": 0.04, "opacities": 5e-3, "sh": 0.08},
     ".sog": {"means": 2e-5, "log_scales": 0.01, "opacities": 3e-3, "sh": 0.02, "quats": 1e-4},
     ".glb": dict.fromkeys(("means", "sh"), 0) | {"log_scales": 1e-6, "opacities": 1e-6},

@@ -166,7 +166,7 @@ def test_the_cache_returns_the_pictures_and_casts_each_once(monkeypatch):
     assert first.dtype == torch.uint8 and len(cache._pictures) == 2
     expected = caster.render(c2w[1].numpy(), float(fovy[1]), 10, 12, 2)
     np.testing.assert_allclose(first[1] / 255.0, expected, atol=0.5 / 255 + 1e-6)
-    monkeypatch.setattr(caster, "render", lambda *args, **kwargs: pytest.fail("cast again"))
+    monkeypatch.setattr(caster, "render_views", lambda *args, **kwargs: pytest.fail("cast again"))
     assert torch.equal(cache(c2w, fovy, 10, 12), first)
 
 

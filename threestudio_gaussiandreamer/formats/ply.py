@@ -119,7 +119,10 @@ class PlyTable:
             found[element.name], at = read_rows(data, at, element, header.encoding)
             if wanted <= found.keys() and header.encoding != "ascii":
                 break
-        if element is header.elements[-1] and data[at : at + 4096].strip():
+        more = element is header.elements[-1] and data[at : at + 4096].strip()
+        shifted = header.encoding == "ascii" and any(entry.has_lists for entry in header.elements)
+        require(not more or not shifted, "it has more numbers than its header announces")
+        if more:
             said = "PLY file %r: more data follows than the %d rows of %r that it announces"
             logger.warning(said, str(path), element.count, element.name)
         self.path, self.comments = path, header.comments

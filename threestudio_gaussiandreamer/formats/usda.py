@@ -201,10 +201,13 @@ def read_usda(path: str | os.PathLike) -> tuple[Gaussians, list[str]]:
         require(whole, f"expected one prim 'def {SCHEMA} \"name\"' and its '}}', got {prims[:3]}")
         axes = UP_AXIS.findall(metadata)
         require(set(axes) <= {b"Y", b"Z"}, f"only y or z up is read, and its upAxis is {axes}")
+        entries = ATTRIBUTE.findall(body)
         found = {
             name.decode(): (kind.decode(), value.rstrip().removesuffix(b" ("))
-            for kind, name, value in ATTRIBUTE.findall(body)
+            for kind, name, value in entries
         }
+        once = len(entries) == len(found)
+        require(once, "an attribute of the prim is given twice")
         require({"positions", "scales"} <= found.keys(), "the prim has no positions or no scales")
         moved = found.get("xformOpOrder", ("", b"[]"))[1] != b"[]"
         require(not moved, "the prim has a transform")

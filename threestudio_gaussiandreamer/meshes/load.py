@@ -57,10 +57,8 @@ END_OF_NAME = re.compile(r"(?<=\.mtl)[\"']?\s+", re.IGNORECASE)
 """Between the names of libraries on one line; names may have spaces."""
 MATERIAL = re.compile(rb"^[ \t]*newmtl[ \t]+(.*?)\s*$", re.MULTILINE)
 MATERIAL_USED = re.compile(rb"^[ \t]*usemtl\b", re.MULTILINE)
-LINE = re.compile(rb"^[ \t]*(v|vt|vn|f)[ \t]+", re.MULTILINE | re.IGNORECASE)
-ROWS_AND_FACES = re.compile(rb"^(v|vt|vn|f) (.*)$", re.MULTILINE)
-RELATIVE_FACE = re.compile(rb"^f .*-", re.MULTILINE)
-ZERO_CORNER = re.compile(rb"^f (?:.*[ /])?0+(?!\d).*", re.MULTILINE)
+OBJ_NUMBERS = {b"v": (3, 4, 6, 7), b"vt": (2, 3), b"vn": (3,)}
+"""Numbers on a line of an OBJ: 4 with a weight, 6 with a colour, 7 with alpha."""
 
 
 def load_mesh(
@@ -361,31 +359,37 @@ def _parts(path: Path, budget: Budget) -> list[Mesh]:
 
 
 def _plain_obj(data: bytes) -> bytes:
-    """Return an OBJ in which lines of vertices and faces begin as trimesh expects it, and whose
-    faces count from the first vertex, as trimesh reads relative numbers from the last one.
+    """Return an OBJ whose faces count from the first vertex, after checking how many numbers each
+    line has: trimesh reads relative numbers from the last vertex, ignores lines that it doesn't
+    know, and divides the numbers of all vertices into rows of the first one's width.
     """
-    text = data.replace(b"\\\r\n", b"").replace(b"\\\n", b"")
-    text = LINE.sub(lambda found: found[1].lower() + b" ", text)
-    wrong = ZERO_CORNER.search(text)
-    require(wrong is None, f"vertices are counted from 1: {wrong and wrong[0][:80]!r}")
-    if not RELATIVE_FACE.search(text):
-        return text
-    counts = {b"v": 0, b"vt": 0, b"vn": 0}
+    counts, lines, widths = dict.fromkeys(OBJ_NUMBERS, 0), [], set()
 
     def absolute(number: bytes, count: int) -> bytes:
-        if not number.startswith(b"-"):
-            return number
-        require(int(number) >= -count, f"a face names number {int(number)} of {count} vertices")
-        return b"%d" % (count + 1 + int(number))
+        if number and int(number) <= 0:
+            known = -count <= int(number) < 0
+            require(known, f"a face names number {int(number)} of {count} vertices")
+            return b"%d" % (count + 1 + int(number))
+        return number
 
-    def line(found: re.Match[bytes]) -> bytes:
-        if found[1] in counts:
-            counts[found[1]] += 1
-            return found[0]
-        corners = (zip(x.split(b"/"), counts.values(), strict=False) for x in found[2].split())
-        return b"f " + b" ".join(b"/".join(absolute(*x) for x in corner) for corner in corners)
-
-    return ROWS_AND_FACES.sub(line, text)
+    text = data.replace(b"\\\r\n", b"").replace(b"\\\n", b"")
+    for place, line in enumerate(text.split(b"\n"), 1):
+        kind, *words = line.split() or [b""]
+        kind = kind.lower()
+        if kind[:1] in (b"v", b"f") and kind != b"vp":
+            usual = len(words) in OBJ_NUMBERS.get(kind, ()) or kind == b"f" and len(words) > 2
+            shown = repr(line[:80].decode(errors="replace"))
+            require(usual, f"line {place} is no vertex or face: {shown}")
+            if kind == b"f" and (b"-" in line or b"0" in line):
+                corners = (zip(x.split(b"/"), counts.values(), strict=False) for x in words)
+                words = [b"/".join(absolute(*x) for x in corner) for corner in corners]
+            elif kind in counts:
+                counts[kind] += 1
+                widths |= {len(words)} if kind == b"v" else set()
+            line = b" ".join([kind, *words])
+        lines.append(line)
+    require(len(widths) < 2 or widths == {3, 6}, "its vertices have different numbers of values")
+    return b"\n".join(lines)
 
 
 def _exact_stl(data: bytes) -> bytes:

@@ -61,10 +61,7 @@ class MeshCaster:
             fovy: vertical field of view in radians, in (0, pi).
             supersample: each pixel is the mean of a regular supersample x supersample grid.
         """
-        image = np.zeros((height, width, 4), dtype=np.float32)
-        for fill in self._bands(image, c2w, fovy, supersample):
-            fill()
-        return image
+        return self.render_views([(c2w, fovy)], height, width, supersample=supersample)[0]
 
     def render_views(
         self,

@@ -143,8 +143,5 @@ def _render(
 
 def opengl(views: Views) -> Float[np.ndarray, "V 4 4"]:
     """Return the camera-to-world matrices of the views."""
-    c2w = torch.zeros_like(views.viewmats)
-    flip = torch.tensor([1.0, -1.0, -1.0], device=c2w.device)
-    c2w[:, :3, :3] = views.viewmats[:, :3, :3].transpose(1, 2) * flip
-    c2w[:, :3, 3], c2w[:, 3, 3] = views.positions, 1
-    return c2w.double().cpu().numpy()
+    flip = np.array([1.0, -1, -1, 1])
+    return np.linalg.inv(views.viewmats.double().cpu().numpy()) * flip
