@@ -130,7 +130,6 @@ def test_a_part_as_thin_as_a_cell_stays(caplog):
         ({"texture": 0}, "--texture: expected a number from 64 to 8192"),
         ({"views": 1}, "--views: expected a number from 8"),
         ({"method": "fuson"}, "did you mean 'fusion'"),
-        ({"min_component": 2}, "--min-component: expected a number from 0 to 0.5"),
         ({"eps2d": -1}, "--eps2d: expected 0 or more"),
     ],
 )

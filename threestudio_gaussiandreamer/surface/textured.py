@@ -9,7 +9,6 @@ method         ``fusion`` of rendered depths, or a level set of the summed ``den
 resolution     cells along the longest side of the grid that the surface is extracted from
 views          number of renders, on a sphere around the cloud, for depths and colours
 view_size      width and height of a render, pixels
-min_component  connected parts with a smaller share of the surface's area than this are dropped
 eps2d          screen-space dilation of the renders, square pixels; null: the run's, or 0.3
 antialias      whether the renders are antialiased; null: as in the run, or not
 =============  ===================================================================================
@@ -34,6 +33,8 @@ from .closed import Faces, Vertices, simplified, without_small_parts
 from .fusion import DepthFusion, render
 
 METHODS = ("fusion", "density")
+MIN_COMPONENT = 0.01
+"""Connected parts with a smaller share of the surface's area than this are dropped."""
 VIEW_BYTES = 5
 """Memory per pixel of a view: colour and opacity, and one byte of work."""
 TEXEL_BYTES = 150
@@ -55,9 +56,10 @@ class MeshOptions:
     resolution: int = field(default=144, metadata=in_range(16, 256, "cells"))
     views: int = field(default=64, metadata=in_range(8, 1024, "renders"))
     view_size: int = field(default=512, metadata=in_range(64, 2048, "pixels each way"))
-    min_component: float = field(default=0.01, metadata=in_range(0, 0.5))
     eps2d: Optional[float] = field(default=None, metadata=at_least(0, "square pixels"))
     antialias: Optional[bool] = None
+
+    REMOVED = {"min_component": (MIN_COMPONENT, f"it is {MIN_COMPONENT}")}
 
     @staticmethod
     def check(cfg: "MeshOptions") -> None:
@@ -113,14 +115,17 @@ def mesh_from_gaussians(
     eps2d = EPS2D if options.eps2d is None else options.eps2d
     renders = render(cloud, views._replace(eps2d=eps2d, antialias=bool(options.antialias)), fusion)
     vertices, faces = _extracted(gaussians, fusion, options)
-    least = options.min_component
-    vertices, faces, specks = without_small_parts(vertices, faces, least)
+    vertices, faces, specks = without_small_parts(vertices, faces, MIN_COMPONENT)
     if not len(faces):
         raise _no_surface(gaussians)
     # simplification cuts through thin parts and opens cavities, so there are small ones again
-    vertices, faces, tips = without_small_parts(*simplified(vertices, faces, options.faces), least)
+    vertices, faces, tips = without_small_parts(
+        *simplified(vertices, faces, options.faces), MIN_COMPONENT
+    )
     if specks + tips:
-        warn(f"mesh: {specks + tips} loose parts below {least:.2%} of the area are left out")
+        warn(
+            f"mesh: {specks + tips} loose parts below {MIN_COMPONENT:.2%} of the area are left out"
+        )
     atlas = unwrap(vertices, faces, options.texture)
     mesh = Mesh(vertices[atlas.rows], atlas.faces, uv=atlas.uv)
     return mesh._replace(texture=bake(mesh, renders, options.texture))
