@@ -6,11 +6,6 @@ import json
 import os
 import pickle
 import signal
-import socket
-import subprocess
-import sys
-import time
-import urllib.request
 
 import pytest
 
@@ -58,39 +53,17 @@ def memory():
 @pytest.fixture(scope="module")
 def s3():
     """The URL of a bucket on a moto server."""
-    for package in ("s3fs", "moto.server"):
-        pytest.importorskip(package)
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    command = [sys.executable, "-m", "moto.server", "-p", str(port)]
-    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-    server = subprocess.Popen(command, **quiet)
-    endpoint = f"http://127.0.0.1:{port}"
+    s3fs = pytest.importorskip("s3fs")
+    server = pytest.importorskip("moto.server").ThreadedMotoServer("127.0.0.1", 0)
+    server.start()
+    keys = dict.fromkeys(("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"), "testing")
+    keys["AWS_ENDPOINT_URL"] = "http://{}:{}".format(*server.get_host_and_port())
     with pytest.MonkeyPatch.context() as patch:
-        for name, value in {
-            "AWS_ENDPOINT_URL": endpoint,
-            "AWS_ACCESS_KEY_ID": "testing",
-            "AWS_SECRET_ACCESS_KEY": "testing",
-            "AWS_DEFAULT_REGION": "us-east-1",
-        }.items():
+        for name, value in {**keys, "AWS_DEFAULT_REGION": "us-east-1"}.items():
             patch.setenv(name, value)
-        wait_for(endpoint)
-        import s3fs
-
         s3fs.S3FileSystem().mkdir("farms")
         yield "s3://farms/one"
-    server.kill()
-    server.wait()
-
-
-def wait_for(endpoint):
-    for _ in range(300):
-        try:
-            return urllib.request.urlopen(endpoint, timeout=1)
-        except OSError:
-            time.sleep(0.1)
-    raise RuntimeError("the S3 server doesn't start")
+    server.stop()
 
 
 LEFT_OUT = ("ckpts/epoch=0-step=5.ckpt", "ckpts/fetched.ckpt", "ckpts-2/last.ckpt", "ckpts-2/.a")
