@@ -63,7 +63,7 @@ def test_a_round_of_auto_says_what_more_would_gain_and_so_does_the_end():
     density.cloud.started_with.fill_(10)
     needed = after_step(density)
     cost = 10 * math.log10(1.025) / math.log2(10 / 8)
-    assert needed.gain == pytest.approx(0.5 * (cost / 0.12) ** 3) and len(density.cloud) == 10
+    assert needed.gain == pytest.approx(0.5 * (cost / 0.12) ** 2) and len(density.cloud) == 10
     assert str(needed) == "half as many would lose 1 dB or more"
     assert density.summary() == "10 of 10 Gaussians: a round would have lost too much"
     density.cloud.gain.fill_(0.25)

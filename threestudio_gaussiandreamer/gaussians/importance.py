@@ -30,9 +30,9 @@ from ..core.host_copies import to_device
 
 SAMPLES = 12
 """Approximate number of samples of the removal error per round; each costs a backward pass."""
-SLOPE, POWER = 0.12, 3
+SLOPE, POWER = 0.12, 2
 """What a round costs where twice as many Gaussians gain 0.5 dB, dB per doubling and before training
-recovers any of it; and the power of that cost with which the gain grows. Measured on eight objects
+recovers any of it; and the power of that cost with which the gain grows. Measured on ten objects
 (reports/how_many_gaussians.md).
 """
 IDLE = 0.01
