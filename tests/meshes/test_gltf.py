@@ -111,15 +111,9 @@ def test_samplers_wrap_as_they_say(code, u, expected, saved):
 
 def test_a_clamped_edge_isn_t_blended_with_the_other_one(saved):
     uv = np.tile(np.float32([0.0, 0.25]), (4, 1))
-    clamped, mirrored, repeated = (
-        color_at(
-            saved(textured_quad(FOUR, uv=uv, sampler={"wrapS": code, "wrapT": 33071})), 0.5, 0.5
-        )
-        for code in (33071, 33648, 10497)
-    )
-    np.testing.assert_allclose(clamped, RED / 255)
-    np.testing.assert_allclose(mirrored, RED / 255)
-    np.testing.assert_allclose(repeated, [0.5, 0.5, 0])
+    for code, expected in ((33071, RED / 255), (33648, RED / 255), (10497, [0.5, 0.5, 0])):
+        path = saved(textured_quad(FOUR, uv=uv, sampler={"wrapS": code, "wrapT": 33071}))
+        np.testing.assert_allclose(color_at(path, 0.5, 0.5), expected)
 
 
 def test_wrapping_survives_a_merge_and_a_picture_is_kept_once(tmp_path):

@@ -18,19 +18,12 @@ def test_texels_are_bilinear_and_repeat():
     """Values at texel centres are the texels', halfway between two their mean; outside [0, 1] the
     texture repeats.
     """
-    texture = np.array(IMAGE, dtype=np.uint8)
-    places = np.array([[0.25, 0.75], [0.5, 0.75], [0.75, 0.25], [1.25, -0.25], [0.0, 0.75]])
+    places = np.float32([[0.25, 0.75], [0.5, 0.75], [0.75, 0.25], [1.25, -0.25], [0.0, 0.75]])
+    uv, faces = np.repeat(places, 3, axis=0), np.arange(15).reshape(5, 3)
+    mesh = Mesh(np.zeros((15, 3)), faces, uv=uv, texture=np.array(IMAGE, np.uint8))
     expected = [[1, 0, 0], [0.5, 0.5, 0], [1, 1, 1], [1, 0, 0], [0.5, 0.5, 0]]
-    for place, color in zip(places, expected, strict=True):
-        mesh = Mesh(
-            np.zeros((3, 3)),
-            np.array([[0, 1, 2]]),
-            uv=np.repeat(place[None], 3, axis=0).astype(np.float32),
-            texture=texture,
-        )
-        np.testing.assert_allclose(
-            surface_colors(mesh, np.array([0]), np.full((1, 3), 1 / 3))[0], color, atol=1e-6
-        )
+    found = surface_colors(mesh, np.arange(5), np.full((5, 3), 1 / 3))
+    np.testing.assert_allclose(found, expected, atol=1e-6)
 
 
 def test_surface_distances_of_a_sphere(tmp_path):

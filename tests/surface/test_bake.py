@@ -127,18 +127,9 @@ def test_triangles_of_the_grid_share_no_texel():
     assert {0 <= x < size and 0 <= y < size for x, y in owners} == {True}
 
 
-def test_as_many_faces_fit_as_it_says():
-    size = 512
+def test_as_many_faces_fit_as_it_says_and_go_to_the_grid(size=512):
     count = faces_that_fit(size)
     assert count > XATLAS_FACES  # fewer are unwrapped to charts
-    faces = np.resize(BALL.faces, (count, 3))
-    uv = in_grid(BALL.vertices, faces, size).uv
-    assert uv.max() <= 1
-    legs = np.ptp(uv.reshape(count, 3, 2), axis=1) * size
-    assert legs.min() >= 2
-
-
-def test_many_faces_are_unwrapped_to_the_grid():
-    many = trimesh.creation.icosphere(subdivisions=4)
-    found = unwrap(many.vertices, many.faces, 512)
-    assert len(found.rows) == 3 * len(many.faces)  # every face for itself
+    found = unwrap(BALL.vertices, np.resize(BALL.faces, (count, 3)), size)
+    assert len(found.rows) == 3 * count and found.uv.max() <= 1  # every face for itself
+    assert np.ptp(found.uv.reshape(count, 3, 2), axis=1).min() * size >= 2
