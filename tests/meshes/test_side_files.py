@@ -122,6 +122,9 @@ def test_the_texture_of_an_obj_is_found(libraries, materials, tmp_path):
     [
         ("my toy/grün 1.png", "my toy/grün 1.png", "utf-8"),
         ("grün.png", "grün.png", "latin-1"),
+        ("木头.png", "木头.png", "gbk"),
+        ("текстура.png", "текстура.png", "cp1251"),
+        ("テクスチャ.png", "テクスチャ.png", "shift_jis"),
         ("gru\u0308n.png", "gr\u00fcn.png", "utf-8"),
         ("gr\u00fcn.png", "gru\u0308n.png", "utf-8"),
         ("my tex.png", '"my tex.png"', "utf-8"),

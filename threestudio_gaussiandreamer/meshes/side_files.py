@@ -33,6 +33,8 @@ BYTES_PER_TEXEL = 14
 BYTES_PER_VERTEX = 200
 BYTES_PER_FACE = 150
 """Peak memory while a part is decoded, merged, cleaned and transformed."""
+ENCODINGS = ("latin-1", "cp1252", "cp1250", "cp1251", "gb18030", "shift_jis", "cp949", "big5")
+"""Of names in files that aren't UTF-8."""
 FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "GIF", "TGA", "TIFF")
 consulted: dict[str, Optional[tuple[int, int]]] = {}
 """The ``stamp`` of every file that a mesh has named, by path; the prior's cache reads and clears
@@ -93,6 +95,14 @@ def _plain(name: str) -> str:
     return unicodedata.normalize("NFC", urllib.parse.unquote(name)).casefold()
 
 
+def _spellings(name: str) -> set[str]:
+    """Return how a mesh file may spell the name of a file, apart from case and accents' form."""
+    name = unicodedata.normalize("NFC", name)
+    raw = [name.encode(encoding, "backslashreplace") for encoding in ENCODINGS]
+    texts = (x.decode(y, "backslashreplace") for x in raw for y in ("latin-1", "utf-8"))
+    return {_plain(x) for x in (name, *texts)}
+
+
 class SideFiles:
     """Reads files whose names are relative to the mesh file."""
 
@@ -105,7 +115,7 @@ class SideFiles:
 
         Names are relative to the mesh's folder and may have the separators of Windows, quotes and
         escaped spaces. If there is no such file, one with the same base name next to the mesh is
-        read, else one whose name differs in case, accents' form or percent-encoding.
+        read, else one whose name differs in case, accents' form, percent-encoding or encoding.
 
         Raises:
             Unreadable: it is no regular file (a FIFO would block), or can't be read.
@@ -129,7 +139,7 @@ class SideFiles:
         for place in found:
             with contextlib.suppress(OSError, ValueError):
                 beside = sorted(place.parent.iterdir())
-                yield from (x for x in beside if _plain(place.name) == _plain(x.name))
+                yield from (x for x in beside if _plain(place.name) in _spellings(x.name))
 
     def _content(self, path: Path) -> bytes:
         consulted[str(path)] = stamp(path)
