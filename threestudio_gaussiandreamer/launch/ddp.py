@@ -69,19 +69,18 @@ def planned_processes(n_gpus: int, trainer: Mapping[str, Any]) -> Processes:
     Raises:
         UserError: the options contradict the launcher, or there are too few GPUs.
     """
-    devices, nodes = trainer.get("devices"), trainer.get("num_nodes")
-    for option, value in (("devices", devices), ("num_nodes", nodes)):
-        if value is not None and not (is_whole(value) and value > 0):
-            raise UserError(f"trainer.{option}: expected a whole number from 1 on, got {value!r}")
-    found = _started_processes() or Processes(devices or max(n_gpus, 1), nodes or 1)
-    for name, asked, there in (
-        ("devices", devices, found.devices),
-        ("num_nodes", nodes, found.nodes),
-    ):
-        if asked not in (None, there):
+    asked = {n: trainer[n] for n in ("devices", "num_nodes") if trainer.get(n) is not None}
+    for name, value in asked.items():
+        if not (is_whole(value) and value > 0):
+            raise UserError(f"trainer.{name}: expected a whole number from 1 on, got {value!r}")
+    wanted = Processes(asked.get("devices", max(n_gpus, 1)), asked.get("num_nodes", 1))
+    found = _started_processes() or wanted
+    for name, there in (("devices", found.devices), ("num_nodes", found.nodes)):
+        if asked.get(name, there) != there:
             raise UserError(
-                f"trainer.{name} is {asked}, but {found.started_by} has started {found.nodes} x "
-                f"{found.devices} processes (machines x processes): leave the option out"
+                f"trainer.{name} is {asked[name]}, but {found.started_by} has started "
+                f"{found.nodes} x {found.devices} processes (machines x processes): leave the "
+                "option out"
             )
     if n_gpus and found.devices > n_gpus:
         raise UserError(
