@@ -8,6 +8,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -39,6 +40,7 @@ class Stopped(BaseException):
         self.signum, self.step = signum, step
 
 
+@dataclass(eq=False)
 class RunRecord(pl.Callback):
     """Write ``configs/raw.yaml``, ``configs/parsed.yaml``, ``code/`` and ``cmd.txt`` when the first
     stage starts, before the prior. Files of an earlier run in the folder are replaced when there
@@ -46,19 +48,15 @@ class RunRecord(pl.Callback):
     with the first checkpoint, so that a start that fails leaves them in their place.
     """
 
-    def __init__(
-        self,
-        folder: Path,
-        cfg: Any,
-        sources: Sequence[tuple[Path, bytes]],
-        command: str,
-        records_code: bool,
-        at_zero: bool,
-    ) -> None:
-        self.folder, self.cfg, self.sources, self.command = folder, cfg, sources, command
-        self.records_code, self.at_zero = records_code, at_zero
-        self._files: dict[Path, bytes] = {}
-        self._is_due = self._is_read = False
+    folder: Path
+    cfg: Any
+    sources: Sequence[tuple[Path, bytes]]
+    command: str
+    records_code: bool
+    at_zero: bool
+    _files: dict[Path, bytes] = field(default_factory=dict)
+    _is_due: bool = False
+    _is_read: bool = False
 
     def setup(self, trainer: Any, pl_module: Any, stage: str) -> None:
         if not trainer.is_global_zero or self._is_read:
