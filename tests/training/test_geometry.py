@@ -131,24 +131,6 @@ def test_a_step_moves_means_in_the_unit_of_their_rate(sphere_points, unit):
     assert torch.allclose(geometry.means, before - 0.5 * wanted[..., 0], atol=1e-4, rtol=1e-4)
 
 
-def test_densification_happens_at_its_steps_only_and_the_optimiser_follows(sphere_points):
-    densify = {"enabled": True, "start": 4, "stop": 9, "every": 4, "grad_threshold": 1.0}
-    densify["min_opacity"] = 0.01
-    geometry = started(sphere_points, densify=densify)
-    optimizer = torch.optim.Adam(geometry.parameter_groups())
-    sizes = []
-    for step in range(1, 13):
-        DensityControl(geometry).after_backward(seen(geometry), 64, 64)
-        sum((p**2).sum() for p in geometry.parameters()).backward()
-        optimizer.step()
-        optimizer.zero_grad()
-        DensityControl(geometry).after_step(optimizer, step)
-        sizes.append(len(geometry))
-    assert sizes == [400] * 3 + [800] * 4 + [1600] * 5
-    assert optimizer.param_groups[0]["params"][0] is geometry.means
-    assert optimizer.state[geometry.means]["exp_avg"].shape == (1600, 3)
-
-
 @pytest.mark.parametrize("absgrad", [False, True])
 def test_the_rasteriser_collects_absolute_gradients_where_they_decide(sphere_points, absgrad):
     densify = {"enabled": True, "absgrad": absgrad}
