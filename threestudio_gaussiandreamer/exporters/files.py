@@ -193,44 +193,41 @@ def add(
     save_name: str,
     params: Params,
     save_type: str = "gaussians",
-    options: Sequence[tuple[str, Any, Any]] = (),
+    options: Sequence[tuple[str, Any, Any, Rule]] = (),
     check: Callable[[Any], None] = lambda cfg: None,
 ) -> None:
     """Register the exporter of a format.
 
     Args:
         save_name: default of the option.
-        options: name, type and field of options beside ``save_name`` and ``save_video``.
+        options: name, type, default and rule of those beside ``save_name`` and ``save_video``.
         check: raises UserError for options that can't be had.
     """
 
     def call(self: FileExporter) -> List[ExporterOutput]:
         return [ExporterOutput(self.cfg.save_name, save_type, params(self.gaussians(), self.cfg))]
 
-    given = [option("save_name", str, save_name, SAVE_NAME), *options]
+    given = [("save_name", str, save_name, SAVE_NAME), *options]
+    given = [(name, kind, field(default=x, metadata=rule)) for name, kind, x, rule in given]
     space = {"check": staticmethod(check), "__module__": __name__}
     config = make_dataclass("Config", given, bases=(FileExporter.Config,), namespace=space)
     title = name.title().replace("-", "") + "Exporter"
     register(name + SUFFIX)(type(title, (FileExporter,), {"__call__": call, "Config": config}))
 
 
-def option(name: str, kind: Any, default: Any, rule: Rule) -> tuple[str, Any, Any]:
-    return name, kind, field(default=default, metadata=rule)
-
-
-PADDING = option("pad_sh_degree", Optional[int], None, in_range(0, 3))
-CELLS = option("resolution", int, 128, in_range(8, 512, "cells"))
-LEVEL = option("level", float, 0.5, in_range(1e-6, 1))
-LEAST = option("min_opacity", float, 0.0, in_range(0, 1))
-WRITTEN = option("version", int, VERSION, in_range(*VERSIONS))
-add("ply", "gaussians.ply", ply, "ply", [option("up", str, VIEWER_UP, UP), PADDING])
+PADDING = ("pad_sh_degree", Optional[int], None, in_range(0, 3))
+CELLS = ("resolution", int, 128, in_range(8, 512, "cells"))
+LEVEL = ("level", float, 0.5, in_range(1e-6, 1))
+LEAST = ("min_opacity", float, 0.0, in_range(0, 1))
+WRITTEN = ("version", int, VERSION, in_range(*VERSIONS))
+add("ply", "gaussians.ply", ply, "ply", [("up", str, VIEWER_UP, UP), PADDING])
 add("spz", "gaussians.spz", spz, "spz", [WRITTEN], lambda cfg: require_version(cfg.version))
 add("compressed-ply", "gaussians.compressed.ply", stored(".compressed.ply"))
 add("sog", "gaussians.sog", stored(".sog"))
 add("glb", "gaussians.glb", stored(".glb", ".spz.glb"))
 add("usda", "gaussians.usda", stored(".usda", ".usdz"))
 add("points", "points.ply", points, "points", [LEAST])
-add("surface", "model.obj", surface, "surface", [option("up", str, "y", UP), CELLS, LEVEL])
+add("surface", "model.obj", surface, "surface", [("up", str, "y", UP), CELLS, LEVEL])
 
 
 @register("gaussiandreamer-mesh-exporter")
@@ -299,25 +296,17 @@ class BundleExporter(Exporter):
             case count as the same, as on some file systems).
             """
             if unused := [name for name in cfg.options if name not in cfg.formats]:
-                raise UserError(
-                    f"options.{unused[0]}: {unused[0]} isn't in formats "
-                    f"({', '.join(cfg.formats)}), so its options have no effect"
-                )
+                said = f"isn't in formats ({', '.join(cfg.formats)}), so its options have no effect"
+                raise UserError(f"options.{unused[0]}: {unused[0]} {said}")
             writers: dict[str, str] = {}
             for name in cfg.formats:
                 file = getattr(options_of(name, cfg), "save_name", f"{name}/")
                 if (other := writers.setdefault(file.casefold(), name)) != name:
-                    raise UserError(
-                        f"options.{name}.save_name: {file!r} is the file of the format {other}; "
-                        "choose another name"
-                    )
+                    said = f"{file!r} is the file of the format {other}; choose another name"
+                    raise UserError(f"options.{name}.save_name: {said}")
 
     cfg: Config
     drawing: Mapping[str, Any] = DRAWING
-
-    def configure(self, **parts: Any) -> None:
-        super().configure(**parts)
-        self.parts = parts
 
     def __call__(self) -> List[ExporterOutput]:
         return [output for outputs in self.by_format().values() for output in outputs()]
@@ -327,9 +316,10 @@ class BundleExporter(Exporter):
         fails leaves the others. The Gaussians are read once for all of them.
         """
         shared = functools.cache(lambda: read_gaussians(self.geometry))
+        parts = {name: getattr(self, name) for name in ("geometry", "material", "background")}
 
         def outputs(name: str) -> List[ExporterOutput]:
-            exporter = find(name + SUFFIX)(vars(options_of(name, self.cfg)), **self.parts)
+            exporter = find(name + SUFFIX)(vars(options_of(name, self.cfg)), **parts)
             if isinstance(exporter, FileExporter):
                 exporter.shared, exporter.drawing = shared(), self.drawing
             return outputs_of(exporter)
