@@ -36,6 +36,8 @@ BYTES_PER_FACE = 150
 ENCODINGS = ("latin-1", "cp1252", "cp1250", "cp1251", "gb18030", "shift_jis", "cp949", "big5")
 """Of names in files that aren't UTF-8."""
 FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "GIF", "TGA", "TIFF")
+ENCODINGS = ("latin-1", "cp1252", "cp1250", "cp1251", "gb18030", "shift_jis", "cp949", "big5")
+"""Of names in files that aren't UTF-8."""
 consulted: dict[str, Optional[tuple[int, int]]] = {}
 """The ``stamp`` of every file that a mesh has named, by path; the prior's cache reads and clears
 it."""
@@ -80,8 +82,8 @@ def stamp(path: str | Path) -> Optional[tuple[int, int]]:
 
 
 def utf8(text: bytes) -> bytes:
-    """Return a text in UTF-8, without a byte order mark; one that is neither UTF-8 nor UTF-16 is
-    read as Latin-1.
+    """Return a text in UTF-8, without a byte order mark; one in an encoding without a mark becomes
+    one character per byte, from which ``SideFiles`` finds the files that it names.
     """
     if text[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE):
         return text.decode("utf-16", "replace").encode()
