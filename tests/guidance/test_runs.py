@@ -58,17 +58,17 @@ def config(path, **system):
     return path
 
 
-def diffusion(model, family="stable-diffusion"):
+def diffusion(model):
     """Return the options that a user gives for the real weights."""
     return {
-        "prompt_processor_type": f"{family}-prompt-processor",
+        "prompt_processor_type": "stable-diffusion-prompt-processor",
         "prompt_processor": {
             "pretrained_model_name_or_path": "${system.guidance.pretrained_model_name_or_path}",
             "prompt": "a fox",
             "negative_prompt": "ugly",
             "use_perp_neg": True,
         },
-        "guidance_type": f"{family}-guidance",
+        "guidance_type": "stable-diffusion-guidance",
         "guidance": {
             "pretrained_model_name_or_path": str(model),
             "guidance_scale": 20.0,
