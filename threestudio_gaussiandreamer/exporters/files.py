@@ -69,9 +69,7 @@ RESERVED = ("pruned", "report.json", "report.png", "view.html", "poster.png")
 
 
 def require_file_name(option: str, name: str) -> None:
-    """Raise UserError unless ``name``, the value of ``option``, is a valid name of a file directly
-    in the export folder.
-    """
+    """Raise UserError unless ``name``, the value of ``option``, can be a file's in the folder."""
     folders = not name or name != os.path.basename(name) or name in (os.curdir, os.pardir)
     long = "\0" in name or len(name.encode(errors="surrogateescape")) > NAME_BYTES
     if folders or long or name.casefold() in RESERVED:
@@ -82,7 +80,6 @@ def require_file_name(option: str, name: str) -> None:
 
 SAVE_NAME = rule(require_file_name)
 UP = one_of(AXES)
-"""The rule for the option ``up``, the axis of the file that points up."""
 
 
 DRAWING = {"eps2d": EPS2D, "antialias": False}
@@ -109,9 +106,7 @@ class FileExporter(Exporter):
 
 
 def read_gaussians(geometry: Any) -> Gaussians:
-    """Read the Gaussians of a geometry as float32 arrays. Those with values that aren't finite are
-    skipped with a warning.
-    """
+    """Read a geometry's Gaussians as float32; those that aren't finite are left out, and logged."""
     found = finite(Gaussians.of(geometry).arrays(), "export")
     return found._replace(log_scales=found.log_scales.clip(*LOG_SCALE_RANGE))  # as they are drawn
 
@@ -291,9 +286,8 @@ class BundleExporter(Exporter):
 
         @staticmethod
         def check(cfg: "BundleExporter.Config") -> None:
-            """Raise UserError if options of a format are invalid, there are options of a format
-            that isn't in ``formats``, or two formats write the same file (names that differ only in
-            case count as the same, as on some file systems).
+            """Raise UserError for invalid options, options of a format that isn't in ``formats``,
+            and two formats that write the same file, as names are on systems without case.
             """
             if unused := [name for name in cfg.options if name not in cfg.formats]:
                 said = f"isn't in formats ({', '.join(cfg.formats)}), so its options have no effect"
@@ -312,8 +306,8 @@ class BundleExporter(Exporter):
         return [output for outputs in self.by_format().values() for output in outputs()]
 
     def by_format(self) -> Dict[str, Callable[[], List[ExporterOutput]]]:
-        """Return a function for each format that builds and calls its exporter, so that one that
-        fails leaves the others. The Gaussians are read once for all of them.
+        """Return a function for each format that calls its exporter, so that one that fails leaves
+        the others. The Gaussians are read once.
         """
         shared = functools.cache(lambda: read_gaussians(self.geometry))
         parts = {name: getattr(self, name) for name in ("geometry", "material", "background")}
@@ -328,9 +322,7 @@ class BundleExporter(Exporter):
 
 
 def options_of(name: str, cfg: Any) -> Any:
-    """Parse and check the options of one format, in which the bundle's ``up`` is the default of an
-    option of that name.
-    """
+    """Parse and check the options of one format; the bundle's ``up`` is the default of its own."""
     options, exporter = cfg.options.get(name, {}), find(name + SUFFIX)
     if not isinstance(options, Mapping):
         raise UserError(f"options.{name}: expected keys and values, got {options!r}")
