@@ -127,8 +127,7 @@ class Source(NamedTuple):
     """The option whose value ``name`` is, for messages."""
     revision: Optional[str] = None
     """Branch, tag or commit of a hub model; None = its main branch."""
-    download_options: str = ""
-    """Of the ``hf download`` command that messages suggest."""
+    download_options: str = ""  # of the ``hf download`` command that messages suggest
 
     def __str__(self) -> str:
         return f"model {self.name[:200]!r} ({self.option})"
