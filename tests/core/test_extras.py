@@ -14,14 +14,7 @@ from threestudio_gaussiandreamer.formats.gaussian_files import StoredCloud, writ
 PROMPT = "system.prompt_processor.prompt=a red fox"
 COMMANDS = [
     ("toybox.demo", ["a red fox"], "diffusion"),
-    ("toybox.train", ["work"], "diffusion"),
-    ("toybox.export", ["work", "models"], "diffusion"),
     ("evaluation.scorecard", ["run", "--metrics", "clip", "--clip", "run"], "diffusion"),
-    (
-        "evaluation.clip_similarity",
-        ["--clip", "run", "--prompt", "a fox", "cloud.ply"],
-        "diffusion",
-    ),
     ("launch.experiment", ["--config", "toybox.yaml", "--train", PROMPT], "diffusion"),
     ("farm.command", ["prompts.txt", "--config", "demo.yaml"], "cluster"),
     ("convert.command", ["cloud.ply", "object.glb"], "mesh"),
