@@ -273,6 +273,8 @@ class Run:
 
     def discard_if_unused(self) -> None:
         """Remove the folder if this run created it, has made no step and has written no results."""
+        if self.claimed.first_made is None:  # nor can a name that is too long be looked into
+            return
         trained = self.trainer is not None and self.trainer.global_step > max(self.resumed_step, 0)
         kept = ("save/it*", "save/prior/points.npz", "ckpts/*.ckpt")
         if not trained and not any(path for name in kept for path in self.folder.glob(name)):
