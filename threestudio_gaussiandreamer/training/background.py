@@ -29,7 +29,9 @@ class FlatBackground(BaseBackground):
     @dataclass
     class Config(BaseBackground.Config):
         mode: str = field(default="fixed", metadata=one_of(("fixed", "random", "learned")))
-        color: Tuple[float, float, float] = field(default=(0.0,) * 3, metadata=each(in_range(0, 1)))
+        color: Tuple[float, float, float] = field(
+            default=(0.0, 0.0, 0.0), metadata=each(in_range(0, 1))
+        )
         lr: Any = field(default=1e-2, metadata=schedule(min=0))
 
         REMOVED: ClassVar[dict[str, Any]] = {"hold_steps": (1, "each step has its own colours")}
