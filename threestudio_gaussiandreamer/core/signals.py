@@ -9,25 +9,18 @@ from typing import Any, NoReturn
 
 from .errors import Terminated
 
-Handler = Callable[[int, Any], Any]
 
-
-def stop_signals() -> list[int]:
-    """List the signals that stop a run; without SIGHUP if it is ignored, as under ``nohup``."""
+def set_handlers(handler: Callable[[int, Any], Any]) -> dict[int, Any]:
+    """Install ``handler`` for the stop signals, without SIGHUP if it is ignored, as under ``nohup``;
+    return the earlier handlers, none outside of the main thread, where Python doesn't allow this.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        return {}
     signals = [signal.SIGINT, signal.SIGTERM]
     hang_up = getattr(signal, "SIGHUP", None)  # not on Windows
     if hang_up is not None and signal.getsignal(hang_up) != signal.SIG_IGN:
         signals.append(hang_up)
-    return signals
-
-
-def set_handlers(handler: Handler) -> dict[int, Any]:
-    """Install ``handler`` for the stop signals and return the earlier handlers; none outside of the
-    main thread, where Python doesn't allow this.
-    """
-    if threading.current_thread() is not threading.main_thread():
-        return {}
-    return {signum: signal.signal(signum, handler) for signum in stop_signals()}
+    return {signum: signal.signal(signum, handler) for signum in signals}
 
 
 def restore_handlers(handlers: dict[int, Any]) -> None:
