@@ -11,7 +11,7 @@ from .errors import Terminated
 
 
 def set_handlers(handler: Callable[[int, Any], Any]) -> dict[int, Any]:
-    """Install ``handler`` for the stop signals, without SIGHUP if it is ignored, as under ``nohup``;
+    """Install ``handler`` for the stop signals, but SIGHUP if it is ignored, as under ``nohup``;
     return the earlier handlers, none outside of the main thread, where Python doesn't allow this.
     """
     if threading.current_thread() is not threading.main_thread():
