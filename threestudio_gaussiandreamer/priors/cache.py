@@ -21,7 +21,6 @@ from ..host import info, run_seed
 from ..meshes.side_files import consulted, stamp
 from .base import points_of
 
-OURS = Path(__file__).parents[1]
 MAX_FILES = 1000
 """Files of a folder that are compared; models have fewer."""
 
@@ -78,14 +77,14 @@ def _files(options: Any) -> Iterator[tuple[str, int, int]]:
 
 
 def _code(kind: type) -> Iterator[tuple[str, str]]:
-    """Yield name and digest of the source files of a class and those it is derived from; of another
-    package's class, of all files in its folder if that is a package.
+    """Yield name and digest of the source files of a class and those it is derived from, with all
+    files of their folders that are packages.
     """
     modules = {base.__module__ for base in kind.__mro__}
     found = [getattr(sys.modules.get(name), "__file__", None) for name in sorted(modules)]
     for file in map(Path, filter(None, found)):
-        is_foreign = OURS not in file.parents and (file.parent / "__init__.py").is_file()
-        for source in sorted(file.parent.rglob("*.py")) if is_foreign else [file]:
+        package = (file.parent / "__init__.py").is_file()
+        for source in sorted(file.parent.rglob("*.py")) if package else [file]:
             with contextlib.suppress(OSError):  # not to be read
                 yield source.name, hashlib.sha256(source.read_bytes()).hexdigest()
 

@@ -123,13 +123,12 @@ def read_motions(path: str) -> Motions:
 
 def _sample_frame_joint(motion: np.ndarray) -> Float[np.ndarray, "S F J 3"]:
     """Convert any of the layouts to (samples, frames, joints, 3)."""
-    ordered, shape = np.zeros(0), motion.shape
-    if len(shape) == 4 and shape[1] in JOINT_COUNTS and shape[2] == 3:
-        ordered = motion.transpose(0, 3, 1, 2)
-    elif len(shape) == 3 and shape[0] in JOINT_COUNTS and shape[1] == 3:
-        ordered = motion.transpose(2, 0, 1)[None]
+    shape, ordered = motion.shape, np.zeros(0)
+    samples = motion[None] if len(shape) == 3 else motion
+    if samples.ndim == 4 and samples.shape[1] in JOINT_COUNTS and samples.shape[2] == 3:
+        ordered = samples.transpose(0, 3, 1, 2)
     elif len(shape) == 3 and shape[1] in JOINT_COUNTS and shape[2] == 3:
-        ordered = motion[None]
+        ordered = samples
     require(
         motion.dtype.kind in "fiu" and ordered.size > 0,
         f"it holds an array {shape} of {motion.dtype}: (samples, 22 or 24 joints, 3, frames) "
