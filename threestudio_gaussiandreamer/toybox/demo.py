@@ -81,8 +81,8 @@ def is_option(word: str) -> bool:
     return "=" in word and " " not in word.partition("=")[0]
 
 
-def run(args: argparse.Namespace) -> None:
-    """Train the prompts that aren't finished, then write sheet and table."""
+def run(args: argparse.Namespace) -> int:
+    """Train the prompts that aren't finished, then write sheet and table; return the exit code."""
     for prompt in args.prompts:
         if not prompt.strip():
             raise UserError(f'a prompt is empty: give one such as "{PROMPTS[0]}"')
@@ -94,11 +94,15 @@ def run(args: argparse.Namespace) -> None:
     recognition.load_judge(args.models)  # a missing file is reported before the training
     claimed = open_folder(root, {key: vars(args)[key] for key in ("prompts", "options", "models")})
     try:
-        runs = [train(claimed.path, index, args) for index in range(len(args.prompts))]
+        runs = [run_folder(claimed.path, i, prompt) for i, prompt in enumerate(args.prompts, 1)]
+        for index in range(len(runs)):
+            if code := train(claimed.path, index, runs[index], args):
+                return code
         register_parts()
         write_results(claimed.path, args, runs)
     finally:
         claimed.release()
+    return 0
 
 
 def open_folder(root: Path, record: dict[str, Any]) -> RunFolder:
@@ -116,21 +120,25 @@ def open_folder(root: Path, record: dict[str, Any]) -> RunFolder:
 # ---- training ------------------------------------------------------------------------------------
 
 
-def train(folder: Path, index: int, args: argparse.Namespace) -> Path:
-    """Train one prompt unless that is done; return the folder of its run."""
-    prompt, text = args.prompts[index], folder / f"prompt{index + 1}.txt"
+def run_folder(folder: Path, number: int, prompt: str) -> Path:
+    """Return the folder of a prompt's run."""
     words = re.sub(r"[^a-z0-9]+", "_", prompt.lower())[:NAME_LENGTH]
-    place = folder / "runs" / f"prompt{index + 1}_{words}"
+    return folder / "runs" / f"prompt{number}_{words}"
+
+
+def train(folder: Path, index: int, place: Path, args: argparse.Namespace) -> int:
+    """Train one prompt unless that is done; return the launcher's exit code."""
+    prompt, text = args.prompts[index], folder / f"prompt{index + 1}.txt"
     record = read_json(place.with_suffix(".json"), dict)
     if record.get("finished"):
-        return place
+        return 0
     with atomic_file(text, durable=False) as file:
         file.write(prompt.encode())
     print(f"\n{index + 1}/{len(args.prompts)}: {prompt}", flush=True)
     place.parent.mkdir(exist_ok=True)
-    start, finished = time.monotonic(), False
+    start, code = time.monotonic(), None
     try:
-        launch([
+        code = launch([
             f"exp_root_dir={folder}",
             "name=runs",
             f"tag={place.name}",
@@ -140,17 +148,16 @@ def train(folder: Path, index: int, args: argparse.Namespace) -> Path:
             f"system.guidance.pretrained_model_name_or_path={args.models}",
             *args.options,
         ])  # fmt: skip
-        finished = True
     finally:
         seconds = round(record.get("seconds", 0.0) + time.monotonic() - start, 1)
         with atomic_file(place.with_suffix(".json")) as file:
-            file.write(json_text({"seconds": seconds, "finished": finished}).encode())
-    return place
+            file.write(json_text({"seconds": seconds, "finished": code == 0}).encode())
+    return code
 
 
-def launch(options: list[str]) -> None:
+def launch(options: list[str]) -> int:
     """Run the launcher in a process of its own, and wait for it even after Ctrl-C: it has received
-    the signal too, and writes a checkpoint.
+    the signal too, and writes a checkpoint. Return its exit code.
     """
     program = [sys.executable, "-m", "threestudio_gaussiandreamer.launch.experiment"]
     with raised_signals() as received:
@@ -165,8 +172,7 @@ def launch(options: list[str]) -> None:
     if received:
         print("the same command continues", flush=True)
         interrupt(received[0])
-    if code:
-        raise SystemExit(code)
+    return code
 
 
 # ---- results -------------------------------------------------------------------------------------
