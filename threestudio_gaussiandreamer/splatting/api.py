@@ -8,7 +8,7 @@ from torch import Tensor
 from ..core.devices import without_autocast
 from .backends import choose_backend
 from .scene import Rasterized, RasterizeOptions
-from .validation import SHAPES, checked_scene, smallest_alpha
+from .validation import checked_scene, smallest_alpha
 
 
 def rasterize(
@@ -76,8 +76,10 @@ def rasterize(
     options = RasterizeOptions(
         near, far, eps2d, antialias, alpha_min, alpha_max, stop, downsample, absgrad
     )
-    given = means, quats, scales, opacities, colors, viewmats, Ks, background
-    tensors = {name: x for name, x in zip(SHAPES, given, strict=True) if x is not None}
+    tensors = {"means": means, "quats": quats, "scales": scales, "opacities": opacities}
+    tensors |= {"colors": colors, "viewmats": viewmats, "Ks": Ks}
+    if background is not None:
+        tensors["background"] = background
     scene = checked_scene(tensors, width, height, options, non_finite)
     with without_autocast(means.device.type):
         return choose_backend(backend, scene.means).module.rasterize(scene, options)

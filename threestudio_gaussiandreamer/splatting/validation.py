@@ -13,17 +13,7 @@ from .scene import RasterizeOptions, Scene
 PRESETS = {"fast": 1 / 255, "balanced": 1 / 1024, "accurate": 1 / 65536}
 LARGEST_SIDE = 16 * (2**16 - 1)  # pixels; kernels number tiles and their ends with 16 bits
 ROUNDING = 1e-4  # how far scales and opacities may lie outside their ranges
-SHAPES = {
-    "means": ["N 3"],
-    "quats": ["N 4"],
-    "scales": ["N 3"],
-    "opacities": ["N"],
-    "colors": ["N C", "B N C"],
-    "viewmats": ["B 4 4"],
-    "Ks": ["B 3 3"],
-    "background": ["C", "B C"],
-}
-GAUSSIANS = list(SHAPES)[:5]
+GAUSSIANS = ("means", "quats", "scales", "opacities", "colors")
 
 
 def smallest_alpha(preset: str, alpha_min: Optional[float]) -> float:
@@ -40,9 +30,9 @@ def smallest_alpha(preset: str, alpha_min: Optional[float]) -> float:
 def checked_scene(
     tensors: dict[str, Tensor], width: int, height: int, options: RasterizeOptions, policy: str
 ) -> Scene:
-    """Check all arguments of `rasterize` except the backend. Convert the tensors, named as in
-    `SHAPES`, to contiguous float32, or to float64 if all Gaussians' tensors are; cameras and
-    background, which may be left out, may have another type.
+    """Check all arguments of `rasterize` except the backend. Convert the tensors to
+    contiguous float32, or to float64 if all Gaussians' tensors are; cameras and background, which
+    may be left out, may have another type.
 
     Raises:
         UserError: a tensor has the wrong type, device or shape, a number is out of its range, some
@@ -97,18 +87,21 @@ def _check_shapes(tensors: dict[str, Tensor]) -> None:
     if views == 0 or channels == 0:
         got = f"viewmats {shapes['viewmats']}, colors {shapes['colors']}"
         raise UserError(f"at least one view and one colour channel are needed; got {got}.")
-    sizes = {"N": n, "B": views, "C": channels, "3": 3, "4": 4}
+    expected = {
+        "means": {"(N, 3)": (n, 3)},
+        "quats": {"(N, 4)": (n, 4)},
+        "scales": {"(N, 3)": (n, 3)},
+        "opacities": {"(N,)": (n,)},
+        "colors": {"(N, C)": (n, channels), "(B, N, C)": (views, n, channels)},
+        "viewmats": {"(B, 4, 4)": (views, 4, 4)},
+        "Ks": {"(B, 3, 3)": (views, 3, 3)},
+        "background": {"(C,)": (channels,), "(B, C)": (views, channels)},
+    }
     for name, shape in shapes.items():
-        known = {text: tuple(sizes[size] for size in text.split()) for text in SHAPES[name]}
-        if shape not in known.values():
-            wanted = (
-                f"({text.replace(' ', ', ')}{',' * (len(one) == 1)}) = {one}"
-                for text, one in known.items()
-            )
-            raise UserError(
-                f"{name} must have the shape {' or '.join(wanted)}; got {shape}. N={n} is from "
-                f"means, B={views} from viewmats, C={channels} from colors."
-            )
+        if shape not in expected[name].values():
+            wanted = " or ".join(f"{words} = {known}" for words, known in expected[name].items())
+            sizes = f"N={n} is from means, B={views} from viewmats, C={channels} from colors"
+            raise UserError(f"{name} must have the shape {wanted}; got {shape}. {sizes}.")
 
 
 def _check_numbers(width: int, height: int, options: RasterizeOptions) -> None:
