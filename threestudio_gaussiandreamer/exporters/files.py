@@ -62,8 +62,7 @@ from ..host import (
 from ..surface.textured import MeshOptions, mesh_from_gaussians, require_mesh_libraries
 
 SUFFIX = "-exporter"
-NAME_BYTES = 255
-"""The longest file name on common file systems, bytes."""
+NAME_BYTES = 255  # of the longest file name on common file systems
 RESERVED = ("pruned", "report.json", "report.png", "view.html", "poster.png")
 """Names of other files that a run writes into the export folder."""
 
@@ -83,8 +82,7 @@ UP = one_of(AXES)
 
 
 DRAWING = {"eps2d": EPS2D, "antialias": False}
-"""Options of a run's renderer that its exports need: the dilation in square pixels of the final
-image, and whether it antialiases."""
+"""Of a run's renderer: the dilation in square pixels of the image, and whether it antialiases."""
 
 
 class FileExporter(Exporter):
@@ -213,7 +211,6 @@ def add(
 PADDING = ("pad_sh_degree", Optional[int], None, in_range(0, 3))
 CELLS = ("resolution", int, 128, in_range(8, 512, "cells"))
 LEVEL = ("level", float, 0.5, in_range(1e-6, 1))
-LEAST = ("min_opacity", float, 0.0, in_range(0, 1))
 WRITTEN = ("version", int, VERSION, in_range(*VERSIONS))
 add("ply", "gaussians.ply", ply, "ply", [("up", str, VIEWER_UP, UP), PADDING])
 add("spz", "gaussians.spz", spz, "spz", [WRITTEN], lambda cfg: require_version(cfg.version))
@@ -221,7 +218,7 @@ add("compressed-ply", "gaussians.compressed.ply", stored(".compressed.ply"))
 add("sog", "gaussians.sog", stored(".sog"))
 add("glb", "gaussians.glb", stored(".glb", ".spz.glb"))
 add("usda", "gaussians.usda", stored(".usda", ".usdz"))
-add("points", "points.ply", points, "points", [LEAST])
+add("points", "points.ply", points, "points", [("min_opacity", float, 0.0, in_range(0, 1))])
 add("surface", "model.obj", surface, "surface", [("up", str, "y", UP), CELLS, LEVEL])
 
 
