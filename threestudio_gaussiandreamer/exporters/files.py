@@ -258,9 +258,6 @@ class MeshExporter(FileExporter):
         return outputs
 
 
-# ---- several formats -----------------------------------------------------------------------------
-
-
 def available_formats() -> list[str]:
     """Return the formats: every registered exporter but the bundle itself."""
     exporters = [name.removesuffix(SUFFIX) for name in names() if name.endswith(SUFFIX)]
