@@ -1,8 +1,6 @@
 """Read NPY and NPZ files, and pickled dicts of arrays, from untrusted sources: without running any
-code of theirs, within a memory budget, and with one type of error for every kind of damage.
-
-``numpy.load`` trusts the header: it allocates the size that the header gives, ignores trailing
-data, and raises many types of errors for damaged files.
+code of theirs, within a memory budget (``numpy.load`` allocates what the header says), and with one
+type of error for every kind of damage.
 
 In a pickle every class and function is replaced by one that only keeps what it was called with.
 What that stands for is worked out afterwards, for the few kinds that hold arrays: NumPy's, SciPy's
@@ -133,9 +131,7 @@ OURS = {
     "bytes": lambda: b"",
     "_reconstructor": lambda cls, *_: cls(),
 }
-"""Functions of ours that make bytes, and objects of protocols 0 and 1, by the names of those that
-pickles call for it.
-"""
+"""Functions of ours in place of those that make bytes, and objects of protocols 0 and 1."""
 
 
 class _Unpickler(pickle.Unpickler):

@@ -1,9 +1,7 @@
-"""Compressed PLY, PlayCanvas' chunked layout: 16.3 bytes for a Gaussian of degree 0, and one byte
-for each further coefficient; described in PlayCanvas' manual, "The Compressed PLY Format".
-
-Elements, binary little-endian: ``chunk``, minima and maxima of 256 Gaussians' positions, logarithms
-of scales and, but in files of the first version, colours; ``vertex``, four u32 a Gaussian; and
-``sh`` with f_rest as bytes, absent at degree 0. Axes as those of a PLY."""
+"""Compressed PLY, PlayCanvas' chunked layout, described in their manual, "The Compressed PLY
+Format". Elements, binary little-endian: ``chunk``, minima and maxima of 256 Gaussians' positions,
+logarithms of scales and, but in files of the first version, colours; ``vertex``, four u32 a
+Gaussian; and ``sh`` with f_rest as bytes, absent at degree 0. Axes as those of a PLY."""
 
 import os
 from collections.abc import Sequence
@@ -28,8 +26,6 @@ LIMITS = tuple(
     for bound in ("min", "max")
     for name in names
 )
-WITHOUT_COLORS = 12
-"""Number of limits in files of the format's first version."""
 PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 BITS = (11, 10, 11)
 SH_REACH = 4.0
@@ -114,9 +110,7 @@ def read_compressed_ply(path: str | os.PathLike) -> Gaussians:
 def _packed(
     gaussians: Gaussians,
 ) -> tuple[Float[np.ndarray, "C 3 2 3"], Integer[np.ndarray, "N 4"]]:
-    """Return minimum and maximum of positions, scales and colours for each chunk, the last of which
-    is filled up with copies of the last Gaussian; and the words of each Gaussian.
-    """
+    """Return minima and maxima for each chunk, filled up with the last Gaussian, and the words."""
     scales = gaussians.log_scales.clip(-MAX_STORED_LOG, MAX_STORED_LOG)
     values = np.stack([gaussians.means, scales, sh0_to_rgb(gaussians.sh[:, 0])], axis=1)
     count, missing = len(values), -len(values) % CHUNK
@@ -154,7 +148,7 @@ def _read_elements(path: Path) -> dict[str, np.ndarray]:
     count = elements["vertex"].count
     rest = [tuple(f"f_rest_{i}" for i in range(3 * (k - 1))) for k in COEFFICIENTS[1:]]
     layouts = {
-        "chunk": ((LIMITS, LIMITS[:WITHOUT_COLORS]), "f4", ceil(count / CHUNK)),
+        "chunk": ((LIMITS, LIMITS[:12]), "f4", ceil(count / CHUNK)),
         "vertex": ((PACKED,), "u4", count),
         "sh": (rest, "u1", count),
     }

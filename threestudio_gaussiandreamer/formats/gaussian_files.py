@@ -1,9 +1,7 @@
-"""Read and write files of Gaussians of all formats, with the metadata that a file can hold: its
-axes, whether the cloud was trained with antialiasing, and the PSNR to which it was pruned.
+"""Read and write files of Gaussians of all formats, with the metadata that a file can hold.
 
-The axes of a file are known: a PLY has them in a comment of its header, the other formats by
-definition. A PLY without that comment, as other programs write it, is read as -y up, the axes of 3D
-Gaussian splatting and its viewers. The same axes are written by default."""
+A PLY has its axes in a comment of its header, the other formats by definition. A PLY without that
+comment, as other programs write it, is read as -y up, and the same axes are written by default."""
 
 import logging
 import re
@@ -15,17 +13,10 @@ from ..core.errors import UserError, unknown
 from ..core.files import existing_file
 from ..gaussians.axes import AXES, VIEWER_UP, WORLD_UP, rotate, rotation_between
 from ..gaussians.gaussians import Gaussians, drawable
+from . import ply
 from .compressed_ply import is_compressed_ply, read_compressed_ply, write_compressed_ply
 from .glb import GLB_UP, read_glb, write_glb, write_spz_glb
 from .packing import ANTIALIASED
-from .ply import (
-    gaussian_properties,
-    header_bytes,
-    is_gaussian_ply,
-    read_comments,
-    read_gaussians,
-    write_gaussians,
-)
 from .sog import SOG_UP, read_sog, write_sog
 from .splat import read_ksplat, read_splat
 from .spz import SPZ_UP, VERSION, read_spz, spz_arrays, spz_bytes, write_spz
@@ -33,10 +24,8 @@ from .usda import USDA_UP, read_usd, write_usda, write_usdz
 
 logger = logging.getLogger(__name__)
 
-UP, PRUNED = "up:", "pruned to the likeness, dB:"
-"""Keys of the comments in files; the second is the PSNR to the original cloud."""
-VERTICAL_AXIS = "Vertical Axis:"
-"""Nerfstudio's key for the up axis."""
+UP, NERFSTUDIO_UP, PRUNED = "up:", "Vertical Axis:", "pruned to the likeness, dB:"
+"""Keys of the comments in files; the last is the PSNR to the original cloud."""
 RENDER_MODE = re.compile(r"splatrendermode: *(\w+)|antialiased ([01])", re.IGNORECASE)
 """``ANTIALIASED``, or Postshot's comment."""
 
@@ -81,13 +70,12 @@ class CloudFormat(NamedTuple):
 
 def _read_ply(path: Path) -> Content:
     """Read a PLY of either layout."""
-    if is_compressed_ply(path):
-        return read_compressed_ply(path), read_comments(path)
-    return read_gaussians(path), read_comments(path)
+    read = read_compressed_ply if is_compressed_ply(path) else ply.read_gaussians
+    return read(path), ply.read_comments(path)
 
 
 FORMATS = {
-    ".ply": CloudFormat(VIEWER_UP, _read_ply, write_gaussians, any_up=True),
+    ".ply": CloudFormat(VIEWER_UP, _read_ply, ply.write_gaussians, any_up=True),
     ".compressed.ply": CloudFormat(VIEWER_UP, _read_ply, write_compressed_ply, any_up=True),
     ".spz": CloudFormat(SPZ_UP, read_spz, write_spz),
     ".sog": CloudFormat(SOG_UP, read_sog, write_sog),
@@ -114,9 +102,7 @@ PRUNED_FORMATS = (".ply", ".spz")
 
 
 def suffix_of(name: str) -> str:
-    """Return the longest known extension of a file name in lower case, or what follows its last
-    dot.
-    """
+    """Return the longest known extension of a file name in lower case, else its last suffix."""
     known = [suffix for suffix in (*FORMATS, *LEVELS) if name.lower().endswith(suffix)]
     return max(known, key=len, default=Path(name).suffix.lower())
 
@@ -129,11 +115,9 @@ def conversion(name: str) -> str:
 
 
 def holds_gaussians(path: Path) -> bool:
-    """Return whether a file of a run's export is of Gaussians; GLB and USDA, of which the export
-    can be a mesh, are left out.
-    """
+    """Return whether a file of a run's export is of Gaussians; not of GLB and USDA, also meshes."""
     suffix = suffix_of(path.name)
-    return suffix in ALWAYS_GAUSSIANS or suffix == ".ply" and is_gaussian_ply(path)
+    return suffix in ALWAYS_GAUSSIANS or suffix == ".ply" and ply.is_gaussian_ply(path)
 
 
 def require_format(name: str, option: str, formats: Collection[str] = WRITTEN) -> str:
@@ -188,7 +172,7 @@ def read_stored(file: Path, *, up: Optional[str] = None) -> StoredCloud:
 
 def stated_up(notes: list[str]) -> Optional[str]:
     """Return the up axis in a file's comments, or None if they have none that is known."""
-    stated = (_note(notes, UP) or _note(notes, VERTICAL_AXIS)).lower()
+    stated = (_note(notes, UP) or _note(notes, NERFSTUDIO_UP)).lower()
     if stated and stated not in AXES:
         said = "the up axis in the file's comment %r is none of %s: it is ignored"
         logger.warning(said, f"{UP} {stated[:40]}", ", ".join(AXES))
@@ -197,12 +181,12 @@ def stated_up(notes: list[str]) -> Optional[str]:
 
 def ply_up(path: Path) -> str:
     """Return the up axis of a PLY of Gaussians, by default that of viewers."""
-    return stated_up(read_comments(path)) or VIEWER_UP
+    return stated_up(ply.read_comments(path)) or VIEWER_UP
 
 
 def is_antialiased(path: Path) -> bool:
     """Return whether a PLY of Gaussians says that they were trained with antialiasing."""
-    return _stated_mode(read_comments(path))
+    return _stated_mode(ply.read_comments(path))
 
 
 def _note(notes: list[str], key: str) -> str:
@@ -257,8 +241,8 @@ def file_size(cloud: StoredCloud, suffix: str) -> int:
     if suffix == ".spz":
         return len(spz_bytes(cloud.in_axes(SPZ_UP).gaussians, notes_of(cloud, suffix)))
     count, harmonics = cloud.gaussians.sh.shape[:2]
-    properties = gaussian_properties(harmonics)
-    header = header_bytes([("vertex", count, properties)], notes_of(cloud, suffix))
+    properties = ply.gaussian_properties(harmonics)
+    header = ply.header_bytes([("vertex", count, properties)], notes_of(cloud, suffix))
     return len(header) + 4 * len(properties) * count
 
 

@@ -1,18 +1,13 @@
 """Gaussians in GLB files by the glTF extension KHR_gaussian_splatting, plain or as SPZ.
 
-Plain files follow the ratified extension: points with the kernel "ellipse" in the colour space
-"srgb_rec709_display"; scales and opacities are linear, quaternions xyzw, harmonics with the
-Condon-Shortley phase as in PLY files, all float32. ``COLOR_0`` lets programs without the extension
-show coloured points. Axes are glTF's, y up, front +z.
+Plain files follow the ratified extension: scales and opacities are linear, quaternions xyzw,
+harmonics with the Condon-Shortley phase as in PLY files, all float32. ``COLOR_0`` lets programs
+without the extension show coloured points. Axes are glTF's, y up, front +z. ``extras`` of the asset
+hold antialiasing and notes.
 
-Files with KHR_gaussian_splatting_compression_spz_2 hold an SPZ file in a buffer view. They are
-written as CesiumJS reads them, which takes SPZ's coordinates for glTF's. The draft of that
-extension wants them half a turn apart; files of programs that follow it are known by the ``kernel``
-that Cesium's lack.
-
-The extension has no place for antialiasing and notes, so they are in ``extras`` of the asset.
-Other compressions of the extension, kernels other than "ellipse", and nodes that scale by different
-factors along the axes aren't read."""
+Files with an SPZ in a buffer view are written as CesiumJS reads them, which takes SPZ's coordinates
+for glTF's. The draft of that extension wants them half a turn apart; files of programs that follow
+it are known by the ``kernel`` that Cesium's lack."""
 
 import logging
 import os
@@ -28,15 +23,7 @@ from ..gaussians.sh import COEFFICIENTS, sh0_colors
 from ..meshes.gltf import Document, World, world_matrices
 from ..meshes.mesh import srgb_to_linear
 from ..meshes.write import accessor, write_glb_file
-from .packing import (
-    FLOAT_OPACITY_MARGIN,
-    displayed,
-    is_linear,
-    logits,
-    opacities,
-    to_byte,
-    unit_quats,
-)
+from . import packing
 from .reading import reading, require, require_file_memory
 from .spz import spz_arrays, spz_bytes
 
@@ -134,17 +121,17 @@ def read_glb(path: str | os.PathLike) -> tuple[Gaussians, list[str]]:
 
 def _attributes(gaussians: Gaussians) -> dict[str, np.ndarray]:
     """Return the attributes by semantic; their rows have multiples of 4 bytes, as glTF requires."""
-    opacity = opacities(gaussians.logit_opacities)[:, None]
+    opacity = packing.opacities(gaussians.logit_opacities)[:, None]
     fallback = np.concatenate([srgb_to_linear(sh0_colors(gaussians.sh[:, 0])), opacity], axis=1)
     named = {
         "POSITION": gaussians.means,
-        "COLOR_0": to_byte(255 * fallback),
-        f"{EXTENSION}:ROTATION": unit_quats(gaussians.quats)[:, [1, 2, 3, 0]],
+        "COLOR_0": packing.to_byte(255 * fallback),
+        f"{EXTENSION}:ROTATION": packing.unit_quats(gaussians.quats)[:, [1, 2, 3, 0]],
         f"{EXTENSION}:SCALE": np.exp(gaussians.log_scales),
         f"{EXTENSION}:OPACITY": opacity,
     }
-    harmonics = zip(_semantics(gaussians.sh.shape[1]), gaussians.sh.transpose(1, 0, 2), strict=True)
-    named |= dict(harmonics)
+    harmonics = gaussians.sh.transpose(1, 0, 2)
+    named |= dict(zip(_semantics(len(harmonics)), harmonics, strict=True))
     return {
         name: np.ascontiguousarray(values, None if values.dtype == np.uint8 else "<f4")
         for name, values in named.items()
@@ -209,8 +196,8 @@ def _read_primitive(document: Document, primitive: dict[str, Any]) -> Gaussians:
     read = _read_spz if SPZ in extension.get("extensions", {}) else _read_plain
     gaussians = read(document, primitive["attributes"], extension)
     space = extension.get("colorSpace", SPLATTING["colorSpace"])
-    if is_linear(space):
-        return displayed(gaussians, str(document.path))
+    if packing.is_linear(space):
+        return packing.displayed(gaussians, str(document.path))
     if "709" not in str(space):
         logger.warning("%s: colours of %r are read as sRGB", document.path, str(space)[:40])
     return gaussians
@@ -244,19 +231,18 @@ def _read_plain(
         return values
 
     degree = _harmonics({"attributes": attributes})
+    opacity = rows(f"{EXTENSION}:OPACITY", "SCALAR")[:, 0]
     return Gaussians(
         means=rows("POSITION", "VEC3"),
         quats=rows(f"{EXTENSION}:ROTATION", "VEC4")[:, [3, 0, 1, 2]],
         log_scales=_log_scales(rows(f"{EXTENSION}:SCALE", "VEC3"), document),
-        logit_opacities=logits(rows(f"{EXTENSION}:OPACITY", "SCALAR")[:, 0], FLOAT_OPACITY_MARGIN),
+        logit_opacities=packing.logits(opacity, packing.FLOAT_OPACITY_MARGIN),
         sh=np.stack([rows(semantic, "VEC3") for semantic in _semantics(degree)], axis=1),
     )
 
 
 def _log_scales(scales: Float[np.ndarray, "N 3"], document: Document) -> Float[np.ndarray, "N 3"]:
-    """Return the logarithms of scales. The extension's drafts up to April 2026, and splat-transform
-    until June 2026, stored logarithms, most of which are negative.
-    """
+    """Return the logarithms of scales, which drafts of the extension up to April 2026 stored."""
     if len(scales) and np.median(scales) < 0:
         logger.warning("%s: scales are read as logarithms, as drafts of 2026 had", document.path)
         return scales

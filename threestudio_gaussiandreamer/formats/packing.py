@@ -12,15 +12,11 @@ from ..meshes.mesh import linear_to_srgb
 
 log = logging.getLogger(__name__)
 ANTIALIASED = "SplatRenderMode: mip"
-"""The comment by which Brush, SuperSplat and splat-transform tag clouds trained with antialiasing.
-"""
+"""The comment by which other programs tag clouds trained with antialiasing."""
 OPACITY_MARGIN = 1 / 2040
-"""Opacities that are read from bytes are clamped to this distance from 0 and 1, an eighth of a
-step, since their logits are infinite there.
-"""
+"""Opacities from bytes are clamped to this distance from 0 and 1, an eighth of a step."""
 FLOAT_OPACITY_MARGIN = 2.0**-25
-"""The same for opacities that are read as float32: half the distance from 1 to the next lower one.
-"""
+"""The same for opacities from float32: half the distance from 1 to the next lower one."""
 MAX_OPACITY_BYTE = 254
 """Other readers take the logit of the byte over 255, which is infinite at 255."""
 
@@ -34,11 +30,8 @@ def morton_order(means: Float[np.ndarray, "N 3"], cube: bool = False) -> Integer
     size = (high - low).max() if cube else high - low
     cells = ((means - low) / np.maximum(size, 1e-12) * 1023).astype(np.int64)
     bits = cells[:, :, None] >> np.arange(10) & 1
-    return (
-        (bits << (3 * np.arange(10) + np.arange(3)[:, None]))
-        .sum(axis=(1, 2))
-        .argsort(kind="stable")
-    )
+    codes = (bits << (3 * np.arange(10) + np.arange(3)[:, None])).sum(axis=(1, 2))
+    return codes.argsort(kind="stable")
 
 
 def unit_quats(quats: Float[np.ndarray, "N 4"]) -> Float[np.ndarray, "N 4"]:
@@ -111,9 +104,8 @@ def displayed(gaussians: Gaussians, name: str) -> Gaussians:
     """
     log.warning("%s: linear colours become sRGB; blended edges look a little different", name)
     linear = sh0_to_rgb(gaussians.sh[:, :1]).clip(0)
-    slope = np.where(
-        linear <= 0.0031308, 12.92, 1.055 / 2.4 * np.maximum(linear, 0.0031308) ** (1 / 2.4 - 1)
-    )
+    power = 1.055 / 2.4 * np.maximum(linear, 0.0031308) ** (1 / 2.4 - 1)
+    slope = np.where(linear <= 0.0031308, 12.92, power)
     sh = (gaussians.sh * slope).astype(np.float32)
     sh[:, :1] = rgb_to_sh0(linear_to_srgb(linear))
     return gaussians._replace(sh=sh)

@@ -1,11 +1,8 @@
 """PLY files of 3D Gaussians and of coloured points.
 
-Gaussians are written in the usual layout of 3D Gaussian splatting (little-endian float32):
-``x y z nx ny nz f_dc_0..2 f_rest_0.. opacity scale_0..2 rot_0..3``, where ``f_dc``/``f_rest`` are
-spherical harmonics (``f_rest`` channel by channel), ``opacity`` is a logit, ``scale`` a logarithm
-and ``rot`` a quaternion wxyz. When reading, ``f_rest`` may be missing; so may ``scale_2``, of 2D
-Gaussians, and ``f_dc`` where ``red green blue`` are there, as nerfstudio's exporter writes. The
-3D filter of Mip-Splatting, ``filter_3D``, is applied; rows of nothing but zeros are left out.
+Gaussians are written in the usual layout of 3D Gaussian splatting: spherical harmonics channel by
+channel, logits of opacities, logarithms of scales, quaternions wxyz. When reading, ``f_rest`` may
+be missing; so may ``scale_2``, of 2D Gaussians, and ``f_dc`` where ``red green blue`` are there.
 
 Tables of vertices are read as other programs write them: text or binary of either byte order,
 properties in any order and of any number type, unknown properties and elements. No more is
@@ -40,14 +37,8 @@ GAUSSIAN = (*MEANS, *SH_CONSTANT, "opacity", *LOG_SCALES, *QUATS)
 COLORS = ("red", "green", "blue")
 EXACT_COLORS = ("float_red", "float_green", "float_blue")
 FILTER = "filter_3D"
-FLAT_LOG_SCALE = float(np.log(1e-6))
-"""Logarithm of the third scale of 2D Gaussians, which files leave out or store as -inf."""
 MIN_UNIT, MAX_UNIT = -0.01, 2.0
-"""Range of colours that are taken for numbers in [0, 1], to which they are clipped: interpolation
-and high dynamic range exceed it a little.
-"""
-COMPRESSED = "packed_position"
-"""A property by which compressed PLY files are recognised."""
+"""Range of colours that are taken for numbers in [0, 1], which interpolation exceeds a little."""
 NUMBER_TYPES = dict(
     pair.split(":")
     for pair in "char:i1 uchar:u1 short:i2 ushort:u2 int:i4 uint:u4 float:f4 double:f8 int8:i1 "
@@ -66,7 +57,7 @@ class Property(NamedTuple):
     type: str
     """NumPy's type code of the values, without byte order."""
     count_type: Optional[str] = None
-    """NumPy's type code of a list's length; None where the property is no list."""
+    """That of a list's length; None where the property is no list."""
 
 
 class Element(NamedTuple):
@@ -128,7 +119,7 @@ class PlyTable:
         self.path, self.comments = path, header.comments
         self.columns = {name: column.values for name, column in found["vertex"].items()}
         self.faces = found.get("face", {})
-        self._types = {entry.name: np.dtype(entry.type) for entry in vertices[0].properties}
+        self.types = {entry.name: np.dtype(entry.type) for entry in vertices[0].properties}
 
     def has(self, names: Collection[str]) -> bool:
         return all(name in self.columns for name in names)
@@ -144,13 +135,8 @@ class PlyTable:
         """Return several columns as float64, which holds every stored number exactly."""
         return np.stack([self.columns[name].astype(np.float64) for name in names], axis=1)
 
-    def stored_type(self, name: str) -> np.dtype:
-        """Return the number type that the header states."""
-        return self._types[name]
 
-
-# --------------------------------------------------------------------------------------------------
-# writing
+# ---- writing -------------------------------------------------------------------------------------
 
 
 def write_gaussians(
@@ -181,16 +167,9 @@ def gaussian_columns(gaussians: Gaussians) -> Float[np.ndarray, "N P"]:
     """Return the values of the columns of :func:`gaussian_properties`; normals are zero."""
     count, harmonics = gaussians.sh.shape[:2]
     by_channel = gaussians.sh[:, 1:].transpose(0, 2, 1).reshape(count, 3 * (harmonics - 1))
-    columns = [
-        gaussians.means,
-        np.zeros_like(gaussians.means),
-        gaussians.sh[:, 0],
-        by_channel,
-        gaussians.logit_opacities[:, None],
-        gaussians.log_scales,
-        gaussians.quats,
-    ]
-    return np.concatenate(columns, axis=1)
+    means, logits = gaussians.means, gaussians.logit_opacities[:, None]
+    columns = [means, np.zeros_like(means), gaussians.sh[:, 0], by_channel, logits]
+    return np.concatenate([*columns, gaussians.log_scales, gaussians.quats], axis=1)
 
 
 def read_comments(path: str | os.PathLike) -> list[str]:
@@ -223,8 +202,7 @@ def write_points(path: str | os.PathLike, cloud: PointCloud) -> None:
     write_table(path, properties, rows)
 
 
-# --------------------------------------------------------------------------------------------------
-# reading
+# ---- reading -------------------------------------------------------------------------------------
 
 
 def read_gaussians(path: str | os.PathLike) -> Gaussians:
@@ -298,20 +276,14 @@ def _require_gaussians(table: PlyTable) -> None:
 
 
 def _read_sizes(table: PlyTable) -> tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, " N"]]:
-    """Read the logarithms of the scales, of which the third one of 2D Gaussians is
-    ``FLAT_LOG_SCALE``, and the logits of the opacities.
-
-    Mip-Splatting's 3D filter is applied: the variances grow by its square, and opacities shrink by
-    the ratio of the volumes.
+    """Read logarithms of scales and logits of opacities. By Mip-Splatting's 3D filter the variances
+    grow by its square, and opacities shrink by the ratio of the volumes.
     """
-    scales, logits = (
-        table[tuple(name for name in LOG_SCALES if table.has([name]))],
-        table["opacity"],
-    )
+    scales = table[tuple(name for name in LOG_SCALES if name in table.columns)]
+    logits = table["opacity"]
     if scales.shape[1] < 3 or (len(scales) and (scales[:, 2] == -np.inf).all()):
         logger.warning("%s: 2D Gaussians, without a third scale: read as flat ones", table.path)
-        third = ((0, 0), (0, 1))
-        scales = np.pad(scales[:, :2], third, constant_values=FLAT_LOG_SCALE)
+        scales = np.pad(scales[:, :2], ((0, 0), (0, 1)), constant_values=np.log(1e-6))
     if FILTER not in table.columns:
         return scales, logits
     logger.warning("%s: its 3D filter is applied to scales and opacities", table.path)
@@ -322,9 +294,7 @@ def _read_sizes(table: PlyTable) -> tuple[Float[np.ndarray, "N 3"], Float[np.nda
 
 
 def _without_zeros(arrays: Gaussians, table: PlyTable) -> Gaussians:
-    """Leave out rows in which everything is zero, the quaternion too: buffers that a program has
-    not filled, which would be Gaussians of size 1 at the origin.
-    """
+    """Leave out rows of zeros, which a program hasn't filled: they would be Gaussians of size 1."""
     empty = (arrays.quats == 0).all(axis=1) & (arrays.means == 0).all(axis=1)
     empty &= (arrays.log_scales == 0).all(axis=1) & (arrays.logit_opacities == 0)
     empty &= (arrays.sh[:, 0] == 0).all(axis=1)
@@ -337,7 +307,7 @@ def _without_zeros(arrays: Gaussians, table: PlyTable) -> Gaussians:
 
 def _format_hint(table: PlyTable) -> str:
     """Return a hint for the message if the properties are those of another kind of PLY."""
-    if COMPRESSED in table.columns:
+    if "packed_position" in table.columns:
         command = "python -m threestudio_gaussiandreamer.convert in.compressed.ply out.ply"
         return f" It is a compressed PLY: convert it by `{command}`."
     if table.has(MEANS) and not {*SH_CONSTANT, "opacity"} & set(table.columns):
@@ -349,11 +319,9 @@ def _read_sh(table: PlyTable) -> Float[np.ndarray, "N K 3"]:
     """Read the harmonics; ``f_rest`` may be missing."""
     count = sum(name.startswith("f_rest_") for name in table.columns)
     rest_names = tuple(f"f_rest_{i}" for i in range(count))
-    said = (
-        f"{count} properties f_rest_* fit no degree of spherical harmonics: f_rest_0 to f_rest_8,"
-    )
     usual = count % 3 == 0 and round((count // 3 + 1) ** 0.5) ** 2 == count // 3 + 1
-    require(usual and table.has(rest_names), f"{said} _23 or _44 were expected")
+    said = f"{count} properties f_rest_* fit no degree of spherical harmonics: f_rest_0 to f_rest_"
+    require(usual and table.has(rest_names), f"{said}8, _23 or _44 were expected")
     if table.has(SH_CONSTANT):
         constant = table[SH_CONSTANT][:, None]
     else:
@@ -369,7 +337,7 @@ def _read_colors(table: PlyTable) -> Float[np.ndarray, "N 3"]:
     diffuse = ("diffuse_red", "diffuse_green", "diffuse_blue")
     for names in (EXACT_COLORS, COLORS, diffuse, ("r", "g", "b")):
         if table.has(names):
-            return unit_colors(table[names], table.stored_type(names[0]), table.path)
+            return unit_colors(table[names], table.types[names[0]], table.path)
     if table.has(SH_CONSTANT):
         return sh0_colors(table[SH_CONSTANT])
     logger.warning("%s has no colours: grey is used", table.path)
@@ -407,8 +375,7 @@ def unit_colors(
     return colors / np.float32(full)
 
 
-# --------------------------------------------------------------------------------------------------
-# tables
+# ---- tables --------------------------------------------------------------------------------------
 
 
 def write_table(
@@ -515,11 +482,8 @@ def read_rows(
     count, order, text = element.count, BYTE_ORDERS[encoding], encoding == "ascii"
     names = [entry.name for entry in element.properties]
     kinds = [
-        [
-            code and np.dtype("f8" if text else order + code)
-            for code in (entry.count_type, entry.type)
-        ]
-        for entry in element.properties
+        [code and np.dtype("f8" if text else order + code) for code in (each.count_type, each.type)]
+        for each in element.properties
     ]
     if not count or not names:
         return {name: Lists(np.zeros(0, np.int64), np.zeros(0)) for name in names}, at

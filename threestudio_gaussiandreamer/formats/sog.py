@@ -1,17 +1,12 @@
 """SOG (Spatially Ordered Gaussians), PlayCanvas' format for the web: lossless WebP images
-in a zip archive, about 15 bytes for a Gaussian of degree 0 (developer.playcanvas.com, "The SOG
-Format").
+in a zip archive (developer.playcanvas.com, "The SOG Format").
 
-Gaussian i, along a Morton curve, is pixel i of each image but the palette's. ``model`` is
-"antialiased" where the Gaussians were trained with antialiasing. The axes are those of the PLY, as
-splat-transform writes and reads them (-y up), though the specification says y up.
+Gaussian i, along a Morton curve, is pixel i of each image but the palette's. The axes are those of
+the PLY, as splat-transform writes and reads them (-y up), though the specification says y up.
 
 Version 2 is written. Also read is version 1, which has no codebooks: the bytes of scales, sh0 and
 shN are steps between ``mins`` and ``maxs``, those of sh0's alpha of the logit of the opacity; and
-files without an archive, by their ``meta.json``.
-
-JSON and images are checked before they are unpacked. Nothing is written to the disk, and the images
-of a folder lie beside its ``meta.json``, so names can't lead anywhere."""
+files without an archive, by their ``meta.json``, from whose folder alone images are read."""
 
 import io
 import json
@@ -38,8 +33,7 @@ SOG_UP = VIEWER_UP
 ANTIALIASED_MODEL = "antialiased"
 MAX_PALETTE = 65536
 MAX_DISTANCES = 3e8
-"""Limit of the distances that an iteration of k-means computes, entries times Gaussians; at the
-limit the palette takes one core about half a minute."""
+"""Of entries to Gaussians, in an iteration of k-means: about half a minute of one core in all."""
 MEMBER_DATE = (1980, 1, 1, 0, 0, 0)
 """Constant, so that equal clouds give equal files."""
 VERSIONS = 1, 2
@@ -56,8 +50,6 @@ BYTES_PER_PIXEL = 24
 PACKINGS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 ROUNDS = 12
 """Iterations; later ones hardly reduce the error."""
-SHORT_WORK = 10**7
-"""Distances that are computed without a progress bar."""
 BLOCK = 2048
 """Vectors whose distances to all entries are computed at once."""
 
@@ -150,8 +142,8 @@ def _encoded(gaussians: Gaussians) -> tuple[dict[str, np.ndarray], dict[str, Any
         "sh0": {"codebook": _numbers(color_book), "files": ["sh0.webp"]},
     }
     if gaussians.sh.shape[1] > 1 and count:
-        palette_images, meta["shN"] = _palette(gaussians.sh[:, 1:])
-        images |= palette_images
+        palette, meta["shN"] = _palette(gaussians.sh[:, 1:])
+        images |= palette
     return images, meta
 
 
@@ -327,9 +319,8 @@ class _Archive:
 def scalar_codebook(
     values: Float[np.ndarray, "*shape"], size: int = 256
 ) -> tuple[Float[np.ndarray, " size"], Integer[np.ndarray, "*shape"]]:
-    """Return ``size`` ascending values and the index of the nearest one for each of ``values``.
-
-    Up to ``size`` different values are kept exactly.
+    """Return ``size`` ascending values and the index of the nearest one for each of ``values``, of
+    which up to ``size`` different ones are kept exactly.
     """
     ordered = np.sort(values, axis=None).astype(np.float64)
     if not len(ordered):
@@ -347,10 +338,8 @@ def scalar_codebook(
 def _lloyd(
     ordered: Float[np.ndarray, " N"], distinct: Float[np.ndarray, " D"], size: int
 ) -> Float[np.ndarray, " size"]:
-    """Move each value to the mean of what it stands for.
-
-    The start is as dense as the third root of the values' density, the optimum for many values
-    (Panter and Dite 1951).
+    """Move each value to the mean of what it stands for, from a density of the third root of the
+    values' density, the optimum for many values (Panter and Dite 1951).
     """
     mass = np.concatenate([[0], np.cumsum(np.diff(distinct) ** (2 / 3))])
     book = np.interp(np.linspace(0, mass[-1], size), mass, distinct)
@@ -376,9 +365,8 @@ def vector_codebook(
 
     start = np.random.default_rng(0).choice(len(vectors), size, replace=False)
     book = vectors[np.sort(start)].astype(np.float32)
-    rounds = range(ROUNDS // 2)
-    short = len(vectors) * size < SHORT_WORK
-    for _ in tqdm(rounds, "palette of harmonics", leave=False, disable=short or None):
+    hidden = len(vectors) * size < 10**7 or None
+    for _ in tqdm(range(ROUNDS // 2), "palette of harmonics", leave=False, disable=hidden):
         nearest = _nearest(vectors, book)
         counts = np.bincount(nearest, minlength=size)[:, None]
         columns = (np.bincount(nearest, column, size) for column in vectors.T)
@@ -391,6 +379,5 @@ def _nearest(
     vectors: Float[np.ndarray, "N D"], book: Float[np.ndarray, "K D"]
 ) -> Integer[np.ndarray, " N"]:
     squares = (book**2).sum(axis=1)
-    starts = range(0, len(vectors), BLOCK)
-    blocks = (vectors[at : at + BLOCK] for at in starts)
+    blocks = (vectors[at : at + BLOCK] for at in range(0, len(vectors), BLOCK))
     return np.concatenate([(squares - 2 * block @ book.T).argmin(axis=1) for block in blocks])

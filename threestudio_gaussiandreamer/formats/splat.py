@@ -1,15 +1,13 @@
-"""``.splat`` and ``.ksplat``: read only, since they have less precision than what is written here.
-Axes of both are those of 3D Gaussian splatting's PLY, -y up.
+"""``.splat`` and ``.ksplat``, which are only read. Axes of both are those of the PLY, -y up.
 
 ``.splat``, antimatter15's format, is headerless records without harmonics, with linear scales and
 quaternions wxyz as 128 + 128 q.
 
-``.ksplat``, of mkkellogg's GaussianSplats3D, levels 0 to 2: a header of 4096 bytes, a header of
-1024 bytes for each section, then the sections: the counts of their partly filled buckets, the
-centres of all buckets, and a record for each Gaussian, with linear scales, wxyz, and the harmonics
-above the constant one band by band, and in a band channel by channel. At levels 1 and 2 numbers are
-float16, positions are steps from the centre of the Gaussian's bucket, and at level 2 harmonics are
-bytes."""
+``.ksplat``, of mkkellogg's GaussianSplats3D, levels 0 to 2: a header, one for each section, then
+the sections: the counts of their partly filled buckets, the centres of all buckets, and a record
+for each Gaussian, with linear scales, wxyz, and the harmonics above the constant one band by band,
+and in a band channel by channel. At levels 1 and 2 numbers are float16, positions are steps from
+the centre of the Gaussian's bucket, and at level 2 harmonics are bytes."""
 
 import os
 
@@ -40,11 +38,9 @@ SECTION = np.dtype(
 )
 NUMBERS = (("<f4", "<f4", "<f4"), ("<u2", "<f2", "<f2"), ("<u2", "<f2", "u1"))
 """Types of positions, of scales and quaternions, and of harmonics, by level."""
-STEPS = 32767
-"""Steps from a bucket's centre to its side, where the section doesn't say."""
 HARMONICS_RANGE = (-1.5, 1.5)
 MAX_DEGREE = 2
-ROUNDED_TO_0 = 2.0**-25
+ROUNDED_TO_0 = np.float32(2**-25)
 """The largest scale that is 0 as float16."""
 
 
@@ -108,15 +104,9 @@ class _File:
         for section in sections:
             values = {name: section[name].item() for name in SECTION.names}
             position, number, harmonic = NUMBERS[self.level]
-            record = np.dtype(
-                [
-                    ("mean", position, 3),
-                    ("scale", number, 3),
-                    ("quat", number, 4),
-                    ("rgba", "u1", 4),
-                    ("sh", harmonic, 3 * (COEFFICIENTS[values["degree"]] - 1)),
-                ]
-            )
+            fields = [("mean", position, 3), ("scale", number, 3), ("quat", number, 4)]
+            rest = 3 * (COEFFICIENTS[values["degree"]] - 1)
+            record = np.dtype([*fields, ("rgba", "u1", 4), ("sh", harmonic, rest)])
             buckets = 4 * values["partial"] + values["stride"] * values["buckets"]
             rows = self.rows(record, at + buckets, values["count"])
             means = rows["mean"] if self.level == 0 else self.positions(rows["mean"], values, at)
@@ -136,7 +126,7 @@ class _File:
         usual = usual and section["stride"] == 3 * centers.itemsize and held == len(steps)
         require(usual, f"its buckets hold {held} of the {len(steps)} Gaussians: it is damaged")
         sizes = np.concatenate([np.full(section["full"], section["bucket"], np.int64), partly])
-        far = section["steps"] or STEPS
+        far = section["steps"] or 32767  # steps from a bucket's centre to its side
         offsets = (steps.astype(np.float64) - far) * (section["block"] / 2 / far)
         return offsets + np.repeat(centers.reshape(-1, 3), sizes, axis=0)
 
@@ -148,10 +138,8 @@ class _File:
         sh[:, 0] = rgb_to_sh0(rows["rgba"][:, :3] / np.float32(255))
         values = rows["sh"].astype(np.float32)
         if self.level == 2:
-            low, high = (
-                said or usual
-                for said, usual in zip(self.header["range"], HARMONICS_RANGE, strict=True)
-            )
+            ranges = zip(self.header["range"], HARMONICS_RANGE, strict=True)
+            low, high = (said or usual for said, usual in ranges)
             values = low + (high - low) * (values / 255)
         for start, end in ((1, 4), (4, 9)):
             if values.shape[1] >= 3 * (end - 1):
@@ -161,7 +149,7 @@ class _File:
         return Gaussians(
             means=means.astype(np.float32),
             quats=rows["quat"].astype(np.float32),
-            log_scales=np.log(np.where(scales == 0, np.float32(ROUNDED_TO_0), scales)),
+            log_scales=np.log(np.where(scales == 0, ROUNDED_TO_0, scales)),
             logit_opacities=logits_of_bytes(rows["rgba"][:, 3]),
             sh=sh,
         )

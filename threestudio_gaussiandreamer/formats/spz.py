@@ -1,10 +1,7 @@
-"""SPZ, the compact file of Gaussians that web viewers read: about 17 bytes for a Gaussian of degree
-0, where a PLY takes 68.
-
-The format is Niantic's (github.com/nianticlabs/spz, MIT). Versions 3 and 4 are written, 1 to 4 are
-read: a header and one block for each attribute. Quaternions are xyzw. Axes are right, up, back
-unless a record says others (SPZ_ADOBE_coordinate_system), which are turned when read, and which
-version 4 can have when written.
+"""SPZ, the compact file of Gaussians that web viewers read, Niantic's (github.com/nianticlabs/spz,
+MIT). Versions 3 and 4 are written, 1 to 4 are read: a header and one block for each attribute.
+Quaternions are xyzw. Axes are right, up, back unless a record says others
+(SPZ_ADOBE_coordinate_system), which version 4 can have when written.
 
 Versions 1 to 3 are one gzip member around header and blocks. Version 4 has a plain header of 32
 bytes, extensions, of which only the record of the axes is written, a table of the packed and
@@ -55,13 +52,9 @@ MIN_WINDOW = 8 << 20
 DECODED_BYTES, DECODED_BYTES_PER_HARMONIC = 180, 9
 """Bytes of memory that reading takes per Gaussian, and per harmonic of it, with a safety margin."""
 MIN_STEPS_PER_SIZE, STEPS_PER_SIZE = 2, 32
-"""Resolution of positions: steps per median size of the Gaussians. More steps hardly improve the
-PSNR (reports/answered.md).
-"""
+"""Steps of positions per median size of the Gaussians; more bring little (reports/answered.md)."""
 INLIER_QUANTILE, OUTLIER_FACTOR = 0.99, 256
-"""If the range of the farthest position would leave fewer than ``MIN_STEPS_PER_SIZE`` steps,
-positions beyond ``OUTLIER_FACTOR`` times the ``INLIER_QUANTILE`` quantile of distances are clipped.
-"""
+"""Positions beyond this times that quantile are clipped if too few steps would be left else."""
 MAX_FIXED, COLOR_SCALE = 2**23 - 1, 0.15
 COLOR_REACH = 0.5 / COLOR_SCALE
 """Largest absolute value of a stored constant harmonic: colours from -0.44 to 1.44."""
@@ -217,8 +210,7 @@ def spz_arrays(packed: bytes) -> tuple[Gaussians, bool]:
     gaussians = Gaussians(means, quats, log_scales + np.float32(MIN_LOG_SCALE), logits, sh)
     system = _system(extensions) if header.flags & HAS_EXTENSIONS else OWN_SYSTEM
     if system != OWN_SYSTEM:
-        turned = np.stack([DIRECTIONS[letter] for letter in system], axis=1)
-        gaussians = rotate(gaussians, turned)
+        gaussians = rotate(gaussians, np.stack([DIRECTIONS[x] for x in system], axis=1))
     return gaussians, bool(header.flags & IS_ANTIALIASED)
 
 
@@ -242,9 +234,7 @@ def _quats(block: Integer[np.ndarray, "N B"], header: SpzHeader) -> Float[np.nda
 
 
 def _fractional_bits(gaussians: Gaussians) -> int:
-    """Choose the number of fractional bits from the Gaussians' size; fewer if large positions need
-    more of the 23 bits for the integer part.
-    """
+    """Choose the fractional bits by the Gaussians' size, of the 23 that positions have."""
     if not len(gaussians.means):
         return 1  # some readers refuse 0
     distances = np.abs(gaussians.means).max(axis=1)
@@ -309,9 +299,7 @@ def _gzip(data: bytes, comment: str) -> bytes:
 
 
 def _unpack_gzip(packed: bytes) -> tuple[SpzHeader, bytes, bytes]:
-    """Return header, blocks and extensions of versions 1 to 3; unpack no more than the header's
-    counts require.
-    """
+    """Return header, blocks and extensions of versions 1 to 3, no more than the counts require."""
     stream = zlib.decompressobj(16 + zlib.MAX_WBITS)
     header = SpzHeader._make(HEADER.unpack(stream.decompress(packed, HEADER.size)))
     _check(header, (1, 2, 3), len(packed))

@@ -1,14 +1,12 @@
-"""USDA text of one ParticleField3DGaussianSplat prim, the Gaussians of OpenUSD from 26.03 on, for
-Omniverse, Houdini and other programs of film and simulation. Writing needs no USD library.
+"""USDA text of one ParticleField3DGaussianSplat prim, the Gaussians of OpenUSD from 26.03 on.
 
 Scales and opacities are linear, quaternions (w, x, y, z), coefficients of a Gaussian one after the
-other, all float32 with 9 digits. Axes: y up, front +z; one unit is one metre. USD has no attribute
-for antialiasing: it and the notes are in the layer's ``customLayerData``.
+other, all float32 with 9 digits. Axes: y up, front +z; one unit is one metre. Antialiasing and the
+notes are in the layer's ``customLayerData``.
 
-Text of one such prim, with one line for each attribute, as this module, OpenUSD and NVIDIA's
-converter write it, is read here, also inside a USDZ; all else by OpenUSD where it is installed:
-binary layers, scenes with transforms, references and several prims, half precision, and the first
-of time samples. Other attributes are ignored, and so is the unit of the layer."""
+Text of one such prim, with one line for each attribute, also inside a USDZ, is read and written
+without a library; all else is read by OpenUSD where it is installed. Other attributes and the unit
+of the layer are ignored."""
 
 import io
 import os
@@ -46,17 +44,10 @@ TYPES = {
     HARMONICS: "float3[]",
     COLORS: "color3f[]",
 }
-"""Of the prim's attributes."""
-REACH = 3.0
-"""Standard deviations of a Gaussian that the prim's extent contains."""
 LAYER, ALIGNMENT, ZIP_HEADER = "gaussians.usda", 64, 30
-"""Of a USDZ: the name of its layer, the alignment of its content, and the size of the header before
-the name.
-"""
+"""Of a USDZ: the layer's name, the alignment of its content, the size of the header before it."""
 PADDING, PADDING_ID = struct.Struct("<HH"), 0x1986
 """The extra field that aligns the content, and OpenUSD's mark of it."""
-ROWS = 4096
-"""Values that are formatted at once."""
 PRIMS = re.compile(rb"^[ \t]*(?:def|over|class|variantSet)\b.*", re.MULTILINE)
 HEAD = rb"^[ \t]*(?:custom )?(?:uniform )?([\w\[\]]+) ([\w:]+) = (.*)"
 ATTRIBUTE = re.compile(HEAD, re.MULTILINE)
@@ -74,7 +65,6 @@ DEFAULTS = {"orientations": [1.0, 0, 0, 0], "opacities": [1.0]}
 """Of all Gaussians, in files that leave an attribute out."""
 OF_NUMBERS = b"0123456789+-.eEinfa "
 """Bytes that numbers consist of, inf and nan included."""
-TO_SPACES = bytes.maketrans(b"()", b"  ")
 
 
 def write_usda(path: str | os.PathLike, gaussians: Gaussians, notes: Sequence[str] = ()) -> None:
@@ -130,8 +120,8 @@ def _write_layer(file: BinaryIO, gaussians: Gaussians, notes: Sequence[str]) -> 
     }
     for name, values in arrays.items():
         file.write(f"    {TYPES[name]} {name} = [".encode())
-        for at in range(0, len(values), ROWS):
-            rows = map(_tuple, values[at : at + ROWS])
+        for at in range(0, len(values), 4096):  # values that are formatted at once
+            rows = map(_tuple, values[at : at + 4096])
             file.write((", " if at else "").encode() + ", ".join(rows).encode())
         layout = f'elementSize = {harmonics}\n        interpolation = "vertex"\n    )\n'
         file.write(f"] (\n        {layout}".encode() if name == HARMONICS else b"]\n")
@@ -145,10 +135,10 @@ def _tuple(value: np.ndarray) -> str:
 
 
 def _extent(gaussians: Gaussians) -> np.ndarray:
-    """Return the corners of the box that holds the Gaussians, (2, 3)."""
+    """Return the corners of the box that holds the Gaussians to 3 standard deviations, (2, 3)."""
     if not len(gaussians.means):
         return np.zeros((2, 3), np.float32)
-    reach = REACH * np.exp(gaussians.log_scales.max(axis=1, keepdims=True).astype(np.float64))
+    reach = 3.0 * np.exp(gaussians.log_scales.max(axis=1, keepdims=True).astype(np.float64))
     corners = [(gaussians.means - reach).min(axis=0), (gaussians.means + reach).max(axis=0)]
     return np.clip(np.stack(corners), -3e38, 3e38).astype(np.float32)
 
@@ -206,8 +196,7 @@ def read_usda(path: str | os.PathLike) -> tuple[Gaussians, list[str]]:
             name.decode(): (kind.decode(), value.rstrip().removesuffix(b" ("))
             for kind, name, value in entries
         }
-        once = len(entries) == len(found)
-        require(once, "an attribute of the prim is given twice")
+        require(len(entries) == len(found), "an attribute of the prim is given twice")
         require({"positions", "scales"} <= found.keys(), "the prim has no positions or no scales")
         moved = found.get("xformOpOrder", ("", b"[]"))[1] != b"[]"
         require(not moved, "the prim has a transform")
@@ -225,9 +214,7 @@ def read_usda(path: str | os.PathLike) -> tuple[Gaussians, list[str]]:
 
 
 def _text(path: Path) -> bytes:
-    """Return the content of a layer, in a USDZ that of its first file, without comments and texts
-    of several lines.
-    """
+    """Return a layer, in a USDZ its first file, without comments and texts of several lines."""
     data = path.read_bytes()
     if data[:2] == b"PK":
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
@@ -257,13 +244,12 @@ def _read_by_openusd(path: Path) -> tuple[Gaussians, list[str]]:
 
     stage, now = Usd.Stage.Open(str(path)), Usd.TimeCode.EarliestTime()
     worlds = UsdGeom.XformCache(now)
-    prims = Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies())
+    prims, name = (
+        Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies()),
+        f"USD file {str(path)!r}",
+    )
     parts = [
-        placed(
-            _of_prim(prim, now, path),
-            np.array(worlds.GetLocalToWorldTransform(prim)).T,
-            f"USD file {str(path)!r}",
-        )
+        placed(_of_prim(prim, now, path), np.array(worlds.GetLocalToWorldTransform(prim)).T, name)
         for prim in prims
         if prim.GetTypeName() == SCHEMA
     ]
@@ -336,6 +322,6 @@ def _array(text: bytes, name: str) -> Float[np.ndarray, "N width"]:
     count = marks.count(b"(") if width > 1 else marks.count(b",") + 1
     usual = marks == b",".join([one] * count)
     require(usual, f"{name} should consist of {f'tuples of {width} ' * (width > 1)}numbers")
-    parts = text.translate(TO_SPACES).split(b",")
+    parts = text.translate(bytes.maketrans(b"()", b"  ")).split(b",")
     numbers = np.fromiter(map(float, parts), np.float64, len(parts))
     return numbers.astype(np.float32).reshape(count, width)

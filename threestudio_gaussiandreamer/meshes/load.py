@@ -218,7 +218,7 @@ def read_ply_mesh(path: Path) -> list[Mesh]:
         require(known.all(), said)
         mesh = Mesh(vertices, indices[triangles])
         if table.has(COLORS):
-            colors = unit_colors(table[COLORS], table.stored_type(COLORS[0]), path)
+            colors = unit_colors(table[COLORS], table.types[COLORS[0]], path)
             mesh = mesh._replace(vertex_colors=_finite(colors, path))
         elif all(name in faces for name in COLORS):
             colors = np.stack([faces[name].values for name in COLORS], axis=1)
