@@ -7,7 +7,7 @@ hold antialiasing and notes.
 
 Files with an SPZ in a buffer view are written as CesiumJS reads them, which takes SPZ's coordinates
 for glTF's. The draft of that extension wants them half a turn apart; files of programs that follow
-it are known by the ``kernel`` that Cesium's lack."""
+it are known by the ``kernel`` that Cesium's lack. Other compressions and kernels aren't read."""
 
 import logging
 import os
@@ -242,7 +242,9 @@ def _read_plain(
 
 
 def _log_scales(scales: Float[np.ndarray, "N 3"], document: Document) -> Float[np.ndarray, "N 3"]:
-    """Return the logarithms of scales, which drafts of the extension up to April 2026 stored."""
+    """Return the logarithms of scales, which drafts of the extension up to April 2026, and
+    splat-transform until June 2026, stored.
+    """
     if len(scales) and np.median(scales) < 0:
         logger.warning("%s: scales are read as logarithms, as drafts of 2026 had", document.path)
         return scales

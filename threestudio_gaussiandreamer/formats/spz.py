@@ -54,7 +54,9 @@ DECODED_BYTES, DECODED_BYTES_PER_HARMONIC = 180, 9
 MIN_STEPS_PER_SIZE, STEPS_PER_SIZE = 2, 32
 """Steps of positions per median size of the Gaussians; more bring little (reports/answered.md)."""
 INLIER_QUANTILE, OUTLIER_FACTOR = 0.99, 256
-"""Positions beyond this times that quantile are clipped if too few steps would be left else."""
+"""Where the farthest position would leave fewer than ``MIN_STEPS_PER_SIZE`` steps, positions beyond
+``OUTLIER_FACTOR`` times this quantile of distances are clipped.
+"""
 MAX_FIXED, COLOR_SCALE = 2**23 - 1, 0.15
 COLOR_REACH = 0.5 / COLOR_SCALE
 """Largest absolute value of a stored constant harmonic: colours from -0.44 to 1.44."""

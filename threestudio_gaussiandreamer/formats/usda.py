@@ -244,10 +244,8 @@ def _read_by_openusd(path: Path) -> tuple[Gaussians, list[str]]:
 
     stage, now = Usd.Stage.Open(str(path)), Usd.TimeCode.EarliestTime()
     worlds = UsdGeom.XformCache(now)
-    prims, name = (
-        Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies()),
-        f"USD file {str(path)!r}",
-    )
+    prims = Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies())
+    name = f"USD file {str(path)!r}"
     parts = [
         placed(_of_prim(prim, now, path), np.array(worlds.GetLocalToWorldTransform(prim)).T, name)
         for prim in prims

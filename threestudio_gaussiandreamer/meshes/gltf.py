@@ -1,15 +1,11 @@
-"""Triangle meshes and points of glTF 2.0 files (``.glb``, ``.gltf``), in the scene's axes.
+"""Triangle meshes and points of glTF 2.0 files (``.glb``, ``.gltf``), in the scene's axes, with
+what trimesh ignores or misreads: strips, fans, normalised, strided and sparse accessors, morph
+targets with their default weights, skins in the pose of their joints, samplers, any set of texture
+coordinates, KHR_texture_transform, and COLOR_0. Files with compressed geometry (Draco, meshopt),
+instances, basisu or DDS textures, or that require an unknown extension are rejected; lines, lights,
+normals and animations are ignored.
 
-Supported: the default scene with its transforms; triangles, strips, fans and points; all component
-types, normalised, strided and sparse; morph targets with their default weights; skins in the pose
-of their joints; base colours with factor, texture, sampler, any set of texture coordinates,
-KHR_texture_transform, and COLOR_0. Files are rejected if they have compressed geometry (Draco,
-meshopt), instances by EXT_mesh_gpu_instancing, basisu or DDS textures, or require any other unknown
-extension. Lines, lights, normals and animations are ignored. trimesh ignores or misreads most of
-these features.
-
-What reads a document runs inside :func:`~threestudio_gaussiandreamer.formats.reading.reading`,
-which makes one message of all that a damaged file raises."""
+What reads a document runs inside :func:`~threestudio_gaussiandreamer.formats.reading.reading`."""
 
 import base64
 import json
@@ -31,9 +27,7 @@ from .side_files import Budget, SideFiles, decode_texture
 
 POINTS, LINES, TRIANGLES, STRIP, FAN = 0, (1, 2, 3), 4, 5, 6
 LARGEST_UV = 2.0**20
-"""Texture coordinates are clamped to this: the resolution of larger float32 numbers is too low to
-distinguish texels, and sums of very large ones overflow.
-"""
+"""Texture coordinates are clamped to this; larger float32 numbers don't tell texels apart."""
 WRAPS = {10497: REPEAT, 33648: MIRROR, 33071: CLAMP}
 NEAREST = 9728
 UNREAD_IMAGES = ("KHR_texture_basisu", "MSFT_texture_dds")
@@ -41,7 +35,6 @@ UNSET_FACTOR = [0.4, 0.4, 0.4]
 """trimesh's default for materials without a colour; ignored, since it would darken the texture."""
 
 World = Float[np.ndarray, "4 4"]
-
 log = logging.getLogger(__name__)
 COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
@@ -54,19 +47,16 @@ READ_EXTENSIONS = {
     "KHR_mesh_quantization",
     "KHR_texture_transform",
 }
+MATERIALS = (
+    "anisotropy clearcoat diffuse_transmission dispersion emissive_strength ior iridescence sheen "
+    "specular transmission unlit variants volume"
+)
 HARMLESS_EXTENSIONS = {
     "EXT_lights_image_based",
     "KHR_animation_pointer",
     "KHR_lights_punctual",
-    "KHR_materials_unlit",
-    "KHR_materials_variants",
     "KHR_xmp_json_ld",
-} | {
-    f"KHR_materials_{name}"
-    for name in (
-        "anisotropy clearcoat diffuse_transmission dispersion emissive_strength ior iridescence "
-        "sheen specular transmission volume"
-    ).split()
+    *(f"KHR_materials_{name}" for name in MATERIALS.split()),
 }
 """Extensions that are ignored, since they don't affect unlit colours or geometry."""
 
@@ -88,10 +78,7 @@ class Numbers(NamedTuple):
 
 
 class Document:
-    """A parsed file; entries are looked up by kind and index.
-
-    Args:
-        path: a ``.glb`` or ``.gltf`` file.
+    """A parsed ``.glb`` or ``.gltf`` file; entries are looked up by kind and index.
 
     Raises:
         Unreadable: the file isn't glTF 2.0, is damaged, or requires an unsupported extension.
@@ -135,8 +122,6 @@ class Document:
         usual = type(value) is int and value >= 0
         require(usual, f"{key} should be 0 or more, not {str(value)[:40]}")
         return value
-
-    # -- binary data -------------------------------------------------------------------------------
 
     def view(self, index: Any) -> tuple[memoryview, int]:
         """Return the bytes of a buffer view, and its stride (0 = tightly packed)."""
@@ -267,7 +252,7 @@ class Surface(NamedTuple):
     """The base colour of a material."""
 
     factor: Optional[Float[np.ndarray, "3"]] = None
-    """Display values in [0, 1]; None where the material names none."""
+    """Display values in [0, 1]."""
     texture: Optional[UInt8[np.ndarray, "H W 3"]] = None
     tile: Optional[Tile] = None
     coordinates: int = 0
@@ -338,10 +323,7 @@ class Materials:
         return Tile(0, width, height, *wraps, sampler.get("magFilter") == NEAREST)
 
     def _transform(self, transform: dict[str, Any]) -> np.ndarray:
-        """Return KHR_texture_transform as a matrix: scale, then rotate, then move.
-
-        The rotation is counter-clockwise as seen in the texture, whose v grows downwards.
-        """
+        """Return KHR_texture_transform as a matrix: scale, rotate (v grows downwards), move."""
         numbers = self.document.numbers
         offset = numbers(transform.get("offset", [0, 0]), 2)
         scale = numbers(transform.get("scale", [1, 1]), 2)
@@ -500,10 +482,8 @@ class _Scene:
     def _skinned(
         self, skin: Any, attributes: dict[str, Any], positions: Float[np.ndarray, "V 3"]
     ) -> Float[np.ndarray, "V 3"]:
-        """Return the vertices of a skinned mesh in the pose of its joints.
-
-        The mesh's own node doesn't move it (glTF 2.0, 3.7.3.3); each vertex is moved by the
-        weighted mean of its joints' matrices.
+        """Return the vertices moved by the weighted mean of their joints' matrices; the mesh's own
+        node doesn't move them (glTF 2.0, 3.7.3.3).
         """
         entry, count = self.document.entry("skins", skin), len(positions)
         matrices = np.stack([self.worlds[joint] for joint in entry["joints"]])

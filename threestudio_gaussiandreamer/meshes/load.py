@@ -5,13 +5,11 @@ Colours are unlit: texture times vertex colour, else vertex, face or material co
 all are display values (sRGB) in [0, 1]. A texture's alpha channel is ignored.
 
 ``up="auto"`` is +y for glTF, OBJ and other modelling formats and +z for PLY, STL and OFF. The front
-is the axis after the up axis (x -> y -> z -> x), which is +z for y-up files, as glTF says, and +x
-for z-up ones.
+is the axis after the up axis (x -> y -> z -> x): +z for y-up files, as glTF says, +x for z-up ones.
 
-glTF is read by ``gltf.py``, PLY here, and other formats (OBJ, STL, OFF, ...) by trimesh, after a
-check of what it would ignore silently or read wrongly. A PLY has texture coordinates of vertices
-(Blender) or of the corners of faces (MeshLab); the names of its textures are in comments
-``TextureFile``, which Blender doesn't write."""
+Formats but glTF and PLY are read by trimesh, after a check of what it would ignore silently or read
+wrongly. A PLY has texture coordinates of vertices (Blender) or of the corners of faces (MeshLab);
+the names of its textures are in comments ``TextureFile``, which Blender doesn't write."""
 
 import io
 import logging
@@ -32,12 +30,7 @@ from .side_files import Budget, SideFiles, decode_image, decode_texture, open_te
 
 GLTF_FORMATS = ("glb", "gltf")
 Z_UP_FORMATS = ("ply", "stl", "off", "xyz")
-AXES = {
-    sign + name: (1 if sign == "+" else -1) * np.eye(3)[i]
-    for sign in "+-"
-    for i, name in enumerate("xyz")
-}
-
+AXES = dict(zip("+x +y +z -x -y -z".split(), [*np.eye(3), *-np.eye(3)], strict=True))
 ASSETS = Path(__file__).parents[1] / "assets"
 
 log = logging.getLogger(__name__)
@@ -46,12 +39,9 @@ COORDINATES = (("s", "t"), ("u", "v"), ("texture_u", "texture_v"))
 """Of vertices, by the names that programs give them."""
 OF_CORNERS, TEXTURE_NUMBER, TEXTURE_FILE = "texcoord", "texnumber", "TextureFile "
 MATERIALS = "materials"
-"""The name by which trimesh asks for the joined material libraries of an OBJ; all other files that
-it asks for are textures.
-"""
+"""By which trimesh asks for the joined libraries of an OBJ; what else it asks for are textures."""
 UNSET_COLOR = (102, 102, 102)
 """trimesh's default for materials without a colour; ignored, since it would darken the texture."""
-
 LIBRARIES = re.compile(rb"^[ \t]*mtllib[ \t]+(.*)$", re.MULTILINE)
 END_OF_NAME = re.compile(r"(?<=\.mtl)[\"']?\s+", re.IGNORECASE)
 """Between the names of libraries on one line; names may have spaces."""
@@ -133,7 +123,8 @@ def read_parts(path: Path) -> list[Mesh]:
     extension = _extension(path)
     if extension in GLTF_FORMATS:
         return read_gltf(path)
-    return read_ply_mesh(path) if extension == "ply" else read_with_trimesh(path)
+    with reading(path, "mesh") as path:
+        return (_of_ply if extension == "ply" else _by_trimesh)(path, Budget(path))
 
 
 def mesh_formats() -> set[str]:
@@ -198,46 +189,37 @@ def pose_rotation(extension: str, up: str, front: Optional[str]) -> np.ndarray:
 # ---- PLY -----------------------------------------------------------------------------------------
 
 
-def read_ply_mesh(path: Path) -> list[Mesh]:
-    """Read the parts of a PLY, one for each texture; points have no faces.
-
-    Raises:
-        UserError: the file is damaged or exceeds its budget.
-    """
-    with reading(path, "mesh") as path:
-        table, budget = PlyTable(path, faces=True), Budget(path)
-        require(table.has(MEANS), f"its vertices have no {', '.join(MEANS)}")
-        vertices, faces = table.doubles(MEANS), table.faces
-        found = [faces[name] for name in INDICES if name in faces]
-        corners = found[0] if found else Lists(*np.zeros((2, 0)))
-        triangles, polygons = _triangles(corners)
-        budget.spend_geometry(len(vertices), len(triangles))
-        indices = corners.values.astype(np.int64)
-        known = (indices >= 0) & (indices < len(vertices)) & (indices == corners.values)
-        said = f"it is damaged: a face names a vertex beyond the last of {len(vertices)}"
-        require(known.all(), said)
-        mesh = Mesh(vertices, indices[triangles])
-        if table.has(COLORS):
-            colors = unit_colors(table[COLORS], table.types[COLORS[0]], path)
-            mesh = mesh._replace(vertex_colors=_finite(colors, path))
-        elif all(name in faces for name in COLORS):
-            colors = np.stack([faces[name].values for name in COLORS], axis=1)
-            full = 255 if colors.max(initial=0) > 1 else 1
-            mesh = mesh._replace(face_colors=unit_rgb(colors[polygons] / full))
-        uv = _corner_coordinates(table, corners, indices)
-        if uv is None or not len(triangles):
-            return [mesh]
-        numbers = np.zeros(len(corners.lengths))
-        numbers = faces[TEXTURE_NUMBER].values if TEXTURE_NUMBER in faces else numbers
-        return _textured(mesh, table, triangles, indices, uv, numbers[polygons], budget)
+def _of_ply(path: Path, budget: Budget) -> list[Mesh]:
+    """Return a part for each texture; points have no faces."""
+    table = PlyTable(path, faces=True)
+    require(table.has(MEANS), f"its vertices have no {', '.join(MEANS)}")
+    vertices, faces = table.doubles(MEANS), table.faces
+    found = [faces[name] for name in INDICES if name in faces]
+    corners = found[0] if found else Lists(*np.zeros((2, 0)))
+    triangles, polygons = _triangles(corners)
+    budget.spend_geometry(len(vertices), len(triangles))
+    indices = corners.values.astype(np.int64)
+    known = (indices >= 0) & (indices < len(vertices)) & (indices == corners.values)
+    said = f"it is damaged: a face names a vertex beyond the last of {len(vertices)}"
+    require(known.all(), said)
+    mesh = Mesh(vertices, indices[triangles])
+    if table.has(COLORS):
+        colors = unit_colors(table[COLORS], table.types[COLORS[0]], path)
+        mesh = mesh._replace(vertex_colors=_finite(colors, path))
+    elif all(name in faces for name in COLORS):
+        colors = np.stack([faces[name].values for name in COLORS], axis=1)
+        full = 255 if colors.max(initial=0) > 1 else 1
+        mesh = mesh._replace(face_colors=unit_rgb(colors[polygons] / full))
+    uv = _corner_coordinates(table, corners, indices)
+    if uv is None or not len(triangles):
+        return [mesh]
+    numbers = np.zeros(len(corners.lengths))
+    numbers = faces[TEXTURE_NUMBER].values if TEXTURE_NUMBER in faces else numbers
+    return _textured(mesh, table, triangles, indices, uv, numbers[polygons], budget)
 
 
-def _triangles(
-    corners: Lists,
-) -> tuple[Int[np.ndarray, "T 3"], Int[np.ndarray, " T"]]:
-    """Divide polygons into fans; return the positions of the triangles' corners among all corners,
-    and the polygon of each triangle.
-    """
+def _triangles(corners: Lists) -> tuple[Int[np.ndarray, "T 3"], Int[np.ndarray, " T"]]:
+    """Divide polygons into fans; return the triangles' corners among all, and their polygons."""
     lengths = corners.lengths.astype(np.int64)
     counts = np.maximum(lengths - 2, 0)
     polygons = np.repeat(np.arange(len(lengths)), counts)
@@ -279,8 +261,8 @@ def _textured(
     numbers: Float[np.ndarray, " T"],
     budget: Budget,
 ) -> list[Mesh]:
-    """Return a part for each texture: the triangles with its number, with vertices divided where
-    their coordinates differ. Triangles without a texture keep their colours.
+    """Return a part for each texture, with vertices divided where their coordinates differ; the
+    triangles without a texture keep their colours.
     """
     path, files = table.path, SideFiles(table.path, budget)
     said = [text for text in table.comments if text.lower().startswith(TEXTURE_FILE.lower())]
@@ -310,19 +292,7 @@ def _textured(
 # ---- other formats, by trimesh -------------------------------------------------------------------
 
 
-def read_with_trimesh(path: Path) -> list[Mesh]:
-    """Read the parts of a file, transformed by its scene graph; parts that consist of points have
-    no faces.
-
-    Raises:
-        UserError: the file is damaged, exceeds its budget, or references something that isn't a
-            regular file.
-    """
-    with reading(path, "mesh") as path:
-        return _parts(path, Budget(path))
-
-
-def _parts(path: Path, budget: Budget) -> list[Mesh]:
+def _by_trimesh(path: Path, budget: Budget) -> list[Mesh]:
     import trimesh
 
     files, content = _Resolver(path, budget), path.read_bytes()

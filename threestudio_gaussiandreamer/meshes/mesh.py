@@ -1,5 +1,5 @@
-"""The type of a triangle mesh, merging of meshes, colours at points of the surface, and sampling of
-it. Colours of files become float32 display values in [0, 1]."""
+"""Triangle meshes: merging, colours at points of the surface, and samples of it. Colours of files
+become float32 display values in [0, 1]."""
 
 import logging
 from typing import NamedTuple, Optional
@@ -52,9 +52,8 @@ class Mesh(NamedTuple):
     @property
     def has_colors(self) -> bool:
         """Whether the mesh has any colours."""
-        return any(
-            colors is not None for colors in (self.texture, self.vertex_colors, self.face_colors)
-        )
+        found = self.texture, self.vertex_colors, self.face_colors
+        return any(colors is not None for colors in found)
 
 
 # ---- merging -------------------------------------------------------------------------------------
@@ -130,16 +129,14 @@ def unit_rgb(colors: Shaped[np.ndarray, "N C"]) -> Float[np.ndarray, "N 3"]:
 
 def linear_to_srgb(linear: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
     """Return display values by the curve of IEC 61966-2-1; negative ones stay on its line."""
-    return np.where(
-        linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 0) ** (1 / 2.4) - 0.055
-    ).astype(np.float32)
+    power = 1.055 * np.maximum(linear, 0) ** (1 / 2.4) - 0.055
+    return np.where(linear <= 0.0031308, 12.92 * linear, power).astype(np.float32)
 
 
 def srgb_to_linear(display: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
     """Invert :func:`linear_to_srgb` for values in [0, 1]."""
-    return np.where(display <= 0.04045, display / 12.92, ((display + 0.055) / 1.055) ** 2.4).astype(
-        np.float32
-    )
+    power = ((display + 0.055) / 1.055) ** 2.4
+    return np.where(display <= 0.04045, display / 12.92, power).astype(np.float32)
 
 
 def surface_colors(
@@ -161,9 +158,7 @@ def surface_colors(
 
 
 def vertex_surface_colors(mesh: Mesh) -> Float[np.ndarray, "V 3"]:
-    """Return the colour at each vertex; at a texture seam, or where its faces have different
-    colours, that of one of them.
-    """
+    """Return the colour at each vertex, of one of its faces where they differ."""
     if not len(mesh.faces):
         return _vertex_colors(mesh._replace(texture=None))
     corner = np.zeros(len(mesh.vertices), np.int64)
@@ -226,10 +221,7 @@ def _wrapped(coordinate: np.ndarray, wrap: int) -> np.ndarray:
 
 
 def _neighbour(first: np.ndarray, offset: int, size: int, wrap: int) -> np.ndarray:
-    """Return the column or row ``offset`` after ``first``, which is in [-1, size - 1].
-
-    Beyond an edge it is the opposite edge if the texture repeats, else the edge itself.
-    """
+    """Return the column or row ``offset`` after ``first``, wrapped or clipped at the edges."""
     index = first.astype(np.int64) + offset
     return index % size if wrap == REPEAT else index.clip(0, size - 1)
 
@@ -280,9 +272,7 @@ def face_areas(mesh: Mesh) -> Float[np.ndarray, " F"]:
 
 
 def repeated_faces(mesh: Mesh) -> Bool[np.ndarray, " F"]:
-    """Return which faces have the same corner positions as an earlier face, in any order and with
-    any vertex indices.
-    """
+    """Return which faces have the same corner positions as an earlier one, in any order."""
     _, place, _ = distinct(mesh.vertices)
     corners = np.sort(place[mesh.faces], axis=1)
     order = np.lexsort(corners.T)

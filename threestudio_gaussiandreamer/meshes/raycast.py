@@ -1,16 +1,16 @@
 """Render target images by ray casting a mesh, independently of the splatting.
 
 Colours are unlit, and faces are visible from both sides. Cameras are the host's (OpenGL ``c2w``;
-see ``cameras.py``): the ray through pixel (i, j) of an H x W image has the camera
-direction ``((j + 0.5 - W/2)/f, -(i + 0.5 - H/2)/f, -1)`` with ``f = H / (2 tan(fovy/2))``.
+see ``cameras.py``): the ray through pixel (i, j) of an H x W image has the camera direction
+``((j + 0.5 - W/2)/f, -(i + 0.5 - H/2)/f, -1)`` with ``f = H / (2 tan(fovy/2))``.
 
 Where embree isn't installed, a z-buffer in NumPy finds the visible triangles, in homogeneous
 coordinates (Olano and Greer 1997, "Triangle Scan Conversion using 2D Homogeneous Coordinates").
 With corners a, b, c in camera coordinates and the ray d = (x, y, -1), the edge functions
 d . (b x c), d . (c x a), d . (a x b) all have the sign of det(a, b, c) exactly if the ray hits the
 triangle in front of the camera. They are proportional to the barycentric weights, and their sum
-over the determinant is 1 / depth. So triangles that cross the camera's plane need no clipping, and
-adjacent ones leave no gap."""
+over the determinant is 1 / depth, so that triangles that cross the camera's plane aren't clipped.
+"""
 
 import functools
 import logging
@@ -33,9 +33,7 @@ PIXELS_PER_CAST = 2**20
 log = logging.getLogger(__name__)
 NEAR = 1e-6
 SLACK = 1e-6
-"""Margin around a triangle's box in pixels, so that its rounding errors don't exclude samples that
-the edge functions would include.
-"""
+"""Margin around a triangle's box in pixels, for its rounding errors."""
 
 
 class MeshCaster:
@@ -73,8 +71,6 @@ class MeshCaster:
         progress: str = "",
     ) -> Float[np.ndarray, "N H W 4"]:
         """Render several cameras (c2w, fovy) in threads on all cores; see :meth:`render`.
-
-        Embree and NumPy's indexing release the GIL.
 
         Args:
             progress: label of a progress bar, shown in terminals only; empty for no bar.
@@ -217,9 +213,7 @@ def _embree_hits(
 
 
 class TargetCache:
-    """Cache of up to ``capacity`` images of a mesh by camera, as bytes; evicts the least recently
-    used one.
-    """
+    """Cache of up to ``capacity`` images of a mesh, as bytes; evicts the least recently used."""
 
     def __init__(self, caster: MeshCaster, supersample: int, capacity: int) -> None:
         self.caster, self.supersample, self.capacity = caster, supersample, capacity
@@ -229,10 +223,7 @@ class TargetCache:
     def plan(
         self, c2w: Float[Tensor, "B 4 4"], fovy: Float[Tensor, " B"], height: int, width: int
     ) -> None:
-        """Announce images that will be requested. They are cast together with missing ones, many at
-        once, which is faster; not in advance, so that the first request does not wait for all of
-        them.
-        """
+        """Announce images that will be requested; they are cast many at once with missing ones."""
         keyed = {_key(camera, height, width): camera for camera in _cameras(c2w, fovy)}
         self._planned |= {key: keyed[key] for key in keyed if key not in self._pictures}
 
@@ -334,8 +325,8 @@ def zbuffer_hits(
 def _boxes(
     corners: Float[np.ndarray, "F 3 3"], focal: float, rows: np.ndarray, columns: np.ndarray
 ) -> Int[np.ndarray, "F 4"]:
-    """Return the box of samples around each triangle (first row, end, first column, end): empty for
-    those behind the near plane, the whole picture for those that cross it.
+    """Return the samples around each triangle (first row, end, first column, end): none for those
+    behind the near plane, all for those that cross it.
     """
     near = -corners[..., 2] >= NEAR
     depth = np.where(near, -corners[..., 2], 1)

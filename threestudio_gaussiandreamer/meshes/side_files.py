@@ -1,9 +1,6 @@
 """Files that a mesh file references, buffers of glTF, materials of OBJ, textures of both, and the
-memory that loading may allocate, by the sizes in the headers.
-
-A small file can expand to a large size: a PNG of one colour, a thousand nodes that instance one
-mesh, an accessor of a billion zeros. There is one budget for a mesh file and the files that it
-references."""
+memory that loading may allocate, by the sizes in the headers: a small file can expand to a large
+size. There is one budget for a mesh file and the files that it references."""
 
 import codecs
 import contextlib
@@ -26,21 +23,14 @@ from ..formats.reading import BYTES_PER_FILE_BYTE, Unreadable, require
 log = logging.getLogger(__name__)
 
 FIXED_BYTES = 1 << 30
-"""Budget of every file: one texture of 8192 x 8192, or three million triangles. There are
-``BYTES_PER_FILE_BYTE`` per byte of the file in addition.
-"""
-BYTES_PER_TEXEL = 14
-BYTES_PER_VERTEX = 200
-BYTES_PER_FACE = 150
+"""Budget of every file, besides its size: a texture of 8192 x 8192, or three million triangles."""
+BYTES_PER_TEXEL, BYTES_PER_VERTEX, BYTES_PER_FACE = 14, 200, 150
 """Peak memory while a part is decoded, merged, cleaned and transformed."""
 ENCODINGS = ("latin-1", "cp1252", "cp1250", "cp1251", "gb18030", "shift_jis", "cp949", "big5")
 """Of names in files that aren't UTF-8."""
 FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "GIF", "TGA", "TIFF")
-ENCODINGS = ("latin-1", "cp1252", "cp1250", "cp1251", "gb18030", "shift_jis", "cp949", "big5")
-"""Of names in files that aren't UTF-8."""
 consulted: dict[str, Optional[tuple[int, int]]] = {}
-"""The ``stamp`` of every file that a mesh has named, by path; the prior's cache reads and clears
-it."""
+"""The ``stamp`` of every file that a mesh has named; the prior's cache reads and clears it."""
 
 
 class Budget:

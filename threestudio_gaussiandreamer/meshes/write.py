@@ -1,9 +1,7 @@
-"""Write a textured mesh as GLB, or as OBJ with its MTL and PNG.
+"""Write a textured mesh as GLB, or as OBJ with its MTL and PNG; both are y up, front +z.
 
-Textures hold display values, and both formats define the texture of the base colour as sRGB, so the
-bytes are stored as they are. Both are y up with the front at +z where the mesh is. An OBJ names a
-position once however often a seam repeats it, so the file is as closed as the mesh; a GLB repeats
-it, as glTF requires."""
+Bytes of textures are stored as they are, display values. An OBJ names a position once however often
+a seam repeats it, so the file is as closed as the mesh; a GLB repeats it, as glTF requires."""
 
 import io
 import json
@@ -25,7 +23,6 @@ UNLIT = "KHR_materials_unlit"
 COMPONENTS = {"u1": 5121, "u4": 5125, "f4": 5126}
 LINEAR, CLAMP_TO_EDGE = 9729, 33071
 ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER = 34962, 34963
-ALIGNMENT = 4
 NAME_BYTES = 63
 """Longest name that Blender keeps."""
 MTL = """# threestudio-gaussiandreamer
@@ -104,7 +101,7 @@ def write_glb_file(
     Raises:
         UserError: the file can't be written.
     """
-    padded = [block + b"\0" * (-len(block) % ALIGNMENT) for block in blocks]
+    padded = [block + b"\0" * (-len(block) % 4) for block in blocks]
     starts = np.cumsum([0, *map(len, padded)]).tolist()
     views = [
         {"buffer": 0, "byteOffset": start, "byteLength": len(block), **view}
@@ -112,7 +109,7 @@ def write_glb_file(
     ]
     content = {"bufferViews": views, "buffers": [{"byteLength": starts[-1]}]} if views else {}
     text = json.dumps({**document, **content}, separators=(",", ":")).encode()
-    text += b" " * (-len(text) % ALIGNMENT)
+    text += b" " * (-len(text) % 4)
     with atomic_file(path) as file:
         file.write(struct.pack("<4sII", b"glTF", 2, 28 + len(text) + starts[-1]))
         file.write(struct.pack("<I4s", len(text), b"JSON") + text)
@@ -145,18 +142,10 @@ def _document(arrays: Mapping[str, np.ndarray], unlit: bool, name: str) -> dict[
     """Return the JSON of a GLB with one mesh; the arrays and the picture are its buffer views."""
     targets = [ELEMENT_ARRAY_BUFFER] + [ARRAY_BUFFER] * (len(arrays) - 1)
     accessors = [accessor(view, values) for view, values in enumerate(arrays.values())]
-    accessors[1] |= {
-        "min": arrays["POSITION"].min(axis=0).tolist(),
-        "max": arrays["POSITION"].max(axis=0).tolist(),
-    }
-    material: dict[str, Any] = {
-        "name": name,
-        "pbrMetallicRoughness": {
-            "baseColorTexture": {"index": 0},
-            "metallicFactor": 0.0,
-            "roughnessFactor": 1.0,
-        },
-    }
+    places = arrays["POSITION"]
+    accessors[1] |= {"min": places.min(axis=0).tolist(), "max": places.max(axis=0).tolist()}
+    color = {"baseColorTexture": {"index": 0}, "metallicFactor": 0.0, "roughnessFactor": 1.0}
+    material: dict[str, Any] = {"name": name, "pbrMetallicRoughness": color}
     attributes = {name: view for view, name in enumerate(arrays) if name != "indices"}
     primitive = {"attributes": attributes, "indices": 0, "material": 0}
     # without mipmaps, which would mix parts of the texture that are far apart on the surface
@@ -238,9 +227,7 @@ def write_obj(path: str | os.PathLike, surface: Surface) -> None:
 
 
 def companions(path: str | os.PathLike) -> tuple[Path, ...]:
-    """Return the files that are written beside a mesh: the PNG and the MTL of an OBJ, with ``_``
-    for spaces, at which some readers end a file's name.
-    """
+    """Return the PNG and the MTL beside an OBJ, with ``_`` for spaces, which end some names."""
     path = Path(path)
     beside = path.suffix.lower() == ".obj"
     path = path.with_name("_".join(path.name.split()))
