@@ -10,7 +10,6 @@ from ..core.errors import UserError, unknown
 from ..gaussians.axes import VIEWER_UP, rotate
 from .gaussian_files import FORMATS, StoredCloud
 
-Y_UP = "y"
 VECTORS = {f"{sign}{axis}": s * np.eye(3)[i]
            for i, axis in enumerate("xyz") for sign, s in (("+", 1.0), ("-", -1.0))}  # fmt: skip
 GAUSSIANS, MESH = "gaussians", "mesh"
@@ -100,7 +99,7 @@ def from_producer(cloud: StoredCloud, name: str, suffix: str = ".ply") -> Stored
     known = FORMATS.get(suffix, FORMATS[".ply"])
     if known.up != VIEWER_UP and (name, suffix) not in UNTURNED:
         cloud = cloud.in_axes(VIEWER_UP)
-    return cloud._replace(gaussians=rotate(cloud.gaussians, rotation), up=Y_UP)
+    return cloud._replace(gaussians=rotate(cloud.gaussians, rotation), up="y")
 
 
 def to_y_up(axes: Axes) -> Float[np.ndarray, "3 3"]:

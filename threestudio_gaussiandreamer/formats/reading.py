@@ -1,10 +1,11 @@
 """Read files from anywhere: one message for every kind of damage, and a limit of the memory that a
 file may take, in proportion to its size, since a small one can announce gigabytes."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from os import PathLike
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -56,6 +57,14 @@ def require(fits: bool, problem: str) -> None:
     """Raise :class:`Unreadable` unless ``fits``."""
     if not fits:
         raise Unreadable(problem)
+
+
+def whole_number(entry: Mapping[str, Any], key: str, default: Any = None) -> int:
+    """Return a count or an offset of an object of JSON, which must be an integer of 0 or more."""
+    value = entry.get(key, default)
+    usual = type(value) is int and value >= 0
+    require(usual, f"{key} should be 0 or more, not {str(value)[:40]}")
+    return value
 
 
 def require_file_memory(needed: int, file_size: int, content: str) -> None:

@@ -27,7 +27,7 @@ from ..gaussians.gaussians import Gaussians, finite
 from ..gaussians.sh import COEFFICIENTS
 from . import packing
 from .packing import ANTIALIASED
-from .reading import reading, require, require_file_memory
+from .reading import reading, require, require_file_memory, whole_number
 
 SOG_UP = VIEWER_UP
 ANTIALIASED_MODEL = "antialiased"
@@ -226,12 +226,12 @@ class _Archive:
         require(self.version in VERSIONS, said)
         shape = self.meta["means"].get("shape") if self.version == 1 else None
         counted = {"count": shape[0]} if isinstance(shape, list) and shape else self.meta
-        self.count, self.bands = self._number(counted, "count"), 0
+        self.count, self.bands = whole_number(counted, "count"), 0
         if self.meta.get("shN") is not None and self.version == 1:
             width = self._pixels("shN", 0).shape[1]
             self.bands = [PALETTE_COLUMNS * (k - 1) for k in COEFFICIENTS].index(width or -1)
         elif self.meta.get("shN") is not None:
-            self.bands = self._number(self.meta["shN"], "bands")
+            self.bands = whole_number(self.meta["shN"], "bands")
         said = f"harmonics of degree {self.bands}: 0 to 3 were expected"
         require(self.bands < len(COEFFICIENTS), said)
         each = DECODED_BYTES + DECODED_BYTES_PER_HARMONIC * COEFFICIENTS[self.bands]
@@ -257,12 +257,6 @@ class _Archive:
             return book[:, 0][pixels]
         return book[pixels, np.arange(pixels.shape[-1]) % book.shape[1]]
 
-    def _number(self, section: dict[str, Any], key: str) -> int:
-        value = section.get(key)
-        usual = type(value) is int and value >= 0
-        require(usual, f"{key} should be 0 or more, not {str(value)[:40]}")
-        return value
-
     def floats(self, section: str, key: str, count: int) -> Float[np.ndarray, " C"]:
         """Return ``count`` numbers of the JSON."""
         numbers = np.atleast_1d(np.array(self.meta[section][key], np.float64)).clip(-1e38, 1e38)
@@ -283,7 +277,7 @@ class _Archive:
         height, width = pixels.shape[:2]
         count = height * PALETTE_COLUMNS
         if self.version != 1:
-            count = self._number(self.meta["shN"], "count")
+            count = whole_number(self.meta["shN"], "count")
         fits = width == PALETTE_COLUMNS * coefficients and height * PALETTE_COLUMNS >= count
         require(fits, f"the palette of {count} entries can't have {width} x {height} pixels")
         return pixels[..., :3].reshape(-1, coefficients, 3)[:count]

@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Float, Integer, UInt8
 
 from ..core.quaternions import rotation_rows
-from ..formats.reading import reading, require
+from ..formats.reading import reading, require, whole_number
 from .mesh import CLAMP, MIRROR, REPEAT, Mesh, Tile, linear_to_srgb, unit_rgb
 from .side_files import Budget, SideFiles, decode_texture
 
@@ -116,20 +116,13 @@ class Document:
         require(len(values) == count, f"{count} numbers were expected, not {str(values)[:80]}")
         return np.array([float(value) for value in values])
 
-    def size(self, entry: dict[str, Any], key: str, default: Optional[int] = None) -> int:
-        """Return a count or an offset of an entry, an integer of 0 or more."""
-        value = entry.get(key, default)
-        usual = type(value) is int and value >= 0
-        require(usual, f"{key} should be 0 or more, not {str(value)[:40]}")
-        return value
-
     def view(self, index: Any) -> tuple[memoryview, int]:
         """Return the bytes of a buffer view, and its stride (0 = tightly packed)."""
         view = self.entry("bufferViews", index)
         content = self._buffer(view.get("buffer"))
-        start, length = self.size(view, "byteOffset", 0), self.size(view, "byteLength")
+        start, length = whole_number(view, "byteOffset", 0), whole_number(view, "byteLength")
         require(start + length <= len(content), f"buffer view {index} ends after its buffer")
-        return content[start : start + length], self.size(view, "byteStride", 0)
+        return content[start : start + length], whole_number(view, "byteStride", 0)
 
     def accessor(self, index: Any, kinds: tuple[str, ...]) -> Numbers:
         """Return the numbers of an accessor.
@@ -142,7 +135,7 @@ class Document:
         said = f"accessor {index} is {str(kind)[:20]} of component type {str(component)[:20]}"
         usual = kind in kinds and component in COMPONENTS
         require(usual, f"{said}; {' or '.join(kinds)} was expected")
-        shape = self.size(entry, "count"), WIDTHS[kind]
+        shape = whole_number(entry, "count"), WIDTHS[kind]
         dtype = np.dtype(COMPONENTS[component])
         if "bufferView" in entry:
             values = self._strided(entry, shape, dtype)
@@ -160,7 +153,7 @@ class Document:
 
     def count(self, index: Any) -> int:
         """Return how many elements an accessor announces."""
-        return self.size(self.entry("accessors", index), "count")
+        return whole_number(self.entry("accessors", index), "count")
 
     def _strided(
         self, entry: dict[str, Any], shape: tuple[int, int], dtype: np.dtype
@@ -171,14 +164,14 @@ class Document:
         if not shape[0]:
             return np.zeros(shape, dtype)
         require(stride == 0 or stride >= row, f"rows of {row} bytes can't be {stride} bytes apart")
-        start, stride = self.size(entry, "byteOffset", 0), stride or row
+        start, stride = whole_number(entry, "byteOffset", 0), stride or row
         end = start + (shape[0] - 1) * stride + row  # NumPy doesn't check it where it overflows
         require(end <= len(content), "an accessor ends after its buffer view: it is damaged")
         return np.ndarray(shape, dtype, content, start, (stride, dtype.itemsize))
 
     def _with_sparse(self, values: np.ndarray, sparse: Any, dtype: np.dtype) -> np.ndarray:
         """Return a copy in which some rows are replaced."""
-        count, where = self.size(sparse, "count"), sparse["indices"]
+        count, where = whole_number(sparse, "count"), sparse["indices"]
         kind = COMPONENTS.get(where.get("componentType"))
         require(kind in INDICES, "the indices of a sparse accessor should be unsigned integers")
         rows = self._strided(where, (count, 1), np.dtype(kind))[:, 0]
@@ -196,7 +189,7 @@ class Document:
             else:
                 content = self._chunk if index == 0 else None
             require(content is not None, f"buffer {index} is missing")
-            whole = len(content) >= self.size(entry, "byteLength")
+            whole = len(content) >= whole_number(entry, "byteLength")
             require(whole, f"buffer {index} is shorter than it should be")
             self._buffers[index] = memoryview(content)
         return self._buffers[index]
