@@ -287,6 +287,11 @@ def test_without_openusd_the_package_is_named(tmp_path, monkeypatch):
         ("    float3[] scales", "    token[] xformOpOrder = [1]\n    float3[] scales", "transform"),
         ("def Particle", "over Particle", "expected one prim"),
         ("    float3[] scales", "    def Xform {", "expected one prim"),
+        (
+            "    float3[] scales",
+            "    float[] opacities.connect = </X.o>\n    float3[] scales",
+            "of others",
+        ),
         ("\n}\n", "\n", "and its '}'"),
         ("\n}\n", "\n}\ndef Xform {\n}\n", "expected one prim"),
         ("(\n    default", '(\n    doc = """a\n    default', "truncated"),

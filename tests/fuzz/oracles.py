@@ -47,7 +47,7 @@ class _Rows:
         self.order = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}[encoding]
         self.at, self.body = 0, body
         self.words = [] if self.order else body.decode("latin-1").split()
-        self.first = len(body.lstrip().partition(b"\n")[0].split())
+        self.lines = [] if self.order else [len(x.split()) for x in body.split(b"\n") if x.strip()]
 
     def row(self, properties: list[tuple[str, str, str]]) -> list[float]:
         values = []
@@ -73,7 +73,10 @@ class _Rows:
 
 def _text_number(words: list[str]) -> float:
     try:
-        return float(words.pop(0))
+        word = words.pop(0)
+        if "_" in word:
+            raise ValueError
+        return float(word)
     except (IndexError, ValueError) as error:
         raise Illegal("not a number") from error
 
@@ -82,10 +85,13 @@ def ply_vertices(data: bytes) -> PlyVertices:
     """The vertices of a PLY file (Turk 1994)."""
     encoding, elements, body = ply_header(data)
     rows, vertices = _Rows(encoding, body), None
-    name, count, properties = elements[0] if elements else ("", 0, [])
-    listed = any(count_kind for _, _, count_kind in properties)
-    if encoding == "ascii" and count and not listed and rows.first != len(properties):
-        raise Illegal("more or fewer numbers than properties")
+    for _, count, properties in elements:
+        if any(count_kind for _, _, count_kind in properties):
+            break
+        lines = rows.lines[: count if properties else 0]
+        if any(length != len(properties) for length in lines):
+            raise Illegal("more or fewer numbers than properties")
+        rows.lines = rows.lines[len(lines) :]
     for name, count, properties in elements:
         if properties and count > len(data):
             raise Illegal("more rows than bytes")
@@ -96,6 +102,10 @@ def ply_vertices(data: bytes) -> PlyVertices:
             columns = np.array(table, np.float64).reshape(len(table), len(properties)).T
             types = {name: kind for name, kind, _ in properties}
             vertices = dict(zip(types, columns, strict=True)), types, count
+            for kind, column in zip(types.values(), columns, strict=True):
+                whole = np.iinfo(kind) if kind in "bBhHiI" else None
+                if whole and ((column < whole.min) | (column > whole.max)).any():
+                    raise Illegal("an integer out of its type's range")
             if len(elements) > 1 and elements[-1][0] != "vertex":
                 return PlyVertices(*vertices, leftover=False)  # later elements aren't read
     if vertices is None:

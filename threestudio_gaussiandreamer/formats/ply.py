@@ -8,6 +8,7 @@ Tables of vertices are read as other programs write them: text or binary of eith
 properties in any order and of any number type, unknown properties and elements. No more is
 allocated than the file's size accounts for, whatever count the header states."""
 
+import itertools
 import logging
 import os
 import re
@@ -120,6 +121,10 @@ class PlyTable:
         self.columns = {name: column.values for name, column in found["vertex"].items()}
         self.faces = found.get("face", {})
         self.types = {entry.name: np.dtype(entry.type) for entry in vertices[0].properties}
+        for name in (name for name, kind in self.types.items() if kind.kind != "f"):
+            limits, column = np.iinfo(self.types[name]), self.columns[name]
+            beyond = ((column < limits.min) | (column > limits.max)).any()
+            require(not beyond, f"{name} is beyond the range of its type")
 
     def has(self, names: Collection[str]) -> bool:
         return all(name in self.columns for name in names)
@@ -461,13 +466,18 @@ def _property(words: list[str], element: Element) -> Property:
 
 
 def _packed(text: bytes, header: Header) -> bytes:
-    """Return the numbers of a text as float64."""
-    numbers = np.fromiter(map(float, text.split()), np.float64)
-    first, row = header.elements[0], text.lstrip().partition(b"\n")[0].split()
-    said = f"the first row of {first.name!r} has {len(row)} numbers, "
-    usual = not first.count or first.has_lists or len(row) == len(first.properties)
-    require(usual, said + f"{len(first.properties)} are announced")
-    return numbers.tobytes()
+    """Return the numbers of a text as float64; up to the first element with lists, a line is a
+    row.
+    """
+    rows, at = [line.split() for line in text.split(b"\n") if line.strip()], 0
+    for element in itertools.takewhile(lambda element: not element.has_lists, header.elements):
+        width = len(element.properties)
+        end = at + (element.count if width else 0)
+        said = f"a row of {element.name!r} has other than the {width} numbers that are announced"
+        require(all(len(row) == width for row in rows[at:end]), said)
+        at = end
+    require(b"_" not in text, "it has other words than numbers")  # Python reads 1_0 as 10
+    return np.fromiter(map(float, itertools.chain.from_iterable(rows)), np.float64).tobytes()
 
 
 def read_rows(

@@ -51,10 +51,13 @@ PADDING, PADDING_ID = struct.Struct("<HH"), 0x1986
 PRIMS = re.compile(rb"^[ \t]*(?:def|over|class|variantSet)\b.*", re.MULTILINE)
 HEAD = rb"^[ \t]*(?:custom )?(?:uniform )?([\w\[\]]+) ([\w:]+) = (.*)"
 ATTRIBUTE = re.compile(HEAD, re.MULTILINE)
+METADATA = re.compile(rb" \(\n(?:.*\n)*?[ \t]*\)[ \t]*$", re.MULTILINE)
+"""Of the prim, or of one of its attributes."""
+CHANGING = re.compile(rb"\.(?:timeSamples|connect|spline)\b")
 COMMENT = re.compile(rb"^[ \t]*#.*", re.MULTILINE)
 COLOR_SPACE = "colorSpace:name"
 """The attribute by which a prim names the colour space of its harmonics."""
-COLOR_SPACES = re.compile(rb"^.*\bcolorSpace(?::name)? = (.*)", re.MULTILINE)
+COLOR_SPACES = re.compile(rb"\bcolorSpace(?::name)? = (.*)")
 """Of a prim, or of an array."""
 UP_AXIS = re.compile(rb'upAxis = "(\w+)"')
 NOTES = re.compile(rb'string\[\] notes = \[((?:"[^"\\]*"(?:, )?)*)\]')
@@ -191,11 +194,11 @@ def read_usda(path: str | os.PathLike) -> tuple[Gaussians, list[str]]:
         require(whole, f"expected one prim 'def {SCHEMA} \"name\"' and its '}}', got {prims[:3]}")
         axes = UP_AXIS.findall(metadata)
         require(set(axes) <= {b"Y", b"Z"}, f"only y or z up is read, and its upAxis is {axes}")
+        linear = any(map(is_linear, COLOR_SPACES.findall(body)))
+        body = METADATA.sub(b"", body)
+        require(not CHANGING.search(body), "its values change with time or are those of others")
         entries = ATTRIBUTE.findall(body)
-        found = {
-            name.decode(): (kind.decode(), value.rstrip().removesuffix(b" ("))
-            for kind, name, value in entries
-        }
+        found = {name.decode(): (kind.decode(), value.rstrip()) for kind, name, value in entries}
         require(len(entries) == len(found), "an attribute of the prim is given twice")
         require({"positions", "scales"} <= found.keys(), "the prim has no positions or no scales")
         moved = found.get("xformOpOrder", ("", b"[]"))[1] != b"[]"
@@ -205,7 +208,6 @@ def read_usda(path: str | os.PathLike) -> tuple[Gaussians, list[str]]:
             require(other == kind, f"{name} should be {kind}, not {other}")
         arrays = {name: _array(found.get(name, ("", b"[]"))[1], name) for name in ARRAYS}
         degree = found.get(DEGREE, ("", b"3"))[1].decode("ascii", "replace")
-        linear = any(map(is_linear, COLOR_SPACES.findall(body)))
         gaussians = _built(degree, arrays, linear, str(file))
         up = axes[0].decode().lower() if axes else USDA_UP
         said = NOTES.search(metadata)
