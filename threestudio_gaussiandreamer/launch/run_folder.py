@@ -50,6 +50,8 @@ HASH = r"-[0-9a-f]{8}$"
 SLUG_SOURCE = 1024
 """Characters of a text that its slug is made of: normalising takes quadratic time."""
 SLUG_CHARACTERS = "-_.,+=()'! "
+WINDOWS_DEVICES = {f"{port}{i}" for port in ("com", "lpt") for i in range(1, 10)}
+WINDOWS_DEVICES |= {"con", "prn", "aux", "nul"}
 
 
 def name_folders(cfg: Any, paths: Sequence[str | os.PathLike] = ()) -> None:
@@ -200,12 +202,12 @@ def _require_folder_name(tag: str, timestamp: str) -> None:
 
 
 def safe_name(text: str) -> str:
-    """Convert ``text`` to a valid folder name: unchanged if it is valid and at most 64 bytes long,
-    else a slug of at most 64 bytes and a hash of the text. A name that this function has returned
-    stays as it is, since a farm's worker passes its asset's name as a run's tag.
+    """Convert ``text`` to a valid folder name: unchanged if it is valid on all systems and at most
+    64 bytes long, else a slug of at most 64 bytes and a hash of the text. A name that this function
+    has returned stays as it is, since a farm's worker passes its asset's name as a run's tag.
 
     Valid characters are letters, digits, ``-_.,+=()'!`` and inner spaces. A name may not begin with
-    a dot or hyphen or end with a dot."""
+    a dot or hyphen or end with a dot, or be that of a Windows device."""
     hashed = re.search(HASH, text)
     if text and _slug(text, SLUG_BYTES + len(hashed[0]) if hashed else SLUG_BYTES) == text:
         return text
@@ -219,7 +221,10 @@ def _slug(text: str, most_bytes: int) -> str:
         c if c.isalnum() or c in SLUG_CHARACTERS else "_"
         for c in unicodedata.normalize("NFC", text[:SLUG_SOURCE])
     )
-    return slug.encode()[:most_bytes].decode(errors="ignore").lstrip("-. ").rstrip(". ")
+    slug = slug.encode()[:most_bytes].decode(errors="ignore").lstrip("-. ").rstrip(". ")
+    # Windows ignores what follows a dot, and reads a raised digit as that digit
+    device = unicodedata.normalize("NFKC", slug.split(".")[0]).strip().lower()
+    return f"_{slug}"[:most_bytes] if device in WINDOWS_DEVICES else slug
 
 
 def _set_trial(cfg: Any, trial_name: str) -> None:
