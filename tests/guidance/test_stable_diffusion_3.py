@@ -2,6 +2,8 @@
 form.
 """
 
+import json
+
 import pytest
 import torch
 
@@ -92,3 +94,15 @@ def test_the_size_is_the_models_unless_given(model, prompts):
     tiny.gradient(tiny.guidance(KIND, model, image_size=192), prompts, renders())
     with pytest.raises(UserError, match="image_size: expected a multiple of 16"):
         tiny.guidance(KIND, model, image_size=72)
+    with pytest.raises(UserError, match="image_size: .* positions up to 192 pixels, got 208"):
+        tiny.guidance(KIND, model, image_size=208)
+
+
+def test_a_shift_that_depends_on_the_picture_is_asked_for(tmp_path):
+    folder = tiny_large_models.stable_diffusion_3(tmp_path / "dynamic")
+    file = folder / "scheduler" / "scheduler_config.json"
+    settings = json.loads(file.read_text()) | {"use_dynamic_shifting": True}
+    file.write_text(json.dumps(settings))
+    with pytest.raises(UserError, match="set system.guidance.flow_shift"):
+        tiny.guidance(KIND, folder)
+    assert tiny.guidance(KIND, folder, flow_shift=3.0).image_size == 64

@@ -24,6 +24,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Optional
 
+from ..core.errors import UserError
 from ..core.options import in_range, one_of
 from ..diffusion import rectified_flow, sds
 from ..host import register
@@ -57,6 +58,11 @@ class StableDiffusion3Guidance(StableDiffusionGuidance):
         from diffusers import FlowMatchEulerDiscreteScheduler
 
         config = load_settings(FlowMatchEulerDiscreteScheduler, folder, "scheduler").config
+        if config.use_dynamic_shifting and self.cfg.flow_shift is None:
+            raise UserError(
+                f"the scheduler of {self.cfg.pretrained_model_name_or_path} chooses its shift by "
+                "the size of the picture: set system.guidance.flow_shift, such as 3"
+            )
         self.prediction_type = "velocity"
         shift = config.shift if self.cfg.flow_shift is None else self.cfg.flow_shift
         sigmas = rectified_flow.shifted_sigmas(config.num_train_timesteps, shift)
@@ -69,6 +75,16 @@ class StableDiffusion3Guidance(StableDiffusionGuidance):
             SD3Transformer2DModel, folder, "transformer", self.prepare_denoiser
         )
         self.text_width = self.transformer.config.joint_attention_dim
+
+    def size_of_images(self, factor: int = 1) -> int:
+        size, config = super().size_of_images(factor), self.transformer.config
+        largest = config.pos_embed_max_size * config.patch_size * factor
+        if size > largest:
+            raise UserError(
+                f"system.guidance.image_size: {self.cfg.pretrained_model_name_or_path} knows "
+                f"positions up to {largest} pixels, got {size}"
+            )
+        return size
 
     def run_network(self, z: Latents, t: Timesteps, embeddings: Embeddings) -> Latents:
         abar = self._abar[t]
