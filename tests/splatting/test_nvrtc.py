@@ -121,6 +121,7 @@ def test_the_release_that_torch_was_built_with_is_tried_first(monkeypatch, tmp_p
         (tmp_path / "nvidia" / place).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / "nvidia" / place).touch()
     monkeypatch.delenv("GAUSSIANDREAMER_NVRTC", raising=False)
+    monkeypatch.setenv("CUDA_HOME", "x" * 300)  # can't be read, as a folder without permission
     monkeypatch.setattr(nvrtc.sysconfig, "get_paths", lambda: {"purelib": str(tmp_path)})
     for release, first in (("12.8", "libnvrtc.so.12"), ("13.0", "libnvrtc.so.13")):
         monkeypatch.setattr(torch.version, "cuda", release)

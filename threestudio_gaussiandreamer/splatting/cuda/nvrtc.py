@@ -8,6 +8,7 @@ options and compiler version.
 
 import ctypes
 import functools
+import glob
 import hashlib
 import logging
 import os
@@ -208,7 +209,8 @@ def _candidates() -> list[str]:
     folders.insert(0, Path(torch.__file__).parent / "lib")
     if toolkit := os.environ.get("CUDA_HOME"):
         folders.append(Path(toolkit, "lib64"))
-    paths = (str(path) for folder in folders for path in sorted(folder.glob(pattern)))
+    # Path.glob raises for a folder that can't be read
+    paths = [path for folder in folders for path in sorted(glob.glob(str(folder / pattern)))]
     found = [path for path in paths if not re.search(r"builtins|\.alt\.", path)]
     return [*dict.fromkeys(found), f"libnvrtc.so.{release}", "libnvrtc.so.12", "libnvrtc.so"]
 
