@@ -15,6 +15,7 @@ weight = torch.nn.Parameter(torch.ones(2))
 optimizer = torch.optim.Adam([weight], lr=0.1)
 weight.square().sum().backward()
 optimizer.step(), optimizer.zero_grad()
+assert torch.compiler.disable(recursive=False)(len) is torch.compiler.disable(len) is len
 late = ("torch._dynamo", "torchmetrics")
 print([isinstance(sys.modules[name], Late) for name in late])
 print({"scipy.signal", "transformers"} & sys.modules.keys())

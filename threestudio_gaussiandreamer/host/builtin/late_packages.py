@@ -44,8 +44,11 @@ def import_lightning() -> None:
     if not {"lightning", METRICS, COMPILER} & sys.modules.keys():
         try:
             sys.meta_path.insert(0, Late)
-            names = {"disable": lambda function, *_, **__: function, "graph_break": lambda: None}
-            names["OptimizedModule"] = type("OptimizedModule", (), {})
+            names = {
+                "disable": lambda function=None, *_, **__: function or (lambda found: found),
+                "graph_break": lambda *_, **__: None,
+                "OptimizedModule": type("OptimizedModule", (), {}),
+            }
             vars(sys.modules["torch"])["_dynamo"] = Late(COMPILER, **names)
             package = Late(METRICS, __version__=metadata.version(METRICS), _logger=LOGGER)
             import_module(f"{METRICS}.utilities")  # before metric, which it imports
