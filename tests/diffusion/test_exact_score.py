@@ -8,6 +8,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.diffusion import sds
 from threestudio_gaussiandreamer.diffusion.exact_score import (
     COLOR_MATRIX,
@@ -123,4 +124,6 @@ def test_decode_inverts_encode_on_what_the_latent_holds(matrix):
     assert math.isclose(latents.std(), 1, rel_tol=1e-4)
     # float32 through a pseudo-inverse
     torch.testing.assert_close(latent.decode(latents), rgb, rtol=0, atol=1e-5)
+    with pytest.raises(UserError, match="all of one colour"):
+        latent.normalised(torch.full((2, 3, 4, 4), 0.5))
     assert torch.equal(COLOR_MATRIX.T @ COLOR_MATRIX, torch.eye(3))

@@ -24,6 +24,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
+from ..core.errors import UserError
 from . import sds
 
 CPU_CHUNK_ELEMENTS, GPU_CHUNK_ELEMENTS = 2**18, 2**24
@@ -150,8 +151,12 @@ class LinearLatent(NamedTuple):
         )
 
     def normalised(self, rgb: Float[Tensor, "K 3 h w"]) -> "LinearLatent":
-        """Return a latent scaled to unit variance on pooled images in [0, 1]."""
+        """Return a latent scaled to unit variance on pooled images in [0, 1]; raise UserError if
+        they are all of one colour.
+        """
         std = self._replace(scale=1.0).encode_pooled(rgb).std()
+        if not std > 0:
+            raise UserError("a latent can't be normalised on images that are all of one colour")
         return self._replace(scale=1 / float(std))
 
 

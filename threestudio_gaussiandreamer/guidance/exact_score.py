@@ -136,7 +136,7 @@ class ExactScoreGuidance(ScoreDistillation):
         mesh = MeshCaster(load_mesh(cfg.mesh, up=cfg.up, front=cfg.front))
         self.truth = MeshTruth(mesh, cfg.supersample, cfg.max_cached_targets, self._picture_size)
         self._banks: dict[tuple[int, int], Bank] = {}
-        self._size: tuple[int, int] = (0, 0)
+        self._size: Optional[tuple[int, int]] = None
         self._perplexity = 1.0
         ranges = OrbitRanges(
             BANK_ELEVATIONS, (-180.0, 180.0), cfg.bank_distance_range, cfg.bank_fovy_range
@@ -224,6 +224,8 @@ class ExactScoreGuidance(ScoreDistillation):
         **batch: Any,
     ) -> list[Mixture]:
         """Return the mixture of each item, for pictures of the size that ``encode`` has set."""
+        if self._size is None:
+            raise UserError("exact-score-guidance takes renders, not latents (rgb_as_latents)")
         background = background_of(comp_rgb_bg, len(c2w), c2w.device)
         rgba = self.truth.pictures(c2w, fovy, *self._size)
         own = self._latent().encode(composite(rgba, background))
