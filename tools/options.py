@@ -31,7 +31,8 @@ def defaults(tree: ast.Module) -> dict[str, str]:
             if isinstance(value, ast.Call) and ast.unparse(value.func) == "field":
                 given = [word.value for word in value.keywords if word.arg == "default"]
                 value = given[0] if given else None
-            found.setdefault(node.target.id, ast.unparse(value) if value else "")
+            if not isinstance(value, ast.Subscript):  # of a class that isn't a Config
+                found.setdefault(node.target.id, ast.unparse(value) if value else "")
     return found
 
 

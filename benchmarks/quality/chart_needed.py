@@ -24,11 +24,10 @@ def main() -> None:
     plt = pyplot()
     figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4.6), width_ratios=(3, 2))
     for name, color in zip(order, COLOURS, strict=False):
-        left.plot(*zip(*fixed[name], strict=True), color=color, linewidth=1.4, label=name)
+        left.plot(*zip(*fixed[name], strict=True), color=color, linewidth=1.4)
         left.plot(*chosen[name], "*", color=color, markersize=13, markeredgecolor="white")
     set_log_x(left)
     left.set(xlabel="Gaussians; star: the choice of budget: auto", ylabel=DECIBEL)
-    left.legend(frameon=False, fontsize=9, loc="lower right")
     places = range(len(order))
     right.barh(places, [chosen[name][0] for name in order], color=COLOURS[: len(order)], alpha=0.8)
     needed = [needed_number(fixed[name]) for name in order]
