@@ -59,11 +59,12 @@ def table(folder):
 
 
 def test_a_run_in_several_folders_is_scored_once(tmp_path, judge, monkeypatch):
-    """Also behind links, of which one leads to a folder above."""
+    """Also behind links, of which two lead to folders above: without a guard they never end."""
     runs = finished(tmp_path / "runs", PROMPTS[:2])
     links = tmp_path / "links"
     links.mkdir()
-    for name, where in (("first", runs / "gaussiandreamer/run0"), ("up", links), ("all", runs)):
+    first = runs / "gaussiandreamer/run0"
+    for name, where in (("first", first), ("up", links), ("top", tmp_path), ("all", runs)):
         (links / name).symlink_to(where)
     monkeypatch.chdir(tmp_path)
     again = ["runs/gaussiandreamer/run1", str(runs), "runs", "links"]

@@ -224,7 +224,8 @@ def test_a_row_that_has_changed_has_a_state_of_its_own(tmp_path, file):
 
 def test_a_record_that_something_else_has_written_is_one_message(tmp_path):
     note(Place(tmp_path), FOX, "result.json")
-    for content in ("", "{", "[1]", "[" * 99_999):
+    wrong = ['{"seconds": "5"}', '{"worker_seconds": null}', '{"scores": [1]}']
+    for content in ("", "{", "[1]", "[" * 99_999, *wrong, '{"scores": {"psnr": [1]}}'):
         (tmp_path / "assets/fox/result.json").write_text(content)
         with pytest.raises(UserError, match="assets/fox/result.json is damaged .*: delete it, or"):
             list(Place(tmp_path).records([FOX]))

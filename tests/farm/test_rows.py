@@ -103,6 +103,7 @@ def test_texts_that_are_no_folders_names_are_an_asset_each(tmp_path):
         ("prompt,overrides\na,max_steps", ".csv", "line 2: the override 'max_steps' isn't"),
         ('prompt,overrides\na,"x=\'1"', ".csv", "open quote"),
         ('{"prompt": "a"', ".jsonl", "line 1: can't be read as JSON"),
+        ('{"prompt": "a", "prompt": "b"}', ".jsonl", "'prompt' is given twice"),
         ("[" * 20_000, ".jsonl", "line 1: can't be read as JSON"),
         ('["a"]', ".jsonl", "line 1: expected an object"),
         ('{"prompt": 1}', ".jsonl", "line 1: the prompt is 1"),

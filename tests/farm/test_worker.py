@@ -67,6 +67,30 @@ def test_attempts_are_counted_in_the_session_and_in_all(tmp_path):
         count_attempts(tmp_path, "two", JOB._replace(row=JOB.row._replace(prompt="b", line=7)))
 
 
+@pytest.mark.parametrize(
+    ("text", "saves_memory", "counted", "kept"),
+    [
+        ("one host 7\none KEY host 7\n\none\n", False, (4, 4), True),
+        ("one KEY host 7\n", False, (2, 2), True),
+        ("one KEY host 7\n", True, (1, 1), False),
+        ("saves_memory.txt: one KEY host 7\n", True, (2, 2), True),
+        ("saves_memory.txt: one host 7\n", False, (1, 1), False),
+        ("one KEY-saves_memory host 7\n", True, (2, 2), True),
+    ],
+)
+def test_attempts_that_earlier_versions_noted(tmp_path, text, saves_memory, counted, kept):
+    """Without a key, or with the key alone and a file that told the configuration."""
+    folder = tmp_path / "fox"
+    (folder / "ckpts").mkdir(parents=True)
+    file, _, lines = text.rpartition(": ")
+    if file:
+        (folder / file).touch()
+    (folder / "attempts.txt").write_text(lines.replace("KEY", JOB.row.key))
+    job = JOB._replace(saves_memory=saves_memory)
+    assert count_attempts(folder, "one", job) == counted
+    assert (folder / "ckpts").exists() == kept
+
+
 def setting(place):
     recipe = Recipe((Source("a.yaml", b""),), (), True, 1, Source("low.yaml", b""))
     return Setting(recipe, place, None, ".", "now", retries=1)

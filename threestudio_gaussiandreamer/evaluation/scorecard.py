@@ -4,8 +4,8 @@
 import argparse
 import csv
 import functools
-import glob
 import io
+import os
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -106,15 +106,13 @@ def find_results(folders: Sequence[str], failed: list[str]) -> list[Result]:
     """
     places: dict[Path, str] = {}
     for folder in folders:
-        pattern = f"{glob.escape(str(Path(folder).expanduser()))}/**/save/it*-export"
-        exports = map(Path, glob.glob(pattern, recursive=True))
-        runs = sorted({str(export.parents[1]) for export in exports})
+        runs = list(run_folders(Path(folder).expanduser()))
         if not runs:
             raise UserError(
                 f"{folder!r} is no folder that holds finished runs, which have a save/it*-export"
             )
         for run in runs:
-            places.setdefault(Path(run).resolve(), run)
+            places.setdefault(run.resolve(), str(run))
     results = []
     for place in places.values():
         try:
@@ -122,6 +120,18 @@ def find_results(folders: Sequence[str], failed: list[str]) -> list[Result]:
         except UserError as error:
             failed.append(str(error))
     return results
+
+
+def run_folders(folder: Path) -> Iterator[Path]:
+    """Yield the folders of finished runs below a folder; runs inside runs aren't searched."""
+    seen = set()
+    for place, names, _ in os.walk(folder, followlinks=True):
+        real, found = os.path.realpath(place), any(Path(place).glob("save/it*-export"))
+        if found and real not in seen:
+            yield Path(place)
+        # behind a link to a folder above is nothing new
+        names[:] = [] if found or real in seen else sorted(names)
+        seen.add(real)
 
 
 def scored(

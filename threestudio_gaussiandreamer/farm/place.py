@@ -31,6 +31,7 @@ failed; complete; its record is of another row."""
 LAST, FETCHED = "ckpts/last.ckpt", "ckpts/fetched.ckpt"
 NOT_UPLOADED = ("ckpts/epoch=*", "ckpts/*-prev.ckpt", FETCHED, "ckpts/.*", "ckpts-*/*", "tb_logs/*")
 NOT_UPLOADED += (RESULT,)  # comes last
+NUMBERS = ("seconds", "worker_seconds", "megabytes", "steps", "gaussians", "bytes", "attempts")
 MISSING = (FileNotFoundError, IsADirectoryError, NotADirectoryError)
 BATCH = 1000
 """Records that are read together."""
@@ -113,13 +114,16 @@ class Place:
 
     def read_json(self, *names: str) -> list[Optional[dict[str, Any]]]:
         """Return the contents of JSON files of the farm; None for those that don't exist. Raises
-        UserError for one that isn't an object.
+        UserError for one that isn't an object, or no record.
         """
         found = []
         for name, content in zip(names, self.read(names), strict=True):
             try:
                 found.append(None if content is None else {**json.loads(content)})
-            except (ValueError, TypeError, RecursionError) as error:
+                record = found[-1] or {}
+                scores = (record.get("scores") or {}).values()
+                sum([*(record.get(key, 0) for key in NUMBERS), *filter(None, scores)])
+            except (ValueError, TypeError, AttributeError, RecursionError) as error:
                 raise UserError(
                     f"{self}/{name} is damaged ({error}): delete it, or choose another --out"
                 ) from error

@@ -176,12 +176,19 @@ def _from_csv(texts: Iterator[str]) -> Iterator[dict[str, Any]]:
 def _from_jsonl(texts: Iterator[str]) -> Iterator[dict[str, Any]]:
     for text in texts:
         try:
-            values = json.loads(text)
+            values = json.loads(text, object_pairs_hook=_named_once)
         except (ValueError, RecursionError) as error:
             raise UserError(f"can't be read as JSON: {error}") from error
         if not isinstance(values, dict):
             raise UserError('expected an object {"prompt": "a fox"}')
         yield values
+
+
+def _named_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    names = [name for name, _ in pairs]
+    if len(set(names)) < len(names):
+        raise ValueError(f"{max(names, key=names.count)!r} is given twice")
+    return dict(pairs)
 
 
 FORMATS: dict[str, Callable[[Iterator[str]], Iterator[dict[str, Any]]]] = {

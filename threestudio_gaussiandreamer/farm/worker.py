@@ -181,10 +181,14 @@ def count_attempts(folder: Path, session: str, job: Job) -> tuple[int, int]:
     Raises AnotherRow if the folder's checkpoints are of another row.
     """
     path, made_with = folder / "attempts.txt", variant(job.row, job.saves_memory)
-    earlier = list(map(str.split, path.open(encoding="utf-8"))) if path.exists() else []
-    if not all(words[1].startswith(job.row.key) for words in earlier):
+    lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
+    earlier = [line.split() for line in lines if line.strip()]
+    # earlier versions noted no key, or the key alone and the configuration by a file
+    made = [words[1] if len(words) == 4 else job.row.key for words in earlier]
+    saved = variant(job.row, (folder / "saves_memory.txt").exists())
+    if not all(text.startswith(job.row.key) for text in made):
         raise AnotherRow(job.row)
-    if any(words[1] != made_with for words in earlier):
+    if any((saved if text == job.row.key else text) != made_with for text in made):
         shutil.rmtree(folder, ignore_errors=True)
         earlier = []
     folder.mkdir(parents=True, exist_ok=True)
