@@ -209,7 +209,9 @@ def test_a_binary_stl_may_begin_like_text_and_have_more_bytes(tmp_path, header):
         ("empty.glb", b"", "isn't a GLB file, which begins with glTF"),
         ("page.glb", b"<!doctype html>", "is a web page, not the file itself"),
         ("flat.obj", b"v 1 1 1\nv 1 1 1\nv 1 1 1\nf 1 2 3\n", "zero area"),
-        ("zero.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 0 2 3\n", "names number 0 of 3 vertices"),
+        ("zero.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 0 2 3\n", "line 4 is no vertex or face: 'f"),
+        ("word.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\nf x 2 3\n", "line 5 is no .*: 'f x"),
+        ("word.obj", b"v 0 0 0\nv 1_0 0 0\nv 0 1 0\nf 1 2 3\n", "line 2 is no .*: 'v 1_0"),
         ("two.obj", b"v 0 0\nv 1 0\nv 0 1\nf 1 2 3\n", "line 1 is no vertex or face"),
         ("back.obj", b"v 0 0 0\nv 1 0 0\nf -3 -2 -1\nv 0 0 1\n", "names number -3 of 2 vertices"),
         ("cut.stl", bytes(80) + b"\2\0\0\0" + bytes(60), "184 bytes were expected, not 144"),
@@ -274,12 +276,25 @@ def test_colours_of_an_off_files_vertices(tmp_path, head, colors):
 
 
 @pytest.mark.parametrize(
-    ("head", "more"), [("OFF", ""), ("NOFF", " 0 0 1"), ("COFF", " 1 0 red"), ("COFF", " nan 0 0")]
+    ("head", "of_vertices", "of_faces", "warned"),
+    [
+        ("OFF", "", " 255 0 0", "faces"),
+        ("OFF", "", "", None),
+        ("NOFF", " 0 0 1", "", None),
+        ("CNOFF", " 0 0 1 255 0 0", "", "vertices"),
+        ("COFF", " 1 0 red", "", "vertices"),
+        ("COFF", " nan 0 0 1", "", "vertices"),
+    ],
 )
-def test_other_numbers_of_an_off_file_are_no_colours(tmp_path, head, more):
-    vertices = "".join(f"{corner}{more}\n" for corner in CORNERS)
-    (tmp_path / "a.off").write_text(f"{head}\n4 4 6\n" + vertices + OFF_FACES)
-    assert not load_mesh(tmp_path / "a.off").has_colors
+def test_other_colours_of_an_off_file_are_reported(
+    tmp_path, caplog, head, of_vertices, of_faces, warned
+):
+    path = tmp_path / "a.off"
+    vertices = "".join(f"{corner}{of_vertices}\n" for corner in CORNERS)
+    path.write_text(f"{head}\n4 4 6\n" + vertices + OFF_FACES.replace("\n", f"{of_faces}\n"))
+    assert not load_mesh(path).has_colors
+    found = f"colours of its {warned} aren't read" in caplog.text
+    assert found if warned else "colours" not in caplog.text
 
 
 # Real meshes

@@ -49,6 +49,8 @@ MATERIAL = re.compile(rb"^[ \t]*newmtl[ \t]+(.*?)\s*$", re.MULTILINE)
 MATERIAL_USED = re.compile(rb"^[ \t]*usemtl\b", re.MULTILINE)
 OBJ_NUMBERS = {b"v": (3, 4, 6, 7), b"vt": (2, 3), b"vn": (3,)}
 """Numbers on a line of an OBJ: 4 with a weight, 6 with a colour, 7 with alpha."""
+NUMBER = re.compile(rb"(?i)[-+]?(?:(?:\d+(?:\.\d*)?|\.\d+)(?:e[-+]?\d+)?|nan|inf)")
+CORNER = re.compile(rb"-?[1-9]\d*(?:/(?:-?[1-9]\d*)?){0,2}")
 
 
 def load_mesh(
@@ -308,7 +310,7 @@ def _by_trimesh(path: Path, budget: Budget) -> list[Mesh]:
         if files.refused:
             raise files.refused
     if path.suffix.lower() == ".off":
-        colors = _off_colors(content.decode("utf-8-sig", errors="replace"))
+        colors = _off_colors(content.decode("utf-8-sig", errors="replace"), path)
         if colors is not None:
             (geometry,) = scene.geometry.values()
             geometry.visual.vertex_colors = colors
@@ -329,18 +331,18 @@ def _by_trimesh(path: Path, budget: Budget) -> list[Mesh]:
 
 
 def _plain_obj(data: bytes) -> bytes:
-    """Return an OBJ whose faces count from the first vertex, after checking how many numbers each
-    line has: trimesh reads relative numbers from the last vertex, ignores lines that it doesn't
-    know, and divides the numbers of all vertices into rows of the first one's width.
+    """Return an OBJ whose faces count from the first vertex, after checking the numbers of each
+    line: trimesh reads relative numbers from the last vertex, ignores lines that it doesn't know,
+    stops at words that are no numbers (NumPy 1.26), and divides the numbers of all vertices into
+    rows of the first one's width.
     """
     counts, lines, widths = dict.fromkeys(OBJ_NUMBERS, 0), [], set()
 
     def absolute(number: bytes, count: int) -> bytes:
-        if number and int(number) <= 0:
-            known = -count <= int(number) < 0
-            require(known, f"a face names number {int(number)} of {count} vertices")
-            return b"%d" % (count + 1 + int(number))
-        return number
+        if not number.startswith(b"-"):
+            return number
+        require(int(number) >= -count, f"a face names number {int(number)} of {count} vertices")
+        return b"%d" % (count + 1 + int(number))
 
     text = data.replace(b"\\\r\n", b"").replace(b"\\\n", b"")
     for place, line in enumerate(text.split(b"\n"), 1):
@@ -348,9 +350,10 @@ def _plain_obj(data: bytes) -> bytes:
         kind = kind.lower()
         if kind[:1] in (b"v", b"f") and kind != b"vp":
             usual = len(words) in OBJ_NUMBERS.get(kind, ()) or kind == b"f" and len(words) > 2
+            usual = usual and all(map((CORNER if kind == b"f" else NUMBER).fullmatch, words))
             shown = repr(line[:80].decode(errors="replace"))
             require(usual, f"line {place} is no vertex or face: {shown}")
-            if kind == b"f" and (b"-" in line or b"0" in line):
+            if kind == b"f" and b"-" in line:
                 corners = (zip(x.split(b"/"), counts.values(), strict=False) for x in words)
                 words = [b"/".join(absolute(*x) for x in corner) for corner in corners]
             elif kind in counts:
@@ -372,19 +375,25 @@ def _exact_stl(data: bytes) -> bytes:
     return data[:size]
 
 
-def _off_colors(text: str) -> Optional[np.ndarray]:
+def _off_colors(text: str, path: Path) -> Optional[np.ndarray]:
     """Return the colours of an OFF file's vertices as bytes, written from 0 to 1 or to 255, which
-    trimesh doesn't read; None if not every vertex has one.
+    trimesh doesn't read; None if not every vertex has one. Logs a warning for others.
     """
     words = (line.partition("#")[0].split() for line in text.splitlines())
     (kind, *counts), *lines = filter(None, words)
-    (vertices, *_), *lines = [counts, *lines] if counts else lines
+    (vertices, faces, *_), *lines = [counts, *lines] if counts else lines
+    rows, polygons = lines[: int(vertices)], lines[int(vertices) :][: int(faces)]
     try:
-        rows = [row[3:6] for row in lines[: int(vertices)]]
-        colors = np.array(rows, float).reshape(len(rows), 3)
+        colors = np.array([row[3:6] for row in rows], float).reshape(len(rows), 3)
     except ValueError:  # of other lengths, or no numbers
-        return None
-    if kind.upper() not in ("OFF", "COFF") or not np.isfinite(colors).all():
+        colors = np.array([np.nan])
+    usual = kind.upper() in ("OFF", "COFF") and np.isfinite(colors).all()
+    has_more = "C" in kind.upper() or kind.upper() == "OFF" and any(len(row) > 3 for row in rows)
+    of_faces = any(len(polygon) > int(polygon[0]) + 1 for polygon in polygons)
+    if of_faces or has_more and not usual:
+        said = "%s: the colours of its %s aren't read; convert it to PLY to keep them"
+        log.warning(said, path, "faces" if of_faces else "vertices")
+    if not usual:
         return None
     return (colors * (255 if colors.max() <= 1 else 1)).round().clip(0, 255).astype(np.uint8)
 
