@@ -157,6 +157,8 @@ def test_a_damaged_file_only_loses_its_part(full_run):
         for name in names:
             (full_run / name).write_bytes(damage)
         assert "held_out/compare.png" in write_index(full_run).read_text()
+    (full_run / "configs/parsed.yaml").write_text("trainer: &all {a: 1}\nsystem: {b: *all}\n")
+    assert "system.b.a" not in write_index(full_run).read_text()
 
 
 def test_the_gallery_shows_prompt_poster_and_scores_and_is_replaced(full_run):

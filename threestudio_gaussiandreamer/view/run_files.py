@@ -189,7 +189,11 @@ def read_json(path: Path, kind: type[T]) -> T:
 def read_yaml(path: Path) -> dict[str, Any]:
     """Read a mapping from a YAML file; an empty one if there is none or it is damaged."""
     try:
-        content = yaml.safe_load(read_text(path))
+        text = read_text(path)
+        # a ``parsed.yaml`` has no aliases, which can expand without limit
+        if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text)):
+            return {}
+        content = yaml.safe_load(text)
     except (ValueError, RecursionError, yaml.YAMLError):
         return {}
     return content if isinstance(content, dict) else {}
