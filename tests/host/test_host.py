@@ -3,6 +3,7 @@
 import re
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -22,7 +23,7 @@ from threestudio_gaussiandreamer.host.builtin.models import (
     Rasterizer,
     SolidColorBackground,
 )
-from threestudio_gaussiandreamer.host.builtin.system import BaseSystem
+from threestudio_gaussiandreamer.host.builtin.system import BaseLift3DSystem, BaseSystem
 
 # -- registry --------------------------------------------------------------------------------------
 
@@ -161,11 +162,23 @@ def test_a_system_configures_then_loads_weights_then_post_configures(tmp_path):
 
 
 def test_the_step_of_a_resumed_checkpoint_is_the_true_one():
-    system = BaseSystem({})
+    old = {"weights_ignore_modules": None, "cleanup_after_test_step": True}
+    system = BaseSystem(old | {"cleanup_after_validation_step": False})
     assert (system.true_current_epoch, system.true_global_step) == (0, 0)
     system.set_resume_status(2, 1200)
     assert (system.true_current_epoch, system.true_global_step) == (2, 1200)
     assert system.C([0, 0.0, 1.0, 2400]) == 0.5
+
+
+def test_an_output_that_the_system_cannot_write_is_named():
+    class Odd:
+        cfg = SimpleNamespace(save_video=False)
+
+        def __call__(self):
+            return [SimpleNamespace(save_type="txt")]
+
+    with pytest.raises(UserError, match="SimpleNamespace has no save_txt, which Odd asks for"):
+        BaseLift3DSystem.on_predict_epoch_end(SimpleNamespace(exporter=Odd()))
 
 
 # -- which host ------------------------------------------------------------------------------------

@@ -52,15 +52,19 @@ def test_parts_that_the_system_can_not_train_are_refused(name, part, base, monke
         check_parts(SimpleNamespace(**cfg))
 
 
-def check(guidance_type, guidance=(), **prior):
-    options = {"prompt_processor_type": "plain-prompt-processor", "prompt_processor": {}}
+def check(guidance_type, guidance=(), prompts="plain-prompt-processor", **prior):
+    options = {"prompt_processor_type": prompts, "prompt_processor": {}}
     cfg = options | {"guidance_type": guidance_type, "guidance": dict(guidance)}
     preflight_parts(GaussianCloud(prior), SimpleNamespace(**cfg))
 
 
-def test_a_guidance_gets_options_that_are_not_given():
+def test_a_guidance_gets_options_that_are_not_given_before_any_folder_is_made(
+    tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
     with pytest.raises(UserError, match="^system.guidance: weights 'missing.bin' does not exist"):
-        check("test-weights-guidance")
+        check("test-weights-guidance", prompts="gaussiandreamer-stable-diffusion-prompt-processor")
+    assert not [*tmp_path.iterdir()]
 
 
 def test_a_preflight_of_another_kind_is_named():

@@ -81,13 +81,11 @@ class GaussianDreamerSystem(export.GaussianSavers, BaseLift3DSystem):
         pages: bool = True
 
         REMOVED: ClassVar[dict[str, Any]] = {
+            **getattr(BaseLift3DSystem.Config, "REMOVED", {}),  # threestudio's has none
             "image_targets": (
                 lambda stage: not (isinstance(stage, Mapping) and stage.get("stop")),
                 "pictures of the 2D model as targets brought nothing (reports/tried.md)",
             ),
-            "weights_ignore_modules": (None, "weights are loaded where names agree"),
-            "cleanup_after_validation_step": (False, "memory is kept for the next step"),
-            "cleanup_after_test_step": (False, "memory is kept for the next step"),
         }
 
         @staticmethod
@@ -402,14 +400,15 @@ def check_parts(cfg: Any) -> None:
 
 def preflight_parts(geometry: Any, cfg: Any) -> None:
     """Check what the parts of a run need from outside, such as files, before any long work: call
-    ``preflight`` of the prior, if the cloud is empty, and of the classes of prompt processor and
-    guidance with their options. The UserError for what is missing names the part's section.
+    ``preflight`` of the prior, if the cloud is empty, and of the classes of guidance and, since it
+    makes a folder, last of prompt processor, with their options. The UserError for what is missing
+    names the part's section.
     """
     checks: dict[str, Callable[[], None]] = {}
     if not len(geometry):
         keep = geometry.cfg.keep_attributes
         checks["geometry.prior"] = lambda: preflight_prior(geometry.prior(), keep)
-    for name in ("prompt_processor", "guidance"):
+    for name in ("guidance", "prompt_processor"):
         part = find(getattr(cfg, f"{name}_type"))
         if hasattr(part, "preflight"):
             require_class_method(part, "preflight")

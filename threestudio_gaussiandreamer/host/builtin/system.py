@@ -8,6 +8,7 @@ from typing import Any, Optional
 import lightning.pytorch as pl
 
 from ...core.checkpoint_file import load_module_weights
+from ...core.errors import UserError
 from ...core.options import parse_structured
 from ...core.schedule import C
 from .base import Updateable, load_parameters
@@ -30,6 +31,12 @@ class BaseSystem(pl.LightningModule, Updateable, SaverMixin):
         optimizer: dict = field(default_factory=dict)
         scheduler: Optional[dict] = None
         weights: Optional[str] = None
+
+        REMOVED = {
+            "weights_ignore_modules": (None, "weights are loaded where names agree"),
+            "cleanup_after_validation_step": (False, "memory is kept for the next step"),
+            "cleanup_after_test_step": (False, "memory is kept for the next step"),
+        }
 
     cfg: Config
 
@@ -163,5 +170,10 @@ class BaseLift3DSystem(BaseSystem):
         if self.exporter.cfg.save_video:
             self.on_test_epoch_end()
         for output in self.exporter():
-            save = getattr(self, f"save_{output.save_type}")
+            save = getattr(self, f"save_{output.save_type}", None)
+            if save is None:
+                raise UserError(
+                    f"{type(self).__name__} has no save_{output.save_type}, which "
+                    f"{type(self.exporter).__name__} asks for"
+                )
             save(f"it{self.true_global_step}-export/{output.save_name}", **output.params)
