@@ -16,7 +16,7 @@ import functools
 import logging
 import math
 import os
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -32,6 +32,8 @@ PIXELS_PER_CAST = 2**20
 """Pixels of pictures that :class:`TargetCache` casts together."""
 log = logging.getLogger(__name__)
 NEAR = 1e-6
+PAIRS_PER_STEP = 2**17
+"""(triangle, sample) pairs that are tested at once, to bound the memory and use the CPU's cache."""
 SLACK = 1e-6
 """Margin around a triangle's box in pixels, for its rounding errors."""
 
@@ -301,41 +303,90 @@ def zbuffer_hits(
             centre, rows downwards.
     """
     corners = ((vertices - c2w[:3, 3]) @ c2w[:3, :3])[faces]
-    a, b, c = np.moveaxis(corners, 1, 0)
+    box = _boxes(corners, focal, rows, columns)
+    index = np.flatnonzero((box[:, 0] < box[:, 1]) & (box[:, 2] < box[:, 3]))
+    a, b, c = np.moveaxis(corners[index], 1, 0)
     edges = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1)
     volume = np.einsum("tc,tc->t", a, edges[:, 0])
-    edges = (edges * np.sign(volume)[:, None, None])[..., None, None]
-    box = _boxes(corners, focal, rows, columns)
-    seen = (volume != 0) & (box[:, 0] < box[:, 1]) & (box[:, 2] < box[:, 3])  # not edge-on
-    x, y = columns / focal, -rows[:, None] / focal
-    nearest = np.full((len(rows), len(columns)), -1)
-    inverse_depth, weights = np.zeros(nearest.shape), np.zeros((*nearest.shape, 3))
-    for face in np.flatnonzero(seen):
-        top, bottom, left, right = box[face]
-        part, (p, q, r) = np.s_[top:bottom, left:right], edges[face].swapaxes(0, 1)
-        values = x[left:right] * p + y[top:bottom] * q - r  # edge functions, >= 0 inside
-        total = values.sum(axis=0)
-        value = total / abs(volume[face])
-        nearer = (values >= 0).all(axis=0) & (value > inverse_depth[part]) & (value < 1 / NEAR)
-        nearest[part][nearer], inverse_depth[part][nearer] = face, value[nearer]
-        weights[part][nearer] = (values[:, nearer] / total[nearer]).T
-    return nearest, weights
+    edges *= np.sign(volume)[:, None, None]
+    seen = volume != 0  # not exactly edge-on
+    index, edges, volume = index[seen], edges[seen], np.abs(volume[seen])
+    x, y = columns / focal, -rows / focal
+
+    def edge_functions(triangle: np.ndarray, corner: int, sample: np.ndarray) -> np.ndarray:
+        """Return the edge function opposite a corner for each pair, >= 0 inside."""
+        edge, (row, column) = edges[triangle, corner], np.divmod(sample, len(columns))
+        return x[column] * edge[:, 0] + y[row] * edge[:, 1] - edge[:, 2]
+
+    nearest = np.full(len(rows) * len(columns), -1)
+    inverse_depth, weights = np.zeros(len(nearest)), np.zeros((len(nearest), 3))
+    for triangle, sample in _pairs(box[index], len(columns)):
+        total = 0.0
+        for corner in range(3):
+            value = edge_functions(triangle, corner, sample)
+            inside = value >= 0
+            triangle, sample, total = triangle[inside], sample[inside], (total + value)[inside]
+        value = total / volume[triangle]
+        nearer = (value > inverse_depth[sample]) & (value < 1 / NEAR)
+        triangle, sample, value = triangle[nearer], sample[nearer], value[nearer]
+        np.maximum.at(inverse_depth, sample, value)
+        best = np.flatnonzero(value == inverse_depth[sample])
+        places, first = np.unique(sample[best], return_index=True)
+        nearest[places] = triangle[best[first]]
+    sample = np.flatnonzero(nearest >= 0)
+    found = [edge_functions(nearest[sample], corner, sample) for corner in range(3)]
+    weights[sample] = np.stack(found, axis=1) / sum(found)[:, None]
+    nearest[sample] = index[nearest[sample]]
+    shape = len(rows), len(columns)
+    return nearest.reshape(shape), weights.reshape(*shape, 3)
+
+
+def _pairs(
+    box: Int[np.ndarray, "T 4"], width: int
+) -> Iterator[tuple[Int[np.ndarray, " P"], Int[np.ndarray, " P"]]]:
+    """Yield all pairs (triangle, sample) with the sample in the triangle's box, in the order of the
+    triangles, up to ``PAIRS_PER_STEP`` at a time.
+    """
+    across = box[:, 3] - box[:, 2]
+    ends = np.cumsum((box[:, 1] - box[:, 0]) * across)
+    starts = np.concatenate([[0], ends[:-1]])
+    for first in range(0, ends[-1] if len(ends) else 0, PAIRS_PER_STEP):
+        last = min(first + PAIRS_PER_STEP, ends[-1])
+        some = np.arange(np.searchsorted(ends, first, "right"), np.searchsorted(starts, last))
+        triangle = np.repeat(some, np.minimum(ends[some], last) - np.maximum(starts[some], first))
+        row, column = np.divmod(np.arange(first, last) - starts[triangle], across[triangle])
+        yield triangle, (box[triangle, 0] + row) * width + box[triangle, 2] + column
 
 
 def _boxes(
     corners: Float[np.ndarray, "F 3 3"], focal: float, rows: np.ndarray, columns: np.ndarray
 ) -> Int[np.ndarray, "F 4"]:
-    """Return the samples around each triangle (first row, end, first column, end): none for those
-    behind the near plane, all for those that cross it.
+    """Return the box of samples around each triangle (first row, end, first column, end), empty for
+    triangles behind the camera.
     """
-    near = -corners[..., 2] >= NEAR
-    depth = np.where(near, -corners[..., 2], 1)
+    points = _in_front(corners)
+    with np.errstate(invalid="ignore"):  # NaN marks a missing point
+        across = focal * points[..., 0] / -points[..., 2]
+        down = focal * points[..., 1] / points[..., 2]
     ends = []
-    for places, values in ((rows, -corners[..., 1]), (columns, corners[..., 0])):
-        values = focal * values / depth
-        ends.append(np.searchsorted(places, values.min(axis=1) - SLACK))
-        ends.append(np.searchsorted(places, values.max(axis=1) + SLACK, "right"))
+    for places, values in ((rows, down), (columns, across)):
+        ends.append(np.searchsorted(places, np.fmin.reduce(values, 1) - SLACK))
+        ends.append(np.searchsorted(places, np.fmax.reduce(values, 1) + SLACK, "right"))
     box = np.stack(ends, axis=1)
-    box[~near.all(axis=1)] = 0, len(rows), 0, len(columns)
-    box[~near.any(axis=1)] = 0
+    box[np.isnan(down).all(axis=1)] = 0
     return box
+
+
+def _in_front(corners: Float[np.ndarray, "F 3 3"]) -> Float[np.ndarray, "F P 3"]:
+    """Clip triangles at the near plane: return their corners, NaN for those on the camera's side of
+    it, and the points where edges cross it, NaN for edges that don't.
+    """
+    behind = -corners[..., 2] < NEAR
+    if not behind.any():
+        return corners
+    following, depth = np.roll(corners, -1, axis=1), -corners[..., 2] - NEAR
+    with np.errstate(invalid="ignore", divide="ignore"):
+        along = depth / (depth - np.roll(depth, -1, axis=1))
+    along[behind == np.roll(behind, -1, axis=1)] = np.nan
+    crossings = corners + along[..., None] * (following - corners)
+    return np.concatenate([np.where(behind[..., None], np.nan, corners), crossings], axis=1)
