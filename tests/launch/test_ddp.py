@@ -129,6 +129,8 @@ TASK = dict.fromkeys(launcher.SLURM, "1")
         (SLURM | {k: "0" for k in TASK if k != "SLURM_NODEID"}, "set, but not SLURM_NODEID: start"),
         (TORCHRUN, "TORCHELASTIC_RUN_ID is set, but not RANK, LOCAL_RANK: start .* with torchrun"),
         ({"TORCHELASTIC_RUN_ID": "1"}, "not RANK, LOCAL_RANK, WORLD_SIZE, LOCAL_WORLD_SIZE: "),
+        (TORCHRUN | RANKS | {"WORLD_SIZE": "3"}, "WORLD_SIZE is 3, no multiple of LOCAL_WORLD_"),
+        (TASK | SLURM | {"SLURM_NTASKS": "3"}, "SLURM_NTASKS is 3, no multiple of SLURM_NNODES"),
         ({"RANK": "1", "WORLD_SIZE": "2"}, "RANK is 1, but nothing says how many .* torchrun"),
         (TASK | SLURM | {"SLURM_JOB_NAME": "bash"}, "SLURM_PROCID is 1, but nothing says"),
         ({"SLURM_NTASKS": "0"}, "SLURM_NTASKS is '0'; expected a whole number from 1 on"),

@@ -35,18 +35,25 @@ def require_launcher(environment: Mapping[str, str] = os.environ) -> None:
     """Check the variables of a run, which may be one of several processes.
 
     Raises:
-        UserError: one isn't a whole number, or some of those that belong together are missing.
+        UserError: one isn't a whole number, some of those that belong together are missing, or the
+            machines have different numbers of processes.
     """
     require_numbers(environment)
     by_torchrun, by_slurm = "TORCHELASTIC_RUN_ID" in environment, many_tasks(environment)
-    first, names, program = "SLURM_NTASKS", SLURM, "srun"
+    first, names, program, sizes = "SLURM_NTASKS", SLURM, "srun", SIZES[2:]
     if by_torchrun:
-        first, names, program = "TORCHELASTIC_RUN_ID", TORCHRUN, "torchrun"
+        first, names, program, sizes = "TORCHELASTIC_RUN_ID", TORCHRUN, "torchrun", SIZES[:2]
     missing = [name for name in names if name not in environment]
     if missing and (by_torchrun or by_slurm):
         raise UserError(
             f"the environment variable {first} is set, but not {', '.join(missing)}: start the "
             f"command with {program}, or `unset {first}` for a single process"
+        )
+    size, step = (int(environment.get(name, 1)) for name in sizes)
+    if size % step and (by_torchrun or by_slurm):
+        raise UserError(
+            f"the environment variable {sizes[0]} is {size}, no multiple of {sizes[1]}, which is "
+            f"{step}: give each machine as many processes"
         )
     for name, started, hint in (
         ("RANK", by_torchrun, "start the command with torchrun"),
