@@ -51,8 +51,12 @@ def test_the_state_of_another_optimiser_is_refused(cloud):
             for parameter in group["params"]:
                 parameter.grad = torch.ones_like(parameter)
         optimizer.step()
-    plain = torch.optim.SGD(cloud.parameter_groups(), lr=1e-3)
-    check_optimizer("SGD", [plain.state_dict()], "a.ckpt")
-    for damaged in ([None], [{"param_groups": [{"params": [0]}], "state": {}}]):
+    with pytest.raises(UserError, match="Adamax can't resume .*: KeyError 'exp_inf'"):
+        check_optimizer("Adamax", [optimizer.state_dict()], "a.ckpt")
+    for kind in (torch.optim.SGD, torch.optim.Adafactor):
+        plain = kind(cloud.parameter_groups(), lr=1e-3)
+        plain.step()
+        check_optimizer(kind.__name__, [plain.state_dict()], "a.ckpt")
+    for damaged in ([], [None], [{"param_groups": [{"params": [0]}], "state": {}}]):
         with pytest.raises(UserError, match="Adam can't resume"):
             check_optimizer("Adam", damaged, "a.ckpt")

@@ -291,19 +291,31 @@ class Run:
 
 
 def check_optimizer(name: str, states: Sequence[dict[str, Any]], path: str) -> None:
-    """Raise UserError if the states in a checkpoint are those of another optimiser than
+    """Raise UserError if the states in a checkpoint are none, or those of another optimiser than
     ``torch.optim.<name>``, which torch's restoring doesn't notice.
     """
     kind = getattr(torch.optim, name, None)
-    for state in states if kind is not None else ():
-        try:
+    if kind is None:
+        return
+    try:
+        if not states:
+            raise ValueError("there is no optimiser")
+        for state in states:
             sizes = [len(group["params"]) for group in state["param_groups"]]
             restored = kind([{"params": list(torch.zeros(n, 1))} for n in sizes], lr=0.0)
+            options = list(restored.defaults)  # to which restoring may add
             restored.load_state_dict(state)
             for group in restored.param_groups:
-                _ = [group[option] for option in restored.defaults]
-        except Exception as error:  # torch doesn't check keys and types
-            raise UserError(
-                f"{path}: {name} can't resume from its optimizer_states, which may be another "
-                f"optimiser's: {type(error).__name__} {error}"
-            ) from error
+                _ = [group[option] for option in options]
+            for moments in restored.state.values():
+                ranks = [m.dim() for m in moments.values() if isinstance(m, torch.Tensor)]
+                parameter = torch.zeros([1] * max(ranks, default=1))
+                parameter.grad = torch.zeros_like(parameter)
+                fresh = kind([parameter], lr=0.0)
+                fresh.step(lambda: 0.0)
+                _ = [moments[key] for key in fresh.state[parameter]]
+    except Exception as error:  # torch doesn't check keys and types
+        raise UserError(
+            f"{path}: {name} can't resume from its optimizer_states, which may be another "
+            f"optimiser's: {type(error).__name__} {error}"
+        ) from error
