@@ -114,6 +114,18 @@ def test_parents_of_another_run_stay(folder):
     assert os.listdir("outputs/tiny") == []
 
 
+def test_a_parent_that_was_just_removed_is_made_again(folder, monkeypatch):
+    failures = [FileNotFoundError(2, "removed by its creator")] * 3
+
+    def mkdir(path, **options):
+        if failures:
+            raise failures.pop()
+        os.makedirs(path)
+
+    monkeypatch.setattr(Path, "mkdir", mkdir)
+    assert make_folder(folder) == Path("outputs") and folder.is_dir()
+
+
 def test_the_message_names_the_process_that_holds_the_folder(folder, monkeypatch):
     monkeypatch.setattr("sys.argv", ["launch.py", "--train", "tag=a b"])
 

@@ -121,14 +121,18 @@ def make_folder(path: Path) -> Optional[Path]:
     Raises:
         UserError: it can't be created.
     """
-    try:
-        missing = [folder for folder in (path, *path.parents) if not folder.exists()]
-        path.mkdir(parents=True)
-        return missing[-1] if missing else path
-    except (OSError, ValueError) as error:
-        if isinstance(error, FileExistsError) and path.is_dir():
-            return None
-        raise unwritable(path, error) from error
+    for attempt in count(1):
+        try:
+            missing = [folder for folder in (path, *path.parents) if not folder.exists()]
+            path.mkdir(parents=True)
+            return missing[-1] if missing else path
+        except (OSError, ValueError) as error:
+            if isinstance(error, FileExistsError) and path.is_dir():
+                return None
+            # another run may have just removed a parent that it had created
+            if not isinstance(error, FileNotFoundError) or attempt == 10:
+                raise unwritable(path, error) from error
+    raise AssertionError("unreachable")
 
 
 def require_writable(folder: Path, option: str = "exp_root_dir") -> None:
