@@ -64,6 +64,13 @@ def test_a_copy_of_a_run_is_left_for_other_folders(folder, copied, options):
     assert cfg.trial_dir == f"outputs/tiny/{'c' if 'tag=c' in options else 'a'}"
 
 
+def test_a_run_of_the_same_name_elsewhere_is_left_with_a_warning(folder, caplog):
+    cfg = load("tag=a", "use_timestamp=false", "resume=other/outputs/tiny/a/ckpts/last.ckpt")
+    here, other = folder / "outputs/tiny/a", folder / "other/outputs/tiny/a"
+    said = f"the checkpoint is of the run in {other}; this one writes to {here}"
+    assert Path(cfg.trial_dir).absolute() == here and said in caplog.text
+
+
 def test_a_run_of_the_same_second_is_resumed_in_its_folder(folder, monkeypatch):
     class Noon(datetime):
         @classmethod

@@ -88,6 +88,9 @@ def name_folders(cfg: Any, paths: Sequence[str | os.PathLike] = ()) -> None:
                     f"resume={cfg.resume}: there is no such checkpoint; did you mean "
                     f"resume={AUTO}, the newest one of this run?"
                 )
+        run, here = _run_of(cfg.resume), os.path.abspath(cfg.trial_dir)
+        if run.name == cfg.trial_name and not _is_same(str(run), here):
+            warn(f"the checkpoint is of the run in {run}; this one writes to {here}")
 
 
 def _follow_config(cfg: Any, paths: Sequence[str | os.PathLike]) -> None:
