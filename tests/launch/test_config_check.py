@@ -13,7 +13,7 @@ from tests.launch.bad_input_cases import DEMO, SMALL, assert_refused
 from threestudio_gaussiandreamer import host, register_parts
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.core.methods import require_dataclass
-from threestudio_gaussiandreamer.host import BaseBackground, BaseObject, register
+from threestudio_gaussiandreamer.host import BaseBackground, BaseModule, BaseObject, register
 from threestudio_gaussiandreamer.launch.config import load_config
 from threestudio_gaussiandreamer.launch.config_check import (
     check_config,
@@ -139,6 +139,8 @@ def test_a_valid_configuration_passes_and_its_numbers_become_numbers(demo):
     cfg.trainer |= {"limit_val_batches": 1, "limit_train_batches": 1.0, "overfit_batches": 0.0}
     cfg.trainer |= {"max_time": "00:01:00:00", "max_steps": "-1", "strategy": "ddp"}
     cfg.checkpoint.every_n_train_steps = 5
+    check_config(cfg)
+    cfg.trainer.strategy = None  # as old parsed.yaml have it
     cfg.system.exporter_type, cfg.system.exporter = "dummy-exporter", {}
     check_config(cfg)
     assert cfg.trainer.max_steps == -1
@@ -220,6 +222,10 @@ class Uncallable(BaseObject):
     pass
 
 
+class NoForward(BaseModule):
+    pass
+
+
 class NoArgument(BaseObject):
     def __call__(self):
         return {}
@@ -238,6 +244,7 @@ class Unfinished(BaseBackground):
     ("kind", "part", "message"),
     [
         ("guidance", Uncallable, r"system.guidance_type: Uncallable has no __call__\(rgb, ...\)"),
+        ("guidance", NoForward, r"system.guidance_type: NoForward has no forward\(rgb, ...\)"),
         ("guidance", NoArgument, r"called as __call__\(rgb, ...\): too many positional"),
         ("background", Unfinished, r"background_type: Unfinished has no forward\(dirs, ...\)"),
         ("prior", len, "prior_type: x is a builtin_function_or_method; register a class"),

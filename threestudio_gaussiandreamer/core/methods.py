@@ -7,12 +7,14 @@ from .errors import UserError
 
 
 def find_method(owner: type, name: str) -> Any:
-    """Return what a class or its bases define under a name; None if nothing or if it is abstract.
+    """Return what a class or its bases define under a name; None if nothing, if it is abstract, or
+    if it is the ``forward`` with which ``nn.Module`` says that there is none.
 
     Unlike ``getattr``, this doesn't find ``__call__`` of the metaclass.
     """
     found = next((vars(base)[name] for base in owner.__mro__ if name in vars(base)), None)
-    return None if getattr(found, "__isabstractmethod__", False) else found
+    is_missing = getattr(found, "__name__", "") == "_forward_unimplemented"
+    return None if is_missing or getattr(found, "__isabstractmethod__", False) else found
 
 
 def require_method(owner: type, name: str, *parameters: str, more: bool = False) -> None:
