@@ -140,8 +140,12 @@ def test_the_message_names_the_process_that_holds_the_folder(folder, monkeypatch
         claim(folder)
     os.kill(other, signal.SIGKILL)
     os.waitpid(other, 0)
+    again = claim(folder)
+    assert (folder / ".lock").is_file()
+    (folder / ".lock").unlink()
+    (folder / ".lock").mkdir()  # can't be unlinked, as on a disk that has become read-only
+    again.release()
     claim(folder).release()
-    assert list(folder.iterdir()) == []
 
 
 def test_without_flock_a_file_keeps_a_second_run_away(folder, monkeypatch):
@@ -154,12 +158,30 @@ def test_without_flock_a_file_keeps_a_second_run_away(folder, monkeypatch):
         claim(folder)
     other = claim_new(folder)[0]
     assert other.path == folder.with_name("run-2")
+    rename = Path.rename
+
+    def rename_before_another_run(path, target):
+        rename(path, target)
+        path.mkdir()
+        (path / ".lock").touch()
+
+    monkeypatch.setattr(Path, "rename", rename_before_another_run)
     other.discard()
+    assert os.listdir(other.path) == [".lock"]
     first.release()
     assert list(folder.iterdir()) == []
     (folder / ".lock").mkdir()
     with pytest.raises(UserError, match="outputs/tiny/run"):
         claim(folder)
+
+
+def test_a_folder_that_can_not_be_renamed_is_removed_in_place(folder, monkeypatch):
+    def unsupported(path, target):
+        raise OSError(95, "Operation not supported")
+
+    monkeypatch.setattr(Path, "rename", unsupported)
+    claim(folder).discard()
+    assert not Path("outputs").exists()
 
 
 def test_a_folder_that_was_there_is_never_removed(folder):
@@ -210,4 +232,17 @@ def test_a_path_that_blocks_a_result_is_found_before_the_work(folder, name, make
     (folder / name).parent.mkdir(parents=True)
     make(folder / name)
     with pytest.raises(UserError, match=f"{name} is no writable"):
+        require_writable(folder)
+
+
+def test_a_checkpoint_may_be_protected_or_a_broken_link(folder, monkeypatch):
+    """It is replaced by renaming."""
+    monkeypatch.setattr(os, "access", lambda path, mode: os.stat(path).st_mode & 0o222)  # for root
+    (folder / "ckpts").mkdir(parents=True)
+    (folder / "ckpts/last.ckpt").symlink_to("step=2.ckpt")
+    require_writable(folder)
+    (folder / "ckpts/step=2.ckpt").touch(mode=0o444)
+    require_writable(folder)
+    (folder / "cmd.txt").touch(mode=0o444)
+    with pytest.raises(UserError, match="cmd.txt is no writable file"):
         require_writable(folder)

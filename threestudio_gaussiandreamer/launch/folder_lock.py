@@ -43,11 +43,13 @@ class RunFolder:
         path: the folder.
         first_made: the topmost folder that was created on the way to it; None if it was there.
         release: releases the lock, which also ends with the process.
+        by_file: whether the file in the folder is the lock.
     """
 
     path: Path
     first_made: Optional[Path] = None
     release: Callable[[], None] = field(default=lambda: None)
+    by_file: bool = False
 
     def discard(self) -> None:
         """Remove the folder if this process created it, and the parents that were created with it
@@ -57,11 +59,18 @@ class RunFolder:
         if first is None:
             return
         with contextlib.suppress(OSError):  # another run has put something there
-            if fcntl is None:  # Windows renames no folder of open files
+            if self.by_file:  # later it would remove that of another run; Windows: it is open
                 self.release()
-            unused = self.path.rename(self.path.with_name(f".{self.path.name}-{os.getpid()}"))
-            self.release()
+            unused = self.path.with_name(f".{self.path.name}-{os.getpid()}")
+            try:
+                self.path.rename(unused)
+                self.release()
+            except OSError:  # a file system that renames no folders
+                if self.by_file:  # another run may have locked it by now
+                    raise
+                unused = self.path
             shutil.rmtree(unused, ignore_errors=True)
+            self.release()
             for folder in self.path.parents:
                 if not folder.is_relative_to(first):
                     break
@@ -82,7 +91,7 @@ def claim_new(path: Path) -> tuple[RunFolder, int]:
         first_made = make_folder(candidate)
         if first_made is not None:
             with contextlib.suppress(FolderInUse):  # another run has locked it in the meantime
-                return RunFolder(candidate, first_made, _lock(candidate)), number
+                return RunFolder(candidate, first_made, *_lock(candidate)), number
     raise AssertionError("unreachable")
 
 
@@ -102,7 +111,7 @@ def claim(
     while True:
         first_made = make_folder(path)
         try:
-            return RunFolder(path, first_made, _lock(path))
+            return RunFolder(path, first_made, *_lock(path))
         except FileNotFoundError:  # the run that created it has just removed it
             continue
         except FolderInUse as error:
@@ -152,7 +161,10 @@ def require_writable(folder: Path, option: str = "exp_root_dir") -> None:
         for name in (*SUBFOLDERS, *FILES):
             path, wanted = folder / name, "folder" if name in SUBFOLDERS else "file"
             fits = path.is_dir() if name in SUBFOLDERS else path.is_file()  # no FIFO
-            if os.path.lexists(path) and not (fits and os.access(path, os.W_OK)):
+            # these two are replaced by renaming, also if they are protected or a broken link
+            is_replaced = name in FILES[:2]
+            exists = path.exists() if is_replaced else os.path.lexists(path)
+            if exists and not (fits and (is_replaced or os.access(path, os.W_OK))):
                 raise OSError(errno.EEXIST, f"{path} is no writable {wanted}")
     except (OSError, ValueError) as error:
         raise unwritable(folder, error, option) from error
@@ -173,8 +185,8 @@ def _holder(folder: Path) -> str:
     return ""
 
 
-def _lock(path: Path) -> Callable[[], None]:
-    """Lock a folder, and return what releases it.
+def _lock(path: Path) -> tuple[Callable[[], None], bool]:
+    """Lock a folder, and return what releases it, and whether its file is the lock.
 
     Raises:
         FolderInUse: another process has locked it; the message is further advice.
@@ -192,14 +204,15 @@ def _lock(path: Path) -> Callable[[], None]:
         except FileNotFoundError:
             raise
         except OSError:  # a file system without locks; Windows, which opens no folder
-            return _lock_by_file(file)
+            return _lock_by_file(file), True
         if not os.path.samestat(os.fstat(descriptor), os.stat(path)):
             raise FileNotFoundError(errno.ENOENT, "replaced by another folder", str(path))
         with contextlib.suppress(OSError):  # it is only for messages
             owner = f"{socket.gethostname()} {os.getpid()} {shlex.join(sys.argv)[:500]}"
             file.write_text(owner, encoding="utf-8")
-        opened.callback(file.unlink, missing_ok=True)
-        return opened.pop_all().close
+        opened.enter_context(contextlib.suppress(OSError))  # of a disk that is read-only by then
+        opened.callback(file.unlink)
+        return opened.pop_all().close, False
 
 
 def _lock_by_file(file: Path) -> Callable[[], None]:
