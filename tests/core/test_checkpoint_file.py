@@ -145,6 +145,11 @@ def test_a_missing_file_lists_what_is_there(tmp_path):
         match="there is no checkpoint .*lst.ckpt; others in this folder, not checked: .*last.ckpt",
     ):
         load_file(tmp_path / "lst.ckpt")
+    os.mkfifo(tmp_path / "fifo.ckpt")
+    with pytest.raises(UserError, match="there is no checkpoint .*fifo.ckpt"):
+        load_file(tmp_path / "fifo.ckpt")
+    with pytest.raises(UserError, match="the folder of the checkpoint .*a.ckpt can't be written"):
+        save_file(tmp_path / "last.ckpt" / "a.ckpt", content())
 
 
 def test_a_full_disk_leaves_the_earlier_file_and_no_temporary_one(tmp_path):

@@ -4,6 +4,7 @@ import contextlib
 import io
 import os
 import sys
+import types
 
 import pytest
 
@@ -91,6 +92,11 @@ def test_characters_that_the_terminal_does_not_have_are_written_as_escapes(tmp_p
     with tolerant_output():
         print("ein Fuchs, grün")
     assert (tmp_path / "out.txt").read_text() == "ein Fuchs, gr\\xfcn\n"
+    logger = types.SimpleNamespace(write=(written := []).append, flush=lambda: None)
+    monkeypatch.setattr(sys, "stdout", logger)
+    with tolerant_output():
+        print("grün")
+    assert "".join(written) == "grün\n"
 
 
 def buffered(descriptor):

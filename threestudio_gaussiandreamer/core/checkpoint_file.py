@@ -35,9 +35,14 @@ def save_file(path: str | os.PathLike, content: Any) -> None:
     """
     path, buffer = Path(path), io.BytesIO()
     torch.save(content, buffer)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    for stale in temporaries_of(path):  # of processes that were killed while saving
-        stale.unlink(missing_ok=True)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        for stale in temporaries_of(path):  # of processes that were killed while saving
+            stale.unlink(missing_ok=True)
+    except OSError as error:
+        raise UserError(
+            f"the folder of the checkpoint {path} can't be written: {error.strerror or error}"
+        ) from error
     with atomic_file(path) as file:
         # the last two bytes of an archive without a comment are the length of the comment
         length = (len(_MARK) + _DIGITS).to_bytes(2, "little")
@@ -58,6 +63,8 @@ def load_file(path: str | os.PathLike, map_location: Any = "cpu") -> Any:
         meant = f": did you mean {last}?" if last.is_file() else _siblings(path / "*")
         raise UserError(f"{path} is a folder, not a checkpoint{meant}")
     try:
+        if not path.is_file():  # reading a FIFO would wait for a writer
+            raise FileNotFoundError(path)
         _verify(path)
         content = torch.load(path, map_location=map_location, weights_only=True)
         _require_stored(content, os.path.getsize(path))

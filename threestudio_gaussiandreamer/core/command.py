@@ -144,7 +144,7 @@ class Tolerant:
         return getattr(self.stream, name)
 
     def write(self, text: str) -> int:
-        encoding = self.stream.encoding or "utf-8"
+        encoding = getattr(self.stream, "encoding", None) or "utf-8"
         self._try(self.stream.write, text.encode(encoding, "backslashreplace").decode(encoding))
         return len(text)
 
