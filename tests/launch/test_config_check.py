@@ -137,13 +137,13 @@ def test_a_valid_configuration_passes_and_its_numbers_become_numbers(demo):
     cfg = copy.deepcopy(demo)
     cfg.system.loss |= {"lambda_sparsity": [0, 0.0, 1.0, 5], "lambda_other": 0}
     cfg.trainer |= {"limit_val_batches": 1, "limit_train_batches": 1.0, "overfit_batches": 0.0}
-    cfg.trainer |= {"max_time": "00:01:00:00", "max_steps": "-1", "strategy": "ddp"}
+    cfg.trainer |= {"max_time": "00:01:00:00", "max_steps": "-1", "strategy": None}
     cfg.checkpoint.every_n_train_steps = 5
     check_config(cfg)
     cfg.trainer.strategy = None  # as old parsed.yaml have it
     cfg.system.exporter_type, cfg.system.exporter = "dummy-exporter", {}
     check_config(cfg)
-    assert cfg.trainer.max_steps == -1
+    assert cfg.trainer.max_steps == -1 and cfg.trainer.strategy == "auto"
 
 
 @pytest.mark.parametrize(
@@ -268,6 +268,16 @@ def test_a_broken_extension_is_named(folder, file, source, message):
     (folder / "custom" / file).parent.mkdir(parents=True)
     (folder / "custom" / file).write_text(source)
     with pytest.raises(UserError, match=f"the extension .*{message}"):
+        load_extensions()
+
+
+def test_a_package_in_custom_that_can_not_be_read_is_one_message(folder, monkeypatch):
+    def forbidden(path):
+        raise PermissionError(13, "Permission denied")
+
+    (folder / "custom/part").mkdir(parents=True)
+    monkeypatch.setattr("pathlib.Path.is_file", forbidden)
+    with pytest.raises(UserError, match="the extensions in custom can't be read: .*denied"):
         load_extensions()
 
 

@@ -91,6 +91,8 @@ def check_config(cfg: Any) -> None:
         UserError: an unknown key or name (with the nearest valid one), or a value of the wrong type
             or out of range. The message is about the first error and begins with its dotted path.
     """
+    if cfg.trainer.get("strategy", "auto") is None:  # as an earlier parsed.yaml may have it
+        cfg.trainer.strategy = "auto"
     # the trainer first, since schedules of parts may refer to its number of steps
     _check_arguments("trainer", cfg.trainer, pl.Trainer, TRAINER)
     parse_structured(ViewerConfig, cfg.viewer, "viewer.")

@@ -144,9 +144,10 @@ def load_extensions(folder: Path = Path("custom")) -> list[str]:
     """
     try:
         entries = sorted(folder.iterdir()) if folder.is_dir() else []
+        extensions = [entry for entry in entries if _is_extension(entry)]
     except OSError as error:
         raise UserError(f"the extensions in {folder} can't be read: {error}") from error
-    return [_load(entry) for entry in entries if _is_extension(entry)]
+    return [_load(entry) for entry in extensions]
 
 
 def _is_extension(entry: Path) -> bool:
