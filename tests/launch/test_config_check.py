@@ -137,7 +137,7 @@ def test_a_valid_configuration_passes_and_its_numbers_become_numbers(demo):
     cfg = copy.deepcopy(demo)
     cfg.system.loss |= {"lambda_sparsity": [0, 0.0, 1.0, 5], "lambda_other": 0}
     cfg.trainer |= {"limit_val_batches": 1, "limit_train_batches": 1.0, "overfit_batches": 0.0}
-    cfg.trainer |= {"max_time": "00:01:00:00", "max_steps": "-1", "strategy": None}
+    cfg.trainer |= {"max_time": "00:01:00:00", "max_steps": "-1", "strategy": "ddp"}
     cfg.checkpoint.every_n_train_steps = 5
     check_config(cfg)
     cfg.trainer.strategy = None  # as old parsed.yaml have it

@@ -92,7 +92,7 @@ def one_of(choices: Collection[str] | Callable[[], Collection[str]]) -> Rule:
     def check(path: str, value: Any) -> None:
         known = choices() if callable(choices) else choices
         if value not in known:
-            raise unknown(path, value, [name for name in known if name is not None])
+            raise unknown(path, value, known)
 
     return rule(check)
 

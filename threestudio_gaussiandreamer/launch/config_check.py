@@ -72,7 +72,7 @@ TRAINER: dict[str, Rule] = {
         f"1 without a launcher of several machines, which sets {' or '.join(CLUSTER)}",
         lambda count: count == 1 or any(name in os.environ for name in CLUSTER),
     ),
-    "strategy": one_of(("auto", "ddp", None)),
+    "strategy": one_of(("auto", "ddp")),
 }
 """What Lightning itself doesn't check before training, or what has no use here."""
 LONGEST_NAME = 200
