@@ -280,7 +280,8 @@ class Training:
         self.ema.update_parameters(self.model)
         progress.step += 1
         progress.images += self.stage.batch
-        return {"loss": loss.detach(), "grad_norm": norm, **metrics}
+        metrics = {"loss": loss, "grad_norm": norm, **metrics}
+        return {name: value.detach() for name, value in metrics.items()}
 
     def save(self) -> None:
         """Write the checkpoint and the curves."""
