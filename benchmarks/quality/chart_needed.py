@@ -1,5 +1,5 @@
-"""Draw docs/charts/needed.png: dB against the number of Gaussians, with the choice of ``budget:
-auto``, and both numbers of each object; from needed.csv, which ``runs --charts needed`` writes.
+"""Draw docs/charts/needed.png from needed.csv (``runs --charts needed``): dB against the number of
+Gaussians and against seconds, with the choice of ``budget: auto``, and what was needed.
 
     python -m benchmarks.quality.chart_needed
 """
@@ -18,23 +18,28 @@ GAIN = 0.5
 
 def main() -> None:
     rows = [row for row in rows_of("needed") if row["step"] != "0"]
-    fixed = {name: curve([row for row in of(rows, name)]) for name in {r["object"] for r in rows}}
-    chosen = {name: choice(of(rows, name)) for name in fixed}
+    of = {row["object"]: [r for r in rows if r["object"] == row["object"]] for row in rows}
+    fixed, chosen = ({name: by(of[name]) for name in of} for by in (curve, choice))
     order = sorted(fixed, key=lambda name: chosen[name][0])
-    plt = pyplot()
-    figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4.6), width_ratios=(3, 2))
+    dense = [row for row in rows if row["x"] == "5657"]
+    was = {row["object"]: [float(row[x]) for x in ("cpu_seconds", "psnr")] for row in dense}
+    figure, axes = pyplot().subplots(1, 3, figsize=(14, 4.6), width_ratios=(3, 2, 2))
+    left, middle, right = axes
     for name, color in zip(order, COLOURS, strict=False):
         left.plot(*zip(*fixed[name], strict=True), color=color, linewidth=1.4)
-        left.plot(*chosen[name], "*", color=color, markersize=13, markeredgecolor="white")
+        left.plot(*chosen[name][:2], "*", color=color, markersize=13, markeredgecolor="white")
+        middle.plot(*zip(was[name], chosen[name][:0:-1], strict=True), "-", color=color)
+        middle.plot(*chosen[name][:0:-1], "*", color=color, markersize=13, markeredgecolor="white")
     set_log_x(left)
     left.set(xlabel="Gaussians; star: the choice of budget: auto", ylabel=DECIBEL)
+    middle.set_xlabel("CPU seconds; from 5,657 Gaussians to auto's")
     places = range(len(order))
     right.barh(places, [chosen[name][0] for name in order], color=COLOURS[: len(order)], alpha=0.8)
     needed = [needed_number(fixed[name]) for name in order]
     right.plot(needed, places, "|", color="0.1", markersize=20, markeredgewidth=2)
     right.set_yticks(places, order)
-    right.set_xlabel("Gaussians chosen; line: needed, at half a dB a doubling")
-    for panel in (left, right):
+    right.set_xlabel("Gaussians chosen; line: needed")
+    for panel in axes:
         panel.grid(alpha=0.25)
         panel.spines[["top", "right"]].set_visible(False)
     figure.suptitle("As many Gaussians as the scene needs", x=0.01, ha="left", fontweight="bold")
@@ -43,10 +48,6 @@ def main() -> None:
     print(saved(figure, "needed"))
     for name, number in zip(order, needed, strict=True):
         print(f"{name}: {chosen[name][0]:,.0f} of {number:,.0f} needed, {chosen[name][1]:.2f} dB")
-
-
-def of(rows: list[Row], name: str) -> list[Row]:
-    return [row for row in rows if row["object"] == name]
 
 
 def curve(rows: list[Row]) -> list[tuple[int, float]]:
@@ -58,10 +59,11 @@ def curve(rows: list[Row]) -> list[tuple[int, float]]:
     return [(count, statistics.median(found[count])) for count in sorted(found)]
 
 
-def choice(rows: list[Row]) -> tuple[float, float]:
-    """Return the medians over the seeds of (number, dB) that ``auto`` chose."""
+def choice(rows: list[Row]) -> tuple[float, ...]:
+    """Return the medians over the seeds of (number, dB, CPU seconds) that ``auto`` gave."""
     runs = [row for row in rows if row["variant"] == f"auto, {GAIN:g} dB"]
-    return tuple(statistics.median(float(r[name]) for r in runs) for name in ("gaussians", "psnr"))
+    columns = ("gaussians", "psnr", "cpu_seconds")
+    return tuple(statistics.median(float(run[name]) for run in runs) for name in columns)
 
 
 def needed_number(points: list[tuple[int, float]], gain: float = GAIN) -> float:
