@@ -76,13 +76,13 @@ def motion(folder):
 @pytest.fixture
 def seen(monkeypatch):
     """Record (views, rows of text) of every forward pass of the UNet."""
-    calls, noise = [], TextToImageDistillation.noise
+    calls, noise = [], TextToImageDistillation.predict_rows
 
-    def recorded(self, z, t, embeddings):
+    def recorded(self, z, t, embeddings, *scale):
         calls.append((len(z), len(embeddings)))
-        return noise(self, z, t, embeddings)
+        return noise(self, z, t, embeddings, *scale)
 
-    monkeypatch.setattr(TextToImageDistillation, "noise", recorded)
+    monkeypatch.setattr(TextToImageDistillation, "predict_rows", recorded)
     return calls
 
 

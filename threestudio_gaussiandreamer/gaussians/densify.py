@@ -168,7 +168,6 @@ def rotate(quats: Float[Tensor, "N 4"], vectors: Float[Tensor, "N 3"]) -> Float[
 
 
 @contextmanager
-@torch.no_grad()
 def steps_by_size(
     means: Float[Tensor, "N 3"], scales: Float[Tensor, "N 3"], quats: Float[Tensor, "N 4"]
 ) -> Iterator[None]:
@@ -178,7 +177,8 @@ def steps_by_size(
     scales, quats, before = scales.detach(), quats.detach().clone(), means.detach().clone()
     means.grad = scales * rotate(quats * quats.new_tensor([1.0, -1.0, -1.0, -1.0]), means.grad)
     yield
-    means.copy_(before + rotate(quats, scales * (means - before)))
+    with torch.no_grad():
+        means.copy_(before + rotate(quats, scales * (means - before)))
 
 
 def update_optimizer(

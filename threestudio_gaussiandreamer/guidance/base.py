@@ -356,6 +356,8 @@ class ScoreDistillation(BaseObject, ABC):
             scale: 1 for no guidance.
             rescale: see ``recon_std_rescale``.
         """
+        if (eps := self.guided_at_once(z, t, condition, scale, rescale)) is not None:
+            return eps
         cond, uncond = self._pair(self.predict(z, t, condition), z)
         if uncond is None and scale != 1:
             _warn_of_no_effect(scale, type(self).__name__)
@@ -363,6 +365,12 @@ class ScoreDistillation(BaseObject, ABC):
         if rescale and scale != 1:
             eps = sds.rescaled(eps, cond, z, self.abar_of(t), rescale)
         return eps
+
+    def guided_at_once(
+        self, z: Latents, t: Timesteps, condition: Any, scale: float, rescale: float
+    ) -> Optional[Latents]:
+        """Return what :meth:`guided_noise` does, where one evaluation per view gives it."""
+        return None
 
     def both(self, z: Latents, t: Timesteps, condition: Any) -> tuple[Latents, Latents]:
         """Predict the noise, conditional and unconditional; twice the same if there is only one."""

@@ -338,13 +338,12 @@ class TextToImageDistillation(ScoreDistillation):
             said = "vsd-variant trains a LoRA in the plain UNet"
             raise UserError(f"system.guidance.{found[0]}: {said}: set {found[0]}=false")
 
-    def guided_noise(
-        self, z: Latents, t: Timesteps, condition: Condition, scale: float, *, rescale: float = 0.0
-    ) -> Latents:
-        """See the base class; one evaluation per view where that is all that is needed."""
+    def guided_at_once(
+        self, z: Latents, t: Timesteps, condition: Condition, scale: float, rescale: float
+    ) -> Optional[Latents]:
         takes_scale = self.scale_width is not None and scale > 1 and not rescale
         if condition.negative_weights is not None or not (takes_scale or scale == 1):
-            return super().guided_noise(z, t, condition, scale, rescale=rescale)
+            return None
         eps = self.predict_rows(z, t, condition.embeddings[: len(z)], scale)
         return self._contrasted(eps, z, t, condition, scale)
 

@@ -135,6 +135,7 @@ class Viewer {
     Object.assign(this.canvas, { width, height });
     this.sort();
     while (!this.cloud.order.settled) await new Promise((done) => setTimeout(done, 1));
+    Object.assign(this.canvas, { width, height });  // the window may have resized it
     this.draw(this.renderer.targets.still, 1);
     return this.renderer.pixels();
   }
