@@ -27,6 +27,7 @@ from tests.formats.test_splat import ksplat_file
 from tests.fuzz import mutations, oracles
 from tests.fuzz.mutations import BINARY, TEXT, Mutator, Packing
 from tests.helpers.object_clouds import ball
+from tests.helpers.ply_files import ply_bytes
 from threestudio_gaussiandreamer import register_parts
 from threestudio_gaussiandreamer.core.checkpoint_file import load_checkpoint, save_file
 from threestudio_gaussiandreamer.core.errors import UserError
@@ -154,26 +155,11 @@ def some_gaussians(count: int, degree: int) -> Gaussians:
     return arrays._replace(log_scales=arrays.log_scales - 2)
 
 
-def ply_bytes(
-    columns: dict[str, tuple[str, np.ndarray]], encoding: str, faces: bool = False
-) -> bytes:
-    """A PLY of any encoding, with an element of lists before the vertices if asked for."""
-    order, count = ply.BYTE_ORDERS[encoding], len(next(iter(columns.values()))[1])
-    listed = "element face 2\nproperty list uchar int vertex_indices\nproperty float area\n"
-    header = f"ply\nformat {encoding} 1.0\ncomment made for fuzzing\n" + listed * faces
-    header += f"element vertex {count}\n"
-    header += "".join(f"property {kind} {name}\n" for name, (kind, _) in columns.items())
-    kinds = {name: (order or "<") + ply.NUMBER_TYPES[kind] for name, (kind, _) in columns.items()}
-    rows = np.empty(count, list(kinds.items()))
-    for name, (_, values) in columns.items():
-        rows[name] = values
-    if encoding == "ascii":
-        lines = (b" ".join(b"%.9g" % value for value in row) + b"\n" for row in rows.tolist())
-        body = b"3 0 1 2 0.5\n4 0 1 2 3 0.25\n" * faces + b"".join(lines)
-    else:
-        face = np.dtype([("n", "u1"), ("v", order + "i4", 3), ("area", order + "f4")])
-        body = np.array([(3, [0, 1, 2], 0.5)] * 2, face).tobytes() * faces + rows.tobytes()
-    return f"{header}end_header\n".encode() + body
+FACES = "comment made for fuzzing\nelement face 2\nproperty list uchar int vertex_indices\n"
+FACES += "property float area"
+FACE = np.dtype([("n", "u1"), ("v", "<i4", 3), ("area", "<f4")])
+TEXT_FACES = FACES, b"3 0 1 2 0.5\n4 0 1 2 3 0.25\n"
+BINARY_FACES = FACES, np.array([(3, [0, 1, 2], 0.5)] * 2, FACE).tobytes()
 
 
 def gaussian_plys() -> list[bytes]:
@@ -187,7 +173,7 @@ def gaussian_plys() -> list[bytes]:
         names += ["opacity", *ply.LOG_SCALES, *ply.QUATS]
         table = zip(names, np.concatenate(values, axis=1).T, strict=True)
         columns = {name: ("float", column) for name, column in table}
-        seeds.append(ply_bytes(columns, encoding, faces=degree == 1))
+        seeds.append(ply_bytes(columns, encoding, before=BINARY_FACES if degree else ("", b"")))
     return seeds
 
 
@@ -201,9 +187,9 @@ def point_plys() -> list[bytes]:
     normals = {name: ("float", np.full(20, 0.577)) for name in ("nx", "ny", "nz")}
     return [
         ply_bytes(places | bytes_, "ascii"),
-        ply_bytes(places | normals | bytes_, "binary_little_endian", faces=True),
+        ply_bytes(places | normals | bytes_, "binary_little_endian", before=BINARY_FACES),
         ply_bytes(places | shorts, "binary_big_endian"),
-        ply_bytes(places | floats, "ascii", faces=True),
+        ply_bytes(places | floats, "ascii", before=TEXT_FACES),
     ]
 
 

@@ -5,6 +5,8 @@ from pathlib import Path
 import numpy as np
 
 from threestudio_gaussiandreamer.formats.ply import (
+    BYTE_ORDERS,
+    NUMBER_TYPES,
     gaussian_columns,
     gaussian_properties,
     write_table,
@@ -41,13 +43,31 @@ def cloud(count=50, normals=True):
     )
 
 
+def ply_bytes(columns, encoding="ascii", *, count=None, before=("", b""), after=("", b"")):
+    """Return a PLY file of vertices, and header and bytes of other elements around them.
+
+    Args:
+        columns: type and values of each property, by name.
+        count: what the header announces, if not the number of values.
+    """
+    order = BYTE_ORDERS[encoding] or "<"
+    kinds = [(name, order + NUMBER_TYPES[kind]) for name, (kind, _) in columns.items()]
+    rows = np.array([*zip(*(values for _, values in columns.values()), strict=True)], kinds)
+    lines = (b" ".join(b"%.9g" % value for value in row) + b"\n" for row in rows.tolist())
+    body = b"".join(lines) if encoding == "ascii" else rows.tobytes()
+    properties = [f"{kind} {name}" for name, (kind, _) in columns.items()]
+    counted = len(rows) if count is None else count
+    head = header(encoding, counted, properties, before[0], after[0])
+    return head.encode() + before[1] + body + after[1]
+
+
 def header(
     encoding="ascii", count=2, properties=("float x", "float y", "float z"), before="", after=""
 ):
     """Return the header of a PLY file as other programs write it."""
     lines = ["ply", f"format {encoding} 1.0", *filter(None, [before]), f"element vertex {count}"]
     lines += [f"property {entry}" for entry in properties]
-    return "\n".join([*lines, after, "end_header\n"])
+    return "\n".join([*lines, *filter(None, [after]), "end_header\n"])
 
 
 def saved(folder, content, name="file.ply"):

@@ -1,57 +1,45 @@
 """Fixtures of the stability tests: `measured` and `fault`, and the report of measured values."""
 
+import functools
 import inspect
 import json
 import logging
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, Callable, Optional
+from typing import Any, Optional
 
 import pytest
 
 from tests.stability.backends import backends_of, cuda_on_the_host
-from tests.stability.rows import ROWS
 from tests.stability.small_runs import EVERY_STEP, Ended, launch
 from threestudio_gaussiandreamer import register_parts
 
 register_parts()
 
-REPORT = pytest.StashKey[list]()
+REPORT: list[dict] = []
 
 
-class Measured:
-    """Record what a test measured, and assert the row's bar."""
+def measure(
+    record: Callable[[Any], None],
+    value: Any,
+    unit: str = "",
+    *,
+    what: str = "",
+    at_most: Optional[float] = None,
+    at_least: Optional[float] = None,
+) -> None:
+    """Record a number (quantity ``what``, in ``unit``) and assert its bound, or record a text.
 
-    def __init__(self, properties: list):
-        self.properties = properties
-
-    def __call__(
-        self,
-        value: Any,
-        unit: str = "",
-        *,
-        what: str = "",
-        at_most: Optional[float] = None,
-        at_least: Optional[float] = None,
-    ) -> None:
-        """Record a number (quantity ``what``, in ``unit``) and assert its bound, or record a text
-        result that was asserted before.
-
-        Of several values of the same ``what`` the report shows the worst: the smallest if
-        ``at_least`` is given, else the largest.
-        """
-        worst = "min" if at_least is not None else "max"
-        value = value if isinstance(value, str) else float(getattr(value, "item", lambda: value)())
-        self.properties.append(
-            ("measured", {"value": value, "unit": unit, "what": what, "worst": worst})
-        )
-        assert at_most is None or value <= at_most, (
-            f"{what or 'measured'} {value} {unit} > {at_most}"
-        )
-        assert at_least is None or value >= at_least, (
-            f"{what or 'measured'} {value} {unit} < {at_least}"
-        )
+    Of several values of the same ``what`` the report shows the worst: the smallest if ``at_least``
+    is given, else the largest.
+    """
+    value = value if isinstance(value, str) else float(getattr(value, "item", lambda: value)())
+    plain = value if isinstance(value, str) or math.isfinite(value) else str(value)
+    record((plain, unit, what, "min" if at_least is not None else "max"))
+    said = f"{what or 'measured'} {value} {unit}, not"
+    assert at_most is None or value <= at_most, f"{said} at most {at_most}"
+    assert at_least is None or value >= at_least, f"{said} at least {at_least}"
 
 
 @pytest.fixture(autouse=True)
@@ -61,8 +49,8 @@ def stand_in_for_a_gpu(request, monkeypatch) -> None:
 
 
 @pytest.fixture
-def measured(request) -> Measured:
-    return Measured(request.node.user_properties)
+def measured(record_property) -> Callable[..., None]:
+    return functools.partial(measure, functools.partial(record_property, "measured"))
 
 
 @pytest.fixture
@@ -80,7 +68,7 @@ def said() -> Iterator[list[str]]:
 
 
 @pytest.fixture
-def fault(request):
+def fault(measured, record_property) -> Callable[..., None]:
     """``fault(deviation, ours, emulation, at_most)``: assert that our implementation holds the bar
     and that the emulated fault does not.
 
@@ -100,13 +88,11 @@ def fault(request):
         raises: type[Exception] = AssertionError,
     ) -> None:
         bound = {"at_most": at_most} if at_least is None else {"at_least": at_least}
-        Measured(request.node.user_properties)(deviation(ours), unit, **bound)
-        emulated = Measured([])
+        measured(deviation(ours), unit, **bound)
+        found: list[tuple] = []
         with pytest.raises(raises) as caught:
-            emulated(deviation(emulation), unit, **bound)
-        crashed = {"value": caught.type.__name__, "unit": "", "what": "", "worst": "max"}
-        measured = emulated.properties[0][1] if emulated.properties else crashed
-        request.node.user_properties.append(("emulation", measured))
+            measure(found.append, deviation(emulation), unit, **bound)
+        record_property("emulation", (*found, (caught.type.__name__, "", "", "max"))[0])
 
     return hold
 
@@ -128,54 +114,30 @@ def pytest_configure(config) -> None:
     config.addinivalue_line(
         "markers", "stability(group, name, bar): the row of the stability tables that a test is"
     )
-    config.stash[REPORT] = []
 
 
 def pytest_collection_modifyitems(items) -> None:
     for item in items:
-        marker = item.get_closest_marker("stability")
-        if marker:
-            item.user_properties.append(("row", _describe(item, *marker.args)))
+        if marker := item.get_closest_marker("stability"):
+            *row, bar = marker.args
+            reason = inspect.getdoc(item.function) or ""
+            assert reason or not bar, f"{item.nodeid}: a changed bar needs a docstring"
+            names = {"file": item.path.stem, "name": item.originalname}
+            item.user_properties.append(
+                ("row", {"row": row, "bar": bar, "reason": reason, **names})
+            )
 
 
-def _describe(item: pytest.Item, group: str, name: str, bar: Optional[str]) -> dict:
-    reason = inspect.getdoc(item.function) or ""
-    if bar and not reason:
-        raise pytest.UsageError(f"{item.nodeid}: a changed bar needs a docstring that proves it")
-    return {
-        **ROWS[group, name]._asdict(),
-        "changed_bar": bar,
-        "reason": reason,
-        "file": item.path.name,
-        "test": item.originalname,
-    }
-
-
-@pytest.hookimpl(hookwrapper=True)
-def pytest_runtest_makereport(item):
-    report = (yield).get_result()
-    properties = dict(item.user_properties)
-    if report.when == "call" and "row" in properties:
-        values = {
-            kind: [_plain(x) for key, x in item.user_properties if key == kind]
-            for kind in ("measured", "emulation")
-        }
-        item.config.stash[REPORT].append({**properties["row"], "outcome": report.outcome, **values})
-
-
-def _plain(entry: dict) -> dict:
-    """Replace infinity and NaN, which JSON does not support, by text."""
-    value = entry["value"]
-    return {
-        **entry,
-        "value": value if isinstance(value, str) or math.isfinite(value) else str(value),
-    }
+def pytest_runtest_logreport(report) -> None:
+    if report.when == "call" and (row := dict(report.user_properties).get("row")):
+        kinds = ("measured", "emulation")
+        values = {kind: [x for key, x in report.user_properties if key == kind] for kind in kinds}
+        REPORT.append({**row, "outcome": report.outcome, **values})
 
 
 def pytest_sessionfinish(session) -> None:
-    path = session.config.getoption("--stability-report", default=None)
-    if path:
-        path.write_text(json.dumps(session.config.stash[REPORT], indent=1) + "\n")
+    if path := session.config.getoption("--stability-report", default=None):
+        path.write_text(json.dumps(REPORT, indent=1) + "\n")
 
 
 @pytest.fixture(scope="session")

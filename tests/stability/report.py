@@ -1,16 +1,18 @@
-"""Write reports/stability.md from what the stability tests measured.
+"""The known failures of rows.yaml, and reports/stability.md from what their tests measured.
 
 ``pytest tests/stability --stability-report FILE`` records each test; ``python -m
 tests.stability.report FILE`` keeps one entry per row in benchmarks/results/stability.json and
-writes the page. ``make docs`` writes the page from that file alone.
+writes the page; ``make docs`` writes the page from that file alone.
 """
 
 import json
 import sys
 from collections.abc import Iterable
 from pathlib import Path
+from typing import NamedTuple, Optional
 
-from tests.stability.rows import GROUPS, ROWS, Row
+import pytest
+import yaml
 
 ROOT = Path(__file__).parents[2]
 RESULTS, PAGE = ROOT / "benchmarks/results/stability.json", ROOT / "reports/stability.md"
@@ -28,34 +30,50 @@ compared in float32 with the same formula in float64 unless a test says otherwis
 """
 
 
+class Row(NamedTuple):
+    bar: str
+    peers: str
+    title: str = ""
+    """One line about the defect (A0), or empty."""
+
+
+TABLE = yaml.safe_load(Path(__file__).with_name("rows.yaml").read_text())
+ROWS = {
+    (group, name): Row(*cells)
+    for group, section in TABLE.items()
+    for name, *cells in section["rows"]
+}
+
+
+def row(group: str, name: str, *, bar: Optional[str] = None) -> pytest.MarkDecorator:
+    """Mark a test as one of a row; a ``bar`` of its own needs a docstring that justifies it."""
+    assert (group, name) in ROWS, f"rows.yaml has no row {name!r} in {group}"
+    return pytest.mark.stability(group, name, bar)
+
+
 def main(source: str) -> None:
     """Summarise the tests in the JSON ``source``, and write the page."""
     results = json.loads(Path(source).read_text())
     rows = [
-        summary_of(row, [test for test in results if (test["group"], test["name"]) == key])
-        for key, row in ROWS.items()
+        summary_of(key, [test for test in results if tuple(test["row"]) == key]) for key in ROWS
     ]
     RESULTS.write_text(json.dumps(rows, indent=1, ensure_ascii=False) + "\n")
     PAGE.write_text(page())
 
 
-def summary_of(row: Row, tests: list[dict]) -> dict:
+def summary_of(key: tuple[str, str], tests: list[dict]) -> dict:
     """Return what a row's tests measured, as one entry of stability.json."""
-    names = dict.fromkeys((test["file"].removesuffix(".py"), test["test"]) for test in tests)
     return {
-        "group": row.group,
-        "name": row.name,
-        "failed": sorted({test["test"] for test in tests if test["outcome"] != "passed"}),
+        "group": key[0],
+        "name": key[1],
+        "failed": sorted({test["name"] for test in tests if test["outcome"] != "passed"}),
         "measured": worst_of(tests, "measured"),
         "emulation": worst_of(tests, "emulation"),
-        "tests": [f"{file}::{name}" for file, name in names],
+        "tests": list(dict.fromkeys(f"{test['file']}::{test['name']}" for test in tests)),
         "changed_bars": {
-            test["test"]: {
-                "bar": test["changed_bar"],
-                "reason": " ".join(test["reason"].split()),
-            }
+            test["name"]: {"bar": test["bar"], "reason": " ".join(test["reason"].split())}
             for test in tests
-            if test["changed_bar"]
+            if test["bar"]
         },
     }
 
@@ -63,77 +81,52 @@ def summary_of(row: Row, tests: list[dict]) -> dict:
 def worst_of(tests: list[dict], kind: str) -> str:
     """Return the worst value of each quantity and unit, and the results that are words."""
     groups: dict[tuple, list] = {}
-    for entry in (entry for test in tests for entry in test[kind]):
-        words = isinstance(entry["value"], str)
-        groups.setdefault(
-            (entry["what"], entry["unit"], entry["worst"], entry["value"] if words else ""), []
-        ).append(entry["value"])
+    for value, unit, what, worst in (entry for test in tests for entry in test[kind]):
+        words = value if isinstance(value, str) else ""
+        groups.setdefault((what, unit, worst, words), []).append(value)
     texts = []
     for (what, unit, worst, words), values in groups.items():
         value = words or f"{min(values) if worst == 'min' else max(values):.3g}"
-        texts.append((f"{what}: " if what else "") + " ".join(filter(None, (value, unit))))
+        texts.append((f"{what}: " if what else "") + f"{value} {unit}".strip())
     return "; ".join(dict.fromkeys(texts))
 
 
 def page() -> str:
-    """Return the text of reports/stability.md."""
+    """Return the text of reports/stability.md: how many rows hold, and a table for each group."""
     entries = {(entry["group"], entry["name"]): entry for entry in json.loads(RESULTS.read_text())}
-    groups = (section(group, entries) for group in GROUPS)
-    return "\n".join([INTRO, summary(entries), *groups])
-
-
-def summary(entries: dict[tuple[str, str], dict]) -> str:
-    """Return how many rows there are, hold, and were not run."""
-    run = [key for key in ROWS if entries.get(key, {}).get("tests")]
-    held = sum(not entries[key]["failed"] for key in run)
-    counts = [f"{len(ROWS)} rows, {held} hold"]
-    absent = [f"{group} {name}" for group, name in ROWS if (group, name) not in run]
-    if absent:
-        counts.append(f"not run: {', '.join(absent)}")
-    return "; ".join(counts) + ".\n"
+    entries = {key: entries.get(key) or summary_of(key, []) for key in ROWS}
+    run = [entry for entry in entries.values() if entry["tests"]]
+    held = f"{len(ROWS)} rows, {sum(not entry['failed'] for entry in run)} hold"
+    absent = [" ".join(key) for key, entry in entries.items() if not entry["tests"]]
+    held += f"; not run: {', '.join(absent)}" if absent else ""
+    groups = (section(group, entries) for group in TABLE)
+    return "\n".join([INTRO, f"{held}.\n", *groups])
 
 
 def section(group: str, entries: dict[tuple[str, str], dict]) -> str:
-    """Return the table of a group, and its changed bars."""
-    rows = [row for row in ROWS.values() if row.group == group]
-    emulated = ["Emulated fault"] if group == "A0" else []
+    """Return the table of a group, and the bars that were replaced, with their reasons."""
+    emulated = ["Emulated fault"] * (group == "A0")
     heads = ["Row", "Bar", "Measured", *emulated, "Test", "Other projects"]
-    lines = [f"## {group} {GROUPS[group]}", "", table_line(heads), table_line(["---"] * len(heads))]
-    for row in rows:
-        entry = entries.get((group, row.name)) or summary_of(row, [])
-        changed = " *(changed, see below)*" if entry["changed_bars"] else ""
-        name = f"**{row.name}** {row.title}" if row.title else row.name
-        tests = ", ".join(f"`{test}`" for test in entry["tests"])
-        emulation = [entry["emulation"]] if emulated else []
-        lines.append(
-            table_line([name, row.bar + changed, outcome(entry), *emulation, tests, row.peers])
-        )
-    return "\n".join([*lines, "", *changed_bars(rows, entries)])
+    lines, bars = [table_line(heads), table_line(["---"] * len(heads))], []
+    for (_, name), entry in ((key, entry) for key, entry in entries.items() if key[0] == group):
+        known, changed = ROWS[group, name], entry["changed_bars"]
+        failed = f"**fails** ({', '.join(entry['failed'])}): " if entry["failed"] else ""
+        cells = [
+            f"**{name}** {known.title}" if known.title else name,
+            known.bar + " *(changed, see below)*" * bool(changed),
+            failed + entry["measured"] if entry["tests"] else "**not run**",
+            *[entry["emulation"]] * len(emulated),
+            ", ".join(f"`{test}`" for test in entry["tests"]),
+            known.peers,
+        ]
+        lines.append(table_line(cells))
+        bars += [f"* {name} (`{x}`): **{y['bar']}**. {y['reason']}" for x, y in changed.items()]
+    bars = ["Bars that were changed, and why:", "", *bars, ""] if bars else []
+    return "\n".join([f"## {group} {TABLE[group]['title']}", "", *lines, "", *bars])
 
 
 def table_line(cells: Iterable[str]) -> str:
-    """Return one line of a Markdown table."""
     return f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |"
-
-
-def outcome(entry: dict) -> str:
-    """Return the worst values, after the tests that fail."""
-    if not entry["tests"]:
-        return "**not run**"
-    failed = f"**fails** ({', '.join(entry['failed'])}): " if entry["failed"] else ""
-    return failed + entry["measured"]
-
-
-def changed_bars(rows: list[Row], entries: dict[tuple[str, str], dict]) -> list[str]:
-    """Return a list of the bars that were replaced: the new bar and its test's docstring."""
-    items = [
-        f"* {row.name} (`{test}`): **{changed['bar']}**. {changed['reason']}"
-        for row in rows
-        for test, changed in entries.get((row.group, row.name), summary_of(row, []))[
-            "changed_bars"
-        ].items()
-    ]
-    return ["Bars that were changed, and why:", "", *items, ""] if items else []
 
 
 if __name__ == "__main__":

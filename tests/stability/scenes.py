@@ -4,11 +4,26 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from tests.helpers.pixel_guidance import TowardsGrey
 from tests.helpers.splatting_scenes import Cloud, Run, front_camera, one_gaussian, rasterize
 from threestudio_gaussiandreamer.cameras import Orbit
 from threestudio_gaussiandreamer.gaussians.point_cloud import PointCloud
+from threestudio_gaussiandreamer.host import register
 from threestudio_gaussiandreamer.splatting import Rasterized
 from threestudio_gaussiandreamer.training.geometry import GaussianCloud
+
+
+@register("stability-corrupted-guidance")
+class CorruptedScore(TowardsGrey):
+    """Replace the score of some items, at the steps in ``corrupted``, by a value."""
+
+    corrupted: dict[int, dict[int, float]] = {}
+
+    def predict(self, z, t, condition):
+        eps, _ = super().predict(z, t, condition)
+        for item, value in self.corrupted.get(self.step, {}).items():
+            eps[item] = value
+        return eps, None
 
 
 def seeded(seed: int = 0) -> torch.Generator:

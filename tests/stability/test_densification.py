@@ -11,7 +11,7 @@ import torch
 
 from tests.stability import scenes
 from tests.stability.backends import slow
-from tests.stability.rows import row
+from tests.stability.report import row
 from tests.stability.small_runs import DEMO, Ended, differences, launch
 from threestudio_gaussiandreamer.cameras import orbit_c2w
 from threestudio_gaussiandreamer.core.errors import UserError

@@ -11,7 +11,9 @@ import scipy.stats
 import torch
 import trimesh
 
-from tests.stability.rows import row
+from tests.helpers.ply_files import ply_bytes, rng
+from tests.stability.report import row
+from tests.stability.scenes import ball
 from tests.stability.small_runs import launch
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
@@ -29,13 +31,8 @@ from threestudio_gaussiandreamer.metrics import psnr
 from threestudio_gaussiandreamer.training.geometry import GaussianCloud, grow_points
 
 
-def rng(seed: int = 0) -> np.random.Generator:
-    return np.random.default_rng(seed)
-
-
 def sphere(count: int = 1000) -> np.ndarray:
-    points = rng().normal(size=(count, 3))
-    return points / np.linalg.norm(points, axis=1, keepdims=True)
+    return ball(count).points / 0.7
 
 
 def colored(points: np.ndarray, color: float = 0.5) -> PointCloud:
@@ -43,6 +40,7 @@ def colored(points: np.ndarray, color: float = 0.5) -> PointCloud:
 
 
 GROWING = {"num_candidates": 20_000, "radius": 0.05}
+FAR = [[1000.0, 0, 0]]
 
 
 def started(cloud: PointCloud, **options) -> GaussianCloud:
@@ -70,31 +68,20 @@ def write_ply(
 ) -> Path:
     names = [*"xyz", *(["red", "green", "blue"] if colors is not None else [])]
     rows = points if colors is None else np.concatenate([points, colors], axis=1)
-    lines = [
-        "ply",
-        "format ascii 1.0",
-        f"element vertex {len(points)}",
-        *(f"property float {name}" for name in names),
-        f"element face {len(faces)}",
-        "property list uchar int vertex_indices",
-        "end_header",
-        *(" ".join(f"{x!r}" for x in values) for values in rows.tolist()),
-        *(f"3 {a} {b} {c}" for a, b, c in faces),
-    ]
-    path.write_text("\n".join(lines) + "\n")
+    columns = {name: ("float", column) for name, column in zip(names, rows.T, strict=True)}
+    text = f"element face {len(faces)}\nproperty list uchar int vertex_indices"
+    body = b"".join(b"3 %d %d %d\n" % tuple(face) for face in faces)
+    path.write_bytes(ply_bytes(columns, after=(text, body)))
     return path
 
 
 def write_obj(path: Path, points: np.ndarray, faces: np.ndarray) -> Path:
-    lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in points.tolist()]
-    lines += [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in faces]
-    path.write_text("\n".join(lines) + "\n")
+    lines = [f"v {x!r} {y!r} {z!r}\n" for x, y, z in points.tolist()]
+    path.write_text("".join([*lines, *(f"f {a + 1} {b + 1} {c + 1}\n" for a, b, c in faces)]))
     return path
 
 
 def ball_mesh(subdivisions: int = 3) -> tuple[np.ndarray, np.ndarray]:
-    import trimesh
-
     ball = trimesh.creation.icosphere(subdivisions)
     return np.array(ball.vertices), np.array(ball.faces)
 
@@ -212,29 +199,22 @@ def corrupted(values: np.ndarray, share: float) -> np.ndarray:
     return values
 
 
-SOURCES = {
-    "mesh": lambda folder, points, colors, faces: write_ply(
-        folder / "a.ply", points, colors, faces
-    ),
-    "mesh without colours": lambda folder, points, _, faces: write_obj(
-        folder / "a.obj", points, faces
-    ),
-    "points": lambda folder, points, colors, _: write_ply(folder / "a.ply", points, colors),
-    "rows of text": lambda folder, points, colors, _: write_text(folder / "a.xyz", points, colors),
-}
-
-COLOURED = [source for source in SOURCES if source != "mesh without colours"]
+def write_source(source: str, folder: Path, points, colors, faces) -> Path:
+    if source == "mesh without colours":
+        return write_obj(folder / "a.obj", points, faces)
+    if source == "rows of text":
+        np.savetxt(folder / "a.xyz", np.concatenate([points, colors], axis=1), "%.9g")
+        return folder / "a.xyz"
+    return write_ply(folder / "a.ply", points, colors, faces if source == "mesh" else ())
 
 
-def write_text(path: Path, points: np.ndarray, colors: np.ndarray) -> Path:
-    np.savetxt(path, np.concatenate([points, colors], axis=1), "%.9g")
-    return path
+COLOURED = ["mesh", "points", "rows of text"]
 
 
 @row("A2", "NaN/Inf vertices, NaN colours")
 @pytest.mark.parametrize(
     "source, what",
-    [*itertools.product(SOURCES, ["vertices"]), *((source, "colours") for source in COLOURED)],
+    [("mesh without colours", "vertices"), *itertools.product(COLOURED, ["vertices", "colours"])],
 )
 def test_a_few_bad_rows_are_counted_and_many_refused(source, what, tmp_path, measured, said):
     """A vertex of kept faces without a colour becomes grey; otherwise its point is dropped."""
@@ -244,7 +224,7 @@ def test_a_few_bad_rows_are_counted_and_many_refused(source, what, tmp_path, mea
 
     def with_bad(share: float) -> GaussianCloud:
         changed = arrays | {what: corrupted(arrays[what], share)}
-        path = SOURCES[source](tmp_path, *changed.values(), faces)
+        path = write_source(source, tmp_path, *changed.values(), faces)
         return initialized(prior_type, path, enabled=False)
 
     geometry = with_bad(0.01)
@@ -260,16 +240,16 @@ def test_a_few_bad_rows_are_counted_and_many_refused(source, what, tmp_path, mea
 
 
 @row("A2", "No colours")
-@pytest.mark.parametrize("source", ["mesh", "points", "ply"])
+@pytest.mark.parametrize("source", ["mesh", "point-cloud", "ply"])
 def test_without_colours_the_cloud_is_grey_with_a_message(source, tmp_path, measured, said):
     points, faces = ball_mesh()
-    path = tmp_path / {"mesh": "a.obj", "points": "a.xyz", "ply": "a.ply"}[source]
+    path = tmp_path / {"mesh": "a.obj", "point-cloud": "a.xyz"}.get(source, "a.ply")
     if source == "mesh":
         write_obj(path, points, faces)
-    elif source == "points":
+    elif source == "point-cloud":
         np.savetxt(path, points)
     else:
-        trimesh.PointCloud(points).export(path)
+        write_ply(path, points)
     prior_type = "mesh-prior" if source == "mesh" else "point-cloud-prior"
     colors = initialized(prior_type, path, **GROWING).colors(torch.zeros(1, 3)).detach()
     given, grown = colors[: len(points)], colors[len(points) :]
@@ -277,10 +257,6 @@ def test_without_colours_the_cloud_is_grey_with_a_message(source, tmp_path, meas
     assert len(grown) > 300 and grown.std() > 0.05
     assert grown.min() >= 0.5 - 1e-6 and grown.max() <= 0.7 + 1e-6
     assert any("no colours: grey is used" in message for message in said)
-
-
-FAR = [[1000.0, 0, 0]]
-CUBE = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
 
 
 def initialized_from(path: Path) -> tuple[GaussianCloud, int]:
@@ -291,24 +267,22 @@ def initialized_from(path: Path) -> tuple[GaussianCloud, int]:
     return geometry, len(geometry) - (642 if points else 2000)
 
 
-def write_npz(path: Path, points: np.ndarray) -> Path:
-    np.savez(path, points=points, colors=rng().random(points.shape))
-    return path
-
-
 @row("A2", "Units and pose")
 @pytest.mark.parametrize("kind", ["obj", "npz"])
 @pytest.mark.parametrize("unit", [1e-3, 1.0, 1e3])
 def test_neither_unit_nor_place_matters(unit, kind, tmp_path, measured):
     """Millimetres, metres, kilometres, each at its place and 10 000 units away."""
     points, faces = ball_mesh()
-    arguments = () if kind == "npz" else (faces,)
-    write = write_npz if kind == "npz" else write_obj
-    (tmp_path / "b").mkdir()
-    usual, expected = initialized_from(write(tmp_path / f"a.{kind}", points, *arguments))
+
+    def written(points: np.ndarray) -> Path:
+        if kind == "obj":
+            return write_obj(tmp_path / "a.obj", points, faces)
+        np.savez(tmp_path / "a.npz", points=points, colors=rng().random(points.shape))
+        return tmp_path / "a.npz"
+
+    usual, expected = initialized_from(written(points))
     for shift in (0.0, 1e4):
-        path = write(tmp_path / f"b/a.{kind}", points * unit + shift, *arguments)
-        other, count = initialized_from(path)
+        other, count = initialized_from(written(points * unit + shift))
         off = abs(count / expected - 1) * 100
         measured(off, "%", what="deviation of the accepted share", at_most=1.0)
         n = min(len(usual), len(other))
@@ -337,8 +311,9 @@ def test_a_flat_prior_grows_a_slab_within_the_caps(axes, measured):
 @row("A2", "No grown point")
 def test_a_cube_without_grown_points(measured):
     few = {"enabled": True, "num_candidates": 100_000, "radius": 0.0025}
-    geometry = started(colored(CUBE), grow=few)
-    assert torch.equal(geometry.means, torch.from_numpy(CUBE).float())
+    cube = colored(list(itertools.product((-1.0, 1.0), repeat=3)))
+    geometry = started(cube, grow=few)
+    assert torch.equal(geometry.means, torch.from_numpy(cube.points))
     assert torch.allclose(geometry.colors(torch.zeros(1, 3)), torch.tensor(0.5))
     assert picture(geometry).isfinite().all()
     measured(len(geometry), "Gaussians, the vertices", at_most=8)

@@ -30,7 +30,7 @@ from tests.helpers.splatting_scenes import (
     stacks_on_one_pixel,
 )
 from tests.stability.backends import BACKENDS, backends_of
-from tests.stability.rows import row
+from tests.stability.report import row
 from tests.stability.scenes import clamped_alpha, drawn, finite, joined, pixels, seeded, stack
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
