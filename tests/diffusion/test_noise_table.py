@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from threestudio_gaussiandreamer.diffusion import noise_table
-from threestudio_gaussiandreamer.diffusion.noise_table import SLICES, NoiseTable
+from threestudio_gaussiandreamer.diffusion import inversion as noise_table
+from threestudio_gaussiandreamer.diffusion.inversion import SLICES, NoiseTable
 
 
 @pytest.fixture(scope="module")

@@ -202,8 +202,6 @@ def test_sizes_that_do_not_fit_are_named(mesh_path):
         ExactScoreGuidance(
             {"mesh": "no.glb", "space": "latent", "latent_size": 33, "image_size": 64}
         )
-    with pytest.raises(UserError, match="renders, not latents"):
-        guidance(mesh_path)(uniform(1, 16, 16, 3), None, rgb_as_latents=True, **batch(0.0))
     latent = guidance(mesh_path, space="latent", latent_size=5)
     large = guidance(mesh_path, mode="view-agnostic", bank_views=2000)
     for exact, size, said in ((latent, 16, "latent_size"), (large, 512, "GiB")):

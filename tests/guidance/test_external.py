@@ -103,9 +103,8 @@ def test_each_signature_gets_what_it_takes():
     "returned, message",
     [
         (torch.zeros(3), "returned Tensor"),
-        ({"loss_sds": torch.zeros(4)}, r"returned loss_sds of .*4.*: one number was expected"),
-        ({"loss_sds": "x"}, "returned loss_sds of str: one number was expected"),
-        ({"loss_sds": torch.tensor(torch.nan)}, "returned loss_sds = nan: expected a finite"),
+        ({"loss_sds": torch.zeros(4)}, r"returned loss_sds = tensor.* expected one finite"),
+        ({"loss_sds": torch.tensor(torch.nan)}, "returned loss_sds = .*nan.*: expected one finite"),
         ({"loss_sds": torch.inf}, "returned loss_sds = inf"),
         ({"loss_sds": torch.ones(()), "loss_off": 0.0, "note": 1.5}, None),
     ],

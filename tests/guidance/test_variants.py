@@ -19,7 +19,7 @@ from threestudio_gaussiandreamer.diffusion.consistent_noise import (
     attached_noise,
     cell_values,
 )
-from threestudio_gaussiandreamer.diffusion.noise_table import NoiseTable
+from threestudio_gaussiandreamer.diffusion.inversion import NoiseTable
 from threestudio_gaussiandreamer.guidance.variants import vsd
 
 EXACT = 1e-10

@@ -17,7 +17,7 @@ from torch.nn.utils import parameters_to_vector
 
 from tests.helpers import tiny_guidance as tiny
 from threestudio_gaussiandreamer.diffusion import sds
-from threestudio_gaussiandreamer.diffusion.noise_table import NoiseTable
+from threestudio_gaussiandreamer.diffusion.inversion import NoiseTable
 from threestudio_gaussiandreamer.guidance.variants import vsd
 
 VSD = threestudio.find("stable-diffusion-vsd-guidance")

@@ -10,9 +10,6 @@ it: views from similar distances share their cells.
 The values stand in a table that a hash of the cell looks up. The pixels of the background look up
 rows that change with each draw."""
 
-from functools import lru_cache
-from typing import NamedTuple
-
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float, Int
@@ -51,47 +48,30 @@ def surface_cells(
     Args:
         size: of the cells, world units: a power of two.
     """
-    lattices = _lattices(points.device)
-    per_unit = size.reciprocal()[:, None, None, None]
-    cells = torch.addcmul(lattices.shifts, points, per_unit).floor_().int().mul_(lattices.primes)
-    return cells.sum(2, dtype=torch.int32).add_(lattices.marks)
+    lattice = _counted(0, LATTICES, points.device)[:, None, None, None]
+    shifts, per_unit = lattice[..., None] / LATTICES, size.reciprocal()[:, None, None, None]
+    cells = torch.addcmul(shifts, points, per_unit).floor_().int()
+    primes = torch.tensor(PRIMES, dtype=torch.int32, device=points.device)[:, None, None]
+    # the last term makes the rows of one lattice differ from those of the others
+    return cells.mul_(primes).sum(2, dtype=torch.int32).add_(lattice * (TABLE // LATTICES))
 
 
-class Lattices(NamedTuple):
-    """What differs between the lattices, and the factors of the hash."""
-
-    shifts: Float[Tensor, "L 1 1 1 1"]
-    """In cells, along all axes."""
-    marks: Int[Tensor, "L 1 1 1"]
-    """Make the rows of one lattice differ from those of the others."""
-    primes: Int[Tensor, "3 1 1"]
-
-
-@lru_cache(maxsize=4)
-def _lattices(device: torch.device) -> Lattices:
-    number = torch.arange(LATTICES, dtype=torch.int32, device=device)[:, None, None, None]
-    primes = torch.tensor(PRIMES, dtype=torch.int32, device=device)[:, None, None]
-    return Lattices(number[..., None] / LATTICES, number * (TABLE // LATTICES), primes)
-
-
-@lru_cache(maxsize=4)
 def background_cells(
     first: int, count: int, height: int, width: int, device: torch.device
 ) -> Int[Tensor, "L B h w"]:
-    """Return a number for each lattice, item and pixel, from which its row follows in each step.
-
-    Args:
-        first: number of the first of ``count`` items.
+    """Return a number for each lattice, item and pixel, from which its row follows in each step;
+    ``first`` is the number of the first of ``count`` items.
     """
-    items, rows, columns = (
-        torch.arange(begin, begin + n, dtype=torch.int32, device=device) * factor
-        for begin, n, factor in (
-            (first, count, ITEM),
-            (0, height, PRIMES[0]),
-            (0, width, PRIMES[1]),
-        )
+    lattices = _counted(0, LATTICES, device) * (TABLE // LATTICES)
+    items = _counted(first, count, device) * ITEM
+    rows, columns = (
+        _counted(0, n, device) * prime for n, prime in zip((height, width), PRIMES, strict=False)
     )
-    return _lattices(device).marks + items[:, None, None] + rows[:, None] + columns
+    return lattices[:, None, None, None] + items[:, None, None] + rows[:, None] + columns
+
+
+def _counted(first: int, count: int, device: torch.device) -> Int[Tensor, " n"]:
+    return torch.arange(first, first + count, dtype=torch.int32, device=device)
 
 
 def cell_size(c2w: Float[Tensor, "B 4 4"], focal: Float[Tensor, " B"]) -> Float[Tensor, " B"]:

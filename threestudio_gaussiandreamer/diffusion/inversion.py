@@ -1,15 +1,25 @@
-"""DDIM inversion: the deterministic trajectory from a clean latent towards noise."""
+"""DDIM inversion, the deterministic trajectory from a clean latent towards noise, and the noise
+that its steps may add.
+"""
 
-import itertools
-from collections.abc import Callable, Iterable
-from functools import lru_cache
+from collections.abc import Callable, Sequence
 from typing import NamedTuple, Optional
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from . import sds
+from ..core import streams
+from .sds import ddim_factors, per_item
+
+LENGTH = 2**22
+"""Numbers in a table at least; 16 MiB."""
+SLICES = 16
+"""Items that a table holds at least."""
+SPREAD = 0.5 * (5**0.5 - 1)
+"""Distance of the parts of a step, as a share of the table: the multiples of the golden section,
+modulo 1, are far from one another.
+"""
 
 
 class Step(NamedTuple):
@@ -23,23 +33,15 @@ class Step(NamedTuple):
     """The timestep of z, before the step."""
 
 
-Predict = Callable[[Step], Float[Tensor, "R c h w"]]
-Fresh = Callable[[int], Float[Tensor, "B c h w"]]
-
-
-Factors = tuple[float, float, float]
-"""What a step multiplies z, the predicted noise and fresh noise by."""
-
-
 def invert(
-    predict: Predict,
+    predict: Callable[[Step], Float[Tensor, "R c h w"]],
     x: Float[Tensor, "B c h w"],
     t: Int[Tensor, " B"],
     alphas_cumprod: Float[Tensor, " T"],
     stride: int,
     *,
     eta: float = 0.0,
-    fresh: Optional[Fresh] = None,
+    fresh: Optional[Callable[[int], Float[Tensor, "B c h w"]]] = None,
 ) -> Float[Tensor, "B c h w"]:
     """Follow DDIM (Song et al. 2021, eq. 12 with eta 0) from x, taken as the latent of timestep 0,
     to each item's timestep t.
@@ -54,57 +56,51 @@ def invert(
         fresh: returns the standard normal noise of all items in a step, given its index; needed if
             ``eta`` isn't 0.
     """
-    ends = t.tolist()
     # in this order, the items that have ended are always the first
-    order = sorted(range(len(ends)), key=ends.__getitem__)
-    rows = left = torch.tensor(order, dtype=torch.long, device=x.device)
-    table = _factors(alphas_cumprod, stride, eta)
-    factors = _factors_of_steps(table, [ends[item] for item in order], stride, x)
-    ended: list[Tensor] = []
-    # a step writes to memory that is there: to allocate it takes longer than the arithmetic
-    z = x.index_select(0, rows)
-    spare, noise = torch.empty_like(z), torch.empty_like(z)
-    for index, (ratio, slope, deviation) in enumerate(factors):
-        if gone := len(z) - len(ratio):
-            ended.append(z[:gone])
-            left, z, spare, noise = left[gone:], z[gone:], spare[gone:], noise[gone:]
-        predicted = predict(Step(index, left, z, left.new_full(left.shape, index * stride)))
-        torch.mul(z, ratio, out=spare).addcmul_(predicted, slope)
+    ends, rows = t.cpu().sort(stable=True)
+    left = rows = rows.to(x.device)
+    abar, z, ended = alphas_cumprod.cpu(), x.index_select(0, rows), []
+    for index, start in enumerate(range(0, int(ends[-1]), stride)):
+        gone = int((ends <= start).sum())
+        ended.append(z[:gone])
+        ends, left, z = ends[gone:], left[gone:], z[gone:]
+        now, later = abar[start], abar[ends.clamp(max=start + stride)]
+        variance = (1 - now) / (1 - later) * (1 - later / now)
+        deviation = eta * variance.clamp_min(0).sqrt()
+        factors = torch.stack([*ddim_factors(now, later), deviation]).to(x.device)
+        ratio, slope, deviation = (per_item(values, x) for values in factors)
+        predicted = predict(Step(index, left, z, torch.full_like(left, start)))
+        z = (z * ratio).addcmul_(predicted, slope)
         if eta and fresh is not None:
-            torch.index_select(fresh(index).to(x), 0, left, out=noise)
-            spare.addcmul_(noise, deviation)
-        z, spare = spare, z
+            z.addcmul_(fresh(index).to(x)[left], deviation)
     return torch.empty_like(x).index_copy_(0, rows, torch.cat([*ended, z]))
 
 
-def _factors_of_steps(
-    table: list[Factors], ends: list[int], stride: int, like: Float[Tensor, "B *d"]
-) -> Iterable[tuple[Tensor, Tensor, Tensor]]:
-    """Return the factors of each step for the items that it moves, each (R, 1, ..., 1): all of them
-    are views of one tensor.
+class NoiseTable:
+    """A table of standard normal numbers, a function of the run's seed, of which a draw is a slice
+    (Salimans et al. 2017, arXiv:1703.03864, section 2.1): drawing costs nothing.
+
+    Numbers of one draw are independent. Slices of different draws overlap by chance, shifted
+    against each other, so each pair of numbers is uncorrelated.
 
     Args:
-        table: the factors of the step that ends at each timestep.
-        ends: the timesteps of the items, ascending.
+        shape: of one item.
     """
-    counts: list[int] = []
-    factors: list[float] = []
-    for start in range(0, ends[-1], stride):
-        moved = [table[min(end, start + stride)] for end in ends if end > start]
-        counts += [len(moved)] * 3
-        factors += itertools.chain(*zip(*moved, strict=True))
-    values = torch.tensor(factors, dtype=like.dtype, device=like.device)
-    parts = values.view(-1, *[1] * (like.dim() - 1)).split_with_sizes(counts)
-    return zip(parts[::3], parts[1::3], parts[2::3], strict=True)
 
+    def __init__(self, seed: int, shape: Sequence[int], device: torch.device | str = "cpu") -> None:
+        self.seed, self.shape = seed, torch.Size(shape)
+        length = max(LENGTH, SLICES * self.shape.numel())
+        generator = streams.generator(seed, "noise table")
+        self._values = torch.randn(length, generator=generator).to(device)
 
-@lru_cache(maxsize=4)
-def _factors(alphas_cumprod: Float[Tensor, " T"], stride: int, eta: float) -> list[Factors]:
-    """Return the factors of the step that ends at each timestep, from the last multiple of the
-    stride before.
-    """
-    ends = torch.arange(len(alphas_cumprod), device=alphas_cumprod.device)
-    now, later = alphas_cumprod[(ends - 1).clamp_min(0) // stride * stride], alphas_cumprod
-    variance = (1 - now) / (1 - later) * (1 - later / now)
-    deviation = eta * variance.clamp_min(0).sqrt()
-    return [*zip(*(f.tolist() for f in (*sds.ddim_factors(now, later), deviation)), strict=True)]
+    def draw(
+        self, stream: str, step: int, first: int, count: int, part: int = 0
+    ) -> Float[Tensor, "B *d"]:
+        """Return standard normal numbers for ``count`` items, numbered from ``first``, each a
+        function of (seed, stream, step, part, item).
+        """
+        numel = self.shape.numel()
+        places = len(self._values) - numel
+        begin = streams.derive_seed(self.seed, stream, step) + part * int(SPREAD * places)
+        begins = ((begin + item * numel) % places for item in range(first, first + count))
+        return torch.stack([self._values[i : i + numel].view(self.shape) for i in begins])

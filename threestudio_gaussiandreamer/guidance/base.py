@@ -104,10 +104,11 @@ class ScoreDistillation(BaseObject, ABC):
 
         @staticmethod
         def check(cfg: Any) -> None:
-            for step in _knots(cfg.min_step_percent, cfg.max_step_percent):
-                sds.step_range(
-                    C(cfg.min_step_percent, step, step), C(cfg.max_step_percent, step, step)
-                )
+            percents = cfg.min_step_percent, cfg.max_step_percent
+            lists = [entries for entries in percents if not isinstance(entries, (int, float))]
+            # all steps at which the slope of a schedule changes, and harmless others
+            for step in {0, *(int(entry) for entries in lists for entry in entries)}:
+                sds.step_range(*(C(percent, step, step) for percent in percents))
             variant_class(cfg)
 
     cfg: Config
@@ -166,13 +167,6 @@ class ScoreDistillation(BaseObject, ABC):
     def particle_model(self, options: Any) -> Any:
         """Return the model of the renders that ``vsd-variant``, whose options are given, trains."""
         return GaussianParticles()
-
-    @classmethod
-    def check_particle_model(cls, cfg: Any) -> None:
-        """Raise UserError if ``vsd-variant`` can't be used with these options of the guidance."""
-        if cls.NO_LORA:
-            said = "vsd-variant trains a LoRA in a UNet of single views"
-            raise UserError(f"{said}, and {cls.NO_LORA}: use another system.guidance.variant_type")
 
     @classmethod
     def preflight(cls, cfg: Any) -> None:
@@ -458,12 +452,6 @@ def variant_class(cfg: Any) -> type[Variant]:
 def _warn_of_no_effect(scale: float, name: str) -> None:
     """Warn, once per process, of a scale where there is only one prediction."""
     warn(f"guidance_scale={scale:g} has no effect: {name}.predict returns no unconditional one")
-
-
-def _knots(*schedules: Any) -> set[int]:
-    """Return all steps at which the slope of a schedule changes, and harmless others."""
-    lists = [entries for entries in schedules if not isinstance(entries, (int, float))]
-    return {0, *(int(entry) for entries in lists for entry in entries)}
 
 
 @torch.no_grad()

@@ -30,7 +30,6 @@ class DeepFloydGuidance(TextToImageDistillation):
     family = FAMILY
 
     def load(self, folder: Path) -> None:
-        super().load(folder)
         self.require_text_to_image(3)
         self.image_size = self.size_of_images()
 

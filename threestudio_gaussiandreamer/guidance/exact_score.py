@@ -48,7 +48,7 @@ from ..core.given_gradient import given_gradient
 from ..core.memory import count_of, require_memory
 from ..core.options import at_least, in_range, interval, one_of, required
 from ..diffusion import sds
-from ..diffusion.exact_score import COLOR_MATRIX, LinearLatent, denoise
+from ..diffusion.exact_score import COLOR_MATRIX, LinearLatent
 from ..host import parse_structured, register
 from ..meshes.load import AXES, load_mesh, mesh_file
 from ..meshes.raycast import MeshCaster
@@ -59,11 +59,11 @@ from .picture_bank import (
     Bank,
     MeshTruth,
     Mixture,
-    Modes,
     background_of,
     composite,
     mixture_of,
     resized,
+    scores,
 )
 from .types import Latents, Residual, Timesteps
 from .variants.sds import SDS
@@ -135,7 +135,7 @@ class ExactScoreGuidance(ScoreDistillation):
         cfg = self.cfg
         mesh = MeshCaster(load_mesh(cfg.mesh, up=cfg.up, front=cfg.front))
         self.truth = MeshTruth(mesh, cfg.supersample, cfg.max_cached_targets, self._picture_size)
-        self._banks: dict[tuple[int, int], Bank] = {}
+        self._bank: Optional[Bank] = None
         self._size: Optional[tuple[int, int]] = None
         self._perplexity = 1.0
         ranges = OrbitRanges(
@@ -224,8 +224,6 @@ class ExactScoreGuidance(ScoreDistillation):
         **batch: Any,
     ) -> list[Mixture]:
         """Return the mixture of each item, for pictures of the size that ``encode`` has set."""
-        if self._size is None:
-            raise UserError("exact-score-guidance takes renders, not latents (rgb_as_latents)")
         background = background_of(comp_rgb_bg, len(c2w), c2w.device)
         rgba = self.truth.pictures(c2w, fovy, *self._size)
         own = self._latent().encode(composite(rgba, background))
@@ -239,24 +237,16 @@ class ExactScoreGuidance(ScoreDistillation):
     def predict(
         self, z: Latents, t: Timesteps, condition: list[Mixture]
     ) -> tuple[Latents, Optional[Latents]]:
-        abar = self.abar_of(t)
         by_pictures = itertools.groupby(condition, lambda mixture: id(mixture.pictures))
         groups = [list(group) for _, group in by_pictures]
-        sizes = [len(group) for group in groups]
-        conditional, perplexities, unconditional = [], [], []
-        for z_some, abar_some, group in zip(
-            z.flatten(1).split(sizes), abar.split(sizes), groups, strict=True
-        ):
-            modes = Modes.of(group)
-            known = z_some, abar_some, modes.squared_distances(z_some, abar_some)
-            eps, perplexity = denoise(*known, modes.weighted_sum, modes.log_prior)
-            conditional.append(eps)
-            perplexities.append(perplexity)
-            if self.needs_unconditional:
-                unconditional.append(denoise(*known, modes.weighted_sum)[0])
-        self.evaluations += len(z) * (2 if self.needs_unconditional else 1)
+        parts = (values.split([*map(len, groups)]) for values in (z.flatten(1), self.abar_of(t)))
+        found = [scores(*part) for part in zip(*parts, groups, strict=True)]
+        conditional, perplexities, unconditional = zip(*found, strict=True)
         self._perplexity = float(torch.cat(perplexities).mean())
-        uncond = torch.cat(unconditional).view_as(z) if unconditional else None
+        self.evaluations += len(z) * (2 if self.needs_unconditional else 1)
+        uncond = None
+        if self.needs_unconditional:
+            uncond = torch.cat([predict() for predict in unconditional]).view_as(z)
         return torch.cat(conditional).view_as(z), uncond
 
     def conditional(self, z: Latents, t: Timesteps, condition: list[Mixture]) -> Latents:
@@ -296,11 +286,8 @@ class ExactScoreGuidance(ScoreDistillation):
 
     def bank(self, height: int, width: int) -> Bank:
         """Return the bank at a picture size, in pixels; the bank of the last size is cached."""
-        if (height, width) not in self._banks:
-            self._banks = {(height, width): self._cast_bank(height, width)}
-        return self._banks[height, width]
-
-    def _cast_bank(self, height: int, width: int) -> Bank:
+        if self._bank and self._bank.rgba.shape[1:3] == (height, width):
+            return self._bank
         cameras = zip(self.bank_orbit.c2w.numpy(), self.bank_orbit.fovy.tolist(), strict=True)
         images = self.truth.mesh.render_views(
             cameras, height, width, supersample=self.cfg.supersample, progress="bank of views"
@@ -311,7 +298,8 @@ class ExactScoreGuidance(ScoreDistillation):
             factor = pooling_factor(height, width, self.cfg.latent_size)
             pooled = F.avg_pool2d(pooled, factor)
             latent = LinearLatent(factor, COLOR_MATRIX).normalised(pooled[:, :3])
-        return Bank.of((images * 255).round().byte(), pooled, latent)
+        self._bank = Bank.of((images * 255).round().byte(), pooled, latent)
+        return self._bank
 
     def _latent(self) -> LinearLatent:
         return LinearLatent() if self.cfg.space == "pixel" else self.bank(*self._size).latent

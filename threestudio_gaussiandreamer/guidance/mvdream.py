@@ -67,18 +67,8 @@ class MVDreamGuidance(StableDiffusionGuidance):
     # without view contrast and Perp-Neg, which it doesn't have
     UNGUIDED_IGNORES = ("guidance_interval", "recon_std_rescale")
 
-    def load_denoiser(self, folder: Path) -> None:
-        from diffusers import UNet2DConditionModel
-
-        self.unet = self.network(
-            UNet2DConditionModel,
-            folder,
-            "unet",
-            self.prepare_denoiser,
-            read=load_multiview_unet,
-            key=(self.cfg.n_view,),
-        )
-        self.text_width = self.unet.config.cross_attention_dim
+    def load_denoiser(self, folder: Path, **options: Any) -> None:
+        super().load_denoiser(folder, read=load_multiview_unet, key=(self.cfg.n_view,))
 
     def prepare_denoiser(self, network: nn.Module) -> nn.Module:
         attend_across_views(network, self.cfg.n_view)

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from ..diffusion.exact_score import (
     LinearLatent,
+    denoise,
     expanded_distances,
     images_per_chunk,
     squared_distances,
@@ -151,41 +152,34 @@ class Mixture(NamedTuple):
     """0 for the modes of the conditional mixture, -inf for others."""
 
 
-class Modes(NamedTuple):
-    """The modes of the items of a batch whose mixtures have the same pictures."""
-
-    own: Float[Tensor, "B d"]
-    pictures: Optional[Pictures]
-    mixing: Optional[Float[Tensor, "B c l"]]
-    log_prior: Optional[Float[Tensor, "B K"]]
-
-    @staticmethod
-    def of(mixtures: list[Mixture]) -> "Modes":
-        own = torch.stack([mixture.own for mixture in mixtures]).flatten(1)
-        pictures = mixtures[0].pictures
-        if pictures is None:
-            return Modes(own, None, None, None)
+def scores(
+    z: Float[Tensor, "B d"], abar: Float[Tensor, " B"], mixtures: list[Mixture]
+) -> tuple[Float[Tensor, "B d"], Float[Tensor, " B"], Callable[[], Float[Tensor, "B d"]]]:
+    """Return the conditional prediction of the noise in z, the perplexity of its responsibilities,
+    and what computes the unconditional prediction, for mixtures that have the same pictures.
+    """
+    own = torch.stack([mixture.own for mixture in mixtures]).flatten(1)
+    pictures = mixtures[0].pictures
+    if pictures is None:  # the responsibility of a single mode is 1 at any distance
+        distances = z.new_zeros((len(z), 1), dtype=torch.float64)
+        mean_of, log_prior = own.mul, None
+    else:
         mixing = torch.stack([mixture.mixing for mixture in mixtures])
-        return Modes(own, pictures, mixing, torch.stack([m.log_prior for m in mixtures]))
+        log_prior = torch.stack([mixture.log_prior for mixture in mixtures])
+        wide, double = z.double(), mixing.double()
+        of_layers = (double.mT @ wide.unflatten(1, (mixing.shape[1], -1))).flatten(1)
+        parts = [of_layers @ part.flatten(1).double().mT for part in _chunks(pictures.layers)]
+        norms = torch.einsum("bcl,klm,bcm->bk", double, pictures.products, double)
+        of_pictures = expanded_distances(wide, abar, norms, torch.cat(parts, dim=1))
+        distances = torch.cat([squared_distances(z, own[:, None], abar), of_pictures], dim=1)
 
-    def squared_distances(
-        self, z: Float[Tensor, "B d"], abar: Float[Tensor, " B"]
-    ) -> Float[Tensor, "B K"]:
-        if self.pictures is None:  # the responsibility of a single mode is 1 at any distance
-            return z.new_zeros((len(z), 1), dtype=torch.float64)
-        wide, mixing = z.double(), self.mixing.double()
-        of_layers = (mixing.mT @ wide.unflatten(1, (mixing.shape[1], -1))).flatten(1)
-        parts = [of_layers @ part.flatten(1).double().mT for part in _chunks(self.pictures.layers)]
-        norms = torch.einsum("bcl,klm,bcm->bk", mixing, self.pictures.products, mixing)
-        distances = expanded_distances(wide, abar, norms, torch.cat(parts, dim=1))
-        return torch.cat([squared_distances(z, self.own[:, None], abar), distances], dim=1)
+        def mean_of(weights: Float[Tensor, "B K"]) -> Float[Tensor, "B d"]:
+            layers = weighted_sum(weights[:, 1:], pictures.layers.flatten(1))
+            found = mixing.to(layers) @ layers.unflatten(1, (mixing.shape[2], -1))
+            return weights[:, :1] * own + found.flatten(1)
 
-    def weighted_sum(self, weights: Float[Tensor, "B K"]) -> Float[Tensor, "B d"]:
-        if self.pictures is None:
-            return weights * self.own
-        layers = weighted_sum(weights[:, 1:], self.pictures.layers.flatten(1))
-        found = self.mixing.to(layers) @ layers.unflatten(1, (self.mixing.shape[2], -1))
-        return weights[:, :1] * self.own + found.flatten(1)
+    eps, perplexity = denoise(z, abar, distances, mean_of, log_prior)
+    return eps, perplexity, lambda: denoise(z, abar, distances, mean_of)[0]
 
 
 def mixture_of(

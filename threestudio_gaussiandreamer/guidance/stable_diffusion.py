@@ -42,7 +42,6 @@ class StableDiffusionGuidance(TextToImageDistillation):
     def load(self, folder: Path) -> None:
         from diffusers import AutoencoderKL
 
-        super().load(folder)
         self.vae_dtype = self.vae_type(folder)
         self.vae = self.network(
             AutoencoderKL, folder, "vae", lambda vae: vae.to(self.device), dtype=self.vae_dtype

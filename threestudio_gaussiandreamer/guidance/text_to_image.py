@@ -40,6 +40,7 @@ arXiv:2210.03142), such as that of a latent consistency model (Luo et al. 2023, 
 and predicts the noise with guidance in one evaluation.
 """
 
+from abc import abstractmethod
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -73,8 +74,6 @@ TAKEN_SCALES = (1, 20)
 """Those that a network which takes the scale may know; latent consistency models' are 3 to 15."""
 SCALE_UNIT = 1000.0
 """Factor of the scale in its embedding."""
-NOT_ADAPTABLE = ("enable_torch_compile", "enable_sequential_cpu_offload")
-"""Options that replace the UNet's forward pass, where ``vsd-variant`` trains a LoRA."""
 HALF_TYPES = {"float16": torch.float16, "bfloat16": torch.bfloat16}
 
 
@@ -159,6 +158,7 @@ class TextToImageDistillation(ScoreDistillation):
             f"{str(self.dtype).removeprefix('torch.')}"
         )
         self.set_schedule(folder)
+        self.load_denoiser(folder)
         self.load(folder)
         low, high = USUAL_SCALES if self.scale_width is None else TAKEN_SCALES
         if not low <= self.cfg.guidance_scale <= high:
@@ -193,15 +193,16 @@ class TextToImageDistillation(ScoreDistillation):
         """The network that predicts the noise."""
         return self.unet
 
+    @abstractmethod
     def load(self, folder: Path) -> None:
-        """Load the networks; subclasses extend this with their own."""
-        self.load_denoiser(folder)
+        """Load further networks, and set ``image_size``."""
 
-    def load_denoiser(self, folder: Path) -> None:
+    def load_denoiser(self, folder: Path, **options: Any) -> None:
         """Load the network that predicts the noise, and set ``text_width`` and ``scale_width``."""
         from diffusers import UNet2DConditionModel
 
-        self.unet = self.network(UNet2DConditionModel, folder, "unet", self.prepare_denoiser)
+        prepare = self.prepare_denoiser
+        self.unet = self.network(UNet2DConditionModel, folder, "unet", prepare, **options)
         self.scale_width = self.unet.config.time_cond_proj_dim
         self.text_width = self.unet.config.encoder_hid_dim or self.unet.config.cross_attention_dim
 
@@ -288,9 +289,6 @@ class TextToImageDistillation(ScoreDistillation):
             prompt_utils: a :class:`.view_prompts.PromptEmbeddings`, or threestudio's
                 ``PromptProcessorOutput``.
         """
-        if not hasattr(prompt_utils, "get_text_embeddings"):
-            said = "set system.prompt_processor_type to the processor of its model"
-            raise UserError(f"this guidance needs text embeddings: {said}")
         elevation, azimuth = batch["elevation"], batch["azimuth"]
         more = (batch["camera_distances"], self.cfg.view_dependent_prompting)
         views, other = (elevation, azimuth, *more), None
@@ -330,13 +328,6 @@ class TextToImageDistillation(ScoreDistillation):
 
     def particle_model(self, options: Any) -> LoRAParticles:
         return LoRAParticles(self.unet, options.rank, options.lr)
-
-    @classmethod
-    def check_particle_model(cls, cfg: Any) -> None:
-        super().check_particle_model(cfg)
-        if found := [name for name in NOT_ADAPTABLE if getattr(cfg, name)]:
-            said = "vsd-variant trains a LoRA in the plain UNet"
-            raise UserError(f"system.guidance.{found[0]}: {said}: set {found[0]}=false")
 
     def guided_at_once(
         self, z: Latents, t: Timesteps, condition: Condition, scale: float, rescale: float

@@ -16,7 +16,6 @@ from torch import Tensor
 
 from ...core import streams
 from ...core.distributed import first_item
-from ...core.errors import UserError
 from ...diffusion.consistent_noise import TABLE, attached_noise, cell_values
 from ...host import register, run_seed
 from ..types import Batch, Latents, Residual
@@ -36,11 +35,6 @@ class CFD(Variant):
         self._table: Optional[Float[Tensor, "c TABLE"]] = None
 
     def residual(self, guidance: Any, latents: Latents, condition: Any, batch: Batch) -> Residual:
-        if missing := [name for name in self.RENDERS if name not in batch]:
-            raise UserError(
-                f"cfd-variant attaches noise to the rendered surface: give the guidance the "
-                f"renderer's {' and '.join(missing)}, as gaussiandreamer-system does"
-            )
         if self._table is None:  # the same in all processes of a run
             generator = streams.generator(run_seed(), "surface noise")
             self._table = cell_values(latents.shape[1], generator).to(latents.device)

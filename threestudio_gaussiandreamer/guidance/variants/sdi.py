@@ -27,8 +27,7 @@ from torch import Tensor
 
 from ...core.distributed import first_item
 from ...core.options import in_range
-from ...diffusion.inversion import Step, invert
-from ...diffusion.noise_table import NoiseTable
+from ...diffusion.inversion import NoiseTable, Step, invert
 from ...diffusion.sds import per_item
 from ...host import register, run_seed
 from ..types import Batch, Latents, Residual
@@ -56,22 +55,17 @@ class SDI(Variant):
         # rounded up, since each step costs predictions and the option limits their number
         stride = -(-len(guidance.alphas_cumprod) // self.cfg.inversion_steps)
         scale, eta = self.cfg.inversion_scale, self.cfg.eta
-        table, count = self._table_for(latents), len(latents)
-        first = first_item(count)
+        count, first = len(latents), first_item(len(latents))
+        if self._table is None or self._table.shape != latents.shape[1:]:
+            self._table = NoiseTable(run_seed(), latents.shape[1:], latents.device)
 
         def predict(step: Step) -> Tensor:
             chosen = guidance.select(condition, step.rows)
             return guidance.guided_noise(step.z, step.t, chosen, scale)
 
         def fresh(index: int) -> Tensor:
-            return table.draw("inversion", guidance.step, first, count, part=index)
+            return self._table.draw("inversion", guidance.step, first, count, part=index)
 
         z = invert(predict, latents, t, guidance.alphas_cumprod, stride, eta=eta, fresh=fresh)
         noise = z.addcmul(per_item(-abar.sqrt(), z), latents).mul_(per_item((1 - abar).rsqrt(), z))
         return guidance.predict_noise(z, t, condition) - noise, abar
-
-    def _table_for(self, latents: Latents) -> NoiseTable:
-        """Return the table of the noise that the inversion adds to items of this shape."""
-        if self._table is None or self._table.shape != latents.shape[1:]:
-            self._table = NoiseTable(run_seed(), latents.shape[1:], latents.device)
-        return self._table

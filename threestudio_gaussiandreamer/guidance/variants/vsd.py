@@ -29,6 +29,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from ...core.distributed import all_sum, average_gradients, first_item
+from ...core.errors import UserError
 from ...core.options import in_range, positive
 from ...core.streams import generator
 from ...diffusion import sds
@@ -38,6 +39,8 @@ from .base import Variant
 
 ADAPTED = re.compile(r"\.(to_q|to_k|to_v|to_out\.0)$")
 """Layers of an attention block that get a low-rank addition."""
+REPLACES_UNET = ("enable_torch_compile", "enable_sequential_cpu_offload")
+"""Options that replace the UNet's forward pass."""
 CAMERA = 16
 """Numbers in a camera-to-world matrix."""
 BETAS = (0.9, 0.99)
@@ -142,11 +145,12 @@ class LoRAParticles(nn.Module):
             camera: the camera of each item; zeros for none.
         """
         embedding = nn.functional.silu(camera.float() @ self.camera_in.T) @ self.camera_out.T
+
+        def add(down: Tensor, up: Tensor, layer: Any, inputs: Any, output: Tensor) -> Tensor:
+            return output + (inputs[0].float() @ down.T @ up.T).to(output)
+
         layers = zip(adapted_layers(network), self.down, self.up, strict=True)
-        handles = [
-            layer.register_forward_hook(partial(_with_low_rank, down, up))
-            for layer, down, up in layers
-        ]
+        handles = [layer.register_forward_hook(partial(add, *pair)) for layer, *pair in layers]
         handles.append(
             network.time_embedding.register_forward_hook(
                 lambda module, inputs, output: output + embedding.to(output)
@@ -172,30 +176,24 @@ class LoRAParticles(nn.Module):
         predicted noise (ProlificDreamer, eq. 8).
         """
         self.optimizer.zero_grad(set_to_none=True)
-        report = self._backward(guidance, latents, condition, batch) if len(latents) else {}
-        average_gradients(self.parameters())
-        if all(p.grad is not None and p.grad.isfinite().all() for p in self.parameters()):
+        parameters, report = list(self.parameters()), {}
+        if len(latents):
+            noised = particle_noise(guidance, latents)
+            camera = batch["c2w"].to(noised.z.device).flatten(1)
+            place = run_seed(), "lora camera 0", guidance.step, first_item(len(camera))
+            kept = torch.rand(len(camera), 1, generator=generator(*place)) >= CAMERA_DROPOUT
+            with self.applied(guidance.unet, camera * kept.to(camera)):
+                difference = guidance.conditional(noised.z, noised.t, condition) - noised.noise
+            # the sum's gradient at the network's output has the size of the noise, so that it
+            # neither overflows nor underflows in half precision; the mean is taken in float32
+            gradients = torch.autograd.grad(difference.square().sum(), parameters)
+            for parameter, gradient in zip(parameters, gradients, strict=True):
+                parameter.grad = gradient / difference.numel()
+            report["lora_error"] = float(difference.detach().square().mean())
+        average_gradients(parameters)
+        if all(p.grad is not None and p.grad.isfinite().all() for p in parameters):
             self.optimizer.step()
         return report
-
-    def _backward(
-        self, guidance: Any, latents: Latents, condition: Any, batch: Batch
-    ) -> dict[str, float]:
-        """Set the gradient of one noisy copy of each render; return its mean squared error."""
-        noised = particle_noise(guidance, latents)
-        camera = batch["c2w"].to(noised.z.device).flatten(1)
-        first = first_item(len(camera))
-        rng = generator(run_seed(), "lora camera 0", guidance.step, first)
-        kept = torch.rand(len(camera), 1, generator=rng) >= CAMERA_DROPOUT
-        with self.applied(guidance.unet, camera * kept.to(camera)):
-            difference = guidance.conditional(noised.z, noised.t, condition) - noised.noise
-        # the sum's gradient at the network's output has the size of the noise, so that it neither
-        # overflows nor underflows in half precision; the mean is taken in float32 afterwards
-        parameters = list(self.parameters())
-        gradients = torch.autograd.grad(difference.square().sum(), parameters)
-        for parameter, gradient in zip(parameters, gradients, strict=True):
-            parameter.grad = gradient / difference.numel()
-        return {"lora_error": float(difference.detach().square().mean())}
 
     def state(self) -> State:
         """Return weights and, after the first step of Adam, its moments, by name."""
@@ -237,12 +235,6 @@ def adapted_layers(network: nn.Module) -> list[nn.Linear]:
     ]
 
 
-def _with_low_rank(
-    down: Tensor, up: Tensor, layer: nn.Module, inputs: tuple[Tensor, ...], output: Tensor
-) -> Tensor:
-    return output + (inputs[0].float() @ down.T @ up.T).to(output)
-
-
 def particle_noise(guidance: Any, latents: Latents) -> Noised:
     """Add noise at timesteps from 1 to the last, drawn independently of those of the residual."""
     last = len(guidance.alphas_cumprod) - 1
@@ -274,7 +266,12 @@ class VSD(Variant):
     @classmethod
     def preflight(cls, guidance: Any, cfg: Any) -> None:
         super().preflight(guidance, cfg)
-        guidance.check_particle_model(cfg)
+        if guidance.NO_LORA:
+            said = f"trains a LoRA in a UNet of single views, and {guidance.NO_LORA}"
+            raise UserError(f"vsd-variant {said}: use another system.guidance.variant_type")
+        if found := [name for name in REPLACES_UNET if getattr(cfg, name, False)]:
+            said = f"vsd-variant trains a LoRA in the plain UNet: set {found[0]}=false"
+            raise UserError(f"system.guidance.{found[0]}: {said}")
 
     def particles(self, guidance: Any) -> Any:
         """Return the particle model, which is built on first use, when the networks are loaded."""
