@@ -129,15 +129,15 @@ def rows(name: str, cloud: StoredCloud) -> Iterator[dict[str, Any]]:
             written = time.process_time()
             after = read_cloud(str(path))
             done = time.process_time()
-            found = compare(reference(cloud, SIZE), after)
+            mean, worst = compare(reference(cloud, SIZE), after)
             yield {
                 "object": name,
                 "degree": cloud.gaussians.sh_degree,
                 "gaussians": len(cloud.gaussians.means),
                 "format": known.name,
                 "bytes": path.stat().st_size,
-                "psnr": round(found.mean, 2),
-                "worst": round(found.worst, 2),
+                "psnr": round(mean, 2),
+                "worst": round(worst, 2),
                 "write_s": round(written - started, 3),
                 "read_s": round(done - written, 3),
             }

@@ -1,5 +1,5 @@
-"""Spark in headless Chromium renders an exported file like this package: upright, facing the
-camera, in the same colours.
+"""In headless Chromium, Spark renders an exported file and three.js a GLB like this package:
+upright, facing the camera, in the same colours.
 
 The environment variable VIEWER_NODE_MODULES names the folder node_modules with the npm packages of
 ``benchmarks/viewers/browser.py``.
@@ -14,16 +14,20 @@ import pytest
 import torch
 
 from benchmarks.viewers import browser
+from tests.helpers.painted_ball import painted_ball
 from threestudio_gaussiandreamer.cameras import orbit_c2w, to_opencv
 from threestudio_gaussiandreamer.formats.gaussian_files import StoredCloud, write_cloud
-from threestudio_gaussiandreamer.gaussians.axes import VIEWER_UP
+from threestudio_gaussiandreamer.gaussians.axes import VIEWER_UP, WORLD_UP, rotation_between
 from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
 from threestudio_gaussiandreamer.gaussians.sh import rgb_to_sh0, sh0_to_rgb
+from threestudio_gaussiandreamer.meshes.raycast import MeshCaster, over_background
+from threestudio_gaussiandreamer.meshes.write import write_textured_glb
 from threestudio_gaussiandreamer.metrics import psnr
 from threestudio_gaussiandreamer.splatting import rasterize
+from threestudio_gaussiandreamer.surface.textured import MeshOptions, mesh_from_gaussians
 
 MODULES = Path(os.environ.get("VIEWER_NODE_MODULES", "node_modules"))
-SIZE, DISTANCE, FOVY, DILATION = 128, 3.0, math.radians(40), 0.1
+SIZE, THREE, DISTANCE, FOVY, DILATION = 128, 192, 3.0, math.radians(40), 0.1
 
 
 def asymmetric_cloud(count: int = 300) -> Gaussians:
@@ -44,11 +48,8 @@ def drawn_from_the_front(cloud: Gaussians) -> torch.Tensor:
     c2w = orbit_c2w(torch.zeros(1), torch.zeros(1), torch.full((1,), DISTANCE))
     viewmats, Ks = to_opencv(c2w, torch.full((1,), FOVY), SIZE, SIZE)
     shapes = cloud.means, cloud.quats, cloud.log_scales.exp(), cloud.logit_opacities.sigmoid()
-    colors = sh0_to_rgb(cloud.sh[:, 0])
-    white = torch.ones(1, 3)
-    return rasterize(
-        *shapes, colors, viewmats, Ks, SIZE, SIZE, background=white, eps2d=DILATION
-    ).image[0]
+    view, options = (viewmats, Ks, SIZE, SIZE), {"background": torch.ones(1, 3), "eps2d": DILATION}
+    return rasterize(*shapes, sh0_to_rgb(cloud.sh[:, 0]), *view, **options).image[0]
 
 
 @pytest.mark.slow
@@ -60,14 +61,9 @@ def test_spark_shows_an_exported_file_as_our_renderer_does(tmp_path, suffix):
     write_cloud(str(path), StoredCloud(cloud.arrays()).in_axes(VIEWER_UP))
     c2w = np.eye(4)
     c2w[2, 3] = DISTANCE
-    (shown,) = browser.draw_with_spark(
-        path,
-        [browser.Camera(c2w, FOVY)],
-        SIZE,
-        MODULES,
-        options={"preBlurAmount": DILATION, "blurAmount": 0.0},
-        rotation=browser.UNTURNED if suffix == ".spz" else browser.HALF_TURN_ABOUT_X,
-    )
+    how = {"options": {"preBlurAmount": DILATION, "blurAmount": 0.0}}
+    how["rotation"] = browser.UNTURNED if suffix == ".spz" else browser.HALF_TURN_ABOUT_X
+    (shown,) = browser.draw_with_spark(path, [browser.Camera(c2w, FOVY)], SIZE, MODULES, **how)
     ours = drawn_from_the_front(cloud)
     spark = torch.from_numpy(shown / np.float32(255))
     # Spark stores 8 bits per colour and cuts Gaussians at sqrt(8) standard deviations
@@ -75,12 +71,27 @@ def test_spark_shows_an_exported_file_as_our_renderer_does(tmp_path, suffix):
     assert float(psnr(spark.flip(1), ours)) < 25  # the cloud isn't symmetric
 
 
-def test_what_is_missing_is_named(tmp_path, monkeypatch):
-    monkeypatch.setattr(browser, "chromium", lambda: None)
-    assert "chromium" in browser.missing(tmp_path)
-    monkeypatch.setattr(browser, "chromium", lambda: "/usr/bin/chromium")
-    assert "@sparkjsdev/spark" in browser.missing(tmp_path)
-    for name in browser.MODULES:
-        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / name).touch()
-    assert browser.missing(tmp_path) is None
+@pytest.mark.slow
+@pytest.mark.parametrize("faces", [1500, 6000])
+def test_three_draws_a_mesh_as_our_ray_caster_does(faces, tmp_path):
+    if lacking := browser.missing(MODULES, [browser.THREE]):
+        pytest.skip(lacking)
+    ball = painted_ball(1500)
+    means = ball.means * np.float32([1, 0.7, 0.9]) + np.float32([0.1, 0, 0.2])
+    options = MeshOptions(faces=faces, texture=512, views=24, view_size=256, resolution=64)
+    mesh = mesh_from_gaussians(ball._replace(means=means), options)
+    rotation = rotation_between(WORLD_UP, "y")
+    y_up = mesh._replace(vertices=mesh.vertices @ rotation.T)
+    write_textured_glb(tmp_path / "mesh.glb", y_up, unlit=True)
+    angles = torch.tensor([0.0, 70.0, 200.0])
+    c2w = orbit_c2w(torch.tensor([10.0, 40, -20]), angles, torch.full((3,), 3.0)).double().numpy()
+    ours = MeshCaster(mesh).render_views([(matrix, FOVY) for matrix in c2w], THREE, THREE)
+    ours = torch.from_numpy(over_background(ours, np.ones(3, np.float32)))
+    turned = c2w.copy()
+    turned[:, :3] = rotation @ c2w[:, :3]
+    cameras = [browser.Camera(matrix, FOVY) for matrix in turned]
+    theirs = browser.draw_with_three(tmp_path / "mesh.glb", cameras, THREE, MODULES)
+    theirs = torch.from_numpy(theirs / 255).float()
+    assert psnr(theirs, ours) > 35
+    assert psnr(theirs.flip(2), ours) < 25  # a mirrored picture is seen to be wrong
+    assert psnr(theirs**2.2, ours) < 25  # and so are wrong colours

@@ -125,7 +125,7 @@ def test_rewards_of_views(tmp_path, monkeypatch):
         (["{}", "--metrics", "quality"], "--imagereward FOLDER, after `hf download"),
         (["{}", "--metrics", "imagereward", "--imagereward", "no"], "ImageReward.pt is missing"),
         (["{}", "--metrics", "judge", "--judge", "none.safetensors"], "none.safetensors"),
-        (["{}", "--metrics", "judge", "--size", "0", "--judge", "{judge}"], "--size 0"),
+        (["{}", "--metrics", "judge", "--size", "0", "--judge", "{judge}"], "--size: exp"),
         (["{}", "--metrics", "judge", "--size", "64", "--judge", "{judge}"], "--size has no"),
         (
             ["{}/configs", "--metrics", "judge", "--judge", "{judge}"],

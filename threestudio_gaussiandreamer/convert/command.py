@@ -120,47 +120,40 @@ def run(args: argparse.Namespace) -> None:
     for loss in (*dropped(whole, stored), *losses(stored, suffix, args.spz_version)):
         print(f"lost: {loss}")
     if truth:
-        found = compare(truth, read_cloud(args.output))
-        print(
-            f"check: {found.mean:.1f} dB in {VIEWS} views of {size} x {size} pixels, "
-            f"{found.worst:.1f} dB in the worst one"
-        )
+        mean, worst = compare(truth, read_cloud(args.output))
+        views = f"{VIEWS} views of {size} x {size} pixels"
+        print(f"check: {mean:.1f} dB in {views}, {worst:.1f} dB in the worst one")
 
 
 def _check_options(args: argparse.Namespace, suffix: str, mesh: bool) -> None:
-    require_writable(args.output, "OUT")
-    if args.producer and args.up:
-        raise UserError("--from and --up both say which axis of IN is up: give one")
-    if suffix == ".spz":
-        require_version(args.spz_version)
-    elif args.spz_version != VERSION:
-        raise UserError(f"--spz-version: OUT is a {suffix} file")
-    turned = suffix == ".spz" and args.spz_version == ZSTD_VERSION
-    axes = SYSTEM_OF if turned else AXES if not mesh and FORMATS[suffix].any_up else ()
-    if args.up_out and args.up_out not in axes:
-        raise UserError(
-            f"--up-out: OUT is a {suffix} file, whose axes are fixed; it is for PLYs, and y or -y "
-            "with --spz-version 4"
-        )
+    for path in (args.output, *(companions(args.output) if mesh else ())):
+        require_writable(path, "OUT")
     for name, rule in RULES.items():
         if (value := getattr(args, name)) is not None:
             rule[RULE](f"--{name}", value)
-    if args.size is not None and not args.check:
-        raise UserError("--size: has no effect without --check")
-    if args.gaussians and suffix != ".glb":
-        raise UserError(f"--gaussians: OUT is a {suffix} file, which always holds Gaussians")
-    if not mesh:
-        given = [name for name in (*MESH_OPTIONS, "unlit") if getattr(args, name) is not None]
-        if given:
-            option = given[0].replace("_", "-")
-            raise UserError(f"--{option}: OUT is a file of Gaussians; it is for meshes")
-        return
-    for path in companions(args.output):
-        require_writable(path, "OUT")
-    if args.check:
-        raise UserError("--check: OUT is a mesh; it is for files of Gaussians")
-    check_options(MeshOptions, mesh_options(args, False), "--")
-    require_mesh_libraries()
+    out, version = f"OUT is a {suffix} file", args.spz_version
+    turned = suffix == ".spz" and version == ZSTD_VERSION
+    axes = SYSTEM_OF if turned else AXES if not mesh and FORMATS[suffix].any_up else ()
+    fixed = f"--up-out: {out}, whose axes are fixed; it is for PLYs, and y or -y with --spz-version"
+    of_mesh = [name for name in (*MESH_OPTIONS, "unlit") if getattr(args, name) is not None]
+    no_mesh = [f"--{name.replace('_', '-')}: OUT is a file of Gaussians" for name in of_mesh]
+    mistakes = {
+        "--from and --up both say which axis of IN is up: give one": args.producer and args.up,
+        f"--spz-version: {out}": suffix != ".spz" and version != VERSION,
+        f"{fixed} 4": args.up_out and args.up_out not in axes,
+        "--size: has no effect without --check": args.size is not None and not args.check,
+        f"--gaussians: {out}, which always holds Gaussians": args.gaussians and suffix != ".glb",
+        f"{''.join(no_mesh[:1])}; it is for meshes": no_mesh and not mesh,
+        "--check: OUT is a mesh; it is for files of Gaussians": mesh and args.check,
+    }
+    for mistake, made in mistakes.items():
+        if made:
+            raise UserError(mistake)
+    if suffix == ".spz":
+        require_version(version)
+    if mesh:
+        check_options(MeshOptions, mesh_options(args, False), "--")
+        require_mesh_libraries()
 
 
 def _read(source: Path, args: argparse.Namespace) -> StoredCloud:

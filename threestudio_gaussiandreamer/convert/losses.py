@@ -2,7 +2,6 @@
 that is read back."""
 
 from collections.abc import Iterator
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -114,15 +113,6 @@ def _of_sog(cloud: StoredCloud) -> Iterator[str]:
 # ---- dB ------------------------------------------------------------------------------------------
 
 
-class RoundTrip(NamedTuple):
-    """PSNR of a cloud after a round trip to the cloud before, dB."""
-
-    mean: float
-    """Over all pixels of all views."""
-    worst: float
-    """Of the worst view."""
-
-
 @torch.no_grad()
 def reference(before: StoredCloud, size: int) -> tuple[str, Views, Float[Tensor, "V H W 3"]]:
     """Render a cloud from ``VIEWS`` directions around it, with or without antialiasing as it was
@@ -142,9 +132,13 @@ def reference(before: StoredCloud, size: int) -> tuple[str, Views, Float[Tensor,
 
 
 @torch.no_grad()
-def compare(truth: tuple[str, Views, Float[Tensor, "V H W 3"]], after: StoredCloud) -> RoundTrip:
-    """Render the cloud after the round trip as :func:`reference` did, and compare the images."""
+def compare(
+    truth: tuple[str, Views, Float[Tensor, "V H W 3"]], after: StoredCloud
+) -> tuple[float, float]:
+    """Render a cloud as :func:`reference` did; return the PSNR of the images to those before, dB:
+    over all pixels of all views, and of the worst view.
+    """
     up, views, images = truth
     found = render_all(after.in_axes(up).gaussians.tensors(), views)
     worst = min(float(psnr(*pair)) for pair in zip(found, images, strict=True))
-    return RoundTrip(float(psnr(found, images)), worst)
+    return float(psnr(found, images)), worst

@@ -25,7 +25,7 @@ from ..core import images as picture_files
 from ..core.command import run_command
 from ..core.errors import UserError
 from ..core.files import atomic_file, existing_file, json_text, output_folder
-from ..core.options import shown
+from ..core.options import RULE, between, in_range
 from ..core.streams import numpy_generator
 from ..host import get_device
 from ..models.bundled import CLIP, NAME, model_part
@@ -36,8 +36,8 @@ from .results import Result, find_result, read_result, render_views
 from .t3bench import require_folder_names, write_meshes
 
 FILES = ("clip.json", "clip.png")
-PERCENT = 100.0
-THUMBNAIL = 160
+PERCENT, THUMBNAIL = 100.0, 160
+PIXELS = in_range(1, MAX_SIDE, "pixels")
 
 
 class Protocol(NamedTuple):
@@ -181,24 +181,16 @@ def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
     return parser.parse_args(argv)
 
 
-def picture_size(given: Optional[int]) -> int:
-    """Return the value of ``--size``, or the paper's."""
-    size = Protocol().size if given is None else given
-    if not 1 <= size <= MAX_SIDE:
-        raise UserError(f"--size {shown(size)}: expected 1 to {MAX_SIDE} pixels")
-    return size
-
-
 def protocol_of(args: argparse.Namespace) -> Protocol:
     """Check the options and return them as a :class:`Protocol`."""
-    for option, value in (("--size", args.size), ("--fovy", args.fovy)):
-        if value is not None and has_own_cameras(args.clip):
-            raise UserError(f"{option} has no effect with --clip {args.clip}")
-    size = picture_size(args.size)
-    fovy = Protocol().fovy_deg if args.fovy is None else args.fovy
-    if not 0 < fovy < 180:
-        raise UserError(f"--fovy {fovy}: expected degrees between 0 and 180")
-    return protocol_for(args.clip, seeds=tuple(args.seeds), fovy_deg=fovy, size=size)
+    given = {"seeds": tuple(args.seeds)}
+    for option, name, rule in (("size", "size", PIXELS), ("fovy", "fovy_deg", between(0, 180))):
+        if (value := getattr(args, option)) is not None:
+            rule[RULE](f"--{option}", value)
+            given[name] = value
+            if has_own_cameras(args.clip):
+                raise UserError(f"--{option} has no effect with --clip {args.clip}")
+    return protocol_for(args.clip, **given)
 
 
 def run(args: argparse.Namespace) -> None:

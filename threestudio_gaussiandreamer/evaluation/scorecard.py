@@ -19,10 +19,11 @@ from .. import register_parts
 from ..core.command import run_command
 from ..core.errors import UserError, unknown
 from ..core.files import atomic_file, json_text, output_folder
+from ..core.options import RULE
 from ..core.streams import numpy_generator
 from ..models.bundled import NAME
 from .asset_metrics import METRICS, Asset, Metric
-from .clip_similarity import Protocol, has_own_cameras, picture_size
+from .clip_similarity import PIXELS, Protocol, has_own_cameras
 from .results import Result, find_result, read_result
 
 FILES = ("scorecard.csv", "scorecard.json")
@@ -84,7 +85,8 @@ def open_metrics(args: argparse.Namespace) -> list[Metric]:
     names = [name.strip() for name in args.metrics.split(",") if name.strip()]
     if not names:
         raise UserError(f"--metrics is empty: expected some of {', '.join(METRICS)}")
-    size = picture_size(args.size)
+    if args.size is not None:
+        PIXELS[RULE]("--size", args.size)
     for name in names:
         if name not in METRICS:
             raise unknown("metric", name, METRICS)
@@ -96,7 +98,7 @@ def open_metrics(args: argparse.Namespace) -> list[Metric]:
     sized = [METRICS[name] for name in names if METRICS[name].sized]
     if args.size is not None and all(metric.needs[0] == own for metric in sized):
         raise UserError("--size has no effect on these metrics, whose pictures have their own size")
-    args.size = size
+    args.size = args.size or Protocol().size
     return [METRICS[name](args) for name in names]
 
 

@@ -17,6 +17,7 @@ from jaxtyping import Float
 
 from ..cameras import look_at
 from ..core.errors import UserError
+from ..core.files import output_folder
 from ..core.options import shown
 from ..gaussians.gaussians import Gaussians, opaque
 from ..gaussians.surface import gaussian_surface
@@ -37,16 +38,11 @@ def write_meshes(
     folder: Path, name: str, results: Sequence[Result], prompts: Sequence[str]
 ) -> None:
     """Write meshes into ``folder``, a checkout of T3Bench; the results into a folder ``name``."""
-    try:
-        for result, prompt in zip(results, prompts, strict=True):
-            export = folder / "outputs_mesh_t3" / name / folder_name(prompt) / "save/it0-export"
-            export.mkdir(parents=True, exist_ok=True)
-            surface = gaussian_surface(normalized(read_result(result)))
-            write_obj(export / "model.obj", surface)
-            print(f"T3Bench: {export}", flush=True)
-    except OSError as error:
-        why = error.strerror or error
-        raise UserError(f"--t3bench {folder} can't be written: {why}") from error
+    for result, prompt in zip(results, prompts, strict=True):
+        export = folder / "outputs_mesh_t3" / name / folder_name(prompt) / "save/it0-export"
+        output_folder(export, "--t3bench", ["model.obj"])
+        write_obj(export / "model.obj", gaussian_surface(normalized(read_result(result))))
+        print(f"T3Bench: {export}", flush=True)
 
 
 def require_folder_names(method: str, prompts: Sequence[str]) -> None:

@@ -9,13 +9,25 @@ from dataclasses import dataclass, field
 from typing import Any, Optional
 
 from ..core.errors import UserError
-from ..core.options import INT64_MAX, at_least, in_range, shown
+from ..core.options import (
+    INT64_MAX,
+    RULE,
+    Rule,
+    at_least,
+    between,
+    in_range,
+    is_number,
+    positive,
+    satisfies,
+    wrong,
+)
 from ..gaussians.simplify import Budget
 from ..gaussians.views import LEAST_ERROR
 
 BUDGETS = ("count", "bytes", "psnr", "within", "auto")
-LOSSES = (1e-3, 30.0)
-"""Range of ``within``, dB."""
+NUMBER = satisfies("a number", is_number)
+WHOLE = satisfies("a whole number from 1 on", lambda v: is_number(v) and 1 <= v == int(v))
+LOSSES, GAINS = in_range(1e-3, 30, "dB"), between(0, 6, "dB")
 
 
 @dataclass
@@ -79,58 +91,42 @@ def budget_of(
         count = count_within(parse_bytes(options.bytes, f"{where}bytes"))
         return Budget(count=parse_count(count, f"{where}bytes: the number of Gaussians that fit"))
     if options.psnr is not None:
-        psnr = parse_number(options.psnr, f"{where}psnr", "dB")
-        if psnr <= 0:
-            raise UserError(f"{where}psnr: expected a number above 0, got {psnr:g}")
-        return Budget(psnr=psnr)
+        return Budget(psnr=parse_number(options.psnr, f"{where}psnr", "dB", positive("dB")))
     if options.within is not None:
-        loss = parse_number(options.within, f"{where}within", "dB")
-        if not LOSSES[0] <= loss <= LOSSES[1]:
-            raise UserError(
-                f"{where}within: expected a loss from {LOSSES[0]:g} to {LOSSES[1]:g} dB, got "
-                f"{loss:g}"
-            )
+        loss = parse_number(options.within, f"{where}within", "dB", LOSSES)
         return Budget(psnr=psnr_for_loss(loss, options.quality))
     if options.auto is not None:
-        gain = parse_number(options.auto, f"{where}auto", "dB")
-        if not 0 < gain < 6:
-            raise UserError(f"{where}auto: expected a gain between 0 and 6 dB, got {gain:g}")
+        gain = parse_number(options.auto, f"{where}auto", "dB", GAINS)
         error = Budget().error if options.quality is None else error_of(options.quality)
         return Budget(gain=gain, error=error)
     return Budget()
 
 
-def parse_number(value: Any, option: str, unit: str = "") -> float:
-    """Parse a finite number, with or without its unit."""
+def parse_number(value: Any, option: str, unit: str = "", rule: Rule = NUMBER) -> float:
+    """Parse a number, with or without its unit, and check it."""
     text = str(value).strip()
     number = text[: -len(unit)] if unit and text.lower().endswith(unit.lower()) else text
     try:
-        found = float(number)
+        found: Any = float(number)
     except ValueError:
-        found = math.nan
-    if not math.isfinite(found):
-        raise UserError(f"{option}: expected a number, got {shown(text)}")
+        found = text  # which no rule for numbers accepts
+    rule[RULE](option, found)
     return found
 
 
 def parse_count(value: Any, option: str) -> int:
     """Parse a whole number of at least 1."""
-    found = parse_number(value, option)
-    if found < 1 or found != int(found):
-        raise UserError(f"{option}: expected a whole number from 1 on, got {found:g}")
-    return int(found)
+    return int(parse_number(value, option, rule=WHOLE))
 
 
 def parse_bytes(value: Any, option: str) -> int:
     """Parse a size such as 500kB or 2MB into bytes; k, M and G are powers of 1000."""
     # no two neighbouring parts of the pattern match the same character, so it takes linear time
     found = re.fullmatch(r"([\d.]+)\s*(k|m|g)?b?", str(value).strip().lower())
-    if not found:
-        raise UserError(f"{option}: expected a size such as 500kB or 2MB, got {shown(str(value))}")
-    factor = 1000 ** ("kmg".index(found[2]) + 1 if found[2] else 0)
-    size = parse_number(found[1], option) * factor
+    factor = 1000 ** ("kmg".index(found[2]) + 1) if found and found[2] else 1
+    size = parse_number(found[1], option) * factor if found else math.inf
     if size > INT64_MAX:
-        raise UserError(f"{option}: expected a size below 2^63 bytes, got {shown(str(value))}")
+        raise wrong(option, "a size such as 500kB or 2MB, below 2^63 bytes", value)
     return int(size)
 
 
