@@ -5,7 +5,6 @@ exported, upright.
 import importlib
 import pkgutil
 import sys
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -31,7 +30,6 @@ from threestudio_gaussiandreamer.host import (
 from threestudio_gaussiandreamer.launch.parts import check_kind
 from threestudio_gaussiandreamer.meshes.load import load_mesh
 from threestudio_gaussiandreamer.meshes.write import write_obj, write_textured_mesh
-from threestudio_gaussiandreamer.training.export import save
 
 register_parts()
 for module in pkgutil.iter_modules(exporters.__path__):
@@ -272,12 +270,6 @@ def test_an_exporter_must_return_outputs(returned):
     kind = "entries of type dict" if isinstance(returned, list) else type(returned).__name__
     with pytest.raises(UserError, match=f"Broken returned {kind}; expected a list of Exporter"):
         outputs_of(Broken())
-
-
-def test_an_unknown_save_type_names_those_that_the_system_has():
-    system = SimpleNamespace(save_json=str, save_file=repr)
-    with pytest.raises(UserError, match="save_type of an exporter 'txt': choose from file, json"):
-        save(system, ExporterOutput("a.txt", "txt", {}), "a.txt", {})
 
 
 @register("test-uncallable-exporter")

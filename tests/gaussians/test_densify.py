@@ -6,7 +6,7 @@ from torch import nn
 
 from threestudio_gaussiandreamer.core.streams import generator
 from threestudio_gaussiandreamer.gaussians import densify
-from threestudio_gaussiandreamer.gaussians.densify import Rules, Statistics
+from threestudio_gaussiandreamer.training.density import DensifyConfig
 
 
 def cloud(n, seed=0, log_scale=-4.0):
@@ -21,23 +21,18 @@ def cloud(n, seed=0, log_scale=-4.0):
     return {name: nn.Parameter(value) for name, value in values.items()}
 
 
-def statistics(n, gradient=0.0, contribution=None):
-    return Statistics(
-        torch.full((n,), float(gradient)),
-        torch.linspace(0, 1, n) if contribution is None else contribution,
-    )
-
-
-def densified(params, stats, **rules):
-    rules = Rules(**({"min_gaussians": 1} | rules))
-    return densify.densify_and_prune(params, stats, rules, generator(0, "s"))
+def densified(params, gradient=0.0, least=1, most=500_000, **rules):
+    """Densify a cloud whose contribution grows with the index."""
+    count = len(params["means"])
+    gradient = torch.as_tensor(gradient).expand(count)
+    statistics, rng = (gradient, torch.linspace(0, 1, count)), generator(0, "s")
+    return densify.densify_and_prune(params, *statistics, DensifyConfig(**rules), least, most, rng)
 
 
 def test_selected_small_gaussians_are_cloned_and_large_ones_split():
     params = cloud(4)
     params["log_scales"].data[2:] = -1.0  # larger than split_scale
-    stats = Statistics(torch.tensor([1.0, 0.0, 1.0, 0.0]), torch.ones(4))
-    change = densified(params, stats, split_scale=0.04, max_scale=10)
+    change = densified(params, [1.0, 0.0, 1.0, 0.0], split_scale=0.04, max_scale=10)
     assert sorted(change.parents.tolist()) == [0, 0, 1, 2, 2, 3]
     assert change.is_new.sum() == 3  # one clone, two children; the split one itself is gone
     children = (change.parents == 2).nonzero()[:, 0]
@@ -61,7 +56,7 @@ def test_split_samples_follow_the_gaussian():
 
 @pytest.mark.parametrize("cap", [1, 7, 10, 13, 19])
 def test_the_cap_is_exact_and_drops_what_contributes_least(cap):
-    change = densified(cloud(10), statistics(10, gradient=1.0), max_gaussians=cap)
+    change = densified(cloud(10), 1.0, most=cap)
     assert len(change.parents) == cap
     if cap < 10:  # contribution grows with the index
         assert change.parents.tolist() == list(range(10 - cap, 10))
@@ -71,29 +66,28 @@ def test_which_gaussians_are_dropped_and_what_the_floor_keeps(caplog):
     params = cloud(6)
     params["logit_opacities"].data[0] = -5.0  # faint
     params["log_scales"].data[1, 2] = 0.0  # huge
-    assert densified(params, statistics(6)).parents.tolist() == [2, 3, 4, 5]
-    unseen = densified(cloud(5), statistics(5, gradient=0.0))
+    assert densified(params).parents.tolist() == [2, 3, 4, 5]
+    unseen = densified(cloud(5))
     assert unseen.parents.tolist() == [0, 1, 2, 3, 4] and not unseen.is_new.any()
     params = cloud(50)
-    densified(params, statistics(50), min_gaussians=64)
+    densified(params, least=64)
     assert not caplog.records
     params["logit_opacities"].data[5:] = -10.0
-    densified(params, statistics(50), min_gaussians=20)
+    densified(params, least=20)
     assert "only 5 of 50 Gaussians would be left: the 20 that contribute most stay" in caplog.text
     params["logit_opacities"].data[:] = -10.0
-    best = densified(params, statistics(50), min_gaussians=20)
+    best = densified(params, least=20)
     assert best.parents.tolist() == list(range(30, 50))
-    best = densify.prune_to(cloud(5), torch.tensor([0.3, 0.9, 0.1, 0.5, 0.2]), 3)
-    assert best.parents.tolist() == [0, 1, 3]
+    assert densify.highest(torch.tensor([0.3, 0.9, 0.1, 0.5, 0.2]), 3).tolist() == [0, 1, 3]
 
 
 def test_the_room_of_faint_gaussians_is_used_in_the_same_round():
     """Ten at a cap of ten, three of them faint: the three others with the largest gradients are
     cloned.
     """
-    params, stats = cloud(10), Statistics(torch.linspace(1, 2, 10), torch.ones(10))
+    params = cloud(10)
     params["logit_opacities"].data[:3] = -5.0
-    change = densified(params, stats, max_gaussians=10)
+    change = densified(params, torch.linspace(1, 2, 10), most=10)
     assert sorted(change.parents.tolist()) == [3, 4, 5, 6, 7, 7, 8, 8, 9, 9]
 
 

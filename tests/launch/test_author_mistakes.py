@@ -24,7 +24,7 @@ def run(source, *options):
 
 DENSITY = """
 import torch
-from threestudio_gaussiandreamer.gaussians.densify import Change, prune_to
+from threestudio_gaussiandreamer.gaussians.densify import Change, highest, select, unchanged
 from threestudio_gaussiandreamer.host import BaseObject, register
 from threestudio_gaussiandreamer.training.density import DensityRule
 
@@ -45,8 +45,9 @@ def test_an_own_density_rule_is_called_around_every_step(tmp_path, monkeypatch):
         self.calls += [step]
         open("calls", "a").write(f"{self.calls}\\n")
         count = len(self.cloud) - 10
-        highest = prune_to(self.cloud.parameters_by_name(), self.cloud.opacities(), count)
-        self.cloud.apply_change(highest, optimizer)
+        same = unchanged(self.cloud.parameters_by_name())
+        change = select(same, highest(self.cloud.opacities().detach(), count))
+        self.cloud.apply_change(change, optimizer)
 """
     assert run(DENSITY + source, OWN_DENSITY) == 0
     expected = [f"[True, {n}, True, 16, {n + 1}]" for n in range(3)]
@@ -97,41 +98,21 @@ FORGOTTEN = """
 """
 
 MISTAKES = {
-    "regulariser: NaN": (
-        REGULARISER + "def own(out): return out['means'].mean() * float('nan')",
-        [OWN_REGULARISER],
-        "mine-regulariser returned nan: expected a finite number",
-    ),
     "regulariser: a vector": (
         REGULARISER + "def own(out): return out['opacities']",
         [OWN_REGULARISER],
-        "mine-regulariser returned a tensor of shape (300,); expected one number",
-    ),
-    "regulariser: number of arguments": (
-        REGULARISER + "def own(out, cloud): return out['opacities'].mean()",
-        [OWN_REGULARISER],
-        "mine-regulariser is a function of (out, cloud), which is called as (out)",
-    ),
-    "regulariser: a class": (
-        REGULARISER + "class own:\n    def __call__(self, out): return out['opacities'].mean()",
-        [OWN_REGULARISER],
-        "mine-regulariser is the class own; register a function of (out)",
+        "mine-regulariser returned (300,); expected one number",
     ),
     "regulariser: registered under another name": (
         REGULARISER.replace("mine-regulariser", "smooth") + "def own(out): return 0",
         ["system.loss.lambda_smooth=1"],
         "a regulariser of your own is a function below @register('smooth-regulariser')",
     ),
-    "regulariser: an output that there isn't": (
-        REGULARISER + "def own(out): return out['scale'].mean()",
-        [OWN_REGULARISER],
-        "output that mine-regulariser reads: 'scale': did you mean 'scales'?",
-    ),
     "density rule: removes all Gaussians": (
         DENSITY
         + """
     def after_step(self, optimizer, step):
-        none = prune_to(self.cloud.parameters_by_name(), self.cloud.opacities(), 0)
+        none = select(unchanged(self.cloud.parameters_by_name()), torch.arange(0))
         self.cloud.apply_change(none, optimizer)
 """,
         [OWN_DENSITY],
@@ -146,7 +127,7 @@ MISTAKES = {
         self.cloud.apply_change(Change(rows, rows < 0, values), optimizer)
 """,
         [OWN_DENSITY],
-        "the change of the cloud has log_scales of shape None; expected (50, 3)",
+        "the change of the cloud has the shapes {'means': (50, 3)}; expected",
     ),
     "density rule: rows that there aren't": (
         DENSITY
@@ -167,11 +148,6 @@ MISTAKES = {
 """,
         [OWN_DENSITY],
         "geometry.means isn't among the optimiser's parameters",
-    ),
-    "density rule: returns something else": (
-        DENSITY + "    def after_step(self, optimizer, step): return len(self.cloud)",
-        [OWN_DENSITY],
-        "Own.after_step returned int; expected None or a Need",
     ),
     "prior: an empty cloud": (
         PART.format("prior", "priors.base", "Prior")

@@ -70,7 +70,7 @@ def demo():
         ("system.material_type=gaussiandreamer-cloud", "a part of the kind geometry; expected one"),
         ("system.background_type=ply-exporter", "a part of the kind exporter; expected one of the"),
         ("data_type=mesh-prior", "data_type is 'mesh-prior', a part of the kind prior; expected"),
-        ("data.rays=-1", "data.rays: expected true or false, got -1"),
+        ("system.pages=-1", "system.pages: expected true or false, got -1"),
         ("system.geometry.grow.radius=[1]", "system.geometry.grow.radius: expected a number, got"),
         ("system.geometry.prior.color=3", "color: expected null, 'grey', 'random' or [red, green,"),
         ("data.resolution_milestones=[5]", "data.resolution_milestones: give height, width or"),

@@ -17,14 +17,14 @@ from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.core.streams import generator
 from threestudio_gaussiandreamer.formats.gaussian_files import StoredCloud, write_cloud
 from threestudio_gaussiandreamer.gaussians import densify
-from threestudio_gaussiandreamer.gaussians.densify import PARAMETERS, Rules, Statistics
+from threestudio_gaussiandreamer.gaussians.densify import PARAMETERS
 from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
 from threestudio_gaussiandreamer.gaussians.views import render_all, views_around
 from threestudio_gaussiandreamer.host import find
 from threestudio_gaussiandreamer.launch.config import load_config
 from threestudio_gaussiandreamer.launch.config_check import check_config
 from threestudio_gaussiandreamer.metrics import psnr
-from threestudio_gaussiandreamer.training.density import DensityControl
+from threestudio_gaussiandreamer.training.density import DensifyConfig, DensityControl
 from threestudio_gaussiandreamer.training.geometry import GaussianCloud
 
 NO_LIMITS = {"min_opacity": 0.0, "max_scale": 1e9}
@@ -135,9 +135,9 @@ def test_a_trained_cloud_that_is_too_large_keeps_what_contributes(tmp_path, meas
 def test_the_floor_keeps_what_contributes_most(rules, measured, said):
     geometry = started()
     Training(geometry).observe()
-    stats = Statistics(geometry.gradient_sum, geometry.contribution)
-    rules, parameters = Rules(grad_threshold=1e9, **rules), geometry.parameters_by_name()
-    change = densify.densify_and_prune(parameters, stats, rules, generator(0, "s"))
+    statistics, rng = (geometry.gradient_sum, geometry.contribution), generator(0, "s")
+    rest = *statistics, DensifyConfig(grad_threshold=1e9, **rules), 64, 500_000, rng
+    change = densify.densify_and_prune(geometry.parameters_by_name(), *rest)
     assert torch.equal(change.parents, geometry.contribution.topk(64).indices.sort().values)
     (message,) = said
     assert message.startswith("only 0 of 200 Gaussians would be left: the 64 that contribute most")

@@ -43,13 +43,13 @@ from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.core.streams import generator
 from threestudio_gaussiandreamer.diffusion import sds
 from threestudio_gaussiandreamer.gaussians import densify
-from threestudio_gaussiandreamer.gaussians.densify import PARAMETERS, Rules, Statistics
+from threestudio_gaussiandreamer.gaussians.densify import PARAMETERS
 from threestudio_gaussiandreamer.gaussians.grow import grow, nearest_distance_scales
 from threestudio_gaussiandreamer.gaussians.point_cloud import PointCloud
 from threestudio_gaussiandreamer.guidance.base import NonFiniteScore
 from threestudio_gaussiandreamer.splatting import torch_backend
 from threestudio_gaussiandreamer.splatting.projection import quats_to_rotations
-from threestudio_gaussiandreamer.training.density import DensityControl
+from threestudio_gaussiandreamer.training.density import DensifyConfig, DensityControl
 from threestudio_gaussiandreamer.training.geometry import (
     LEARNING_RATES,
     STATISTICS,
@@ -321,12 +321,12 @@ def test_f12_a_checkpoint_holds_the_cloud_and_its_statistics(fault):
     )
 
 
-def left_of(geometry, contribution, **rules):
+def left_of(geometry, contribution, most=500_000):
     """Return what densifies and prunes a cloud without limits leaves of it."""
-    rules = Rules(min_opacity=0.0, max_scale=1e9, min_gaussians=1, **rules)
-    stats = Statistics(torch.zeros(len(geometry)), contribution)
+    rules = DensifyConfig(min_opacity=0.0, max_scale=1e9)
+    rest = contribution, rules, 1, most, generator(0, "s")
     parameters = geometry.parameters_by_name()
-    return densify.densify_and_prune(parameters, stats, rules, generator(0, "s"))
+    return densify.densify_and_prune(parameters, torch.zeros(len(geometry)), *rest)
 
 
 @row("A0", "F13")
@@ -473,8 +473,7 @@ def test_f19_a_negative_loss_is_back_propagated(fault):
         system.optimizers.return_value = optimizer
         system.losses.return_value = {"x": -(parameter**2).sum()}
         system.manual_backward.side_effect = lambda loss: loss.backward()
-        system.loss_scale.value.return_value = 1.0
-        system.loss_scale.has_skipped.return_value = False
+        system.trainer.precision_plugin.scaler = None
         system.optimize = functools.partial(GaussianDreamerSystem.optimize, system)
         GaussianDreamerSystem.training_step(system, {"width": 1, "height": 1}, 0)
         return taken[0]
@@ -521,7 +520,7 @@ def test_f21_the_cap_takes_what_contributes_least(fault):
     best = contribution.sort(descending=True).values[:200].sum()
 
     def ours():
-        return left_of(started(500), contribution, max_gaussians=200).parents
+        return left_of(started(500), contribution, most=200).parents
 
     def random_choice():
         return torch.randperm(500, generator=seeded())[:200]

@@ -25,7 +25,7 @@ from threestudio_gaussiandreamer.meshes.load import load_mesh
 from threestudio_gaussiandreamer.meshes.raycast import MeshCaster, over_background
 from threestudio_gaussiandreamer.metrics import psnr
 from threestudio_gaussiandreamer.splatting import rasterize
-from threestudio_gaussiandreamer.training.data import TrainCameras, make_batch
+from threestudio_gaussiandreamer.training.data import TrainCameras, orbit_batch
 from threestudio_gaussiandreamer.training.held_out import EvaluationConfig, HeldOut
 from threestudio_gaussiandreamer.training.system import GaussianDreamerSystem
 
@@ -203,15 +203,14 @@ EDGE = [
     *NINE,
     "system.guidance.max_step_percent=[5,0.98,0.55,6]", "system.guidance.grad_clip=[5,0.5,1.0,6]",
     "data.height=[16,24]", "data.width=[16,24]", "data.resolution_milestones=[5]",
-    "system.geometry.lr_means=[5,1e-2,1e-3,6]", "data.train_views=0", "data.progressive_until=8",
+    "system.geometry.lr_means=[5,1e-2,1e-3,6]", "data.train_views=0",
     "system.loss.lambda_sds=[5,1.0,0.5,6]",
 ]  # fmt: skip
 
 DENSIFYING = [
     *NINE,
     "system.geometry.densify={enabled: true, start: 1, every: 2, stop: 9, grad_threshold: 1e-4}",
-    "data.train_views=0", "data.camera_perturb=0.1", "data.center_perturb=0.05",
-    "data.up_perturb=0.02",
+    "data.train_views=0",
 ]  # fmt: skip
 
 
@@ -431,8 +430,9 @@ def with_cameras(monkeypatch, change) -> None:
     def changed(self, step):
         batch = collate(self, step)
         view = Orbit(*(batch[n] for n in ("elevation", "azimuth", "camera_distances", "fovy")))
-        size = batch["height"], batch["width"]
-        return make_batch(*change(view), batch["light_positions"], *size)
+        view, c2w = change(view)
+        made = orbit_batch(view, batch["height"], batch["width"])
+        return made | {"c2w": c2w, "light_positions": batch["light_positions"]}
 
     monkeypatch.setattr(TrainCameras, "collate", changed)
 

@@ -38,16 +38,6 @@ def test_a_round_says_how_many_it_left_and_another_step_leaves_the_cloud():
     assert after_step(density) is None and len(density.cloud) == 8
 
 
-def test_a_cloud_larger_than_max_gaussians_is_reported():
-    """That of a checkpoint; densification would reduce it."""
-    said = control(10, max_gaussians=5, budget=None).schedule_problem(3, 100)
-    assert "10 Gaussians, more than system.geometry.max_gaussians (5)" in said
-    assert control(10, max_gaussians=10, budget=None).schedule_problem(3, 100) is None
-    densified = control(10, max_gaussians=5, budget=None, densify=ROUNDS)
-    assert "the checkpoint has" not in densified.schedule_problem(3, 100)
-    assert "the checkpoint has" in densified.schedule_problem(11, 100)
-
-
 def sampled(density, removal, error):
     """Set the statistics of the views since the last round."""
     density.cloud.removal.copy_(removal)
@@ -127,7 +117,7 @@ def test_the_error_of_a_round_is_that_of_its_views_or_of_the_likeness(known):
         ({"budget": None}, 0, 5, None),
         ({"budget": 5}, 0, 5, "4 of the 10 rounds of pruning would come after step 5"),
         ({"budget": 5}, 0, -1, None),
-        ({"budget": 5}, 9, 10, "no round of pruning remains, so 10 Gaussians are kept inst"),
+        ({"budget": 5}, 9, 10, "0 rounds of pruning must reduce 10 Gaussians to 5"),
         ({"budget": 2}, 0, 10, None),
         ({"budget": 1}, 7, 10, "2 rounds of pruning must reduce 10 Gaussians to 1"),
         ({"budget": 20}, 9, 10, None),
@@ -138,7 +128,9 @@ def test_the_error_of_a_round_is_that_of_its_views_or_of_the_likeness(known):
         ({"densify": ROUNDS}, 10, -1, None),
         ({"densify": ROUNDS}, 0, 5, "1 of the 2 rounds of densification would come after step 5"),
         ({"densify": ROUNDS | {"every": 50}}, 0, 20, "densification has no round"),
-        ({"densify": ROUNDS, "max_gaussians": 10}, 0, 20, "there are 10 Gaussians, the most"),
+        ({"densify": ROUNDS, "max_gaussians": 10}, 0, 20, "10 Gaussians leave no room for more"),
+        ({"max_gaussians": 5}, 3, 100, "10 Gaussians leave no room"),  # of a checkpoint
+        ({"max_gaussians": 10}, 3, 100, None),
         ({"densify": ROUNDS, "max_gaussians": 10}, 12, 20, None),
         ({"budget": 5, "densify": ROUNDS}, 0, 5, "set system.geometry.prune.start"),
     ],

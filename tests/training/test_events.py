@@ -93,7 +93,6 @@ def test_a_run_logs_each_number_once_and_the_error_that_its_guidance_returns(
         ({"train_views": 8}, 2, [(8, 16, 24)]),
         ({"train_views": 8}, 1, []),
         ({}, 9, []),
-        ({"train_views": 8, "up_perturb": 0.1}, 9, []),
         ({"train_views": 8, "height": [16, 32], "resolution_milestones": [3]}, 9, []),
     ],
 )

@@ -4,9 +4,9 @@ import pytest
 import torch
 
 from tests.training.runs import launch, length, run_folder
+from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.training import finite
 from threestudio_gaussiandreamer.training.finite import (
-    NonFiniteParameters,
     optimizer_tensors,
     require_finite,
     warn_if_invisible,
@@ -18,7 +18,7 @@ from threestudio_gaussiandreamer.training.system import GaussianDreamerSystem
 def test_one_number_that_is_not_finite_is_named(value):
     bad = torch.zeros(5, 3)
     bad[4, 1] = value
-    with pytest.raises(NonFiniteParameters, match=r"step 7: 1 of the 15 numbers of means are NaN"):
+    with pytest.raises(UserError, match=r"step 7: 1 of the 15 numbers of means are NaN"):
         require_finite([("quats", torch.ones(5, 4)), ("means", bad)], step=7)
 
 
@@ -27,15 +27,10 @@ def test_the_loss_that_was_bad_first_is_named():
     for step in range(5, 30):
         losses.append((step, {"sds": good, "tv": good * torch.nan if step in (9, 12) else good}))
     means = [("means", torch.full((2,), torch.nan))]
-    with pytest.raises(NonFiniteParameters, match="after the weighted loss_tv was nan in step 9:"):
+    with pytest.raises(UserError, match="after the weighted loss_tv was nan in step 9:"):
         require_finite(means, step=30, losses=losses)
-    with pytest.raises(NonFiniteParameters, match="means are NaN or infinite: the run stops"):
+    with pytest.raises(UserError, match="means are NaN or infinite: the run stops"):
         require_finite(means, step=1)
-
-
-def test_large_and_missing_numbers_are_finite():
-    require_finite([("exp_avg", torch.full((1000,), 3e38)), ("empty", torch.zeros(0))], step=0)
-    require_finite([], step=0)
 
 
 def test_the_state_of_an_optimiser_is_part_of_it():
@@ -45,7 +40,7 @@ def test_the_state_of_an_optimiser_is_part_of_it():
     parameter.grad = torch.tensor([1.0, 1e30])
     optimizer.step()
     assert parameter.isfinite().all()
-    with pytest.raises(NonFiniteParameters, match="1 of the 2 numbers of means.exp_avg_sq"):
+    with pytest.raises(UserError, match="1 of the 2 numbers of means.exp_avg_sq"):
         require_finite(optimizer_tensors(optimizer), step=1)
 
 
@@ -113,9 +108,10 @@ def test_a_cloud_that_is_not_finite_is_not_exported(tmp_path, painted_box, monke
     assert not list(tmp_path.rglob("it*"))
 
 
-def test_finite_numbers_of_a_cloud_that_no_camera_sees_are_named():
-    with pytest.raises(NonFiniteParameters, match=r"1 of the 6 numbers of geometry.means are beyo"):
+def test_numbers_that_no_camera_sees_are_named_and_large_moments_are_not():
+    with pytest.raises(UserError, match=r"1 of the 6 numbers of geometry.means are beyo"):
         require_finite([("geometry.means", torch.tensor([[0, 0, -1e20], [0, 1, 2]]))], step=2)
-    with pytest.raises(NonFiniteParameters, match="3 numbers of log_scales are beyond 30"):
+    with pytest.raises(UserError, match="3 numbers of log_scales are beyond 30"):
         require_finite([("log_scales", torch.tensor([100.0, 0, 0]))], step=2)
-    require_finite([("means.exp_avg", torch.tensor([1e20])), ("means", torch.zeros(0, 3))], step=2)
+    require_finite([("means.exp_avg", torch.tensor([3e38])), ("means", torch.zeros(0, 3))], step=2)
+    require_finite([], step=0)

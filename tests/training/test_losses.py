@@ -1,6 +1,7 @@
 """The regularisers of the renders, against values computed by hand."""
 
 import math
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -46,11 +47,11 @@ def test_each_regulariser_is_weighted_and_computed_only_where_it_has_a_weight():
 
 def test_losses_without_a_gradient_are_named():
     with_one = torch.ones(2, requires_grad=True).sum()
-    assert total({"sds": with_one, "off": torch.tensor(0.0)}, "x").requires_grad
-    with pytest.raises(UserError, match="loss_sds, loss_off of my-guidance has no gradient"):
-        total({"sds": with_one.detach(), "off": torch.tensor(0.0)}, "my-guidance")
-    with pytest.raises(UserError, match="^loss_sds of my-guidance has no gradient"):
-        total({"sds": with_one.detach(), "tv": with_one}, "my-guidance")
+    assert total({"sds": with_one, "off": torch.tensor(0.0)}).requires_grad
+    with pytest.raises(UserError, match="loss_sds, loss_off has no gradient"):
+        total({"sds": with_one.detach(), "off": torch.tensor(0.0)})
+    with pytest.raises(UserError, match="^loss_sds has no gradient"):
+        total({"sds": with_one.detach(), "tv": with_one})
 
 
 def test_numbers_of_a_guidance_are_logged_but_not_its_error_to_the_truth():
@@ -60,41 +61,19 @@ def test_numbers_of_a_guidance_are_logged_but_not_its_error_to_the_truth():
     assert numbers == {"train/grad_norm": 1.0, "train/loss_sds": 4.0}
 
 
-def test_weights_of_zero_alone_and_losses_declared_by_a_string_are_refused():
-    class Guidance:
-        LOSSES = ("sds",)
-
+def test_weights_of_zero_alone_are_refused():
     with pytest.raises(UserError, match="system.loss: every weight is 0"):
-        check_losses(Guidance, {"lambda_sds": 0, "lambda_tv": None})
-    check_losses(Guidance, {"lambda_sds": 0, "lambda_tv": 1.0})
-    Guidance.LOSSES = "sds"
-    with pytest.raises(UserError, match=r"Guidance.LOSSES is a string: write \('sds',\), a tuple"):
-        check_losses(Guidance, {"lambda_sds": 1.0})
+        check_losses(SimpleNamespace(LOSSES=("sds",)), {"lambda_sds": 0, "lambda_tv": None})
+    check_losses(SimpleNamespace(LOSSES=("sds",)), {"lambda_sds": 0, "lambda_tv": 1.0})
 
 
 @pytest.mark.parametrize(
-    ("returned", "message"),
-    [
-        (lambda out: out["comp_rgb"], r"a tensor of shape \(1, 2, 2, 3\)"),
-        (lambda out: out["comp_rgb"].detach().mean(), r"a tensor of shape \(\) without a gradient"),
-        (lambda out: 0.5, "float"),
-        (lambda out: None, "NoneType"),
-        (lambda out: out["comp_rgb"].mean() / 0, "inf: expected a finite"),
-        (lambda out: out["comp_rbg"].mean(), "own-regulariser reads: 'comp_rbg': did you mean"),
-    ],
+    ("value", "said"), [(torch.ones(2), r"\(2,\)"), (0.5, "float"), (None, "NoneType")]
 )
-def test_what_an_own_regulariser_returns_is_checked(returned, message):
-    own(returned)
-    out = {"comp_rgb": torch.ones(1, 2, 2, 3, requires_grad=True)}
-    message = message if "reads" in message else f"own-regulariser returned {message}"
-    with pytest.raises(UserError, match=message):
-        weighted_losses({"loss_sds": torch.ones(())}, out, {"sds": 1, "own": 2})
-
-
-def test_an_error_of_an_own_regulariser_is_not_taken_for_a_missing_output():
-    own(lambda out: {}["a table of its own"])
-    with pytest.raises(KeyError, match="a table of its own"):
-        weighted_losses({"loss_sds": torch.ones(())}, {"comp_rgb": 0}, {"sds": 1, "own": 2})
+def test_an_own_regulariser_returns_one_number(value, said):
+    own(lambda out: value)
+    with pytest.raises(UserError, match=f"own-regulariser returned {said}; expected one number"):
+        weighted_losses({"loss_sds": torch.ones(())}, {}, {"sds": 1, "own": 2})
 
 
 def test_the_names_of_regularisers_are_their_own():

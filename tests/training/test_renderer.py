@@ -9,11 +9,7 @@ from threestudio_gaussiandreamer import cameras
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.host import find
 from threestudio_gaussiandreamer.training.background import FlatBackground
-from threestudio_gaussiandreamer.training.renderer import (
-    SplattingRenderer,
-    normals_from_depth,
-    require_outputs,
-)
+from threestudio_gaussiandreamer.training.renderer import SplattingRenderer, normals_from_depth
 
 
 def plane(height: int, width: int) -> tuple[torch.Tensor, ...]:
@@ -83,19 +79,10 @@ def test_depth_and_normals_are_computed_when_they_are_read():
             r"returned a tensor \(3,\); expected a tensor of colours",
         ),
         (lambda dirs: None, r"returned NoneType; expected a tensor of colours \(2, 4, 5, 3\)"),
-        (lambda dirs: dirs / 0, "function returned colours that aren't finite"),
     ],
 )
-def test_a_background_of_another_shape_or_type_or_not_finite_is_named(background, message):
+def test_a_background_of_another_shape_or_type_is_named(background, message):
     out = SimpleNamespace(image=torch.zeros(2, 4, 5, 3), alpha=torch.zeros(2, 4, 5, 1))
     c2w, fovy = torch.eye(4).expand(2, 4, 4), torch.ones(2)
     with pytest.raises(UserError, match=message):
-        SplattingRenderer._composite(SimpleNamespace(background=background), out, c2w, fovy, {})
-
-
-def test_a_renderer_that_drops_outputs_is_named():
-    out = {"comp_rgb": torch.zeros(1, 4, 4, 3), "rasterized": None}
-    with pytest.raises(UserError, match="no comp_rgb_bg and no opacity and no depth: expected"):
-        require_outputs(None, out)
-    with pytest.raises(UserError, match="returned no comp_rgb and"):
-        require_outputs(None, torch.zeros(1, 4, 4, 3))
+        SplattingRenderer._composite(SimpleNamespace(background=background), out, c2w, fovy)

@@ -17,7 +17,7 @@ and pruning by contribution removes floaters as well."""
 import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Mapping, NamedTuple
+from typing import Any, Mapping, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -44,25 +44,6 @@ class Change(NamedTuple):
     """The new parameters, (M, ...) each."""
 
 
-class Rules(NamedTuple):
-    """When to clone, split and drop; lengths in world units."""
-
-    grad_threshold: float = 2e-4
-    split_scale: float = 0.04
-    """Larger ones are split, smaller ones are cloned."""
-    min_opacity: float = 0.05
-    max_scale: float = 0.4
-    max_gaussians: int = 500_000
-    min_gaussians: int = 64
-
-
-class Statistics(NamedTuple):
-    """Per-Gaussian statistics of the training steps since the last densification."""
-
-    gradient: Float[Tensor, " N"]
-    contribution: Float[Tensor, " N"]
-
-
 def screen_gradients(
     means2d_grad: Float[Tensor, "B N 2"], width: int, height: int, loss_scale: float = 1.0
 ) -> Float[Tensor, "B N"]:
@@ -77,26 +58,37 @@ def screen_gradients(
 
 
 def densify_and_prune(
-    params: Mapping[str, Tensor], stats: Statistics, rules: Rules, rng: torch.Generator
+    params: Mapping[str, Tensor],
+    gradient: Float[Tensor, " N"],
+    contribution: Float[Tensor, " N"],
+    rules: Any,
+    least: int,
+    most: int,
+    rng: torch.Generator,
 ) -> Change:
     """Clone small and split large Gaussians whose positional gradient is above the threshold, and
     drop those with a low opacity or a large scale.
 
     A Gaussian that no view has seen has no gradient and is neither cloned nor split; nor are those
-    with a low opacity. The number of Gaussians stays within ``max_gaussians``, counted after the
-    low opacities are dropped, and ``min_gaussians``.
+    with a low opacity. The number of Gaussians stays within ``most``, counted after the low
+    opacities are dropped, and ``least``.
+
+    Args:
+        gradient, contribution: see above, of the steps since the last densification.
+        rules: ``grad_threshold``, ``min_opacity``, and in world units ``split_scale``, from which
+            on Gaussians are split rather than cloned, and ``max_scale``.
     """
     faint = torch.sigmoid(params["logit_opacities"].detach()) < rules.min_opacity
-    chosen = (stats.gradient > rules.grad_threshold) & ~faint
+    chosen = (gradient > rules.grad_threshold) & ~faint
     # each clone or split adds one; where there is no room for all, those with the largest gradients
-    room = max(rules.max_gaussians - int((~faint).sum()), 0)
-    ranked = torch.where(chosen, stats.gradient, torch.full_like(stats.gradient, -1.0))
+    room = max(most - int((~faint).sum()), 0)
+    ranked = torch.where(chosen, gradient, torch.full_like(gradient, -1.0))
     chosen[torch.argsort(ranked, descending=True, stable=True)[room:]] = False
     large = params["log_scales"].exp().amax(-1) > rules.split_scale
     change = clone_and_split(params, clone=chosen & ~large, split=chosen & large, rng=rng)
     huge = change.values["log_scales"].exp().amax(-1) > rules.max_scale
     rows = change.parents
-    return keep(change, ~(faint[rows] | huge), stats.contribution[rows], rules)
+    return keep(change, ~(faint[rows] | huge), contribution[rows], least, most)
 
 
 def clone_and_split(
@@ -121,20 +113,23 @@ def clone_and_split(
 
 
 def keep(
-    change: Change, wanted: Bool[Tensor, " M"], contribution: Float[Tensor, " M"], rules: Rules
+    change: Change,
+    wanted: Bool[Tensor, " M"],
+    contribution: Float[Tensor, " M"],
+    least: int,
+    most: int,
 ) -> Change:
-    """Drop the unwanted rows, but keep at least ``min_gaussians`` and at most ``max_gaussians``,
-    those with the largest contribution.
+    """Drop the unwanted rows, but keep at least ``least`` and at most ``most``, those with the
+    largest contribution.
     """
     # every wanted row before every unwanted one, so that the floor is filled from the best of these
     rank = torch.argsort(contribution, descending=True, stable=True)
     rank = rank[torch.argsort(wanted[rank].int(), descending=True, stable=True)]
-    left, floor = int(wanted.sum()), min(rules.min_gaussians, len(wanted))
+    left, floor = int(wanted.sum()), min(least, len(wanted))
     if left < floor:
         few = "only %d of %d Gaussians would be left: the %d that contribute most stay (%s)"
         logger.warning(few, left, len(wanted), floor, "min_gaussians")
-    count = min(max(left, floor), rules.max_gaussians)
-    return select(change, rank[:count].sort().values)
+    return select(change, rank[: min(max(left, floor), most)].sort().values)
 
 
 def highest(scores: Float[Tensor, " N"], count: int) -> Int[Tensor, " M"]:
@@ -146,11 +141,6 @@ def select(change: Change, rows: Int[Tensor, " M"]) -> Change:
     """Keep some rows of a change."""
     values = {name: value[rows] for name, value in change.values.items()}
     return Change(change.parents[rows], change.is_new[rows], values)
-
-
-def prune_to(params: Mapping[str, Tensor], scores: Float[Tensor, " N"], count: int) -> Change:
-    """Keep the ``count`` Gaussians with the highest scores, in their order."""
-    return select(unchanged(params), highest(scores, count))
 
 
 def unchanged(params: Mapping[str, Tensor]) -> Change:

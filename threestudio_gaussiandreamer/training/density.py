@@ -9,11 +9,11 @@ As gsplat's ``Strategy``, one object is called around every optimiser step; anot
     loss.backward()
     control.after_backward(rasterized, width, height)   adds to the statistics
     optimizer.step()
-    outcome = control.after_step(optimizer, step + 1)   densifies and prunes when it is due
+    needed = control.after_step(optimizer, step + 1)    densifies and prunes when it is due
 
-``step`` counts finished optimiser steps. The statistics are buffers of the cloud, so that they are
-in its checkpoint. What is cloned and split: ``gaussians/densify.py``; what is dropped to meet a
-budget: ``gaussians/importance.py``; the options: the head of ``geometry.py``.
+``step`` counts finished optimiser steps. The statistics are buffers of the cloud, and so in its
+checkpoint. What is cloned and split: ``gaussians/densify.py``; what is dropped to meet a budget:
+``gaussians/importance.py``; the options: the head of ``geometry.py``.
 """
 
 import inspect
@@ -33,7 +33,7 @@ from ..core.methods import require_method
 from ..core.options import at_least, between, in_range, positive
 from ..core.streams import generator
 from ..gaussians import densify, importance
-from ..gaussians.densify import Change, Rules, Statistics
+from ..gaussians.densify import Change
 from ..gaussians.importance import AddedBackground, Need
 from ..host import find, parse_structured, register, run_seed
 from ..splatting import Rasterized
@@ -189,33 +189,24 @@ class DensityControl(DensityRule):
 
     def schedule_problem(self, step: int, max_steps: int) -> Optional[str]:
         """Describe why the remaining rounds can't do what they are to."""
-        end = max_steps if max_steps > 0 else math.inf
-        problems = self._densification_problem(step, end), self._pruning_problem(step, end)
+        cfg, count = self.cloud.cfg, len(self.cloud)
+        end, problems = max_steps if max_steps > 0 else math.inf, []
+        growth = rounds_of(cfg.densify) if cfg.densify.enabled else range(0)
+        left = max(growth, default=0) > step
+        if cfg.densify.enabled:
+            problems.append(round_problem("densification", "densify", growth, end))
+        if count > cfg.max_gaussians or left and count == cfg.max_gaussians:
+            problems.append(
+                f"{count} Gaussians leave no room for more below system.geometry.max_gaussians "
+                f"({cfg.max_gaussians}), which limits only the start and densification: for fewer, "
+                "set system.geometry.budget, or prune the result"
+            )
+        if cfg.budget is not None:
+            problems.append(self._pruning_problem(step, end))
         return "; ".join(filter(None, problems)) or None
-
-    def _densification_problem(self, step: int, end: float) -> Optional[str]:
-        cfg, count, most = self.cloud.cfg.densify, len(self.cloud), self.cloud.cfg.max_gaussians
-        rounds = rounds_of(cfg) if cfg.enabled else range(0)
-        left = max(rounds, default=0) > step
-        if count > most and not left:  # of a checkpoint
-            return (
-                f"the checkpoint has {count} Gaussians, more than system.geometry.max_gaussians "
-                f"({most}), which limits only the start and densification: for fewer, set "
-                "system.geometry.budget, or prune the result"
-            )
-        if cfg.enabled and (problem := round_problem("densification", "densify", rounds, end)):
-            return problem
-        if left and count >= most:
-            return (
-                f"densification can only replace what it drops: there are {count} Gaussians, the "
-                "most that system.geometry.max_gaussians allows"
-            )
-        return None
 
     def _pruning_problem(self, step: int, end: float) -> Optional[str]:
         budget, keep, count = self.cloud.cfg.budget, self.cloud.cfg.prune.keep, len(self.cloud)
-        if budget is None:
-            return None
         rounds = rounds_of(self.cloud.cfg.prune)
         if problem := round_problem("pruning", "prune", rounds, end):
             return problem
@@ -227,18 +218,14 @@ class DensityControl(DensityRule):
         if budget == AUTO or count <= budget:
             return None
         left = [round_ for round_ in rounds if step < round_ <= end]
-        if not left:
-            return (
-                f"no round of pruning remains, so {count} Gaussians are kept instead of {budget}: "
-                "set system.geometry.prune.start, stop and every accordingly"
-            )
-        share = self.kept_share(count, left[0])
-        if share >= keep - 0.005:  # equal in the two decimals of the message
+        share = self.kept_share(count, left[0]) if left else 0.0
+        # equal in the two decimals of the message
+        if share >= keep - 0.005:
             return None
         return (
-            f"{len(left)} rounds of pruning must reduce {count} Gaussians to {budget}: "
-            f"each keeps {share:.2f} instead of {keep:g}, which loses more quality; use more "
-            "rounds (system.geometry.prune.every) or start with fewer"
+            f"{len(left)} rounds of pruning must reduce {count} Gaussians to {budget}: each keeps "
+            f"{share:.2f} instead of {keep:g}, which loses more quality; use more rounds "
+            "(system.geometry.prune.start, stop and every) or start with fewer"
         )
 
     # -- statistics --------------------------------------------------------------------------------
@@ -322,15 +309,10 @@ class DensityControl(DensityRule):
         most = cloud.cfg.max_gaussians
         if budget not in (None, AUTO):
             most = min(most, max(budget, len(cloud)))
-        sizes = cfg.split_scale, cfg.min_opacity, cfg.max_scale
-        rules = Rules(cfg.grad_threshold, *sizes, most, cloud.cfg.min_gaussians)
         gradient = cloud.gradient_sum / cloud.gradient_count.clamp_min(1)
-        return densify.densify_and_prune(
-            cloud.parameters_by_name(),
-            Statistics(gradient, cloud.contribution),
-            rules,
-            generator(run_seed(), "split", step),
-        )
+        statistics, rng = (gradient, cloud.contribution), generator(run_seed(), "split", step)
+        counts = cloud.cfg.min_gaussians, most
+        return densify.densify_and_prune(cloud.parameters_by_name(), *statistics, cfg, *counts, rng)
 
     def _prune(self, step: int, first: Optional[Change]) -> tuple[Change, Optional[Need]]:
         """Prune once towards the budget, after the change ``first`` by densification at the same

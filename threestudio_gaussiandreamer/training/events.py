@@ -136,7 +136,7 @@ def prefetch_truth(system: Any) -> None:
     if truth is None or not isinstance(trainer.datamodule, GaussianDreamerDataModule):
         return
     cameras = trainer.datamodule.train_dataset
-    if cameras.pool is None or cameras.moves or len(cameras.sizes) > 1:
+    if cameras.pool is None or len(cameras.sizes) > 1:
         return
     ((*size, batch_size),), pool = cameras.sizes, cameras.pool
     steps = math.inf if trainer.max_steps < 0 else trainer.max_steps - system.global_step

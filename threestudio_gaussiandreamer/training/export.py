@@ -13,13 +13,12 @@ prior/gaussians.spz         the initial cloud, before training
 """
 
 import functools
-import inspect
 import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Optional
 
-from ..core.errors import UserError, unknown
+from ..core.errors import UserError
 from ..core.files import atomic_file
 from ..core.images import write_animation
 from ..exporters.files import (
@@ -151,25 +150,10 @@ def writers(
                 )
             written.add(name)
             noted = {"pruned_to": pruned_to} if out.save_type in CLOUDS else {}
-            save(system, out, f"{folder}/{out.save_name}", noted)
+            save = getattr(system, f"save_{out.save_type}")
+            save(f"{folder}/{out.save_name}", **{**noted, **out.params})
 
     return {name: functools.partial(write, outputs) for name, outputs in formats.items()}
-
-
-def save(system: Any, out: ExporterOutput, path: str, noted: Mapping[str, Any]) -> None:
-    """Write one output of an exporter; raise UserError if the system can't save its type."""
-    write, params = getattr(system, f"save_{out.save_type}", None), {**noted, **out.params}
-    if write is None:
-        known = [name.removeprefix("save_") for name in dir(system) if name.startswith("save_")]
-        raise unknown("save_type of an exporter", out.save_type, known)
-    try:
-        inspect.signature(write).bind(path, **params)
-    except TypeError as error:
-        raise UserError(
-            f"params of {out.save_name}: {error}; save_{out.save_type} takes "
-            f"{inspect.signature(write)}"
-        ) from error
-    write(path, **params)
 
 
 def export_pruned(system: Any, folder: str) -> None:

@@ -22,10 +22,6 @@ LIMITS = {"means": 1e9, "log_scales": 30.0, "sh0": 1e9, "sh_rest": 1e9}
 far, and scales of e^30 are far beyond the e^10 that is drawn at most."""
 
 
-class NonFiniteParameters(UserError):
-    """Training produced NaN or infinity."""
-
-
 def optimizer_tensors(optimizer: torch.optim.Optimizer) -> Iterator[tuple[str, Tensor]]:
     """Yield parameters of an optimiser, and tensors of its state, such as ``means.exp_avg``."""
     for group in optimizer.param_groups:
@@ -50,7 +46,7 @@ def require_finite(
         losses: the weighted losses of the steps since the last check, read only for the message.
 
     Raises:
-        NonFiniteParameters: the message has the name of the first tensor that isn't finite, the
+        UserError: the message has the name of the first tensor that isn't finite, the
             number of its bad values, and the loss that may be the cause.
     """
     named = [
@@ -71,7 +67,7 @@ def require_finite(
         for loss, value in of_step.items()
         if not value.isfinite().all()
     )
-    raise NonFiniteParameters(
+    raise UserError(
         f"step {step}: {int(bad.sum())} of the {values.numel()} numbers of {name} "
         f"are {what}{next(causes, '')}: the run stops, and nothing of "
         "this state is saved or exported. "
@@ -105,27 +101,9 @@ def warn_if_invisible(opacity: Float[Tensor, "B H W 1"], step: int) -> None:
         )
 
 
-class LossScale:
-    """The loss scale of automatic mixed precision, a factor on all gradients: if it makes them
-    infinite, it is halved and the step is skipped, which this counts.
+def loss_scale(trainer: Any) -> float:
+    """Return the factor of automatic mixed precision on all gradients, 1 without it. If it makes
+    them infinite, it is halved and the step is skipped.
     """
-
-    def __init__(self) -> None:
-        self.skipped_steps = 0
-
-    def value(self, trainer: Any) -> float:
-        """Return the current factor on the gradients; 1 without mixed precision."""
-        scaler = getattr(trainer.precision_plugin, "scaler", None)
-        return 1.0 if scaler is None else float(scaler.get_scale())
-
-    def has_skipped(self, trainer: Any, before: float) -> bool:
-        """Return whether the step that began with the scale ``before`` was skipped; warn of it."""
-        if self.value(trainer) >= before:
-            return False
-        self.skipped_steps += 1
-        warn(
-            f"step {trainer.global_step}: gradients overflowed at the loss scale {before:g}, "
-            "so its update was skipped; schedules continue "
-            f"({self.skipped_steps} such steps so far)"
-        )
-        return True
+    scaler = getattr(trainer.precision_plugin, "scaler", None)
+    return 1.0 if scaler is None else float(scaler.get_scale())

@@ -51,11 +51,10 @@ from typing import Any, List
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from ..core.errors import UserError
-from ..core.host_copies import DelayedReads
 from ..core.memory import count_of
 from ..core.methods import require_method
 from ..core.options import (
@@ -141,13 +140,9 @@ class GaussianCloud(BaseGeometry):
 
         def __post_init__(self) -> None:
             if isinstance(self.budget, str):
-                self.budget = self.budget.lower()
-                with contextlib.suppress(ValueError):
-                    self.budget = float(self.budget)  # 5e3 is text to PyYAML
+                self.budget = None if self.budget.lower() == "none" else self.budget.lower()
             if isinstance(self.budget, float) and self.budget.is_integer():
-                self.budget = int(self.budget)
-            if self.budget == "none":
-                self.budget = None
+                self.budget = int(self.budget)  # 5e3
 
         @staticmethod
         def check(cfg: Any) -> None:
@@ -173,7 +168,6 @@ class GaussianCloud(BaseGeometry):
 
     def configure(self) -> None:
         self.bands = (self.cfg.sh_degree + 1) ** 2
-        self._warned, self.reads = False, DelayedReads()
         self._allocate(0)
 
     # -- size --------------------------------------------------------------------------------------
@@ -331,24 +325,6 @@ class GaussianCloud(BaseGeometry):
             self.logit_opacities.clamp_(-15.0, 15.0)
             self.log_scales.clamp_(*LOG_SCALE_RANGE)
 
-    @torch.no_grad()
-    def warn_of_clamped_sizes(self) -> None:
-        """Warn once if scales are beyond ``LOG_SCALE_RANGE``; on a GPU when it is known."""
-        low, high = LOG_SCALE_RANGE
-
-        def tell(clamped: Bool[Tensor, " N"]) -> None:
-            if not self._warned and clamped.any():
-                self._warned = True
-                first = clamped.nonzero()[0]
-                logger.warning(
-                    "%d of %d Gaussians are drawn at e^%g or e^%g, the bounds of their sizes; the "
-                    "first is number %d", clamped.sum(), len(clamped), low, high, first,
-                )  # fmt: skip
-
-        if not self._warned:
-            clamped = ((self.log_scales < low) | (self.log_scales > high)).any(-1)
-            self.reads.submit(clamped, tell)
-
     def parameters_by_name(self) -> dict[str, nn.Parameter]:
         return {name: getattr(self, name) for name in PARAMETERS}
 
@@ -384,19 +360,7 @@ class GaussianCloud(BaseGeometry):
         """Apply ``change`` to the cloud and to the rows of the optimiser's state, and reset the
         statistics; raise UserError if no Gaussian is left, or parents and values don't fit.
         """
-        self._require_fit(change)
-        old = self.parameters_by_name()
-        new = {name: nn.Parameter(value) for name, value in change.values.items()}
-        densify.update_optimizer(optimizer, old, new, change)
-        for name, parameter in new.items():
-            setattr(self, name, parameter)
-        for name in STATISTICS:
-            self.register_buffer(name, torch.zeros(len(change.parents), device=self.means.device))
-        self.error.zero_()
-
-    def _require_fit(self, change: Change) -> None:
-        """Raise UserError if a density rule's change leaves nothing, or doesn't fit the cloud."""
-        rows, count = change.parents, len(change.parents)
+        rows, count, old = change.parents, len(change.parents), self.parameters_by_name()
         if not count:
             raise UserError("the change of the cloud leaves no Gaussian: keep some, or all")
         if rows.is_floating_point() or not 0 <= int(rows.min()) <= int(rows.max()) < len(self):
@@ -404,14 +368,17 @@ class GaussianCloud(BaseGeometry):
                 f"parents of the change of the cloud: expected {count} integers from 0 to "
                 f"{len(self) - 1}, the rows of the Gaussians that they come from"
             )
-        for name, old in self.parameters_by_name().items():
-            expected = (count, *old.shape[1:])
-            found = getattr(change.values.get(name), "shape", None)
-            if found != expected:
-                found = found if found is None else tuple(found)
-                raise UserError(
-                    f"the change of the cloud has {name} of shape {found}; expected {expected}"
-                )
+        shapes = {name: (count, *parameter.shape[1:]) for name, parameter in old.items()}
+        found = {name: tuple(value.shape) for name, value in change.values.items()}
+        if found != shapes:
+            raise UserError(f"the change of the cloud has the shapes {found}; expected {shapes}")
+        new = {name: nn.Parameter(value) for name, value in change.values.items()}
+        densify.update_optimizer(optimizer, old, new, change)
+        for name, parameter in new.items():
+            setattr(self, name, parameter)
+        for name in STATISTICS:
+            self.register_buffer(name, torch.zeros(count, device=self.means.device))
+        self.error.zero_()
 
 
 def grow_points(cloud: PointCloud, cfg: GrowConfig, ground: int = 0) -> PointCloud:

@@ -29,7 +29,6 @@ from ..meshes.mesh import SurfaceDistance
 from ..meshes.raycast import over_background
 from ..view.run_files import read_json
 from .data import MAX_SIDE, orbit_batch
-from .renderer import require_outputs
 
 VIEW_BYTES = 40
 """Memory per pixel, bytes: ground truth (16), over the background (12), and render (12)."""
@@ -95,7 +94,7 @@ class HeldOut:
         images, backgrounds, side = [], [], self.cfg.size * renderer.cfg.downsample
         for start in range(0, self.cfg.views, chunk):
             part = self.orbit.rows(slice(start, start + chunk))
-            out = require_outputs(renderer, renderer(**orbit_batch(part, side, side)))
+            out = renderer(**orbit_batch(part, side, side))
             images.append(out["comp_rgb"].cpu())
             backgrounds.append(out["comp_rgb_bg"].cpu().mean((1, 2)))
         for module, training in modes:

@@ -12,8 +12,6 @@ All are means over pixels, whereas score distillation is a sum over latents: rai
 proportion to height x width.
 """
 
-import inspect
-from collections import ChainMap
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Optional
 
@@ -47,46 +45,28 @@ def weighted_losses(
         found = ", ".join(guided) or "nothing"
         raise UserError(f"the guidance returned no loss_*, such as loss_sds: it returned {found}")
     check_weights(weights, raw)
-    raw |= {k: _of_renders(k, call, out) for k, call in regularisers().items() if weights.get(k)}
+    for name, call in regularisers().items():
+        if weights.get(name):
+            value = call(out)
+            if not isinstance(value, Tensor) or value.numel() != 1:
+                found = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
+                raise UserError(
+                    f"{name}{SUFFIX} returned {found}; expected one number that is computed from "
+                    "the renders or the cloud, as from .mean()"
+                )
+            raw[name] = value.reshape(())
     return {name: value * weights[name] for name, value in raw.items()}
 
 
-class _Outputs(ChainMap):
-    """What a regulariser sees, computed when it is read; what is missing is named."""
-
-    def __missing__(self, name: str) -> None:
-        raise unknown(f"output that {self.reader} reads:", name, self)
-
-
-def _of_renders(name: str, call: Any, out: Mapping[str, Any]) -> Float[Tensor, ""]:
-    """Return a regulariser of a step's outputs, one finite number with a gradient."""
-    seen, name = _Outputs(out), name + SUFFIX
-    seen.reader = name
-    value = call(seen)
-    if not isinstance(value, Tensor) or value.numel() != 1 or not value.requires_grad:
-        found = type(value).__name__
-        if isinstance(value, Tensor):
-            found = f"a tensor of shape {tuple(value.shape)}"
-            found += "" if value.requires_grad else " without a gradient"
-        raise UserError(
-            f"{name} returned {found}; expected one number that is computed from the renders or "
-            "the cloud, as from .mean()"
-        )
-    # on a GPU, looking would wait for it: there finite.py names it at its next check
-    if value.device.type == "cpu" and not value.isfinite():
-        raise UserError(f"{name} returned {value.item()}: expected a finite number")
-    return value.reshape(())
-
-
-def total(losses: Mapping[str, Tensor], guidance: str) -> Float[Tensor, ""]:
+def total(losses: Mapping[str, Tensor]) -> Float[Tensor, ""]:
     """Return the sum of the losses; raise UserError if one that isn't a plain 0 has no gradient."""
     loss = sum(losses.values())
     constant = [name for name, value in losses.items() if not value.requires_grad and value != 0]
     if constant or not loss.requires_grad:
         names = ", ".join(f"loss_{name}" for name in (constant if loss.requires_grad else losses))
         raise UserError(
-            f"{names} of {guidance} has no gradient: compute it from the renders, without detach() "
-            "or torch.no_grad()"
+            f"{names} has no gradient: compute it from the renders, without detach() or "
+            "torch.no_grad()"
         )
     return loss
 
@@ -128,7 +108,7 @@ def logged_names(guidance: type, options: Iterable[str]) -> Optional[set[str]]:
 
 def check_losses(guidance: type, options: Mapping[str, Any]) -> None:
     """Check the keys of ``system.loss``, and if the class of the guidance declares its losses, that
-    they fit those. Raises UserError, also for a regulariser that isn't a function of one argument.
+    they fit those. Raises UserError.
     """
     for name in options:
         if not name.startswith("lambda_"):
@@ -139,21 +119,7 @@ def check_losses(guidance: type, options: Mapping[str, Any]) -> None:
             "system.loss: every weight is 0, so that nothing would be trained: give one, such as "
             "system.loss.lambda_sds=1"
         )
-    for name, function in regularisers().items():
-        if not options.get(f"lambda_{name}"):
-            continue
-        name += SUFFIX
-        if isinstance(function, type):
-            found = f"{name} is the class {function.__name__}"
-            raise UserError(f"{found}; register a function of (out)")
-        try:
-            (signature := inspect.signature(function)).bind("out")
-        except TypeError as error:
-            found = f"{name} is a function of {signature}"
-            raise UserError(f"{found}, which is called as (out): {error}") from error
     known = getattr(guidance, "LOSSES", None)  # also of guidances that aren't ScoreDistillation
-    if isinstance(known, str):
-        raise UserError(f"{guidance.__name__}.LOSSES is a string: write ({known!r},), a tuple")
     if known is not None:
         check_weights({key.removeprefix("lambda_"): value for key, value in options.items()}, known)
 

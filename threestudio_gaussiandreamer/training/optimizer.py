@@ -106,8 +106,6 @@ def _check_rates(params: Any) -> None:
     if not isinstance(params, Mapping):
         raise UserError(f"optimizer.params: expected parts and their lr, got {params!r}")
     for name, options in params.items():
-        if name == "geometry":
-            raise UserError("optimizer.params.geometry: its rates are system.geometry.lr_*")
         if name not in PARTS:
             raise unknown("key system.optimizer.params.", name, PARTS)
         if not isinstance(options, Mapping) or set(options) != {"lr"}:
@@ -149,10 +147,8 @@ class PartRates:
                 f"system.optimizer.params.{name}.lr; 0 leaves them as they are"
             )
         if own in self.rates and not trained:
-            hint = " for it: its rate is system.background.lr" if ours else " to train"
-            raise UserError(
-                f"system.optimizer.params.{name}: {type(part).__name__} has no parameters{hint}"
-            )
+            found = f"{type(part).__name__} has no parameters that need this rate"
+            raise UserError(f"system.optimizer.params.{name}: {found}")
         return [*groups, {"params": trained, "name": own, "lr": 0.0}] if trained else groups
 
     def set(self, optimizer: torch.optim.Optimizer, epoch: int, step: int) -> None:

@@ -15,10 +15,9 @@ downsample  1, or 2: return the 2x2 box of the rendered size (the paper renders 
 ==========  ========================================================================================
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 import torch.nn.functional as F
@@ -46,21 +45,8 @@ def check_backend(option: str, name: str) -> None:
         raise UserError(f"{option}: {error}") from error
 
 
-DRAWING = ("near", "far", "eps2d", "antialias", "preset", "downsample", "backend")
+DRAWING = ("eps2d", "antialias", "preset", "downsample", "backend")
 """Options that `rasterize` is given."""
-OUTPUTS = ("comp_rgb", "comp_rgb_bg", "opacity", "depth", "rasterized")
-"""What training reads of a renderer's outputs, whatever its options are."""
-
-
-def require_outputs(renderer: Any, out: Any) -> Mapping[str, Any]:
-    """Return the outputs of a renderer; raise UserError if some of ``OUTPUTS`` are missing."""
-    missing = [name for name in OUTPUTS if name not in out] if isinstance(out, Mapping) else OUTPUTS
-    if missing:
-        raise UserError(
-            f"{type(renderer).__name__} returned no {' and no '.join(missing)}: expected a mapping "
-            f"with {', '.join(OUTPUTS)}; add to the one that SplattingRenderer.forward returns"
-        )
-    return out
 
 
 @register("gaussiandreamer-splatting")
@@ -72,14 +58,12 @@ class SplattingRenderer(Rasterizer):
         preset: str = field(default="balanced", metadata=one_of(PRESETS))
         antialias: bool = False
         eps2d: float = field(default=0.3, metadata=at_least(0, "square pixels"))
-        near: float = field(default=0.01, metadata=positive())
-        far: float = field(default=1e10, metadata=positive())
         downsample: int = field(default=1, metadata=in_range(1, 2))
 
-        @staticmethod
-        def check(cfg: Any) -> None:
-            if not cfg.near < cfg.far:
-                raise UserError(f"far: expected more than near ({cfg.near:g}), got {cfg.far:g}")
+        REMOVED: ClassVar[dict[str, Any]] = {
+            "near": (0.01, "it is 0.01 world units"),
+            "far": (1e10, "there is no far plane"),
+        }
 
     cfg: Config
 
@@ -88,7 +72,7 @@ class SplattingRenderer(Rasterizer):
         super().configure(geometry, material, background)
 
     def forward(
-        self, c2w: Tensor, fovy: Tensor, height: int, width: int, **batch: Any
+        self, c2w: Tensor, fovy: Tensor, height: int, width: int, **unused: Any
     ) -> LazyMapping:
         """Render B views, in float32 whatever the trainer's precision is: half precision would move
         cameras by thousandths.
@@ -122,7 +106,7 @@ class SplattingRenderer(Rasterizer):
             if flat:
                 image, background = out.image, color[:, None, None]
             else:
-                image, background = self._composite(out, c2w, fovy, batch)
+                image, background = self._composite(out, c2w, fovy)
         records = torch.is_grad_enabled()
 
         def surface(normals: bool) -> Tensor:
@@ -140,23 +124,15 @@ class SplattingRenderer(Rasterizer):
         later = {"depth": partial(surface, False), "comp_normal": partial(surface, True)}
         return LazyMapping(pictures, later)
 
-    def _composite(
-        self, out: Rasterized, c2w: Tensor, fovy: Tensor, batch: dict[str, Any]
-    ) -> tuple[Tensor, Tensor]:
+    def _composite(self, out: Rasterized, c2w: Tensor, fovy: Tensor) -> tuple[Tensor, Tensor]:
         """Composite over another extension's background, which takes a direction per pixel."""
-        height, width = out.image.shape[1:3]
-        rays = batch.get("rays_d")
-        if rays is None or rays.shape[1:3] != (height, width):
-            rays = cameras.ray_directions(c2w, fovy, height, width)
+        rays = cameras.ray_directions(c2w, fovy, *out.image.shape[1:3])
         background, wanted = self.background(rays.to(out.image)), tuple(out.image.shape)
         name, found = type(self.background).__name__, type(background).__name__
         if isinstance(background, Tensor):
             found = f"a tensor {tuple(background.shape)}"
         if getattr(background, "shape", None) != wanted:
             raise UserError(f"{name} returned {found}; expected a tensor of colours {wanted}")
-        # on a GPU, looking would wait for it
-        if background.device.type == "cpu" and not background.isfinite().all():
-            raise UserError(f"{name} returned colours that aren't finite")
         return out.image + (1 - out.alpha) * background, background
 
 

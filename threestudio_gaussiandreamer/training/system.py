@@ -42,7 +42,6 @@ from ..core.host_copies import flush_reads
 from ..core.methods import require_class_method
 from ..core.schedule import parse_schedule, validate_schedule
 from ..gaussians.gaussians import SHAPES, require_cloud
-from ..gaussians.importance import Need
 from ..guidance import external
 from ..guidance.external import truth_of
 from ..host import BaseLift3DSystem, C, find, info, parse_structured, register, warn
@@ -62,7 +61,6 @@ from .losses import (
     weighted_losses,
 )
 from .optimizer import PartRates, check_optimizer, make_optimizer, restore_arguments
-from .renderer import require_outputs
 
 Outputs, Batch, Losses = Mapping[str, Any], dict[str, Any], dict[str, Tensor]
 GUIDANCE_LR = 1e-4
@@ -123,8 +121,7 @@ class GaussianDreamerSystem(export.GaussianSavers, BaseLift3DSystem):
         self.density = density_rule(self.geometry)
         self.automatic_optimization = False
         self.__dict__["guidance"] = self.measurements = self.prompt_utils = None
-        self.loss_scale = finite.LossScale()
-        self.step_log = events.StepLog()
+        self.skipped_steps, self.step_log = 0, events.StepLog()
         self.recent_losses: deque[tuple[int, Losses]] = deque(maxlen=finite.CHECK_EVERY)
         self._learnt: Optional[dict[str, Tensor]] = None
 
@@ -148,7 +145,7 @@ class GaussianDreamerSystem(export.GaussianSavers, BaseLift3DSystem):
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         # before the file of an earlier, good state is replaced
-        flush_reads(self.step_log, self.geometry, self.guidance)
+        flush_reads(self.step_log, self.guidance)
         self.require_finite()
         if self.measurements:  # the prior's cloud isn't in this file, so score it now
             scores = self.measurements.score_postponed()
@@ -212,7 +209,7 @@ class GaussianDreamerSystem(export.GaussianSavers, BaseLift3DSystem):
     # -- one step ----------------------------------------------------------------------------------
 
     def forward(self, batch: dict[str, Any]) -> Mapping[str, Any]:
-        return require_outputs(self.renderer, self.renderer(**batch))
+        return self.renderer(**batch)
 
     def training_step(self, batch: dict[str, Any], batch_idx: int) -> None:
         """Render, score, sum the losses, differentiate, optimise, densify and prune, log."""
@@ -222,7 +219,7 @@ class GaussianDreamerSystem(export.GaussianSavers, BaseLift3DSystem):
         guided = self.guide(out, batch)
         self.density.before_backward(out, self.global_step, self.error_of(out, batch, guided))
         losses = self.losses(guided, out)
-        self.manual_backward(total(losses, self.cfg.guidance_type))
+        self.manual_backward(total(losses))
         self.optimize(optimizer, out, batch, losses)
         self.control_density(optimizer)
         self.report(out, batch, guided, losses)
@@ -234,14 +231,18 @@ class GaussianDreamerSystem(export.GaussianSavers, BaseLift3DSystem):
         finite.warn_if_invisible(out["opacity"], self.global_step)
         require_gradients(self.geometry, losses)
         average_gradients(p for group in optimizer.param_groups for p in group["params"])
-        loss_scale = self.loss_scale.value(self.trainer)
-        self.density.after_backward(out["rasterized"], batch["width"], batch["height"], loss_scale)
+        scale = finite.loss_scale(self.trainer)
+        self.density.after_backward(out["rasterized"], batch["width"], batch["height"], scale)
         with self.geometry.steps_by_size():
             optimizer.step()
         self.geometry.clamp_colors()
-        if self.loss_scale.has_skipped(self.trainer, loss_scale):
-            skipped = {"train/skipped_steps": self.loss_scale.skipped_steps}
-            self.step_log.write(self.trainer, skipped)
+        if finite.loss_scale(self.trainer) < scale:
+            self.skipped_steps += 1
+            warn(
+                f"step {self.global_step}: gradients overflowed at the loss scale {scale:g}, so "
+                "its update was skipped; schedules continue"
+            )
+            self.step_log.write(self.trainer, {"train/skipped_steps": self.skipped_steps})
         if self.global_step % finite.CHECK_EVERY == 0:
             self.require_finite()
         optimizer.zero_grad()
@@ -251,9 +252,6 @@ class GaussianDreamerSystem(export.GaussianSavers, BaseLift3DSystem):
         before = len(self.geometry)
         # the torch optimiser in Lightning's wrapper, since the rows of its state are changed
         needed = self.density.after_step(optimizer.optimizer, self.global_step)
-        if not isinstance(needed, Need | None):
-            found = f"{type(self.density).__name__}.after_step returned {type(needed).__name__}"
-            raise UserError(f"{found}; expected None or a Need")
         if needed and needed.gain >= 0:
             self.step_log.write(self.trainer, {"prune/gain": needed.gain})
             changed = f"{before} -> {len(self.geometry)} Gaussians"
@@ -302,7 +300,6 @@ class GaussianDreamerSystem(export.GaussianSavers, BaseLift3DSystem):
         if error := self.error_of(out, batch, guided):
             shown["dB"] = psnr_of_error(error())
         self.step_log.write(self.trainer, numbers | shown, shown)
-        self.geometry.warn_of_clamped_sizes()
 
     def on_train_batch_end(self, outputs: Any, batch: Any, batch_idx: int) -> None:
         super().on_train_batch_end(outputs, batch, batch_idx)
@@ -321,7 +318,7 @@ class GaussianDreamerSystem(export.GaussianSavers, BaseLift3DSystem):
             events.log_scores(self.loggers, scores, self.cfg.evaluation.views)
 
     def on_train_end(self) -> None:
-        flush_reads(self.step_log, self.geometry, self.guidance)
+        flush_reads(self.step_log, self.guidance)
         self.require_finite()
         if self.measurements:
             self.measurements.stop_clock()
@@ -386,9 +383,6 @@ class GaussianDreamerSystem(export.GaussianSavers, BaseLift3DSystem):
 
 def check_parts(cfg: Any) -> None:
     """Raise UserError if a part that the system needs is missing or isn't of the needed class."""
-    for name in ("geometry", "renderer", "guidance", "prompt_processor"):
-        if not getattr(cfg, f"{name}_type"):
-            raise UserError(f"{name}_type is empty: name a registered part")
     for name, ours in OURS.items():
         part, base = getattr(cfg, f"{name}_type"), find(ours)
         if not issubclass(find(part), base):

@@ -57,8 +57,6 @@ class RenderSettings(NamedTuple):
             antialias=renderer.antialias,
             alpha_min=PRESETS[renderer.preset],
             bound_colors=bound_colors,
-            near=renderer.near,
-            far=renderer.far,
         )
 
 
