@@ -131,11 +131,11 @@ def test_a_sample_of_the_removal_error_is_that_of_a_sum_of_signed_pixels():
     signs = torch.randint(0, 2, shape, generator=generator(0, "r"), dtype=torch.float32) * 2 - 1
     total = (images * signs).sum() - (alpha * (signs * color).sum(-1, keepdim=True)).sum()
     (gradients,) = torch.autograd.grad(total, opacities, retain_graph=True)
-    added = importance.AddedBackground(alpha, color)
+    added = (alpha, color)
     found = importance.removal_error(images, opacities, generator(0, "r"), added)
     assert torch.equal(found, (opacities.detach() * gradients).square()) and found.amin() > 0
     color = color.expand(shape).clone()  # per pixel
-    added = importance.AddedBackground(alpha, color)
+    added = (alpha, color)
     assert torch.equal(found, importance.removal_error(images, opacities, generator(0, "r"), added))
 
 

@@ -25,10 +25,10 @@ def test_the_neighbours_of_points_are_the_nearest(monkeypatch, dimensions, count
     points = cloud(170, dimensions)
     apart = distances(points, points)
     rows = []
-    for found in NeighbourSearch(points).of_points(count):
-        rows += found.rows.tolist()
-        assert np.allclose(found.distances, np.sort(apart[found.rows])[:, :count], atol=1e-15)
-        assert np.allclose(apart[found.rows[:, None], found.nearest], found.distances, atol=1e-15)
+    for some, found, nearest in NeighbourSearch(points).of_points(count):
+        rows += some.tolist()
+        assert np.allclose(found, np.sort(apart[some])[:, :count], atol=1e-15)
+        assert np.allclose(apart[some[:, None], nearest], found, atol=1e-15)
     assert sorted(rows) == list(range(170))
 
 

@@ -103,7 +103,8 @@ def test_a_large_cloud_loses_its_hidden_gaussians_without_a_recovery(monkeypatch
     monkeypatch.setattr(simplifying, "LARGE", 450)
     monkeypatch.setattr(simplifying, "LOSSLESS", 30.0)
     cloud = ball()
-    found = simplify(cloud, Budget(count=200), recovery(cloud, 48), rank=rank)
+    monkeypatch.setattr(simplifying, "view_importance", rank)
+    found = simplify(cloud, Budget(count=200), recovery(cloud, 48))
     assert len(found.means) == 200 and ranked and max(ranked) < len(cloud.means)
     assert fitted and max(fitted) < simplifying.KEEP * len(cloud.means)
 
@@ -130,6 +131,7 @@ def test_a_large_cloud_is_pruned_at_once_to_what_its_images_need(monkeypatch, ne
         raise StopIteration
 
     monkeypatch.setattr(kept, "quality", quality)
+    monkeypatch.setattr(simplifying, "view_importance", rank)
     with pytest.raises(StopIteration):
-        simplify(cloud, Budget(count=80), kept, rank=rank)
+        simplify(cloud, Budget(count=80), kept)
     assert len(asked) <= simplifying.BISECTIONS + 1

@@ -134,9 +134,8 @@ def distinct(
 def _neighbour_distances(search: NeighbourSearch, neighbours: int) -> Float[np.ndarray, " D"]:
     """Compute the root mean square distance to the nearest ``neighbours`` other points."""
     distances = np.empty(len(search.order))
-    for found in search.of_points(neighbours + 1):
-        others = found.distances[:, 1:]  # column 0 is the point itself
-        distances[found.rows] = np.sqrt(np.mean(others**2, axis=1))
+    for rows, found, _ in search.of_points(neighbours + 1):
+        distances[rows] = np.sqrt(np.mean(found[:, 1:] ** 2, axis=1))
     return distances
 
 

@@ -39,15 +39,6 @@ IDLE = 0.01
 """Share of an equal part of the error, E / N, that a Gaussian must save to be worth keeping."""
 
 
-class AddedBackground(NamedTuple):
-    """A colour C that is added behind rendered images: they become I + (1 - alpha) C."""
-
-    alpha: Float[Tensor, "B H W 1"]
-    """Rendered with the images, so it has a graph."""
-    color: Float[Tensor, "B bh bw C"]
-    """May be negative."""
-
-
 def importance(
     contribution: Float[Tensor, " N"], removal: Float[Tensor, " N"]
 ) -> Float[Tensor, " N"]:
@@ -60,7 +51,7 @@ def removal_error(
     images: Float[Tensor, "B H W C"],
     opacities: Float[Tensor, " N"],
     rng: torch.Generator,
-    added: Optional[AddedBackground] = None,
+    added: Optional[tuple[Tensor, Tensor]] = None,
 ) -> Float[Tensor, " N"]:
     """Draw an unbiased estimate of the removal error of each Gaussian: the squared change of the
     views without it, summed over pixels and channels.
@@ -74,7 +65,9 @@ def removal_error(
     Args:
         images: rendered views, whose graph is kept.
         opacities: the tensor that they were rendered with.
-        added: a background that the views had but ``images`` don't show.
+        added: alpha (B, H, W, 1), rendered with the images, and a colour C (B, bh, bw, C), which
+            may be negative: the views had it but ``images`` I don't show it; they become
+            I + (1 - alpha) C.
     """
 
     def draw(count: int) -> Int8[Tensor, "count H W C"]:
@@ -87,8 +80,9 @@ def removal_error(
     zero = images.new_zeros(())
     total = given_gradient(images, signs, zero)
     if added is not None:
-        of_alpha = _sum_of_products(signs, added.color).neg_()
-        total = total + given_gradient(added.alpha, of_alpha, zero)
+        alpha, color = added
+        of_alpha = _sum_of_products(signs, color).neg_()
+        total = total + given_gradient(alpha, of_alpha, zero)
     (gradients,) = torch.autograd.grad(total, opacities, retain_graph=True)
     gradients = all_sum(gradients)
     return (opacities.detach() * gradients).square().nan_to_num(nan=0.0)

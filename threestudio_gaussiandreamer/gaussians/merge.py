@@ -25,7 +25,6 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..splatting.projection import quats_to_rotations
-from .densify import Change, unchanged
 from .neighbours import NeighbourSearch
 from .sh import C0
 
@@ -60,46 +59,43 @@ class _Shapes(NamedTuple):
     colors: Float[Tensor, "N 3"]
 
 
-def merge_duplicates(params: Mapping[str, Tensor], *, at_least: int = 1) -> Change:
-    """Merge all duplicates; a merged Gaussian is marked as new, with the first of its pair as the
-    parent.
+def merge_duplicates(params: Mapping[str, Tensor], *, at_least: int = 1) -> dict[str, Tensor]:
+    """Merge all duplicates; return new parameters, with the merged Gaussian in the place of the
+    first of its pair.
 
     Args:
         params: means, log_scales, quats, logit_opacities and the spherical harmonics (sh, or sh0
             and sh_rest).
         at_least: the number of Gaussians is not reduced below this.
     """
-    change = unchanged(params)
-    spent = torch.zeros(len(change.parents), dtype=torch.float64)
+    values = {name: value.detach().clone() for name, value in params.items()}
+    # cost of the earlier merges that each results from, accumulated, so that a sequence of small
+    # merges can't change the result by much
+    spent = torch.zeros(len(values["means"]), dtype=torch.float64)
     while True:
-        most = max(len(change.parents) - at_least, 0)
-        pairs, costs = (values[:most] for values in duplicates(change.values, spent))
-        if not len(pairs):
-            return change
-        change, spent = _merged(change, spent, pairs, costs)
+        pairs, found = _cheap_pairs(_shapes(values))
+        costs = found + spent[pairs].amax(1)
+        chosen = _disjoint(pairs, costs)[: max(len(spent) - at_least, 0)]
+        if not chosen:
+            return values
+        stay = torch.ones(len(spent), dtype=torch.bool)
+        stay[pairs[chosen, 1]] = False
+        spent[pairs[chosen, 0]] = costs[chosen]
+        for name, merged in _together(values, pairs[chosen]).items():
+            values[name][pairs[chosen, 0].to(values[name].device)] = merged.to(values[name])
+        values = {name: value[stay.to(value.device)] for name, value in values.items()}
+        spent = spent[stay]
 
 
-def duplicates(
-    params: Mapping[str, Tensor], spent: Float[Tensor, " N"]
-) -> tuple[Int[Tensor, "P 2"], Float[Tensor, " P"]]:
-    """Find disjoint pairs of rows to merge, those with the lowest cost first.
-
-    Args:
-        spent: cost of the earlier merges that each row results from.
-
-    Returns:
-        the pairs, and their costs including ``spent``.
-    """
-    pairs, found = _cheap_pairs(_shapes(params))
-    # accumulated, so that a sequence of small merges can't change the result by much
-    costs = found + spent[pairs].amax(1)
+def _disjoint(pairs: Int[Tensor, "P 2"], costs: Float[Tensor, " P"]) -> list[int]:
+    """Choose disjoint pairs that cost at most ``DUPLICATE``, those with the lowest cost first."""
     order = costs.argsort(stable=True)[: int((costs <= DUPLICATE).sum())]
     taken, chosen = set(), []
     for row, (first, second) in zip(order.tolist(), pairs[order].tolist(), strict=True):
         if first not in taken and second not in taken:
             taken |= {first, second}
             chosen.append(row)
-    return pairs[chosen], costs[chosen]
+    return chosen
 
 
 def _shapes(params: Mapping[str, Tensor]) -> _Shapes:
@@ -125,66 +121,54 @@ def _cheap_pairs(shapes: _Shapes) -> tuple[Int[Tensor, "P 2"], Float[Tensor, " P
     """Return the pairs of neighbours that cost at most ``DUPLICATE``, each once and its smaller row
     first, in ascending order, and their costs. Gaussians that aren't finite are in none.
     """
-    keys, costs, count = [], [], len(shapes.means)
-    for pairs in _neighbours(shapes.means):
-        found = _costs(shapes, pairs)
-        low, high = pairs[found <= DUPLICATE].unbind(1)
-        keys.append(low * count + high)
-        costs.append(found[found <= DUPLICATE])
-    if not keys:
-        return torch.zeros(0, 2, dtype=torch.long), torch.zeros(0, dtype=torch.float64)
+    rows, count = shapes.means.isfinite().all(1).nonzero()[:, 0].numpy(), len(shapes.means)
+    keys, costs = [torch.zeros(0, dtype=torch.long)], [torch.zeros(0, dtype=torch.float64)]
+    for first, second in _neighbours(shapes.means.numpy()[rows]):
+        apart = first != second
+        both = np.stack([rows[first[apart]], rows[second[apart]]], 1)
+        for pairs in torch.from_numpy(np.sort(both, axis=1)).split(PAIRS_AT_ONCE):
+            cost = _costs(shapes, pairs)
+            low, high = pairs[cost <= DUPLICATE].unbind(1)
+            keys.append(low * count + high)
+            costs.append(cost[cost <= DUPLICATE])
     keys, places = np.unique(torch.cat(keys).numpy(), return_index=True)
-    keys = torch.from_numpy(keys)
-    return torch.stack([keys // count, keys % count], 1), torch.cat(costs)[places]
+    pairs = np.stack(np.divmod(keys, max(count, 1)), 1)
+    return torch.from_numpy(pairs), torch.cat(costs)[places]
 
 
-def _neighbours(means: Float[Tensor, "N 3"]) -> Iterator[Int[Tensor, "P 2"]]:
-    """Pair every finite Gaussian with its nearest neighbours, smaller row first, at most
-    ``PAIRS_AT_ONCE`` pairs at a time; most pairs come twice.
+def _neighbours(
+    points: Float[np.ndarray, "N 3"],
+) -> Iterator[tuple[Int[np.ndarray, " P"], Int[np.ndarray, " P"]]]:
+    """Yield pairs of each point with its nearest ones, most of them twice, and of neighbours in
+    sorted order, since many copies of one point all have the same few nearest ones.
     """
-    rows = means.isfinite().all(1).nonzero()[:, 0].numpy()
-    if len(rows) < 2:
+    if len(points) < 2:
         return
-    points, count = means.numpy()[rows], min(NEIGHBOURS + 1, len(rows))
-    for found in NeighbourSearch(points).of_points(count):
-        yield from _pairs(rows, np.repeat(found.rows, count), found.nearest.reshape(-1))
-    # Many copies of one point all have the same few nearest neighbours, hence only one or two
-    # disjoint pairs; pairs of neighbours in sorted order are added for them.
+    count = min(NEIGHBOURS + 1, len(points))
+    for rows, _, nearest in NeighbourSearch(points).of_points(count):
+        yield np.repeat(rows, count), nearest.reshape(-1)
     order = np.lexsort(points.T)
-    yield from _pairs(rows, order[:-1], order[1:])
-
-
-def _pairs(
-    rows: Int[np.ndarray, " N"], first: Int[np.ndarray, " P"], second: Int[np.ndarray, " P"]
-) -> Iterator[Int[Tensor, "P 2"]]:
-    """Yield pairs of two different Gaussians from their places in ``rows``."""
-    different = first != second
-    pairs = np.stack([rows[first[different]], rows[second[different]]], 1)
-    yield from torch.from_numpy(np.sort(pairs, axis=1)).split(PAIRS_AT_ONCE)
-
-
-def _shares(shapes: _Shapes, pairs: Int[Tensor, "P 2"], least: float = 0.0) -> Float[Tensor, " P"]:
-    """Return f, the first one's share of the weight of each pair; at least ``least`` for both."""
-    first, second = shapes.weights[pairs].unbind(1)
-    return (first / (first + second)).clamp(least, 1 - least)
+    yield order[:-1], order[1:]
 
 
 def _moments(
-    shapes: _Shapes, pairs: Int[Tensor, "P 2"], f: Float[Tensor, " P"]
-) -> tuple[Float[Tensor, "P 3"], Float[Tensor, "P 3 3"]]:
-    """Return the mean and the covariance of each pair for the first one's share f."""
+    shapes: _Shapes, pairs: Int[Tensor, "P 2"], least: float = 0.0
+) -> tuple[Float[Tensor, " P"], Float[Tensor, "P 3"], Float[Tensor, "P 3 3"]]:
+    """Return f, the first one's share of the weight of each pair, at least ``least`` for both, and
+    the mean and the covariance of the pair.
+    """
     i, j = pairs.unbind(1)
+    f = (shapes.weights[i] / (shapes.weights[i] + shapes.weights[j])).clamp(least, 1 - least)
     apart = shapes.means[i] - shapes.means[j]
     means = shapes.means[j] + f[:, None] * apart
     weight, first, second = f[:, None, None], _covariances(shapes, i), _covariances(shapes, j)
     within = weight * first + (1 - weight) * second
-    return means, within + weight * (1 - weight) * apart[:, :, None] * apart[:, None]
+    return f, means, within + weight * (1 - weight) * apart[:, :, None] * apart[:, None]
 
 
 def _costs(shapes: _Shapes, pairs: Int[Tensor, "P 2"]) -> Float[Tensor, " P"]:
     i, j = pairs.unbind(1)
-    f = _shares(shapes, pairs, LEAST_SHARE)
-    _, covariances = _moments(shapes, pairs, f)
+    f, _, covariances = _moments(shapes, pairs, LEAST_SHARE)
     growth = (
         torch.linalg.slogdet(covariances).logabsdet
         - f * shapes.log_determinants[i]
@@ -192,20 +176,6 @@ def _costs(shapes: _Shapes, pairs: Int[Tensor, "P 2"]) -> Float[Tensor, " P"]:
     )
     apart = (shapes.colors[i] - shapes.colors[j]).square().sum(1)
     return 0.5 * (growth + torch.log1p(f * (1 - f) * apart / COLOR_TOLERANCE**2))
-
-
-def _merged(
-    change: Change, spent: Tensor, pairs: Int[Tensor, "P 2"], costs: Float[Tensor, " P"]
-) -> tuple[Change, Tensor]:
-    """Replace the first row of each pair by the merged Gaussian, and remove the second."""
-    values, device = change.values, change.parents.device
-    for name, merged in _together(values, pairs).items():
-        values[name][pairs[:, 0].to(device)] = merged.to(values[name])
-    spent[pairs[:, 0]] = costs
-    is_new, stay = change.is_new.clone(), torch.ones_like(change.is_new)
-    is_new[pairs[:, 0].to(device)], stay[pairs[:, 1].to(device)] = True, False
-    left = {name: value[stay] for name, value in values.items()}
-    return Change(change.parents[stay], is_new[stay], left), spent[stay.cpu()]
 
 
 def _together(params: Mapping[str, Tensor], pairs: Int[Tensor, "P 2"]) -> dict[str, Tensor]:
@@ -216,8 +186,7 @@ def _together(params: Mapping[str, Tensor], pairs: Int[Tensor, "P 2"]) -> dict[s
 
     params = {name: value.detach().cpu()[pairs.flatten()] for name, value in params.items()}
     shapes, pairs = _shapes(params), torch.arange(2 * len(pairs)).view(-1, 2)
-    f = _shares(shapes, pairs)
-    means, covariances = _moments(shapes, pairs, f)
+    f, means, covariances = _moments(shapes, pairs)
     # one that covers less than half of the merged area adds as much less to its opacity
     merged_areas = (torch.linalg.slogdet(covariances).logabsdet / 3).exp()
     covered = (2 * shapes.areas[pairs] / merged_areas[:, None]).clamp(max=1)

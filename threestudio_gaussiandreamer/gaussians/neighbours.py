@@ -5,7 +5,6 @@ are near each other, so points and queries are sorted by the cells of a grid fir
 chunks, which bounds the memory of their results."""
 
 from collections.abc import Iterator
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -15,15 +14,6 @@ CELLS = 64
 SAMPLES = 10_000
 """Points from which the box is estimated."""
 QUERIES_AT_ONCE = 2**18
-
-
-class Neighbours(NamedTuple):
-    """The nearest points of some of the points."""
-
-    rows: Int[np.ndarray, " Q"]
-    distances: Float[np.ndarray, "Q K"]
-    """Ascending; the first is 0, the point's own."""
-    nearest: Int[np.ndarray, "Q K"]
 
 
 class NeighbourSearch:
@@ -39,13 +29,17 @@ class NeighbourSearch:
         self.order = spatial_order(points)
         self.tree = cKDTree(points[self.order])
 
-    def of_points(self, count: int) -> Iterator[Neighbours]:
-        """Yield the ``count`` <= P nearest points of every point, itself among them, in chunks."""
+    def of_points(
+        self, count: int
+    ) -> Iterator[tuple[Int[np.ndarray, " Q"], Float[np.ndarray, "Q K"], Int[np.ndarray, "Q K"]]]:
+        """Yield, in chunks, rows of points, and the distances and the rows of the ``count`` <= P
+        points nearest to each; the first is the point itself, at 0.
+        """
         for start in range(0, len(self.order), QUERIES_AT_ONCE):
             chunk = slice(start, start + QUERIES_AT_ONCE)
             places = range(1, count + 1)  # a range, so that K = 1 keeps its dimension
             distances, found = self.tree.query(self.tree.data[chunk], k=places, workers=-1)
-            yield Neighbours(self.order[chunk], distances, self.order[found])
+            yield self.order[chunk], distances, self.order[found]
 
     def nearest(
         self, queries: Float[np.ndarray, "Q 3"], reach: float

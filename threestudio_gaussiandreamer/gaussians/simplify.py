@@ -39,8 +39,6 @@ RESERVE = 10.0
 BISECTIONS = 4
 """Steps that find how far a large cloud can be pruned at once, to within 1/16 of the range."""
 
-Ranking = Callable[[Gaussians, Views, int], Float[Tensor, " N"]]
-
 
 class Budget(NamedTuple):
     """Where to stop: at a number of Gaussians, before the PSNR of the validation views, in dB,
@@ -84,7 +82,6 @@ def simplify(
     recovery: Recovery,
     *,
     report: Callable[[Round], None] = lambda done: None,
-    rank: Ranking = view_importance,
 ) -> Gaussians:
     """Prune in rounds down to the smallest cloud that meets the budget.
 
@@ -92,12 +89,11 @@ def simplify(
         cloud: the original of ``recovery``.
         recovery: fits the remaining Gaussians after each round, and measures the quality.
         report: called after each round that was kept.
-        rank: returns the importance of each Gaussian, given the cloud, views and a seed.
 
     Raises:
         UserError: no Gaussian is visible in any view, so that they can't be ranked.
     """
-    return _Search(budget, recovery, report, rank).run(cloud)
+    return _Search(budget, recovery, report).run(cloud)
 
 
 class _Search:
@@ -105,11 +101,8 @@ class _Search:
     importance.
     """
 
-    def __init__(
-        self, budget: Budget, recovery: Recovery, report: Callable[[Round], None], rank: Ranking
-    ) -> None:
-        self.budget, self.recovery, self.report, self.rank = budget, recovery, report, rank
-        self.rounds = 0
+    def __init__(self, budget: Budget, recovery: Recovery, report: Callable[[Round], None]) -> None:
+        self.budget, self.recovery, self.report, self.rounds = budget, recovery, report, 0
 
     def run(self, cloud: Gaussians) -> Gaussians:
         self._take(self._unfitted(cloud))
@@ -129,7 +122,7 @@ class _Search:
     @functools.cached_property
     def scores(self) -> Float[Tensor, " N"]:
         """The importance of the Gaussians, ranked when it is first needed."""
-        return self.rank(self.cloud, self.recovery.train_views, self.recovery.seed)
+        return view_importance(self.cloud, self.recovery.train_views, self.recovery.seed)
 
     @property
     def cloud(self) -> Gaussians:
@@ -163,7 +156,7 @@ class _Search:
 
     def _merge(self) -> None:
         values = self.cloud._asdict()
-        merged = Gaussians(**merge_duplicates(values, at_least=self.budget.count or 1).values)
+        merged = Gaussians(**merge_duplicates(values, at_least=self.budget.count or 1))
         if len(merged.means) <= (1 - SMALLEST_DROP) * len(self.cloud.means):
             self._try(merged)
 
@@ -173,7 +166,12 @@ class _Search:
         Ends when the next count isn't above the last rejected one, or nothing is left to drop.
         """
         keep, failed = KEEP, 0
-        while failed < (count := self._next_count(keep)) < len(self.cloud.means):
+        while True:
+            here = len(self.cloud.means)
+            count = max(int(keep * here), self.budget.count or 1)
+            small = self.budget.count is None and count >= (1 - SMALLEST_DROP) * here
+            if small or not failed < count < here:
+                return
             if self._try(keep_best(self.cloud, self.scores, count)):
                 failed = 0
             else:
@@ -188,16 +186,6 @@ class _Search:
         self.rounds += 1
         self.report(done)
         return True
-
-    def _next_count(self, keep: float) -> int:
-        """Return the number of Gaussians after the next round; the present number if there is
-        nothing left to prune, or less than ``SMALLEST_DROP``.
-        """
-        here = len(self.cloud.means)
-        if self.budget.count is not None:
-            return min(here, max(int(keep * here), self.budget.count))
-        count = max(1, int(keep * here))
-        return here if count >= (1 - SMALLEST_DROP) * here else count
 
 
 def rounds_to(count: int, here: int) -> int:

@@ -34,7 +34,7 @@ from ..core.options import at_least, between, in_range, positive
 from ..core.streams import generator
 from ..gaussians import densify, importance
 from ..gaussians.densify import Change
-from ..gaussians.importance import AddedBackground, Need
+from ..gaussians.importance import Need
 from ..host import find, parse_structured, register, run_seed
 from ..splatting import Rasterized
 
@@ -249,7 +249,7 @@ class DensityControl(DensityRule):
         # still have a removal error.
         random = draw_shared(len(image), lambda count: torch.rand(count, 1, 1, 3, generator=rng))
         random = to_device(random, image.device).to(image)
-        added = AddedBackground(pictures["opacity"], random - pictures["comp_rgb_bg"].detach())
+        added = pictures["opacity"], random - pictures["comp_rgb_bg"].detach()
         opacities = pictures["gaussian_opacities"]
         self.cloud.removal += importance.removal_error(image, opacities, rng, added)
         if self.cloud.wants_absgrad:

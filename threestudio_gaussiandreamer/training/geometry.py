@@ -301,7 +301,7 @@ class GaussianCloud(BaseGeometry):
 
     def merge_duplicates(self) -> None:
         """Merge groups of near-identical Gaussians, until the budget is met or none are left."""
-        merged = merge_duplicates(self.parameters_by_name(), at_least=min_count(self.cfg)).values
+        merged = merge_duplicates(self.parameters_by_name(), at_least=min_count(self.cfg))
         if fewer := len(self) - len(merged["means"]):
             logger.info("%d of %d Gaussians are duplicates of others: merged", fewer, len(self))
             self.set_arrays(sh=torch.cat([merged.pop("sh0"), merged.pop("sh_rest")], 1), **merged)

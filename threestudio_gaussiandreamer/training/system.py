@@ -383,6 +383,9 @@ class GaussianDreamerSystem(export.GaussianSavers, BaseLift3DSystem):
 
 def check_parts(cfg: Any) -> None:
     """Raise UserError if a part that the system needs is missing or isn't of the needed class."""
+    for name in ("geometry", "renderer", "guidance", "prompt_processor"):
+        if not getattr(cfg, f"{name}_type"):
+            raise UserError(f"{name}_type is empty: name a registered part")
     for name, ours in OURS.items():
         part, base = getattr(cfg, f"{name}_type"), find(ours)
         if not issubclass(find(part), base):
