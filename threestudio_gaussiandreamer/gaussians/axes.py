@@ -29,8 +29,6 @@ AXES = {
     "z": np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]),
 }
 """Rotation to the axes (right, up, front), by the name of the axis that is up."""
-SAME_SCALE = 1e-4
-"""Largest relative difference of a node's scales that counts as rounding."""
 FRONTS = {"y": "+z", "-y": "-z", "z": "+x"}
 
 
@@ -67,7 +65,7 @@ def placed(gaussians: Gaussians, world: Float[np.ndarray, "4 4"], name: str) -> 
         return gaussians
     scale = np.linalg.norm(world[:3, :3], axis=0).mean()
     rotation = world[:3, :3] / (scale if 0 < scale < np.inf else 1)
-    close = np.allclose(rotation.T @ rotation, np.eye(3), atol=SAME_SCALE)
+    close = np.allclose(rotation.T @ rotation, np.eye(3), atol=1e-4)  # rounding
     if not close or np.linalg.det(rotation) < 0 or not np.isfinite(world).all():
         raise UserError(f"{name}: a node mirrors its Gaussians or scales them by different factors")
     turned = rotate(gaussians, rotation)

@@ -4,15 +4,15 @@ and its statistics.
 A :class:`Change` gives for every new row the old row that it comes from and whether the Gaussian is
 new, so that a Gaussian keeps its moments.
 
-Statistics are per view and unscaled. ``gradient`` is the norm of the loss's gradient with respect
-to the projected centre in normalised device units (half the image is 1), of the loss of one view
-(not divided by the batch), averaged over the views that saw the Gaussian: its meaning doesn't
-depend on resolution, batch size or a loss scale. ``contribution`` is the largest sigma_i T_i over
-the pixels of recent views (RadSplat, Niemeyer et al. 2024).
+Statistics are per view and unscaled. ``gradient`` is the norm of the gradient of one view's loss
+(not divided by the batch) with respect to the projected centre in normalised device units (half the
+image is 1), averaged over the views that saw the Gaussian, whatever resolution, batch size and loss
+scale are. ``contribution`` is the largest sigma_i T_i over the pixels of recent
+views (RadSplat, Niemeyer et al. 2024).
 
-Clone and split rules: Kerbl et al. 2023, section 5.2. Their periodic opacity reset, which removes
-floaters, isn't implemented: score distillation doesn't recover the opacities that a reset lowers,
-and pruning by contribution removes floaters as well."""
+Clone and split rules: Kerbl et al. 2023, section 5.2, without their periodic opacity reset: score
+distillation doesn't recover the opacities that it lowers, and pruning by contribution removes
+floaters as well."""
 
 import logging
 from collections.abc import Iterator
@@ -70,8 +70,8 @@ def densify_and_prune(
     drop those with a low opacity or a large scale.
 
     A Gaussian that no view has seen has no gradient and is neither cloned nor split; nor are those
-    with a low opacity. The number of Gaussians stays within ``most``, counted after the low
-    opacities are dropped, and ``least``.
+    with a low opacity. At least ``least`` and at most ``most``, counted after the low opacities are
+    dropped, stay, those with the largest contribution.
 
     Args:
         gradient, contribution: see above, of the steps since the last densification.
@@ -87,8 +87,15 @@ def densify_and_prune(
     large = params["log_scales"].exp().amax(-1) > rules.split_scale
     change = clone_and_split(params, clone=chosen & ~large, split=chosen & large, rng=rng)
     huge = change.values["log_scales"].exp().amax(-1) > rules.max_scale
-    rows = change.parents
-    return keep(change, ~(faint[rows] | huge), contribution[rows], least, most)
+    wanted = ~(faint[change.parents] | huge)
+    # every wanted row before every unwanted one, so that the floor is filled from the best of these
+    rank = torch.argsort(contribution[change.parents], descending=True, stable=True)
+    rank = rank[torch.argsort(wanted[rank].int(), descending=True, stable=True)]
+    left, floor = int(wanted.sum()), min(least, len(wanted))
+    if left < floor:
+        few = "only %d of %d Gaussians would be left: the %d that contribute most stay (%s)"
+        logger.warning(few, left, len(wanted), floor, "min_gaussians")
+    return select(change, rank[: min(max(left, floor), most)].sort().values)
 
 
 def clone_and_split(
@@ -110,26 +117,6 @@ def clone_and_split(
     values["means"][children] += rotate(values["quats"][children], offsets)
     values["log_scales"][children] -= torch.log(torch.tensor(SPLIT_SHRINK))
     return Change(parents, is_new, values)
-
-
-def keep(
-    change: Change,
-    wanted: Bool[Tensor, " M"],
-    contribution: Float[Tensor, " M"],
-    least: int,
-    most: int,
-) -> Change:
-    """Drop the unwanted rows, but keep at least ``least`` and at most ``most``, those with the
-    largest contribution.
-    """
-    # every wanted row before every unwanted one, so that the floor is filled from the best of these
-    rank = torch.argsort(contribution, descending=True, stable=True)
-    rank = rank[torch.argsort(wanted[rank].int(), descending=True, stable=True)]
-    left, floor = int(wanted.sum()), min(least, len(wanted))
-    if left < floor:
-        few = "only %d of %d Gaussians would be left: the %d that contribute most stay (%s)"
-        logger.warning(few, left, len(wanted), floor, "min_gaussians")
-    return select(change, rank[: min(max(left, floor), most)].sort().values)
 
 
 def highest(scores: Float[Tensor, " N"], count: int) -> Int[Tensor, " M"]:

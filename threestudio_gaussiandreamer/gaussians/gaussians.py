@@ -18,10 +18,8 @@ logger = logging.getLogger(__name__)
 Array = np.ndarray | Tensor
 MAX_LOG = 87.0
 """Largest absolute value of stored logits and logarithms of scales: exp(-87) is about the smallest
-normal float32, and the sigmoid of +-87 rounds to 1 and 0.
+normal float32.
 """
-
-
 SHAPES: dict[str, tuple[int, ...]] = {
     "means": (3,),
     "log_scales": (3,),
@@ -49,11 +47,7 @@ class Gaussians(NamedTuple):
 
     @classmethod
     def of(cls, source: Any) -> "Gaussians":
-        """Collect the attributes of ``source`` that have the names of the fields.
-
-        Raises:
-            UserError: it lacks some.
-        """
+        """Collect the attributes with the names of the fields; UserError for missing ones."""
         require_attributes(source, cls._fields)
         return cls(*(getattr(source, name) for name in cls._fields))
 

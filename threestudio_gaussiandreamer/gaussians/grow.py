@@ -140,5 +140,5 @@ def _neighbour_distances(search: NeighbourSearch, neighbours: int) -> Float[np.n
 
 
 def _isolation_cap(distances: Float[np.ndarray, " D"]) -> float:
-    # "lower": in a small cloud the percentile must not be the isolated point's own distance.
+    # "lower": in a small cloud the percentile must not be the isolated point's own distance
     return ISOLATED_FACTOR * float(np.quantile(distances, 0.99, method="lower"))

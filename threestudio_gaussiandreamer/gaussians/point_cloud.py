@@ -29,9 +29,8 @@ class PointCloud(NamedTuple):
 
     def split(self, count: int) -> tuple["PointCloud", "PointCloud"]:
         """Return the first ``count`` points, with the faces, and the remaining ones."""
-        parts = (
-            [None if values is None else values[rows] for values in self[:3]]
+        first, rest = (
+            PointCloud(*(None if values is None else values[rows] for values in self[:3]))
             for rows in (slice(count), slice(count, None))
         )
-        first, rest = parts
-        return PointCloud(*first, faces=self.faces), PointCloud(*rest)
+        return first._replace(faces=self.faces), rest

@@ -14,7 +14,7 @@ from torch import Tensor
 from ..core.streams import generator
 from .densify import steps_by_size
 from .gaussians import Gaussians
-from .views import Views, draw, psnr_lower_bound, render_with_contribution
+from .views import Views, psnr_lower_bound, rasterize_views, render_with_contribution
 
 LEARNING_RATES = {
     "means": 0.05,
@@ -56,10 +56,9 @@ class Recovery:
         train_views: the views that are fitted.
         val_views: other views, on which a recovery is accepted or rejected, since the PSNR of the
             fitted views improves even when that of others falls by a dB.
-        steps: Adam steps per recovery of at most ``MOST`` Gaussians.
+        steps: of Adam, for at most ``MOST`` Gaussians.
         seed: for the order of the views.
-        as_stored: converts Gaussians to what is read back from the file that will be written;
-            quality is measured on the result.
+        as_stored: converts to what is read back from the file, whose quality is measured.
         sh_reach: largest absolute value of the constant harmonic that the file can store.
     """
 
@@ -116,13 +115,8 @@ def recover(
     sh_reach: float = math.inf,
     lr_scale: float = 1.0,
 ) -> Gaussians:
-    """Fit Gaussians to the images of views; return new ones.
-
-    Args:
-        steps: Adam steps, each on four views; the rates fall linearly to zero.
-        seed: for the order of the views.
-        sh_reach: largest absolute value of the constant harmonics.
-        lr_scale: multiplies ``LEARNING_RATES``.
+    """Fit Gaussians to the images of views in Adam steps on four views each, with rates that fall
+    linearly from ``lr_scale`` times ``LEARNING_RATES`` to zero; return new ones.
     """
     leaves = cloud.map(lambda values: values.detach().clone().requires_grad_())
     rates = {name: lr_scale * rate for name, rate in LEARNING_RATES.items()}
@@ -131,7 +125,7 @@ def recover(
     for step, rows in enumerate(_batches(len(images), steps, seed)):
         for group in adam.param_groups:
             group["lr"] = rates[group["name"]] * (1 - step / steps)
-        image, _ = draw(leaves, views, rows)
+        image = rasterize_views(leaves, views, rows).image
         ((image - images[rows]) ** 2).mean().backward()
         with steps_by_size(leaves.means, leaves.log_scales.exp(), leaves.quats):
             adam.step()

@@ -23,7 +23,7 @@ from .gaussians import Gaussians
 from .importance import importance, removal_error
 from .merge import merge_duplicates
 from .recover import Recovery, Round
-from .views import Views, draw, row_batches
+from .views import Views, rasterize_views, row_batches
 
 KEEP = 0.8
 """Smallest fraction that a round keeps."""
@@ -41,18 +41,16 @@ BISECTIONS = 4
 
 
 class Budget(NamedTuple):
-    """Where to stop: at a number of Gaussians, before the PSNR of the validation views, in dB,
-    falls below a bound, or where twice as many would gain ``gain`` dB; at most one of the three is
-    given.
+    """Where to stop: at a number of Gaussians, before the PSNR of the validation views falls below
+    a bound, dB, or where twice as many would gain ``gain`` dB; at most one of them is given.
     """
 
     count: Optional[int] = None
     psnr: Optional[float] = None
     gain: Optional[float] = None
     error: float = 1e-4
-    """Mean squared error of the input to the ground truth, to which that of pruning is added for
-    ``gain``. Where nothing is known of it, 40 dB.
-    """
+    """Mean squared error of the input to the ground truth, to which ``gain`` adds that of pruning;
+    40 dB where nothing is known of it."""
 
     def met_by(self, done: Round, before: Round) -> bool:
         """Return whether a round, which began with ``before``, is within the budget."""
@@ -70,9 +68,9 @@ def view_importance(cloud: Gaussians, views: Views, seed: int = 0) -> Float[Tens
     rng = generator(seed, "worth")
     contribution, removal = torch.zeros(2, len(opacities), device=opacities.device)
     for rows in row_batches(views, len(opacities)):
-        image, contributed = draw(cloud, views, rows, opacities)
-        contribution = torch.maximum(contribution, contributed.amax(0))
-        removal = removal + removal_error(image, opacities, rng)
+        out = rasterize_views(cloud, views, rows, opacities=opacities)
+        contribution = torch.maximum(contribution, out.contribution.amax(0))
+        removal = removal + removal_error(out.image, opacities, rng)
     return importance(contribution, removal)
 
 
@@ -97,15 +95,13 @@ def simplify(
 
 
 class _Search:
-    """State of :func:`simplify`: the round with the smallest cloud so far, and its Gaussians'
-    importance.
-    """
+    """State of :func:`simplify`: ``best`` is the round with the smallest cloud so far."""
 
     def __init__(self, budget: Budget, recovery: Recovery, report: Callable[[Round], None]) -> None:
         self.budget, self.recovery, self.report, self.rounds = budget, recovery, report, 0
 
     def run(self, cloud: Gaussians) -> Gaussians:
-        self._take(self._unfitted(cloud))
+        self._take_unfitted(cloud)
         self._reduce(self.recovery.contribution)
         if not self.scores.any():
             raise UserError(
@@ -128,13 +124,14 @@ class _Search:
     def cloud(self) -> Gaussians:
         return self.best.cloud
 
-    def _unfitted(self, cloud: Gaussians) -> Round:
-        """Return a round without a recovery; only a gain needs its quality, as stored."""
-        return Round(cloud, math.inf if self.budget.gain is None else self.recovery.quality(cloud))
-
     def _take(self, best: Round) -> None:
         self.best = best
         self.__dict__.pop("scores", None)
+
+    def _take_unfitted(self, cloud: Gaussians) -> None:
+        # only a gain needs its quality, as stored
+        unknown = self.budget.gain is None
+        self._take(Round(cloud, math.inf if unknown else self.recovery.quality(cloud)))
 
     def _reduce(self, scores: Float[Tensor, " N"]) -> None:
         """Prune a large cloud at once, as far as its images stay the same without a recovery."""
@@ -152,7 +149,7 @@ class _Search:
         for _ in range(BISECTIONS if low < high else 0):
             middle = (low + high) // 2
             low, high = (low, middle) if same(middle) else (middle, high)
-        self._take(self._unfitted(keep_best(self.cloud, scores, high)))
+        self._take_unfitted(keep_best(self.cloud, scores, high))
 
     def _merge(self) -> None:
         values = self.cloud._asdict()

@@ -107,20 +107,17 @@ def _summed(
         _add_many(sums, in_cells, np.flatnonzero(half_sides == half_side), int(half_side))
     for row in np.flatnonzero(half_sides > SMALL):
         _add_one(sums, in_cells, row, int(half_sides[row]))
-    inner = np.zeros((*shape, 1))
-    inner[1:-1, 1:-1, 1:-1] = 1
-    sums *= inner
+    sums *= np.pad(np.ones(np.subtract(shape, 2)), 1)[..., None]
     return sums[..., 0], sums[..., 1:]
 
 
 class _InCells(NamedTuple):
-    """Gaussians in units of cells."""
+    """Gaussians in units of cells; ``weights``, times the opacity, are summed."""
 
     places: Float[np.ndarray, "N 3"]
     precisions: Float[np.ndarray, "3 3 N"]
     opacities: Float[np.ndarray, " N"]
     weights: Float[np.ndarray, "N 4"]
-    """1, red, green, blue: what is summed, times the opacity."""
 
 
 def _add_many(
@@ -181,7 +178,7 @@ def covariance_matrices(gaussians: Gaussians) -> Float[np.ndarray, "N 3 3"]:
 
 
 def _corner(bits: int) -> tuple[slice, ...]:
-    """Return the slices of a grid of nodes that select corner x + 2 y + 4 z of each cell."""
+    """Select corner x + 2 y + 4 z of each cell of a grid of nodes."""
     return tuple(slice(1, None) if bits >> axis & 1 else slice(None, -1) for axis in range(3))
 
 

@@ -136,32 +136,33 @@ def require_renderable(cloud: Gaussians, radius: float) -> None:
         )
 
 
-def draw(
-    cloud: Gaussians, views: Views, rows: Tensor, opacities: Optional[Float[Tensor, " N"]] = None
-) -> tuple[Float[Tensor, "B size size 3"], Float[Tensor, "B N"]]:
-    """Render some of the views; return images and each Gaussian's contribution to them.
-
-    Args:
-        rows: (B,) indices of the views.
-        opacities: used instead of the cloud's own, for gradients with respect to them.
-    """
-    grey = torch.full((3,), 0.5, device=cloud.means.device)
-    background = grey if views.backgrounds is None else views.backgrounds[rows]
-    out = rasterize_views(cloud, views, rows, background, opacities=opacities)
-    return out.image, out.contribution
-
-
 def rasterize_views(
     cloud: Gaussians,
     views: Views,
     rows: Tensor,
-    background: Float[Tensor, "... C"],
+    background: Optional[Float[Tensor, "... C"]] = None,
     *,
     opacities: Optional[Float[Tensor, " N"]] = None,
     channels: Optional[Float[Tensor, "B N K"]] = None,
 ) -> Rasterized:
-    """Rasterize some of the views; ``channels`` are composited after the three colours."""
-    colors = sh_to_colors(cloud.sh, _directions(cloud, views, rows))
+    """Rasterize some of the views.
+
+    Args:
+        rows: (B,) indices of the views.
+        background: by default that of the views, or grey.
+        opacities: used instead of the cloud's own, for gradients with respect to them.
+        channels: composited after the three colours.
+    """
+    if background is None:
+        grey = torch.full((3,), 0.5, device=cloud.means.device)
+        background = grey if views.backgrounds is None else views.backgrounds[rows]
+    # a single direction, of shape (1, 3), where the colours don't depend on it, saves most of the
+    # time and memory outside the rasteriser
+    directions = cloud.means.new_tensor([[0.0, 0.0, 1.0]])
+    if cloud.sh.shape[1] > 1:
+        away = cloud.means.detach() - views.positions[rows, None]
+        directions = torch.nn.functional.normalize(away, dim=-1)
+    colors = sh_to_colors(cloud.sh, directions)
     if channels is not None:
         colors = torch.cat([colors.expand(len(rows), -1, -1), channels], dim=-1)
     if opacities is None:
@@ -177,15 +178,6 @@ def rasterize_views(
     )
 
 
-def _directions(cloud: Gaussians, views: Views, rows: Tensor) -> Float[Tensor, "*B N 3"]:
-    """Return the unit vectors from the views to the Gaussians; a single one, of shape (1, 3), if
-    the colours don't depend on it, which saves most of the time and memory outside the rasteriser.
-    """
-    if cloud.sh.shape[1] == 1:
-        return cloud.means.new_tensor([[0.0, 0.0, 1.0]])
-    return torch.nn.functional.normalize(cloud.means.detach() - views.positions[rows, None], dim=-1)
-
-
 def render_all(cloud: Gaussians, views: Views) -> Float[Tensor, "V H W 3"]:
     """Render the images of all views, without gradients."""
     return render_with_contribution(cloud, views)[0]
@@ -198,9 +190,9 @@ def render_with_contribution(
     """Render the images of all views; return each Gaussian's largest contribution to any too."""
     images, contribution = [], torch.zeros_like(cloud.logit_opacities)
     for rows in row_batches(views, len(cloud.means)):
-        image, contributed = draw(cloud, views, rows)
-        images.append(image)
-        contribution = torch.maximum(contribution, contributed.amax(0))
+        out = rasterize_views(cloud, views, rows)
+        images.append(out.image)
+        contribution = torch.maximum(contribution, out.contribution.amax(0))
     return torch.cat(images), contribution
 
 
