@@ -46,8 +46,6 @@ def test_of_a_run_its_own_page_is_shown(run_folder):
 
 def test_what_can_not_be_shown_is_named(tmp_path, ply, monkeypatch):
     for options, message in (
-        ({"preset": "acurate"}, "unknown --preset 'acurate': did you mean 'accurate'"),
-        ({"up": "w"}, "unknown --up 'w'"),
         ({"background": "red"}, "--background: expected RRGGBB"),
         ({"eps2d": -1.0}, "--eps2d: expected a number of square pixels"),
     ):

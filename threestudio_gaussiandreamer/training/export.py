@@ -100,8 +100,8 @@ def prompt_of(system: Any) -> str:
 
 
 def export(system: Any) -> None:
-    """Write the files of the exporter, the page, and the pruned cloud: the end of a training run
-    and of ``--export``. Raises the first error of one of these, after all others are written.
+    """Write the files of the exporter, the page, and the pruned cloud. Raises the first error of
+    one of these, after all others are written.
     """
     folder = f"it{system.true_global_step}-export"
     calls = writers(system, system.geometry, folder)
@@ -188,7 +188,7 @@ def exported_files(folder: Path) -> list[str]:
 
 
 def save_first_cloud(system: Any) -> None:
-    """Keep the cloud that training starts with, so that pages can show it beside the result."""
+    """Keep the cloud that training starts with, which pages show beside the result."""
     if system.cfg.pages and system.trainer.is_global_zero:
         first = StoredCloud(read_gaussians(system.geometry))
         write_cloud(system.get_save_path(FIRST_CLOUD), first, ".spz")
@@ -252,9 +252,7 @@ def discard_turntable(system: Any) -> None:
 
 
 def write_turntable(system: Any) -> None:
-    """Write the test pictures as a video, and fewer of them as WebP. A video that can't be written
-    is a warning, since the exports follow.
-    """
+    """Write the test pictures as a video, or warn, since the exports follow; and some as WebP."""
     name = turntable_name(system)
     options = {"save_format": "mp4", "fps": 30, "name": "test", "step": system.true_global_step}
     try:

@@ -39,15 +39,14 @@ def require_finite(
     step: int,
     losses: Iterable[tuple[int, Mapping[str, Tensor]]] = (),
 ) -> None:
-    """Check that no tensor, of any shape, contains NaN, infinity or, of a cloud, numbers beyond
-    ``LIMITS``; synchronises with the device once.
+    """Check that no tensor contains NaN, infinity or, of a cloud, numbers beyond ``LIMITS``;
+    synchronises with the device once.
 
     Args:
         losses: the weighted losses of the steps since the last check, read only for the message.
 
     Raises:
-        UserError: the message has the name of the first tensor that isn't finite, the
-            number of its bad values, and the loss that may be the cause.
+        UserError: names the first bad tensor, how many values, and the loss that may be the cause.
     """
     named = [
         (name, values, LIMITS.get(name.rpartition(".")[2], torch.finfo(values.dtype).max))

@@ -214,18 +214,16 @@ class GaussianCloud(BaseGeometry):
     # -- derived quantities ------------------------------------------------------------------------
 
     def scales(self) -> Float[Tensor, "N 3"]:
-        """Compute standard deviations along the axes, world units; clamped where exp would over- or
-        underflow float32.
-        """
+        """Compute standard deviations, world units; clamped where exp would leave float32."""
         return self.log_scales.clamp(*LOG_SCALE_RANGE).exp()
 
     def opacities(self) -> Float[Tensor, " N"]:
         return torch.sigmoid(self.logit_opacities)
 
     def drawn(self) -> dict[str, Tensor]:
-        """Return ``means``, ``quats``, ``scales`` and ``opacities`` as they are drawn, by name."""
-        shape = {"means": self.means, "quats": self.quats, "scales": self.scales()}
-        return {**shape, "opacities": self.opacities()}
+        """Return what regularisers see, as it is drawn."""
+        scales, opacities = self.scales(), self.opacities()
+        return dict(means=self.means, quats=self.quats, scales=scales, opacities=opacities)
 
     @property
     def sh(self) -> Float[Tensor, "N K 3"]:
@@ -344,9 +342,7 @@ class GaussianCloud(BaseGeometry):
                 group["lr"] = C(getattr(self.cfg, LEARNING_RATES[group["name"]]), epoch, step)
 
     def steps_by_size(self) -> contextlib.AbstractContextManager[None]:
-        """Let a step of the optimiser see the means in standard deviations, if that is the unit of
-        their rate.
-        """
+        """Let the optimiser see the means in standard deviations, if their rate has that unit."""
         if self.cfg.lr_means_unit != "size" or self.means.grad is None:
             return contextlib.nullcontext()
         return densify.steps_by_size(self.means, self.scales(), self.quats)

@@ -1,8 +1,8 @@
 """Held-out scores: compare the cloud with ray-cast views of the mesh that aren't used in training,
-composited over the background of the render. PSNR and SSIM, averaged over the views; fraction of
-views that show another side of the object (multi-face); fraction of the opacity far from the
-surface (floater mass); fraction of pixels with a colour outside [0, 1] (out of gamut); mean
-saturation of the colours relative to the ground truth's."""
+composited over the background of the render. PSNR and SSIM, averaged over the views; shares of
+views that show another side of the object (multi-face), of the opacity far from the surface
+(floater mass) and of pixels with a colour outside [0, 1] (out of gamut); saturation of the colours
+relative to the ground truth's."""
 
 import time
 from collections.abc import Iterator

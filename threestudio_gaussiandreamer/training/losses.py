@@ -35,10 +35,7 @@ def weighted_losses(
     guided: Mapping[str, Any], out: Mapping[str, Any], weights: Mapping[str, float]
 ) -> dict[str, Tensor]:
     """Compute the weighted ``loss_*`` of a guidance, and the weighted regularisers of ``out``, the
-    renderer's outputs and the cloud as it is drawn.
-
-    Raises:
-        UserError: there is no loss, a weight without a loss, or a loss without a weight.
+    renderer's outputs and the cloud as it is drawn; raises UserError as :func:`check_weights`.
     """
     raw = {k.removeprefix("loss_"): v for k, v in guided.items() if k.startswith("loss_")}
     if not raw:
@@ -107,8 +104,8 @@ def logged_names(guidance: type, options: Iterable[str]) -> Optional[set[str]]:
 
 
 def check_losses(guidance: type, options: Mapping[str, Any]) -> None:
-    """Check the keys of ``system.loss``, and if the class of the guidance declares its losses, that
-    they fit those. Raises UserError.
+    """Raise UserError for wrong keys of ``system.loss``, also if the class of the guidance declares
+    its losses.
     """
     for name in options:
         if not name.startswith("lambda_"):

@@ -6,7 +6,7 @@ import http
 import ipaddress
 import socket
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, Optional
 from urllib.parse import urlsplit
 
@@ -89,11 +89,8 @@ class LiveView:
     def show_cameras(
         self, c2w: Float[np.ndarray, "B 4 4"], fovy: Float[np.ndarray, " B"], aspect: float
     ) -> None:
-        """Show the frustums of the training cameras: OpenGL's, in the world's axes.
-
-        Args:
-            fovy: radians.
-            aspect: width over height.
+        """Show the frustums of the training cameras: OpenGL's, in the world's axes; ``fovy`` in
+        radians, ``aspect`` width over height.
         """
         import viser.transforms
 
@@ -126,17 +123,19 @@ class Controls:
     def __init__(self, view: LiveView) -> None:
         gui = view.server.gui
         self.paused, self.step, self.picture = (threading.Event() for _ in range(3))
-        self._pause = gui.add_button("Pause")
-        self._pause.on_click(lambda _: self._toggle())
-        step = gui.add_button("One step")
-        step.on_click(lambda _: self.step.set())
-        picture = gui.add_button("Picture of the score model")
-        picture.on_click(lambda _: self.picture.set())
+        self._buttons, self._gui, self._view = [], gui, view
+        self._pause = self._add("Pause", self._toggle)
+        self._add("One step", self.step.set)
+        self._add("Picture of the score model", self.picture.set)
         self.cameras = gui.add_checkbox("Training cameras", True)
         self.cameras.on_update(lambda _: self.cameras.value or view.remove_cameras())
-        self._buttons, self._gui = [self._pause, step, picture, self.cameras], gui
-        self._view = view
+        self._buttons.append(self.cameras)
         self._image: Optional[Any] = None
+
+    def _add(self, label: str, action: Callable[[], None]) -> Any:
+        self._buttons.append(button := self._gui.add_button(label))
+        button.on_click(lambda _: action())
+        return button
 
     def may_go_on(self) -> bool:
         """Return whether the next step may begin; in a pause, a press of "One step" allows one."""
@@ -176,8 +175,7 @@ def is_own_page(site: Optional[str], origin: Optional[str], host: str) -> bool:
     machine, so that origin and host agree; therefore unknown names are refused.
 
     Args:
-        site: the header Host.
-        origin: the header Origin; ``None`` without one, as programs other than browsers send it.
+        site, origin: the headers Host and Origin, which only browsers send.
         host: the name or address that the server listens on.
     """
     name = (urlsplit(f"http://{site or ''}").hostname or "").rstrip(".")

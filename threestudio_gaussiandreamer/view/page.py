@@ -16,12 +16,12 @@ from urllib.parse import quote
 
 import numpy as np
 
-from ..core.errors import UserError, unknown
+from ..core.errors import UserError
 from ..core.files import atomic_file
 from ..formats.gaussian_files import StoredCloud, notes_of
 from ..formats.ply import NORMALS, gaussian_columns, gaussian_properties, header_bytes
 from ..formats.spz import SPZ_UP, spz_bytes
-from ..gaussians.axes import AXES, WORLD_UP, rotation_between
+from ..gaussians.axes import WORLD_UP, rotation_between
 from ..gaussians.gaussians import Gaussians, finite
 from ..gaussians.views import NEAR, bounds
 from ..splatting import PRESETS, RasterizeOptions
@@ -100,7 +100,9 @@ def page(shown: Shown, options: PageOptions, before: Optional[Shown] = None) -> 
     poster = picture(cloud, options.settings, pose, POSTER_SIZE)
     if not options.keep_background:
         options = options._replace(background=backdrop(poster, options.background))
-    script, style = sources(SCRIPTS), sources(["page.css"])
+    script, style = sources(*SCRIPTS), sources("page.css")
+    blocks = {f"cloud-{i}": packed(shown.cloud.gaussians) for i, shown in enumerate(clouds)}
+    blocks["spz"] = spz_bytes(cloud.in_axes(SPZ_UP).gaussians, notes_of(cloud, ".spz"))
     return template("page.html").render(
         policy=policy(script, style),
         title=options.title,
@@ -108,8 +110,8 @@ def page(shown: Shown, options: PageOptions, before: Optional[Shown] = None) -> 
         script=script,
         meta=_meta(clouds, options, pose),
         poster=_poster(poster, options.background),
-        data=_data_blocks(clouds),
-        shaders={name: sources([name]) for name in SHADERS},
+        data={name: base64.b64encode(block).decode() for name, block in blocks.items()},
+        shaders={name: sources(name) for name in SHADERS},
     )
 
 
@@ -165,17 +167,9 @@ def _meta(clouds: Sequence[Shown], options: PageOptions, pose: Pose) -> dict[str
     }
 
 
-def _data_blocks(clouds: Sequence[Shown]) -> dict[str, str]:
-    blocks = {f"cloud-{i}": packed(shown.cloud.gaussians) for i, shown in enumerate(clouds)}
-    stored = clouds[0].cloud
-    blocks["spz"] = spz_bytes(stored.in_axes(SPZ_UP).gaussians, notes_of(stored, ".spz"))
-    return {name: base64.b64encode(data).decode() for name, data in blocks.items()}
-
-
 def packed(gaussians: Gaussians) -> bytes:
-    """Compress the columns of a PLY file of N Gaussians (arrays) except the normals, which are
-    zero, to the bit. Each column is four planes (the lowest bytes of all values, then the next
-    ones, ...), since signs and exponents repeat.
+    """Compress the columns of a PLY file of Gaussians (arrays) but the normals to the bit, each as
+    four planes (the lowest bytes of all values, then the next ones, ...).
     """
     names = [name for name, _ in gaussian_properties(gaussians.sh.shape[1])]
     stored = [number for number, name in enumerate(names) if name not in NORMALS]
@@ -207,15 +201,13 @@ def _poster(poster: Any, background: Color) -> str:
 
 
 @cache
-def _source(name: str) -> str:
-    """Read a file of ``web/``; drop indentation, blank lines and comment lines."""
-    lines = (line.strip() for line in (WEB / name).read_text(encoding="utf-8").splitlines())
-    return "\n".join(line for line in lines if line and not line.startswith("//"))
-
-
-def sources(names: Sequence[str]) -> str:
-    """Join files of ``web/``; scripts become one script in strict mode, with one global scope."""
-    joined = "\n".join(map(_source, names))
+def sources(*names: str) -> str:
+    """Join files of ``web/`` without indentation, blank lines and comment lines; scripts become one
+    script in strict mode, with one global scope.
+    """
+    texts = [(WEB / name).read_text(encoding="utf-8") for name in names]
+    lines = (line.strip() for text in texts for line in text.splitlines())
+    joined = "\n".join(line for line in lines if line and not line.startswith("//"))
     return f'"use strict";\n{joined}' if names[0].endswith(".js") else joined
 
 
@@ -285,8 +277,7 @@ def cloud_page(
         up: the axis of the file that is up; by default from the file or its format's convention.
 
     Raises:
-        UserError: an option is invalid, which the message names as the command does; or the file
-            can't be read, or has no or too many Gaussians.
+        UserError: an option is invalid, or the file can't be read, or has no or too many Gaussians.
     """
     color = None
     if background is not None:
@@ -299,10 +290,6 @@ def cloud_page(
         color = (red / 255, green / 255, blue / 255)
     if eps2d is not None and not 0 <= eps2d < 1e6:
         raise UserError(f"--eps2d: expected a number of square pixels from 0 on, got {eps2d:g}")
-    if preset is not None and preset not in PRESETS:
-        raise unknown("--preset", preset, PRESETS)
-    if up is not None and up not in AXES:
-        raise unknown("--up", up, AXES)
     stored, run = read_any(source, up), RunFiles.around(source)
     require_page_size(len(stored.gaussians.means), str(source))
     if run:

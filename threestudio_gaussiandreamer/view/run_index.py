@@ -30,8 +30,6 @@ SCORES = {"psnr": "dB", "ssim": "SSIM", "multi_face": "multi-face", "gaussians":
 MAX_COMMANDS, MAX_POINTS, VALIDATION_PICTURES = 10, 400, 8
 TIMES = "times.json"
 """What the launcher notes of each stage: its name, when it began, and its seconds."""
-WIDTH, HEIGHT, LEFT, BOTTOM, TOP = 340, 180, 56, 160, 22
-"""Size of a curve's picture, and where its axes are, pixels."""
 SECTIONS = ("data", "system", "trainer", "checkpoint")
 USERS = ("name", "tag", "seed", "description", "exp_root_dir", "use_timestamp")
 """Keys at the top level that users set; the others are computed."""
@@ -67,8 +65,6 @@ def write_index(folder: Path) -> Path:
         scores=scores,
         scores_note=MULTI_FACE_NOTE,
         curves=[drawn(curves[name], CURVES[name]) for name in curves],
-        **{"width": WIDTH, "height": HEIGHT, "left": LEFT, "right": WIDTH - 8},
-        **{"top": TOP, "bottom": BOTTOM},
         pictures=[_picture(path, run) for path in _pictures(run)],
         commands=read_text(folder / "cmd.txt").splitlines()[-MAX_COMMANDS:],
         changes=config_changes(folder / "configs"),
@@ -100,9 +96,8 @@ def _pictures(run: RunFiles) -> list[Path]:
 def _picture(path: Path, run: RunFiles, page_folder: Optional[Path] = None) -> dict[str, Any]:
     """Return what a page shows of a picture, and a colour on which its object doesn't vanish."""
     color, caption = backdrop_of_file(path), str(path.relative_to(run.save))
-    where = address(path, page_folder or run.folder)
-    color = color and hex_color(color)
-    return {"href": where, "name": path.name, "caption": caption, "color": color}
+    shown = {"href": address(path, page_folder or run.folder), "name": path.name}
+    return shown | {"caption": caption, "color": color and hex_color(color)}
 
 
 def _times(run: RunFiles) -> Iterator[tuple[str, str, str]]:
@@ -188,29 +183,26 @@ def read_curves(folder: Path, names: Sequence[str]) -> dict[str, Curve]:
 
 
 def drawn(curve: Curve, title: str) -> dict[str, Any]:
-    """Return the picture of a curve over steps, logarithmic for several powers of ten."""
+    """Return a curve over steps for the page, logarithmic for several powers of ten: its points in
+    the unit square, and the lowest and highest value, first and last step.
+    """
     curve = curve[:: -(-len(curve) // MAX_POINTS)]
     steps, values = zip(*curve, strict=True)
     low, high = min(values), max(values)
     logarithmic = low > 0 and high > 100 * low
     heights = [math.log10(value) for value in values] if logarithmic else values
-    xs, ys = _scaled(steps, LEFT, WIDTH - 8), _scaled(heights, BOTTOM, TOP)
-    title = f"{title}, logarithmic" if logarithmic else title
-    texts = [
-        (LEFT, 14, title, "start"),
-        (LEFT - 4, TOP + 8, number(high), "end"),
-        (LEFT - 4, BOTTOM, number(low), "end"),
-        (LEFT, HEIGHT - 6, f"step {number(steps[0])}", "start"),
-        (WIDTH - 8, HEIGHT - 6, number(steps[-1]), "end"),
-    ]
-    points = " ".join(f"{x:.1f},{y:.1f}" for x, y in zip(xs, ys, strict=True))
-    return {"title": title, "points": points, "texts": texts}
+    points = zip(_in_unit(steps), _in_unit(heights), strict=True)
+    return {
+        "title": f"{title}, logarithmic" if logarithmic else title,
+        "points": " ".join(f"{x:.4f},{y:.4f}" for x, y in points),
+        "ends": [number(end) for end in (low, high, steps[0], steps[-1])],
+    }
 
 
-def _scaled(values: Sequence[float], first: float, last: float) -> list[float]:
-    """Map the range of the values to ``first`` to ``last``; a constant lies in the middle."""
+def _in_unit(values: Sequence[float]) -> list[float]:
+    """Map the range of the values to 0 to 1; a constant lies in the middle."""
     low, span = min(values), max(values) - min(values)
-    return [first + (last - first) * ((value - low) / span if span else 0.5) for value in values]
+    return [(value - low) / span if span else 0.5 for value in values]
 
 
 def write_gallery(folder: Path) -> Path:
