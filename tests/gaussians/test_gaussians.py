@@ -12,16 +12,6 @@ def some(count=5, degree=1):
     return Gaussians(*(rng.normal(size=(count, *shape)).astype(np.float32) for shape in shapes))
 
 
-def test_rows_selects_the_same_gaussians_from_every_field():
-    gaussians, index = some(), np.array([3, 0])
-    for kind in (gaussians, gaussians.tensors()):
-        chosen = kind.rows(index)
-        for name in Gaussians._fields:
-            assert (getattr(chosen, name) == getattr(kind, name)[index]).all()
-    assert len(gaussians.rows(gaussians.means[:, 0] > 1e9).means) == 0
-    assert gaussians.sh_degree == 1
-
-
 def test_tensors_and_arrays_convert_back_and_forth_without_gradients():
     gaussians = some()
     tensors = gaussians.tensors().map(lambda values: values.requires_grad_())

@@ -1,7 +1,5 @@
 """Recovery improves Gaussians and never makes them worse."""
 
-from types import SimpleNamespace
-
 import pytest
 import torch
 
@@ -16,12 +14,6 @@ def views(cloud, train, val, size=48):
     """Return training and validation views."""
     sets = ((train, 0.0), (val, 45.0))
     return [views_around(cloud, count, size, turn=turn) for count, turn in sets]
-
-
-def keep_duplicates(monkeypatch):
-    monkeypatch.setattr(
-        simplify, "merge_duplicates", lambda values, at_least: SimpleNamespace(values=values)
-    )
 
 
 def test_recovery_pays():
@@ -56,7 +48,7 @@ def test_a_recovery_never_lowers_the_quality(monkeypatch, count, bearable, tried
         return cloud if lr_scale <= next(bearable) else cloud._replace(sh=cloud.sh + 1)
 
     monkeypatch.setattr(recover, "recover", recover_with)
-    keep_duplicates(monkeypatch)
+    monkeypatch.setattr(simplify, "merge_duplicates", lambda values, at_least: values)
     recovery = Recovery(cloud, train_views, val_views, steps=1)
     found = simplify.simplify(cloud, Budget(count=count), recovery)
     assert scales == tried
