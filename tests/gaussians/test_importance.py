@@ -131,7 +131,10 @@ def test_sampling_leaves_the_gradients_of_the_loss_alone(backend):
         geometry = cloud(12, budget=budget, densify={"enabled": True, "absgrad": True})
         geometry.sh0.data[0] = -0.5 / 0.28209479177387814  # black, as the background
         opacities = geometry.opacities()
-        shape, colors = (geometry.means, geometry.quats, geometry.scales()), geometry.colors(c2w)
+        shape, colors = (
+            (geometry.means, geometry.quats, geometry.scales()),
+            geometry.colors(c2w[:, :3, 3]),
+        )
         inputs = *shape, opacities, colors, viewmats, Ks, 32, 32
         out = rasterize(*inputs, absgrad=True, backend=backend)
         pictures = {"comp_rgb": out.image, "opacity": out.alpha, "rasterized": out}
