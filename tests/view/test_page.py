@@ -21,23 +21,11 @@ from threestudio_gaussiandreamer.view.page import (
     coarse,
     packed,
     page,
-    write_page,
 )
 
 
 def meta(text: str) -> dict:
     return json.loads(re.search(r'id="meta">(.*?)</script>', text)[1])
-
-
-def test_5000_gaussians_and_their_prior_take_less_than_600_kB(tmp_path):
-    path = tmp_path / "view.html"
-    # a prior's Gaussians are isotropic and equally opaque
-    prior = cloud(10_000, stretch=0.0, size=0.01)
-    plain = prior.gaussians._replace(quats=np.tile(np.float32([1, 0, 0, 0]), (10_000, 1)))
-    plain = plain._replace(logit_opacities=np.full(10_000, -1, np.float32))
-    before = Shown(prior._replace(gaussians=plain), "prior")
-    write_page(path, Shown(cloud(5000), "result"), options(), before)
-    assert path.stat().st_size < 600_000
 
 
 def test_a_prompt_is_text_wherever_it_stands():

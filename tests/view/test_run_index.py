@@ -13,8 +13,6 @@ from urllib.parse import unquote
 import numpy as np
 import pytest
 
-from benchmarks.viewers.browser import chromium
-from benchmarks.viewers.devtools import open_page
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.core.images import write
 from threestudio_gaussiandreamer.view.page import cloud_page
@@ -28,9 +26,6 @@ from threestudio_gaussiandreamer.view.run_index import (
 
 PROMPT = 'a <img src=x onerror="alert(1)"> & </title><script>alert(1)</script>'
 LOG = "dB,loss,gaussians,step\n10.0,5.0,200,1\n,,,2\n20.0,0.01,150,123456\nnan,x,,4\n"
-
-
-PHONE = {"width": 320, "height": 600, "deviceScaleFactor": 1, "mobile": True}
 
 
 class Tags(HTMLParser):
@@ -113,21 +108,6 @@ def test_a_white_object_does_not_vanish_on_the_page(full_run):
     write(full_run / "save" / "it7-export" / "poster.png", poster)
     for page in (write_index(full_run), write_gallery(full_run.parent)):
         assert re.search(r'<img [^>]*poster.png"[^>]*style="background: #202020"', page.read_text())
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(chromium() is None, reason="no Chromium is installed")
-def test_a_phone_shows_the_pages_without_scrolling_sideways(full_run):
-    """And numbers in one line."""
-    run = full_run.rename(full_run.with_name("a_long_path_" * 12))
-    with open_page(write_gallery(run.parent).as_uri(), size=(320, 600)) as page:
-        page.call("Emulation.setDeviceMetricsOverride", **PHONE)
-        assert page.evaluate("document.documentElement.scrollWidth") <= 320
-        page.call("Page.navigate", url=(run / "index.html").as_uri())
-        page.evaluate("new Promise(done => setTimeout(done, 1000))")
-        assert page.evaluate("document.documentElement.scrollWidth") <= 320
-        cells = "[...document.querySelector('table').querySelectorAll('td')]"
-        assert max(page.evaluate(f"{cells}.map(x => x.offsetHeight)")) < 35
 
 
 def test_names_that_are_not_utf_8_are_linked(full_run):
