@@ -5,7 +5,6 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.training.background import FlatBackground
 from threestudio_gaussiandreamer.training.geometry import GaussianCloud
 from threestudio_gaussiandreamer.training.optimizer import PartRates
@@ -46,15 +45,6 @@ def test_learned_starts_at_the_colour_stays_in_range_and_learns():
     assert optimizer.param_groups[0]["lr"] == pytest.approx(0.2)
     color = background.color(1)[0]
     assert color[0] > 0.95 and color[1] < 0.05 and color.min() >= 0 and color.max() <= 1
-
-
-@pytest.mark.parametrize(
-    "wrong, named",
-    [({"mode": "randm"}, "random"), ({"color": [0, 0, 2]}, "color"), ({"lr": "fast"}, "lr")],
-)
-def test_wrong_options_are_named(wrong, named):
-    with pytest.raises(UserError, match=named):
-        FlatBackground(wrong)
 
 
 def test_a_derived_background_with_colours_of_pixels_is_drawn():

@@ -5,8 +5,6 @@ keeps at most 1.2 M.
 import math
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
 from threestudio_gaussiandreamer.gaussians.sh import rgb_to_sh0
@@ -26,52 +24,40 @@ RATES = {
 """Those of configs/demo.yaml."""
 
 
-def torus(count: int, seed: int) -> Gaussians:
-    """Return flat Gaussians of random colours on a torus, each of which is visible from
-    somewhere.
-    """
+def colored(rng: torch.Generator) -> torch.Tensor:
+    return rgb_to_sh0(torch.rand(M, 1, 3, generator=rng))
+
+
+def torus(seed: int) -> Gaussians:
+    """Return flat Gaussians of random colours on a torus, each visible from somewhere."""
     rng = torch.Generator().manual_seed(seed)
-    u, v = 2 * math.pi * torch.rand(2, count, generator=rng)
+    u, v = 2 * math.pi * torch.rand(2, M, generator=rng)
     normals = torch.stack([u.cos() * v.cos(), u.sin() * v.cos(), v.sin()], 1)
-    ring = torch.stack([u.cos(), u.sin(), torch.zeros(count)], 1)
-    size = 0.5 * math.sqrt(4 * math.pi**2 * 0.7 * 0.3 / count)
-    noise = 0.3 * torch.randn(count, 3, generator=rng)
-    log_scales = torch.tensor([size, size, 0.2 * size]).log() + noise
+    ring = torch.stack([u.cos(), u.sin(), torch.zeros(M)], 1)
+    size = 0.5 * math.sqrt(4 * math.pi**2 * 0.7 * 0.3 / M)
+    log_scales = torch.tensor([size, size, 0.2 * size]).log()
+    log_scales = log_scales + 0.3 * torch.randn(M, 3, generator=rng)
     # half a turn around the bisector takes +z to the normal
     bisectors = torch.nn.functional.normalize(normals + torch.tensor([0, 0, 1.0]), dim=1)
-    quats = torch.cat([torch.zeros(count, 1), bisectors], 1)
-    opacities = 0.6 + 0.35 * torch.rand(count, generator=rng)
+    quats = torch.cat([torch.zeros(M, 1), bisectors], 1)
+    opacities = 0.6 + 0.35 * torch.rand(M, generator=rng)
     means = 0.7 * ring + 0.3 * normals
-    return Gaussians(means, quats, log_scales, opacities.logit(), colored(count, rng))
+    return Gaussians(means, quats, log_scales, opacities.logit(), colored(rng))
 
 
-def colored(count: int, rng: torch.Generator) -> Float[Tensor, "N 1 3"]:
-    return rgb_to_sh0(torch.rand(count, 1, 3, generator=rng))
-
-
-def floaters(count: int, seed: int) -> Gaussians:
-    """Return Gaussians like those of the torus, uniformly in a box without cameras."""
-    rng = torch.Generator().manual_seed(1000 + seed)
-    means = 1.6 * torch.rand(count, 3, generator=rng) - 0.8
-    return torus(count, seed + 1)._replace(means=means, sh=colored(count, rng))
-
-
-def mixed(clouds: list[Gaussians], seed: int) -> Gaussians:
-    """Join clouds in random order."""
-    together = Gaussians(*(torch.cat(values) for values in zip(*clouds, strict=True)))
-    order = torch.randperm(len(together.means), generator=torch.Generator().manual_seed(seed))
-    return together.rows(order)
-
-
-def with_copies_and_floaters(true: Gaussians, seed: int) -> Gaussians:
-    """Add copies, moved by about a third of the thinnest axis, and floaters as opaque as
-    the rest.
+def with_copies_and_floaters(true: Gaussians) -> Gaussians:
+    """Add copies, moved by about a third of the thinnest axis, and floaters as opaque as the rest,
+    in a box without cameras; all in random order.
     """
-    rng = torch.Generator().manual_seed(seed)
+    rng = torch.Generator().manual_seed(0)
     thinnest = true.log_scales.exp().amin(1, keepdim=True)
-    shifts = (0.3 * thinnest * torch.randn(true.means.shape, generator=rng) for _ in range(2))
-    moved = [true._replace(means=true.means + shift) for shift in shifts]
-    return mixed([true, *moved, floaters(len(true.means), seed)], seed)
+    shifts = [0.3 * thinnest * torch.randn(M, 3, generator=rng) for _ in range(2)]
+    rng = torch.Generator().manual_seed(1000)
+    means = 1.6 * torch.rand(M, 3, generator=rng) - 0.8
+    floaters = torus(1)._replace(means=means, sh=colored(rng))
+    clouds = true, *(true._replace(means=true.means + shift) for shift in shifts), floaters
+    order = torch.randperm(4 * M, generator=torch.Generator().manual_seed(0))
+    return Gaussians(*(torch.cat(values)[order] for values in zip(*clouds, strict=True)))
 
 
 def trained(geometry, views, pictures):
@@ -79,27 +65,19 @@ def trained(geometry, views, pictures):
     adam = torch.optim.Adam(geometry.parameter_groups(), betas=(0.9, 0.99), eps=1e-15)
     rng = torch.Generator().manual_seed(0)
 
-    def draw(rows, opacities):
-        colors = geometry.colors(views.positions[rows])
-        cloud = geometry.means, geometry.quats, geometry.scales(), opacities, colors
-        camera = views.viewmats[rows], views.Ks[rows]
-        return rasterize(*cloud, *camera, SIZE, SIZE, background=views.backgrounds[rows])
-
     control = DensityControl(geometry)
     for step in range(1, STEPS + 1):
         geometry.set_learning_rates(adam, 0, step)
         rows = torch.randperm(len(pictures), generator=rng)[:4]
         opacities = geometry.opacities()
-        out = draw(rows, opacities)
-        behind = views.backgrounds[rows][:, None, None]
-        pictures_now = {
-            "comp_rgb": out.image,
-            "opacity": out.alpha,
-            "comp_rgb_bg": behind,
-            "gaussian_opacities": opacities,
-        }
+        shape, colors = (geometry.means, geometry.quats), geometry.colors(views.positions[rows])
+        camera, behind = (views.viewmats[rows], views.Ks[rows], SIZE, SIZE), views.backgrounds[rows]
+        cloud = *shape, geometry.scales(), opacities, colors
+        out = rasterize(*cloud, *camera, background=behind)
+        seen = {"comp_rgb": out.image, "opacity": out.alpha, "gaussian_opacities": opacities}
         error = (out.image.detach() - pictures[rows]).square().mean()
-        control.before_backward(pictures_now, step - 1, lambda error=error: error)
+        seen["comp_rgb_bg"] = behind[:, None, None]
+        control.before_backward(seen, step - 1, lambda error=error: error)
         (0.5 * (out.image - pictures[rows]).square().sum() / 4).backward()
         control.after_backward(out, SIZE, SIZE)
         adam.step()
@@ -109,8 +87,8 @@ def trained(geometry, views, pictures):
 
 
 def test_auto_finds_the_true_number_with_visible_floaters_and_copies():
-    true = torus(M, 0)
-    start = with_copies_and_floaters(true, 0)
+    true = torus(0)
+    start = with_copies_and_floaters(true)
     views, unseen = (
         views_around(true, count, SIZE, turn=turn) for count, turn in ((48, 0.0), (16, 60.0))
     )

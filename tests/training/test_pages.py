@@ -76,6 +76,10 @@ def test_a_run_ends_with_a_page_of_its_cloud(save):
     poster = np.asarray(Image.open(save / "it2-export" / "poster.png"))
     assert poster.shape == (512, 512, 4)
     assert poster[0, 0, 3] == 0 and poster[..., 3].max() > 60
+    turntable = Image.open(save / "it2-test.webp")
+    assert turntable.n_frames == len(list((save / "it2-test").glob("*.png"))) == 3
+    expected = read(save / "it2-test" / "0.png").astype(float)
+    assert np.abs(np.asarray(turntable.convert("RGB")) - expected).mean() < 8
 
 
 def test_a_run_without_ffmpeg_or_a_page_exports_its_cloud_all_the_same(
@@ -91,23 +95,6 @@ def test_a_run_without_ffmpeg_or_a_page_exports_its_cloud_all_the_same(
     said = capfd.readouterr().err
     assert "pip install imageio-ffmpeg" in said
     assert "no view.html is written" in said and "200 Gaussians" in said
-
-
-def test_the_turntable_is_an_animated_picture_too(save):
-    turntable = Image.open(save / "it2-test.webp")
-    assert turntable.n_frames == len(list((save / "it2-test").glob("*.png"))) == 3
-    expected = read(save / "it2-test" / "0.png").astype(float)
-    assert np.abs(np.asarray(turntable.convert("RGB")) - expected).mean() < 8
-
-
-def test_pictures_of_an_earlier_test_are_discarded(save):
-    system = SimpleNamespace(get_save_dir=lambda: str(save), true_global_step=2)
-    pictures = list((save / "it2-test").glob("*.png"))
-    kept = {path: path.read_bytes() for path in pictures}
-    discard_turntable(system)
-    assert kept and not any(path.exists() for path in kept)
-    for path, content in kept.items():
-        path.write_bytes(content)
 
 
 IMAGES = "[...document.images].map(image => image.decode().then(() => image.naturalWidth))"
@@ -133,7 +120,9 @@ def test_a_browser_shows_the_index_of_a_run(save):
         assert index.as_uri() in page.requests
 
 
-def test_export_writes_the_page_again_and_keeps_the_pictures_of_the_test(save, painted_box):
+def test_export_writes_the_page_again_and_the_next_test_discards_earlier_pictures(
+    save, painted_box
+):
     pictures = sorted((save / "it2-test").glob("*.png"))
     page = save / "it2-export/view.html"
     page.unlink()
@@ -141,3 +130,5 @@ def test_export_writes_the_page_again_and_keeps_the_pictures_of_the_test(save, p
     assert launch(save.parents[2], painted_box, *resume, stage="--export") == 0
     assert pictures and sorted((save / "it2-test").glob("*.png")) == pictures
     assert [shown["label"] for shown in meta(page)["clouds"]] == ["result", "prior"]
+    discard_turntable(SimpleNamespace(get_save_dir=lambda: str(save), true_global_step=2))
+    assert not any(path.exists() for path in pictures)
