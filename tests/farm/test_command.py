@@ -4,6 +4,7 @@ import fcntl
 import os
 import sys
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
@@ -43,9 +44,7 @@ def farm(tmp_path, monkeypatch, capsys):
 
 
 def no_ray(monkeypatch):
-    def refuse(address):
-        raise AssertionError("Ray was started")
-
+    refuse = Mock(side_effect=AssertionError("Ray was started"))
     monkeypatch.setattr(command.driver, "connect", refuse)
 
 
@@ -172,8 +171,8 @@ def test_the_low_memory_configuration_is_used_where_it_is_valid():
     ],
 )
 def test_a_folder_of_another_farm_is_refused(tmp_path, other, message):
-    require_same_farm(Place(tmp_path), RECIPE)
     moved = (Source("elsewhere/a.yaml", b"x: 1"),)
-    require_same_farm(Place(tmp_path), RECIPE._replace(sources=moved))
+    for same in (RECIPE, RECIPE._replace(sources=moved)):
+        require_same_farm(Place(tmp_path), same)
     with pytest.raises(ValueError, match=f"belongs to another farm: {message}"):
         require_same_farm(Place(tmp_path), other)

@@ -2,6 +2,7 @@
 
 import errno
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
 
@@ -16,15 +17,14 @@ ROWS = [Row(f"toy{i}", f"toy {i}", i) for i in range(6)]
 LOW = Source("low.yaml", b"")
 
 
+class RayError(Exception):
+    pass
+
+
 class FakeRay:
-    """Ray's calls that the driver makes; an outcome may be an exception."""
+    """Ray's calls that the driver makes; a handle returns an outcome, which may be an exception."""
 
-    class exceptions:
-        class RayError(Exception):
-            pass
-
-        class RayActorError(RayError):
-            pass
+    exceptions = SimpleNamespace(RayError=RayError)
 
     def __init__(self):
         self.restarted = []
@@ -33,24 +33,21 @@ class FakeRay:
         return handles[:num_returns], handles[num_returns:]
 
     def get(self, handle, timeout=None):
-        if isinstance(handle.outcome, Exception):
-            raise handle.outcome
-        return handle.outcome
+        if isinstance(outcome := handle(), Exception):
+            raise outcome
+        return outcome
 
     def kill(self, worker, no_restart):
         assert not no_restart
         self.restarted.append(worker)
 
 
-class Handle:
-    """Of a call: its outcome, which is there at once."""
-
-    def __init__(self, outcome):
-        self.outcome = outcome
-
-
 def remote(call):
-    return SimpleNamespace(remote=lambda *args: Handle(call(*args)))
+    def handle(*args):
+        outcome = call(*args)
+        return lambda: outcome
+
+    return SimpleNamespace(remote=handle)
 
 
 def finished(job):
@@ -67,15 +64,10 @@ class Bench:
         board = SimpleNamespace(
             read=remote(lambda: self.beats), stop=remote(lambda: self.stops.append(1))
         )
-        self.driver = Driver(
-            self.ray,
-            [SimpleNamespace(make=remote(self._make))],
-            Setting(recipe, self.place, board, "", "now", 3),
-            iter([Job(row, spent=100.0) for row in rows]),
-            10.0,
-            len(rows),
-            0,
-        )
+        workers = [SimpleNamespace(make=remote(self._make))]
+        setting = Setting(recipe, self.place, board, "", "now", 3)
+        jobs = iter([Job(row, spent=100.0) for row in rows])
+        self.driver = Driver(self.ray, workers, setting, jobs, 10.0, len(rows), 0)
 
     def _make(self, job, number, setting):
         self.made.append(job)
@@ -116,7 +108,7 @@ def stopped_once():
     [
         (finished, LOW, [FINISHED, *REST], None),
         (first_is(FAILS), LOW, [FAILED, *REST], "no surface"),
-        (first_is(FakeRay.exceptions.RayActorError("killed")), LOW, [FAILED, *REST], "its worker"),
+        (first_is(RayError("killed")), LOW, [FAILED, *REST], "its worker"),
         (first_is(NO, saves_memory=False), LOW, [FINISHED, *REST], None),
         (first_is(NO), LOW, [FAILED, *REST], "out of memory"),
         (first_is(NO), None, [FAILED, *REST], "out of memory"),
@@ -131,15 +123,9 @@ def test_an_outcome_decides_what_becomes_of_an_asset(
     tmp_path, capsys, answers, low_memory, states, error
 ):
     bench = Bench(tmp_path, answers, low_memory=low_memory)
-    noted = []
-    write = bench.place.write
-
-    def watched(name, record):
-        noted.append(record)
-        write(name, record)
-
-    bench.place.write = watched
+    bench.place.write = Mock(wraps=bench.place.write)
     bench.driver.run()
+    noted = [call.args[1] for call in bench.place.write.call_args_list]
     assert bench.states() == states and not bench.stops
     record, said = bench.records()[0], capsys.readouterr().err
     assert "toy5: f" in said and (answers is not finished or "(1 of 6, 00:00 left)" in said)
@@ -167,11 +153,8 @@ def test_obstacles_end_the_farm_and_leave_the_assets_to_the_next(tmp_path, monke
         bench.driver.run()
     assert len(bench.made) == 3
     bench = Bench(tmp_path / "c", lambda job: FAILS)
-
-    def refuse(folder, *args, **options):
-        raise OSError(errno.ENOSPC, "no space left")
-
-    monkeypatch.setattr("pathlib.Path.mkdir", refuse)  # the record of the failure
+    full = Mock(side_effect=OSError(errno.ENOSPC, "no space left"))
+    monkeypatch.setattr("pathlib.Path.mkdir", full)  # the record of the failure
     with pytest.raises(UserError, match="no space left"):
         bench.driver.run()
     assert len(bench.made) == 1 and bench.stops
@@ -196,11 +179,8 @@ def test_a_worker_that_hangs_is_restarted_once_for_each_standstill(tmp_path):
 def test_ctrl_c_lets_the_workers_write_checkpoints(tmp_path):
     def answers(job):
         if job.row == ROWS[1]:
-            bench.driver.fill = interrupted
+            bench.driver.fill = Mock(side_effect=KeyboardInterrupt)
         return finished(job) if job.row == ROWS[0] else {"state": STOPPED, "error": "stopped"}
-
-    def interrupted():
-        raise KeyboardInterrupt
 
     bench = Bench(tmp_path, answers)
     with pytest.raises(KeyboardInterrupt):

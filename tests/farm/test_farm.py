@@ -101,14 +101,10 @@ class Farm:
         self.command = [*command, "--out", str(self.out), "--gpus", "0", "--workers", "2"]
 
     def start(self, *more, cluster="", **environment):
-        return subprocess.Popen(
-            [*self.command, *(["--address", cluster] if cluster else []), *more],
-            cwd=self.place,
-            env={**os.environ, "PYTHONPATH": str(ROOT), **environment},
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-        )
+        command = [*self.command, *(["--address", cluster] if cluster else []), *more]
+        environment = {**os.environ, "PYTHONPATH": str(ROOT), **environment}
+        output = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+        return subprocess.Popen(command, cwd=self.place, env=environment, **output)
 
     def run(self, *more, **options):
         process = self.start(*more, **options)
@@ -167,12 +163,9 @@ def made(tmp_path_factory, cluster):
     return farm
 
 
-def test_a_killed_worker_goes_on_from_the_last_checkpoint(made):
+def test_a_killed_worker_goes_on_and_the_assets_are_those_of_single_runs_to_the_bit(made):
     logs = [path.read_text() for path in made.out.glob("assets/*/log.txt")]
     assert any("resume=auto: resuming from" in log for log in logs)
-
-
-def test_the_assets_are_those_of_single_runs_to_the_bit(made):
     results = made.records()
     assert list(results) == [f"toy{i}" for i in range(COUNT)] and not made.records("failed.json")
     for result in results.values():

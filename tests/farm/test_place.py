@@ -6,6 +6,7 @@ import json
 import os
 import pickle
 import signal
+from unittest.mock import Mock
 
 import pytest
 
@@ -126,13 +127,12 @@ def test_the_result_is_uploaded_last_and_a_reader_sees_no_half_asset(memory, mon
     upload = place.upload
 
     def watched(name, path):
-        seen.append(name)
-        assert Place(memory).finished(FOX) is None
+        seen.append(Place(memory).finished(FOX))
         upload(name, path)
 
     monkeypatch.setattr(place, "upload", watched)
     place.publish(FOX, RESULT)
-    assert len(seen) == 3 and Place(memory).finished(FOX)
+    assert seen == [None] * 3 and Place(memory).finished(FOX)
 
 
 @pytest.mark.parametrize("error", [ConnectionError("no route"), FileNotFoundError("no bucket")])
@@ -140,12 +140,8 @@ def test_a_store_that_is_gone_is_named_and_a_bucket_that_does_not_exist_is_empty
     memory, monkeypatch, error
 ):
     place, lacks = Place(memory), isinstance(error, FileNotFoundError)
-
-    def gone(*args, **options):
-        raise error
-
     for name in ("cat_file", "pipe_file", "put_file", "ls", "rm_file"):
-        monkeypatch.setattr(place.system, name, gone)
+        monkeypatch.setattr(place.system, name, Mock(side_effect=error))
     for write, act in (
         (False, lambda: place.finished(FOX)),
         (False, lambda: place.names("a")),
@@ -161,7 +157,6 @@ def test_a_store_that_is_gone_is_named_and_a_bucket_that_does_not_exist_is_empty
 
 
 def checkpoint(place, step):
-    """Write the last checkpoint of an asset's run."""
     content = {"global_step": step, "epoch": 0, "state_dict": {}}
     save_file(place.work_folder(FOX) / LAST, content)
 
@@ -244,9 +239,7 @@ def test_a_url_that_can_not_be_used_is_one_message(monkeypatch):
     with pytest.raises(UserError, match="nothing://farm can't be used"):
         Place("nothing://farm")
 
-    def refuses(*args, **options):
-        raise ConnectionRefusedError("Connection refused")
-
+    refuses = Mock(side_effect=ConnectionRefusedError("Connection refused"))
     monkeypatch.setattr("fsspec.core.url_to_fs", refuses)
     with pytest.raises(UserError, match="ftp://host/farm can't be used: Connection refused"):
         Place("ftp://host/farm")

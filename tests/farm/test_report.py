@@ -52,8 +52,3 @@ def test_the_report_has_states_costs_pictures_and_failures(tmp_path, place, monk
     assert [row["name"] for row in rows] == [row.name for row in ROWS]
     assert rows[0]["seconds"] == 36.0 and rows[4]["seconds"] is None
     assert list(rows[0]) == list(report.COLUMNS)
-
-
-def test_an_empty_farm_has_a_report(tmp_path):
-    report.write_report(Place(tmp_path), ROWS, len(ROWS))
-    assert "waiting" in (tmp_path / "report/table.csv").read_text()

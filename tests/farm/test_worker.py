@@ -2,6 +2,7 @@
 
 import errno
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -71,7 +72,6 @@ def test_attempts_are_counted_in_the_session_and_in_all(tmp_path):
     ("text", "saves_memory", "counted", "kept"),
     [
         ("one host 7\none KEY host 7\n\none\n", False, (4, 4), True),
-        ("one KEY host 7\n", False, (2, 2), True),
         ("one KEY host 7\n", True, (1, 1), False),
         ("saves_memory.txt: one KEY host 7\n", True, (2, 2), True),
         ("saves_memory.txt: one host 7\n", False, (1, 1), False),
@@ -104,10 +104,8 @@ def place(tmp_path, monkeypatch):
 
 
 def test_an_asset_is_given_up_after_its_retries(place, monkeypatch):
-    def dies(*args):
-        raise KeyboardInterrupt  # nothing of the worker goes on after it, as after a kill
-
-    monkeypatch.setattr(Worker, "_run", dies)
+    # nothing of the worker goes on after it, as after a kill
+    monkeypatch.setattr(Worker, "_run", Mock(side_effect=KeyboardInterrupt))
     for _ in range(2):
         with pytest.raises(KeyboardInterrupt):
             Worker().make(JOB, 0, setting(place))
@@ -120,18 +118,11 @@ def test_a_folder_that_a_dying_process_still_holds_is_waited_for(place, monkeypa
     monkeypatch.setattr(worker.Heartbeat, "report", lambda self, beat: False)
     codes = [FolderInUse("held"), FolderInUse("held"), 128 + 15]
 
-    class Run:
-        def run(self):
-            code = codes.pop(0)
-            if isinstance(code, Exception):
-                raise code
-            return code
-
-    made = []
-    monkeypatch.setattr(experiment, "prepare", lambda *args, **more: made.append(1) or Run())
+    run = Mock(**{"run.side_effect": codes})
+    monkeypatch.setattr(experiment, "prepare", Mock(return_value=run))
     outcome = Worker().make(JOB, 0, setting(place))
     assert outcome == {"state": STOPPED, "error": "stopped by signal 15"}
-    assert len(made) == 3 and not codes
+    assert run.run.call_count == experiment.prepare.call_count == 3
 
 
 def test_a_machine_with_another_version_or_without_the_folder_is_named(place):
@@ -143,9 +134,7 @@ def test_a_machine_with_another_version_or_without_the_folder_is_named(place):
 
 def test_an_asset_without_files_has_failed(place, monkeypatch):
     """Such as one whose run has written to another folder."""
-    run = SimpleNamespace(
-        system=SimpleNamespace(geometry=None), trainer=SimpleNamespace(global_step=5)
-    )
+    run = Mock(**{"trainer.global_step": 5})
     monkeypatch.setattr(Worker, "_run", lambda *args: (run, 0))
     outcome = Worker().make(JOB, 0, setting(place))
     assert outcome["state"] == FAILED and "has left no files in" in outcome["error"]
@@ -156,14 +145,11 @@ def test_an_exit_of_a_part_fails_its_asset_and_one_of_ray_ends_the_worker(place,
     def exits(self, *args):
         exec("raise SystemExit(3)", {"__name__": module})
 
-    def fails(*args):
-        raise ValueError("no such thing")
-
     monkeypatch.setattr(Worker, "_run", exits)
     module = "a_part"
     outcome = Worker().make(JOB, 0, setting(place))
     assert outcome["state"] == FAILED and "ended the run with sys.exit(3)" in outcome["error"]
-    monkeypatch.setattr(Worker, "_run", fails)
+    monkeypatch.setattr(Worker, "_run", Mock(side_effect=ValueError("no such thing")))
     other = Job(Row("cat", "a cat"))
     assert Worker().make(other, 0, setting(place))["error"] == "ValueError: no such thing"
     assert "Traceback" in (place.work_folder(other.row) / "log.txt").read_text()
@@ -195,18 +181,16 @@ def test_the_board_knows_since_when_nothing_has_changed(monkeypatch):
 def test_reports_are_rare_and_a_run_is_stopped_once(monkeypatch):
     now = SimpleNamespace(seconds=0.0)
     monkeypatch.setattr(worker.time, "monotonic", lambda: now.seconds)
-    told, stops, steps = [], [], []
+    told, stops, setting = [], [], Mock()
     monkeypatch.setattr(worker.signal, "raise_signal", stops.append)
     monkeypatch.setattr(Heartbeat, "report", lambda _, beat: told.append(beat) or len(told) > 2)
-    setting = SimpleNamespace(
-        place=SimpleNamespace(keep_checkpoint=lambda *asset: steps.append(asset))
-    )
-    beats = Heartbeat(Job(Row("fox", "a fox")), 1, 0, setting)
+    beats = Heartbeat(JOB, 1, 0, setting)
     for _ in range(4):
         now.seconds += 0.5
         beats.on_train_batch_end(SimpleNamespace(global_step=3, max_steps=12))
     assert [beat.stage for beat in told] == ["starting", "training", "training"]
     now.seconds = 9.0
     beats.on_train_batch_end(SimpleNamespace(global_step=4, max_steps=12))
-    assert told[-1] == BEAT._replace(step=4) and len(steps) == 5
+    assert told[-1] == BEAT._replace(step=4)
+    assert setting.place.keep_checkpoint.call_count == 5
     assert stops == [worker.signal.SIGTERM]
