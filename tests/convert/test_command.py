@@ -66,6 +66,8 @@ def test_what_is_lost_and_the_decibels_are_printed(source, tmp_path, capsys):
 
 
 def test_options_change_what_is_written(source, tmp_path):
+    assert main([str(source), str(tmp_path / "4.spz"), "--spz-version", "4"]) == 0
+    assert (tmp_path / "4.spz").read_bytes()[:5] == b"NGSP\4"
     out = str(tmp_path / "a.ply")
     assert main([str(source), out, "--harmonics", "0", "--antialiased", "--up-out", "y"]) == 0
     read = read_cloud(out)
@@ -87,12 +89,6 @@ def test_dropped_harmonics_are_named_and_measured(tmp_path, capsys):
     said = capsys.readouterr().out
     assert "lost: harmonics above degree 1" in said and "lost: the note about pruning" in said
     assert "check: 100.0 dB" not in said and read_cloud(command[1]).pruned_to is None
-
-
-def test_version_4_of_spz(source, tmp_path):
-    pytest.importorskip("zstandard")
-    assert main([str(source), str(tmp_path / "a.spz"), "--spz-version", "4"]) == 0
-    assert (tmp_path / "a.spz").read_bytes()[:5] == b"NGSP\4"
 
 
 @pytest.mark.parametrize(
@@ -117,12 +113,12 @@ def test_version_4_of_spz(source, tmp_path):
         (["in.ply", "a.glb", "--gaussians", "--unlit"], "--unlit: OUT is a file of Gaussians"),
         (["in.ply", "nowhere/a.obj"], "OUT: there is no folder 'nowhere'"),
         (["empty.ply", "a.glb"], "empty.ply holds no Gaussians that can be drawn"),
-        (["text.ply", "a.glb"], "isn't a PLY file|this is not a PLY file"),
+        (["text.ply", "a.glb"], "not a PLY file"),
         (["in.ply", "a.glb", "--up-out", "z"], "--up-out: OUT is a .glb file"),
         (["in.ply", "a.spz", "--up-out", "-y"], "--up-out: OUT is a .spz file"),
         (["in.ply", "a.spz", "--up-out", "z", "--spz-version", "4"], "--up-out: OUT is a .spz"),
-        (["in.ply", "a.glb", "--from", "blender"], None),
-        (["in.ply", "a.ply", "--up-out", "-z"], None),
+        (["in.ply", "a.glb", "--from", "blender"], "invalid choice"),
+        (["in.ply", "a.ply", "--up-out", "-z"], "invalid choice"),
     ],
 )
 def test_errors_are_found_before_anything_is_written(
@@ -137,7 +133,7 @@ def test_errors_are_found_before_anything_is_written(
     before = sorted(tmp_path.iterdir())
     assert main(arguments) == 2
     error = capsys.readouterr().err
-    assert "invalid choice" in error if said is None else _matches(said, error)
+    assert said in error
     assert sorted(tmp_path.iterdir()) == before
 
 
@@ -154,10 +150,6 @@ def test_a_link_is_written_through(source, tmp_path, monkeypatch, command, exist
     options = {prune.main: ["--count", "40", *FAST], view.main: ["--html"]}.get(command, [])
     assert command([str(source), *options, str(link)]) == 0
     assert link.is_symlink() and link.resolve() == other and other.stat().st_size > 100
-
-
-def _matches(pattern, text):
-    return any(part in text for part in pattern.split("|"))
 
 
 # -- meshes --------------------------------------------------------------------------------------

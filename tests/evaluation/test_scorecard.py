@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.evaluation.clip_similarity_cases import blob, save
+from tests.evaluation.conftest import blob, save
 from tests.helpers import tiny_3d_models as tiny
 from tests.helpers import tiny_image_reward
 from threestudio_gaussiandreamer.evaluation import t3bench
@@ -30,6 +30,11 @@ def finished(folder, prompts):
     return folder
 
 
+def table(folder, column="prompt"):
+    with open(folder / "scorecard.csv", newline="") as file:
+        return [row[column] for row in csv.DictReader(file)]
+
+
 @pytest.fixture
 def judge(tmp_path):
     torch.manual_seed(0)
@@ -41,21 +46,14 @@ def test_rows_and_intervals_over_prompts(tmp_path, judge, capsys):
     runs = finished(tmp_path / "runs", PROMPTS)
     arguments = ["--metrics", "judge,janus", "--judge", judge, "--output", str(tmp_path / "out")]
     assert main([str(runs), *arguments]) == 0
-    with open(tmp_path / "out/scorecard.csv", newline="") as file:
-        rows = list(csv.DictReader(file))
-    assert [row["prompt"] for row in rows] == list(PROMPTS)
-    assert rows[3]["kind"] == "nan" and rows[2]["multi_face"] == "nan"
+    assert table(tmp_path / "out") == list(PROMPTS)
+    assert table(tmp_path / "out", "kind")[3] == table(tmp_path / "out", "multi_face")[2] == "nan"
     content = json.loads((tmp_path / "out/scorecard.json").read_text())
     assert content["kind"]["mean"]["count"] == 2  # two prompts have known words
     assert content["multi_face"]["mean"]["count"] == 1  # and a mug has no front
     printed = capsys.readouterr().out
     assert "kind, colors, pattern, accessory: no value for 1 of the prompts ('a zebra')" in printed
     assert "multi_face: no value for 2 of the prompts ('a blue mug with white dots'; 'a" in printed
-
-
-def table(folder):
-    with open(folder / "scorecard.csv", newline="") as file:
-        return [row["prompt"] for row in csv.DictReader(file)]
 
 
 def test_a_run_in_several_folders_is_scored_once(tmp_path, judge, monkeypatch):
@@ -127,10 +125,7 @@ def test_rewards_of_views(tmp_path, monkeypatch):
         (["{}", "--metrics", "judge", "--judge", "none.safetensors"], "none.safetensors"),
         (["{}", "--metrics", "judge", "--size", "0", "--judge", "{judge}"], "--size: exp"),
         (["{}", "--metrics", "judge", "--size", "64", "--judge", "{judge}"], "--size has no"),
-        (
-            ["{}/configs", "--metrics", "judge", "--judge", "{judge}"],
-            "no folder that holds",
-        ),
+        (["{}/configs", "--metrics", "judge", "--judge", "{judge}"], "no folder that holds"),
         (["{}", "--metrics", "judge", "--judge", "{judge}", "--output", "{judge}"], "--output"),
     ],
 )

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tests.evaluation.clip_similarity_cases import blob
+from tests.evaluation.conftest import blob
 from threestudio_gaussiandreamer import register_parts
 from threestudio_gaussiandreamer.evaluation import t3bench
 from threestudio_gaussiandreamer.evaluation.clip_similarity import main

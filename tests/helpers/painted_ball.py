@@ -17,12 +17,17 @@ def sphere_points(count):
 def painted_ball(count=600, radius=0.8, opacity=0.95):
     """Return opaque Gaussians on a sphere, coloured by their direction."""
     directions = sphere_points(count)
-    colors = 0.5 + 0.4 * directions
-    scale = np.log(1.4 * radius / np.sqrt(count))
+    size = 1.4 * radius / np.sqrt(count)
+    return opaque_cloud(radius * directions, 0.5 + 0.4 * directions, size, opacity)
+
+
+def opaque_cloud(means, colors, size, opacity):
+    """Return spheres of a size and an opacity."""
+    count = len(means)
     return Gaussians(
-        means=(radius * directions).astype(np.float32),
+        means=means.astype(np.float32),
         quats=np.tile(np.float32([1, 0, 0, 0]), (count, 1)),
-        log_scales=np.full((count, 3), scale, np.float32),
+        log_scales=np.full((count, 3), np.log(size), np.float32),
         logit_opacities=np.full(count, np.log(opacity / (1 - opacity)), np.float32),
         sh=rgb_to_sh0(colors.astype(np.float32))[:, None],
     )

@@ -50,14 +50,8 @@ def test_a_cloud_is_judged_as_the_viewer_draws_it(source, drawn, eps2d):
 
 def gsplats_names(cloud):
     """Return the values of ``cloud`` under the names of gsplat's checkpoints."""
-    return {
-        "means": cloud.means,
-        "quats": cloud.quats,
-        "scales": cloud.log_scales,
-        "opacities": cloud.logit_opacities,
-        "sh0": cloud.sh,
-        "shN": torch.zeros(len(cloud.means), 0, 3),
-    }
+    names = "means", "quats", "scales", "opacities", "sh0"
+    return dict(zip(names, cloud, strict=True)) | {"shN": torch.zeros(len(cloud.means), 0, 3)}
 
 
 def test_gsplats_checkpoints_are_read(source, tmp_path):
