@@ -15,6 +15,11 @@ KIND = "mvdream"
 
 
 @pytest.fixture
+def model(large):
+    return large(KIND)[0]
+
+
+@pytest.fixture
 def prompts(large):
     return large(KIND)[1]
 

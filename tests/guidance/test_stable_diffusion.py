@@ -137,17 +137,6 @@ def test_compiling_is_asked_for_once(models, prompts, monkeypatch):
     assert [type(network).__name__ for network in asked] == ["UNet2DConditionModel"]
 
 
-def test_the_size_is_the_models_unless_given(models, prompts, caplog):
-    assert guidance(models).image_size == guidance(models, image_size=64).image_size == 64
-    assert "was trained on images of" not in caplog.text
-    guide = guidance(models, image_size=128)
-    assert "was trained on images of 64 x 64" in caplog.text
-    assert guide.encode(renders(size=32).movedim(-1, 1)).shape == (4, 4, 16, 16)
-    gradient(guide, prompts[False], renders(size=32))
-    with pytest.raises(UserError, match="image_size: expected a multiple of 8"):
-        guidance(models, image_size=100)
-
-
 def test_a_model_without_one_size_is_asked_for(tmp_path):
     folder = tiny_models.stable_diffusion(tmp_path / "model")
     config = json.loads((folder / "unet" / "config.json").read_text())

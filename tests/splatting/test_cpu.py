@@ -261,7 +261,7 @@ def test_a_library_of_another_version_is_refused(monkeypatch):
 
 def test_a_build_that_does_not_exist_is_named(force):
     force("v5")
-    with pytest.raises(UserError, match="v4"):
+    with pytest.raises(UserError, match="GAUSSIANDREAMER_ISA=v5, but .* only have .*base"):
         cpu.library()
 
 

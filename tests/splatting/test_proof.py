@@ -166,7 +166,8 @@ def test_right_kernels_are_used_and_compared_once(use):
 
 def test_right_kernels_are_far_from_the_tolerance_and_small_errors_are_not(use):
     use(HostDevice())
-    found, expected = proof.drawn_on(CPU), proof.reference()
+    found = proof.drawn(proof.kernels, CPU, torch.float32)
+    expected = proof.drawn(proof.torch_backend, CPU, torch.float64)
     errors = proof.relative_errors(found, expected)
     assert max(max(sizes.values()) for sizes in errors.values()) < proof.TOLERANCE / 10
     assert [len(sizes) for sizes in errors.values()] == [11, 11, 12]
@@ -288,13 +289,15 @@ def test_memory_that_is_short_is_no_verdict(use, tmp_path, error):
     assert not (tmp_path / "cubins").exists()
 
 
-@pytest.mark.parametrize("failing", ["require_torch", "reference"])
-def test_an_error_of_earlier_work_or_of_torch_is_no_verdict(use, tmp_path, monkeypatch, failing):
-    def fails(*_):
+@pytest.mark.parametrize("owner, name", [(torch, "ones"), (proof.torch_backend, "rasterize")])
+def test_an_error_of_earlier_work_or_of_torch_is_no_verdict(
+    use, tmp_path, monkeypatch, owner, name
+):
+    def fails(*_, **__):
         raise RuntimeError("CUDA error: device-side assert triggered")
 
     use(HostDevice())
-    monkeypatch.setattr(proof, failing, fails)
+    monkeypatch.setattr(owner, name, fails)
     with pytest.raises(RuntimeError, match="device-side"):
         picture()
     assert not (tmp_path / "cubins").exists()
@@ -313,7 +316,7 @@ def test_deterministic_algorithms_are_switched_on_again(use, monkeypatch):
     try:
         torch.use_deterministic_algorithms(True, warn_only=True)
         picture()
-        assert torch.are_deterministic_algorithms_enabled() and seen == [False] * 2
+        assert torch.are_deterministic_algorithms_enabled() and seen == [False] * 3
         assert torch.is_deterministic_algorithms_warn_only_enabled()
     finally:
         torch.use_deterministic_algorithms(False)

@@ -1,8 +1,12 @@
 """The autograd function of the compiled kernels, CPU and CUDA.
 
-Kernels render three colour channels; other numbers of channels are rendered in groups of three."""
+Kernels render three colour channels; other numbers of channels are rendered in groups of three.
+A kernel is one call of a backend, with its options and device: its ``forward`` draws a scene into a
+:class:`Drawn`, fills ``means2d`` (B, N, 2), and returns tensors to save and any other state for
+``backward``, which fills :class:`SceneGradients` and adds the sums over pixels of absolute
+gradients to ``means2d.absgrad`` if it is there."""
 
-from typing import Any, NamedTuple, Optional, Protocol
+from typing import Any, NamedTuple, Optional
 
 import torch
 from torch import Tensor
@@ -49,23 +53,7 @@ Upstream = tuple[Optional[Tensor], ...]
 """Gradients of the loss with respect to image, alpha and depth, contiguous; None means zero."""
 
 
-class Kernel(Protocol):
-    """One call of a compiled backend, with its options and device."""
-
-    def forward(self, scene: Scene, means2d: Tensor, out: Drawn) -> tuple[tuple[Tensor, ...], Any]:
-        """Draw a scene of three channels into ``out``, and fill ``means2d`` (B, N, 2); return the
-        tensors to save for backward, and any other state for it.
-        """
-
-    def backward(
-        self, scene: Scene, means2d: Tensor, saved, state: Any, upstream: Upstream, out
-    ) -> None:
-        """Fill the `SceneGradients` ``out``, given what `forward` returned; add the sums over
-        pixels of absolute gradients to ``means2d.absgrad`` if it is there.
-        """
-
-
-def rasterize(kernel: Kernel, scene: Scene, options: RasterizeOptions) -> Rasterized:
+def rasterize(kernel: Any, scene: Scene, options: RasterizeOptions) -> Rasterized:
     """Render a scene with any number of channels by a kernel for three."""
     if scene.channels > CHANNELS and options.absgrad:
         # |sum over channels| can't be computed from groups of channels.
@@ -86,7 +74,7 @@ class _Rasterize(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx, kernel: Kernel, downsample: int, size, means2d: Tensor, *tensors: Tensor):
+    def forward(ctx, kernel: Any, downsample: int, size, means2d: Tensor, *tensors: Tensor):
         scene = Scene(*tensors, *size)
         ctx.kernel, ctx.size, ctx.means2d, ctx.channels = kernel, size, means2d, scene.channels
         scene = scene._replace(colors=widen(scene.colors), background=widen(scene.background))

@@ -40,7 +40,6 @@ def checked_scene(
             isn't finite.
     """
     _check_tensors(tensors)
-    _check_shapes(tensors)
     _check_numbers(width, height, options)
     if policy not in ("drop", "error"):
         raise unknown("non_finite policy", policy, ("drop", "error"))
@@ -48,11 +47,8 @@ def checked_scene(
         _check_finite(tensors)
     check_ranges(tensors)
     wide = [name for name in GAUSSIANS if tensors[name].dtype == torch.float64]
-    if wide and len(wide) < len(GAUSSIANS):
-        raise UserError(
-            f"{', '.join(GAUSSIANS)} must all be float64 or none of them; float64 here: "
-            f"{', '.join(wide)}."
-        )
+    both = "all float64, or none of them"
+    _require(len(wide) in (0, len(GAUSSIANS)), ", ".join(GAUSSIANS), both, f"{wide} as float64")
     dtype = torch.float64 if wide else torch.float32
     tensors = {name: tensor.to(dtype).contiguous() for name, tensor in tensors.items()}
     views, channels = len(tensors["viewmats"]), tensors["colors"].shape[-1]
@@ -65,28 +61,21 @@ def checked_scene(
 
 
 def _check_tensors(tensors: dict[str, Tensor]) -> None:
+    """Check types, devices and shapes, with N from the means, B from the viewmats and C from the
+    colours.
+    """
     device = getattr(tensors["means"], "device", None)
     for name, tensor in tensors.items():
-        if not isinstance(tensor, Tensor):
-            raise UserError(f"{name} must be a torch.Tensor; got {type(tensor).__name__}.")
-        _require(
-            tensor.is_floating_point(), name, "floating point", f"{tensor.dtype}: call .float()"
-        )
+        _require(isinstance(tensor, Tensor), name, "a torch.Tensor", type(tensor).__name__)
+        kind = f"{tensor.dtype}: call .float()"
+        _require(tensor.is_floating_point(), name, "floating point", kind)
         _require(tensor.device == device, name, f"on the device of means ({device})", tensor.device)
-        if tensor.is_meta:
-            raise UserError(f"{name} is on the device meta, and has no values to draw.")
-
-
-def _check_shapes(tensors: dict[str, Tensor]) -> None:
-    """Check shapes, with N from the means, B from the viewmats and C from the colours."""
+        _require(not tensor.is_meta, name, "on a real device", "the device meta, with no values")
+        _require(tensor.dim(), name, "a tensor such as means (N, 3)", "a single number")
     shapes = {name: tuple(tensor.shape) for name, tensor in tensors.items()}
-    for name, wanted in (("means", "(N, 3)"), ("viewmats", "(B, 4, 4)")):
-        _require(shapes[name], name, f"of the shape {wanted}", "a single number")
-    n, views = shapes["means"][0], shapes["viewmats"][0]
-    channels = shapes["colors"][-1] if shapes["colors"] else 0
-    if views == 0 or channels == 0:
-        got = f"viewmats {shapes['viewmats']}, colors {shapes['colors']}"
-        raise UserError(f"at least one view and one colour channel are needed; got {got}.")
+    n, views, channels = shapes["means"][0], shapes["viewmats"][0], shapes["colors"][-1]
+    got = f"viewmats {shapes['viewmats']}, colors {shapes['colors']}"
+    _require(views and channels, "views and colour channels", "one or more", got)
     expected = {
         "means": {"(N, 3)": (n, 3)},
         "quats": {"(N, 4)": (n, 4)},
@@ -97,11 +86,11 @@ def _check_shapes(tensors: dict[str, Tensor]) -> None:
         "Ks": {"(B, 3, 3)": (views, 3, 3)},
         "background": {"(C,)": (channels,), "(B, C)": (views, channels)},
     }
+    sizes = f"N={n} is from means, B={views} from viewmats, C={channels} from colors"
     for name, shape in shapes.items():
         if shape not in expected[name].values():
             wanted = " or ".join(f"{words} = {known}" for words, known in expected[name].items())
-            sizes = f"N={n} is from means, B={views} from viewmats, C={channels} from colors"
-            raise UserError(f"{name} must have the shape {wanted}; got {shape}. {sizes}.")
+            _require(False, name, f"of the shape {wanted}", f"{shape}; {sizes}")
 
 
 def _check_numbers(width: int, height: int, options: RasterizeOptions) -> None:
@@ -145,8 +134,8 @@ def check_ranges(tensors: dict[str, Tensor]) -> None:
         ("opacities", 1 + ROUNDING, "in [0, 1]", "sigmoid() of logits"),
     ):
         for found in (value.item() for value in tensors[name].detach().aminmax()):
-            if math.isfinite(found) and not -ROUNDING <= found <= most:
-                raise UserError(f"{name} must be {wanted}, but one is {found:g}: pass {hint}.")
+            within = -ROUNDING <= found <= most or not math.isfinite(found)
+            _require(within, name, wanted, f"{found:g}: pass {hint}")
 
 
 _looked_at: set[torch.device] = set()
@@ -157,7 +146,5 @@ def _check_finite(tensors: dict[str, Tensor]) -> None:
         # a finite sum implies finite values, so that the usual case takes one pass
         if not tensor.detach().sum().isfinite() and len(bad := (~tensor.isfinite()).nonzero()):
             first = tuple(bad[0].tolist())
-            raise UserError(
-                f"{name} holds {len(bad)} values that aren't finite, the first at {first}: "
-                f"{tensor[first].item()}."
-            )
+            found = f"{len(bad)} other values, the first at {first}: {tensor[first].item()}"
+            _require(False, name, "finite", found)

@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from ...core.errors import UserError, unknown
+from ...core.errors import UserError
 from ...core.memory import main_memory
 from .. import autograd
 from ..autograd import Drawn, SceneGradients, Upstream
@@ -42,7 +42,7 @@ def rasterize(scene: Scene, options: RasterizeOptions) -> Rasterized:
 
 
 class CpuKernel(NamedTuple):
-    """One call of the library; see :class:`..autograd.Kernel`. The structs are those of scene.h."""
+    """One call of the library; see ``autograd.py``. The structs are those of scene.h."""
 
     library: ctypes.CDLL
     settings: Settings
@@ -171,8 +171,6 @@ def library() -> ctypes.CDLL:
         UserError: this machine or installation doesn't have the named one.
     """
     forced, usable = os.environ.get("GAUSSIANDREAMER_ISA"), usable_builds()
-    if forced and forced not in BUILDS:
-        raise unknown("instruction set in GAUSSIANDREAMER_ISA", forced, BUILDS)
     if not usable:
         raise OSError(
             "the kernel library isn't built, so plain torch draws: install the package again with "

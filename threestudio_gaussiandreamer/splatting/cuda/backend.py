@@ -72,7 +72,7 @@ def rasterize(scene: Scene, options: RasterizeOptions) -> Rasterized:
 
 
 class CudaKernel(NamedTuple):
-    """One call of the kernels; see :class:`..autograd.Kernel`."""
+    """One call of the kernels; see ``autograd.py``."""
 
     device: Any
     settings: Settings

@@ -84,7 +84,10 @@ def compare(device: torch.device) -> str:
             which says nothing about the kernels.
         OSError, AttributeError: a library can't be loaded, or lacks a function.
     """
-    require_torch(device)
+    # errors that the kernels don't cause are raised here
+    torch.ones(2, device=device)
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
     # what deterministic algorithms refuse is no failure of the kernels; switching them imports
     # torch's compiler
     strict = torch.are_deterministic_algorithms_enabled()
@@ -93,9 +96,9 @@ def compare(device: torch.device) -> str:
         torch.use_deterministic_algorithms(False)
     try:
         with torch_threads(1), ThreadPoolExecutor(1) as pool:
-            expected = pool.submit(reference)
+            expected = pool.submit(drawn, torch_backend, torch.device("cpu"), torch.float64)
             try:
-                found = drawn_on(device)
+                found = drawn(kernels, device, torch.float32)
             except (UserError, RuntimeError) as error:
                 if isinstance(error, torch.cuda.OutOfMemoryError) or "out of memory" in str(error):
                     raise
@@ -116,28 +119,9 @@ def compare(device: torch.device) -> str:
     )
 
 
-def require_torch(device: torch.device) -> None:
-    """Let torch compute on the device, where errors that the kernels don't cause are raised."""
-    torch.ones(2, device=device)
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
-
-
-def reference() -> Results:
-    """Return the outputs and gradients of plain torch in float64, on the CPU; the two draws that
-    differ only in ``absgrad`` share one.
-    """
-    default, *_, absolute = OPTIONS.values()
-    cpu = torch.device("cpu"), torch.float64
-    plain, full = (_drawn(torch_backend, *cpu, options) for options in (default, absolute))
-    return {draw: full if options.downsample > 1 else plain for draw, options in OPTIONS.items()}
-
-
-def drawn_on(device: torch.device) -> Results:
-    """Return the outputs and gradients of the kernels in float32, for each draw."""
-    return {
-        draw: _drawn(kernels, device, torch.float32, options) for draw, options in OPTIONS.items()
-    }
+def drawn(backend: ModuleType, device: torch.device, dtype: torch.dtype) -> Results:
+    """Return the outputs and gradients of a backend for each draw."""
+    return {draw: _drawn(backend, device, dtype, options) for draw, options in OPTIONS.items()}
 
 
 def relative_errors(found: Results, expected: Results) -> dict[str, dict[str, float]]:
