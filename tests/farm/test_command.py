@@ -8,7 +8,7 @@ from unittest.mock import Mock
 
 import pytest
 
-from tests.launch.bad_input_cases import DEMO
+from tests.launch.cases import DEMO
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.farm import command
 from threestudio_gaussiandreamer.farm.command import main

@@ -31,7 +31,7 @@ from threestudio_gaussiandreamer.farm.worker import (
     outcome_of,
 )
 from threestudio_gaussiandreamer.launch import experiment
-from threestudio_gaussiandreamer.launch.folder_lock import FolderInUse
+from threestudio_gaussiandreamer.launch.run_folder import FolderInUse
 
 JOB = Job(Row("fox", "a fox"))
 

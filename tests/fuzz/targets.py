@@ -42,8 +42,7 @@ from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians, usable
 from threestudio_gaussiandreamer.gaussians.point_cloud import PointCloud
 from threestudio_gaussiandreamer.launch import config, experiment
 from threestudio_gaussiandreamer.launch.config_check import check_config
-from threestudio_gaussiandreamer.launch.run import Run
-from threestudio_gaussiandreamer.launch.stage_errors import lightning_errors
+from threestudio_gaussiandreamer.launch.run import Run, lightning_errors
 from threestudio_gaussiandreamer.meshes.load import load_mesh
 from threestudio_gaussiandreamer.meshes.raycast import MeshCaster
 from threestudio_gaussiandreamer.priors.gaussians import GaussiansPrior

@@ -28,37 +28,17 @@ from threestudio_gaussiandreamer.host.builtin.system import BaseLift3DSystem, Ba
 # -- registry --------------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def own_registry(monkeypatch):
+def test_a_class_is_found_by_its_name_and_may_be_entered_again(monkeypatch):
+    """Also one of a module that runs again; another one under a taken name is an error."""
     monkeypatch.setattr(registry, "_parts", {})
-    return registry
-
-
-def test_a_class_is_found_by_its_name_and_may_be_entered_twice(own_registry):
-    part = type("Part", (), {})
-    assert own_registry.register("some-part")(part) is part
-    own_registry.register("some-part")(part)
-    assert own_registry.find("some-part") is part
-    assert own_registry.names() == ["some-part"]
-
-
-def test_the_same_class_of_a_module_that_runs_again_takes_its_place(own_registry):
     first, second = (type("Part", (), {"__module__": "plugin"}) for _ in range(2))
-    own_registry.register("some-part")(first)
-    own_registry.register("some-part")(second)
-    assert own_registry.find("some-part") is second
-
-
-def test_another_class_under_a_taken_name_is_an_error(own_registry):
-    own_registry.register("some-part")(type("Part", (), {}))
+    for part in (first, first, second):
+        assert registry.register("some-part")(part) is registry.find("some-part") is part
+    assert registry.names() == ["some-part"]
     with pytest.raises(UserError, match="'some-part' is taken by .*Part"):
-        own_registry.register("some-part")(type("Other", (), {}))
-
-
-def test_an_unknown_name_lists_the_near_ones(own_registry):
-    own_registry.register("mesh-prior")(object)
-    with pytest.raises(UserError, match="unknown part 'mesh-piror': did you mean 'mesh-prior'"):
-        own_registry.find("mesh-piror")
+        registry.register("some-part")(type("Other", (), {}))
+    with pytest.raises(UserError, match="unknown part 'some-prat': did you mean 'some-part'"):
+        registry.find("some-prat")
 
 
 # -- parts -----------------------------------------------------------------------------------------
@@ -75,20 +55,16 @@ class Counter(BaseObject):
         self.ends.append((epoch, global_step))
 
 
-def test_updates_reach_parts_inside_parts():
-    outer = Counter({}, inner=Counter({}))
-    outer.do_update_step(1, 7)
-    outer.do_update_step_end(1, 7)
-    assert outer.inner.steps == outer.steps == [(1, 7, False)] and outer.inner.ends == [(1, 7)]
-
-
-def test_updates_reach_parts_inside_modules():
+def test_updates_reach_parts_inside_parts_and_modules():
     class Holder(BaseModule):
         def configure(self) -> None:
             self.child = BaseModule()
             self.child.counter = Counter({})
 
-    holder = Holder({})
+    outer, holder = Counter({}, inner=Counter({})), Holder({})
+    outer.do_update_step(1, 7)
+    outer.do_update_step_end(1, 7)
+    assert outer.inner.steps == outer.steps == [(1, 7, False)] and outer.inner.ends == [(1, 7)]
     holder.do_update_step(0, 3, on_load_weights=True)
     assert holder.child.counter.steps == [(0, 3, True)]
 
@@ -104,41 +80,27 @@ def test_weights_of_one_module_are_loaded_from_a_checkpoint(tmp_path):
     assert Points({"weights": f"{tmp_path / 'a.ckpt'}:geometry"}).means.tolist() == [1.0, 2.0]
     with pytest.raises(UserError, match="no parameters of 'nothing'"):
         Points({"weights": f"{tmp_path / 'a.ckpt'}:nothing"})
-    save_file(
-        tmp_path / "b.ckpt",
-        {"state_dict": {"geometry.means": torch.ones(3)}, "epoch": 1, "global_step": 7},
-    )
+    state = {"geometry.means": torch.ones(3)}
+    save_file(tmp_path / "b.ckpt", {"state_dict": state, "epoch": 1, "global_step": 7})
     with pytest.raises(UserError, match="b.ckpt:geometry don't fit these options .*size mismatch"):
         Points({"weights": f"{tmp_path / 'b.ckpt'}:geometry"})
 
 
 def test_a_renderer_refers_to_its_parts_without_owning_them():
-    geometry = Points()
-    renderer = Rasterizer(
-        {"radius": 2.0}, geometry=geometry, material=NoMaterial(), background=SolidColorBackground()
-    )
-    assert renderer.geometry is geometry
-    assert list(renderer.state_dict()) == ["bbox"] and renderer.bbox.tolist() == [
-        [-2.0] * 3,
-        [2.0] * 3,
-    ]
+    parts = {"material": NoMaterial(), "background": SolidColorBackground()}
+    renderer = Rasterizer({"radius": 2.0}, geometry=(geometry := Points()), **parts)
+    assert renderer.geometry is geometry and list(renderer.state_dict()) == ["bbox"]
+    assert renderer.bbox.tolist() == [[-2.0] * 3, [2.0] * 3]
 
 
-def test_a_solid_background_has_one_colour_everywhere():
-    background = SolidColorBackground(
-        {"color": [0.25, 0.5, 1.0], "random_aug": True, "random_aug_prob": 1.0}
-    )
-    dirs = torch.zeros(2, 4, 5, 3)
-    assert background.eval()(dirs).shape == (2, 4, 5, 3)
-    assert background(dirs)[1, 3, 4].tolist() == [0.25, 0.5, 1.0]
-    drawn = background.train()(dirs)
-    assert drawn[1, 3, 4].tolist() != [0.25, 0.5, 1.0] and torch.equal(background(dirs), drawn)
-
-
-def test_a_learned_background_gets_gradients():
-    background = SolidColorBackground({"learned": True})
-    background(torch.zeros(1, 2, 2, 3)).sum().backward()
-    assert background.env_color.grad.tolist() == [4.0, 4.0, 4.0]
+def test_a_solid_background_has_one_colour_everywhere(caplog):
+    background = SolidColorBackground({"color": [0.25, 0.5, 1.0], "random_aug": True})
+    assert "random_aug is no option any more" in caplog.text
+    drawn = background(torch.zeros(2, 4, 5, 3))
+    assert drawn.shape == (2, 4, 5, 3) and drawn[1, 3, 4].tolist() == [0.25, 0.5, 1.0]
+    learned = SolidColorBackground({"learned": True})
+    learned(torch.zeros(1, 2, 2, 3)).sum().backward()
+    assert learned.env_color.grad.tolist() == [4.0, 4.0, 4.0]
 
 
 # -- the system ------------------------------------------------------------------------------------
@@ -197,22 +159,18 @@ def path_with_threestudio(tmp_path, monkeypatch):
     sys.modules.pop("threestudio", None)
 
 
-def test_a_folder_called_threestudio_is_not_the_host(path_with_threestudio):
-    path_with_threestudio(None)
-    assert not host._threestudio_is_importable()
-
-
-def test_a_threestudio_that_imports_is_the_host(path_with_threestudio):
-    path_with_threestudio("def register(name): ...")
-    assert host._threestudio_is_importable()
-
-
-def test_a_broken_threestudio_is_an_error_with_its_cause(path_with_threestudio):
-    path_with_threestudio("import no_such_cuda_library")
-    with pytest.raises(
-        UserError, match="can't be imported: No module named 'no_such_cuda_library'"
-    ):
-        host._threestudio_is_importable()
+@pytest.mark.parametrize(
+    ("content", "is_host"),
+    [(None, False), ("def register(name): ...", True), ("import none", None)],
+)
+def test_threestudio_is_the_host_if_it_imports(path_with_threestudio, content, is_host):
+    """Not a folder of its name; a broken one is an error with its cause."""
+    path_with_threestudio(content)
+    if is_host is None:
+        with pytest.raises(UserError, match="can't be imported: No module named 'none'"):
+            host._threestudio_is_importable()
+    else:
+        assert host._threestudio_is_importable() == is_host
 
 
 THREESTUDIO_NAMES = """

@@ -9,7 +9,7 @@ import pytest
 import yaml
 from omegaconf import OmegaConf
 
-from tests.launch.bad_input_cases import DEMO, SMALL, assert_refused
+from tests.launch.cases import DEMO, SMALL, assert_refused
 from threestudio_gaussiandreamer import host, register_parts
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.core.methods import require_dataclass
@@ -60,11 +60,8 @@ def demo():
     [
         ("system.loss.lamda_sds=1", "weights of losses are called lambda_<loss>"),
         ("system.exporter.options.ply.pad_sh_degre=3", "did you mean 'options.ply.pad_sh_degree'"),
-        ("system.exporter.options.ply.pad_sh_degree=9", "expected a number from 0 to 3"),
         ("system.exporter.options.ply.save_name=../x.ply", "save_name: expected the name of a"),
-        ("system.exporter.options.ply=3", "options.ply: expected keys and values"),
-        ("system.loggers.wandb=true", "system.loggers.wandb is True; expected keys and values"),
-        ("system.material_type=''", "system.material_type is empty: name a registered part, such"),
+        ("system.material_type=''", "system.material_type is ''; expected the name of a"),
         ("system.guidance_type=exact-scores", "system.guidance_type: unknown part 'exact-scores'"),
         ("system.renderer_type=no-material", "needs gaussiandreamer-splatting, or a class"),
         ("system.material_type=gaussiandreamer-cloud", "a part of the kind geometry; expected one"),
@@ -74,21 +71,17 @@ def demo():
         ("system.geometry.grow.radius=[1]", "system.geometry.grow.radius: expected a number, got"),
         ("system.geometry.prior.color=3", "color: expected null, 'grey', 'random' or [red, green,"),
         ("data.resolution_milestones=[5]", "data.resolution_milestones: give height, width or"),
-        ("system.geometry.lr_means=-1", "system.geometry.lr_means: expected values of 0 or more"),
         ("system.geometry.prior.up=+w", "unknown up axis '+w'"),
         ("system.guidance.up=w", "unknown system.guidance.up 'w'"),
-        ("system.guidance.front=x", "unknown system.guidance.front 'x': did you mean"),
         ("system.guidance.min_step_percent=[0,0.02,0.9,100]", "0.9 is above max_step_percent"),
         ("system.optimizer.args.eps=-1", "Adam doesn't accept this: Invalid epsilon value"),
         ("system.optimizer.args.betas=[0.9]", "system.optimizer.args.betas: Adam doesn't accept"),
         ("system.optimizer.args.capturable=true", "Adam doesn't accept this: If capturable=True"),
-        ("system.optimizer.args=3", "system.optimizer.args: expected keys and values"),
         ("system.optimizer.name=Optimizer", "Optimizer doesn't accept this"),
         ("trainer.max_time=5", "trainer.max_time: expected a text such as '00:12:00:00'"),
         ("trainer.check_val_every_n_epoch=0", "trainer.check_val_every_n_epoch: expected 1"),
         ("trainer.precision=transformer-engine", "trainer: Requirement 'transformer_engine"),
         ("trainer.num_nodes=2", "trainer.num_nodes: expected 1 without a launcher of several"),
-        ("trainer.limit_val_batches=" + 400 * "9", "trainer.limit_val_batches: expected a whole"),
         ("data.eval_camera_distance=1e30", "data.eval_camera_distance: expected a number from"),
         ("trainer.limit_test_batches=0", "trainer.limit_test_batches: expected more than 0"),
         ("system.evaluation={size: 9999, views: 9999}", "pixels, twice take about 39.99 TB of"),
@@ -98,31 +91,21 @@ def demo():
         ("system.geometry.prior.num_points=999999999999", "999999999999 points take about"),
         ("system.geometry.grow.num_candidates=999999999999", "999999999999 candidates take about"),
         ("trainer.val_check_interval=0.5", "trainer.val_check_interval: expected a whole number"),
-        ("trainer.log_every_n_steps=-1", "trainer.log_every_n_steps: expected 0 or more"),
         ("trainer.strategy=ddp_spawn", "trainer.strategy 'ddp_spawn': choose from auto, ddp"),
-        ("checkpoint.filename='{step}/../../../x'", "below the folder of the checkpoints"),
-        ('checkpoint.filename="a\\0b"', "of names of at most 200 bytes"),
-        (f"checkpoint.filename={300 * 'x'}", "of names of at most 200 bytes"),
-        ("checkpoint.filename='{step'", "expected a format such as '{epoch}-{step}'"),
-        ("system_type=gaussiandreamer-sistem", "did you mean 'gaussiandreamer-system'"),
-        ("data_type=''", "data_type is empty: name a registered part (an overlay needs"),
+        ("data_type=''", "data_type is ''; expected the name of a registered part (an overlay"),
         ("system.geometry_type=[a,b]", "system.geometry_type is ['a', 'b']; expected the name"),
         ("system.geometry=3", "system.geometry is 3; expected keys and values"),
         ("system.loss.lambda_sds=[1,2]", "system.loss.lambda_sds has 2 elements"),
         ("system.loggers.wadb={}", "unknown key 'system.loggers.wadb': did you mean"),
-        ("system.loggers.wandb={enabled: true}", "unknown key 'system.loggers.wandb.enabled'"),
         ("trainer.max_steps=many", "trainer.max_steps: expected a whole number, got 'many'"),
-        ("trainer.max_steps=2.5", "trainer.max_steps: expected a whole number, got 2.5"),
         ("trainer.limit_val_batches=many", "limit_val_batches: expected a whole number or a num"),
         ("trainer.limit_train_batches=1", "expected no value, since views are drawn without end"),
         ("trainer.overfit_batches=2", "trainer.overfit_batches: expected no value, since views"),
         ("trainer.accelerator=cpu", "trainer.accelerator is set by --gpu"),
-        ("checkpoint.every_n_steps=3", "unknown key 'checkpoint.every_n_steps'"),
         ("checkpoint.every_n_epochs=1", "checkpoint: Combination of parameters"),
         ("checkpoint.dirpath=x", "checkpoint.dirpath is set by exp_root_dir"),
         ("viewer={prot: 80}", "unknown key 'viewer.prot': did you mean 'viewer.port'"),
         ("viewer={port: 0}", "viewer.port: expected a number from 1 to 65535, got 0"),
-        ("viewer={updates_per_second: 0}", "viewer.updates_per_second: expected a number from"),
     ],
 )
 def test_a_wrong_value_is_refused_by_the_check(demo, override, message):
@@ -154,7 +137,7 @@ def test_a_valid_configuration_passes_and_its_numbers_become_numbers(demo):
         ("system.geometry.lr_means=1e39", "system.geometry.lr_means: expected a finite number"),
         ("system.loss.lambda_sds=[0,1,1e300,9]", "system.loss.lambda_sds[2]: expected a finite"),
         ("trainer=", "trainer is empty, which would remove its"),
-        ("trainer.max_steps=-1", "checkpoint.every_n_train_steps is -1, as trainer.max_st"),
+        ("trainer.max_steps=-1", "checkpoint: Invalid value for every_n_train_steps=-1"),
         ("exp_root_dir=s3://a/b", "a single run writes to a folder, and only the farm to a URL"),
     ],
 )
@@ -218,26 +201,21 @@ def test_no_option_of_any_part_ends_in_a_traceback(name):
                 assert not (single and wrong), f"{name}.{option.name} takes {value!r}"
 
 
-class Uncallable(BaseObject):
-    pass
+class Uncallable(BaseObject): ...
 
 
-class NoForward(BaseModule):
-    pass
+class NoForward(BaseModule): ...
+
+
+class Unfinished(BaseBackground): ...
 
 
 class NoArgument(BaseObject):
-    def __call__(self):
-        return {}
+    def __call__(self): ...
 
 
 class Threestudios(BaseObject):
-    def __call__(self, rgb, prompt_utils, elevation, *, azimuth, **kwargs):
-        return {}
-
-
-class Unfinished(BaseBackground):
-    pass
+    def __call__(self, rgb, prompt_utils, elevation, *, azimuth, **kwargs): ...
 
 
 @pytest.mark.parametrize(
@@ -282,7 +260,7 @@ def test_a_package_in_custom_that_can_not_be_read_is_one_message(folder, monkeyp
 
 
 def test_an_unknown_part_says_where_own_parts_are_looked_for(folder):
-    with pytest.raises(UserError, match="the folder custom in the working folder, which has none"):
+    with pytest.raises(UserError, match="from the folder custom here, and there is none"):
         find_part("system.guidance_type", "nowhere-guidance")
 
 
@@ -377,7 +355,7 @@ WRONG = [
     (
         ("gaussiandreamer",),
         ["system.prompt_processor_type=plain-prompt-processor", "system.prompt_processor={}"],
-        "needs a prompt processor that encodes text",
+        "needs one that encodes text",
     ),
     (("demo",), (LATENT, "data.height=250"), "pictures of 250x256 can't be pooled"),
     (("demo",), (LATENT, "data.width=[256,250]", "data.resolution_milestones=[9]"), "256x250"),

@@ -21,7 +21,6 @@ from threestudio_gaussiandreamer.launch.ddp import (
     LONGEST_WAIT,
     Processes,
     ReplicatedStrategy,
-    environment_plugins,
     is_lost_process,
     planned_processes,
     trainer_options,
@@ -45,6 +44,10 @@ def environment(monkeypatch):
             monkeypatch.setenv(name, value)
 
     return launched_by
+
+
+def plugins(processes):
+    return trainer_options(processes).get("plugins")
 
 
 @pytest.mark.parametrize(
@@ -97,7 +100,7 @@ def test_a_shell_of_slurm_trains_with_one_process_and_says_so(environment, caplo
     environment(SLURM | {"SLURM_JOB_NAME": "interactive"})
     require_launcher()
     found = planned_processes(0, {})
-    assert found == Processes(1, 1) and environment_plugins(found) == []
+    assert found == Processes(1, 1) and plugins(found) is None
     assert "SLURM has 4 tasks, which a shell (SLURM_JOB_NAME=interactive) doesn't" in caplog.text
     assert "the number of processes that train is 1; for all: srun --job-name" in caplog.text
 
@@ -105,9 +108,9 @@ def test_a_shell_of_slurm_trains_with_one_process_and_says_so(environment, caplo
 def test_a_batch_job_with_one_task_needs_none_of_sruns_variables(environment):
     environment(SLURM | {"SLURM_NTASKS": "1", "SLURM_NNODES": "1"})
     require_launcher()
-    assert environment_plugins(planned_processes(0, {}))
+    assert plugins(planned_processes(0, {}))
     environment(dict.fromkeys(launcher.SLURM, "0"))
-    assert environment_plugins(planned_processes(0, {})) == []
+    assert plugins(planned_processes(0, {})) is None
 
 
 @pytest.mark.parametrize("name", [*launcher.INDICES, *launcher.SIZES])
@@ -164,13 +167,11 @@ def test_a_single_process_needs_no_strategy():
 
 
 def test_lightning_starts_the_processes_in_a_job_with_one_task(environment):
-    assert environment_plugins(Processes(2, 1)) == []
+    assert plugins(Processes(2, 1)) is None
     environment(SLURM | {"SLURM_NTASKS": "1"} | dict.fromkeys(launcher.SLURM, "0"))
-    (plugin,) = environment_plugins(planned_processes(2, {}))
+    (plugin,) = plugins(planned_processes(2, {}))
     assert not plugin.creates_processes_externally
-    assert (
-        environment_plugins(Processes(2, 1, "SLURM")) == environment_plugins(Processes(1, 1)) == []
-    )
+    assert plugins(Processes(2, 1, "SLURM")) is plugins(Processes(1, 1)) is None
 
 
 def raised(error, module):

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.launch import folder_lock
-from threestudio_gaussiandreamer.launch.folder_lock import (
+from threestudio_gaussiandreamer.launch import run_folder
+from threestudio_gaussiandreamer.launch.run_folder import (
     FolderInUse,
     claim,
     claim_new,
@@ -78,7 +78,7 @@ def test_the_creator_without_the_lock_does_not_remove_the_folder(folder, monkeyp
 
 def test_a_folder_that_is_about_to_be_removed_is_made_again(folder, monkeypatch):
     with monkeypatch.context() as patch:
-        stop_before(patch, folder_lock.shutil, "rmtree")
+        stop_before(patch, run_folder.shutil, "rmtree")
         maker = stopped_child(lambda: claim_and_discard(folder))
     other = claim(folder)
     assert other.first_made == folder and go_on(maker) == 0 and folder.is_dir()
@@ -157,7 +157,7 @@ def test_without_flock_a_file_keeps_a_second_run_away(folder, monkeypatch):
     first = claim(folder)
     with pytest.raises(FolderInUse, match="another run is training in outputs/tiny/run.*remove"):
         claim(folder)
-    other = claim_new(folder)[0]
+    other = claim_new(folder)
     assert other.path == folder.with_name("run-2")
     rename = Path.rename
 
@@ -171,16 +171,10 @@ def test_without_flock_a_file_keeps_a_second_run_away(folder, monkeypatch):
     assert os.listdir(other.path) == [".lock"]
     first.release()
     assert list(folder.iterdir()) == []
-    (folder / ".lock").mkdir()
-    with pytest.raises(UserError, match="outputs/tiny/run"):
-        claim(folder)
 
 
 def test_a_folder_that_can_not_be_renamed_is_removed_in_place(folder, monkeypatch):
-    def unsupported(path, target):
-        raise OSError(95, "Operation not supported")
-
-    monkeypatch.setattr(Path, "rename", unsupported)
+    monkeypatch.setattr(Path, "rename", lambda path, target: os.rename("nothing", target))
     claim(folder).discard()
     assert not Path("outputs").exists()
 
@@ -193,8 +187,7 @@ def test_a_folder_that_was_there_is_never_removed(folder):
 
 def claim_numbered(path: Path, start, results) -> None:
     start.wait()
-    claimed, number = claim_new(path)
-    results.put((str(claimed.path), number))
+    results.put(str(claim_new(path).path))
     time.sleep(0.2)  # as a run would keep it
 
 
@@ -209,17 +202,8 @@ def test_runs_of_one_second_get_a_folder_each(folder):
     for run in runs:
         run.join()
     names = ["run", *(f"run-{number}" for number in range(2, 7))]
-    assert found == [(f"outputs/tiny/{name}", i) for i, name in enumerate(names, 1)]
+    assert found == [f"outputs/tiny/{name}" for name in names]
     assert sorted(os.listdir("outputs/tiny")) == names
-
-
-def test_a_deleted_working_folder_is_one_message(folder, tmp_path):
-    os.makedirs("gone")
-    os.chdir("gone")
-    os.rmdir(tmp_path / "gone")
-    with pytest.raises(UserError, match="the output folder outputs/tiny/run can't be written"):
-        make_folder(folder)
-    os.chdir(tmp_path)
 
 
 @pytest.mark.parametrize(

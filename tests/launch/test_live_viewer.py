@@ -9,7 +9,7 @@ import pytest
 from tests.helpers.tiny_runs import assert_same_training
 from tests.view.clouds import cloud
 from threestudio_gaussiandreamer.launch import live_viewer
-from threestudio_gaussiandreamer.launch.live_viewer import LiveViewer, ViewerConfig
+from threestudio_gaussiandreamer.launch.live_viewer import LiveViewer
 
 
 class Watched:
@@ -23,8 +23,7 @@ class Watched:
     def show(self, gaussians, status=""):
         self.shown.append((len(gaussians.means), status))
 
-    def look_from_front(self, pose):
-        pass
+    def look_from_front(self, pose): ...
 
     def show_cameras(self, c2w, fovy, aspect):
         assert c2w.shape[1:] == (4, 4) and len(fovy) == len(c2w) and aspect == 1
@@ -35,17 +34,17 @@ class Watched:
 
 
 class Buttons:
-    """Buttons without a panel; the score model's picture is asked for in every step."""
+    """Buttons without a panel; the score model's picture is asked for in every step, which begins
+    with a short pause if ``pausing``.
+    """
 
-    pausing = False
-    """Whether every step begins with a short pause."""
+    pausing = paused = waited = False
+    steps = 0
 
     def __init__(self, view):
-        self.waited = False
-        self.view, self.picture, self.paused = view, threading.Event(), False
+        self.view, self.picture = view, threading.Event()
         self.picture.set()
         self.cameras = SimpleNamespace(value=True)
-        self.steps = 0
 
     def may_go_on(self):
         if not self.paused:
@@ -58,8 +57,7 @@ class Buttons:
         self.view.pictures.append(image)
         self.picture.set()
 
-    def remove(self):
-        self.removed = True
+    def remove(self): ...
 
 
 @pytest.fixture
@@ -80,8 +78,10 @@ def test_the_training_is_the_same_with_a_viewer(launch_demo, views, tmp_path, mo
     monkeypatch.setattr(Buttons, "pausing", True)
     run = ["use_timestamp=false", "trainer.max_steps=4"]
     assert launch_demo(*run, "tag=off")[0] == 0
+    monkeypatch.setattr(live_viewer, "SECONDS_BETWEEN", 0.03)
     shown = ["viewer.enabled=true", "viewer.updates_per_second=30", "viewer.keep_serving=false"]
-    assert launch_demo(*run, *shown, "tag=on")[0] == 0
+    code, err = launch_demo(*run, *shown, "tag=on")
+    assert code == 0 and "viewer.updates_per_second is no option any more" in err
     (view,) = views
     assert view.shown[-1][1].startswith("step 4, ") and view.cameras > 0 and view.closed
     assert len(view.pictures) == 8 and view.pictures[0].dtype == np.uint8
@@ -90,46 +90,42 @@ def test_the_training_is_the_same_with_a_viewer(launch_demo, views, tmp_path, mo
 
 
 @pytest.fixture
-def viewer():
-    """A viewer at the start of a training, its trainer and its system."""
-    made = LiveViewer(Watched(), ViewerConfig(updates_per_second=1), lambda: False)
+def viewer(monkeypatch):
+    """A viewer at the start of a training, its trainer, its system and a clock."""
+    made = LiveViewer(Watched(), lambda: False)
     geometry = SimpleNamespace(**cloud(10).gaussians._asdict())
     trainer = SimpleNamespace(global_step=3, callback_metrics={"dB": 20.04})
     made.controls = Buttons(made.view)
-    return made, trainer, SimpleNamespace(geometry=geometry)
-
-
-def test_updates_take_at_most_their_share_of_the_time(viewer, monkeypatch):
-    made, trainer, system = viewer
+    made.controls.picture.clear()
+    made.controls.cameras.value = False
     now = SimpleNamespace(value=100.0)
     monkeypatch.setattr(live_viewer.time, "monotonic", lambda: now.value)
+    return made, trainer, SimpleNamespace(geometry=geometry), now
+
+
+def test_updates_take_at_most_their_share_of_the_time(viewer):
+    made, trainer, system, now = viewer
+    shown = []
 
     def slow(gaussians, status=""):
         now.value += 0.5
-        assert status == "step 3, 10 Gaussians, 20.0 dB"
+        shown.append(status)
 
     made.view.show = slow
-    assert made._show_if_due(trainer, system)
-    now.value = 100 + 0.5 / 0.02 - 0.01
-    assert not made._show_if_due(trainer, system)
-    now.value += 0.02
-    assert made._show_if_due(trainer, system)
+    for later in (0.0, 0.5 / 0.02 - 0.51, 0.02):
+        now.value += later
+        made.on_train_batch_end(trainer, system, None, {})
+    assert shown == ["step 3, 10 Gaussians, 20.0 dB"] * 2 and not made.view.cameras
 
 
-def test_nothing_is_read_without_a_browser_and_no_cameras_that_are_switched_off(viewer):
-    made, trainer, system = viewer
-    made.controls.cameras.value = False
-    assert made._show_if_due(trainer, system, {}) and not made.view.cameras
-    made.view.watched, made._due = False, 0.0
-    del system.geometry
-    assert not made._show_if_due(trainer, system)
-
-
-def test_a_pause_ends_with_one_step_or_with_a_signal(viewer, monkeypatch):
-    made, trainer, system = viewer
+def test_a_pause_ends_with_one_step_or_with_a_signal_and_nothing_is_read_without_a_browser(
+    viewer, monkeypatch
+):
+    made, trainer, system, _ = viewer
     waits = []
     monkeypatch.setattr(live_viewer.time, "sleep", waits.append)
-    made.controls.picture.clear()
+    made.view.watched = False
+    del system.geometry
     made.controls.paused, made.controls.steps = True, 1
     made.on_train_batch_start(trainer, system, {}, 0)
     assert not waits

@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.launch.run import check_optimizer
+from threestudio_gaussiandreamer.gaussians.densify import Change
+from threestudio_gaussiandreamer.launch.run import check_optimizer, lightning_errors
 from threestudio_gaussiandreamer.training.geometry import GaussianCloud
 from threestudio_gaussiandreamer.training.system import GaussianDreamerSystem
 
@@ -41,6 +42,22 @@ def test_an_impossible_cloud_is_refused(cloud, name, change, message):
         GaussianDreamerSystem.check_checkpoint({"state_dict": state}, "a.ckpt")
 
 
+@pytest.mark.parametrize(
+    ("parents", "names", "message"),
+    [
+        ([], None, "leaves no Gaussian"),
+        ([3], ["means"], r"has the shapes {'means': \(1, 3\)}; expected"),
+        ([10], None, "parents of the change of the cloud: expected 1 integers from 0 to 9"),
+    ],
+)
+def test_an_impossible_change_of_the_cloud_is_refused(cloud, parents, names, message):
+    stored = cloud.parameters_by_name()
+    values = {name: stored[name].detach()[: len(parents)] for name in names or stored}
+    rows = torch.tensor(parents, dtype=torch.long)
+    with pytest.raises(UserError, match=message):
+        cloud.apply_change(Change(rows, rows < 0, values), None)
+
+
 def test_the_state_of_another_optimiser_is_refused(cloud):
     optimizer = torch.optim.Adam(cloud.parameter_groups(), lr=1e-3)
     for _ in range(2):  # without and with moments
@@ -60,3 +77,11 @@ def test_the_state_of_another_optimiser_is_refused(cloud):
     for damaged in ([], [None], [{"param_groups": [{"params": [0]}], "state": {}}]):
         with pytest.raises(UserError, match="Adam can't resume"):
             check_optimizer("Adam", damaged, "a.ckpt")
+
+
+def test_torchs_words_about_other_parameters_are_one_line():
+    with pytest.raises(UserError) as error, lightning_errors("last.ckpt"):
+        torch.nn.Linear(2, 3).load_state_dict({"tint": torch.ones(3)})
+    assert "last.ckpt was made by another configuration: " in str(error.value)
+    assert 'Unexpected key(s) in state_dict: "tint"' in str(error.value)
+    assert "\n" not in str(error.value)

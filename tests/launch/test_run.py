@@ -1,9 +1,7 @@
 """What a run writes beside its results, and concurrent runs in one folder."""
 
 import datetime
-import fcntl
 import os
-import signal
 from pathlib import Path
 
 import pytest
@@ -20,8 +18,7 @@ from threestudio_gaussiandreamer.launch import (
 )
 from threestudio_gaussiandreamer.launch.config import load_config
 from threestudio_gaussiandreamer.launch.ddp import ReplicatedStrategy
-from threestudio_gaussiandreamer.launch.experiment import main
-from threestudio_gaussiandreamer.launch.folder_lock import claim
+from threestudio_gaussiandreamer.launch.run_folder import claim
 
 # -- files beside the run --------------------------------------------------------------------------
 
@@ -39,19 +36,6 @@ def test_what_is_no_source_in_custom_is_neither_loaded_nor_copied(launch):
     assert code == 0 and "custom/pipe.py is no file" in err
     copied = {name for name in files(only_run() / "code/custom") if not name.endswith(".pyc")}
     assert copied == {"part.py", "package/__init__.py", "package/inner.py"}
-
-
-def test_a_source_that_can_not_be_read_is_left_out_of_the_copy(monkeypatch, tmp_path):
-    def forbidden(path):
-        if path.name == "secret.py":
-            raise PermissionError(13, "Permission denied")
-        return read_bytes(path)
-
-    read_bytes = Path.read_bytes
-    for name in ("secret.py", "part.py", ".hidden.py", "data.npy"):
-        (tmp_path / name).touch()
-    monkeypatch.setattr(Path, "read_bytes", forbidden)
-    assert callbacks.read_sources(tmp_path, Path("code")) == {Path("code/part.py"): b""}
 
 
 def test_the_record_holds_what_was_read_and_said(launch, monkeypatch):
@@ -172,33 +156,6 @@ def test_the_record_of_a_new_run_is_written_with_its_first_checkpoint(launch, mo
     go_on = ["resume=auto", "trainer.max_steps=9"]
     assert launch("--train", *ONE_FOLDER, *go_on, "seed=7")[0] == 0
     assert seen[0] == (5, True) and load_config(parsed).seed == 7
-
-
-def test_a_run_that_is_refused_leaves_the_folder_of_the_one_that_trains(launch, monkeypatch):
-    """The rejected run creates the folder and is stopped before it locks it; it continues while the
-    other one trains.
-    """
-    with monkeypatch.context() as patch:
-        flock = fcntl.flock
-        patch.setattr(
-            fcntl, "flock", lambda *lock: (os.kill(os.getpid(), signal.SIGSTOP), flock(*lock))[1]
-        )
-        refused = os.fork()
-        if refused == 0:
-            os._exit(main(["--config", "tiny.yaml", "--train", *ONE_FOLDER]))
-        assert os.WIFSTOPPED(os.waitpid(refused, os.WUNTRACED)[1])
-    ended = []
-
-    def let_it_go_on(system, batch, batch_idx):
-        if system.global_step == 1:  # when nothing is saved yet
-            os.kill(refused, signal.SIGCONT)
-            ended.append(os.waitstatus_to_exitcode(os.waitpid(refused, 0)[1]))
-        return training_step(system, batch, batch_idx)
-
-    training_step = tiny_parts.TinySystem.training_step
-    monkeypatch.setattr(tiny_parts.TinySystem, "training_step", let_it_go_on)
-    assert launch("--train", *ONE_FOLDER)[0] == 0 and ended == [2]
-    assert {"cmd.txt", "save/it3-0.png", "ckpts/last.ckpt"} <= files(Path("outputs/tiny/run"))
 
 
 def test_a_folder_in_use_is_refused_before_the_parts_are_built(launch, monkeypatch):

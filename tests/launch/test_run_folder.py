@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from omegaconf import OmegaConf
 
-from tests.launch.config_cases import load
+from tests.launch.cases import load
 from threestudio_gaussiandreamer.core.checkpoint_file import save_file
 from threestudio_gaussiandreamer.launch import run_folder
 from threestudio_gaussiandreamer.launch.config import dump_config, load_config

@@ -10,13 +10,16 @@ import sys
 import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
+import torch
 
 from tests.helpers import tiny_parts
 from tests.helpers.tiny_runs import assert_same_training, files, only_run
 from threestudio_gaussiandreamer.core.checkpoint_file import load_file
 from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.core.host_copies import DelayedReads, HostCopy
 from threestudio_gaussiandreamer.launch import callbacks
 from threestudio_gaussiandreamer.launch.config import load_config
 from threestudio_gaussiandreamer.launch.experiment import main
@@ -54,7 +57,7 @@ def test_stopped_and_resumed_equals_never_stopped(launch, monkeypatch):
         patch.setattr(tiny_parts.TinySystem, "validation_step", sends(signal.SIGTERM))
         # the second view brings the second signal, which would end it at once
         code, out, _ = launch("--train", "data.views=1")
-    assert code == 143 and "stopped at step 3" in out
+    assert code == 143 and "stopped at step 4" in out
     parsed = f"{only_run()}/configs/parsed.yaml"
     assert launch("--train", f"resume={only_run()}/ckpts/last.ckpt", config=parsed)[0] == 0
     assert_same_training(only_run() / "ckpts/last.ckpt", whole)
@@ -152,43 +155,29 @@ def test_a_closed_terminal_leaves_a_checkpoint(launch, monkeypatch):
     assert load_file(only_run() / "ckpts/last.ckpt")["global_step"] > 0
 
 
-def test_a_checkpoint_is_written_about_every_minute(launch, monkeypatch):
+@pytest.mark.parametrize(
+    ("seconds", "writing", "steps"), [(20.0, 0.0, [3, 6, 9]), (100.0, 5.0, [1, 6, 11])]
+)
+def test_checkpoints_are_written_about_every_minute_in_a_hundredth_of_the_time(
+    launch, monkeypatch, seconds, writing, steps
+):
     """A run that is killed between its own checkpoints loses at most that much."""
-    steps, clock = [], [0.0]
+    clock, saved, training_step = [0.0], [], tiny_parts.TinySystem.training_step
 
-    def step_of_20_seconds(system, batch, batch_idx):
-        clock[0] += 20.0
-        steps.append((only_run() / "ckpts/last.ckpt").is_file() and last_step())
+    def slow_step(system, batch, batch_idx):
+        clock[0] += seconds
         return training_step(system, batch, batch_idx)
-
-    def last_step():
-        return load_file(only_run() / "ckpts/last.ckpt")["global_step"]
-
-    training_step = tiny_parts.TinySystem.training_step
-    monkeypatch.setattr(tiny_parts.TinySystem, "training_step", step_of_20_seconds)
-    monkeypatch.setattr(callbacks.time, "monotonic", lambda: clock[0])
-    assert launch("--train", "trainer.max_steps=8", "trainer.limit_val_batches=0")[0] == 0
-    assert steps == [False, False, False, 3, 3, 3, 6, 6] and last_step() == 8
-
-
-def test_checkpoints_take_a_hundredth_of_the_time_at_most(launch, monkeypatch):
-    clock, saved = [0.0], []
 
     def slow_save(path, content):
-        clock[0] += 5.0
+        clock[0] += writing
         saved.append(content["global_step"])
 
-    def step_of_100_seconds(system, batch, batch_idx):
-        clock[0] += 100.0
-        return training_step(system, batch, batch_idx)
-
-    training_step = tiny_parts.TinySystem.training_step
-    monkeypatch.setattr(tiny_parts.TinySystem, "training_step", step_of_100_seconds)
+    monkeypatch.setattr(tiny_parts.TinySystem, "training_step", slow_step)
     monkeypatch.setattr(callbacks.time, "monotonic", lambda: clock[0])
     monkeypatch.setattr(callbacks, "save_file", slow_save)
     options = ["trainer.max_steps=12", "trainer.limit_val_batches=0", "checkpoint.save_last=false"]
     assert launch("--train", *options)[0] == 0
-    assert [step for step in saved if step < 12] == [1, 6, 11]
+    assert [step for step in saved if step < 12] == steps and saved[-1] == 12
 
 
 def test_it_runs_outside_of_the_main_thread(launch):
@@ -197,3 +186,13 @@ def test_it_runs_outside_of_the_main_thread(launch):
     thread.start()
     thread.join()
     assert codes == [0]
+
+
+def test_numbers_that_have_not_arrived_are_logged_when_an_exception_ends_training(monkeypatch):
+    monkeypatch.setattr(HostCopy, "ready", lambda copy: False)
+    log, seen = SimpleNamespace(reads=DelayedReads()), []
+    log.reads.submit(torch.tensor(1.0), seen.append)
+    last = callbacks.LastCheckpoint(Path(), None)
+    last.on_exception(None, SimpleNamespace(step_log=log), KeyboardInterrupt())
+    assert seen == [1.0]
+    last.on_exception(None, object(), KeyboardInterrupt())  # another package's system

@@ -11,7 +11,7 @@ from tests.toybox.helpers import copied, options, training
 from threestudio_gaussiandreamer.core.checkpoint_file import load_file, save_file
 from threestudio_gaussiandreamer.core.devices import torch_threads
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.launch.folder_lock import claim
+from threestudio_gaussiandreamer.launch.run_folder import claim
 from threestudio_gaussiandreamer.toybox import judge_stage, loop
 from threestudio_gaussiandreamer.toybox.loop import averaged_weights
 from threestudio_gaussiandreamer.toybox.train import STAGES, main, render_shards

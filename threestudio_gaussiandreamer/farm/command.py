@@ -13,8 +13,8 @@ from ..core.errors import UserError
 from ..core.launcher import train_alone
 from ..core.options import RULE, at_least, positive
 from ..launch.experiment import configure_logging
-from ..launch.folder_lock import claim, require_writable
 from ..launch.options import add_config, parse_with_overrides
+from ..launch.run_folder import claim, require_writable
 from . import driver
 from .board import Board
 from .place import FAILED, FINISHED, Place

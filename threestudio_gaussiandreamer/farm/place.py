@@ -17,7 +17,7 @@ from typing import Any, Optional
 
 from ..core.errors import UserError
 from ..core.files import atomic_file, json_text
-from ..launch.folder_lock import make_folder
+from ..launch.run_folder import make_folder
 from .rows import Row
 
 ASSETS, PARTS = "assets", "parts"

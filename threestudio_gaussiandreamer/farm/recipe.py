@@ -15,8 +15,7 @@ from tqdm import tqdm
 
 from .. import __version__
 from ..core.errors import UserError
-from ..launch.config import read_yaml
-from ..launch.experiment import read_source
+from ..launch.config import read_source, read_yaml
 from ..launch.options import find_config
 from ..launch.run_folder import program_anywhere
 from .place import CHANGED, FINISHED, AnotherRow, Place

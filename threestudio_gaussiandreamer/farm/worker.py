@@ -138,8 +138,8 @@ class Worker:
     def _run(self, job: Job, folder: Path, attempt: int) -> tuple[Any, int]:
         """Train an asset with the launcher; return its run and exit code."""
         from ..launch import experiment
-        from ..launch.folder_lock import FolderInUse
         from ..launch.options import parse_arguments
+        from ..launch.run_folder import FolderInUse
 
         heartbeat = Heartbeat(job, attempt, self.number, self.setting)
         deadline = time.monotonic() + SECONDS_FOR_LOCK

@@ -1,8 +1,5 @@
-"""The host that parts register into: threestudio when it is importable, otherwise the built-in one.
-
-This is the only module that selects the host. All others import these names from here, with the
-same meaning in both hosts.
-"""
+"""The host that parts register into: threestudio when it is importable, otherwise the built-in one;
+all other modules import these names from here, with the same meaning in both hosts."""
 
 import dataclasses
 import os
@@ -17,10 +14,8 @@ from ..core.streams import derive_seed
 
 
 def _threestudio_is_importable() -> bool:
-    """Return whether ``import threestudio`` gives the package, and not just a folder of that name.
-
-    Raises:
-        UserError: threestudio is installed, but importing it fails; the intended host is ambiguous.
+    """Return whether ``import threestudio`` gives the package, and not just a folder of that name;
+    raise UserError if it is installed, but importing it fails: the intended host is ambiguous.
     """
     try:
         import threestudio
@@ -115,11 +110,7 @@ if _threestudio_is_importable():
         return sorted(threestudio.__modules__)
 
     def find(name: str) -> type:
-        """Return the class registered as ``name``.
-
-        Raises:
-            UserError: no part has that name; the message lists similar ones.
-        """
+        """Return the class registered as ``name``; raise UserError, with near ones, if none is."""
         try:
             return threestudio.find(name)
         except KeyError:
@@ -136,9 +127,7 @@ if _threestudio_is_importable():
         return enter
 
     def register_builtin(name: str) -> Callable[[type], type]:
-        """Return a class decorator that has no effect, since threestudio has its own part of this
-        name. In the built-in host it is :func:`register`.
-        """
+        """Return a decorator without effect, since threestudio has its own part of this name."""
         return lambda cls: cls
 
 else:

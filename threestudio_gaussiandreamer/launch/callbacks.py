@@ -1,6 +1,4 @@
-"""Lightning callbacks of the launcher: the record of the run, the progress bar, and checkpoints,
-also when a signal stops training.
-"""
+"""Lightning callbacks of the launcher: the record of the run, the progress bar, checkpoints."""
 
 import contextlib
 import os
@@ -8,16 +6,16 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
-from typing import Any
+from typing import Any, Optional
 
 from ..core.checkpoint_file import load_file, save_file
 from ..core.files import atomic_file
 from ..core.host_copies import flush_reads
 from ..core.signals import interrupt, restore_handlers, set_handlers
-from ..host import info, pl, warn
+from ..host import info, pl
 from .config import dump_config
 from .run_folder import PARSED
 
@@ -25,27 +23,22 @@ SECONDS_BETWEEN = 60.0
 """Shortest time between two checkpoints, seconds: a crash loses about as much training."""
 SHARE_OF_TIME = 0.01
 """Largest share of the running time that is spent on writing checkpoints."""
-SECONDS_SHOWN = 0.5
-"""Time from one drawing of the progress bar to the next, seconds: one costs as much as a log."""
 SOURCE_ENDINGS = (".py", ".yaml", ".h", ".cpp", ".cu", ".html", ".css", ".js", ".glsl")
 
 
 class Stopped(BaseException):
-    """Raised when a signal has stopped training and a checkpoint is written. It derives from
-    BaseException, so that handlers of Exception don't catch it.
-    """
+    """Raised when a signal has stopped training and a checkpoint is written."""
 
     def __init__(self, signum: int, step: int) -> None:
-        super().__init__(f"stopped by {signal.Signals(signum).name} at step {step}")
         self.signum, self.step = signum, step
 
 
 @dataclass(eq=False)
 class RunRecord(pl.Callback):
     """Write ``configs/raw.yaml``, ``configs/parsed.yaml``, ``code/`` and ``cmd.txt`` when the first
-    stage starts, before the prior. Files of an earlier run in the folder are replaced when there
-    are others: its results are renamed when the prior's cloud is there, its checkpoints and record
-    with the first checkpoint, so that a start that fails leaves them in their place.
+    stage starts, before the prior. The results of an earlier run in the folder are set aside when
+    the prior's cloud is there, its checkpoints and record with the first checkpoint, so that a
+    start that fails leaves them in their place.
     """
 
     folder: Path
@@ -54,17 +47,16 @@ class RunRecord(pl.Callback):
     command: str
     records_code: bool
     at_zero: bool
-    _files: dict[Path, bytes] = field(default_factory=dict)
+    _files: Optional[dict[Path, bytes]] = None
     _is_due: bool = False
-    _is_read: bool = False
 
     def setup(self, trainer: Any, pl_module: Any, stage: str) -> None:
-        if not trainer.is_global_zero or self._is_read:
+        if not trainer.is_global_zero or self._files is not None:
             return
-        self._is_read = self._is_due = True
+        self._is_due, self._files = True, {}
         if self.records_code:  # now, since the files may change before they are written
             package, code = Path(__file__).parents[1], self.folder / "code"
-            self._files = read_sources(package, code / package.name)
+            self._files |= read_sources(package, code / package.name)
             self._files |= read_sources(Path("custom"), code / "custom")
         if not (self._has_checkpoints() and (self.folder / PARSED).is_file()):
             self.write()
@@ -84,9 +76,7 @@ class RunRecord(pl.Callback):
 
     @contextlib.contextmanager
     def first_checkpoint(self) -> Iterator[None]:
-        """Replace the record of an earlier run, around the first checkpoint: of a run from step 0
-        before it, together with the earlier checkpoints; of a resumed run after it.
-        """
+        """Replace an earlier run's record before the first checkpoint, or after it if resumed."""
         if self.at_zero:
             if self._has_checkpoints():
                 aside = (self.folder / "ckpts").rename(self.folder / f"ckpts-{self.number}")
@@ -122,38 +112,22 @@ class RunRecord(pl.Callback):
 
 
 def read_sources(source: Path, destination: Path) -> dict[Path, bytes]:
-    """Read the source files below a folder, but for hidden ones; return them by the paths of their
-    copies.
-    """
+    """Read the source files below a folder, but for hidden ones, by the paths of their copies."""
     found = {}
     for path in source.rglob("*"):
         name = path.relative_to(source)
+        is_hidden = any(part.startswith((".", "__pycache__")) for part in name.parts)
         # an editor's lock (a broken link) or a FIFO is no file
-        if path.suffix in SOURCE_ENDINGS and path.is_file():
-            if not any(part.startswith((".", "__pycache__")) for part in name.parts):
-                try:
-                    found[destination / name] = path.read_bytes()
-                except OSError as error:
-                    warn(f"{path} isn't copied to {destination}: {error.strerror}")
+        if path.suffix in SOURCE_ENDINGS and not is_hidden and path.is_file():
+            found[destination / name] = path.read_bytes()
     return found
 
 
 class ProgressBar(pl.callbacks.TQDMProgressBar):
-    """Lightning's progress bar without the version number. In training it is drawn about every
-    :data:`SECONDS_SHOWN`; if the output isn't a terminal, it is printed every 100 steps.
-    """
+    """Lightning's progress bar, drawn every 5 steps, or every 100 without a terminal."""
 
     def __init__(self) -> None:
-        super().__init__(refresh_rate=1 if sys.stderr.isatty() else 100)
-        self._due = 0.0
-
-    def on_train_batch_end(
-        self, trainer: Any, pl_module: Any, outputs: Any, batch: Any, batch_idx: int
-    ) -> None:
-        now, is_last = time.monotonic(), batch_idx + 1 == self.train_progress_bar.total
-        if self.refresh_rate > 1 or is_last or now >= self._due:
-            self._due = now + SECONDS_SHOWN
-            super().on_train_batch_end(trainer, pl_module, outputs, batch, batch_idx)
+        super().__init__(refresh_rate=5 if sys.stderr.isatty() else 100)
 
     def get_metrics(self, trainer: Any, pl_module: Any) -> dict[str, Any]:
         metrics = super().get_metrics(trainer, pl_module)
@@ -167,9 +141,8 @@ class ProgressBar(pl.callbacks.TQDMProgressBar):
 
 
 class AtomicCheckpointIO(pl.plugins.CheckpointIO):
-    """Write and read checkpoints by :mod:`.core.checkpoint_file`, the first one in the context that
-    ``first`` returns; ``steps`` has the step of the last one at each path, ``seconds`` is the
-    duration of the last write.
+    """Write and read checkpoints, the first one in the context that ``first`` returns; ``steps``
+    has the step of the last one at each path, ``seconds`` is the duration of the last write.
     """
 
     def __init__(self, first: Callable[[], Any] = contextlib.nullcontext) -> None:
@@ -197,10 +170,8 @@ class AtomicCheckpointIO(pl.plugins.CheckpointIO):
 class LastCheckpoint(pl.callbacks.Checkpoint):
     """Write ``last.ckpt`` after the last step, about every :data:`SECONDS_BETWEEN`, and after a
     stop signal: the current step is finished, the file written and :class:`Stopped` raised. A
-    second signal stops immediately.
-
-    Lightning calls subclasses of ``Checkpoint`` after all other callbacks, so this one saves the
-    same state as ModelCheckpoint."""
+    second signal stops immediately. Lightning calls subclasses of ``Checkpoint`` last.
+    """
 
     def __init__(self, last: Path, checkpoint_io: AtomicCheckpointIO) -> None:
         self.last, self.checkpoint_io = last, checkpoint_io
@@ -216,10 +187,6 @@ class LastCheckpoint(pl.callbacks.Checkpoint):
         is_due = time.monotonic() >= self._due or trainer.global_step == trainer.max_steps
         if _any_process(trainer, is_due or bool(self.signum)):
             self._save(trainer)
-            self._stop_if_asked(trainer)
-
-    def on_validation_end(self, trainer: Any, pl_module: Any) -> None:
-        if trainer.state.fn == "fit" and not trainer.sanity_checking:
             self._stop_if_asked(trainer)
 
     def on_train_end(self, trainer: Any, pl_module: Any) -> None:
@@ -247,11 +214,9 @@ class LastCheckpoint(pl.callbacks.Checkpoint):
             raise Stopped(self.signum or signal.SIGTERM, trainer.global_step)
 
     def _save(self, trainer: Any) -> None:
-        """Write the checkpoint, and schedule the next one so that saving takes at most
-        :data:`SHARE_OF_TIME` of the running time.
-        """
+        """Write the checkpoint, and schedule the next so that they take :data:`SHARE_OF_TIME`."""
         is_new = self.checkpoint_io.steps.get(os.path.abspath(self.last)) != trainer.global_step
-        # only the first process writes and knows the step, but all take part in saving
+        # only the first process knows the step, but all take part in saving
         if _any_process(trainer, trainer.is_global_zero and is_new):
             trainer.save_checkpoint(self.last)
         # not the time of save_checkpoint(), in which the system scores the prior once

@@ -1,8 +1,7 @@
 """Check a whole configuration before any work: keys at every depth, types and registered names.
 
-The key ``x_type`` names the part that the section ``x`` beside it configures: ``data_type`` and
-``data``, ``system.geometry_type`` and ``system.geometry``, ``system.geometry.prior_type`` and
-``system.geometry.prior``. The keys of a section are the fields of its part's ``Config``."""
+The key ``x_type`` names the part that the section ``x`` beside it configures; the keys of a section
+are the fields of its part's ``Config``."""
 
 import inspect
 import os
@@ -10,7 +9,6 @@ from collections.abc import Mapping
 from dataclasses import field, make_dataclass
 from typing import Any
 
-import torch
 from omegaconf import OmegaConf
 
 from ..core.distributed import require_shareable
@@ -24,7 +22,6 @@ from ..core.options import (
     parse_structured,
     require_mapping,
     satisfies,
-    shown,
 )
 from ..host import find, pl
 from ..training.data import sizes_of_stages
@@ -32,14 +29,9 @@ from .live_viewer import ViewerConfig
 from .parts import check_kind, find_part
 
 LAUNCHER_SETS = {
-    "accelerator": "--gpu",
-    "callbacks": "the launcher",
-    "logger": "the launcher and system.loggers",
-    "plugins": "the launcher",
-    "inference_mode": "the launcher",
-    "enable_checkpointing": "the launcher",
-    "default_root_dir": "exp_root_dir",
-    "dirpath": "exp_root_dir, name and tag",
+    **dict.fromkeys(("callbacks", "logger", "plugins", "inference_mode"), "the launcher"),
+    **{"enable_checkpointing": "the launcher", "accelerator": "--gpu"},
+    **{"default_root_dir": "exp_root_dir", "dirpath": "exp_root_dir, name and tag"},
 }
 # left out when the trainer is built for the check, since they start or look for other processes
 NEEDS_PROCESSES = ("strategy", "num_nodes", "sync_batchnorm")
@@ -75,41 +67,33 @@ TRAINER: dict[str, Rule] = {
     "strategy": one_of(("auto", "ddp")),
 }
 """What Lightning itself doesn't check before training, or what has no use here."""
-LONGEST_NAME = 200
-"""Longest name of a checkpoint, bytes; file systems allow 255, of which numbers and suffixes need
-some.
-"""
 DATA = ("gaussiandreamer-datamodule", "random-camera-datamodule")
 """Data modules that draw new views in each step."""
 
 
 def check_config(cfg: Any) -> None:
     """Check the result of :func:`config.load_config` against the registered parts and Lightning's
-    signatures.
-
-    Raises:
-        UserError: an unknown key or name (with the nearest valid one), or a value of the wrong type
-            or out of range. The message is about the first error and begins with its dotted path.
+    signatures; raise UserError for an unknown key or name (with the nearest valid one), or a value
+    of the wrong type or out of range.
     """
     if cfg.trainer.get("strategy", "auto") is None:  # as an earlier parsed.yaml may have it
         cfg.trainer.strategy = "auto"
     # the trainer first, since schedules of parts may refer to its number of steps
     _check_arguments("trainer", cfg.trainer, pl.Trainer, TRAINER)
+    drop_removed(ViewerConfig, cfg.viewer, "viewer.")
     parse_structured(ViewerConfig, cfg.viewer, "viewer.")
     check_part("data", cfg.data_type, cfg.data)
     check_part("system", cfg.system_type, cfg.system)
     check_sections(cfg)
     _check_arguments("checkpoint", cfg.checkpoint, pl.callbacks.ModelCheckpoint, {})
-    if cfg.checkpoint.get("every_n_train_steps") == cfg.trainer.get("max_steps") == -1:
-        raise UserError(
-            "checkpoint.every_n_train_steps is -1, as trainer.max_steps, from which configurations "
-            "take it: for a run without an end, set it to a number of steps"
-        )
-    _check_monitor(cfg)
-    _check_file_name(build("checkpoint", pl.callbacks.ModelCheckpoint, plain(cfg.checkpoint)))
-    options = {
-        key: value for key, value in plain(cfg.trainer).items() if key not in NEEDS_PROCESSES
-    }
+    # Lightning looks for what is to be monitored only after the first validation
+    monitor, system = cfg.checkpoint.get("monitor"), find(cfg.system_type)
+    if monitor is not None and hasattr(system, "logged"):
+        logged = system.logged(parse_structured(system.Config, cfg.system, "system."))
+        if logged is not None and monitor not in logged | {"epoch", "step"}:
+            raise unknown("checkpoint.monitor", monitor, logged)
+    build("checkpoint", pl.callbacks.ModelCheckpoint, plain(cfg.checkpoint))
+    options = {key: v for key, v in plain(cfg.trainer).items() if key not in NEEDS_PROCESSES}
     build("trainer", pl.Trainer, {**options, "devices": 1, "logger": False})
 
 
@@ -134,17 +118,13 @@ def check_part(path: str, type_name: Any, values: Any) -> None:
         section = key.removesuffix("_type")
         if section == key or section not in typed:
             continue
-        if not typed[key] and (default := getattr(config_class, key, None)):
-            raise UserError(f"{path}.{key} is empty: name a registered part, such as {default!r}")
-        if typed[key]:
+        if typed[key] or getattr(config_class, key, None):  # an empty name is an error there
             given = values.get(section)
             check_part(f"{path}.{section}", typed[key], typed[section] if given is None else given)
 
 
 def _check_arguments(section: str, values: Any, owner: type, rules: Mapping[str, Rule]) -> None:
-    """Check a section against the arguments of a class of Lightning, as against a ``Config``; what
-    isn't given as a number where one is expected becomes one.
-    """
+    """Check a section against the arguments of a class of Lightning; texts become numbers."""
     require_mapping(section, values)
     for key in values:
         if key in LAUNCHER_SETS:
@@ -160,49 +140,8 @@ def _check_arguments(section: str, values: Any, owner: type, rules: Mapping[str,
             values[key] = getattr(typed, key)
 
 
-def _check_file_name(checkpointing: Any) -> None:
-    """Raise UserError unless Lightning can make names of files from ``checkpoint.filename``."""
-    try:
-        made = checkpointing.format_checkpoint_name(
-            {"epoch": torch.tensor(0), "step": torch.tensor(0)}
-        )
-        longest = max(len(os.fsencode(part)) for part in made.split(os.sep))
-        is_inside = not os.path.isabs(made) and not os.path.normpath(made).startswith(os.pardir)
-    except Exception as error:  # of str.format, for instance ValueError, KeyError, AttributeError
-        is_inside, longest, made = False, 0, str(error)
-    if not is_inside or longest > LONGEST_NAME or "\0" in made:
-        raise UserError(
-            f"checkpoint.filename is {shown(checkpointing.filename)}; expected a format such as "
-            f"'{{epoch}}-{{step}}', of names of at most {LONGEST_NAME} bytes below the folder of "
-            "the checkpoints"
-        )
-
-
-def _check_monitor(cfg: Any) -> None:
-    """Check that ``checkpoint.monitor`` is logged; Lightning fails only after the first validation.
-
-    Systems may have a static method ``logged`` that returns the logged names for a configuration;
-    without it nothing is checked."""
-    monitor, system = cfg.checkpoint.get("monitor"), find(cfg.system_type)
-    logged = getattr(system, "logged", None)
-    if monitor is None or logged is None:
-        return
-    quantities = logged(parse_structured(system.Config, cfg.system, "system."))
-    if quantities is not None and monitor not in quantities | {"epoch", "step"}:
-        raise unknown("checkpoint.monitor", monitor, quantities)
-    if not cfg.trainer.get("log_every_n_steps", 1):
-        raise UserError(
-            f"checkpoint.monitor is {monitor!r}, but with trainer.log_every_n_steps=0 nothing "
-            "is logged"
-        )
-
-
 def build(section: str, owner: type, arguments: dict) -> Any:
-    """Construct ``owner(**arguments)``, in which Lightning checks combinations and literals.
-
-    Raises:
-        UserError: the constructor fails.
-    """
+    """Return ``owner(**arguments)``; raise UserError for combinations that Lightning refuses."""
     try:
         return owner(**arguments)
     except Exception as error:  # Lightning also raises OverflowError, AttributeError, ImportError
@@ -218,19 +157,12 @@ def plain(section: Any) -> Any:
 
 
 def check_sections(cfg: Any) -> None:
-    """Check the guidance's options against those of the cameras, background and prompts.
-
-    Args:
-        cfg: a configuration whose sections have been checked.
-
-    Raises:
-        UserError: they contradict each other.
-    """
-    name = cfg.system.get("guidance_type")
+    """Raise UserError if the guidance contradicts the cameras, the renderer or the prompts."""
+    name, system = cfg.system.get("guidance_type"), cfg.system
     options = getattr(find(name), "Config", None) if name else None
     if options is None:
         return
-    guidance = parse_structured(options, cfg.system.get("guidance"))
+    guidance = parse_structured(options, system.get("guidance"))
     # a model that sees several views together must get them together
     together, given = getattr(guidance, "n_view", 1), cfg.data.get("n_view", 1)
     if together not in (1, given):
@@ -240,11 +172,27 @@ def check_sections(cfg: Any) -> None:
         )
     if hasattr(options, "check_render_size") and cfg.data_type in DATA:
         data = parse_structured(find(cfg.data_type).Config, cfg.data)
-        downsample = (cfg.system.get("renderer") or {}).get("downsample", 1)
+        downsample = (system.get("renderer") or {}).get("downsample", 1)
         for height, width, _ in sizes_of_stages(data):
             options.check_render_size(guidance, height // downsample, width // downsample)
-    if hasattr(guidance, "view_dependent_prompting"):
-        _check_prompts(guidance, cfg.system)
+    by_text = hasattr(guidance, "view_dependent_prompting")
+    if by_text and system.get("prompt_processor_type") == "plain-prompt-processor":
+        raise UserError(f"system.prompt_processor_type: {name} needs one that encodes text")
+    if by_text and (system.get("prompt_processor") or {}).get("use_perp_neg"):
+        reasons = {
+            "and this guidance has one prompt for all: set it to false": together > 1,
+            "of which there is one: set system.guidance.view_dependent_prompting=true": (
+                not guidance.view_dependent_prompting
+            ),
+            "as view_contrast does: set it to false, or system.guidance.view_contrast=0": (
+                getattr(guidance, "view_contrast", 0)
+            ),
+        }
+        if reason := next((reason for reason, holds in reasons.items() if holds), None):
+            raise UserError(
+                "system.prompt_processor.use_perp_neg: Perp-Neg compares the prompts of views, "
+                f"{reason}"
+            )
 
 
 def check_shared_views(cfg: Any) -> None:
@@ -255,26 +203,3 @@ def check_shared_views(cfg: Any) -> None:
             require_shareable(
                 views, "data.batch_size", together=getattr(data, "n_view", 1), processes=cfg.n_gpus
             )
-
-
-def _check_prompts(guidance: Any, system: Any) -> None:
-    """Raise UserError where a guidance by text can't use the prompts."""
-    if system.get("prompt_processor_type") == "plain-prompt-processor":
-        raise UserError(
-            f"system.prompt_processor_type: {system.guidance_type} needs a prompt processor that "
-            "encodes text, plain-prompt-processor doesn't"
-        )
-    if not (system.get("prompt_processor") or {}).get("use_perp_neg"):
-        return
-    reason = ""
-    if getattr(guidance, "n_view", 1) > 1:
-        reason = "and this guidance has one prompt for all: set it to false"
-    elif not guidance.view_dependent_prompting:
-        reason = "of which there is one: set system.guidance.view_dependent_prompting=true"
-    elif getattr(guidance, "view_contrast", 0):
-        reason = "as view_contrast does: set it to false, or system.guidance.view_contrast=0"
-    if reason:
-        raise UserError(
-            "system.prompt_processor.use_perp_neg: Perp-Neg compares the prompts of views, "
-            f"{reason}"
-        )

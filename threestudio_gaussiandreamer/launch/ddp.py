@@ -1,11 +1,7 @@
 """Several processes that train one cloud: how many there are, and Lightning's strategy for them.
 
 Every process has a copy of the cloud and renders its share of a step's views. The system averages
-the gradients (``distributed.average_gradients``), not DistributedDataParallel, which ties its
-buckets to the parameters of its first iteration, which densification replaces.
-
-The processes are started by ``torchrun``, by SLURM's ``srun`` with one task each, or by Lightning,
-for ``--gpu 0,1`` or ``trainer.devices=2`` (without a GPU: processes on the CPU)."""
+the gradients: DistributedDataParallel would keep the parameters that densification replaces."""
 
 import importlib
 import os
@@ -24,7 +20,6 @@ from ..host import pl, warn
 
 LONGEST_WAIT = timedelta(hours=12)
 """A process waits so long for the others, for instance while the first one renders results."""
-SLURM, TORCHRUN = "SLURM", "torchrun"
 LOST_CONNECTION = re.compile(
     r"\bpeer\b|\bconnection\b|\bsocket\b|\bremote\b|timed out|broken pipe|pair closure", re.I
 )
@@ -34,11 +29,9 @@ LOST_CONNECTION = re.compile(
 class Processes(NamedTuple):
     """The processes that train one cloud."""
 
-    devices: int
-    """On each machine."""
+    devices: int  # on each machine
     nodes: int
-    started_by: Optional[str] = None
-    """The program that has started them; None if Lightning does."""
+    started_by: Optional[str] = None  # None is Lightning
 
     @property
     def total(self) -> int:
@@ -47,9 +40,6 @@ class Processes(NamedTuple):
 
 class ReplicatedStrategy(pl.strategies.DDPStrategy):
     """Launch and connect processes as DDP does, without wrapping the module."""
-
-    def __init__(self, **options: Any) -> None:
-        super().__init__(**{"timeout": LONGEST_WAIT, **options})
 
     def _setup_model(self, model: torch.nn.Module) -> torch.nn.Module:
         return model
@@ -60,33 +50,30 @@ class ReplicatedStrategy(pl.strategies.DDPStrategy):
 
 def planned_processes(n_gpus: int, trainer: Mapping[str, Any]) -> Processes:
     """Return the processes that torchrun or SLURM has started, else those that ``trainer.devices``
-    (by default one for each visible GPU) and ``trainer.num_nodes`` ask for.
-
-    Args:
-        n_gpus: visible GPUs; 0 for the CPU.
-        trainer: the section of the configuration.
-
-    Raises:
-        UserError: the options contradict the launcher, or there are too few GPUs.
+    (by default one for each of the ``n_gpus`` visible GPUs) and ``trainer.num_nodes`` ask for;
+    raise UserError if the options contradict the launcher, or there are too few GPUs.
     """
     asked = {n: trainer[n] for n in ("devices", "num_nodes") if trainer.get(n) is not None}
     for name, value in asked.items():
         if not (is_whole(value) and value > 0):
             raise UserError(f"trainer.{name}: expected a whole number from 1 on, got {value!r}")
-    wanted = Processes(asked.get("devices", max(n_gpus, 1)), asked.get("num_nodes", 1))
-    found = _started_processes() or wanted
+    found = Processes(asked.get("devices", max(n_gpus, 1)), asked.get("num_nodes", 1))
+    if "TORCHELASTIC_RUN_ID" in os.environ:
+        local = int(os.environ["LOCAL_WORLD_SIZE"])
+        found = Processes(local, int(os.environ["WORLD_SIZE"]) // local, "torchrun")
+    elif launcher.many_tasks():
+        tasks, nodes = (int(os.environ.get(f"SLURM_{key}", 1)) for key in ("NTASKS", "NNODES"))
+        found = Processes(tasks // nodes, nodes, "SLURM")
     for name, there in (("devices", found.devices), ("num_nodes", found.nodes)):
         if asked.get(name, there) != there:
             raise UserError(
                 f"trainer.{name} is {asked[name]}, but {found.started_by} has started "
-                f"{found.nodes} x {found.devices} processes (machines x processes): leave the "
-                "option out"
+                f"{found.nodes} x {found.devices} processes (machines x processes): leave it out"
             )
     if n_gpus and found.devices > n_gpus:
         raise UserError(
             f"{found.devices} processes on a machine need as many GPUs, and {n_gpus} can be seen: "
-            "list them (--gpu 0,1), and let SLURM show all of a machine's GPUs to each task "
-            "(--gpus-per-node), or run with --gpu cpu"
+            "list them (--gpu 0,1; for SLURM --gpus-per-node), or run with --gpu cpu"
         )
     return found
 
@@ -97,37 +84,24 @@ def is_lost_process(error: Exception) -> bool:
     return is_active() and from_torch and bool(LOST_CONNECTION.search(str(error)))
 
 
-def _started_processes() -> Optional[Processes]:
-    """Return what torchrun or SLURM says about its processes; None for a single one."""
-    if "TORCHELASTIC_RUN_ID" in os.environ:
-        local = int(os.environ["LOCAL_WORLD_SIZE"])
-        return Processes(local, int(os.environ["WORLD_SIZE"]) // local, TORCHRUN)
-    tasks, nodes = (int(os.environ.get(f"SLURM_{key}", 1)) for key in ("NTASKS", "NNODES"))
-    return Processes(tasks // nodes, nodes, SLURM) if launcher.many_tasks() else None
-
-
-def environment_plugins(processes: Processes) -> list[Any]:
-    """Return the plugin that lets Lightning start the processes inside of a SLURM job with a single
-    task, where it would wait for SLURM to start them, or miss what only ``srun`` sets.
+def trainer_options(processes: Processes) -> dict[str, Any]:
+    """Return the trainer's options for the processes. In a SLURM job with a single task, Lightning
+    would wait for SLURM to start them: a plugin lets it start them itself.
     """
-    tasks = os.environ.get("SLURM_NTASKS", "1")
-    if launcher.is_shell() and processes.started_by is None and int(tasks) > processes.total:
+    options: dict[str, Any] = {"devices": processes.devices, "num_nodes": processes.nodes}
+    tasks, alone = os.environ.get("SLURM_NTASKS", "1"), processes.started_by is None
+    if launcher.is_shell() and alone and int(tasks) > processes.total:
         warn(
             f"SLURM has {tasks} tasks, which a shell (SLURM_JOB_NAME="
             f"{os.environ['SLURM_JOB_NAME']}) doesn't start: the number of processes that train "
             f"is {processes.total}; for all: srun --job-name train --ntasks-per-node ..."
         )
     environments = importlib.import_module(f"{pl.__name__}.plugins.environments")
-    in_job = environments.SLURMEnvironment.detect()
     by_srun = all(name in os.environ for name in launcher.SLURM)
-    alone = processes.started_by is None and (processes.total > 1 or not by_srun)
-    return [environments.LightningEnvironment()] if in_job and alone else []
-
-
-def trainer_options(processes: Processes) -> dict[str, Any]:
-    """Return the trainer's options for the processes."""
-    options: dict[str, Any] = {"devices": processes.devices, "num_nodes": processes.nodes}
+    if environments.SLURMEnvironment.detect() and alone and (processes.total > 1 or not by_srun):
+        options["plugins"] = [environments.LightningEnvironment()]
     if processes.total > 1:
+        strategy = ReplicatedStrategy(timeout=LONGEST_WAIT)
         # the first process renders all views of validation and test, since it alone writes results
-        options |= {"use_distributed_sampler": False, "strategy": ReplicatedStrategy()}
+        options |= {"use_distributed_sampler": False, "strategy": strategy}
     return options

@@ -1,36 +1,22 @@
-"""The launcher: train, validate, test or export a run from the command line.
+"""The launcher: ``python launch.py --config demo.yaml --train key=value ...``, or the console
+script ``gaussiandreamer`` with the same arguments.
 
-``python launch.py --config demo.yaml --train key=value ...``, or the console script
-``gaussiandreamer`` with the same arguments. A run is a list of stages: choose the device, load the
-extensions, load and check the configuration, make the folder, build data and system, train, test.
-Errors that the user can correct end it with one message and exit code 2; those that are found
-before training leave no files."""
+A run is a list of stages: choose the device, load the extensions, load and check the configuration,
+make the folder, build data and system, train, test. Errors that the user can correct end it with
+one message and exit code 2; those that are found before training leave no files."""
 
 import argparse
-import contextlib
 import gc
 import logging
 import os
 import shlex
 import sys
 import warnings
-from collections.abc import Iterator, Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, Optional
+from collections.abc import Sequence
+from typing import Any, Optional
 
 from ..core.command import run_command
-from ..core.errors import UserError
-from .options import (
-    LIST_PARTS,
-    PROGRAM,
-    announce_device,
-    choose_gpu,
-    find_config,
-    parse_arguments,
-)
-
-if TYPE_CHECKING:
-    from .run import Run
+from .options import LIST_PARTS, PROGRAM, announce_device, choose_gpu, find_config, parse_arguments
 
 NOISE = (
     # warnings of Lightning that don't apply to an infinite dataset of computed cameras, or to a run
@@ -51,15 +37,15 @@ def console() -> None:
 
 
 def main(argv: Optional[Sequence[str]] = None) -> int:
-    """Run one command line (default: ``sys.argv``) and return the exit code.
-
-    The code is 0 on success, 2 after an error that the user can correct, and 129, 130, 141 or 143
-    if SIGHUP, Ctrl-C, a closed pipe or SIGTERM stopped the run."""
+    """Run one command line (default: ``sys.argv``) and return the exit code: 0 on success, 2 after
+    an error that the user can correct, and 129, 130, 141 or 143 if SIGHUP, Ctrl-C, a closed pipe or
+    SIGTERM stopped the run.
+    """
     limit_openmp_spin()
     argv = list(sys.argv[1:] if argv is None else argv)
     if LIST_PARTS in argv:
         return run_command(lambda _: None, lambda _: list_parts())
-    return run_command(parse_arguments, lambda args: run(args, argv), argv)
+    return run_command(parse_arguments, lambda args: prepare(args, argv).run(), argv)
 
 
 def list_parts() -> None:
@@ -74,33 +60,29 @@ def list_parts() -> None:
         print(kind, *(f"  {part}" for part in parts), sep="\n")
 
 
-def run(args: argparse.Namespace, argv: Sequence[str]) -> int:
-    """Run the stages that the module's docstring lists; return the exit code."""
-    return prepare(args, argv).run()
-
-
-def prepare(args: argparse.Namespace, argv: Sequence[str], **options: Any) -> "Run":
-    """Run the stages up to the checked configuration, and return the run that is left to do.
-
-    Args:
-        options: further arguments of :class:`.run.Run`.
-    """
+def prepare(args: argparse.Namespace, argv: Sequence[str], **options: Any) -> Any:
+    """Check everything, and return the :class:`.run.Run`, which is given ``options``, too."""
     config_paths = [find_config(name) for name in args.config]
     choose_gpu(args.gpu, args.overrides)
     if args.typecheck:
         from ..core import typecheck
 
         typecheck.install()
-    # torch and Lightning are imported only here, so that --help and invalid arguments are answered
-    # immediately
-    with without_garbage_collection():
-        from .. import register_parts
-        from .config import load_config
-        from .config_check import check_config
-        from .parts import load_extensions
-        from .run import Run
+    # torch and Lightning are imported only here, so that --help is answered immediately; without
+    # garbage collection, which takes a fifth of the time, but in a notebook with other garbage
+    is_first = gc.isenabled() and "torch" not in sys.modules
+    if is_first:
+        gc.disable()
+    from .. import register_parts
+    from .config import load_config, read_source
+    from .config_check import check_config
+    from .parts import load_extensions
+    from .run import Run
 
-        register_parts()
+    register_parts()
+    if is_first:
+        gc.freeze()
+        gc.enable()
     configure_logging(args.verbose)
     # read only once, since the file may change while the parts are built
     sources = [(path, read_source(path)) for path in config_paths]
@@ -111,31 +93,6 @@ def prepare(args: argparse.Namespace, argv: Sequence[str], **options: Any) -> "R
     return Run(cfg, args, sources, shlex.join([*PROGRAM, *argv]), n_gpus, **options)
 
 
-@contextlib.contextmanager
-def without_garbage_collection() -> Iterator[None]:
-    """Import torch, Lightning and the parts without garbage collection, which takes a fifth of the
-    imports' time, and exclude them from later ones; not if torch is imported already, as in a
-    notebook, where other garbage would never be freed.
-    """
-    if "torch" in sys.modules or not gc.isenabled():
-        yield
-        return
-    gc.disable()
-    try:
-        yield
-    finally:
-        gc.freeze()
-        gc.enable()
-
-
-def read_source(path: Path) -> bytes:
-    """Read a configuration file; raise UserError if it can't be read."""
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise UserError(f"the configuration {path} can't be read: {error}") from error
-
-
 class StderrHandler(logging.Handler):
     """Writes messages as plain lines to what ``sys.stderr`` is at that moment."""
 
@@ -144,9 +101,7 @@ class StderrHandler(logging.Handler):
 
 
 def configure_logging(verbose: bool) -> None:
-    """Send our messages to stderr as plain lines; Lightning's only from warnings up, unless
-    ``verbose``.
-    """
+    """Send our messages to stderr; Lightning's from warnings up, unless ``verbose``."""
     logger = logging.getLogger(__package__.partition(".")[0])
     if not logger.handlers:
         logger.addHandler(StderrHandler())
@@ -160,8 +115,8 @@ def configure_logging(verbose: bool) -> None:
 
 
 def limit_openmp_spin() -> None:
-    """Let idle OpenMP threads spin for about 0.1 ms before they sleep, unless the user has set it;
-    call it before torch is imported. It saves a fifth of the demo's time (reports/speed.md).
+    """Let idle OpenMP threads spin for about 0.1 ms before they sleep, unless the user has set it:
+    a fifth of the demo's time (reports/speed.md). Call it before torch is imported.
     """
     waits = {"GOMP_SPINCOUNT": "10000", "KMP_BLOCKTIME": "0"}
     if not os.environ.keys() & {"OMP_WAIT_POLICY", *waits}:

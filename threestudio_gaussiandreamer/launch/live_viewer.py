@@ -1,18 +1,15 @@
 """Show the cloud in a browser while it trains: ``viewer.enabled=true viewer.port=8080``.
 
-==================  ================================================================================
-option              meaning
-==================  ================================================================================
-enabled             serve the cloud with viser (extra ``[viewer]``)
-host                address to listen on; 127.0.0.1 accepts this machine and SSH tunnels only
-port                port of the web page and its WebSocket
-updates_per_second  upper limit; fewer if updates would take more than ``SHARE_OF_TIME``
-keep_serving        keep the server running after the training, until Ctrl-C
-==================  ================================================================================
+============  =====================================================================================
+option        meaning
+============  =====================================================================================
+enabled       serve the cloud with viser (extra ``[viewer]``)
+host          address to listen on; 127.0.0.1 accepts this machine and SSH tunnels only
+port          port of the web page and its WebSocket
+keep_serving  keep the server running after the training, until Ctrl-C
+============  =====================================================================================
 
-The training is the same bit for bit with and without the viewer: it only reads the cloud, and does
-so only while a browser is connected.
-"""
+The training is the same bit for bit with and without the viewer, which only reads the cloud."""
 
 import time
 from collections.abc import Callable
@@ -32,6 +29,8 @@ from ..view.render import first_pose
 
 SHARE_OF_TIME = 0.02
 """Largest share of the training's time that its thread spends on updates."""
+SECONDS_BETWEEN = 1.0
+"""Shortest time between two updates, seconds."""
 POLL = 0.05
 """Seconds between two checks of the buttons while the training is paused."""
 
@@ -41,19 +40,18 @@ class ViewerConfig:
     enabled: bool = False
     host: str = "127.0.0.1"
     port: int = field(default=8080, metadata=in_range(1, 65535))
-    updates_per_second: float = field(default=1.0, metadata=in_range(0.01, 30))
     keep_serving: bool = True
+
+    REMOVED = {"updates_per_second": (1.0, "the cloud is updated once a second")}
 
 
 class LiveViewer(pl.Callback):
-    """Update a :class:`LiveView` from the training, and act on its buttons.
-
-    Args:
-        stopping: whether a signal has asked the training to stop, which also ends a pause.
+    """Update a :class:`LiveView` from the training, and act on its buttons; ``stopping`` says
+    whether a signal has asked the training to stop, which also ends a pause.
     """
 
-    def __init__(self, view: LiveView, cfg: ViewerConfig, stopping: Callable[[], bool]) -> None:
-        self.view, self.cfg, self.stopping = view, cfg, stopping
+    def __init__(self, view: LiveView, stopping: Callable[[], bool]) -> None:
+        self.view, self.stopping = view, stopping
         self.controls: Optional[Controls] = None
         self._due = 0.0
 
@@ -65,15 +63,13 @@ class LiveViewer(pl.Callback):
 
     def on_train_batch_start(self, trainer: Any, pl_module: Any, batch: Any, *rest: Any) -> None:
         while not (self.controls.may_go_on() or self.stopping()):
-            self._show_picture_if_asked(pl_module, batch)
-            self._show_if_due(trainer, pl_module)
+            self._update(trainer, pl_module, batch, cameras=False)
             time.sleep(POLL)
 
     def on_train_batch_end(
         self, trainer: Any, pl_module: Any, outputs: Any, batch: Any, *rest: Any
     ) -> None:
-        self._show_picture_if_asked(pl_module, batch)
-        self._show_if_due(trainer, pl_module, batch)
+        self._update(trainer, pl_module, batch)
 
     def on_train_end(self, trainer: Any, pl_module: Any) -> None:
         self._show(trainer, pl_module)
@@ -85,27 +81,22 @@ class LiveViewer(pl.Callback):
         step = f"step {trainer.global_step}, {len(cloud.means):,} Gaussians{quality}"
         self.view.show(cloud, step)
 
-    def _show_picture_if_asked(self, system: Any, batch: dict[str, Any]) -> None:
+    def _update(
+        self, trainer: Any, system: Any, batch: dict[str, Any], cameras: bool = True
+    ) -> None:
+        """Show what is asked for or due: the score model's picture, the cloud, its cameras."""
         if self.controls.picture.is_set():
             self.controls.picture.clear()
             self.controls.show_picture(score_picture(system, batch))
-
-    def _show_if_due(
-        self, trainer: Any, pl_module: Any, batch: Optional[dict[str, Any]] = None
-    ) -> bool:
-        """Show the cloud, and the cameras of ``batch``, if that is due and a browser is connected;
-        return whether they were shown.
-        """
         start = time.monotonic()
         if start < self._due or not self.view.watched:
-            return False
-        self._show(trainer, pl_module)
-        if batch is not None and self.controls.cameras.value:
+            return
+        self._show(trainer, system)
+        if cameras and self.controls.cameras.value:
             pose, fovy = (batch[name].detach().cpu().numpy() for name in ("c2w", "fovy"))
             self.view.show_cameras(pose, fovy, batch["width"] / batch["height"])
         spent = time.monotonic() - start
-        self._due = start + max(1 / self.cfg.updates_per_second, spent / SHARE_OF_TIME)
-        return True
+        self._due = start + max(SECONDS_BETWEEN, spent / SHARE_OF_TIME)
 
 
 def current_cloud(system: Any) -> Gaussians:

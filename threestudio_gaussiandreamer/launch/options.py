@@ -1,8 +1,7 @@
-"""Arguments of the launcher, and the choice of GPUs and configuration files, which comes before
-torch is imported.
-"""
+"""Arguments of the launcher, and the choice of GPUs and files, before torch is imported."""
 
 import argparse
+import contextlib
 import os
 import re
 import sys
@@ -15,12 +14,9 @@ from ..core.errors import UserError, unknown
 from ..core.launcher import require_launcher
 
 # how this process was started, for messages that show a command to resume the run
-PROGRAM = {
-    "launch.py": ["python", sys.argv[0]],
-    "gaussiandreamer": ["gaussiandreamer"],
-}.get(Path(sys.argv[0]).name, ["python", "-m", f"{__package__}.experiment"])
-
-
+PROGRAM = {"launch.py": ["python", sys.argv[0]], "gaussiandreamer": ["gaussiandreamer"]}.get(
+    Path(sys.argv[0]).name, ["python", "-m", f"{__package__}.experiment"]
+)
 LIST_PARTS = "--list-parts"
 STAGES = {
     "train": "train, then render the test views",
@@ -31,14 +27,7 @@ STAGES = {
 
 
 def parse_arguments(argv: Sequence[str]) -> argparse.Namespace:
-    """Parse threestudio's options; all other arguments are overrides ``key=value``.
-
-    Returns:
-        config, stage, gpu, verbose, typecheck, and overrides, a list of strings.
-
-    Raises:
-        SystemExit: after ``--help``, or for an invalid argument, with a printed message.
-    """
+    """Parse threestudio's options and ``overrides``; print a message and exit if it can't."""
     parser = argparse.ArgumentParser(
         prog=" ".join(PROGRAM),
         description="Turn a prior into a cloud of 3D Gaussians by score distillation.",
@@ -82,11 +71,7 @@ def add_config(parser: argparse.ArgumentParser) -> None:
 def parse_with_overrides(
     parser: argparse.ArgumentParser, argv: Optional[Sequence[str]]
 ) -> argparse.Namespace:
-    """Parse the arguments; those that ``parser`` doesn't know are ``overrides``, a list of strings.
-
-    Raises:
-        SystemExit: for an invalid argument, with a printed message.
-    """
+    """Parse the arguments; those that ``parser`` doesn't know are ``overrides``."""
     args, args.overrides = parser.parse_known_args(argv)
     for override in args.overrides:
         if override.startswith("-"):
@@ -95,16 +80,9 @@ def parse_with_overrides(
 
 
 def choose_gpu(gpu: Optional[str], overrides: Sequence[str] = ()) -> None:
-    """Set which GPUs are visible to this process; must be called before torch is imported.
-
-    Args:
-        gpu: the argument ``--gpu``; without it as many GPUs as processes on this machine, which
-            torchrun or SLURM has started, or which ``trainer.devices`` among the overrides asks
-            for.
-
-    Raises:
-        UserError: ``gpu`` is neither "cpu" nor a list of numbers, or the launcher's variables are
-            wrong.
+    """Set which GPUs are visible to this process, before torch is imported: those of the argument
+    ``--gpu``, else as many as processes on this machine, which torchrun or SLURM has started, or
+    ``trainer.devices`` among the overrides asks for. Raise UserError if one of them is wrong.
     """
     require_launcher()
     if gpu is not None and not re.fullmatch(r"cpu|\d+(,\d+)*", gpu):
@@ -114,31 +92,18 @@ def choose_gpu(gpu: Optional[str], overrides: Sequence[str] = ()) -> None:
         os.environ["CUDA_VISIBLE_DEVICES"] = ""
     elif "CUDA_VISIBLE_DEVICES" not in os.environ:
         os.environ["CUDA_VISIBLE_DEVICES"] = gpu or ",".join(map(str, range(_processes(overrides))))
-    elif gpu is not None and "LOCAL_RANK" not in os.environ:  # processes inherit the choice
-        print(
-            f"CUDA_VISIBLE_DEVICES={os.environ['CUDA_VISIBLE_DEVICES']} is set: --gpu {gpu} is "
-            "ignored",
-            file=sys.stderr,
-        )
 
 
 def _processes(overrides: Sequence[str]) -> int:
-    """Return how many processes this machine will run, as far as is known before the configuration
-    is read.
-    """
+    """Return how many processes this machine will run, as far as is known by now."""
     found = [re.fullmatch(r"trainer\.devices=(\d{1,4})", override) for override in overrides]
-    asked = [match[1] for match in found if match]
-    started = (os.environ.get(key) for key in ("LOCAL_WORLD_SIZE", "SLURM_NTASKS_PER_NODE"))
-    counts = [text for text in (*started, *asked[-1:]) if text and text.isdecimal()]
-    return max(1, *map(int, counts)) if counts else 1
+    asked = [match[1] for match in found if match][-1:]
+    started = (os.environ.get(key, "") for key in ("LOCAL_WORLD_SIZE", "SLURM_NTASKS_PER_NODE"))
+    return max(1, *(int(text) for text in (*started, *asked, "1") if text.isdecimal()))
 
 
 def announce_device(gpu: Optional[str]) -> int:
-    """Return the number of visible GPUs; log a message if the run falls back to the CPU.
-
-    Raises:
-        UserError: requested GPUs don't exist.
-    """
+    """Return the number of visible GPUs, of which ``--gpu`` may ask for more: a UserError."""
     import torch
 
     from ..host import info
@@ -158,31 +123,21 @@ def announce_device(gpu: Optional[str]) -> int:
 
 
 def find_config(name: str) -> Path:
-    """Find the YAML file for ``--config name``: ``name`` is a path, or a bare name in one of
-    :func:`config_folders`.
-
-    Raises:
-        UserError: there is no such file; the message lists similar names.
+    """Find the YAML file for ``--config name``: a path, or a bare name in :func:`config_folders`.
+    Raise UserError, which lists similar names, if there is no such file.
     """
-    try:
+    with contextlib.suppress(OSError, ValueError, RuntimeError):  # too long; NUL; "~user"
         path = Path(name).expanduser()
         folders = config_folders() if path.name == name else []
         places = [folder / file for folder in folders for file in (name, f"{name}.yaml")]
         if found := next((place for place in (path, *places) if place.is_file()), None):
             return found
-    except (OSError, ValueError, RuntimeError) as error:
-        # a name too long, a NUL inside, the home folder of an unknown user
-        raise UserError(
-            f"configuration {name[:200]!r}: not a usable file name ({error})"
-        ) from error
     known = sorted({file.name for folder in config_folders() for file in folder.glob("*.yaml")})
-    raise unknown("configuration", name, known)
+    raise unknown("configuration", name[:200], known)
 
 
 def config_folders() -> list[Path]:
-    """List the folders in which bare names are looked up: ``./configs``, and ``configs/`` of the
-    checkout or of the installed package.
-    """
+    """List ``./configs``, and ``configs/`` of the checkout or of the installed package."""
     package = Path(__file__).resolve().parents[1]
     folders = [Path("configs"), package / "configs"]
     if (package.parent / "launch.py").is_file():

@@ -1,9 +1,6 @@
 """The registered parts: those of this package, and the user's own in ``./custom``, of which every
-module is imported, so that its ``@register`` decorators run.
-
-As in threestudio, a folder with an ``__init__.py`` is imported under its own name, which may have
-hyphens, and may use relative imports; a file ``part.py`` is imported as ``custom/part``. Names that
-end in ``_disabled`` or begin with a dot are skipped."""
+module is imported but those whose names end in ``_disabled``; a folder with an ``__init__.py``
+under its own name, which may have hyphens, as in threestudio."""
 
 import importlib.util
 import sys
@@ -14,22 +11,13 @@ from typing import Any, Optional
 
 from torch import nn
 
+from .. import host
 from ..core.errors import Terminated, UserError
 from ..core.methods import require_method
 from ..exporters.files import require_export
 from ..guidance.base import ScoreDistillation
 from ..guidance.variants import Variant
-from ..host import (
-    BaseBackground,
-    BaseGeometry,
-    BaseMaterial,
-    Exporter,
-    Rasterizer,
-    find,
-    info,
-    names,
-    pl,
-)
+from ..host import find, info, names, pl
 from ..priors.base import Prior
 from ..prompts.prompt_processors import TextEncoderPromptProcessor
 from ..training.density import DensityRule
@@ -51,49 +39,40 @@ for room, modules in (*MODULES.items(), ("training", "system")):
 KINDS: dict[str, type] = {
     "data": pl.LightningDataModule,
     "system": pl.LightningModule,
-    "geometry": BaseGeometry,
-    "material": BaseMaterial,
-    "background": BaseBackground,
-    "renderer": Rasterizer,
-    "exporter": Exporter,
+    "geometry": host.BaseGeometry,
+    "material": host.BaseMaterial,
+    "background": host.BaseBackground,
+    "renderer": host.Rasterizer,
+    "exporter": host.Exporter,
     "prior": Prior,
     "density": DensityRule,
     "guidance": ScoreDistillation,
     "variant": Variant,
     "prompt_processor": TextEncoderPromptProcessor,
 }
-"""The base class of each kind of part, by the name of its section.
-
-Parts of other packages may have other base classes; a part is refused only if it derives from the
-base class of a different kind.
-"""
+"""The base class of each kind of part, by the name of its section. Parts of other packages may have
+others: a part is refused only if it derives from the base class of a different kind."""
 CALLS = {"guidance": "rgb", "background": "dirs"}
 """The first argument of a call, of the kinds that other packages write without our base class."""
 
 
 def find_part(path: str, type_name: Any) -> type:
     """Return the part that the key ``path`` names; the message of an error names the key too."""
-    if not type_name:
-        hint = ""
-        if path == "data_type":
-            hint = " (an overlay needs the configuration that it changes before it)"
-        raise UserError(f"{path} is empty: name a registered part{hint}")
-    if not isinstance(type_name, str):
-        raise UserError(f"{path} is {type_name!r}; expected the name of a registered part")
+    if not isinstance(type_name, str) or not type_name:
+        overlay = " (an overlay needs the configuration that it changes before it)"
+        raise UserError(
+            f"{path} is {type_name!r}; expected the name of a registered part"
+            f"{overlay if path == 'data_type' else ''}"
+        )
     try:
         return find(type_name)
     except UserError as error:
-        hint = (
-            " (own parts are imported from the folder custom in the working folder, which has "
-            "none; a run's folder has a copy in code)"
-        )
+        hint = " (own parts are imported from the folder custom here, and there is none)"
         raise UserError(f"{path}: {error}{'' if Path('custom').is_dir() else hint}") from error
 
 
 def check_kind(path: str, type_name: str, part: Any) -> None:
-    """Raise UserError if the part of a section is no class, is known to be of another kind, or
-    can't be called.
-    """
+    """Raise UserError if the part of a section is no class, of another kind or not callable."""
     if not isinstance(part, type):
         raise UserError(f"{path}: {type_name} is a {type(part).__name__}; register a class")
     kind, found = path.rpartition(".")[2].removesuffix("_type"), _kind_of(part)
@@ -114,9 +93,7 @@ def check_kind(path: str, type_name: str, part: Any) -> None:
 
 
 def parts_by_kind() -> dict[str, list[str]]:
-    """Return the names of the registered parts; the kind "other" has those without a base class
-    that tells theirs, such as guidances that are plain objects.
-    """
+    """Return the names of the registered parts; "other" has those without one of our bases."""
     found: dict[str, list[str]] = {}
     for name in names():
         is_loss = name.endswith(SUFFIX)
@@ -136,12 +113,7 @@ def _kind_of(part: Any) -> Optional[str]:
 
 
 def load_extensions(folder: Path = Path("custom")) -> list[str]:
-    """Import all extensions in ``folder``, sorted by name, and return their module names.
-
-    Raises:
-        UserError: the folder can't be read, or an extension fails to import; the message names the
-            file, the line and the cause.
-    """
+    """Import all extensions in ``folder``, sorted by name, and return their module names."""
     try:
         entries = sorted(folder.iterdir()) if folder.is_dir() else []
         extensions = [entry for entry in entries if _is_extension(entry)]
@@ -180,17 +152,11 @@ def _load(entry: Path) -> str:
         del sys.modules[name]
         if isinstance(error, Terminated):
             raise
+        frames, root = traceback.extract_tb(error.__traceback__), str(entry.resolve())
+        # the innermost line in the extension; the message of a SyntaxError has its own
+        places = [f"{f.filename}:{f.lineno}: " for f in frames if f.filename.startswith(root)]
         raise UserError(
-            f"the extension {entry} can't be imported: {_cause(error, entry)}"
+            f"the extension {entry} can't be imported: {''.join(places[-1:])}"
+            f"{type(error).__name__}: {error}"
         ) from error
     return name
-
-
-def _cause(error: BaseException, entry: Path) -> str:
-    """Describe an error as ``file:line: message``, with the innermost line in the extension."""
-    if isinstance(error, SyntaxError) and error.lineno:
-        return f"{error.filename}:{error.lineno}: {error.msg}"
-    root, what = str(entry.resolve()), f"{type(error).__name__}: {error}"
-    frames = traceback.extract_tb(error.__traceback__)
-    inside = [frame for frame in frames if frame.filename.startswith(root)]
-    return f"{inside[-1].filename}:{inside[-1].lineno}: {what}" if inside else what

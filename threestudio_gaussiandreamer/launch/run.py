@@ -1,12 +1,11 @@
-"""One run: its folder, its parts, its trainer and the selected stage.
-
-``outputs/<name>/<tag>@<time>/{ckpts, configs/{raw,parsed}.yaml, code, save, tb_logs, csv_logs,
-cmd.txt}``"""
+"""One run: its folder, its parts, its trainer and the selected stage."""
 
 import argparse
 import contextlib
+import errno
+import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import Any, Optional
@@ -14,23 +13,26 @@ from typing import Any, Optional
 import torch
 
 from ..core.checkpoint_file import load_checkpoint
-from ..core.errors import UserError
+from ..core.errors import UserError, raised_in
 from ..core.logs import get_rank
 from ..core.options import parse_structured
 from ..host import find, info, pl, warn
 from ..view.live import LiveView, serve_until_stopped
 from ..view.run_index import note_time, write_index
+from . import run_folder
 from .callbacks import AtomicCheckpointIO, LastCheckpoint, ProgressBar, RunRecord, Stopped
 from .config_check import build, check_shared_views, plain
-from .ddp import environment_plugins, planned_processes, trainer_options
-from .folder_lock import RunFolder, claim, claim_new, require_writable
+from .ddp import is_lost_process, planned_processes, trainer_options
 from .live_viewer import LiveViewer, ViewerConfig
-from .run_folder import PARSED, SIZES, changes_since, renumber, resume_command
-from .stage_errors import lightning_errors, write_errors
 
-# Lightning refuses a checkpoint without the first key; without the others it would resume at step 0
-# or with a new optimiser
 LIGHTNINGS_KEYS = ("pytorch-lightning_version", "loops", "optimizer_states")
+"""Without the last two Lightning would resume at step 0 or with a new optimiser."""
+WRITE_ERRORS = (
+    *(errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM),
+    *(errno.ENOTDIR, errno.EISDIR, errno.EEXIST, errno.ENAMETOOLONG),
+)
+MISMATCHES = ("loading state_dict", "loaded state dict", "optimizer_states", "restore training")
+"""In the messages of torch and Lightning about a state that doesn't match."""
 
 
 class Run:
@@ -38,9 +40,8 @@ class Run:
 
     Args:
         cfg: returned by ``config.load_config`` and checked by ``config_check.check_config``.
-        args: the parsed arguments; ``stage`` is "train", "validate", "test" or "export".
-        sources: the YAML files and their content, stored beside the results.
-        command: the command line, stored beside the results.
+        args: the parsed arguments.
+        sources: the YAML files and their content, stored beside the results, as ``command`` is.
         n_gpus: GPUs to use; 0 for the CPU.
         callbacks: further Lightning callbacks, called before those that write checkpoints.
         records_code: copy the package's sources into the folder when training starts.
@@ -61,7 +62,7 @@ class Run:
         self.callbacks, self.records_code = list(callbacks), records_code
         self.sources, self.command = sources, command
         self.training = args.stage == "train"
-        self.claimed = RunFolder(self.folder)
+        self.claimed = run_folder.RunFolder(self.folder)
         self.resumed_step, self.has_trained = -1, False
         self.size_changes: list[str] = []
         self.trainer: Any = None
@@ -77,34 +78,27 @@ class Run:
         """The checkpoint from which a stopped run is resumed."""
         return self.folder / "ckpts" / "last.ckpt"
 
-    def run(self) -> int:
-        """Build everything, run the stage and return the exit code.
+    @property
+    def to_resume(self) -> str:
+        return f"to resume: {run_folder.resume_command(self.folder, self.args.gpu)}"
 
-        Raises:
-            UserError: an error that the user can correct. A folder that was created for this run
-                and has no results is removed.
-        """
+    def run(self) -> int:
+        """Build everything, run the stage and return the exit code."""
         try:
             self.start()
             with lightning_errors(self.cfg.resume, self.size_changes), write_errors(self.folder):
                 began, start = datetime.now(), time.perf_counter()
                 self.run_stage()
                 if self.has_index:
-                    seconds = time.perf_counter() - start
-                    note_time(self.folder, self.args.stage, began, seconds)
+                    note_time(self.folder, self.args.stage, began, time.perf_counter() - start)
                 self.report()
             if self.view is not None and self.viewer.keep_serving:
                 serve_until_stopped(self.view)
         except Stopped as stop:
-            command = resume_command(self.folder, self.args.gpu)
-            print(f"stopped at step {stop.step}; to resume: {command}", flush=True)
+            print(f"stopped at step {stop.step}; {self.to_resume}", flush=True)
             return 128 + stop.signum
         except BaseException:
-            if self.has_trained:  # the turntable or an export has failed
-                with contextlib.suppress(Exception):  # it would hide the first error
-                    self.report()
-            self.discard_if_unused()
-            self.print_resume_command()
+            self.clean_up()
             raise
         finally:
             if self.claimed.path != self.folder:  # that of a stage
@@ -119,55 +113,44 @@ class Run:
         checkpoint = self.read_resume()
         if self.training:
             check_shared_views(self.cfg)
-        require_writable(self.folder)
+        run_folder.require_writable(self.folder)
         if self.viewer.enabled and self.training and not get_rank():
             self.view = LiveView(self.viewer.host, self.viewer.port, self.cfg.tag or self.cfg.name)
         self.claim_folder()
         # the same seed in all processes; streams that must differ also depend on the rank
         pl.seed_everything(self.cfg.seed, workers=True)
         self.data = find(self.cfg.data_type)(self.cfg.data)
-        self.system = find(self.cfg.system_type)(
-            self.cfg.system, resumed=self.cfg.resume is not None
-        )
+        resumed = self.cfg.resume is not None
+        self.system = find(self.cfg.system_type)(self.cfg.system, resumed=resumed)
         if checkpoint is not None and not self.training:
             self.system.set_resume_status(*checkpoint)
         self.system.set_save_dir(str(self.folder / "save"))
         self.trainer = self.build_trainer()
 
     def read_resume(self) -> Optional[tuple[int, int]]:
-        """Return the epoch and step of the checkpoint to resume from; None without one. The file is
-        read completely, so that damage is found before any work.
-        """
-        path, stage = self.cfg.resume, self.args.stage
+        """Check the checkpoint to resume from; return its epoch and step, None without one."""
+        path, stage = self.cfg.resume, f"--{self.args.stage}"
         if path is None:
             if not self.training and "resume=auto" in self.args.overrides:
-                raise UserError(
-                    f"resume=auto: there is no checkpoint to --{stage}; train first, or check name "
-                    "and tag"
-                )
+                raise UserError(f"resume=auto: there is no checkpoint to {stage}; train first")
             if not self.training:
-                warn(
-                    f"no checkpoint given (resume=...): --{stage} shows what training would start "
-                    "from"
-                )
+                warn(f"no checkpoint given (resume=...): {stage} shows what training starts from")
             return None
         checkpoint = load_checkpoint(path)
         needed = LIGHTNINGS_KEYS if self.training else LIGHTNINGS_KEYS[:1]
-        missing = [key for key in needed if key not in checkpoint]
-        if missing:
+        if missing := [key for key in needed if key not in checkpoint]:
             raise UserError(
                 f"{path} isn't a training checkpoint: it has no {', '.join(missing)}, which "
                 "Lightning writes unless checkpoint.save_weights_only=true"
             )
-        for change in changes_since(self.cfg):  # they may explain what is found next
+        for change in run_folder.changes_since(self.cfg):  # they may explain what is found next
             warn(f"{path} is of another run: {change}")
-        check_checkpoint = getattr(find(self.cfg.system_type), "check_checkpoint", None)
-        if check_checkpoint is not None:
-            check_checkpoint(checkpoint, path)
+        if hasattr(system := find(self.cfg.system_type), "check_checkpoint"):
+            system.check_checkpoint(checkpoint, path)
         if self.training:
             name = (self.cfg.system.get("optimizer") or {}).get("name", "Adam")
             check_optimizer(name, checkpoint["optimizer_states"], path)
-        self.size_changes = changes_since(self.cfg, SIZES)
+        self.size_changes = run_folder.changes_since(self.cfg, run_folder.SIZES)
         self.resumed_step = checkpoint["global_step"]
         return checkpoint["epoch"], self.resumed_step
 
@@ -178,10 +161,7 @@ class Run:
             getattr(self.trainer, name)(self.system, **inputs)
             return
         if 0 <= self.cfg.trainer.get("max_steps", -1) <= self.resumed_step:
-            info(
-                f"the checkpoint is at step {self.resumed_step} of "
-                f"{self.cfg.trainer.max_steps}: nothing is left to train"
-            )
+            info(f"the checkpoint is at step {self.resumed_step}: nothing is left to train")
         self.trainer.fit(self.system, **inputs)
         self.has_trained = True
         self.trainer.test(self.system, datamodule=self.data)
@@ -199,15 +179,11 @@ class Run:
         if summary and self.trainer.is_global_zero:
             print(summary, flush=True)
 
-    # -- the trainer -------------------------------------------------------------------------------
-
     def build_trainer(self) -> Any:
         """Build Lightning's Trainer on the chosen device."""
-        options = {
-            "enable_model_summary": False,
-            "enable_progress_bar": True,
-            **plain(self.cfg.trainer),
-        }
+        options = {"enable_model_summary": False, "enable_progress_bar": True}
+        options |= plain(self.cfg.trainer)
+        processes = planned_processes(self.n_gpus, options)
         at_zero = self.training and self.cfg.resume is None
         with_code = self.records_code and self.training
         record = RunRecord(self.folder, self.cfg, self.sources, self.command, with_code, at_zero)
@@ -215,31 +191,26 @@ class Run:
         callbacks = self.callbacks + ([ProgressBar()] if options["enable_progress_bar"] else [])
         if self.training:
             callbacks += [record, *self.training_callbacks()]
-        elif not (self.folder / PARSED).is_file():
+        elif not (self.folder / run_folder.PARSED).is_file():
             callbacks.append(record)
-        processes = planned_processes(self.n_gpus, options)
-        required = {
+        options |= {
             "accelerator": "gpu" if self.n_gpus else "cpu",
-            "logger": self.build_loggers() if self.training else False,
+            "logger": self.training
+            and [
+                pl.loggers.TensorBoardLogger(self.folder, name="tb_logs"),
+                pl.loggers.CSVLogger(self.folder, name="csv_logs"),
+                *self.system.get_loggers(),
+            ],
             "callbacks": callbacks,
-            "plugins": [self.checkpoint_io, *environment_plugins(processes)],
             "inference_mode": False,
             "default_root_dir": str(self.folder),
+            **trainer_options(processes),
         }
-        required |= trainer_options(processes)
-        return build("trainer", pl.Trainer, options | required)
-
-    def build_loggers(self) -> list:
-        folder = str(self.folder)
-        loggers = [
-            pl.loggers.TensorBoardLogger(folder, name="tb_logs"),
-            pl.loggers.CSVLogger(folder, name="csv_logs"),
-        ]
-        return loggers + list(self.system.get_loggers())
+        options["plugins"] = [self.checkpoint_io, *options.get("plugins", [])]
+        return build("trainer", pl.Trainer, options)
 
     def training_callbacks(self) -> list:
-        # without the version counter a resumed run overwrites last.ckpt instead of adding
-        # last-v1.ckpt
+        # without the version counter a resumed run overwrites last.ckpt
         checkpointing = {"enable_version_counter": False, **plain(self.cfg.checkpoint)}
         if checkpointing.get("save_weights_only"):
             checkpointing["save_last"] = False  # last.ckpt is LastCheckpoint's, always complete
@@ -250,44 +221,39 @@ class Run:
             last,
         ]
         if self.view is not None:
-            callbacks.append(LiveViewer(self.view, self.viewer, lambda: bool(last.signum)))
+            callbacks.append(LiveViewer(self.view, lambda: bool(last.signum)))
         return callbacks
 
-    # -- the folder --------------------------------------------------------------------------------
-
     def claim_folder(self) -> None:
-        """Create the run's folder if it doesn't exist, and lock it against other trainings. In one
-        that is there, other stages lock a folder of their own, to run beside a training.
-        """
+        """Create and lock the folder; a stage beside a training locks one of its own in it."""
         stage = self.args.stage
         if get_rank():
             return
         if not self.training and self.folder.is_dir():
-            self.claimed = claim(self.folder / f".{stage}", f"another --{stage} is at work", "")
+            self.claimed = run_folder.claim(
+                self.folder / f".{stage}", f"another --{stage} is at work", ""
+            )
         elif self.cfg.new_folder:
-            self.claimed, number = claim_new(self.folder)
-            if number > 1:
-                renumber(self.cfg, number)
+            self.claimed = run_folder.claim_new(self.folder)
+            run_folder.renumber(self.cfg, self.claimed.path.name)
         else:
-            self.claimed = claim(self.folder)
+            self.claimed = run_folder.claim(self.folder)
 
-    def discard_if_unused(self) -> None:
-        """Remove the folder if this run created it, has made no step and has written no results."""
-        if self.claimed.first_made is None:  # nor can a name that is too long be looked into
-            return
-        trained = self.trainer is not None and self.trainer.global_step > max(self.resumed_step, 0)
+    def clean_up(self) -> None:
+        """After an error: write the page, or remove a folder without results; say how to go on."""
+        step = 0 if self.trainer is None else self.trainer.global_step
+        if self.has_trained:  # the turntable or an export has failed
+            with contextlib.suppress(Exception):  # it would hide the first error
+                self.report()
         kept = ("save/it*", "save/prior/points.npz", "ckpts/*.ckpt")
-        if not trained and not any(path for name in kept for path in self.folder.glob(name)):
-            self.claimed.discard()
-
-    def print_resume_command(self) -> None:
-        """Print how to go on after an error, if this run has trained and has a checkpoint."""
-        if not self.training or self.trainer is None or not self.trainer.global_step or get_rank():
-            return
+        if self.claimed.first_made is not None and step <= max(self.resumed_step, 0):
+            if not any(any(self.folder.glob(name)) for name in kept):
+                self.claimed.discard()
         # not the checkpoint of an earlier run, of which this one has replaced none yet
-        if self.last.is_file() and (self.cfg.resume is not None or self.checkpoint_io.steps):
-            with contextlib.suppress(OSError):  # of a closed pipe, which would hide the first error
-                print(f"to resume: {resume_command(self.folder, self.args.gpu)}", flush=True)
+        if self.training and step and not get_rank() and self.last.is_file():
+            if self.cfg.resume is not None or self.checkpoint_io.steps:
+                with contextlib.suppress(OSError):  # of a closed pipe
+                    print(self.to_resume, flush=True)
 
 
 def check_optimizer(name: str, states: Sequence[dict[str, Any]], path: str) -> None:
@@ -301,12 +267,11 @@ def check_optimizer(name: str, states: Sequence[dict[str, Any]], path: str) -> N
         if not states:
             raise ValueError("there is no optimiser")
         for state in states:
-            sizes = [len(group["params"]) for group in state["param_groups"]]
-            restored = kind([{"params": list(torch.zeros(n, 1))} for n in sizes], lr=0.0)
+            groups = [list(torch.zeros(len(group["params"]), 1)) for group in state["param_groups"]]
+            restored = kind([{"params": tensors} for tensors in groups], lr=0.0)
             options = list(restored.defaults)  # to which restoring may add
             restored.load_state_dict(state)
-            for group in restored.param_groups:
-                _ = [group[option] for option in options]
+            _ = [group[option] for group in restored.param_groups for option in options]
             for moments in restored.state.values():
                 ranks = [m.dim() for m in moments.values() if isinstance(m, torch.Tensor)]
                 parameter = torch.zeros([1] * max(ranks, default=1))
@@ -319,3 +284,72 @@ def check_optimizer(name: str, states: Sequence[dict[str, Any]], path: str) -> N
             f"{path}: {name} can't resume from its optimizer_states, which may be another "
             f"optimiser's: {type(error).__name__} {error}"
         ) from error
+
+
+# -- errors of a stage that a user can correct -----------------------------------------------------
+
+
+@contextlib.contextmanager
+def lightning_errors(checkpoint: Optional[str], changes: Sequence[str] = ()) -> Iterator[None]:
+    """Convert exceptions that Lightning raises in this context to UserError: the checkpoint doesn't
+    match the configuration, as ``changes`` may explain, the trainer's options are incompatible, or
+    another process has ended; and its SystemExit(1) to the KeyboardInterrupt that it has caught.
+    """
+    try:
+        yield
+    except SystemExit as stop:
+        if isinstance(stop.__context__, KeyboardInterrupt):
+            raise KeyboardInterrupt from None
+        raise
+    except pl.utilities.exceptions.MisconfigurationException as error:
+        raise UserError(f"trainer: {error}") from error
+    except (RuntimeError, ValueError, KeyError) as error:
+        if is_lost_process(error):
+            raise UserError(
+                "another process of this run has ended, so this one stops; the same command with "
+                f"resume=auto goes on ({str(error).strip()})"
+            ) from error
+        if isinstance(error, ValueError) and raised_in(error, pl.__name__):
+            raise UserError(f"trainer: {str(error).strip()}") from error
+        of_state = any(part in str(error) for part in MISMATCHES) or raised_in(error, pl.__name__)
+        if checkpoint is None or isinstance(error, UserError) or not of_state:
+            raise
+        raise UserError(
+            f"the checkpoint {checkpoint} was made by another configuration: "
+            f"{'; '.join(changes) or ' '.join(str(error).split())}"
+        ) from error
+
+
+@contextlib.contextmanager
+def write_errors(folder: Path) -> Iterator[None]:
+    """Convert OSErrors of this context, and of the loggers' threads, to UserErrors: the disk is
+    full, access is denied, or another process has removed a file in ``folder``, of the results.
+    """
+
+    def said(error: Optional[BaseException]) -> str:
+        """Return the message; empty if it is none of these errors."""
+        if not isinstance(error, OSError) or error.errno not in WRITE_ERRORS:
+            return ""
+        what = error.filename or f"the results in {folder}"
+        return f"cannot write {what}: {error.strerror}; make room, or choose another exp_root_dir"
+
+    def in_a_thread(failure: Any) -> None:
+        # only a warning, since the logger raises the error again when it next writes
+        warn(message) if (message := said(failure.exc_value)) else earlier(failure)
+
+    earlier, threading.excepthook = threading.excepthook, in_a_thread
+    try:
+        yield
+    except FileNotFoundError as error:
+        if folder.absolute() not in Path(str(error.filename or "/")).absolute().parents:
+            raise
+        raise UserError(
+            f"{error.filename} has been removed while it was needed: another command works in "
+            f"{folder}; run this one again when that has ended"
+        ) from error
+    except OSError as error:
+        if message := said(error):
+            raise UserError(message) from error
+        raise
+    finally:
+        threading.excepthook = earlier

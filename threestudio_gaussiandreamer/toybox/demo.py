@@ -33,7 +33,7 @@ from ..core.streams import generator
 from ..diffusion import sds
 from ..evaluation.asset_metrics import ATTRIBUTES, Asset, Scores, prior_of, rendered, result_of
 from ..host import find
-from ..launch.folder_lock import RunFolder, claim, claim_new
+from ..launch.run_folder import RunFolder, claim, claim_new
 from ..models.bundled import NAME, is_export
 from ..view.run_files import read_json
 from . import recognition
@@ -111,7 +111,7 @@ def open_folder(root: Path, record: dict[str, Any]) -> RunFolder:
         if read_json(path, dict) == record and not (path.parent / SHEET).exists():
             print(f"continuing {path.parent}", flush=True)
             return claim(path.parent, "another demo is working", "")
-    claimed, _ = claim_new(root / datetime.now().strftime("%Y%m%d-%H%M%S"))
+    claimed = claim_new(root / datetime.now().strftime("%Y%m%d-%H%M%S"))
     with atomic_file(claimed.path / RECORD) as file:
         file.write(json_text(record, indent=1).encode())
     return claimed

@@ -24,7 +24,7 @@ from ..core.errors import UserError, unknown
 from ..core.files import existing_file, output_folder
 from ..core.options import shown
 from ..core.signals import interrupt
-from ..launch.folder_lock import claim
+from ..launch.run_folder import claim
 from ..models.bundled import RECORD
 from ..view.run_files import read_json
 from . import tokens

@@ -53,10 +53,8 @@ def run_seed() -> int:
 def load_parameters(
     module: nn.Module, state: dict[str, Any], source: str, *, strict: bool = True
 ) -> None:
-    """Load parameters into a module; ``source`` names the checkpoint in messages.
-
-    Raises:
-        UserError: a parameter has another shape here, or names differ with ``strict``.
+    """Load parameters into a module; raise UserError, which names the checkpoint ``source``, if one
+    has another shape here, or names differ with ``strict``.
     """
     try:
         module.load_state_dict(state, strict=strict)
@@ -69,9 +67,7 @@ def load_parameters(
 
 
 class Part(Updateable):
-    """What :class:`BaseObject` and :class:`BaseModule` have in common: a typed configuration and a
-    device.
-    """
+    """A typed configuration and a device."""
 
     @dataclass
     class Config:
@@ -88,9 +84,7 @@ class Part(Updateable):
         self.configure(*args, **kwargs)
 
     def configure(self, *args: Any, **kwargs: Any) -> None:
-        """Build the part from ``self.cfg``; gets what the constructor got after the
-        configuration.
-        """
+        """Build the part from ``self.cfg`` and what the constructor got after it."""
 
 
 class BaseObject(Part):

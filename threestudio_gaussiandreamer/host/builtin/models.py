@@ -1,16 +1,13 @@
 """Base classes of the parts of a system, and the host's own minimal parts."""
 
 from abc import abstractmethod
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, NamedTuple, Optional, Tuple
 
 import torch
 from torch import Tensor, nn
 
-from ...core.distributed import draw_shared
-from ...core.options import one_of
-from ...core.streams import generator
-from .base import BaseModule, BaseObject, run_seed
+from .base import BaseModule, BaseObject
 from .registry import register
 
 
@@ -22,23 +19,21 @@ class BaseMaterial(BaseModule):
     """Base class of materials: features to colours; Gaussians have their own colours."""
 
 
-COLOR_ACTIVATIONS = {"sigmoid": torch.sigmoid, "none": lambda x: x}
-
-
 @register("no-material")
 class NoMaterial(BaseMaterial):
-    """Pass colours through a sigmoid; without ``input_feature_dims`` there are no parameters."""
+    """Pass colours through a sigmoid."""
 
     @dataclass
     class Config(BaseMaterial.Config):
         n_output_dims: int = 3
-        color_activation: str = field(default="sigmoid", metadata=one_of(COLOR_ACTIVATIONS))
+
+        REMOVED = {"color_activation": ("sigmoid", "it is the sigmoid")}
 
     cfg: Config
     SECTION = "system.material."
 
     def forward(self, features: Tensor, **kwargs: Any) -> Tensor:
-        return COLOR_ACTIVATIONS[self.cfg.color_activation](features)
+        return features.sigmoid()
 
 
 class BaseBackground(BaseModule):
@@ -51,17 +46,18 @@ class BaseBackground(BaseModule):
 
 @register("solid-color-background")
 class SolidColorBackground(BaseBackground):
-    """One colour for all pixels, fixed or learned; ``random_aug`` replaces it in some steps of
-    training by a random one for each view, both as functions of (seed, step).
-    """
+    """One colour for all pixels, fixed or learned."""
 
     @dataclass
     class Config(BaseBackground.Config):
         n_output_dims: int = 3
         color: Tuple = (1.0, 1.0, 1.0)
         learned: bool = False
-        random_aug: bool = False
-        random_aug_prob: float = 0.5
+
+        REMOVED = {
+            "random_aug": (False, "gaussiandreamer-background has random colours (mode)"),
+            "random_aug_prob": (lambda value: True, "see random_aug"),
+        }
 
     cfg: Config
 
@@ -71,20 +67,9 @@ class SolidColorBackground(BaseBackground):
             self.env_color = nn.Parameter(color)
         else:
             self.register_buffer("env_color", color)
-        self.step = 0
-
-    def update_step(self, epoch: int, global_step: int, on_load_weights: bool = False) -> None:
-        self.step = global_step
 
     def forward(self, dirs: Tensor) -> Tensor:
-        shape = (*dirs.shape[:-1], self.cfg.n_output_dims)
-        if self.training and self.cfg.random_aug:
-            rng = generator(run_seed(), "background", self.step)
-            if torch.rand((), generator=rng) < self.cfg.random_aug_prob:
-                own = (1, 1, self.cfg.n_output_dims)
-                colors = draw_shared(len(dirs), lambda n: torch.rand(n, *own, generator=rng))
-                return colors.to(dirs).expand(shape)
-        return self.env_color.to(dirs).expand(shape)
+        return self.env_color.to(dirs).expand(*dirs.shape[:-1], self.cfg.n_output_dims)
 
 
 class SubModules(NamedTuple):

@@ -9,10 +9,7 @@ _parts: dict[str, type] = {}
 
 def register(name: str) -> Callable[[type], type]:
     """Return a decorator that enters a class, or of a regulariser the function, under ``name``;
-    entering the same one twice is harmless.
-
-    Raises:
-        UserError: another one has that name already.
+    it raises UserError if another one has that name already.
     """
 
     def enter(cls: type) -> type:
@@ -29,11 +26,7 @@ def register(name: str) -> Callable[[type], type]:
 
 
 def find(name: str) -> type:
-    """Return the class registered as ``name``.
-
-    Raises:
-        UserError: no part has that name; the message lists the near ones.
-    """
+    """Return the class registered as ``name``; raise UserError, with the near ones, if none is."""
     if name not in _parts:
         raise unknown("part", name, _parts)
     return _parts[name]

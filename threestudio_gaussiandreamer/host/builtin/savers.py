@@ -31,16 +31,12 @@ class SaverMixin:
         return self._save_dir
 
     def get_save_path(self, filename: str) -> str:
-        """Return the full path of a file below the save folder, and create its folder.
-
-        Raises:
-            UserError: the path is outside the save folder.
+        """Return the full path of a file below the save folder, and create its folder; raise
+        UserError if it is outside of it.
         """
         path = os.path.join(self.get_save_dir(), filename)
         if os.path.relpath(path, self.get_save_dir()).startswith(os.pardir):
-            raise UserError(
-                f"the file name {filename!r} is outside the folder of results {self.get_save_dir()}"
-            )
+            raise UserError(f"the file name {filename!r} is outside of {self.get_save_dir()}")
         os.makedirs(os.path.dirname(path), exist_ok=True)
         return path
 
@@ -48,15 +44,26 @@ class SaverMixin:
         """Make the Weights & Biases logger if ``loggers.wandb.enable``; needs the package wandb."""
         wandb = loggers.get("wandb")
         if wandb and wandb.get("enable"):
-            self._wandb_logger = _wandb_logger(wandb)
+            try:
+                from lightning.pytorch.loggers import WandbLogger
+
+                names = {key: wandb.get(key) for key in ("project", "name")}
+                self._wandb_logger = WandbLogger(**names)
+            except ModuleNotFoundError as error:
+                raise UserError(
+                    "system.loggers.wandb.enable is true, but wandb isn't installed: pip install "
+                    "wandb"
+                ) from error
 
     def get_loggers(self) -> list:
         return [self._wandb_logger] if self._wandb_logger else []
 
     def convert_data(self, data: Any) -> Any:
-        """Convert tensors to numpy arrays, also inside a dict."""
+        """Convert tensors to numpy arrays, also inside of dicts and lists."""
         if isinstance(data, dict):
             return {key: self.convert_data(item) for key, item in data.items()}
+        if isinstance(data, list):
+            return [self.convert_data(item) for item in data]
         return data.detach().cpu().numpy() if isinstance(data, Tensor) else data
 
     def save_image_grid(
@@ -69,7 +76,7 @@ class SaverMixin:
                 of rows; ``kwargs`` as for ``core.images.rgb`` and ``core.images.grayscale``.
         """
         path = self.get_save_path(filename)
-        pictures.write(path, pictures.grid(self._converted(imgs)))
+        pictures.write(path, pictures.grid(self.convert_data(imgs)))
         self._log_file("Image", path, name, step)
         return path
 
@@ -93,9 +100,12 @@ class SaverMixin:
             raise UserError(f"unknown video format {save_format!r}: expected 'mp4' or 'gif'")
         if not filename.endswith(save_format):
             filename += f".{save_format}"
-        path = self.get_save_path(filename)
-        frames = _matching(Path(self.get_save_dir(), img_dir), re.compile(matcher))
-        pictures.write_video(path, frames, fps=fps)
+        path, folder = self.get_save_path(filename), Path(self.get_save_dir(), img_dir)
+        matches = [(re.search(matcher, picture.name), picture) for picture in folder.iterdir()]
+        frames = sorted((int(match[1]), picture) for match, picture in matches if match)
+        if not frames:
+            raise FileNotFoundError(f"no picture in {folder} matches {matcher}")
+        pictures.write_video(path, [picture for _, picture in frames], fps=fps)
         self._log_file("Video", path, name, step)
         return path
 
@@ -103,9 +113,7 @@ class SaverMixin:
         """Save a dict of arrays as npz, anything else as npy."""
         data = self.convert_data(data)
         extension = ".npz" if isinstance(data, dict) else ".npy"
-        path = self.get_save_path(
-            filename if filename.endswith(extension) else filename + extension
-        )
+        path = self.get_save_path(filename.removesuffix(extension) + extension)
         with atomic_file(path) as file:
             np.savez(file, **data) if isinstance(data, dict) else np.save(file, data)
         return path
@@ -116,7 +124,7 @@ class SaverMixin:
         """Save ``mesh.v_pos`` (V,3), ``mesh.t_pos_idx`` (F,3) and, if asked, ``mesh.v_rgb`` (V,3)
         as a Wavefront OBJ without material.
         """
-        path = self.get_save_path(filename if filename.endswith(".obj") else f"{filename}.obj")
+        path = self.get_save_path(f"{filename.removesuffix('.obj')}.obj")
         vertices, faces = self.convert_data(mesh.v_pos), self.convert_data(mesh.t_pos_idx)
         if save_vertex_color:
             vertices = np.concatenate([vertices, self.convert_data(mesh.v_rgb)], axis=1)
@@ -138,11 +146,6 @@ class SaverMixin:
             file.write(json_text(payload).encode())
         return path
 
-    def _converted(self, imgs: list) -> list:
-        if imgs and isinstance(imgs[0], list):
-            return [self._converted(row) for row in imgs]
-        return [self.convert_data(cell) for cell in imgs]
-
     def _log_file(self, kind: str, path: str, name: Optional[str], step: Optional[int]) -> None:
         if name and self._wandb_logger:
             import wandb
@@ -150,23 +153,3 @@ class SaverMixin:
             self._wandb_logger.experiment.log(
                 {name: getattr(wandb, kind)(path), "trainer/global_step": step}
             )
-
-
-def _matching(folder: Path, matcher: re.Pattern) -> list[Path]:
-    found = [
-        (int(match[1]), path) for path in folder.iterdir() if (match := matcher.search(path.name))
-    ]
-    if not found:
-        raise FileNotFoundError(f"no picture in {folder} matches {matcher.pattern}")
-    return [path for _, path in sorted(found)]
-
-
-def _wandb_logger(options: Any) -> Any:
-    try:
-        from lightning.pytorch.loggers import WandbLogger
-
-        return WandbLogger(project=options.get("project"), name=options.get("name"))
-    except ModuleNotFoundError as error:
-        raise UserError(
-            "system.loggers.wandb.enable is true, but wandb isn't installed: pip install wandb"
-        ) from error

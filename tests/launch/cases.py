@@ -1,6 +1,8 @@
-"""Helpers of the bad input tests."""
+"""Helpers of the tests of the launcher."""
 
 from pathlib import Path
+
+from threestudio_gaussiandreamer.launch.config import load_config
 
 DEMO = Path(__file__).parents[2] / "configs" / "demo.yaml"
 
@@ -19,3 +21,7 @@ def assert_refused(code: int, err: str, message: str) -> None:
     assert code == 2 and "Traceback" not in err and not Path("outputs").exists(), err
     assert message in err and sum(line.startswith("error: ") for line in err.splitlines()) == 1
     assert "the cloud starts" not in err
+
+
+def load(*overrides: str):
+    return load_config("tiny.yaml", cli_args=overrides)
