@@ -101,8 +101,8 @@ def rounds_of(schedule: Any) -> range:
 
 class DensityRule:
     """Base class of density rules, whose hooks are called around every optimiser step; ``cfg`` are
-    its options, ``system.geometry.density``. ``cloud`` is a :class:`.geometry.GaussianCloud`, which
-    :meth:`after_step` may change, by ``cloud.apply_change`` where the number of Gaussians changes.
+    its options, ``system.geometry.density``. :meth:`after_step` may change ``cloud``, a
+    :class:`.geometry.GaussianCloud`, by its ``apply_change`` where the number of Gaussians changes.
     """
 
     @dataclass
@@ -149,9 +149,6 @@ class DensityRule:
         return f"{count:,} of {start:,} Gaussians" if start else f"{count:,} Gaussians"
 
 
-HOOKS = ("schedule_problem", "before_backward", "after_backward", "after_step", "summary")
-
-
 def density_rule(cloud: Any) -> DensityRule:
     """Build the rule that ``density_type`` of a cloud names; raise UserError if it can't be one."""
     rule = find(cloud.cfg.density_type)
@@ -160,7 +157,8 @@ def density_rule(cloud: Any) -> DensityRule:
             f"system.geometry.density_type is {cloud.cfg.density_type!r}: expected a class that is "
             f"derived from {DensityRule.__module__}.DensityRule"
         )
-    for name in HOOKS:
+    hooks = "schedule_problem", "before_backward", "after_backward", "after_step", "summary"
+    for name in hooks:
         _, *arguments = inspect.signature(getattr(DensityRule, name)).parameters
         require_method(rule, name, *arguments)
     return rule(cloud)
@@ -234,8 +232,8 @@ class DensityControl(DensityRule):
         self, pictures: dict[str, Any], step: int, error: Optional[MeanError] = None
     ) -> None:
         """Add a sample of the removal error in these renders to the statistics, if the next round
-        of pruning uses it, and of the ``error`` with which ``budget: auto`` compares it; where
-        there is none, ``prune.likeness`` stands for it.
+        of pruning uses it, and the ``error`` with which ``auto`` compares it, or that of
+        ``prune.likeness``.
         """
         if not self.samples_removal(step):
             return
@@ -266,9 +264,7 @@ class DensityControl(DensityRule):
     def after_backward(
         self, out: Rasterized, width: int, height: int, loss_scale: float = 1.0
     ) -> None:
-        """Add one step's contributions, and for densification its screen-space gradients, which
-        mixed precision has multiplied by ``loss_scale``, to the statistics.
-        """
+        """Add contributions, and for densification screen-space gradients, to the statistics."""
         cloud = self.cloud
         if out.means2d.grad is not None and cloud.cfg.densify.enabled:
             pixels = out.means2d.absgrad if cloud.wants_absgrad else out.means2d.grad
@@ -315,8 +311,8 @@ class DensityControl(DensityRule):
         return densify.densify_and_prune(cloud.parameters_by_name(), *statistics, cfg, *counts, rng)
 
     def _prune(self, step: int, first: Optional[Change]) -> tuple[Change, Optional[Need]]:
-        """Prune once towards the budget, after the change ``first`` by densification at the same
-        step; return the combined change, and what ``auto`` has found.
+        """Prune once, after the change ``first`` by densification at the same step; return the
+        combined change, and what ``auto`` has found.
         """
         cloud, cfg = self.cloud, self.cloud.cfg.prune
         change = densify.unchanged(cloud.parameters_by_name()) if first is None else first

@@ -128,8 +128,8 @@ def _call_each(calls: Mapping[str, Callable[[], Any]]) -> None:
 def writers(
     system: Any, geometry: Any, folder: str, pruned_to: Optional[float] = None
 ) -> dict[str, Callable[[], None]]:
-    """Return a function for each format of the exporter of ``system`` that writes its files of a
-    geometry into ``folder``; ``pruned_to``, dB, is noted in files of Gaussians.
+    """Return a function for each format of the exporter that writes its files of a geometry into
+    ``folder``; ``pruned_to``, dB, is noted in files of Gaussians.
     """
     parts = {"geometry": geometry, "material": system.material, "background": system.background}
     exporter = find(system.cfg.exporter_type)(system.cfg.exporter, **parts)
@@ -157,8 +157,8 @@ def writers(
 
 
 def export_pruned(system: Any, folder: str) -> None:
-    """Write the same files of the cloud pruned to ``system.prune``, if it is given, into ``folder``
-    with the prune command's report. Dilation and antialiasing are the renderer's unless given.
+    """Write the same files of the cloud pruned to ``system.prune``, if it is given, and the prune
+    command's report. Dilation and antialiasing are the renderer's unless given.
     """
     options, drawn = PruneOptions(**vars(system.cfg.prune)), settings_of(system)
     if not options.asked_for:
@@ -195,9 +195,7 @@ def save_first_cloud(system: Any) -> None:
 
 
 def write_pages(system: Any, folder: str) -> None:
-    """Write the page and the poster of the cloud of ``system`` into the folder of the exports,
-    unless ``system.pages`` is off or a page can't show it.
-    """
+    """Write the page and the poster, unless ``system.pages`` is off or a page can't show it."""
     if not system.cfg.pages:
         return
     run, settings = RunFiles(Path(system.get_save_dir()).parent), settings_of(system)

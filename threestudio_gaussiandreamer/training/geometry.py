@@ -86,10 +86,8 @@ CAP_VIEWS = (32, 256)
 """Views that rank the Gaussians of a trained cloud that is too large, and their pixels each way."""
 STATISTICS = ("gradient_sum", "gradient_count", "contribution", "removal")
 AUTO_STATE = {"error": 0.0, "gain": -1.0, "started_with": 0.0}
-"""Numbers of a run and their first values: squared error of the views in which ``removal`` was
-sampled, dB that twice as many Gaussians would gain (see ``importance.Need``), and their number at
-the start.
-"""
+"""Numbers of a run: squared error of the views in which ``removal`` was sampled, dB that twice as
+many Gaussians would gain (see ``importance.Need``), and their number at the start."""
 LEARNING_RATES = {
     "means": "lr_means",
     "log_scales": "lr_scales",
@@ -305,13 +303,11 @@ class GaussianCloud(BaseGeometry):
             self.set_arrays(sh=torch.cat([merged.pop("sh0"), merged.pop("sh_rest")], 1), **merged)
 
     def start_from(self, cloud: PointCloud) -> None:
-        """Start with one Gaussian on each point, see ``gaussians_on_points``."""
+        """Start with one Gaussian on each point."""
         self.set_arrays(**gaussians_on_points(cloud, self.cfg)._asdict())
 
     def set_arrays(self, *, sh: Any, **arrays: Any) -> None:
-        """Replace the cloud; spherical harmonics ``sh`` (N, K', 3) are padded with zeros or cut to
-        ``sh_degree``.
-        """
+        """Replace the cloud, with harmonics ``sh`` (N, K', 3) padded or cut to ``sh_degree``."""
         device = self.means.device
         self._allocate(len(arrays["means"]), device)
         with torch.no_grad():

@@ -67,8 +67,8 @@ class HeldOut:
 
     @cached_property
     def rings(self) -> list[tuple[Tensor, Tensor, Tensor]]:
-        """For each distinct pair of elevation and distance: the indices of its held-out views,
-        ``RING`` azimuths in degrees, and the ground truth at those, (R, h, w, 4).
+        """For each pair of elevation and distance: the indices of its held-out views, ``RING``
+        azimuths in degrees, and the ground truth at those, (R, h, w, 4).
         """
         azimuth, same, rings = 360.0 * torch.arange(RING) / RING, torch.ones(RING), []
         places = torch.stack([self.orbit.elevation, self.orbit.distance], 1)
@@ -175,8 +175,8 @@ class Measurements:
 
     @torch.no_grad()
     def begin(self, renderer: Any) -> None:
-        """Drop the scores of an earlier run in the folder. Render the prior's cloud now, and score
-        it with the next one or in :meth:`score_postponed`, since rendering the truth takes seconds.
+        """Drop the scores of an earlier run. Render the prior's cloud now, and score it in
+        :meth:`score_postponed`, since rendering the truth takes seconds.
         """
         self.values, self.seconds = {}, np.zeros(len(CLOCKS))
         with self.paused_clock():
@@ -226,9 +226,7 @@ class Measurements:
             file.write(json_text(self.values, indent=2).encode())
 
     def _save_pictures(self, key: str, renders: Tensor, truth: Tensor) -> None:
-        """Save rows of six views to the folder ``held_out``: ``<key>.png``, ``truth.png``, and
-        ``compare.png`` with prior, result and ground truth.
-        """
+        """Save rows of six views to ``held_out``, also of prior, result and truth together."""
         folder = self.folder / "held_out"
         folder.mkdir(parents=True, exist_ok=True)
         for name, images in ((key, renders), ("truth", truth)):

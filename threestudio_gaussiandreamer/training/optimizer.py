@@ -51,8 +51,8 @@ def accepted_arguments(name: str) -> dict[str, Any]:
 
 
 def foreign_arguments(name: str, arguments: Mapping[str, Any]) -> list[str]:
-    """Return the arguments that an optimiser lacks, or that are a pair in one and a number in the
-    other, as ``eps`` of Adafactor; none if there is no such optimiser.
+    """Return the arguments that an optimiser lacks, or has as a pair in place of a number, as
+    ``eps`` of Adafactor; none if there is no such optimiser.
     """
     if not (accepted := accepted_arguments(name)):
         return []

@@ -342,7 +342,7 @@ class GaussianDreamerSystem(export.GaussianSavers, BaseLift3DSystem):
             events.save_pictures(self, batch)
 
     def on_validation_epoch_end(self) -> None:
-        pass
+        """Do nothing; threestudio's raises an error."""
 
     def test_step(self, batch: dict[str, Any], batch_idx: int) -> None:
         if not rank():

@@ -191,8 +191,8 @@ def is_own_page(site: Optional[str], origin: Optional[str], host: str) -> bool:
 
 @contextlib.contextmanager
 def own_pages_only(host: str) -> Iterator[list[Any]]:
-    """Let the viser server that is started in this context refuse what isn't :func:`is_own_page`:
-    viser has no option for it. Yield the guards; a server without one isn't guarded.
+    """Let the viser server that is started in this context refuse what isn't :func:`is_own_page`;
+    yield the guards, of which an unknown viser asks for none.
     """
     import websockets.asyncio.server as sockets
 
@@ -230,7 +230,7 @@ def splats(gaussians: Gaussians) -> dict[str, np.ndarray]:
 
 def serve(cloud: StoredCloud, host: str, port: int, title: str) -> LiveView:
     """Serve a finished cloud until the returned view is closed; raises UserError as
-    :func:`require_server` does, or if there are no Gaussians, or they reach too far.
+    :func:`require_server`, :func:`require_gaussians` and :func:`first_pose`.
     """
     require_gaussians(len(cloud.gaussians.means), title)
     upright = cloud.in_axes(WORLD_UP)

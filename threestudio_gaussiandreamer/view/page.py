@@ -50,32 +50,27 @@ COARSE_MEANS = 1024
 
 
 class Shown(NamedTuple):
-    """A cloud of a page."""
+    """A cloud of a page, its label there, and its PSNR and the views on which that was measured."""
 
     cloud: StoredCloud
     label: str
-    """Its name in the page's list of clouds."""
     quality: str = ""
-    """Its PSNR and the views on which that was measured; empty if unknown."""
 
 
 class PageOptions(NamedTuple):
-    """What is common to the clouds of a page."""
+    """What is common to the clouds of a page; ``name``, without extension, of the files that it
+    saves; whether the object may vanish on the background, since the user has chosen it."""
 
     title: str
     name: str
-    """Name, without extension, of the files that the page saves."""
     settings: RenderSettings
     background: Color = WHITE
     keep_background: bool = False
-    """Whether the object may vanish on it, since the user has chosen it."""
 
 
-def write_page(
-    path: Path, shown: Shown, options: PageOptions, before: Optional[Shown] = None
-) -> None:
+def write_page(path: Path, *shown: Any) -> None:
     """Write the page of :func:`page`; raises UserError also if the file can't be written."""
-    content = page(shown, options, before)
+    content = page(*shown)
     with atomic_file(path) as file:
         # a title may be a file's name, whose bytes needn't be UTF-8
         file.write(content.encode(errors="replace"))
@@ -179,8 +174,8 @@ def packed(gaussians: Gaussians) -> bytes:
 
 
 def coarse(gaussians: Gaussians) -> Gaussians:
-    """Round the attributes of a cloud that is shown for comparison only, and drop its harmonics
-    above degree 0, to multiples of powers of two, whose lowest bytes vanish when packed.
+    """Round the attributes of a cloud, without harmonics above degree 0, to multiples of powers of
+    two, whose lowest bytes vanish when packed.
     """
     side = float(np.ptp(gaussians.means, axis=0).max(initial=0))
     steps = {"means": 2.0 ** np.ceil(np.log2(max(side, 1e-30) / COARSE_MEANS)), "quats": 1 / 32}

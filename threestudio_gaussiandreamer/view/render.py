@@ -49,9 +49,7 @@ class RenderSettings(NamedTuple):
 
     @classmethod
     def of(cls, renderer: Any, bound_colors: bool) -> "RenderSettings":
-        """Collect the options of our renderer. Its ``eps2d`` is in pixels before ``downsample``;
-        ours is in pixels of the returned image.
-        """
+        """Collect the options of our renderer, whose ``eps2d`` is in pixels before downsampling."""
         return cls(
             eps2d=renderer.eps2d / renderer.downsample**2,
             antialias=renderer.antialias,
@@ -80,9 +78,7 @@ def require_gaussians(count: int, name: str) -> None:
 
 
 def first_pose(cloud: StoredCloud) -> Pose:
-    """Return the pose that shows the whole cloud from the front. Raises UserError for a cloud that
-    is too large for float32.
-    """
+    """Return the pose that shows the whole cloud from the front; UserError if it is too large."""
     gaussians = cloud.gaussians.tensors()
     ball = bounds(gaussians)
     require_renderable(gaussians, ball[1])
@@ -93,10 +89,8 @@ def first_pose(cloud: StoredCloud) -> Pose:
 
 
 def _whole(cloud: Gaussians, ball: Ball) -> Ball:
-    """Extend the ball of :func:`bounds` to all that is connected with it, such as a thin hat.
-
-    From that ball outwards, a Gaussian belongs to the cloud unless there is a gap before it, so
-    that nothing connected is left out and a floater is. Gaussians end at two standard deviations.
+    """Extend the ball of :func:`bounds` outwards to all Gaussians, which end at two standard
+    deviations, before the first gap: a thin hat belongs to the cloud, and a floater doesn't.
     """
     centre, radius = ball
     deviation = cloud.log_scales.exp().amax(1)

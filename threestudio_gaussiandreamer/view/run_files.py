@@ -18,6 +18,7 @@ from ..core.checkpoint_file import load_file
 from ..core.errors import UserError
 from ..core.files import existing_file, is_folder
 from ..core.logs import warn
+from ..core.options import is_numbers, parse_structured
 from ..formats.gaussian_files import (
     READ,
     StoredCloud,
@@ -68,9 +69,7 @@ class RunFiles:
     @property
     def settings(self) -> RenderSettings:
         """How the run has drawn its cloud."""
-        # only here, since the commands for files need neither Lightning nor the configuration
-        from ..core.options import parse_structured
-        from ..training.renderer import SplattingRenderer
+        from ..training.renderer import SplattingRenderer  # files don't need the training
 
         options = section(self.config, "system", "renderer")
         try:
@@ -90,9 +89,8 @@ class RunFiles:
     def background(self) -> Optional[tuple[float, float, float]]:
         """The colour that the run has shown its cloud on; None if it isn't known."""
         color = section(self.config, "system", "background").get("color")
-        numbers = color if isinstance(color, list) and len(color) == 3 else ["none"]
-        valid = all(isinstance(x, (int, float)) and 0 <= x <= 1 for x in numbers)
-        return tuple(map(float, numbers)) if valid else None
+        valid = is_numbers(color, 3) and 0 <= min(color) <= max(color) <= 1
+        return tuple(map(float, color)) if valid else None
 
     @property
     def background_is_given(self) -> bool:
@@ -124,13 +122,12 @@ class RunFiles:
         return next(filter(Path.is_file, found), None)
 
     def psnr(self, key: str, step: Optional[int] = None) -> Optional[float]:
-        """Return dB of the "prior" or "result" on held-out views, with ``step`` only if it was
-        measured at this step; None if they aren't known.
+        """Return dB of the "prior" or "result" on held-out views; None if they aren't known, or not
+        of ``step``.
         """
         found = section(self.scores, key)
-        psnr = found.get("psnr")
-        known = isinstance(psnr, float) and step in (None, found.get("step"))
-        return psnr if known else None
+        known = isinstance(found.get("psnr"), float) and step in (None, found.get("step"))
+        return found["psnr"] if known else None
 
 
 def cloud_file(path: str | os.PathLike, hint: str = "") -> Path:

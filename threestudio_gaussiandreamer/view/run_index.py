@@ -135,9 +135,7 @@ def note_time(folder: Path, stage: str, began: datetime, seconds: float) -> None
 
 
 def config_changes(folder: Path) -> list[tuple[str, Any, Any]]:
-    """Return key, value in the base file and value in the run, for those that differ, of the folder
-    ``configs`` of a run, with ``raw.yaml``, the base file, and ``parsed.yaml``.
-    """
+    """Return key, value in the base file and value in the run, for those that differ."""
     base = dict(leaves(read_yaml(folder / "raw.yaml")))
     return [
         (key, base.get(key, "–"), value)
@@ -162,8 +160,8 @@ Curve = list[tuple[float, float]]
 
 
 def read_curves(folder: Path, names: Sequence[str]) -> dict[str, Curve]:
-    """Return the columns with at least two finite values of the CSV logs of a run; a resumed run
-    has several logs, of which later ones win.
+    """Return the columns with at least two finite values of the CSV logs of a run, of which later
+    ones win.
     """
     values: dict[str, dict[float, float]] = {name: {} for name in names}
     logs = folder.glob("csv_logs/version_*/metrics.csv")
@@ -206,8 +204,8 @@ def _in_unit(values: Sequence[float]) -> list[float]:
 
 
 def write_gallery(folder: Path) -> Path:
-    """Write the gallery of the runs in a folder, and their own indices; returns its path. An index
-    that can't be written is a warning.
+    """Write the gallery of the runs in a folder, and their own indices, if that is possible; return
+    its path.
     """
     patterns = ["/".join(["*"] * depth) for depth in range(1, MAX_DEPTH + 1)]
     found = [path for pattern in patterns for path in folder.glob(pattern) if is_run(path)]
