@@ -11,16 +11,10 @@ from threestudio_gaussiandreamer.gaussians.recover import LR_SCALES, Recovery, R
 from threestudio_gaussiandreamer.gaussians.simplify import (
     Budget,
     keep_best,
-    rounds_to,
     simplify,
     view_importance,
 )
 from threestudio_gaussiandreamer.gaussians.views import views_around
-
-
-def test_how_many_rounds_it_takes():
-    cases = ((100, 100, 0), (10, 20, 0), (10000, 6400, 2), (10000, 1500, 9), (600, 1, 24))
-    assert all(rounds_to(count, here) == rounds for here, count, rounds in cases)
 
 
 def recovery(cloud, size):

@@ -64,6 +64,7 @@ def demo():
         ("system.material_type=''", "system.material_type is ''; expected the name of a"),
         ("system.guidance_type=exact-scores", "system.guidance_type: unknown part 'exact-scores'"),
         ("system.renderer_type=no-material", "needs gaussiandreamer-splatting, or a class"),
+        ("system.geometry_type=no-material", "geometry_type is 'no-material'"),
         ("system.material_type=gaussiandreamer-cloud", "a part of the kind geometry; expected one"),
         ("system.background_type=ply-exporter", "a part of the kind exporter; expected one of the"),
         ("data_type=mesh-prior", "data_type is 'mesh-prior', a part of the kind prior; expected"),

@@ -35,7 +35,10 @@ def test_a_round_says_how_many_it_left_and_another_step_leaves_the_cloud():
     means = density.cloud.means
     assert after_step(density) is None and density.cloud.means is means
     density = control(budget=5)
+    density.cloud.started_with.fill_(1200)
     assert after_step(density) is None and len(density.cloud) == 8
+    assert density.summary() == "8 of 1,200 Gaussians: the budget is 5"
+    assert control().summary() == "10 Gaussians: no budget"  # of a checkpoint without the number
 
 
 def sampled(density, removal, error):
@@ -61,14 +64,6 @@ def test_a_round_of_auto_says_what_more_would_gain_and_so_does_the_end():
     assert density.summary() == "10 of 10 Gaussians: twice as many would gain 0.2 dB"
     after_step(sampled(density, torch.zeros(10), 0.0))  # a round without a sample
     assert density.summary() == "10 of 10 Gaussians: twice as many would gain 0.2 dB"
-
-
-def test_a_run_says_how_many_it_kept_and_why():
-    density = control(budget=5)
-    density.cloud.started_with.fill_(1200)
-    after_step(density)
-    assert density.summary() == "8 of 1,200 Gaussians: the budget is 5"
-    assert control().summary() == "10 Gaussians: no budget"  # of a checkpoint without the number
 
 
 @pytest.mark.parametrize("error", [0.0, math.nan, math.inf])

@@ -1,5 +1,7 @@
 """The cloud: its start from points, its size, its learning rates, its checkpoint."""
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 
@@ -12,7 +14,6 @@ from threestudio_gaussiandreamer.gaussians.densify import screen_gradients
 from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
 from threestudio_gaussiandreamer.gaussians.grow import nearest_distance_scales
 from threestudio_gaussiandreamer.host import BaseGeometry, find
-from threestudio_gaussiandreamer.splatting import Rasterized
 from threestudio_gaussiandreamer.training.density import DensityControl
 from threestudio_gaussiandreamer.training.geometry import GaussianCloud, grow_points
 
@@ -24,17 +25,6 @@ def started(cloud, **cfg):
     geometry = GaussianCloud({"grow": NO_GROWTH, **cfg})
     geometry.start_from(grow_points(cloud, geometry.cfg.grow))
     return geometry
-
-
-def seen(geometry, gradient=1.0, contribution=0.5, size=64):
-    """Return what a render of one view returns, with a gradient at every projected centre."""
-    n = len(geometry)
-    means2d = torch.zeros(1, n, 2, requires_grad=True)
-    means2d.grad = torch.full((1, n, 2), gradient)
-    empty = torch.zeros(1, 1, 1, 1)
-    return Rasterized(
-        empty, empty, empty, means2d, torch.ones(1, n), torch.full((1, n), contribution)
-    )
 
 
 def test_each_point_becomes_one_gaussian_as_the_paper_says(sphere_points):
@@ -73,7 +63,10 @@ def test_the_cloud_takes_its_size_from_the_checkpoint_and_never_asks_the_prior(
     sphere_points, tmp_path
 ):
     geometry = started(sphere_points, sh_degree=2, densify={"enabled": True})
-    DensityControl(geometry).after_backward(seen(geometry), 64, 64)
+    means2d = torch.zeros(1, 400, 2, requires_grad=True)
+    means2d.grad, seen = torch.ones(1, 400, 2), torch.full((1, 400), 0.5)
+    out = SimpleNamespace(means2d=means2d, radii=seen, contribution=seen)
+    DensityControl(geometry).after_backward(out, 64, 64)
     torch.save(geometry.state_dict(), tmp_path / "c.pt")
     other = GaussianCloud({"sh_degree": 2, "prior_type": "no-such-prior"})
     other.load_state_dict(torch.load(tmp_path / "c.pt", weights_only=True))
@@ -168,9 +161,7 @@ def test_colours_by_direction_that_are_dropped_are_told(
     [
         ({"scale_rule": "nearst"}, "nearest"),
         ({"init_opacity": 1.0}, "init_opacity"),
-        ({"sh_degree": 4}, "sh_degree"),
         ({"min_gaussians": 10, "max_gaussians": 5}, "min_gaussians"),
-        ({"grow": {"radius": 0}}, "grow.radius"),
         ({"grow": {"radius": 1e38}}, "grow.radius"),
         ({"lr_means": 1e30}, "lr_means: expected values of 1e\\+06 or less"),
         ({"grow": {"color_range": [0.2, 0.0]}}, "color_range"),

@@ -8,10 +8,9 @@ import pytest
 from threestudio_gaussiandreamer import register_parts
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.core.files import existing_file
-from threestudio_gaussiandreamer.host import BaseGeometry, BaseObject, Rasterizer, find, register
-from threestudio_gaussiandreamer.training import system
+from threestudio_gaussiandreamer.host import BaseObject, register
 from threestudio_gaussiandreamer.training.geometry import GaussianCloud
-from threestudio_gaussiandreamer.training.system import check_parts, preflight_parts
+from threestudio_gaussiandreamer.training.system import preflight_parts
 
 register_parts()
 
@@ -31,25 +30,6 @@ class WeightsGuidance(BaseObject):
 class InstancePreflight(WeightsGuidance):
     def preflight(self):
         """Take no options."""
-
-
-class HostRenderer(Rasterizer):
-    """A renderer without our options and outputs."""
-
-
-@pytest.mark.parametrize(
-    ("name", "part", "base"),
-    [
-        ("geometry", BaseGeometry, "geometry.GaussianCloud"),
-        ("renderer", HostRenderer, "renderer.SplattingRenderer"),
-    ],
-)
-def test_parts_that_the_system_can_not_train_are_refused(name, part, base, monkeypatch):
-    monkeypatch.setattr(system, "find", lambda key: part if key == "own" else find(key))
-    cfg = {"geometry_type": "gaussiandreamer-cloud", "renderer_type": "gaussiandreamer-splatting"}
-    cfg |= {"guidance_type": "g", "prompt_processor_type": "p", f"{name}_type": "own"}
-    with pytest.raises(UserError, match=f"{name}_type is 'own': .* derived from .*{base}"):
-        check_parts(SimpleNamespace(**cfg))
 
 
 def check(guidance_type, guidance=(), prompts="plain-prompt-processor", **prior):
