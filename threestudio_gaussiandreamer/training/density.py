@@ -45,9 +45,8 @@ their learning rate: a Gaussian that the loss doesn't hold up fades until it can
 selection, Deng et al. 2025, arXiv 2511.16980).
 """
 LEAST_ERROR = 2.5e-4
-"""Smallest mean squared error to the ground truth that ``budget: auto`` reckons with: 36 dB. At the
-high rates of the rounds, clouds exceed it that end above 41 dB, where more Gaussians don't pay.
-"""
+"""Smallest mean squared error to the ground truth that ``auto`` reckons with, 36 dB: clouds that
+exceed it at the rates of the rounds end above 41 dB, where more Gaussians don't pay."""
 MeanError = Callable[[], Float[Tensor, ""]]
 
 

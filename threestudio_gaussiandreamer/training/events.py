@@ -99,11 +99,8 @@ def _render_panels(out: Mapping[str, Any]) -> list[Panel]:
 
 
 def score_panels(evaluated: Mapping[str, Any], size: tuple[int, int]) -> list[Panel]:
-    """Arrange the score model's pictures of the first view: noisy, denoised in one step, and
-    denoised in many; ``evaluated`` is the output of :meth:`.ScoreDistillation.evaluate`.
-
-    Args:
-        size: (height, width) to which they are resized, pixels.
+    """Arrange the score model's pictures of the first view, resized to ``size`` (height, width):
+    noisy, denoised in one step, and in many, of :meth:`.ScoreDistillation.evaluate`.
     """
     images = [evaluated[name][:1].movedim(-1, 1) for name in SCORE_PICTURES]
     images = [F.interpolate(x, size, mode="bilinear", align_corners=False) for x in images]

@@ -104,9 +104,7 @@ class GaussianDreamerSystem(export.GaussianSavers, BaseLift3DSystem):
 
     @staticmethod
     def check_checkpoint(checkpoint: dict[str, Any], what: str) -> None:
-        """Raise UserError if the cloud of a checkpoint is empty or malformed; called by the
-        launcher before any object is built from the file ``what``.
-        """
+        """Raise UserError if the cloud of a checkpoint, ``what``, is empty or malformed."""
         if "geometry.means" in checkpoint["state_dict"]:
             names = {name: f"geometry.{name}" for name in SHAPES}
             require_cloud(checkpoint["state_dict"], names, what)
@@ -290,7 +288,7 @@ class GaussianDreamerSystem(export.GaussianSavers, BaseLift3DSystem):
 
     def report(self, out: Outputs, batch: Batch, guided: dict[str, Any], losses: Losses) -> None:
         """Log what the guidance returned, the losses, the number of Gaussians and, if there is a
-        ground truth, the PSNR, every ``log_every_n_steps``.
+        ground truth, the PSNR.
         """
         every = self.trainer.log_every_n_steps
         if not every or self.global_step % every:
@@ -396,10 +394,9 @@ def check_parts(cfg: Any) -> None:
 
 
 def preflight_parts(geometry: Any, cfg: Any) -> None:
-    """Check what the parts of a run need from outside, such as files, before any long work: call
-    ``preflight`` of the prior, if the cloud is empty, and of the classes of guidance and, since it
-    makes a folder, last of prompt processor, with their options. The UserError for what is missing
-    names the part's section.
+    """Check what the parts of a run need from outside, such as files, before any long work: the
+    prior, if the cloud is empty, the guidance, and last, since it makes a folder, the prompt
+    processor. The UserError for what is missing names the part's section.
     """
     checks: dict[str, Callable[[], None]] = {}
     if not len(geometry):

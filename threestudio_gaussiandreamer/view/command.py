@@ -18,14 +18,13 @@ from ..core.files import (
 from ..gaussians.axes import AXES
 from ..gaussians.views import EPS2D
 from ..splatting import PRESETS
-from .live import LiveView, require_server, serve, serve_until_stopped
+from .live import require_server, serve, serve_until_stopped
 from .page import cloud_page, write_page
 from .run_files import RunFiles, cloud_file, is_run, read_any
 from .run_index import write_gallery, write_index
 
 OPTIONS = ("title", "up", "eps2d", "preset", "antialias", "bound_colors", "background")
 """Arguments of :func:`.page.cloud_page`; all but the first two are of pages only."""
-PAGE_SUFFIXES = (".html", ".htm")
 
 
 def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
@@ -42,36 +41,34 @@ def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
     add("--host", default="127.0.0.1", help="address to serve on (this machine)")
     add("--port", type=int, default=8080, help="port to serve on (8080)")
     add("--title", help="what the page is called (default: the run's prompt, or the file's name)")
-    eps2d = f"screen-space dilation, square pixels (default: the run's, or {EPS2D:g})"
-    add("--eps2d", type=float, help=eps2d)
-    preset = "smallest alpha that is drawn (default: the run's, or balanced)"
-    add("--preset", choices=PRESETS, help=preset)
-    antialias = "keep the energy of small Gaussians (default: the run's, or not)"
-    add("--antialias", action=flag, help=antialias)
-    bound = "clamp the colour of each Gaussian to [0, 1] (default: the run's, or yes)"
-    add("--bound-colors", action=flag, help=bound)
-    background = "colour behind the cloud (default: the run's, or ffffff)"
-    add("--background", metavar="RRGGBB", help=background)
-    up = "which axis of PATH is up (default: from the file, else its format's convention)"
-    add("--up", choices=AXES, help=up)
+    add("--eps2d", type=float, help=f"dilation, square pixels (default: the run's, or {EPS2D:g})")
+    add("--preset", choices=PRESETS, help="smallest alpha (default: the run's, or balanced)")
+    add("--antialias", action=flag, help="keep the energy of small Gaussians (default: the run's)")
+    add("--bound-colors", action=flag, help="clamp colours to [0, 1] (default: the run's, or yes)")
+    add("--background", metavar="RRGGBB", help="behind the cloud (default: the run's, or ffffff)")
+    add("--up", choices=AXES, help="the axis of PATH that is up (default: the file's, or format's)")
     return parser.parse_args(joined_values(argv, ["--up"], AXES))
 
 
 def run(args: argparse.Namespace) -> None:
     """Serve a cloud, or write its page, the index of a run, or the gallery of a folder of runs."""
     if args.html is None:
-        serve_until_stopped(served(args))
-        return
-    if is_folder(args.path):
+        if given := _given(args, OPTIONS[2:]):
+            raise UserError(f"{' '.join(given)}: is for the page that --html writes")
+        require_server(args.host, args.port)
+        source = cloud_file(args.path, ", or give --html for the gallery of a folder of runs")
+        address, title = (args.host, args.port), args.title or source.name
+        serve_until_stopped(serve(read_any(source, args.up), *address, title))
+    elif is_folder(args.path):
         run_folder(Path(args.path).expanduser(), args)
-        return
-    source = existing_file(args.path, "file of Gaussians or checkpoint")
-    out = through_link(args.html) if args.html else source.with_suffix(".html")
-    require_writable(out, "--html")
-    require_other_file(out, source, "--html OUT is PATH")
-    if out.suffix.lower() not in PAGE_SUFFIXES:
-        raise UserError(f"--html {args.html}: expected a name that ends in {PAGE_SUFFIXES[0]}")
-    write_cloud_page(source, out, args)
+    else:
+        source = existing_file(args.path, "file of Gaussians or checkpoint")
+        out = through_link(args.html) if args.html else source.with_suffix(".html")
+        require_writable(out, "--html")
+        require_other_file(out, source, "--html OUT is PATH")
+        if out.suffix.lower() not in (".html", ".htm"):
+            raise UserError(f"--html {args.html}: expected a name that ends in .html")
+        write_cloud_page(source, out, args)
 
 
 def write_cloud_page(source: Path, out: Path, args: argparse.Namespace) -> None:
@@ -80,15 +77,6 @@ def write_cloud_page(source: Path, out: Path, args: argparse.Namespace) -> None:
     write_page(out, shown, options)
     count = len(shown.cloud.gaussians.means)
     print(f"{out}: {count:,} Gaussians, {out.stat().st_size / 1e6:.2f} MB")
-
-
-def served(args: argparse.Namespace) -> LiveView:
-    """Serve a cloud, or the last exported cloud of a run."""
-    if given := _given(args, OPTIONS[2:]):
-        raise UserError(f"{' '.join(given)}: is for the page that --html writes")
-    require_server(args.host, args.port)
-    source = cloud_file(args.path, ", or give --html for the gallery of a folder of runs")
-    return serve(read_any(source, args.up), args.host, args.port, args.title or source.name)
 
 
 main = functools.partial(run_command, parse, run)

@@ -7,6 +7,7 @@ import hashlib
 import io
 import math
 import os
+import re
 import zlib
 from collections.abc import Sequence
 from functools import cache
@@ -274,15 +275,9 @@ def cloud_page(
     Raises:
         UserError: an option is invalid, or the file can't be read, or has no or too many Gaussians.
     """
-    color = None
-    if background is not None:
-        try:
-            red, green, blue = bytes.fromhex(background.removeprefix("#"))
-        except ValueError as error:
-            raise UserError(
-                f"--background: expected RRGGBB, such as ff8000, got {background!r}"
-            ) from error
-        color = (red / 255, green / 255, blue / 255)
+    if background is not None and not re.fullmatch("#?[0-9a-fA-F]{6}", background):
+        raise UserError(f"--background: expected RRGGBB, such as ff8000, got {background!r}")
+    color = background and tuple(x / 255 for x in bytes.fromhex(background.removeprefix("#")))
     if eps2d is not None and not 0 <= eps2d < 1e6:
         raise UserError(f"--eps2d: expected a number of square pixels from 0 on, got {eps2d:g}")
     stored, run = read_any(source, up), RunFiles.around(source)
