@@ -1,7 +1,5 @@
-"""Recovery: after pruning, fit the remaining Gaussians to images of the original ones.
-
-The loss is the mean squared error to these images, minimised with Adam. No diffusion model is
-involved, so the appearance stays that of the original."""
+"""Recovery: after pruning, fit the remaining Gaussians to images of the original ones, by the mean
+squared error and Adam. No diffusion model is involved, so the appearance stays the original's."""
 
 import math
 from collections.abc import Callable, Iterator

@@ -24,15 +24,12 @@ FOVY = math.radians(50.0)
 EPS2D = 0.3
 """Screen-space dilation, square pixels; the value that viewers use."""
 NEAR = 0.01
-"""Near plane, in units of the cloud's radius, since the unit of a cloud is unknown. There is no far
-plane.
-"""
+"""Near plane, in units of the cloud's radius, since the unit of a cloud is unknown."""
 MAX_RADIUS = 1e15
 """Largest radius of a cloud, in its units: squares of distances stay within float32's range."""
 VIEWS_PER_CALL, GAUSSIANS_PER_CALL = 4, 2_000_000
-"""Most views that are rendered at once, and most of their Gaussians together, for which the
-rasteriser needs about half a kilobyte each. One view of more is rendered all the same.
-"""
+"""Most views that are rendered at once, and most of their Gaussians together, which take about half
+a kilobyte each."""
 SINES, DISTANCES = (-0.5, 0.9), (1.0, 1.4)
 """Of the views by default: the range of the sine of the elevation, and relative distances."""
 
