@@ -153,8 +153,9 @@ def _load(entry: Path) -> str:
         if isinstance(error, Terminated):
             raise
         frames, root = traceback.extract_tb(error.__traceback__), str(entry.resolve())
-        # the innermost line in the extension; the message of a SyntaxError has its own
         places = [f"{f.filename}:{f.lineno}: " for f in frames if f.filename.startswith(root)]
+        if getattr(error, "lineno", None):  # of a SyntaxError
+            places.append(f"{error.filename}:{error.lineno}: ")
         raise UserError(
             f"the extension {entry} can't be imported: {''.join(places[-1:])}"
             f"{type(error).__name__}: {error}"
