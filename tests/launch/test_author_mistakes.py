@@ -94,6 +94,7 @@ class Own{0}({2}):
 """
 OPTIONS = {
     "regulariser": OWN_REGULARISER,
+    "name": "system.loss.lambda_smooth=1",
     "density rule": OWN_DENSITY,
     "prior": "system.geometry.prior_type=own-prior",
     "exporter": "system.exporter.formats=[own]",
@@ -104,9 +105,9 @@ MISTAKES = {
         REGULARISER + "def own(out): return out['opacities']",
         "mine-regulariser returned (300,); expected one number",
     ),
-    "regulariser: registered under another name": (
-        REGULARISER.replace("mine-regulariser", "mine") + "def own(out): return 0",
-        "a regulariser of your own is a function below @register('mine-regulariser')",
+    "name: without -regulariser": (
+        REGULARISER.replace("mine-regulariser", "smooth") + "def own(out): return 0",
+        "a regulariser of your own is a function below @register('smooth-regulariser')",
     ),
     "density rule: changes parameters without the optimiser": (
         DENSITY
