@@ -235,18 +235,10 @@ def test_a_part_that_cannot_be_called_is_refused(kind, part, message):
     check_kind("system.guidance_type", "threestudios", Threestudios)
 
 
-@pytest.mark.parametrize(
-    ("file", "source", "message"),
-    [
-        ("a.py", "x = '\0'", "a.py can't be imported: .*null bytes"),
-        ("a.py", "def f():\n    raise KeyError('a')\n\nf()\n", "custom/a.py:2: KeyError: 'a'"),
-        ("logging/__init__.py", "", "custom/logging has the name of a module"),
-    ],
-)
-def test_a_broken_extension_is_named(folder, file, source, message):
-    (folder / "custom" / file).parent.mkdir(parents=True)
-    (folder / "custom" / file).write_text(source)
-    with pytest.raises(UserError, match=f"the extension .*{message}"):
+def test_an_extension_with_the_name_of_a_module_is_refused(folder):
+    (folder / "custom/logging").mkdir(parents=True)
+    (folder / "custom/logging/__init__.py").touch()
+    with pytest.raises(UserError, match="custom/logging has the name of a module"):
         load_extensions()
 
 

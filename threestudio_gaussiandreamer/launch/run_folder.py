@@ -164,9 +164,9 @@ def program_anywhere() -> list[str]:
 
 def resume_command(folder: Path, gpu: Optional[str]) -> str:
     """Return the command that resumes the run in ``folder``, valid in any working folder."""
-    run = folder.absolute()
-    words = [*program_anywhere(), "--config", str(run / PARSED), "--train"]
-    return shlex.join([*words, *["--gpu", gpu or ""] * bool(gpu), f"resume={run}/ckpts/last.ckpt"])
+    run, device = folder.absolute(), ["--gpu", gpu] if gpu else []
+    words = [*program_anywhere(), "--config", str(run / PARSED), "--train", *device]
+    return shlex.join([*words, f"resume={run / 'ckpts' / 'last.ckpt'}"])
 
 
 def renumber(cfg: Any, name: str) -> None:
