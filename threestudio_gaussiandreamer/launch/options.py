@@ -111,14 +111,10 @@ def announce_device(gpu: Optional[str]) -> int:
     count = torch.cuda.device_count() if torch.cuda.is_available() else 0
     if gpu is None and not count:
         info("no GPU found: running on the CPU")
-    if gpu in (None, "cpu"):
-        return count
-    if not count:
-        why = "sees no CUDA device" if torch.version.cuda else "is a build without CUDA"
-        raise UserError(f"--gpu {gpu}: torch {torch.__version__} {why}; run with --gpu cpu")
-    visible = os.environ["CUDA_VISIBLE_DEVICES"]
-    if count < len(visible.split(",")):
-        raise UserError(f"--gpu {gpu}: only {count} of the GPUs {visible} can be used")
+    asked = os.environ["CUDA_VISIBLE_DEVICES"].split(",")
+    if gpu not in (None, "cpu") and count < len(asked):
+        found = f"torch {torch.__version__} can use {count} of these GPUs"
+        raise UserError(f"--gpu {gpu}: {found}; run with --gpu cpu")
     return count
 
 
