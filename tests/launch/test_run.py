@@ -10,12 +10,7 @@ from tests.helpers import tiny_parts
 from tests.helpers.tiny_runs import files, only_run
 from threestudio_gaussiandreamer.core.checkpoint_file import load_checkpoint
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.launch import (
-    callbacks,
-    experiment,
-    run,
-    run_folder,
-)
+from threestudio_gaussiandreamer.launch import callbacks, experiment, run, run_folder
 from threestudio_gaussiandreamer.launch.config import load_config
 from threestudio_gaussiandreamer.launch.ddp import ReplicatedStrategy
 from threestudio_gaussiandreamer.launch.run_folder import claim
@@ -53,26 +48,20 @@ def test_the_record_holds_what_was_read_and_said(launch, monkeypatch):
     assert b"--config 'caf\xe9.yaml' --train" in (folder / "cmd.txt").read_bytes()
 
 
-class Built(Exception):
-    """Raised with the options of the trainer, in place of building it."""
-
-
 def test_options_of_the_trainer(launch, monkeypatch):
-    def build(section, owner, options):
-        raise Built(options)
+    """DDP's wrapper would keep the parameters that densification replaces."""
+    made = []
 
-    def options(*overrides):
-        with pytest.raises(Built) as built:
-            launch("--train", *overrides)
-        return built.value.args[0]
+    def build(section, owner, options):
+        made.append(options)
+        raise UserError("of the test")
 
     monkeypatch.setattr(run, "build", build)
-    assert options("trainer.profiler=simple")["profiler"] == "simple"
-    # DDP's wrapper would keep the parameters that densification replaces
     monkeypatch.setattr(experiment, "announce_device", lambda gpu: 2)
-    for strategy in ([], ["trainer.strategy=auto"], ["trainer.strategy=ddp"]):
-        made = options(*strategy)
-        assert isinstance(made["strategy"], ReplicatedStrategy) and made["devices"] == 2
+    for option in ("trainer.profiler=simple", "trainer.strategy=auto", "trainer.strategy=ddp"):
+        assert launch("--train", option)[0] == 2
+        assert isinstance(made[-1]["strategy"], ReplicatedStrategy) and made[-1]["devices"] == 2
+    assert made[0]["profiler"] == "simple" and len(made) == 3
 
 
 # -- runs that meet --------------------------------------------------------------------------------
