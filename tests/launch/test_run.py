@@ -4,8 +4,6 @@ import datetime
 import os
 from pathlib import Path
 
-import pytest
-
 from tests.helpers import tiny_parts
 from tests.helpers.tiny_runs import files, only_run
 from threestudio_gaussiandreamer.core.checkpoint_file import load_checkpoint
