@@ -124,10 +124,10 @@ def read_sources(source: Path, destination: Path) -> dict[Path, bytes]:
 
 
 class ProgressBar(pl.callbacks.TQDMProgressBar):
-    """Lightning's progress bar, drawn every 5 steps, or every 100 without a terminal."""
+    """Lightning's progress bar, drawn every 10 steps, or every 100 without a terminal."""
 
     def __init__(self) -> None:
-        super().__init__(refresh_rate=5 if sys.stderr.isatty() else 100)
+        super().__init__(refresh_rate=10 if sys.stderr.isatty() else 100)
 
     def get_metrics(self, trainer: Any, pl_module: Any) -> dict[str, Any]:
         metrics = super().get_metrics(trainer, pl_module)
