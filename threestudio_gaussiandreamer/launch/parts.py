@@ -116,28 +116,24 @@ def load_extensions(folder: Path = Path("custom")) -> list[str]:
     """Import all extensions in ``folder``, sorted by name, and return their module names."""
     try:
         entries = sorted(folder.iterdir()) if folder.is_dir() else []
-        extensions = [entry for entry in entries if _is_extension(entry)]
+        files = {entry: _file_of(entry) for entry in entries}
     except OSError as error:
         raise UserError(f"the extensions in {folder} can't be read: {error}") from error
-    return [_load(entry) for entry in extensions]
+    return [_load(entry, file) for entry, file in files.items() if file is not None]
 
 
-def _is_extension(entry: Path) -> bool:
+def _file_of(entry: Path) -> Optional[Path]:
+    """Return the file that an extension is imported from; None if it is none."""
+    file = entry / "__init__.py" if entry.is_dir() else entry
     if entry.name.startswith((".", "__")) or entry.stem.endswith("_disabled"):
-        return False
-    if not entry.is_dir() and entry.suffix != ".py":
-        return False
-    if not (file := _file_of(entry)).is_file():
+        return None
+    if file.suffix == ".py" and not file.is_file():
         info(f"{entry} is no extension: {file} is no file")
-    return file.is_file()
+    return file if file.suffix == ".py" and file.is_file() else None
 
 
-def _file_of(entry: Path) -> Path:
-    return entry / "__init__.py" if entry.is_dir() else entry
-
-
-def _load(entry: Path) -> str:
-    name, file = entry.name if entry.is_dir() else f"custom/{entry.stem}", _file_of(entry)
+def _load(entry: Path, file: Path) -> str:
+    name = entry.name if entry.is_dir() else f"custom/{entry.stem}"
     loaded = sys.modules.get(name)
     if loaded is not None and Path(loaded.__file__ or "").resolve() == file.resolve():
         return name
