@@ -222,12 +222,12 @@ def test_the_home_folder_is_expanded_once(folder, monkeypatch):
 
 
 def test_without_timestamp_or_with_several_gpus_the_folder_is_the_tag(folder):
-    for given in ({"cli_args": ["use_timestamp=false"]}, {"n_gpus": 2}):
-        cfg = load_config("tiny.yaml", **given)
+    for how in ({"cli_args": ["use_timestamp=false"]}, {"n_gpus": 2}):
+        cfg = load_config("tiny.yaml", **how)
         assert cfg.trial_dir == "outputs/tiny/a_red_ball" and not cfg.new_folder
-        given["cli_args"] = [*given.get("cli_args", []), "tag="]
+        how["cli_args"] = [*how.get("cli_args", []), "tag="]
         with pytest.raises(UserError, match="a run needs a tag .* with several GPUs"):
-            load_config("tiny.yaml", **given)
+            load_config("tiny.yaml", **how)
 
 
 def test_resume_auto_takes_the_newest_run_of_the_tag(folder):
