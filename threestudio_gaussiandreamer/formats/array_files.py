@@ -3,8 +3,8 @@ code of theirs, within a memory budget (``numpy.load`` allocates what the header
 type of error for every kind of damage.
 
 In a pickle every class and function is replaced by one that only keeps what it was called with.
-What that stands for is worked out afterwards, for the few kinds that hold arrays: NumPy's, SciPy's
-sparse matrices, and chumpy's in the files of SMPL and MANO, which need no chumpy so."""
+Of those, NumPy's arrays, SciPy's sparse matrices, and chumpy's arrays in the files of SMPL and MANO
+are read."""
 
 import io
 import math
@@ -22,10 +22,6 @@ from .reading import Unreadable, reading, require, require_file_memory
 
 MOST_HEADER_BYTES = 1 << 16
 PACKINGS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-CONVERTED_BYTES = 16
-"""Memory per number that is added to the budget for callers, which make two float64 copies."""
-PICKLES = (".pkl", ".pickle")
-"""Extensions of pickles, whose oldest kind has no mark at its start."""
 
 
 def read_arrays(
@@ -40,9 +36,8 @@ def read_arrays(
         optional: names of arrays that may be missing; other arrays are not read.
 
     Raises:
-        UserError: the file is neither NPZ nor NPY nor a pickle, is damaged, lacks a required array,
-            holds other Python objects in its place, or needs more memory than the budget of its
-            size.
+        UserError: the file is neither NPZ nor NPY nor a pickle, is damaged, lacks a required array
+            or has other objects in its place, or needs more memory than the budget of its size.
     """
     with reading(path, kind) as path, open(path, "rb") as file:
         start = file.read(len(npy.MAGIC_PREFIX))
@@ -54,38 +49,31 @@ def read_arrays(
             if dtype.hasobject:
                 return _read_pickle(file.read(), required, optional)
             return {required[0]: _read_array(file, size)}
-        if start[:1] == pickle.PROTO or path.suffix.lower() in PICKLES:
+        # the oldest kind of pickles has no mark at its start
+        if start[:1] == pickle.PROTO or path.suffix.lower() in (".pkl", ".pickle"):
             return _read_pickle(file.read(), required, optional)
-        with zipfile.ZipFile(file) as archive:
-            return _read_archive(archive, size, required, optional)
+        archive, needed, arrays = zipfile.ZipFile(file), 0, {}
+        members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
+        names = _wanted(members, required, optional)
+        for name in names:  # the sizes of all, before any is unpacked
+            usual = members[name].compress_type in PACKINGS
+            require(usual, f"{name!r} is packed in a way that NumPy doesn't")
+            with archive.open(members[name]) as member:
+                shape, dtype, _ = _header_of(member.read(MOST_HEADER_BYTES))
+            needed += math.prod(shape) * (dtype.itemsize + 16)  # callers make two float64 copies
+        require_file_memory(needed, size, f"the arrays {', '.join(names)}")
+        for name in names:
+            with archive.open(members[name]) as member:
+                arrays[name] = _read_array(member, members[name].file_size)
+                member.read()  # at the end, zipfile compares the checksum
+        return arrays
 
 
-def _wanted(
-    found: Collection[Any], required: Sequence[str], optional: Collection[str]
-) -> list[str]:
+def _wanted(found: Collection[Any], required: Sequence[str], optional: Collection[str]) -> list:
     """Return the names to read, after checking that all required ones are there."""
     missing = ", ".join(repr(name) for name in required if name not in found)
     require(not missing, f"it has no array {missing}, only {', '.join(map(str, found)) or 'none'}")
     return [name for name in (*required, *optional) if name in found]
-
-
-def _read_archive(
-    archive: zipfile.ZipFile, size: int, required: Sequence[str], optional: Collection[str]
-) -> dict[str, np.ndarray]:
-    members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
-    names, needed, arrays = _wanted(members, required, optional), 0, {}
-    for name in names:  # the sizes of all, before any is unpacked
-        usual = members[name].compress_type in PACKINGS
-        require(usual, f"{name!r} is packed in a way that NumPy doesn't")
-        with archive.open(members[name]) as file:
-            shape, dtype, _ = _header_of(file.read(MOST_HEADER_BYTES))
-        needed += math.prod(shape) * (dtype.itemsize + CONVERTED_BYTES)
-    require_file_memory(needed, size, f"the arrays {', '.join(names)}")
-    for name in names:
-        with archive.open(members[name]) as file:
-            arrays[name] = _read_array(file, members[name].file_size)
-            file.read()  # at the end, zipfile compares the checksum
-    return arrays
 
 
 def _read_array(file: IO[bytes], size: int) -> np.ndarray:
@@ -106,9 +94,6 @@ def _header_of(start: bytes) -> tuple[tuple[int, ...], np.dtype, int]:
     first = npy.read_magic(file) == (1, 0)
     shape, _, dtype = (npy.read_array_header_1_0 if first else npy.read_array_header_2_0)(file)
     return shape, dtype, file.tell()
-
-
-# ---- pickles -------------------------------------------------------------------------------------
 
 
 class _Object:

@@ -6,7 +6,6 @@ Gaussian; and ``sh`` with f_rest as bytes, absent at degree 0. Axes as those of 
 import os
 from collections.abc import Sequence
 from math import ceil, sqrt
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Integer
@@ -30,8 +29,6 @@ PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 BITS = (11, 10, 11)
 SH_REACH = 4.0
 """Harmonics above degree 0 are clipped to [-SH_REACH, SH_REACH]."""
-MAX_STORED_LOG = 20.0
-"""Logarithms of scales are clipped to plus and minus this, as other readers expect."""
 
 
 def write_compressed_ply(
@@ -63,8 +60,7 @@ def write_compressed_ply(
 
 def is_compressed_ply(path: str | os.PathLike) -> bool:
     """Return whether the file is a PLY with the elements of a compressed one."""
-    header = header_of(path)
-    found = {element.name: element.properties for element in header.elements} if header else {}
+    found = {element.name: element.properties for element in header_of(path).elements}
     return "chunk" in found and [entry.name for entry in found.get("vertex", [])][:1] == [PACKED[0]]
 
 
@@ -74,8 +70,30 @@ def read_compressed_ply(path: str | os.PathLike) -> Gaussians:
     Raises:
         UserError: there is no such file, it is no compressed PLY, or it is damaged.
     """
-    with reading(path, "compressed PLY") as file:
-        elements = _read_elements(file)
+    with reading(path, "compressed PLY") as file, open(file, "rb") as opened:
+        header, data = read_header(opened), opened.read()
+        counts = {entry.name: entry.count for entry in header.elements}
+        known = {(*counts,)} & {("chunk", "vertex"), ("chunk", "vertex", "sh")}
+        require(
+            bool(known) and header.encoding != "ascii", "it isn't binary, or has other elements"
+        )
+        count = counts["vertex"]
+        rest = [tuple(f"f_rest_{i}" for i in range(3 * (k - 1))) for k in COEFFICIENTS[1:]]
+        layouts = {
+            "chunk": ((LIMITS, LIMITS[:12]), "f4", ceil(count / CHUNK)),
+            "vertex": ((PACKED,), "u4", count),
+            "sh": (rest, "u1", count),
+        }
+        elements, at = {}, 0
+        for element in header.elements:
+            layouts_known, kind, rows = layouts[element.name]
+            names = tuple(entry.name for entry in element.properties)
+            usual = all(entry.type == kind and not entry.count_type for entry in element.properties)
+            said = f"{element.name!r} has other properties than those of the format, or other rows"
+            require(usual and names in layouts_known and element.count == rows, said)
+            columns, at = read_rows(data, at, element, header.encoding)
+            values = [column.values for column in columns.values()]
+            elements[element.name] = np.stack(values, axis=1)
     packed, limits = elements["vertex"], elements["chunk"].astype(np.float64)
     chunks = np.arange(len(packed)) // CHUNK
     # colours without limits are in [0, 1]
@@ -91,7 +109,7 @@ def read_compressed_ply(path: str | os.PathLike) -> Gaussians:
     position, rotation, scale, color = packed.astype(np.int64).T
     rgba = (color[:, None] >> np.array([24, 16, 8, 0]) & 255).astype(np.uint8)
     constant = rgb_to_sh0(between(rgba[:, :3] / 255, 2))[:, None].astype(np.float32)
-    rest = elements.get("sh", np.empty((len(packed), 0), np.uint8))
+    rest = elements.get("sh", np.empty((count, 0), np.uint8))
     # the middle of each step; 0 and 255 are the limits themselves
     values = (rest.astype(np.float32) + np.float32(0.5)) / 256
     values[rest == 0], values[rest == 255] = 0, 1
@@ -110,8 +128,8 @@ def read_compressed_ply(path: str | os.PathLike) -> Gaussians:
 def _packed(
     gaussians: Gaussians,
 ) -> tuple[Float[np.ndarray, "C 3 2 3"], Integer[np.ndarray, "N 4"]]:
-    """Return minima and maxima for each chunk, filled up with the last Gaussian, and the words."""
-    scales = gaussians.log_scales.clip(-MAX_STORED_LOG, MAX_STORED_LOG)
+    """Return minima and maxima of each chunk, filled up with the last Gaussian, and the words."""
+    scales = gaussians.log_scales.clip(-20, 20)  # as other readers expect
     values = np.stack([gaussians.means, scales, sh0_to_rgb(gaussians.sh[:, 0])], axis=1)
     count, missing = len(values), -len(values) % CHUNK
     values = np.pad(values, ((0, missing), (0, 0), (0, 0)), "edge") if missing else values
@@ -136,32 +154,6 @@ def _word(fractions: Float[np.ndarray, "N F"], bits: Sequence[int]) -> Integer[n
         most = (1 << width) - 1
         word = word << width | np.rint(np.clip(fraction, 0, 1) * most).astype(np.uint32)
     return word
-
-
-def _read_elements(path: Path) -> dict[str, np.ndarray]:
-    """Read each element as an array (rows, columns), after checking the header."""
-    with open(path, "rb") as file:
-        header, data = read_header(file), file.read()
-    elements = {entry.name: entry for entry in header.elements}
-    known = {(*elements,)} & {("chunk", "vertex"), ("chunk", "vertex", "sh")}
-    require(bool(known) and header.encoding != "ascii", "it isn't binary, or has other elements")
-    count = elements["vertex"].count
-    rest = [tuple(f"f_rest_{i}" for i in range(3 * (k - 1))) for k in COEFFICIENTS[1:]]
-    layouts = {
-        "chunk": ((LIMITS, LIMITS[:12]), "f4", ceil(count / CHUNK)),
-        "vertex": ((PACKED,), "u4", count),
-        "sh": (rest, "u1", count),
-    }
-    found, at = {}, 0
-    for element in header.elements:
-        layouts_known, kind, rows = layouts[element.name]
-        names = tuple(entry.name for entry in element.properties)
-        usual = all(entry.type == kind and not entry.count_type for entry in element.properties)
-        said = f"{element.name!r} has other properties than those of the format, or other rows"
-        require(usual and names in layouts_known and element.count == rows, said)
-        columns, at = read_rows(data, at, element, header.encoding)
-        found[element.name] = np.stack([column.values for column in columns.values()], axis=1)
-    return found
 
 
 def _fractions(words: Integer[np.ndarray, " N"], bits: Sequence[int]) -> np.ndarray:

@@ -31,10 +31,9 @@ RENDER_MODE = re.compile(r"splatrendermode: *(\w+)|antialiased ([01])", re.IGNOR
 
 
 class StoredCloud(NamedTuple):
-    """Gaussians with the metadata of their file."""
+    """Gaussians, as arrays, with the metadata of their file."""
 
     gaussians: Gaussians
-    """As arrays."""
     up: str = WORLD_UP
     """The axis that is up, a key of ``AXES``."""
     pruned_to: Optional[float] = None
@@ -46,11 +45,8 @@ class StoredCloud(NamedTuple):
         """Return the same cloud in coordinates with another axis up."""
         if up == self.up:
             return self
-        rotation = rotation_between(self.up, up)
-        return self._replace(gaussians=rotate(self.gaussians, rotation), up=up)
+        return self._replace(gaussians=rotate(self.gaussians, rotation_between(self.up, up)), up=up)
 
-
-# ---- formats -------------------------------------------------------------------------------------
 
 Content = tuple[Gaussians, list[str]]
 """Gaussians in the file's axes, and notes about them."""
@@ -121,13 +117,8 @@ def holds_gaussians(path: Path) -> bool:
 
 
 def require_format(name: str, option: str, formats: Collection[str] = WRITTEN) -> str:
-    """Return the extension of a file name after checking that it is one of ``formats``.
-
-    Args:
-        option: names the option in the message.
-
-    Raises:
-        UserError: the extension is another one.
+    """Return the extension of a file name; UserError, which names the ``option``, unless it is one
+    of ``formats``.
     """
     suffix = suffix_of(name)
     if suffix not in formats:
@@ -135,9 +126,6 @@ def require_format(name: str, option: str, formats: Collection[str] = WRITTEN) -
         expected = f"expected the name of a {', '.join(others)} or {last} file"
         raise UserError(f"{option}: {expected}, got {name!r}{conversion(name)}")
     return suffix
-
-
-# ---- reading -------------------------------------------------------------------------------------
 
 
 def read_cloud(path: str, *, up: Optional[str] = None) -> StoredCloud:
@@ -156,9 +144,8 @@ def read_cloud(path: str, *, up: Optional[str] = None) -> StoredCloud:
 
 
 def read_stored(file: Path, *, up: Optional[str] = None) -> StoredCloud:
-    """Read all Gaussians of a file, including those that can't be drawn; see :func:`read_cloud`.
-
-    The format is that of the extension, or PLY where the extension is unknown.
+    """Read all Gaussians of a file, including those that can't be drawn, as :func:`read_cloud`; as
+    a PLY where the extension is unknown.
     """
     known = FORMATS.get(suffix_of(file.name), FORMATS[".ply"])
     gaussians, notes = known.read(file)
@@ -198,9 +185,6 @@ def _stated_mode(notes: list[str]) -> bool:
     """Return whether the last note about it says that the cloud was trained with antialiasing."""
     modes = [found for note in notes if (found := RENDER_MODE.fullmatch(note.strip()))]
     return bool(modes) and "".join(filter(None, modes[-1].groups())).lower() in ("mip", "1")
-
-
-# ---- writing -------------------------------------------------------------------------------------
 
 
 def write_cloud(

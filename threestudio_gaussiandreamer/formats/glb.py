@@ -42,8 +42,6 @@ DECODED_BYTES, DECODED_BYTES_PER_HARMONIC = 300, 72
 """Upper bounds of the memory that reading takes, per Gaussian and per harmonic of a Gaussian."""
 HALF_TURN = np.diag([-1.0, 1.0, -1.0])
 """About the y axis."""
-TURNED_GENERATOR = "splat-transform"
-"""It turns the axes of a PLY by half a turn about z, so that the front of its files is -z."""
 
 
 def write_glb(path: str | os.PathLike, gaussians: Gaussians, notes: Sequence[str] = ()) -> None:
@@ -92,16 +90,16 @@ def read_glb(path: str | os.PathLike) -> tuple[Gaussians, list[str]]:
     """Read the Gaussians of all nodes of the default scene, with y up, and the notes of our writer.
 
     Raises:
-        UserError: there is no such file, it is damaged, holds no Gaussians, or
-            Gaussians that aren't supported.
+        UserError: there is no such file, it is damaged, or holds no Gaussians that are supported.
     """
     with reading(path, "GLB file") as file:
         document = Document(file)
-        found = list(_primitives(document))
-        counts = [document.count(item["attributes"]["POSITION"]) for item, _ in found]
-        each = [DECODED_BYTES + DECODED_BYTES_PER_HARMONIC * _harmonics(item) for item, _ in found]
-        needed = sum(a * b for a, b in zip(counts, each, strict=True))
-        require_file_memory(needed, file.stat().st_size, f"{sum(counts)} Gaussians")
+        found, total, needed = list(_primitives(document)), 0, 0
+        for attributes in (primitive["attributes"] for primitive, _ in found):
+            count = document.count(attributes["POSITION"])
+            each = DECODED_BYTES + DECODED_BYTES_PER_HARMONIC * _harmonics(attributes)
+            total, needed = total + count, needed + count * each
+        require_file_memory(needed, file.stat().st_size, f"{total} Gaussians")
         parts = [
             placed(_read_primitive(document, primitive), world, f"GLB file {str(path)!r}")
             for primitive, world in found
@@ -111,12 +109,10 @@ def read_glb(path: str | os.PathLike) -> tuple[Gaussians, list[str]]:
         asset, gaussians = document.json["asset"], joined(parts)
         extras = asset.get("extras")
         notes = extras.get("notes") if isinstance(extras, dict) else None
-    if str(asset.get("generator")).startswith(TURNED_GENERATOR):
+    # it turns the axes of a PLY by half a turn about z, so that the front of its files is -z
+    if str(asset.get("generator")).startswith("splat-transform"):
         gaussians = rotate(gaussians, HALF_TURN)
     return gaussians, [str(note) for note in notes] if isinstance(notes, list) else []
-
-
-# ---- writing -------------------------------------------------------------------------------------
 
 
 def _attributes(gaussians: Gaussians) -> dict[str, np.ndarray]:
@@ -169,9 +165,6 @@ def _document(
     }
 
 
-# ---- reading -------------------------------------------------------------------------------------
-
-
 def _primitives(document: Document) -> Iterator[tuple[dict[str, Any], World]]:
     """Yield each primitive that holds Gaussians, and its node's matrix to world coordinates."""
     for node, world in world_matrices(document).items():
@@ -182,9 +175,9 @@ def _primitives(document: Document) -> Iterator[tuple[dict[str, Any], World]]:
                     yield primitive, world
 
 
-def _harmonics(primitive: dict[str, Any]) -> int:
+def _harmonics(attributes: dict[str, int]) -> int:
     """Return the number of harmonics, by the highest degree whose last coefficient is present."""
-    found = [k for k in COEFFICIENTS if _semantics(k)[-1] in primitive["attributes"]]
+    found = [k for k in COEFFICIENTS if _semantics(k)[-1] in attributes]
     return max(found, default=COEFFICIENTS[0])
 
 
@@ -193,8 +186,15 @@ def _read_primitive(document: Document, primitive: dict[str, Any]) -> Gaussians:
     kernel = extension.get("kernel", SPLATTING["kernel"])
     said = f"its Gaussians have the kernel {str(kernel)[:40]!r}; 'ellipse' was expected"
     require(kernel == SPLATTING["kernel"], said)
-    read = _read_spz if SPZ in extension.get("extensions", {}) else _read_plain
-    gaussians = read(document, primitive["attributes"], extension)
+    if SPZ in (inner := extension.get("extensions", {})):
+        view, _ = document.view(inner[SPZ].get("bufferView"))
+        gaussians, _ = spz_arrays(bytes(view))
+        count = document.count(primitive["attributes"]["POSITION"])
+        said = f"its SPZ has {len(gaussians.means)} rows for {count} Gaussians"
+        require(len(gaussians.means) == count, said)
+        gaussians = rotate(gaussians, HALF_TURN) if "kernel" in extension else gaussians
+    else:
+        gaussians = _read_plain(document, primitive["attributes"], inner)
     space = extension.get("colorSpace", SPLATTING["colorSpace"])
     if packing.is_linear(space):
         return packing.displayed(gaussians, str(document.path))
@@ -203,23 +203,9 @@ def _read_primitive(document: Document, primitive: dict[str, Any]) -> Gaussians:
     return gaussians
 
 
-def _read_spz(
-    document: Document, attributes: dict[str, int], extension: dict[str, Any]
-) -> Gaussians:
-    view, _ = document.view(extension["extensions"][SPZ].get("bufferView"))
-    gaussians, _ = spz_arrays(bytes(view))
-    count = document.count(attributes["POSITION"])
-    said = f"its SPZ has {len(gaussians.means)} rows for {count} Gaussians"
-    require(len(gaussians.means) == count, said)
-    return rotate(gaussians, HALF_TURN) if "kernel" in extension else gaussians
-
-
-def _read_plain(
-    document: Document, attributes: dict[str, int], extension: dict[str, Any]
-) -> Gaussians:
+def _read_plain(document: Document, attributes: dict[str, int], inner: dict[str, Any]) -> Gaussians:
     count = document.count(attributes["POSITION"])
     stored = document.entry("accessors", attributes["POSITION"])
-    inner = extension.get("extensions", {})
     packed = inner and not {"bufferView", "sparse"} & stored.keys()
     require(not packed, f"its Gaussians are compressed by {str([*inner])[:80]}, which isn't read")
 
@@ -230,23 +216,19 @@ def _read_plain(
         require(len(values) == count, said)
         return values
 
-    degree = _harmonics({"attributes": attributes})
     opacity = rows(f"{EXTENSION}:OPACITY", "SCALAR")[:, 0]
+    scales = rows(f"{EXTENSION}:SCALE", "VEC3")
+    if count and np.median(scales) < 0:
+        logger.warning("%s: scales are read as logarithms, as drafts of 2026 had", document.path)
+    else:
+        require(not (scales < 0).any(), "some of its scales are below 0")
+        scales = np.log(scales)
     return Gaussians(
         means=rows("POSITION", "VEC3"),
         quats=rows(f"{EXTENSION}:ROTATION", "VEC4")[:, [3, 0, 1, 2]],
-        log_scales=_log_scales(rows(f"{EXTENSION}:SCALE", "VEC3"), document),
+        log_scales=scales,
         logit_opacities=packing.logits(opacity, packing.FLOAT_OPACITY_MARGIN),
-        sh=np.stack([rows(semantic, "VEC3") for semantic in _semantics(degree)], axis=1),
+        sh=np.stack(
+            [rows(semantic, "VEC3") for semantic in _semantics(_harmonics(attributes))], axis=1
+        ),
     )
-
-
-def _log_scales(scales: Float[np.ndarray, "N 3"], document: Document) -> Float[np.ndarray, "N 3"]:
-    """Return the logarithms of scales, which drafts of the extension up to April 2026, and
-    splat-transform until June 2026, stored.
-    """
-    if len(scales) and np.median(scales) < 0:
-        logger.warning("%s: scales are read as logarithms, as drafts of 2026 had", document.path)
-        return scales
-    require(not (scales < 0).any(), "some of its scales are below 0")
-    return np.log(scales)

@@ -13,12 +13,8 @@ from ..meshes.mesh import linear_to_srgb
 log = logging.getLogger(__name__)
 ANTIALIASED = "SplatRenderMode: mip"
 """The comment by which other programs tag clouds trained with antialiasing."""
-OPACITY_MARGIN = 1 / 2040
-"""Opacities from bytes are clamped to this distance from 0 and 1, an eighth of a step."""
 FLOAT_OPACITY_MARGIN = 2.0**-25
-"""The same for opacities from float32: half the distance from 1 to the next lower one."""
-MAX_OPACITY_BYTE = 254
-"""Other readers take the logit of the byte over 255, which is infinite at 255."""
+"""Opacities from float32 are clamped to this distance from 0 and 1, half a step below 1."""
 
 
 def morton_order(means: Float[np.ndarray, "N 3"], cube: bool = False) -> Integer[np.ndarray, " N"]:
@@ -71,16 +67,14 @@ def opacities(logits: Float[np.ndarray, " N"]) -> Float[np.ndarray, " N"]:
     return expit(logits.astype(np.float64))
 
 
-def opacity_bytes(
-    logits: Float[np.ndarray, " N"], most: int = MAX_OPACITY_BYTE
-) -> Integer[np.ndarray, " N"]:
-    """Return opacities in steps of 1 / 255, at most ``most``."""
+def opacity_bytes(logits: Float[np.ndarray, " N"], most: int = 254) -> Integer[np.ndarray, " N"]:
+    """Return opacities in steps of 1 / 255, below 1, of which other readers take the logit."""
     return to_byte(255 * opacities(logits)).clip(max=most)
 
 
 def logits_of_bytes(alphas: Integer[np.ndarray, " N"]) -> Float[np.ndarray, " N"]:
-    """Return finite logits of opacities that are stored in steps of 1 / 255."""
-    return logits(alphas / 255, OPACITY_MARGIN)
+    """Return logits of opacities in steps of 1 / 255, an eighth of a step away from 0 and 1."""
+    return logits(alphas / 255, 1 / 2040)
 
 
 def logits(values: Float[np.ndarray, " N"], margin: float) -> Float[np.ndarray, " N"]:
@@ -97,10 +91,7 @@ def is_linear(space: Any) -> bool:
 
 def displayed(gaussians: Gaussians, name: str) -> Gaussians:
     """Return Gaussians whose harmonics are of linear light with those of display values, and log
-    it: exact for the constant part; the others follow the slope of sRGB's curve there.
-
-    Args:
-        name: the file, for the message.
+    it, with the file's ``name``: exact for the constant part, by sRGB's slope there for the others.
     """
     log.warning("%s: linear colours become sRGB; blended edges look a little different", name)
     linear = sh0_to_rgb(gaussians.sh[:, :1]).clip(0)

@@ -8,6 +8,7 @@ Tables of vertices are read as other programs write them: text or binary of eith
 properties in any order and of any number type, unknown properties and elements. No more is
 allocated than the file's size accounts for, whatever count the header states."""
 
+import io
 import itertools
 import logging
 import os
@@ -52,8 +53,6 @@ PREFIX = re.compile("^(scalar_)?(scal_)?")
 
 
 class Property(NamedTuple):
-    """A property line of the header."""
-
     name: str
     type: str
     """NumPy's type code of the values, without byte order."""
@@ -62,8 +61,6 @@ class Property(NamedTuple):
 
 
 class Element(NamedTuple):
-    """An element of the header: ``count`` rows of these properties."""
-
     name: str
     count: int
     properties: list[Property]
@@ -74,11 +71,10 @@ class Element(NamedTuple):
 
 
 class Header(NamedTuple):
-    """The header: a key of ``BYTE_ORDERS``, the elements in their order, and the comments."""
-
-    encoding: str
-    elements: list[Element]
-    comments: list[str]
+    encoding: str = ""
+    """A key of ``BYTE_ORDERS``."""
+    elements: Sequence[Element] = ()
+    comments: Sequence[str] = ()
 
 
 class Lists(NamedTuple):
@@ -89,11 +85,7 @@ class Lists(NamedTuple):
 
 
 class PlyTable:
-    """The vertices of a file, one column per property, and its faces if they are asked for.
-
-    Raises:
-        Unreadable: not a PLY, without vertices, or damaged.
-    """
+    """The vertices of a file, one column per property, and its faces if they are asked for."""
 
     def __init__(self, path: Path, faces: bool = False) -> None:
         with open(path, "rb") as file:
@@ -104,17 +96,16 @@ class PlyTable:
         vertices = [element for element in header.elements if element.name == "vertex"]
         require(len(vertices) == 1 and not vertices[0].has_lists, said)
         if header.encoding == "ascii":
-            data = _packed(data, header)
+            data = _packed(data, header.elements)
         wanted = {"vertex", "face"} & {*names} if faces else {"vertex"}
         found: dict[str, dict[str, Lists]] = {}
         for element in header.elements:
             found[element.name], at = read_rows(data, at, element, header.encoding)
             if wanted <= found.keys() and header.encoding != "ascii":
                 break
-        more = element is header.elements[-1] and data[at : at + 4096].strip()
-        shifted = header.encoding == "ascii" and any(entry.has_lists for entry in header.elements)
-        require(not more or not shifted, "it has more numbers than its header announces")
-        if more:
+        if element is header.elements[-1] and data[at : at + 4096].strip():
+            shifted = header.encoding == "ascii" and any(each.has_lists for each in header.elements)
+            require(not shifted, "it has more numbers than its header announces")
             said = "PLY file %r: more data follows than the %d rows of %r that it announces"
             logger.warning(said, str(path), element.count, element.name)
         self.path, self.comments = path, header.comments
@@ -141,9 +132,6 @@ class PlyTable:
         return np.stack([self.columns[name].astype(np.float64) for name in names], axis=1)
 
 
-# ---- writing -------------------------------------------------------------------------------------
-
-
 def write_gaussians(
     path: str | os.PathLike, gaussians: Gaussians, comments: Sequence[str] = ()
 ) -> None:
@@ -157,8 +145,8 @@ def write_gaussians(
         UserError: the file can't be written.
     """
     gaussians = finite(gaussians, str(path))
-    properties = gaussian_properties(gaussians.sh.shape[1])
-    write_table(path, properties, gaussian_columns(gaussians), comments)
+    names = gaussian_properties(gaussians.sh.shape[1])
+    write_table(path, names, gaussian_columns(gaussians), comments)
 
 
 def gaussian_properties(harmonics: int) -> list[tuple[str, str]]:
@@ -175,12 +163,6 @@ def gaussian_columns(gaussians: Gaussians) -> Float[np.ndarray, "N P"]:
     means, logits = gaussians.means, gaussians.logit_opacities[:, None]
     columns = [means, np.zeros_like(means), gaussians.sh[:, 0], by_channel, logits]
     return np.concatenate([*columns, gaussians.log_scales, gaussians.quats], axis=1)
-
-
-def read_comments(path: str | os.PathLike) -> list[str]:
-    """Return the comments in the header of a PLY file; empty if it isn't a PLY file."""
-    header = header_of(path)
-    return header.comments if header else []
 
 
 def write_points(path: str | os.PathLike, cloud: PointCloud) -> None:
@@ -207,21 +189,30 @@ def write_points(path: str | os.PathLike, cloud: PointCloud) -> None:
     write_table(path, properties, rows)
 
 
-# ---- reading -------------------------------------------------------------------------------------
-
-
 def read_gaussians(path: str | os.PathLike) -> Gaussians:
     """Read Gaussians with any degree of spherical harmonics, in the file's axes, also those with
-    values that aren't finite.
+    values that aren't finite; without rows of zeros, which would be Gaussians of size 1.
 
     Raises:
         UserError: there is no such file, it is no PLY of Gaussians, or it is damaged.
     """
     with reading(path, "PLY file") as file:
         table = PlyTable(file)
-        _require_gaussians(table)
+        missing = _lacking(table.columns)
+        require(not missing, f"the Gaussians lack {', '.join(missing)}.{_format_hint(table)}")
+        known = {*GAUSSIAN, *NORMALS, *COLORS, FILTER}
+        unknown = [n for n in table.columns if n not in known and not n.startswith("f_rest_")]
+        if unknown:
+            more = f" and {len(unknown) - 5} more" if len(unknown) > 5 else ""
+            names = ", ".join(unknown[:5])
+            logger.warning("%s: unknown properties are left out: %s%s", file, names, more)
         arrays = Gaussians(table[MEANS], table[QUATS], *_read_sizes(table), _read_sh(table))
-        return _without_zeros(arrays, table)
+    filled = np.column_stack([*arrays[:4], arrays.sh[:, 0]]).any(axis=1)
+    if filled.all():
+        return arrays
+    said = "%s: %d of %d rows hold nothing but zeros: left out"
+    logger.warning(said, path, (~filled).sum(), len(filled))
+    return arrays.rows(filled)
 
 
 def read_points(path: str | os.PathLike) -> PointCloud:
@@ -248,36 +239,28 @@ def require_ply(path: Path) -> None:
 
 def is_gaussian_ply(path: str | os.PathLike) -> bool:
     """Return whether the file is a PLY whose vertices have the properties of Gaussians."""
-    header = header_of(path)
-    found = [element for element in header.elements if element.name == "vertex"] if header else []
+    found = [element for element in header_of(path).elements if element.name == "vertex"]
     return bool(found) and not _lacking([entry.name for entry in found[0].properties])
 
 
-def header_of(path: str | os.PathLike) -> Optional[Header]:
-    """Return the header of a PLY; None if the file isn't one."""
+def header_of(path: str | os.PathLike) -> Header:
+    """Return the header of a PLY; an empty one if the file isn't one."""
     try:
         with open(path, "rb") as file:
             return read_header(file)
     except (OSError, ValueError):
-        return None
+        return Header()
+
+
+def read_comments(path: str | os.PathLike) -> list[str]:
+    """Return the comments in the header of a PLY file; empty if it isn't one."""
+    return [*header_of(path).comments]
 
 
 def _lacking(names: Collection[str]) -> list[str]:
     """Return the properties without which vertices with these ``names`` are no Gaussians."""
     colors = SH_CONSTANT if set(names) >= {*COLORS, "opacity"} else ()
     return [name for name in GAUSSIAN if name not in {*names, *LOG_SCALES[2:], *colors}]
-
-
-def _require_gaussians(table: PlyTable) -> None:
-    """Raise Unreadable if a property of Gaussians is missing; warn about unknown ones."""
-    missing = _lacking(table.columns)
-    require(not missing, f"the Gaussians lack {', '.join(missing)}.{_format_hint(table)}")
-    known = {*GAUSSIAN, *NORMALS, *COLORS, FILTER}
-    unknown = [n for n in table.columns if n not in known and not n.startswith("f_rest_")]
-    if unknown:
-        more = f" and {len(unknown) - 5} more" if len(unknown) > 5 else ""
-        names = ", ".join(unknown[:5])
-        logger.warning("%s: unknown properties are left out: %s%s", table.path, names, more)
 
 
 def _read_sizes(table: PlyTable) -> tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, " N"]]:
@@ -298,20 +281,8 @@ def _read_sizes(table: PlyTable) -> tuple[Float[np.ndarray, "N 3"], Float[np.nda
     return larger.astype(np.float32), packing.logits(opacities, packing.FLOAT_OPACITY_MARGIN)
 
 
-def _without_zeros(arrays: Gaussians, table: PlyTable) -> Gaussians:
-    """Leave out rows of zeros, which a program hasn't filled: they would be Gaussians of size 1."""
-    empty = (arrays.quats == 0).all(axis=1) & (arrays.means == 0).all(axis=1)
-    empty &= (arrays.log_scales == 0).all(axis=1) & (arrays.logit_opacities == 0)
-    empty &= (arrays.sh[:, 0] == 0).all(axis=1)
-    if not empty.any():
-        return arrays
-    said = "%s: %d of %d rows hold nothing but zeros: left out"
-    logger.warning(said, table.path, empty.sum(), len(empty))
-    return arrays.rows(~empty)
-
-
 def _format_hint(table: PlyTable) -> str:
-    """Return a hint for the message if the properties are those of another kind of PLY."""
+    """Return the end of a message about a PLY whose properties are those of another kind."""
     if "packed_position" in table.columns:
         command = "python -m threestudio_gaussiandreamer.convert in.compressed.ply out.ply"
         return f" It is a compressed PLY: convert it by `{command}`."
@@ -352,14 +323,8 @@ def _read_colors(table: PlyTable) -> Float[np.ndarray, "N 3"]:
 def unit_colors(
     colors: Float[np.ndarray, "N 3"], stored_type: np.dtype, path: str | os.PathLike
 ) -> Float[np.ndarray, "N 3"]:
-    """Convert colours stored as integers of 8 or 16 bits, or as numbers up to 1, to [0, 1].
-
-    Args:
-        stored_type: an integer type of 1 or 2 bytes says the range; of others the values do.
-        path: the file, for the message.
-
-    Raises:
-        UserError: the values fit none of these ranges.
+    """Convert colours to [0, 1], of integers of 8 or 16 bits, or numbers up to 1. A ``stored_type``
+    of 1 or 2 bytes says which, else the values do; UserError if they fit none of these ranges.
     """
     integer = np.issubdtype(stored_type, np.integer)
     finite = colors[np.isfinite(colors)]
@@ -380,24 +345,14 @@ def unit_colors(
     return colors / np.float32(full)
 
 
-# ---- tables --------------------------------------------------------------------------------------
-
-
 def write_table(
     path: str | os.PathLike,
     properties: list[tuple[str, str]],
     rows: np.ndarray,
     comments: Sequence[str] = (),
 ) -> None:
-    """Write a binary file atomically.
-
-    Args:
-        properties: name and PLY type of each column.
-        rows: a packed little-endian record array, or (N, P) float32 where all types are float.
-        comments: ASCII lines for the header.
-
-    Raises:
-        UserError: the file can't be written.
+    """Write a binary file atomically: ``rows`` of (N, P) floats, or packed little-endian records,
+    whose columns have the names and PLY types of ``properties``.
     """
     with atomic_file(path) as file:
         file.write(header_bytes([("vertex", len(rows), properties)], comments))
@@ -408,9 +363,7 @@ def write_table(
 def header_bytes(
     elements: Sequence[tuple[str, int, Sequence[tuple[str, str]]]], comments: Sequence[str]
 ) -> bytes:
-    """Return the header of a binary file; of each element name, count, and properties as name and
-    type.
-    """
+    """Return the header of a binary file: of each element name, count, and (name, type) pairs."""
     lines = ["ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in comments)]
     for element, count, properties in elements:
         lines += [f"element {element} {count}"]
@@ -419,11 +372,7 @@ def header_bytes(
 
 
 def read_header(file: BinaryIO) -> Header:
-    """Parse up to ``end_header``; the file is then at the first byte of the data.
-
-    Raises:
-        Unreadable: it is no PLY, or the header is damaged.
-    """
+    """Parse up to ``end_header``, after which the data begins; Unreadable if it is damaged."""
     first = file.readline(16).rstrip()
     require(first == b"ply", "this is not a PLY file: its first line is not 'ply'")
     encoding, elements, comments, words = None, [], [], []
@@ -446,10 +395,6 @@ def read_header(file: BinaryIO) -> Header:
             require(known, f"the header has an unknown line {' '.join(words)[:80]!r}")
     known = ", ".join(BYTE_ORDERS)
     require(encoding in BYTE_ORDERS, f"format {encoding!r} is unknown: {known} were expected")
-    for element in elements:
-        names = {entry.name for entry in element.properties}
-        said = f"element {element.name!r} has two properties of the same name"
-        require(len(names) == len(element.properties), said)
     return Header(encoding, elements, comments)
 
 
@@ -459,35 +404,40 @@ def _property(words: list[str], element: Element) -> Property:
     usual = len(types) == (2 if is_list else 1) and all(kind in NUMBER_TYPES for kind in types)
     said = f"the header line {' '.join(words)[:80]!r} is not a property with a known number type"
     require(usual, said)
-    if name in [entry.name for entry in element.properties]:
-        name = words[-1]
+    others = [entry.name for entry in element.properties]
+    name = words[-1] if name in others else name
+    require(name not in others, f"element {element.name!r} has two properties of the same name")
     codes = [NUMBER_TYPES[kind] for kind in types]
     return Property(name, codes[-1], codes[0] if is_list else None)
 
 
-def _packed(text: bytes, header: Header) -> bytes:
-    """Return the numbers of a text as float64; up to the first element with lists, a line is a
-    row.
-    """
-    rows, at = [line.split() for line in text.split(b"\n") if line.strip()], 0
-    for element in itertools.takewhile(lambda element: not element.has_lists, header.elements):
-        width = len(element.properties)
-        end = at + (element.count if width else 0)
-        said = f"a row of {element.name!r} has other than the {width} numbers that are announced"
-        require(all(len(row) == width for row in rows[at:end]), said)
-        at = end
+def _packed(text: bytes, elements: Sequence[Element]) -> bytes:
+    """Return the numbers of a text as float64; before the first list, a line has to be a row."""
+    plain = itertools.takewhile(lambda element: not element.has_lists, elements)
+    filled = (itertools.repeat(element, element.count) for element in plain if element.properties)
+    rows = itertools.chain.from_iterable(filled)
+
+    def words(line: bytes) -> list[bytes]:
+        found = line.split()
+        if found and (element := next(rows, None)):
+            width = len(element.properties)
+            said = (
+                f"a row of {element.name!r} has other than the {width} numbers that are announced"
+            )
+            require(len(found) == width, said)
+        return found
+
     require(b"_" not in text, "it has other words than numbers")  # Python reads 1_0 as 10
-    return np.fromiter(map(float, itertools.chain.from_iterable(rows)), np.float64).tobytes()
+    numbers = map(float, itertools.chain.from_iterable(map(words, io.BytesIO(text))))
+    return np.fromiter(numbers, np.float64).tobytes()
 
 
 def read_rows(
     data: bytes, at: int, element: Element, encoding: str
 ) -> tuple[dict[str, Lists], int]:
     """Read the properties of an element whose rows begin at the byte ``at``, as views of ``data``
-    where all lists are as long as those of the first row; also return where the rows end.
-
-    Args:
-        encoding: a key of ``BYTE_ORDERS``; the numbers of a text are float64.
+    where all lists are as long as those of the first row; also return where the rows end. The
+    numbers of a text are float64.
     """
     count, order, text = element.count, BYTE_ORDERS[encoding], encoding == "ascii"
     names = [entry.name for entry in element.properties]
@@ -498,23 +448,23 @@ def read_rows(
     if not count or not names:
         return {name: Lists(np.zeros(0, np.int64), np.zeros(0)) for name in names}, at
 
-    def row(at: int) -> tuple[list[int], list[int], int]:
-        """Return where each property begins, its length, and where the row ends."""
-        starts, lengths = [], []
+    def row(at: int) -> tuple[list[tuple[int, int]], int]:
+        """Return where each property begins and its length, and where the row ends."""
+        found = []
         for of_length, kind in kinds:
             length = 1
             if of_length:
                 length, at = int(np.frombuffer(data, of_length, 1, at)[0]), at + of_length.itemsize
                 require(length >= 0, "it has a list of negative length")
-            starts.append(at)
-            lengths.append(length)
+            found.append((at, length))
             at += length * kind.itemsize
-        return starts, lengths, at
+        return found, at
 
     least = count * sum((of_length or kind).itemsize for of_length, kind in kinds)
     said = f"it ends before the {count} rows of {element.name!r} that it announces: it is truncated"
     require(at + least <= len(data), said)
-    _, lengths, end = row(at)
+    first, end = row(at)
+    lengths = [length for _, length in first]
     if at + count * (end - at) <= len(data):  # are all as the first?
         fields = [
             [(f"length {i}", of_length)] * bool(of_length) + [(str(i), kind, (length,))]
@@ -529,15 +479,12 @@ def read_rows(
             }, at + rows.nbytes
     found = []
     for _ in range(count):
-        starts, lengths, at = row(at)
-        found.append((starts, lengths))
+        places, at = row(at)
+        found.append(places)
     require(at <= len(data), "a list is longer than the file: it is truncated or damaged")
-    places, sizes = np.array(found).transpose(1, 2, 0)
-    return {
-        name: Lists(
-            length,
-            np.concatenate([np.frombuffer(data, kind, n, start) if n else np.zeros(0, kind)
-                            for n, start in zip(length.tolist(), place.tolist(), strict=True)]),
-        )
-        for name, (_, kind), place, length in zip(names, kinds, places, sizes, strict=True)
-    }, at  # fmt: skip
+    columns = {}
+    for name, (_, kind), places in zip(names, kinds, zip(*found, strict=True), strict=True):
+        parts = [np.frombuffer(data, kind, n, start) for start, n in places if n]
+        lengths = np.array([n for _, n in places])
+        columns[name] = Lists(lengths, np.concatenate([np.zeros(0, kind), *parts]))
+    return columns, at

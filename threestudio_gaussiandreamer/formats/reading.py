@@ -23,14 +23,11 @@ class Unreadable(ValueError):
 
 @contextmanager
 def reading(path: str | PathLike, kind: str) -> Iterator[Path]:
-    """Yield the existing file ``path``. Whatever a damaged one raises in the block is one error.
-
-    Args:
-        kind: what the file is, for the message ("SPZ file").
+    """Yield the existing file ``path``, a ``kind`` of file ("SPZ file") for the message.
 
     Raises:
-        UserError: there is no such file, or the block raises an error about its content, or a
-            package that reads it is missing.
+        UserError: there is no such file, the block raises any error about its content, or a package
+            that reads it is missing.
     """
     path = existing_file(path, kind)
     where = f"{kind} {str(path)!r}"
@@ -68,11 +65,8 @@ def whole_number(entry: Mapping[str, Any], key: str, default: Any = None) -> int
 
 
 def require_file_memory(needed: int, file_size: int, content: str) -> None:
-    """Raise :class:`Unreadable` if reading takes more memory than a file of its size may.
-
-    Args:
-        needed: bytes, intermediate results included, by the file's header.
-        content: what is announced ("3000000 Gaussians").
+    """Raise :class:`Unreadable` if what is announced, the ``content`` ("30 Gaussians"), takes more
+    bytes, intermediate results included, than a file of this size may.
     """
     budget = FIXED_BYTES + BYTES_PER_FILE_BYTE * file_size
     require(

@@ -13,10 +13,10 @@ import json
 import os
 import zipfile
 from collections.abc import Sequence
-from contextlib import closing
+from contextlib import ExitStack
 from math import ceil, sqrt
 from pathlib import Path
-from typing import Any
+from typing import Any, Optional
 
 import numpy as np
 from jaxtyping import Float, Integer
@@ -42,11 +42,8 @@ CODEBOOK = 256
 PALETTE_COLUMNS = 64
 FIRST_TAG = 252
 """Alpha of a quaternion whose largest component is number 0."""
-MAX_META_BYTES = 1 << 19
 DECODED_BYTES, DECODED_BYTES_PER_HARMONIC = 200, 24
 """Bytes of memory that reading takes per Gaussian, and per harmonic of it, with a safety margin."""
-BYTES_PER_PIXEL = 24
-"""Memory for a pixel of an image while it is decoded."""
 PACKINGS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 ROUNDS = 12
 """Iterations; later ones hardly reduce the error."""
@@ -64,15 +61,19 @@ def write_sog(path: str | os.PathLike, gaussians: Gaussians, notes: Sequence[str
     Raises:
         UserError: harmonics above degree 3, or the file can't be written.
     """
+    from PIL import Image
+
     gaussians = finite(gaussians, str(path))
-    gaussians = gaussians.rows(packing.morton_order(gaussians.means))
-    images, meta = _encoded(gaussians)
+    images, meta = _encoded(gaussians.rows(packing.morton_order(gaussians.means)))
     others = [note for note in notes if note != ANTIALIASED]
     meta |= {"model": ANTIALIASED_MODEL} if ANTIALIASED in notes else {}
     meta |= {"notes": others} if others else {}
     with atomic_file(path) as file, zipfile.ZipFile(file, "w") as archive:
         for name, pixels in images.items():
-            archive.writestr(zipfile.ZipInfo(name, MEMBER_DATE), _webp(pixels))
+            # exact: keep the RGB of pixels with alpha 0, which hold data here
+            webp = {"lossless": True, "exact": True, "method": 4}
+            Image.fromarray(pixels, "RGBA").save(buffer := io.BytesIO(), "WEBP", **webp)
+            archive.writestr(zipfile.ZipInfo(name, MEMBER_DATE), buffer.getvalue())
         archive.writestr(zipfile.ZipInfo("meta.json", MEMBER_DATE), json.dumps(meta))
 
 
@@ -80,10 +81,11 @@ def read_sog(path: str | os.PathLike) -> tuple[Gaussians, list[str]]:
     """Read an SOG file, or by its ``meta.json`` one without an archive; also the notes.
 
     Raises:
-        UserError: there is no such file, it is no SOG of version 1 or 2, it is damaged, or it
-            would take more memory than the budget of its size.
+        UserError: there is no such file, it is no SOG of version 1 or 2, or it is damaged.
     """
-    with reading(path, "SOG file") as file, closing(_Archive(file)) as archive:
+    with reading(path, "SOG file") as file, ExitStack() as opened:
+        unpacked = file.suffix.lower() == ".json"
+        archive = _Archive(file, None if unpacked else opened.enter_context(zipfile.ZipFile(file)))
         low, high = (archive.rows("means", index).astype(np.uint16) for index in (0, 1))
         least, most = (archive.floats("means", key, 3) for key in ("mins", "maxs"))
         logs = least + (most - least) * ((low | high << 8)[:, :3] / 65535)
@@ -108,9 +110,6 @@ def read_sog(path: str | os.PathLike) -> tuple[Gaussians, list[str]]:
         notes = archive.meta.get("notes")
         notes = [note for note in notes if isinstance(note, str)] if type(notes) is list else []
         return gaussians, notes + [ANTIALIASED] * (archive.meta.get("model") == ANTIALIASED_MODEL)
-
-
-# ---- writing -------------------------------------------------------------------------------------
 
 
 def _encoded(gaussians: Gaussians) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
@@ -194,32 +193,19 @@ def _image(rows: Integer[np.ndarray, "N C"]) -> Integer[np.ndarray, "H W 4"]:
     return pixels.reshape(height, width, 4)
 
 
-def _webp(pixels: Integer[np.ndarray, "H W 4"]) -> bytes:
-    from PIL import Image
-
-    buffer = io.BytesIO()
-    # exact: keep the RGB of pixels with alpha 0, which hold data here
-    Image.fromarray(pixels, "RGBA").save(buffer, "WEBP", lossless=True, exact=True, method=4)
-    return buffer.getvalue()
-
-
-# ---- the archive ---------------------------------------------------------------------------------
-
-
 class _Archive:
-    """An open SOG file, or the ``meta.json`` of an unpacked one; version and memory are checked."""
+    """An SOG file, or the ``meta.json`` of an unpacked one; version and memory are checked."""
 
-    def __init__(self, path: Path) -> None:
-        self.path, unpacked = path, path.suffix.lower() == ".json"
-        beside = path.parent.iterdir() if unpacked else ()
+    def __init__(self, path: Path, archive: Optional[zipfile.ZipFile]) -> None:
+        self.path, self._zip = path, archive
+        beside = () if archive else path.parent.iterdir()
         files = [path, *(file for file in beside if file.suffix in (".webp", ".png"))]
         self.size = sum(file.stat().st_size for file in files)
-        self._zip = None if unpacked else zipfile.ZipFile(path)
-        names = self._zip.namelist() if self._zip else []
+        names = archive.namelist() if archive else []
         found = [name for name in names if name.split("/")[-1] == "meta.json"]
         # a folder that was packed by hand is in the names of its files
         self._folder = min(found, key=len, default="meta.json").removesuffix("meta.json")
-        data = self._member(path.name if unpacked else "meta.json", MAX_META_BYTES)
+        data = self._member("meta.json" if archive else path.name, 1 << 19)
         self.meta: dict[str, Any] = json.loads(data.decode("utf-8"))
         self.version = self.meta.get("version", 1)
         said = f"it is of version {str(self.version)[:20]}; version 1 or 2 was expected"
@@ -237,15 +223,11 @@ class _Archive:
         each = DECODED_BYTES + DECODED_BYTES_PER_HARMONIC * COEFFICIENTS[self.bands]
         require_file_memory(self.count * each, self.size, f"{self.count} Gaussians")
 
-    def close(self) -> None:
-        if self._zip is not None:
-            self._zip.close()
-
     def values(
         self, section: str, pixels: Integer[np.ndarray, "*N C"], channels: int = 3
     ) -> Float[np.ndarray, "*N C"]:
         """Return what the bytes of an image stand for: entries of a codebook, in version 1 steps
-        between ``mins`` and ``maxs`` of each of the section's ``channels`` (1: of all).
+        between ``mins`` and ``maxs`` of each of ``channels`` (1: of all).
         """
         if self.version == 1:
             low, high = (self.floats(section, key, channels) for key in ("mins", "maxs"))
@@ -286,17 +268,17 @@ class _Archive:
         from PIL import Image
 
         data = self._member(self.meta[section]["files"][index], self.size)
-        lossy = data[12:16] == b"VP8 "
-        require(not lossy, "one of its images isn't a lossless WebP image, so its numbers are lost")
+        lossless = data[12:16] != b"VP8 "
+        require(lossless, "one of its images isn't a lossless WebP image: its numbers are lost")
         with Image.open(io.BytesIO(data), formats=["WEBP", "PNG"]) as image:
             width, height = image.size
             size = f"{width} x {height} pixels"
-            require_file_memory(BYTES_PER_PIXEL * width * height, self.size, size)
+            require_file_memory(24 * width * height, self.size, size)  # while it is decoded
             return np.asarray(image.convert("RGBA"))
 
     def _member(self, name: str, most: int) -> bytes:
         """Return the content of a member, or of a file beside ``meta.json``, at most ``most``."""
-        if self._zip is None:
+        if not self._zip:
             with self.path.with_name(name).open("rb") as file:  # refuses names with folders
                 data = file.read(most + 1)
             require(len(data) <= most, f"{name!r} has more than {most} bytes")
@@ -307,14 +289,14 @@ class _Archive:
         return self._zip.read(info)  # compares the checksum too
 
 
-# ---- codebooks -----------------------------------------------------------------------------------
-
-
 def scalar_codebook(
     values: Float[np.ndarray, "*shape"], size: int = 256
 ) -> tuple[Float[np.ndarray, " size"], Integer[np.ndarray, "*shape"]]:
-    """Return ``size`` ascending values and the index of the nearest one for each of ``values``, of
-    which up to ``size`` different ones are kept exactly.
+    """Return ``size`` ascending values and the index of the nearest one for each of ``values``.
+
+    Up to ``size`` different values are kept exactly. Else the density is at first the third root of
+    the values', the optimum for many of them (Panter and Dite 1951), and each value moves to the
+    mean of what it stands for.
     """
     ordered = np.sort(values, axis=None).astype(np.float64)
     if not len(ordered):
@@ -323,28 +305,18 @@ def scalar_codebook(
     if len(distinct) <= size:
         book = np.pad(distinct, (0, size - len(distinct)), "edge")
     else:
-        book = _lloyd(ordered, distinct, size)
+        mass = np.concatenate([[0], np.cumsum(np.diff(distinct) ** (2 / 3))])
+        book = np.interp(np.linspace(0, mass[-1], size), mass, distinct)
+        sums = np.concatenate([[0], np.cumsum(ordered)])
+        for _ in range(ROUNDS):
+            ends = np.searchsorted(ordered, (book[1:] + book[:-1]) / 2)
+            ends = np.concatenate([[0], ends, [len(ordered)]])
+            counts = np.diff(ends)
+            means = np.diff(sums[ends]) / np.maximum(counts, 1)
+            book = np.sort(np.where(counts > 0, means, book))
     book = book.astype(np.float32)
     middles = (book[1:] + book[:-1]) / 2
     return book, np.searchsorted(middles, values).astype(np.uint8)
-
-
-def _lloyd(
-    ordered: Float[np.ndarray, " N"], distinct: Float[np.ndarray, " D"], size: int
-) -> Float[np.ndarray, " size"]:
-    """Move each value to the mean of what it stands for, from a density of the third root of the
-    values' density, the optimum for many values (Panter and Dite 1951).
-    """
-    mass = np.concatenate([[0], np.cumsum(np.diff(distinct) ** (2 / 3))])
-    book = np.interp(np.linspace(0, mass[-1], size), mass, distinct)
-    sums = np.concatenate([[0], np.cumsum(ordered)])
-    for _ in range(ROUNDS):
-        ends = np.searchsorted(ordered, (book[1:] + book[:-1]) / 2)
-        ends = np.concatenate([[0], ends, [len(ordered)]])
-        counts = np.diff(ends)
-        means = np.diff(sums[ends]) / np.maximum(counts, 1)
-        book = np.sort(np.where(counts > 0, means, book))
-    return book
 
 
 def vector_codebook(

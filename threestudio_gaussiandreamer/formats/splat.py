@@ -38,10 +38,7 @@ SECTION = np.dtype(
 )
 NUMBERS = (("<f4", "<f4", "<f4"), ("<u2", "<f2", "<f2"), ("<u2", "<f2", "u1"))
 """Types of positions, of scales and quaternions, and of harmonics, by level."""
-HARMONICS_RANGE = (-1.5, 1.5)
 MAX_DEGREE = 2
-ROUNDED_TO_0 = np.float32(2**-25)
-"""The largest scale that is 0 as float16."""
 
 
 def read_splat(path: str | os.PathLike) -> tuple[Gaussians, list[str]]:
@@ -74,82 +71,74 @@ def read_ksplat(path: str | os.PathLike) -> tuple[Gaussians, list[str]]:
         UserError: there is no such file, or it is damaged or of another version.
     """
     with reading(path, ".ksplat file") as file:
-        return _File(np.fromfile(file, np.uint8)).gaussians(), []
-
-
-class _File:
-    """The bytes of a file, which are read at places that are checked."""
-
-    def __init__(self, data: np.ndarray) -> None:
-        self.data = data
-        self.header = self.rows(HEADER, 0, 1)[0]
-        version, self.level = (self.header["major"], self.header["minor"]), self.header["level"]
-        usual = version[0] == 0 and version[1] >= 1 and self.level in range(len(NUMBERS))
-        said = f"not version {version[0]}.{version[1]} and level {self.level}"
+        data = np.fromfile(file, np.uint8)
+        header = _rows(data, HEADER, 0, 1)[0]
+        major, minor, level = (header[name] for name in ("major", "minor", "level"))
+        said = f"not version {major}.{minor} and level {level}"
+        usual = major == 0 and minor >= 1 and level in range(len(NUMBERS))
         require(usual, f"version 0.1 and level 0, 1 or 2 were expected, {said}")
-
-    def rows(self, kind: np.dtype, at: int, count: int) -> np.ndarray:
-        """Return ``count`` values of a type from the byte ``at`` on."""
-        end = at + count * kind.itemsize
-        require(end <= len(self.data), f"it ends after {len(self.data)} bytes instead of {end}")
-        return self.data[at:end].view(kind)
-
-    def gaussians(self) -> Gaussians:
-        """Return the Gaussians of all sections."""
-        sections = self.rows(SECTION, HEADER.itemsize, int(self.header["sections"]))
+        sections = _rows(data, SECTION, HEADER.itemsize, int(header["sections"]))
         degree = sections["degree"].max(initial=0)
         require(degree <= MAX_DEGREE, f"harmonics of degree {degree}; expected 0 to {MAX_DEGREE}")
-        coefficients = COEFFICIENTS[degree]
+        require(len(sections) > 0, "it has no Gaussians")
         at, found = HEADER.itemsize + sections.nbytes, []
-        for section in sections:
-            values = {name: section[name].item() for name in SECTION.names}
-            position, number, harmonic = NUMBERS[self.level]
+        for values in sections.tolist():
+            section = dict(zip(SECTION.names, values, strict=True))
+            position, number, harmonic = NUMBERS[level]
             fields = [("mean", position, 3), ("scale", number, 3), ("quat", number, 4)]
-            rest = 3 * (COEFFICIENTS[values["degree"]] - 1)
+            rest = 3 * (COEFFICIENTS[section["degree"]] - 1)
             record = np.dtype([*fields, ("rgba", "u1", 4), ("sh", harmonic, rest)])
-            buckets = 4 * values["partial"] + values["stride"] * values["buckets"]
-            rows = self.rows(record, at + buckets, values["count"])
-            means = rows["mean"] if self.level == 0 else self.positions(rows["mean"], values, at)
-            found.append(self.cloud(rows, means, coefficients))
-            at += buckets + values["room"] * record.itemsize
-        require(bool(found), "it has no Gaussians")
-        return Gaussians(*(np.concatenate(values) for values in zip(*found, strict=True)))
+            buckets = 4 * section["partial"] + section["stride"] * section["buckets"]
+            rows = _rows(data, record, at + buckets, section["count"])
+            means = rows["mean"] if level == 0 else _positions(rows["mean"], data, section, at)
+            scales = rows["scale"].astype(np.float32)
+            scales[scales == 0] = 2**-25  # the largest scale that is 0 as float16
+            gaussians = Gaussians(
+                means=means.astype(np.float32),
+                quats=rows["quat"].astype(np.float32),
+                log_scales=np.log(scales),
+                logit_opacities=logits_of_bytes(rows["rgba"][:, 3]),
+                sh=_harmonics(rows, header, COEFFICIENTS[degree]),
+            )
+            found.append(gaussians)
+            at += buckets + section["room"] * record.itemsize
+        return Gaussians(*(np.concatenate(values) for values in zip(*found, strict=True))), []
 
-    def positions(
-        self, steps: np.ndarray, section: dict[str, float], at: int
-    ) -> Float[np.ndarray, "N 3"]:
-        """Return positions from steps around the centres of buckets."""
-        partly = self.rows(np.dtype("<u4"), at, section["partial"])
-        centers = self.rows(np.dtype("<f4"), at + partly.nbytes, 3 * section["buckets"])
-        held = section["full"] * section["bucket"] + int(partly.sum(dtype=np.int64))
-        usual = section["full"] + section["partial"] == section["buckets"]
-        usual = usual and section["stride"] == 3 * centers.itemsize and held == len(steps)
-        require(usual, f"its buckets hold {held} of the {len(steps)} Gaussians: it is damaged")
-        sizes = np.concatenate([np.full(section["full"], section["bucket"], np.int64), partly])
-        far = section["steps"] or 32767  # steps from a bucket's centre to its side
-        offsets = (steps.astype(np.float64) - far) * (section["block"] / 2 / far)
-        return offsets + np.repeat(centers.reshape(-1, 3), sizes, axis=0)
 
-    def cloud(
-        self, rows: np.ndarray, means: Float[np.ndarray, "N 3"], coefficients: int
-    ) -> Gaussians:
-        """Return the Gaussians of a section's records, with harmonics up to ``coefficients``."""
-        sh = np.zeros((len(rows), coefficients, 3), np.float32)
-        sh[:, 0] = rgb_to_sh0(rows["rgba"][:, :3] / np.float32(255))
-        values = rows["sh"].astype(np.float32)
-        if self.level == 2:
-            ranges = zip(self.header["range"], HARMONICS_RANGE, strict=True)
-            low, high = (said or usual for said, usual in ranges)
-            values = low + (high - low) * (values / 255)
-        for start, end in ((1, 4), (4, 9)):
-            if values.shape[1] >= 3 * (end - 1):
-                band = values[:, 3 * (start - 1) : 3 * (end - 1)].reshape(len(rows), 3, -1)
-                sh[:, start:end] = band.swapaxes(1, 2)
-        scales = rows["scale"].astype(np.float32)
-        return Gaussians(
-            means=means.astype(np.float32),
-            quats=rows["quat"].astype(np.float32),
-            log_scales=np.log(np.where(scales == 0, ROUNDED_TO_0, scales)),
-            logit_opacities=logits_of_bytes(rows["rgba"][:, 3]),
-            sh=sh,
+def _rows(data: np.ndarray, kind: np.dtype, at: int, count: int) -> np.ndarray:
+    """Return ``count`` values of a type from the byte ``at`` on."""
+    end = at + count * kind.itemsize
+    require(end <= len(data), f"it ends after {len(data)} bytes instead of {end}")
+    return data[at:end].view(kind)
+
+
+def _positions(
+    steps: np.ndarray, data: np.ndarray, section: dict[str, float], at: int
+) -> Float[np.ndarray, "N 3"]:
+    """Return positions from steps around the centres of buckets."""
+    partly = _rows(data, np.dtype("<u4"), at, section["partial"])
+    centers = _rows(data, np.dtype("<f4"), at + partly.nbytes, 3 * section["buckets"])
+    held = section["full"] * section["bucket"] + int(partly.sum(dtype=np.int64))
+    usual = section["full"] + section["partial"] == section["buckets"]
+    usual = usual and section["stride"] == 3 * centers.itemsize and held == len(steps)
+    require(usual, f"its buckets hold {held} of the {len(steps)} Gaussians: it is damaged")
+    sizes = np.concatenate([np.full(section["full"], section["bucket"], np.int64), partly])
+    far = section["steps"] or 32767  # steps from a bucket's centre to its side
+    offsets = (steps.astype(np.float64) - far) * (section["block"] / 2 / far)
+    return offsets + np.repeat(centers.reshape(-1, 3), sizes, axis=0)
+
+
+def _harmonics(rows: np.ndarray, header: np.void, count: int) -> Float[np.ndarray, "N K 3"]:
+    sh = np.zeros((len(rows), count, 3), np.float32)
+    sh[:, 0] = rgb_to_sh0(rows["rgba"][:, :3] / np.float32(255))
+    values = rows["sh"].astype(np.float32)
+    if header["level"] == 2:
+        low, high = (
+            said or usual for said, usual in zip(header["range"], (-1.5, 1.5), strict=True)
         )
+        values = low + (high - low) * (values / 255)
+    for start, end in ((1, 4), (4, 9)):
+        if values.shape[1] >= 3 * (end - 1):
+            band = values[:, 3 * (start - 1) : 3 * (end - 1)].reshape(len(rows), 3, -1)
+            sh[:, start:end] = band.swapaxes(1, 2)
+    return sh

@@ -47,8 +47,6 @@ DIRECTIONS = dict(zip("RUBLDF", np.concatenate([np.eye(3), -np.eye(3)]), strict=
 SYSTEM_OF = {SPZ_UP: OWN_SYSTEM, "-y": "RDF"}
 """Axes that can be written, by the axis that is up."""
 MAX_EXTENSION_BYTES, ZSTD_LEVEL = 1 << 16, 19
-MIN_WINDOW = 8 << 20
-"""Bytes of a Zstandard window that every decoder accepts (RFC 8878, section 3.1.1.1.2)."""
 DECODED_BYTES, DECODED_BYTES_PER_HARMONIC = 180, 9
 """Bytes of memory that reading takes per Gaussian, and per harmonic of it, with a safety margin."""
 MIN_STEPS_PER_SIZE, STEPS_PER_SIZE = 2, 32
@@ -66,8 +64,6 @@ SH_BITS = (5, 4, 4)
 
 
 class SpzHeader(NamedTuple):
-    """The first 16 bytes, which all versions have."""
-
     magic: bytes
     version: int
     count: int
@@ -92,13 +88,8 @@ def write_spz(
     version: int = VERSION,
     up: str = SPZ_UP,
 ) -> None:
-    """Write :func:`spz_bytes` atomically.
-
-    Gaussians that aren't finite are left out, with a warning. Values beyond the format's range are
-    clipped, with a warning for positions and for scales above the range.
-
-    Raises:
-        UserError: the file can't be written.
+    """Write :func:`spz_bytes` atomically, without Gaussians that aren't finite, and with a warning
+    where positions and scales are clipped.
     """
     gaussians = finite(gaussians, str(path))
     data = spz_bytes(gaussians, notes, version=version, up=up)
@@ -112,21 +103,18 @@ def write_spz(
 def spz_bytes(
     gaussians: Gaussians, notes: Sequence[str] = (), *, version: int = VERSION, up: str = SPZ_UP
 ) -> bytes:
-    """Encode Gaussians as an SPZ file.
-
-    They are sorted along a Morton curve, which improves the compression. Positions and scales
-    beyond the format's range are clipped.
+    """Encode Gaussians as an SPZ file, along a Morton curve, which improves the compression.
+    Positions and scales beyond the format's range are clipped.
 
     Args:
         gaussians: in the axes right, up, back, or with another axis ``up``.
-        notes: ASCII texts for the gzip header, which other readers ignore; version 4 has no place
-            for them. ``packing.ANTIALIASED`` sets the header's flag.
+        notes: ASCII texts for the gzip header, which other readers ignore, but in version 4;
+            ``packing.ANTIALIASED`` sets the header's flag.
         version: 3 or 4.
         up: a key of ``SYSTEM_OF``, which version 4 records; version 3 can only have the default.
 
     Raises:
-        UserError: values are NaN or infinite, harmonics are above degree 3, or version 4 is asked
-            for and Zstandard isn't installed.
+        UserError: values aren't finite, harmonics are above degree 3, or Zstandard is missing.
     """
     if not usable(gaussians).all():
         raise UserError("an SPZ file can't hold Gaussians with NaN or infinite values")
@@ -156,8 +144,14 @@ def spz_bytes(
     packed = [np.ascontiguousarray(block).tobytes() for block in blocks]
     if version == ZSTD_VERSION:
         return _zstd(header, packed, SYSTEM_OF[up])
-    comment = "; ".join(note for note in notes if note != ANTIALIASED)
-    return _gzip(HEADER.pack(*header) + b"".join(packed), comment)
+    # one gzip member (RFC 1952) without a time stamp, so that files are reproducible
+    data = HEADER.pack(*header) + b"".join(packed)
+    comment = "; ".join(note for note in notes if note != ANTIALIASED).encode("ascii")
+    head = struct.pack("<4BIBB", 0x1F, 0x8B, 8, 16 if comment else 0, 0, 2, 255)
+    deflate = zlib.compressobj(9, zlib.DEFLATED, -zlib.MAX_WBITS)
+    content = deflate.compress(data) + deflate.flush()
+    checksum = struct.pack("<II", zlib.crc32(data), len(data) & 0xFFFFFFFF)
+    return head + (comment and comment + b"\0") + content + checksum
 
 
 def position_step(gaussians: Gaussians) -> float:
@@ -173,8 +167,7 @@ def out_of_range(gaussians: Gaussians) -> Bool[np.ndarray, " N"]:
 
 
 def read_spz(path: str | os.PathLike) -> tuple[Gaussians, list[str]]:
-    """Read the Gaussians of an SPZ file of version 1 to 4, in its axes: right, up, back; and its
-    notes.
+    """Read the Gaussians of an SPZ file of version 1 to 4, right, up, back, and its notes.
 
     Raises:
         UserError: there is no such file, it is no SPZ file of these versions, or it is damaged.
@@ -188,10 +181,8 @@ def read_spz(path: str | os.PathLike) -> tuple[Gaussians, list[str]]:
 
 
 def spz_arrays(packed: bytes) -> tuple[Gaussians, bool]:
-    """Decode the bytes of an SPZ file; also return whether it was trained antialiased.
-
-    Raises:
-        Exception: it is damaged; callers of files from outside use :func:`reading`.
+    """Decode the bytes of an SPZ file, inside :func:`reading` if it may be damaged; also return
+    whether it was trained antialiased.
     """
     unpack = _unpack_zstd if packed[:4] == MAGIC else _unpack_gzip
     header, data, extensions = unpack(packed)
@@ -243,18 +234,12 @@ def _fractional_bits(gaussians: Gaussians) -> int:
     inliers = float(np.quantile(distances, INLIER_QUANTILE, method="lower"))
     log2_size = float(np.median(gaussians.log_scales.clip(-50, 50).mean(axis=1))) / log(2)
     fewest, wanted = (ceil(log2(n) - log2_size) for n in (MIN_STEPS_PER_SIZE, STEPS_PER_SIZE))
-    room = _room(float(distances.max()))
-    if room < fewest:
-        room = max(room, _room(OUTLIER_FACTOR * inliers))
+    room, inner = (
+        23 - ceil(log2(max(reach, 2.0**-40) * (1 + 1e-6)))
+        for reach in (float(distances.max()), OUTLIER_FACTOR * inliers)
+    )
+    room = max(room, inner) if room < fewest else room
     return max(0, min(room, max(1, wanted), 30))
-
-
-def _room(reach: float) -> int:
-    """Return how many of 23 bits can be fractional for coordinates up to ``reach``."""
-    return 23 - ceil(log2(max(reach, 2.0**-40) * (1 + 1e-6)))
-
-
-# ---- containers ----------------------------------------------------------------------------------
 
 
 def require_version(version: int) -> None:
@@ -279,25 +264,15 @@ def _system(extensions: bytes) -> str:
     system, at = OWN_SYSTEM, 0
     while at + RECORD.size <= len(extensions):
         kind, length = RECORD.unpack_from(extensions, at)
-        content = extensions[at + RECORD.size :][:length]
+        number = int.from_bytes(extensions[at + RECORD.size :][:length], "little")
         at += RECORD.size + length
-        number = int.from_bytes(content, "little")
-        if kind != COORDINATES:
+        if kind == COORDINATES:
+            usual = length == 4 and 0 < number < len(SYSTEMS)
+            require(usual, f"its record of the axes has the number {number}: 1 to 16 were expected")
+            system = SYSTEMS[number]
+        else:
             logger.warning("an SPZ file has vendor extension %#x, which is ignored", kind)
-            continue
-        usual = length == 4 and 0 < number < len(SYSTEMS)
-        require(usual, f"its record of the axes has the number {number}: 1 to 16 were expected")
-        system = SYSTEMS[number]
     return system
-
-
-def _gzip(data: bytes, comment: str) -> bytes:
-    """Compress to one gzip member (RFC 1952) without a time stamp, to make files reproducible."""
-    deflate = zlib.compressobj(9, zlib.DEFLATED, -zlib.MAX_WBITS)
-    note = comment.encode("ascii") + b"\0" if comment else b""
-    head = struct.pack("<4BIBB", 0x1F, 0x8B, 8, 16 if comment else 0, 0, 2, 255)
-    checksum = struct.pack("<II", zlib.crc32(data), len(data) & 0xFFFFFFFF)
-    return head + note + deflate.compress(data) + deflate.flush() + checksum
 
 
 def _unpack_gzip(packed: bytes) -> tuple[SpzHeader, bytes, bytes]:
@@ -338,17 +313,14 @@ def _unpack_zstd(packed: bytes) -> tuple[SpzHeader, bytes, bytes]:
     require(whole and [size for _, size in entries] == sizes, "it is truncated or damaged")
     blocks = []
     for length, size in entries:
-        blocks.append(_unpack_frame(packed[at : at + length], size))
+        # RFC 8878, 3.1.1.1.2: every decoder accepts windows of 8 MiB
+        reader = _zstandard().ZstdDecompressor(max_window_size=max(8 << 20, size))
+        # reads on past ``size`` to the checksum; the frame's own size is not believed
+        blocks += [reader.stream_reader(io.BytesIO(packed[at : at + length])).read(size + 1)]
+        usual = len(blocks[-1]) == size
+        require(usual, "a block of it is of another size than announced: it is damaged")
         at += length
     return header, b"".join(blocks), packed[start:table][:MAX_EXTENSION_BYTES]
-
-
-def _unpack_frame(frame: bytes, size: int) -> bytes:
-    reader = _zstandard().ZstdDecompressor(max_window_size=max(MIN_WINDOW, size))
-    # reads on past ``size`` to the checksum; the frame's own size is not believed
-    data = reader.stream_reader(io.BytesIO(frame)).read(size + 1)
-    require(len(data) == size, "a block of it is of another size than announced: it is damaged")
-    return data
 
 
 def _zstandard() -> Any:

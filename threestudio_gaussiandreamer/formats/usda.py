@@ -49,25 +49,17 @@ LAYER, ALIGNMENT, ZIP_HEADER = "gaussians.usda", 64, 30
 PADDING, PADDING_ID = struct.Struct("<HH"), 0x1986
 """The extra field that aligns the content, and OpenUSD's mark of it."""
 PRIMS = re.compile(rb"^[ \t]*(?:def|over|class|variantSet)\b.*", re.MULTILINE)
-HEAD = rb"^[ \t]*(?:custom )?(?:uniform )?([\w\[\]]+) ([\w:]+) = (.*)"
-ATTRIBUTE = re.compile(HEAD, re.MULTILINE)
+ATTRIBUTE = re.compile(
+    rb"^[ \t]*(?:custom )?(?:uniform )?([\w\[\]]+) ([\w:]+) = (.*)", re.MULTILINE
+)
 METADATA = re.compile(rb" \(\n(?:.*\n)*?[ \t]*\)[ \t]*$", re.MULTILINE)
 """Of the prim, or of one of its attributes."""
-CHANGING = re.compile(rb"\.(?:timeSamples|connect|spline)\b")
-COMMENT = re.compile(rb"^[ \t]*#.*", re.MULTILINE)
-COLOR_SPACE = "colorSpace:name"
-"""The attribute by which a prim names the colour space of its harmonics."""
-COLOR_SPACES = re.compile(rb"\bcolorSpace(?::name)? = (.*)")
-"""Of a prim, or of an array."""
-UP_AXIS = re.compile(rb'upAxis = "(\w+)"')
 NOTES = re.compile(rb'string\[\] notes = \[((?:"[^"\\]*"(?:, )?)*)\]')
 WIDTHS = {"point3f[]": 3, "float3[]": 3, "color3f[]": 3, "quatf[]": 4, "float[]": 1}
 """Numbers of one value, by the type of an array."""
 ARRAYS = tuple(name for name in TYPES if name != DEGREE)
 DEFAULTS = {"orientations": [1.0, 0, 0, 0], "opacities": [1.0]}
 """Of all Gaussians, in files that leave an attribute out."""
-OF_NUMBERS = b"0123456789+-.eEinfa "
-"""Bytes that numbers consist of, inf and nan included."""
 
 
 def write_usda(path: str | os.PathLike, gaussians: Gaussians, notes: Sequence[str] = ()) -> None:
@@ -146,9 +138,6 @@ def _extent(gaussians: Gaussians) -> np.ndarray:
     return np.clip(np.stack(corners), -3e38, 3e38).astype(np.float32)
 
 
-# ---- reading -------------------------------------------------------------------------------------
-
-
 def read_usd(path: str | os.PathLike) -> tuple[Gaussians, list[str]]:
     """Read a USD file of any kind; see :func:`read_usda`, which needs no library.
 
@@ -175,11 +164,8 @@ def read_usd(path: str | os.PathLike) -> tuple[Gaussians, list[str]]:
 
 
 def read_usda(path: str | os.PathLike) -> tuple[Gaussians, list[str]]:
-    """Read a USDA file, or a USDZ that begins with one; rows with values that aren't finite are
-    kept.
-
-    Returns:
-        the Gaussians, y up, and the notes in the layer's custom data.
+    """Read the Gaussians, y up, also those that aren't finite, and the notes of a USDA file, or of
+    a USDZ that begins with one.
 
     Raises:
         UserError: there is no such file, it has another content or layout, or it is damaged.
@@ -192,11 +178,12 @@ def read_usda(path: str | os.PathLike) -> tuple[Gaussians, list[str]]:
         prims = [line.decode("ascii", "replace")[:60] for line in PRIMS.findall(text)]
         whole = text.rstrip().endswith(b"\n}") and len(prims) == 1 and body
         require(whole, f"expected one prim 'def {SCHEMA} \"name\"' and its '}}', got {prims[:3]}")
-        axes = UP_AXIS.findall(metadata)
+        axes = re.findall(rb'upAxis = "(\w+)"', metadata)
         require(set(axes) <= {b"Y", b"Z"}, f"only y or z up is read, and its upAxis is {axes}")
-        linear = any(map(is_linear, COLOR_SPACES.findall(body)))
+        linear = any(map(is_linear, re.findall(rb"\bcolorSpace(?::name)? = (.*)", body)))
         body = METADATA.sub(b"", body)
-        require(not CHANGING.search(body), "its values change with time or are those of others")
+        changing = re.search(rb"\.(?:timeSamples|connect|spline)\b", body)
+        require(not changing, "its values change with time or are those of others")
         entries = ATTRIBUTE.findall(body)
         found = {name.decode(): (kind.decode(), value.rstrip()) for kind, name, value in entries}
         require(len(entries) == len(found), "an attribute of the prim is given twice")
@@ -229,15 +216,12 @@ def _text(path: Path) -> bytes:
         require(len(parts) % 2 == 1, "it has a text without an end: it is truncated")
         data = b'""'.join(parts[::2])
     magic, _, rest = data.partition(b"\n")
-    return magic + b"\n" + COMMENT.sub(b"", rest)
+    return magic + b"\n" + re.sub(rb"(?m)^[ \t]*#.*", b"", rest)
 
 
 def _upright(gaussians: Gaussians, up: str) -> Gaussians:
     """Return Gaussians of a layer with y up."""
     return gaussians if up == USDA_UP else rotate(gaussians, rotation_between(up, USDA_UP))
-
-
-# ---- OpenUSD -------------------------------------------------------------------------------------
 
 
 def _read_by_openusd(path: Path) -> tuple[Gaussians, list[str]]:
@@ -269,7 +253,7 @@ def _of_prim(prim: Any, now: Any, path: Path) -> Gaussians:
         rows = np.array(values, np.float32).reshape(-1, WIDTHS[TYPES[name]])
         return rows[:, [3, 0, 1, 2]] if name == "orientations" else rows  # OpenUSD's are xyzw
 
-    harmonics, space = prim.GetAttribute(HARMONICS), prim.GetAttribute(COLOR_SPACE)
+    harmonics, space = prim.GetAttribute(HARMONICS), prim.GetAttribute("colorSpace:name")
     spaces = [space.Get() if space else "", harmonics.GetColorSpace() if harmonics else ""]
     degree, arrays = prim.GetAttribute(DEGREE).Get(), {name: array(name) for name in ARRAYS}
     return _built(str(degree), arrays, any(map(is_linear, spaces)), str(path))
@@ -278,11 +262,8 @@ def _of_prim(prim: Any, now: Any, path: Path) -> Gaussians:
 def _built(
     degree: str, arrays: dict[str, Float[np.ndarray, "N width"]], linear: bool, name: str
 ) -> Gaussians:
-    """Return the Gaussians of a prim after checking the numbers of its values.
-
-    Args:
-        linear: whether its colours are of linear light.
-        name: the file, for messages.
+    """Return the Gaussians of a prim, whose colours may be of ``linear`` light, after checking the
+    numbers of its values; ``name`` is for the message.
     """
     count, colors = len(arrays["positions"]), arrays.pop(COLORS)
     for attribute, value in DEFAULTS.items():
@@ -317,7 +298,7 @@ def _array(text: bytes, name: str) -> Float[np.ndarray, "N width"]:
     text = text[1:-1]
     if not text.strip():
         return np.empty((0, width), np.float32)
-    marks = text.translate(None, OF_NUMBERS)
+    marks = text.translate(None, b"0123456789+-.eEinfa ")  # also inf and nan
     one = b"(" + b"," * (width - 1) + b")" if width > 1 else b""
     count = marks.count(b"(") if width > 1 else marks.count(b",") + 1
     usual = marks == b",".join([one] * count)

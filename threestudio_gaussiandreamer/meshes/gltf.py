@@ -3,9 +3,7 @@ what trimesh ignores or misreads: strips, fans, normalised, strided and sparse a
 targets with their default weights, skins in the pose of their joints, samplers, any set of texture
 coordinates, KHR_texture_transform, and COLOR_0. Files with compressed geometry (Draco, meshopt),
 instances, basisu or DDS textures, or that require an unknown extension are rejected; lines, lights,
-normals and animations are ignored.
-
-What reads a document runs inside :func:`~threestudio_gaussiandreamer.formats.reading.reading`."""
+normals and animations are ignored."""
 
 import base64
 import json
@@ -15,7 +13,7 @@ import struct
 import urllib.parse
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple, NoReturn, Optional
+from typing import Any, NamedTuple, Optional
 
 import numpy as np
 from jaxtyping import Float, Integer, UInt8
@@ -78,10 +76,8 @@ class Numbers(NamedTuple):
 
 
 class Document:
-    """A parsed ``.glb`` or ``.gltf`` file; entries are looked up by kind and index.
-
-    Raises:
-        Unreadable: the file isn't glTF 2.0, is damaged, or requires an unsupported extension.
+    """A parsed ``.glb`` or ``.gltf`` file, in which entries are looked up by kind and index. Opened
+    and read inside :func:`reading`, since what is damaged raises errors of many types.
     """
 
     def __init__(self, path: Path) -> None:
@@ -92,7 +88,7 @@ class Document:
         usual = is_glb or path.suffix.lower() != ".glb" or data.lstrip()[:1] == b"{"
         require(usual, f"it isn't a GLB file, which begins with glTF, but with {data[:20]!r}")
         text, self._chunk = _glb_chunks(data) if is_glb else (data, None)
-        self.json = json.loads(text.decode("utf-8"), parse_constant=_no_constant)
+        self.json = json.loads(text.decode("utf-8"), parse_constant=int)  # refuses NaN
         self._buffers: dict[int, memoryview] = {}
         version = str(self.json["asset"]["version"])
         said = f"it is glTF of version {version[:20]}; version 2 was expected"
@@ -125,11 +121,7 @@ class Document:
         return content[start : start + length], whole_number(view, "byteStride", 0)
 
     def accessor(self, index: Any, kinds: tuple[str, ...]) -> Numbers:
-        """Return the numbers of an accessor.
-
-        Args:
-            kinds: element types that are expected here, as "VEC3".
-        """
+        """Return the numbers of an accessor of one of these element types, as "VEC3"."""
         entry = self.entry("accessors", index)
         kind, component = entry.get("type"), entry.get("componentType")
         said = f"accessor {index} is {str(kind)[:20]} of component type {str(component)[:20]}"
@@ -163,8 +155,8 @@ class Document:
         row = shape[1] * dtype.itemsize
         if not shape[0]:
             return np.zeros(shape, dtype)
-        require(stride == 0 or stride >= row, f"rows of {row} bytes can't be {stride} bytes apart")
         start, stride = whole_number(entry, "byteOffset", 0), stride or row
+        require(stride >= row, f"rows of {row} bytes can't be {stride} bytes apart")
         end = start + (shape[0] - 1) * stride + row  # NumPy doesn't check it where it overflows
         require(end <= len(content), "an accessor ends after its buffer view: it is damaged")
         return np.ndarray(shape, dtype, content, start, (stride, dtype.itemsize))
@@ -184,21 +176,17 @@ class Document:
     def _buffer(self, index: Any) -> memoryview:
         if index not in self._buffers:
             entry = self.entry("buffers", index)
+            content = self._chunk if index == 0 else None
             if "uri" in entry:
                 content = self.resource(entry["uri"], f"buffer {index}")
-            else:
-                content = self._chunk if index == 0 else None
-            require(content is not None, f"buffer {index} is missing")
-            whole = len(content) >= whole_number(entry, "byteLength")
-            require(whole, f"buffer {index} is shorter than it should be")
+            whole = content is not None and len(content) >= whole_number(entry, "byteLength")
+            require(whole, f"buffer {index} is missing, or shorter than it should be")
             self._buffers[index] = memoryview(content)
         return self._buffers[index]
 
     def resource(self, uri: str, what: str) -> Optional[bytes]:
         """Return the content of a data URI or of a file beside this one; None where it is missing.
-
-        Raises:
-            Unreadable: an address on the network, or not a regular file.
+        Other addresses are Unreadable.
         """
         scheme = urllib.parse.urlsplit(uri[:100]).scheme if ":" in uri[:100] else ""
         if scheme == "data":
@@ -224,10 +212,6 @@ def _glb_chunks(data: bytes) -> tuple[bytes, Optional[memoryview]]:
     return bytes(chunks[0][1]), binary
 
 
-def _no_constant(name: str) -> NoReturn:
-    raise ValueError(f"{name} is no JSON")
-
-
 def read_gltf(path: Path) -> list[Mesh]:
     """Read the parts of the default scene; parts that consist of points have no faces.
 
@@ -236,9 +220,6 @@ def read_gltf(path: Path) -> list[Mesh]:
     """
     with reading(path, "mesh") as file:
         return list(_Scene(Document(file)).parts())
-
-
-# ---- materials -----------------------------------------------------------------------------------
 
 
 class Surface(NamedTuple):
@@ -254,91 +235,13 @@ class Surface(NamedTuple):
     """Applied to them, v downwards."""
 
 
-class Materials:
-    """The materials of a document; each image is decoded once."""
-
-    def __init__(self, document: Document) -> None:
-        self.document = document
-        self._surfaces: dict[Any, Surface] = {None: Surface()}
-        self._textures: dict[Any, Optional[np.ndarray]] = {}
-
-    def surface(self, index: Any) -> Surface:
-        """Return the base colour of the material of this index; None = the default material."""
-        if index not in self._surfaces:
-            self._surfaces[index] = self._read(self.document.entry("materials", index))
-        return self._surfaces[index]
-
-    def _read(self, material: dict[str, Any]) -> Surface:
-        old = _extension(material, "KHR_materials_pbrSpecularGlossiness")
-        model = material.get("pbrMetallicRoughness", {}) if old is None else old
-        kind = "baseColor" if old is None else "diffuse"
-        info, factor = model.get(f"{kind}Texture"), model.get(f"{kind}Factor")
-        if factor is not None:
-            rgb = self.document.numbers(factor, 4)[:3]
-            by_trimesh = "trimesh" in str(self.document.json["asset"].get("generator"))
-            unset = by_trimesh and rgb.tolist() == UNSET_FACTOR
-            unset = unset or f"{kind}Texture" in model and (rgb == 1).all()
-            factor = None if unset else linear_to_srgb(unit_rgb(rgb[None])[0])
-        if info is None:
-            return Surface(factor)
-        texture = self.document.entry("textures", info.get("index"))
-        if (picture := self._image(texture)) is None:
-            return Surface(factor)
-        moved = _extension(info, "KHR_texture_transform") or {}
-        coordinates = moved.get("texCoord", info.get("texCoord", 0))
-        matrix = self._transform(moved) if moved else None
-        return Surface(factor, picture, self._tile(texture, picture), coordinates, matrix)
-
-    def _image(self, texture: dict[str, Any]) -> Optional[np.ndarray]:
-        """Return the picture of a texture; None, with a warning, where its file is missing."""
-        source = (_extension(texture, "EXT_texture_webp") or texture).get("source")
-        if source is None:
-            source = texture.get("source")
-        kinds = [name for name in UNREAD_IMAGES if _extension(texture, name) is not None]
-        said = f"a texture has no PNG, JPEG or WebP image, only {kinds or 'none'}"
-        require(source is not None, said)
-        if source not in self._textures:
-            image = self.document.entry("images", source)
-            if "bufferView" in image:
-                data = bytes(self.document.view(image["bufferView"])[0])
-            else:
-                data = self.document.resource(image.get("uri"), f"image {source}")
-            name = str(image.get("name", source))[:80]
-            found = None if data is None else decode_texture(data, name, self.document.budget)
-            self._textures[source] = found
-        return self._textures[source]
-
-    def _tile(self, texture: dict[str, Any], picture: np.ndarray) -> Tile:
-        height, width = picture.shape[:2]
-        known = "sampler" in texture
-        sampler = self.document.entry("samplers", texture["sampler"]) if known else {}
-        wraps = [WRAPS[sampler.get(key, 10497)] for key in ("wrapS", "wrapT")]
-        return Tile(0, width, height, *wraps, sampler.get("magFilter") == NEAREST)
-
-    def _transform(self, transform: dict[str, Any]) -> np.ndarray:
-        """Return KHR_texture_transform as a matrix: scale, rotate (v grows downwards), move."""
-        numbers = self.document.numbers
-        offset = numbers(transform.get("offset", [0, 0]), 2)
-        scale = numbers(transform.get("scale", [1, 1]), 2)
-        (angle,) = numbers([transform.get("rotation", 0)], 1)
-        c, s = math.cos(angle), math.sin(angle)
-        return np.column_stack([np.array([[c, s], [-s, c]]) * scale, offset])
-
-
 def _extension(entry: dict[str, Any], name: str) -> Optional[dict[str, Any]]:
     return entry.get("extensions", {}).get(name)
 
 
-# ---- scenes --------------------------------------------------------------------------------------
-
-
 def world_matrices(document: Document) -> dict[int, World]:
-    """Return the matrix from each node of the default scene to the world, parents first.
-
-    Without scenes, the nodes that are no children are the roots.
-
-    Raises:
-        Unreadable: a node is shown twice, which would be a cycle or no tree.
+    """Return the matrix from each node of the default scene to the world, parents first. Without
+    scenes, the nodes that are no children are the roots.
     """
     if document.json.get("scenes"):
         roots = document.entry("scenes", document.json.get("scene", 0)).get("nodes", [])
@@ -351,7 +254,7 @@ def world_matrices(document: Document) -> dict[int, World]:
     while waiting:
         index, above = waiting.pop()
         node = document.entry("nodes", index)
-        require(index not in worlds, f"node {index} has two parents")
+        require(index not in worlds, f"node {index} has two parents")  # or is in a cycle
         worlds[index] = above @ _local_matrix(document, node)
         waiting += [(child, worlds[index]) for child in reversed(node.get("children", []))]
     return worlds
@@ -372,11 +275,72 @@ def _local_matrix(document: Document, node: dict[str, Any]) -> World:
 
 
 class _Scene:
-    """The meshes of a document, transformed by the nodes of its default scene."""
+    """The meshes of a document, transformed by the nodes of its default scene, and their materials;
+    each image is decoded once.
+    """
 
     def __init__(self, document: Document) -> None:
-        self.document, self.materials = document, Materials(document)
-        self.worlds = world_matrices(document)
+        self.document, self.worlds = document, world_matrices(document)
+        self._surfaces: dict[Any, Surface] = {None: Surface()}
+        self._pictures: dict[Any, Optional[np.ndarray]] = {}
+
+    def _surface(self, index: Any) -> Surface:
+        """Return the base colour of the material of this index; None = the default material."""
+        if index not in self._surfaces:
+            self._surfaces[index] = self._read(self.document.entry("materials", index))
+        return self._surfaces[index]
+
+    def _read(self, material: dict[str, Any]) -> Surface:
+        old = _extension(material, "KHR_materials_pbrSpecularGlossiness")
+        model = material.get("pbrMetallicRoughness", {}) if old is None else old
+        kind = "baseColor" if old is None else "diffuse"
+        info, factor = model.get(f"{kind}Texture"), model.get(f"{kind}Factor")
+        if factor is not None:
+            rgb = self.document.numbers(factor, 4)[:3]
+            by_trimesh = "trimesh" in str(self.document.json["asset"].get("generator"))
+            unset = by_trimesh and rgb.tolist() == UNSET_FACTOR
+            unset = unset or f"{kind}Texture" in model and (rgb == 1).all()
+            factor = None if unset else linear_to_srgb(unit_rgb(rgb[None])[0])
+        if info is None:
+            return Surface(factor)
+        texture = self.document.entry("textures", info.get("index"))
+        source = (_extension(texture, "EXT_texture_webp") or texture).get("source")
+        source = texture.get("source") if source is None else source
+        kinds = [name for name in UNREAD_IMAGES if _extension(texture, name) is not None]
+        said = f"a texture has no PNG, JPEG or WebP image, only {kinds or 'none'}"
+        require(source is not None, said)
+        if source not in self._pictures:
+            self._pictures[source] = self._decoded(source)
+        if (picture := self._pictures[source]) is None:
+            return Surface(factor)
+        moved = _extension(info, "KHR_texture_transform") or {}
+        coordinates = moved.get("texCoord", info.get("texCoord", 0))
+        matrix = self._transform(moved) if moved else None
+        known = "sampler" in texture
+        sampler = self.document.entry("samplers", texture["sampler"]) if known else {}
+        wraps = [WRAPS[sampler.get(key, 10497)] for key in ("wrapS", "wrapT")]
+        height, width = picture.shape[:2]
+        tile = Tile(0, width, height, *wraps, sampler.get("magFilter") == NEAREST)
+        return Surface(factor, picture, tile, coordinates, matrix)
+
+    def _decoded(self, source: Any) -> Optional[np.ndarray]:
+        """Return an image; None, with a warning, where its file is missing."""
+        image = self.document.entry("images", source)
+        if "bufferView" in image:
+            data = bytes(self.document.view(image["bufferView"])[0])
+        else:
+            data = self.document.resource(image.get("uri"), f"image {source}")
+        name = str(image.get("name", source))[:80]
+        return None if data is None else decode_texture(data, name, self.document.budget)
+
+    def _transform(self, transform: dict[str, Any]) -> np.ndarray:
+        """Return KHR_texture_transform as a matrix: scale, rotate (v grows downwards), move."""
+        numbers = self.document.numbers
+        offset = numbers(transform.get("offset", [0, 0]), 2)
+        scale = numbers(transform.get("scale", [1, 1]), 2)
+        (angle,) = numbers([transform.get("rotation", 0)], 1)
+        c, s = math.cos(angle), math.sin(angle)
+        return np.column_stack([np.array([[c, s], [-s, c]]) * scale, offset])
 
     def parts(self) -> Iterator[Mesh]:
         """Yield each primitive of triangles or points."""
@@ -401,7 +365,12 @@ class _Scene:
         mode, attributes = primitive.get("mode", TRIANGLES), primitive["attributes"]
         count = self.document.count(attributes["POSITION"])
         self.document.budget.spend_geometry(count, 0)
-        corners = self._corners(primitive, count)
+        corners = np.arange(count)
+        if "indices" in primitive:
+            corners = self.document.accessor(primitive["indices"], ("SCALAR",)).values[:, 0]
+            require(corners.dtype.kind == "u", "the indices of a mesh should be unsigned integers")
+            known = not len(corners) or corners.max() < count
+            require(known, f"a face names a vertex beyond the last of {count}")
         self.document.budget.spend_geometry(0, len(corners) // (3 if mode == TRIANGLES else 1))
         faces = _faces(mode, corners.astype(np.int64))
         positions = self._attribute(primitive, "POSITION", ("VEC3",), count, weights)
@@ -418,7 +387,7 @@ class _Scene:
             kinds = ("VEC3", "VEC4")
             found = self._attribute(primitive, "COLOR_0", kinds, count, weights, normalize=True)
             colors = unit_rgb(found)
-        surface = self.materials.surface(primitive.get("material"))
+        surface = self._surface(primitive.get("material"))
         if surface.factor is not None:  # times COLOR_0
             own = 1 if colors is None else colors
             colors = np.broadcast_to(surface.factor * own, vertices.shape)
@@ -436,16 +405,6 @@ class _Scene:
             uv = np.nan_to_num(moved).clip(-LARGEST_UV, LARGEST_UV).astype(np.float32)
         upwards = np.stack([uv[:, 0], 1 - uv[:, 1]], axis=1)
         return part._replace(uv=upwards, texture=surface.texture, tiles=(surface.tile,))
-
-    def _corners(self, primitive: dict[str, Any], count: int) -> Integer[np.ndarray, " C"]:
-        """Return the vertices in the order in which faces take them."""
-        if "indices" not in primitive:
-            return np.arange(count)
-        values = self.document.accessor(primitive["indices"], ("SCALAR",)).values[:, 0]
-        require(values.dtype.kind == "u", "the indices of a mesh should be unsigned integers")
-        known = not len(values) or values.max() < count
-        require(known, f"a face names a vertex beyond the last of {count}")
-        return values
 
     def _attribute(
         self,

@@ -9,7 +9,7 @@ is the axis after the up axis (x -> y -> z -> x): +z for y-up files, as glTF say
 
 Formats but glTF and PLY are read by trimesh, after a check of what it would ignore silently or read
 wrongly. A PLY has texture coordinates of vertices (Blender) or of the corners of faces (MeshLab);
-the names of its textures are in comments ``TextureFile``, which Blender doesn't write."""
+its textures are named by comments ``TextureFile``, which Blender doesn't write."""
 
 import io
 import logging
@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, Optional
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from ..core.errors import UserError, unknown
 from ..core.files import existing_file
@@ -112,9 +112,6 @@ def bundled_meshes() -> list[str]:
     return sorted(file.name for file in ASSETS.glob("*.glb"))
 
 
-# ---- reading -------------------------------------------------------------------------------------
-
-
 def read_parts(path: Path) -> list[Mesh]:
     """Read the parts of a mesh file, transformed by its scene graph, in the file's axes; parts that
     consist of points have no faces.
@@ -144,14 +141,9 @@ def _extension(path: Path) -> str:
     return extension
 
 
-# ---- cleaning and pose ---------------------------------------------------------------------------
-
-
 def _drop_bad_vertices(mesh: Mesh, path: Path) -> Mesh:
     """Remove faces with a vertex that isn't finite, and vertices that no face uses."""
-    finite = np.isfinite(mesh.vertices).all(axis=1)
-    if bad := _few(finite, "vertices", path):
-        log.warning("dropped %d of %d vertices of %s that aren't finite", bad, len(finite), path)
+    finite = _finite(mesh.vertices, "vertices", "dropped", path)
     keep_face = finite[mesh.faces].all(axis=1)
     used, faces = np.unique(mesh.faces[keep_face], return_inverse=True)
     rows = dict.fromkeys(("vertices", "uv", "vertex_colors"), used)
@@ -161,20 +153,19 @@ def _drop_bad_vertices(mesh: Mesh, path: Path) -> Mesh:
     return mesh._replace(faces=faces.reshape(-1, 3), **kept)
 
 
-def _few(finite: np.ndarray, what: str, path: Path) -> int:
-    """Return how many rows aren't finite; raise UserError if they are more than few."""
-    if (bad := int((~finite).sum())) > MAX_NON_FINITE * len(finite):
-        raise UserError(
-            f"{bad} of {len(finite)} {what} of {str(path)!r} aren't finite (at most 5 % may be): "
-            "export the mesh again"
-        )
-    return bad
+def _finite(values: np.ndarray, what: str, done: str, path: Path) -> Bool[np.ndarray, " N"]:
+    """Return which rows are finite; log the others, or raise UserError if they are many."""
+    finite = np.isfinite(values).all(axis=1)
+    said = f"{(~finite).sum()} of {len(finite)} {what} of {str(path)!r} aren't finite"
+    if (~finite).sum() > MAX_NON_FINITE * len(finite):
+        raise UserError(f"{said} (at most 5 % may be): export the mesh again")
+    if not finite.all():
+        log.warning("%s: %s", said, done)
+    return finite
 
 
 def pose_rotation(extension: str, up: str, front: Optional[str]) -> np.ndarray:
-    """Return the rotation (3, 3) from the file's axes to front = +x, up = +z: its rows are front,
-    up x front and up.
-    """
+    """Return the rotation (3, 3) from the file's axes to front = +x, up = +z."""
     up = ("+z" if extension in Z_UP_FORMATS else "+y") if up == "auto" else up
     if up not in AXES:
         raise unknown("up axis", up, ["auto", *AXES])
@@ -186,9 +177,6 @@ def pose_rotation(extension: str, up: str, front: Optional[str]) -> np.ndarray:
             f"the front of a mesh can't lie along its up axis: up is {up}, front is {front}"
         )
     return np.stack([AXES[front], np.cross(AXES[up], AXES[front]), AXES[up]])
-
-
-# ---- PLY -----------------------------------------------------------------------------------------
 
 
 def _of_ply(path: Path, budget: Budget) -> list[Mesh]:
@@ -207,14 +195,22 @@ def _of_ply(path: Path, budget: Budget) -> list[Mesh]:
     mesh = Mesh(vertices, indices[triangles])
     if table.has(COLORS):
         colors = unit_colors(table[COLORS], table.types[COLORS[0]], path)
-        mesh = mesh._replace(vertex_colors=_finite(colors, path))
+        finite = _finite(colors, "colours", "they become grey", path)
+        colors = np.where(finite[:, None], colors, np.float32(GREY))
+        mesh = mesh._replace(vertex_colors=colors)
     elif all(name in faces for name in COLORS):
         colors = np.stack([faces[name].values for name in COLORS], axis=1)
         full = 255 if colors.max(initial=0) > 1 else 1
         mesh = mesh._replace(face_colors=unit_rgb(colors[polygons] / full))
-    uv = _corner_coordinates(table, corners, indices)
+    uv, of_corners = None, faces.get(OF_CORNERS)
+    of_vertices = [names for names in COORDINATES if table.has(names)]
+    if of_corners is not None and (of_corners.lengths == 2 * corners.lengths).all():
+        uv = of_corners.values.reshape(-1, 2)
+    elif of_vertices:
+        uv = table.doubles(of_vertices[0])[indices]
     if uv is None or not len(triangles):
         return [mesh]
+    uv = np.nan_to_num(uv).clip(-LARGEST_UV, LARGEST_UV).astype(np.float32)
     numbers = np.zeros(len(corners.lengths))
     numbers = faces[TEXTURE_NUMBER].values if TEXTURE_NUMBER in faces else numbers
     return _textured(mesh, table, triangles, indices, uv, numbers[polygons], budget)
@@ -228,30 +224,6 @@ def _triangles(corners: Lists) -> tuple[Int[np.ndarray, "T 3"], Int[np.ndarray, 
     first = np.repeat(np.cumsum(lengths) - lengths, counts)
     second = first + 1 + np.arange(len(polygons)) - np.repeat(np.cumsum(counts) - counts, counts)
     return np.stack([first, second, second + 1], axis=1), polygons
-
-
-def _finite(colors: Float[np.ndarray, "V 3"], path: Path) -> Float[np.ndarray, "V 3"]:
-    """Return the colours with grey for those that aren't finite, if they are few."""
-    finite = np.isfinite(colors).all(axis=1)
-    if bad := _few(finite, "colours", path):
-        said = "%d of %d colours of %s aren't finite: they become grey"
-        log.warning(said, bad, len(finite), path)
-    return np.where(finite[:, None], colors, np.float32(GREY))
-
-
-def _corner_coordinates(
-    table: PlyTable, corners: Lists, indices: Int[np.ndarray, " C"]
-) -> Optional[Float[np.ndarray, "C 2"]]:
-    """Return the texture coordinates of all corners, or None."""
-    of_corners = table.faces.get(OF_CORNERS)
-    if of_corners is not None and (of_corners.lengths == 2 * corners.lengths).all():
-        uv = of_corners.values.reshape(-1, 2)
-    else:
-        named = [names for names in COORDINATES if table.has(names)]
-        if not named:
-            return None
-        uv = table.doubles(named[0])[indices]
-    return np.nan_to_num(uv).clip(-LARGEST_UV, LARGEST_UV).astype(np.float32)
 
 
 def _textured(
@@ -291,9 +263,6 @@ def _textured(
     return parts
 
 
-# ---- other formats, by trimesh -------------------------------------------------------------------
-
-
 def _by_trimesh(path: Path, budget: Budget) -> list[Mesh]:
     import trimesh
 
@@ -319,7 +288,14 @@ def _by_trimesh(path: Path, budget: Budget) -> list[Mesh]:
         world, name = scene.graph[node]
         geometry = scene.geometry[name]
         if len(getattr(geometry, "vertices", ())):
-            part = _colored(_surface(geometry, budget), geometry, files)
+            vertices = np.array(geometry.vertices, dtype=np.float64)
+            faces = np.asarray(getattr(geometry, "faces", np.zeros((0, 3))), dtype=np.int64)
+            budget.spend_geometry(len(vertices), len(faces))
+            usual = vertices.shape[1:] == faces.shape[1:] == (3,)
+            known = not len(faces) or faces.min() >= 0 and faces.max() < len(vertices)
+            said = f"it is damaged: a face names a vertex beyond the last of {len(vertices)}"
+            require(usual and known, said)
+            part = _colored(Mesh(vertices, faces), geometry, files)
             if not np.array_equal(world, np.eye(4)):
                 part = part._replace(vertices=part.vertices @ world[:3, :3].T + world[:3, 3])
             of_vertices = [len(x) for x in (part.uv, part.vertex_colors) if x is not None]
@@ -331,10 +307,9 @@ def _by_trimesh(path: Path, budget: Budget) -> list[Mesh]:
 
 
 def _plain_obj(data: bytes) -> bytes:
-    """Return an OBJ whose faces count from the first vertex, after checking the numbers of each
-    line: trimesh reads relative numbers from the last vertex, ignores lines that it doesn't know,
-    stops at words that are no numbers (NumPy 1.26), and divides the numbers of all vertices into
-    rows of the first one's width.
+    """Return an OBJ whose faces count from the first vertex, after checking each line: trimesh
+    counts relative numbers from the last vertex, ignores lines that it doesn't know, stops at words
+    that are no numbers (NumPy 1.26), and cuts all numbers into rows of the first one's width.
     """
     counts, lines, widths = dict.fromkeys(OBJ_NUMBERS, 0), [], set()
 
@@ -376,8 +351,8 @@ def _exact_stl(data: bytes) -> bytes:
 
 
 def _off_colors(text: str, path: Path) -> Optional[np.ndarray]:
-    """Return the colours of an OFF file's vertices as bytes, written from 0 to 1 or to 255, which
-    trimesh doesn't read; None if not every vertex has one. Logs a warning for others.
+    """Return the colours of an OFF file's vertices, from 0 to 1 or 255, as bytes, since trimesh
+    doesn't read them; None if not every vertex has one. Logs a warning for others.
     """
     words = (line.partition("#")[0].split() for line in text.splitlines())
     (kind, *counts), *lines = filter(None, words)
@@ -399,9 +374,8 @@ def _off_colors(text: str, path: Path) -> Optional[np.ndarray]:
 
 
 class _Resolver:
-    """Resolver through which trimesh reads the files that a mesh references.
-
-    trimesh catches the exceptions raised here, so the first Unreadable is kept in ``refused``.
+    """Reads the files that a mesh references for trimesh, which catches what is raised here, so the
+    first Unreadable is kept in ``refused``.
     """
 
     def __init__(self, path: Path, budget: Budget) -> None:
@@ -451,19 +425,10 @@ class _Resolver:
         return self._pictures[id(image)][1]
 
 
-def _surface(geometry: Any, budget: Budget) -> Mesh:
-    """Return vertices and faces of a geometry of trimesh."""
-    vertices = np.array(geometry.vertices, dtype=np.float64)
-    faces = np.asarray(getattr(geometry, "faces", np.zeros((0, 3))), dtype=np.int64)
-    budget.spend_geometry(len(vertices), len(faces))
-    usual = vertices.shape[1:] == faces.shape[1:] == (3,)
-    usual = usual and (not len(faces) or faces.min() >= 0 and faces.max() < len(vertices))
-    require(usual, f"it is damaged: a face names a vertex beyond the last of {len(vertices)}")
-    return Mesh(vertices=vertices, faces=faces)
-
-
 def _colored(part: Mesh, geometry: Any, files: _Resolver) -> Mesh:
-    """Return the part with the texture, vertex colours or face colours of trimesh's geometry."""
+    """Return the part with the colours of trimesh's geometry: a texture is multiplied by the
+    material's colour, unless that is black, as programs write it that don't multiply.
+    """
     visual = geometry.visual
     if not len(part.faces):
         colors = getattr(geometry, "colors", None)
@@ -473,13 +438,8 @@ def _colored(part: Mesh, geometry: Any, files: _Resolver) -> Mesh:
         return part._replace(vertex_colors=unit_rgb(visual.vertex_colors))
     if visual.kind == "face":
         return part._replace(face_colors=unit_rgb(visual.face_colors))
-    return _with_material(part, visual, files) if visual.kind == "texture" else part
-
-
-def _with_material(part: Mesh, visual: Any, files: _Resolver) -> Mesh:
-    """Return the part with its texture multiplied by the material's colour, or with that colour
-    alone. Black with a texture is ignored, as programs write it that don't multiply.
-    """
+    if visual.kind != "texture":
+        return part
     material = visual.material
     image = getattr(material, "image", getattr(material, "baseColorTexture", None))
     # trimesh makes a grey image for an OBJ with coordinates and no material: one without a format

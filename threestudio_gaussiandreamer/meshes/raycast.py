@@ -16,7 +16,7 @@ import functools
 import logging
 import math
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -58,7 +58,7 @@ class MeshCaster:
 
         Args:
             c2w: OpenGL camera to world.
-            fovy: vertical field of view in radians, in (0, pi).
+            fovy: vertical field of view, radians.
             supersample: each pixel is the mean of a regular supersample x supersample grid.
         """
         return self.render_views([(c2w, fovy)], height, width, supersample=supersample)[0]
@@ -72,10 +72,8 @@ class MeshCaster:
         supersample: int = 2,
         progress: str = "",
     ) -> Float[np.ndarray, "N H W 4"]:
-        """Render several cameras (c2w, fovy) in threads on all cores; see :meth:`render`.
-
-        Args:
-            progress: label of a progress bar, shown in terminals only; empty for no bar.
+        """Render several cameras (c2w, fovy) in threads on all cores; see :meth:`render`. Terminals
+        show a bar with the label ``progress`` unless it is empty.
         """
         from tqdm import tqdm
 
@@ -96,14 +94,8 @@ class MeshCaster:
     def visible(
         self, c2w: Float[np.ndarray, "4 4"], fovy: float, height: int, width: int
     ) -> tuple[tuple[int, int], Int[np.ndarray, "h w"], Float[np.ndarray, "h w 3"]]:
-        """Return what is seen at the centres of the pixels that the mesh may cover.
-
-        Args:
-            c2w, fovy: as in :meth:`render`.
-
-        Returns:
-            the row and the column of the first of these pixels, and for each the index of the
-            nearest face, -1 for none, with its barycentric weights.
+        """Return what is seen at the centres of the pixels that the mesh may cover: the row and the
+        column of the first of them, and for each the nearest face, -1 for none, with its weights.
         """
         focal = height / (2 * math.tan(fovy / 2))
         top, bottom, left, right = self._bounds(c2w, focal, height, width)
@@ -121,7 +113,12 @@ class MeshCaster:
         columns = _samples(left, right, supersample) - width / 2
 
         def fill(start: int, end: int) -> None:
-            colors = self._cast(c2w, focal, _samples(start, end, supersample) - height / 2, columns)
+            rows = _samples(start, end, supersample) - height / 2
+            face_index, barycentric = self._hits(c2w, focal, rows, columns)
+            seen = face_index >= 0
+            colors = np.zeros((*seen.shape, 4), dtype=np.float32)
+            colors[seen, :3] = surface_colors(self.mesh, face_index[seen], barycentric[seen])
+            colors[seen, 3] = 1
             shape = end - start, supersample, right - left, supersample, 4
             image[start:end, left:right] = colors.reshape(shape).mean(axis=(1, 3))
 
@@ -146,17 +143,6 @@ class MeshCaster:
         left, right = np.clip([math.floor(columns.min()), math.ceil(columns.max())], 0, width)
         return int(top), int(bottom), int(left), int(right)
 
-    def _cast(
-        self, c2w: np.ndarray, focal: float, rows: np.ndarray, columns: np.ndarray
-    ) -> Float[np.ndarray, "H W 4"]:
-        """Return colour and coverage 1 for samples whose ray hits the mesh, zeros for others."""
-        face_index, barycentric = self._hits(c2w, focal, rows, columns)
-        seen = face_index >= 0
-        colors = np.zeros((*seen.shape, 4), dtype=np.float32)
-        colors[seen, :3] = surface_colors(self.mesh, face_index[seen], barycentric[seen])
-        colors[seen, 3] = 1
-        return colors
-
 
 def over_background(
     rgba: Float[np.ndarray | Tensor, "... 4"], background: Float[np.ndarray | Tensor, "... 3"]
@@ -172,14 +158,8 @@ def _samples(start: int, end: int, supersample: int) -> Float[np.ndarray, " S"]:
     return start + (np.arange((end - start) * supersample) + 0.5) / supersample
 
 
-Hits = Callable[
-    [np.ndarray, float, np.ndarray, np.ndarray],
-    tuple[Int[np.ndarray, "H W"], Float[np.ndarray, "H W 3"]],
-]
-"""As :func:`zbuffer_hits` of one mesh: from c2w, focal, rows and columns."""
-
-
-def _fastest_hits(mesh: Mesh) -> Hits:
+def _fastest_hits(mesh: Mesh) -> Callable[..., tuple[np.ndarray, np.ndarray]]:
+    """Return :func:`zbuffer_hits` of a mesh, or its equivalent by embree."""
     try:
         from embreex.mesh_construction import TriangleMesh
         from embreex.rtcore_scene import EmbreeScene
@@ -245,7 +225,11 @@ class TargetCache:
         missing = {key: camera for key, camera in asked.items() if key not in self._pictures}
         found = {key: self._pictures[key] for key in asked if key not in missing}
         if missing:
-            missing |= self._take_planned(missing, height, width)
+            for key in missing:
+                self._planned.pop(key, None)
+            room = max(0, PIXELS_PER_CAST // (height * width) - len(missing))
+            beside = [key for key in self._planned if key[2:] == (height, width)][:room]
+            missing |= {key: self._planned.pop(key) for key in beside}
             images = self.caster.render_views(
                 missing.values(), height, width, supersample=self.supersample
             )
@@ -259,16 +243,6 @@ class TargetCache:
             del self._pictures[key]
         return [found[key] for key in keys]
 
-    def _take_planned(
-        self, missing: Mapping[tuple, Any], height: int, width: int
-    ) -> dict[tuple, tuple[np.ndarray, float]]:
-        """Return planned cameras of this size that fit into one cast with the missing ones."""
-        for key in missing:
-            self._planned.pop(key, None)
-        room = max(0, PIXELS_PER_CAST // (height * width) - len(missing))
-        beside = [key for key in self._planned if key[2:] == (height, width)][:room]
-        return {key: self._planned.pop(key) for key in beside}
-
 
 def _cameras(
     c2w: Float[Tensor, "B 4 4"], fovy: Float[Tensor, " B"]
@@ -278,8 +252,7 @@ def _cameras(
 
 
 def _key(camera: tuple[np.ndarray, float], height: int, width: int) -> tuple:
-    matrix, angle = camera
-    return matrix.tobytes(), angle, height, width
+    return camera[0].tobytes(), camera[1], height, width
 
 
 # ---- the z-buffer --------------------------------------------------------------------------------
@@ -297,8 +270,6 @@ def zbuffer_hits(
     for none); of faces at equal depth the first. Faces are visible from both sides.
 
     Args:
-        c2w: OpenGL camera to world.
-        focal: focal length, pixels.
         rows, columns: ascending coordinates of the samples in pixels relative to the image's
             centre, rows downwards.
     """
@@ -361,32 +332,17 @@ def _pairs(
 def _boxes(
     corners: Float[np.ndarray, "F 3 3"], focal: float, rows: np.ndarray, columns: np.ndarray
 ) -> Int[np.ndarray, "F 4"]:
-    """Return the box of samples around each triangle (first row, end, first column, end), empty for
-    triangles behind the camera.
+    """Return the box of samples around each triangle (first row, end, first column, end): empty for
+    triangles behind the camera, all samples for those that cross the near plane.
     """
-    points = _in_front(corners)
-    with np.errstate(invalid="ignore"):  # NaN marks a missing point
-        across = focal * points[..., 0] / -points[..., 2]
-        down = focal * points[..., 1] / points[..., 2]
-    ends = []
-    for places, values in ((rows, down), (columns, across)):
-        ends.append(np.searchsorted(places, np.fmin.reduce(values, 1) - SLACK))
-        ends.append(np.searchsorted(places, np.fmax.reduce(values, 1) + SLACK, "right"))
-    box = np.stack(ends, axis=1)
-    box[np.isnan(down).all(axis=1)] = 0
-    return box
-
-
-def _in_front(corners: Float[np.ndarray, "F 3 3"]) -> Float[np.ndarray, "F P 3"]:
-    """Clip triangles at the near plane: return their corners, NaN for those on the camera's side of
-    it, and the points where edges cross it, NaN for edges that don't.
-    """
-    behind = -corners[..., 2] < NEAR
-    if not behind.any():
-        return corners
-    following, depth = np.roll(corners, -1, axis=1), -corners[..., 2] - NEAR
+    x, y, z = np.moveaxis(corners, 2, 0)
     with np.errstate(invalid="ignore", divide="ignore"):
-        along = depth / (depth - np.roll(depth, -1, axis=1))
-    along[behind == np.roll(behind, -1, axis=1)] = np.nan
-    crossings = corners + along[..., None] * (following - corners)
-    return np.concatenate([np.where(behind[..., None], np.nan, corners), crossings], axis=1)
+        places = (rows, focal * y / z), (columns, focal * x / -z)
+    ends = []
+    for samples, values in places:
+        ends.append(np.searchsorted(samples, values.min(axis=1) - SLACK))
+        ends.append(np.searchsorted(samples, values.max(axis=1) + SLACK, "right"))
+    box, ahead = np.stack(ends, axis=1), -z >= NEAR
+    box[~ahead.all(axis=1)] = 0, len(rows), 0, len(columns)
+    box[~ahead.any(axis=1)] = 0
+    return box

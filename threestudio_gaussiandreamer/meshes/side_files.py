@@ -48,7 +48,7 @@ class Budget:
         self.total += BYTES_PER_FILE_BYTE * size
 
     def spend(self, size: int, what: str) -> None:
-        """Deduct ``size`` bytes; raise Unreadable, with ``what``, if that exceeds the budget."""
+        """Deduct ``size`` bytes; raise Unreadable if ``what`` exceeds the budget."""
         self.left -= size
         require(
             self.left >= 0,
@@ -102,15 +102,13 @@ class SideFiles:
         self.path, self.budget = path, budget
 
     def read(self, name: str, *others: str) -> Optional[bytes]:
-        """Return the content of the first of these files that exists; log a warning that has
-        ``name`` and return None if there is none.
+        """Return the content of the first of these files that exists; None, with a warning about
+        ``name``, if there is none.
 
         Names are relative to the mesh's folder and may have the separators of Windows, quotes and
         escaped spaces. If there is no such file, one with the same base name next to the mesh is
         read, else one whose name differs in case, accents' form, percent-encoding or encoding.
-
-        Raises:
-            Unreadable: it is no regular file (a FIFO would block), or can't be read.
+        Unreadable if it is no regular file (a FIFO would block), or can't be read.
         """
         for place in self._places(name, *others):
             try:
@@ -145,18 +143,9 @@ class SideFiles:
             return file.read()
 
 
-# ---- textures ------------------------------------------------------------------------------------
-
-
 def decode_texture(data: bytes, name: str, budget: Budget) -> UInt8[np.ndarray, "H W 3"]:
-    """Decode an image file; alpha is ignored, 16-bit values are rounded to 8 bits.
-
-    Args:
-        data: content of a file in one of ``FORMATS``.
-        name: names the texture in messages.
-
-    Raises:
-        Unreadable: it can't be decoded, or exceeds the budget.
+    """Decode an image file in one of ``FORMATS``: alpha is ignored, 16-bit values are rounded to 8
+    bits. Unreadable if it is damaged or exceeds the budget.
     """
     return decode_image(open_texture(data, name), name, budget)
 

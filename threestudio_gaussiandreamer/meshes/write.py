@@ -39,8 +39,6 @@ map_Kd {texture}
 
 
 class Welded(NamedTuple):
-    """The positions of a mesh, each once, with smooth normals."""
-
     positions: Float[np.ndarray, "W 3"]
     normals: Float[np.ndarray, "W 3"]
     rows: Int[np.ndarray, " V"]
@@ -48,7 +46,7 @@ class Welded(NamedTuple):
 
 
 def welded(mesh: Mesh) -> Welded:
-    """Join the vertices of equal position; normals are weighted by the faces' areas."""
+    """Join the vertices of equal position, with normals weighted by the faces' areas."""
     positions, rows = np.unique(mesh.vertices, axis=0, return_inverse=True)
     rows = rows.reshape(-1)
     faces = rows[mesh.faces]
@@ -85,21 +83,15 @@ def _clean(name: str) -> str:
     return "_".join(printable.split()).encode(errors="ignore")[:NAME_BYTES].decode(errors="ignore")
 
 
-# ---- GLB -----------------------------------------------------------------------------------------
-
-
 def write_glb_file(
     path: str | os.PathLike, document: Mapping[str, Any], blocks: Sequence[bytes]
 ) -> None:
     """Write a GLB atomically.
 
     Args:
-        document: the JSON without ``buffers``; its ``bufferViews``, one for each block, lack
+        document: the JSON, without buffers, and with one of ``bufferViews`` for each block, without
             buffer, offset and length.
         blocks: the binary content; padded to multiples of 4 bytes.
-
-    Raises:
-        UserError: the file can't be written.
     """
     padded = [block + b"\0" * (-len(block) % 4) for block in blocks]
     starts = np.cumsum([0, *map(len, padded)]).tolist()
@@ -178,14 +170,10 @@ def accessor(view: int, values: np.ndarray) -> dict[str, Any]:
     }
 
 
-# ---- OBJ -----------------------------------------------------------------------------------------
-
-
 def write_textured_obj(
     path: str | os.PathLike, mesh: Mesh, unlit: bool = False, name: str = "mesh"
 ) -> None:
-    """Write a mesh with ``uv`` and ``texture`` as OBJ, and its MTL and PNG of the same name beside
-    it.
+    """Write a mesh with ``uv`` and ``texture`` as OBJ, and MTL and PNG of the same name beside it.
 
     Raises:
         UserError: a value isn't finite, or a file can't be written.
@@ -221,9 +209,6 @@ def write_obj(path: str | os.PathLike, surface: Surface) -> None:
     with atomic_file(path) as file:
         np.savetxt(file, rows, fmt="v %.6g %.6g %.6g %.4f %.4f %.4f")
         np.savetxt(file, surface.faces + 1, fmt="f %d %d %d")
-
-
-# ---- both ----------------------------------------------------------------------------------------
 
 
 def companions(path: str | os.PathLike) -> tuple[Path, ...]:

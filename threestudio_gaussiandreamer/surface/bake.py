@@ -1,8 +1,8 @@
 """Texture coordinates of a mesh, and the texture that is baked from renders.
 
-Coordinates are charts by xatlas, or a grid of triangles where there are many: xatlas takes 1 s for
-5,000 faces, 23 s for 20,000. In the grid two triangles share a square cell, each a right-angled
-half, with a gap that keeps their texels apart when colours are interpolated.
+Coordinates are charts by xatlas, or, above 5,000 faces, for which xatlas takes 1 s (20,000: 23 s),
+a grid, in which two triangles share a square cell, each a right-angled half, with a gap that keeps
+their texels apart when colours are interpolated.
 
 A pixel is added to the four texels around its uv coordinates, with weights proportional to the
 squares of its opacity and of the cosine between the surface's normal and the ray. Faces that no
@@ -27,8 +27,6 @@ from .fusion import Renders
 
 XATLAS_FACES = 5000
 """Largest number of faces that xatlas unwraps."""
-PADDING = 2
-"""Texels between charts."""
 GAP = 3.5
 """Texels of a cell's side that aren't a triangle's, so that interpolation mixes no triangles."""
 SMALLEST_CELL = 6
@@ -62,9 +60,7 @@ def faces_that_fit(size: int) -> int:
 
 def unwrap(vertices: Vertices, faces: Faces, size: int) -> Unwrapped:
     """Unwrap a mesh to a texture of size x size texels."""
-    if len(faces) <= XATLAS_FACES:
-        return in_charts(vertices, faces, size)
-    return in_grid(vertices, faces, size)
+    return (in_charts if len(faces) <= XATLAS_FACES else in_grid)(vertices, faces, size)
 
 
 def in_charts(vertices: Vertices, faces: Faces, size: int) -> Unwrapped:
@@ -77,7 +73,7 @@ def in_charts(vertices: Vertices, faces: Faces, size: int) -> Unwrapped:
     scaled = (vertices - vertices.min(axis=0)) / extent
     atlas.add_mesh(scaled.astype(np.float32), faces.astype(np.uint32))
     options = xatlas.PackOptions()
-    options.resolution, options.padding, options.bilinear = size, PADDING, True
+    options.resolution, options.padding, options.bilinear = size, 2, True
     atlas.generate(pack_options=options)
     rows, index, uv = atlas[0]
     time.sleep(0.05)  # the destructor would wait for ever for a thread that isn't asleep yet
@@ -125,8 +121,8 @@ def bake(mesh: Mesh, renders: Renders, size: int) -> UInt8[np.ndarray, "S S 3"]:
 
 
 def _samples(caster: MeshCaster, renders: Renders, view: int) -> tuple[np.ndarray, ...]:
-    """Return the pixels of a view that show the mesh: face (M,), uv (M, 2), and RGB (0 to 255)
-    times weight and weight (M, 4).
+    """Return face (M,), uv (M, 2), and RGB (0 to 255) times weight and weight (M, 4) of the pixels
+    of a view that show the mesh.
     """
     c2w, rgba = renders.c2w[view], renders.rgba[view]
     (top, left), face, weights = caster.visible(c2w, renders.fovy, *rgba.shape[:2])
@@ -162,12 +158,7 @@ def _paint_hidden(
     _splat(texels, uv, np.tile(2 * KNOWN * means[nearest], (len(grid), 1)), size)
 
 
-def _splat(
-    sums: Float[np.ndarray, "T 4"],
-    uv: Float[np.ndarray, "M 2"],
-    values: Float[np.ndarray, "M 4"],
-    size: int,
-) -> None:
+def _splat(sums: np.ndarray, uv: np.ndarray, values: np.ndarray, size: int) -> None:
     """Add values to the four texels around each uv, in bilinear shares."""
     places = np.stack([(1 - uv[:, 1]) * size - 0.5, uv[:, 0] * size - 0.5], axis=1)
     first = np.floor(places).astype(np.int64)
@@ -178,13 +169,8 @@ def _splat(
     _add(sums, rows * size + columns, shares, values)
 
 
-def _add(
-    sums: Float[np.ndarray, "T 4"],
-    rows: Int[np.ndarray, "M k"],
-    shares: Float[np.ndarray, "M k"],
-    values: Float[np.ndarray, "M 4"],
-) -> None:
-    """Add ``shares`` of each of the values to k rows of the sums."""
+def _add(sums: np.ndarray, rows: np.ndarray, shares: np.ndarray, values: np.ndarray) -> None:
+    """Add ``shares`` (M, k) of each of the values (M, 4) to ``rows`` (M, k) of the sums (T, 4)."""
     from scipy.sparse import csc_array
 
     first = np.arange(0, rows.size + 1, rows.shape[1])

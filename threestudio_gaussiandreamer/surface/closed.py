@@ -6,7 +6,7 @@ of face ``h % F`` from its corner ``h // F`` to the next one."""
 import math
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from ..core.errors import UserError
 
@@ -15,8 +15,7 @@ Faces = Int[np.ndarray, "F 3"]
 Pairs = tuple[Int[np.ndarray, " P"], Int[np.ndarray, " P"]]
 """Half-edges that run from the lower vertex index to the higher, and their partners."""
 AGGRESSIVENESS = (7, 5, 3, 1)
-"""Values of fast_simplification's ``agg`` in the order of trial; lower ones keep more of the shape.
-"""
+"""Values of fast_simplification's ``agg``, in their order; lower ones keep more of the shape."""
 ATTEMPTS = 4
 APART = 0.05
 """Fraction of the way to their neighbours by which vertices at one position are moved apart."""
@@ -25,10 +24,8 @@ APART = 0.05
 def without_small_parts(
     vertices: Vertices, faces: Faces, share: float
 ) -> tuple[Vertices, Faces, int]:
-    """Drop connected parts with less than ``share`` of the area, and surfaces of inner cavities.
-
-    Returns:
-        the vertices and faces that are left, and the number of dropped parts that aren't cavities.
+    """Drop connected parts with less than ``share`` of the area, and surfaces of inner cavities;
+    also return the number of dropped parts that aren't cavities.
     """
     label = _labels(half_edges(faces), len(vertices))[faces[:, 0]]
     a, b, c = np.moveaxis(vertices[faces], 1, 0)
@@ -57,10 +54,8 @@ def simplified(vertices: Vertices, faces: Faces, count: int) -> tuple[Vertices, 
                 break
         if found is not None and 0 < len(found[1]) <= count:
             return found
-    raise UserError(
-        f"faces: the surface can't be closed with {count} faces; allow more, or extract it with "
-        "a lower resolution"
-    )
+    said = f"faces: the surface can't be closed with {count} faces"
+    raise UserError(f"{said}; allow more, or extract it with a lower resolution")
 
 
 def _fewer(vertices: Vertices, faces: Faces, count: int, agg: int) -> tuple[Vertices, Faces]:
@@ -93,9 +88,7 @@ def joined(vertices: Vertices, faces: Faces) -> tuple[Vertices, Faces]:
 
 
 def without_folds(faces: Faces) -> Faces:
-    """Drop faces with a repeated corner, pairs of faces with the same corners in opposite
-    orientation, and repeated faces.
-    """
+    """Drop faces with a repeated corner, repeated faces, and pairs of opposite faces."""
     faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
     ordered = np.sort(faces, axis=1)
     lowest = faces.argmin(axis=1)
@@ -125,15 +118,20 @@ def separated(vertices: Vertices, faces: Faces) -> tuple[Vertices, Faces] | None
     """Split the edges and vertices at which a closed mesh touches itself; None if it has holes.
 
     Around an edge of more than two faces, two faces make a pair if only inside lies between them.
-    Each pair gets vertices of its own, which are then moved apart by ``APART``. Where that leaves
-    two pairs with the same two vertices, one of them gets a new vertex in the middle of the edge.
+    Each pair gets vertices of its own, which are moved by ``APART`` towards the mean of their
+    neighbours. Where that leaves two pairs with the same two vertices, one of them gets a new
+    vertex in the middle of the edge.
     """
     for _ in range(ATTEMPTS):
         pairs = _paired(vertices, faces)
         if pairs is None:
             return None
         old, faces = _split(faces, pairs)
-        vertices = _moved_apart(vertices[old], faces, np.bincount(old)[old] > 1)
+        vertices, edges = vertices[old], half_edges(faces)
+        degree = np.maximum(np.bincount(edges[:, 0], minlength=len(vertices)), 1)
+        sums = [np.bincount(edges[:, 0], x[edges[:, 1]], len(vertices)) for x in vertices.T]
+        toward = np.stack(sums, axis=1) / degree[:, None] - vertices
+        vertices = vertices + APART * (np.bincount(old)[old] > 1)[:, None] * toward
         if is_closed(faces):
             return vertices, faces
         vertices, faces = _with_middles(vertices, faces, pairs)
@@ -141,8 +139,8 @@ def separated(vertices: Vertices, faces: Faces) -> tuple[Vertices, Faces] | None
 
 
 def _split(faces: Faces, pairs: Pairs) -> tuple[Int[np.ndarray, " U"], Faces]:
-    """Give each fan, the faces around a vertex that pairs connect, a vertex of its own; return for
-    each new vertex the old one that it replaces, and the faces of new vertices.
+    """Give each fan, the faces around a vertex that pairs connect, a vertex of its own; return the
+    old vertex of each new one, and the faces of new vertices.
     """
     places = [np.divmod(edges, len(faces)) for edges in pairs]  # corner and face of half-edges
     (start, end), (other_start, other_end) = (
@@ -201,14 +199,8 @@ def _paired(vertices: Vertices, faces: Faces) -> Pairs | None:
 def _angles(
     vertices: Vertices, faces: Faces, edges: Int[np.ndarray, "E 2"], group: Int[np.ndarray, " E"]
 ) -> Float[np.ndarray, " E"]:
-    """Return the angle of each half-edge's face around its edge, in radians; 0 at edges of at most
-    two faces, which need none.
-
-    Angles turn counterclockwise about the axis from the edge's lower vertex index to the higher,
-    from a direction that all faces of the edge share.
-
-    Args:
-        group: the edge of each half-edge, without its direction.
+    """Return the angle of each half-edge's face around its edge, radians, counterclockwise about
+    the axis from the lower vertex index to the higher; 0 at edges (``group``) of up to two faces.
     """
     angles = np.zeros(len(edges))
     crowded = np.flatnonzero(np.bincount(group)[group] > 2)
@@ -222,15 +214,6 @@ def _angles(
     up = np.cross(axis, side)
     angles[crowded] = np.arctan2((across * up).sum(1), (across * side).sum(1))
     return angles
-
-
-def _moved_apart(vertices: Vertices, faces: Faces, touching: Bool[np.ndarray, " V"]) -> Vertices:
-    """Move the ``touching`` vertices by ``APART`` towards the mean of their neighbours."""
-    edges = half_edges(faces)
-    count = np.maximum(np.bincount(edges[:, 0], minlength=len(vertices)), 1)
-    sums = [np.bincount(edges[:, 0], x[edges[:, 1]], len(vertices)) for x in vertices.T]
-    toward = np.stack(sums, axis=1) / count[:, None] - vertices
-    return vertices + APART * touching[:, None] * toward
 
 
 def _labels(links: Int[np.ndarray, "L 2"], count: int) -> Int[np.ndarray, " N"]:

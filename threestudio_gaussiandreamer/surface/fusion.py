@@ -35,11 +35,8 @@ EMPTY = 0.999
 
 
 class DepthFusion:
-    """A grid of signed distances in units of ``BAND`` cells, positive outside.
-
-    Args:
-        low, high: corners of the box that holds the Gaussians.
-        resolution: cells along the longest side of the box.
+    """A grid of signed distances in units of ``BAND`` cells, positive outside, around the box from
+    ``low`` to ``high``, whose longest side has ``resolution`` cells.
     """
 
     def __init__(self, low: Float[Tensor, "3"], high: Float[Tensor, "3"], resolution: int) -> None:
@@ -103,11 +100,7 @@ class Renders(NamedTuple):
 
 
 def render(cloud: Gaussians, views: Views, fusion: Optional[DepthFusion]) -> Renders:
-    """Render views of a cloud (tensors), and add the depths to ``fusion``.
-
-    Raises:
-        UserError: the cloud is too large to be rendered in float32.
-    """
+    """Render views of a cloud (tensors), and add the depths to ``fusion``."""
     count = len(views.viewmats)
     rgba = np.empty((count, views.size, views.size, 4), np.uint8)
     with tqdm(desc="surface", unit="view", total=count, disable=None, leave=False) as bar:
@@ -130,11 +123,10 @@ def _render(
     out = rasterize_views(cloud, views, rows, black, channels=moments)
     colors, mean, square = (out.image / out.alpha.clamp_min(1e-6)).split([3, 1, 1], dim=-1)
     if fusion is not None:
-        origin = (
-            torch.einsum("bj,j->b", viewmats[:, 2, :3], cloud.means.mean(0)) + viewmats[:, 2, 3]
-        )
+        origin = torch.einsum("bj,j->b", viewmats[:, 2, :3], cloud.means.mean(0))
+        origin = (origin + viewmats[:, 2, 3])[:, None, None, None]
         deviation = (square - mean.square()).clamp_min(0).sqrt()
-        pictures = (mean + origin[:, None, None, None], deviation, out.alpha)
+        pictures = (mean + origin, deviation, out.alpha)
         for row, *maps in zip(rows, *pictures, strict=True):
             fusion.add(views.viewmats[row], views.Ks[row], *(values[..., 0] for values in maps))
     rgba = torch.cat([colors, out.alpha], dim=-1).clamp(0, 1)

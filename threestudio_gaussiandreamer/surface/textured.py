@@ -35,15 +35,10 @@ from .fusion import DepthFusion, render
 METHODS = ("fusion", "density")
 MIN_COMPONENT = 0.01
 """Connected parts with a smaller share of the surface's area than this are dropped."""
-VIEW_BYTES = 5
-"""Memory per pixel of a view: colour and opacity, and one byte of work."""
-TEXEL_BYTES = 150
-"""Memory per texel while its colours are averaged and gaps are filled."""
 SINES = (-0.9, 0.95)
 """Of the elevations of the first and the last view: undersides are looked at too."""
 DISTANCE = 1.2
-"""Of the views, relative to where the ball of 99 % of the opacity fills them; the rest is outside.
-"""
+"""Of the views, relative to where the ball of 99 % of the opacity fills them."""
 
 
 @dataclass
@@ -63,9 +58,7 @@ class MeshOptions:
 
     @staticmethod
     def check(cfg: "MeshOptions") -> None:
-        """Raise UserError unless the texture has room for the faces, and renders and texture fit
-        into memory.
-        """
+        """Raise UserError unless the texture has room for the faces, and all fits into memory."""
         fit = faces_that_fit(cfg.texture)
         if cfg.faces > fit:
             raise UserError(
@@ -73,9 +66,10 @@ class MeshOptions:
                 f"faces, not {cfg.faces}; take fewer faces or a larger texture"
             )
         pictures = f"{cfg.views} renders of {cfg.view_size} x {cfg.view_size} pixels"
-        require_memory("view_size", VIEW_BYTES * cfg.views * cfg.view_size**2, pictures)
+        # a pixel has colour, opacity, and one byte of work; a texel sums of colours and of weights
+        require_memory("view_size", 5 * cfg.views * cfg.view_size**2, pictures)
         texels = f"a texture of {cfg.texture} x {cfg.texture} texels"
-        require_memory("texture", TEXEL_BYTES * cfg.texture**2, texels)
+        require_memory("texture", 150 * cfg.texture**2, texels)
 
 
 def require_mesh_libraries() -> None:
@@ -122,10 +116,8 @@ def mesh_from_gaussians(
     vertices, faces, tips = without_small_parts(
         *simplified(vertices, faces, options.faces), MIN_COMPONENT
     )
-    if specks + tips:
-        warn(
-            f"mesh: {specks + tips} loose parts below {MIN_COMPONENT:.2%} of the area are left out"
-        )
+    if loose := specks + tips:
+        warn(f"mesh: {loose} loose parts below {MIN_COMPONENT:.2%} of the area are left out")
     atlas = unwrap(vertices, faces, options.texture)
     mesh = Mesh(vertices[atlas.rows], atlas.faces, uv=atlas.uv)
     return mesh._replace(texture=bake(mesh, renders, options.texture))
