@@ -37,13 +37,10 @@ def test_what_numpy_wrote_is_read(tmp_path, save):
     np.save(tmp_path / "x.npy", ARRAYS["a"])
     found = read_arrays(tmp_path / "x.npy", "file", ["points"])
     assert np.array_equal(found["points"], ARRAYS["a"])
-
-
-def test_objects_are_not_unpickled_unless_nobody_asked_for_them(tmp_path):
-    np.savez(tmp_path / "x.npz", good=np.ones(3), bad=np.array({"a": 1}, dtype=object))
-    assert read_arrays(tmp_path / "x.npz", "file", ["good"])["good"].sum() == 3
+    np.savez(tmp_path / "y.npz", good=np.ones(3), bad=np.array({"a": 1}, dtype=object))
+    assert read_arrays(tmp_path / "y.npz", "file", ["good"])["good"].sum() == 3
     with pytest.raises(UserError, match="could run code"):
-        read_arrays(tmp_path / "x.npz", "file", ["bad"])
+        read_arrays(tmp_path / "y.npz", "file", ["bad"])
 
 
 @pytest.mark.parametrize("protocol", range(pickle.HIGHEST_PROTOCOL + 1))
@@ -73,6 +70,10 @@ class Runs:
         (pickle.dumps({"a": np.ones(9)})[:-40], "is truncated, damaged"),
         (b"\x80\2Nr\xff\xff\xff\x7f.", "fill the memory"),
         (b"\x80\2cposix\nsystem\nX\4\0\0\0trueb.", "is truncated, damaged"),
+        (
+            pickle.dumps({"a": scipy.sparse.csc_matrix((10**6, 10**6))}),
+            "sparse matrix .* of memory",
+        ),
     ],
 )
 def test_pickles_run_no_code(tmp_path, monkeypatch, data, said):
@@ -81,13 +82,6 @@ def test_pickles_run_no_code(tmp_path, monkeypatch, data, said):
     with pytest.raises(UserError, match=said):
         read_arrays(tmp_path / "x.pkl", "file", ["a"])
     assert "RAN" not in os.environ
-
-
-def test_a_sparse_matrix_that_would_fill_the_memory_is_refused(tmp_path):
-    wide = scipy.sparse.csc_matrix((10**6, 10**6))
-    (tmp_path / "x.pkl").write_bytes(pickle.dumps({"a": wide}))
-    with pytest.raises(UserError, match="a sparse matrix .* of memory"):
-        read_arrays(tmp_path / "x.pkl", "file", ["a"])
 
 
 def npy(header: str, body: bytes) -> bytes:

@@ -100,9 +100,6 @@ def test_babylon_reads_our_glb_and_we_read_what_it_makes_of_it(tmp_path):
     assert_close(constant, found, means=0, opacities=2.1e-3, sh=7.1e-3, quats=1e-3)
 
 
-# ---- gaussforge ----------------------------------------------------------------------------------
-
-
 def from_gaussforge(ir):
     shapes = {"positions": (-1, 3), "rotations": (-1, 4), "scales": (-1, 3), "alphas": (-1,)}
     values = [np.frombuffer(ir[name], np.float32).reshape(shape) for name, shape in shapes.items()]
@@ -113,7 +110,7 @@ def from_gaussforge(ir):
 
 
 @pytest.mark.parametrize("degree", [1, 3])  # its binding for Python fails at degree 0
-@pytest.mark.parametrize("name", [*WRITTEN])
+@pytest.mark.parametrize("name", WRITTEN)
 def test_gaussforge_reads_what_we_write(tmp_path, name, degree):
     gaussforge = pytest.importorskip("gaussforge", reason="gaussforge isn't installed")
     path = write(tmp_path / name, ball(300, degree))

@@ -38,9 +38,7 @@ OPENGL = ((0, 1, 0), (0, 0, 1))
 SAVE_PLY = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])
 TO_GLB = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]]).T
 RENDERER = np.array([[-1, 0, 0], [0, 0, 1], [0, -1, 0]])
-"""Hunyuan3D's texture stage loads (x, y, z) as (-x, z, -y), a mirrored mesh upside down; its
-pictures are mirrored back.
-"""
+"""Hunyuan3D's texture stage loads (x, y, z) as (-x, z, -y), mirrored, and mirrors its pictures."""
 EXPORTS = [
     ("trellis", GAUSSIANS, Z_UP_FRONT_MINUS_Y, SAVE_PLY),
     ("trellis", MESH, Z_UP_FRONT_MINUS_Y, TO_GLB),
@@ -101,15 +99,12 @@ def test_formats_with_axes_of_their_own_come_from_a_turned_ply(tmp_path, name, s
     assert nearest.max() < 1e-3
 
 
-def test_an_spz_of_supersplat_has_the_axes_of_its_ply():
+def test_an_spz_of_supersplat_has_the_axes_of_its_ply_and_plain_axes_agree_with_the_option_up():
     raw = StoredCloud(ball(9), "y")
     found = from_producer(raw, "supersplat", ".spz").gaussians.means
     np.testing.assert_allclose(found, raw.gaussians.means * [1, -1, -1], atol=1e-6)
-
-
-@pytest.mark.parametrize(("name", "up"), [("3dgs", "-y"), ("lgm", "y"), ("nerfstudio", "z")])
-def test_plain_axes_agree_with_the_option_up(name, up):
-    np.testing.assert_allclose(to_y_up(producer_axes(name, GAUSSIANS)), AXES[up], atol=1e-12)
+    for name, up in (("3dgs", "-y"), ("lgm", "y"), ("nerfstudio", "z")):
+        np.testing.assert_allclose(to_y_up(producer_axes(name, GAUSSIANS)), AXES[up], atol=1e-12)
 
 
 def test_an_unknown_producer_and_one_of_other_files_are_refused():

@@ -30,9 +30,7 @@ def members(path):
 def repacked(path, packing=zipfile.ZIP_STORED, **changes):
     """The file with members replaced, or dropped where they are None; meta is updated."""
     content = members(path)
-    meta = json.loads(content["meta.json"])
-    for key, value in changes.pop("meta", {}).items():
-        meta[key] = value
+    meta = json.loads(content["meta.json"]) | changes.pop("meta", {})
     content["meta.json"] = json.dumps(meta).encode()
     content |= {name.replace("__", "."): value for name, value in changes.items()}
     with zipfile.ZipFile(path, "w", packing) as archive:
@@ -49,13 +47,8 @@ def image(size, lossless=True, frames=1, mode="RGBA"):
     return buffer.getvalue()
 
 
-FILES = ["means_l.webp", "means_u.webp"]
-NO_PALETTE = {
-    "bands": 1,
-    "count": 0,
-    "codebook": [0] * 256,
-    "files": ["shN_centroids.webp", "shN_labels.webp"],
-}
+FILES, PALETTE = ["means_l.webp", "means_u.webp"], ["shN_centroids.webp", "shN_labels.webp"]
+NO_PALETTE = {"bands": 1, "count": 0, "codebook": [0] * 256, "files": PALETTE}
 
 
 @pytest.fixture
@@ -64,14 +57,11 @@ def path(tmp_path):
     return tmp_path / "a.sog"
 
 
-def test_the_mode_and_the_notes_are_kept(tmp_path):
-    write_sog(tmp_path / "a.sog", ball(9), [ANTIALIASED, "one", "two"])
-    assert sog.read_sog(tmp_path / "a.sog")[1] == ["one", "two", ANTIALIASED]
-    assert json.loads(members(tmp_path / "a.sog")["meta.json"])["model"] == "antialiased"
-
-
-def test_the_images_are_laid_out_as_published(path):
-    """Decoded by Pillow, by the formulas of the specification."""
+def test_the_images_are_laid_out_as_published(path, tmp_path):
+    """Decoded by Pillow, by the formulas of the specification; mode and notes are kept."""
+    write_sog(tmp_path / "b.sog", ball(9), [ANTIALIASED, "one", "two"])
+    assert sog.read_sog(tmp_path / "b.sog")[1] == ["one", "two", ANTIALIASED]
+    assert json.loads(members(tmp_path / "b.sog")["meta.json"])["model"] == "antialiased"
     content, read = members(path), read_sog(path)
     meta = json.loads(content["meta.json"])
     pixels = {
@@ -87,7 +77,7 @@ def test_the_images_are_laid_out_as_published(path):
     np.testing.assert_allclose(read.sh[:, 0], book[pixels["sh0.webp"][:, :3]], atol=1e-6)
     tags = pixels["quats.webp"][:, 3]
     assert ((tags >= 252) & (tags <= 255)).all() and len(set(tags)) == 4
-    assert content["meta.json"] and meta["count"] == 50 and meta["version"] == 2
+    assert (meta["count"], meta["version"]) == (50, 2)
 
 
 def test_names_of_members_lead_nowhere(path, tmp_path):
@@ -126,7 +116,7 @@ def test_names_of_members_lead_nowhere(path, tmp_path):
         ({"shN_labels__webp": image((8, 8)), "meta": {"shN": NO_PALETTE}}, "damaged"),
     ],
     ids=range(20),
-)  # fmt: skip
+)
 def test_damaged_files_are_refused(path, changes, said):
     with pytest.raises(UserError, match=said):
         read_sog(repacked(path, **changes))
@@ -181,16 +171,12 @@ def unpacked(path, folder, version=2):
     return folder / "meta.json"
 
 
-def test_a_folder_without_an_archive_is_read_by_its_json(path, tmp_path):
-    read = read_cloud(str(unpacked(path, tmp_path / "folder")))
-    stored = read_cloud(str(path))
-    assert all(np.array_equal(a, b) for a, b in zip(read.gaussians, stored.gaussians, strict=True))
-    assert (read.up, read.pruned_to) == ("-y", 40)
-
-
-def test_a_folder_may_hold_png_and_lie_in_the_archive(path, tmp_path):
+def test_folders_are_read_by_their_json_also_in_an_archive_and_with_png(path, tmp_path):
     """PNG as glTF-Transform converts them; a folder that was zipped by hand."""
     file, stored = unpacked(path, tmp_path / "folder"), read_sog(path)
+    read = read_cloud(str(file))
+    assert all(np.array_equal(a, b) for a, b in zip(read.gaussians, stored, strict=True))
+    assert (read.up, read.pruned_to) == ("-y", 40)
     with pytest.raises(UserError, match="is a folder, .* give the meta.json in it"):
         read_cloud(str(file.parent))
     with zipfile.ZipFile(tmp_path / "b.sog", "w") as archive:
@@ -209,8 +195,8 @@ def test_version_1_is_read(path, tmp_path):
     """Steps between mins and maxs, by the formulas of PlayCanvas' reader of version 1."""
     file = unpacked(path, tmp_path / "folder", 1)
     read, stored = read_sog(file), read_sog(path)
-    for name in ("means", "quats"):
-        np.testing.assert_array_equal(getattr(read, name), getattr(stored, name))
+    np.testing.assert_array_equal(read.means, stored.means)
+    np.testing.assert_array_equal(read.quats, stored.quats)
 
     def pixels(name):
         with Image.open(file.with_name(name)) as picture:
@@ -230,11 +216,7 @@ def test_version_1_is_read(path, tmp_path):
     ("section", "value", "said"),
     [
         ("means", {"files": FILES}, "count should be 0 or more, not None"),
-        (
-            "scales",
-            {"mins": [0], "maxs": [1], "files": ["scales.webp"]},
-            "mins of scales",
-        ),
+        ("scales", {"mins": [0], "maxs": [1], "files": ["scales.webp"]}, "mins of scales"),
         ("sh0", {"files": ["../folder/sh0.webp"]}, "Invalid name"),
         ("shN", {"files": ["sh0.webp"]}, "damaged"),
     ],
@@ -246,9 +228,6 @@ def test_damaged_folders_are_refused(path, tmp_path, section, value, said):
         read_sog(file)
 
 
-# ---- codebooks -----------------------------------------------------------------------------------
-
-
 def test_many_values_are_kept_better_than_by_equal_steps():
     values = np.random.default_rng(0).normal(size=20_000).astype(np.float32) ** 3
     book, rows = scalar_codebook(values)
@@ -257,8 +236,5 @@ def test_many_values_are_kept_better_than_by_equal_steps():
     assert ((book[rows] - values) ** 2).mean() < 0.2 * ((equal - values) ** 2).mean()
     nearest = np.abs(values[:500, None] - book).argmin(1)
     np.testing.assert_allclose(book[rows[:500]], book[nearest])
-
-
-def test_no_values():
     book, rows = scalar_codebook(np.zeros((0, 3), np.float32))
     assert book.shape == (256,) and rows.shape == (0, 3)

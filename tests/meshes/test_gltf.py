@@ -1,5 +1,7 @@
 """Generated glTF files with one feature each: positions and colours are those of the standard."""
 
+import functools
+import operator
 import tracemalloc
 import zlib
 
@@ -26,6 +28,15 @@ from threestudio_gaussiandreamer.meshes.gltf import read_gltf
 from threestudio_gaussiandreamer.meshes.load import load_mesh
 from threestudio_gaussiandreamer.meshes.mesh import surface_colors
 from threestudio_gaussiandreamer.priors.point_cloud import PointCloudPrior
+
+
+@pytest.fixture
+def saved(tmp_path):
+    def save(made):
+        (tmp_path / "a.glb").write_bytes(made.glb())
+        return tmp_path / "a.glb"
+
+    return save
 
 
 def test_a_picture_is_upright(saved):
@@ -172,24 +183,20 @@ def test_strips_and_fans(mode, faces, indexed, saved):
     made = Gltf()
     order = np.array([4, 2, 0, 1, 3]) if indexed else np.arange(5)
     indices = {"indices": made.accessor(order.astype("u4"))} if indexed else {}
-    made.primitive(
-        {"POSITION": np.float32(np.random.default_rng(0).random((5, 3)))}, mode=mode, **indices
-    )
+    positions = np.float32(np.random.default_rng(0).random((5, 3)))
+    made.primitive({"POSITION": positions}, mode=mode, **indices)
     np.testing.assert_array_equal(read_gltf(saved(made))[0].faces, order[np.array(faces)])
 
 
-def test_16_bit_pictures(saved):
+def test_16_bit_pictures_and_a_factor_that_tints(saved):
     grey = np.uint16([[0x4040, 0xFFFF], [0, 0x8080]])
     (part,) = read_gltf(saved(textured_quad(grey)))
     np.testing.assert_array_equal(part.texture[..., 0], [[0x40, 0xFF], [0, 0x80]])
-
-
-def test_a_factor_tints_the_texture(saved):
     path = saved(textured_quad(FOUR, sampler=NEAREST, factor=[0.2158605, 1, 1, 1]))
     np.testing.assert_allclose(color_at(path, 0.2, 0.8), [128 / 255, 0, 0], atol=2e-3)  # sRGB
 
 
-def test_nodes_are_placed_by_all_their_parents(saved):
+def test_nodes_are_placed_by_all_their_parents_and_mirrored_ones_turn_their_faces(saved):
     made = textured_quad(FOUR)
     turn = [0, 0, np.sqrt(0.5), np.sqrt(0.5)]  # +x becomes +y
     made.document["nodes"] = [
@@ -198,11 +205,7 @@ def test_nodes_are_placed_by_all_their_parents(saved):
     ]
     (part,) = read_gltf(saved(made))
     np.testing.assert_allclose(part.vertices[2], [1 - 3, 2, 5], atol=1e-12)
-
-
-def test_a_mirrored_node_turns_its_faces_round(saved):
-    made = textured_quad(FOUR)
-    made.document["nodes"][0]["scale"] = [-1, 1, 1]
+    made.document["nodes"] = [{"mesh": 0, "scale": [-1, 1, 1]}]
     (part,) = read_gltf(saved(made))
     a, b, c = part.vertices[part.faces[0]]
     assert np.cross(b - a, c - a)[2] > 0
@@ -245,30 +248,22 @@ def test_a_point_cloud_of_a_mesh_has_its_texture_s_colours(saved):
     np.testing.assert_array_equal(cloud.colors, np.array([RED, GREEN, BLUE, WHITE]) / 255)
 
 
-# ---- what isn't read -----------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    "name",
-    ["KHR_draco_mesh_compression", "EXT_meshopt_compression", "ACME_magic", "KHR_texture_basisu"],
-)
-def test_extensions_that_are_required_and_not_read_are_named(name, saved):
-    with pytest.raises(UserError, match=f"requires the glTF extension '{name}'"):
-        read_gltf(saved(textured_quad(FOUR, extensionsRequired=[name])))
-
-
-def test_extensions_that_change_no_colour_are_no_hindrance(saved):
+def test_extensions_that_are_required_and_not_read_are_named(saved):
+    for name in (
+        "KHR_draco_mesh_compression",
+        "EXT_meshopt_compression",
+        "KHR_texture_basisu",
+        "A",
+    ):
+        with pytest.raises(UserError, match=f"requires the glTF extension '{name}'"):
+            read_gltf(saved(textured_quad(FOUR, extensionsRequired=[name])))
     names = ["KHR_materials_unlit", "KHR_texture_transform", "KHR_materials_clearcoat"]
     assert read_gltf(saved(textured_quad(FOUR, extensionsRequired=names)))
 
 
 def changed(made, path, value):
     """Return the document with one value replaced."""
-    *way, last = path
-    entry = made.document
-    for key in way:
-        entry = entry[key]
-    entry[last] = value
+    functools.reduce(operator.getitem, path[:-1], made.document)[path[-1]] = value
     return made
 
 
@@ -306,9 +301,6 @@ def test_the_end_of_an_accessor_is_found_where_64_bits_overflow(saved):
     made.document["accessors"][2] |= {"count": 2**60, "byteOffset": 16}
     with pytest.raises(UserError, match="ends after its buffer view"):
         read_gltf(saved(made))
-
-
-# ---- one memory budget for everything in a file --------------------------------------------------
 
 
 def refused(made, saved):

@@ -6,10 +6,17 @@ import time
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.meshes.load import AXES, find_mesh, load_mesh
-from threestudio_gaussiandreamer.meshes.mesh import sample_surface, surface_colors
+from threestudio_gaussiandreamer.meshes.mesh import (
+    Mesh,
+    SurfaceDistance,
+    merged,
+    sample_surface,
+    surface_colors,
+)
 
 trimesh = pytest.importorskip("trimesh")
 THIRDS = np.full((1, 3), 1 / 3)
@@ -26,29 +33,8 @@ def saved(mesh, path):
     return path
 
 
-def textured_quad(image, uv=((0, 0), (1, 0), (1, 1), (0, 1)), y=0.0, size=1.0):
-    """Return a square in the xz plane, with corners in the order of ``uv``."""
-    from PIL import Image
-
-    corners = np.array([[0, y, 0], [1, y, 0], [1, y, 1], [0, y, 1]]) * [size, 1, size]
-    material = trimesh.visual.material.PBRMaterial(
-        baseColorTexture=Image.fromarray(np.asarray(image, dtype=np.uint8))
-    )
-    visual = trimesh.visual.TextureVisuals(uv=np.array(uv, dtype=float), material=material)
-    return trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], visual=visual, process=False)
-
-
 def center_color(mesh, face=0):
     return surface_colors(mesh, np.array([face]), THIRDS)[0]
-
-
-def facing(mesh, direction):
-    """Return the index of the face whose normal is closest to ``direction``."""
-    a, b, c = np.moveaxis(mesh.vertices[mesh.faces], 1, 0)
-    return int((np.cross(b - a, c - a) @ np.asarray(direction)).argmax())
-
-
-# Pose
 
 
 def test_the_box_is_centred_and_its_longest_half_side_is_the_scale(tmp_path):
@@ -100,9 +86,6 @@ def test_a_scene_is_merged_with_its_transforms(tmp_path):
     np.testing.assert_allclose(np.ptp(mesh.vertices, axis=0), [2, 0.5, 0.5], atol=1e-6)
 
 
-# Colours
-
-
 def test_colours_of_vertices_faces_and_materials(tmp_path):
     mesh = load_mesh(saved(box(), tmp_path / "plain.glb"))
     assert not mesh.has_colors
@@ -126,40 +109,57 @@ def test_colours_of_vertices_faces_and_materials(tmp_path):
 
 
 def test_a_texture_is_tinted_by_its_material(tmp_path):
-    quad = textured_quad(np.full((2, 2, 3), 255))
     for tint, seen in ([255, 0, 255, 255], [1, 0, 1]), ([102, 102, 102, 255], 1):
-        quad.visual.material.baseColorFactor = tint  # the second is trimesh's "no colour given"
-        found = center_color(load_mesh(saved(quad, tmp_path / "a.glb")))
+        material = trimesh.visual.material.PBRMaterial(
+            baseColorTexture=Image.new("RGB", (2, 2), "white"),
+            baseColorFactor=tint,  # the second is trimesh's "no colour given"
+        )
+        visual = trimesh.visual.TextureVisuals(uv=np.eye(3, 2), material=material)
+        triangle = trimesh.Trimesh(np.eye(3), [[0, 1, 2]], visual=visual, process=False)
+        found = center_color(load_mesh(saved(triangle, tmp_path / "a.glb")))
         np.testing.assert_allclose(found, seen, atol=1e-6)
 
 
-def test_a_scene_of_textures_and_colours_keeps_them_apart(tmp_path):
-    """Two textures of different sizes (one of them repeating), vertex colours and a plain part."""
-    red, checks = np.tile([[[255, 0, 0]]], (3, 5, 1)), [[[0, 0, 255], [0, 255, 0]]]
-    repeated = textured_quad(checks, uv=((0, 0), (4, 0), (4, 1), (0, 1)), y=1.0)
-    coloured = box(center=(5, 0, 0))
-    coloured.visual.vertex_colors = [255, 255, 0, 255]
-    scene = trimesh.Scene([textured_quad(red), repeated, coloured, box(center=(9, 0, 0))])
-    mesh = load_mesh(saved(scene, tmp_path / "a.glb"))
-    assert len(mesh.faces) == 28 and mesh.tile_index.shape == (28,)
-    centres = mesh.vertices[mesh.faces].mean(axis=1)
-    order = np.lexsort(centres[:, 1:].T[::-1])  # by the file's x, then y
-    textured = np.flatnonzero(mesh.tile_index >= 0)
-    red_face, striped_face = textured[np.argsort(centres[textured, 2], kind="stable")][::2]
-    np.testing.assert_allclose(center_color(mesh, red_face), [1, 0, 0], atol=1e-6)
-    across = mesh.uv[mesh.faces[striped_face], 0]
-    weights = [
-        np.linalg.lstsq(np.stack([across, np.ones(3)]), [4 * u, 1], rcond=None)[0]
-        for u in (0.0625, 0.1875, 0.3125, 0.8125)
+def test_a_merged_scene_has_the_colours_of_its_parts():
+    """Two textures of other sizes, one repeating, colours of vertices, of faces, and none."""
+    rng, corners = (
+        np.random.default_rng(0),
+        np.float64([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]),
+    )
+    plain, uv = Mesh(corners, np.array([[0, 1, 2], [0, 2, 3]])), corners[:, :2].astype(np.float32)
+    pictures = [rng.integers(0, 256, (*size, 3), np.uint8) for size in ((3, 5), (1, 2))]
+    parts = [plain._replace(uv=uv, texture=pictures[0])]
+    parts += [plain._replace(uv=4 * uv, texture=pictures[1], vertex_colors=rng.random((4, 3)))]
+    parts += [plain._replace(vertex_colors=rng.random((4, 3))), plain]
+    parts += [plain._replace(face_colors=rng.random((2, 3)))]
+    weights, faces = rng.dirichlet([1] * 3, 10), np.arange(10)
+    expected = [
+        surface_colors(part, faces[:2], weights[2 * i :][:2]) for i, part in enumerate(parts)
     ]
-    # at u = 1/4, 3/4, 5/4 and 13/4 of the texture
-    stripes = surface_colors(mesh, np.full(4, striped_face), np.array(weights))
-    np.testing.assert_allclose(stripes, [[0, 0, 1], [0, 1, 0], [0, 0, 1], [0, 0, 1]], atol=1e-5)
-    np.testing.assert_allclose(center_color(mesh, order[-13]), [1, 1, 0], atol=1e-6)
-    np.testing.assert_allclose(center_color(mesh, order[-1]), 0.5, atol=1e-6)
+    mesh = merged(parts)
+    assert len(mesh.tiles) == 2
+    found = surface_colors(mesh, faces, weights)
+    np.testing.assert_allclose(found, np.concatenate(expected), atol=1e-6)
 
 
-# Bad input
+def test_texels_are_bilinear_and_repeat():
+    """Values at texel centres are the texels', halfway between two their mean; outside [0, 1] the
+    texture repeats.
+    """
+    image = [[[255, 0, 0], [0, 255, 0]], [[0, 0, 255], [255, 255, 255]]]
+    places = np.float32([[0.25, 0.75], [0.5, 0.75], [0.75, 0.25], [1.25, -0.25], [0.0, 0.75]])
+    uv, faces = np.repeat(places, 3, axis=0), np.arange(15).reshape(5, 3)
+    mesh = Mesh(np.zeros((15, 3)), faces, uv=uv, texture=np.array(image, np.uint8))
+    expected = [[1, 0, 0], [0.5, 0.5, 0], [1, 1, 1], [1, 0, 0], [0.5, 0.5, 0]]
+    found = surface_colors(mesh, np.arange(5), np.full((5, 3), 1 / 3))
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+
+
+def test_surface_distances_of_a_sphere(tmp_path):
+    mesh = load_mesh(saved(trimesh.creation.icosphere(4), tmp_path / "a.ply"))
+    points = np.array([[1.5, 0, 0], [0, 0, 0], [0, 1.0, 0]])
+    # spacing of 2e5 samples on a sphere is 0.008; the icosphere's faces lie up to 0.002 inside
+    np.testing.assert_allclose(SurfaceDistance(mesh)(points), [0.5, 1.0, 0.0], atol=0.012)
 
 
 def test_objects_as_programs_write_them_are_read(tmp_path):
@@ -251,9 +251,6 @@ def test_bad_options_are_named(tmp_path, options, message):
         load_mesh(saved(box(), tmp_path / "a.ply"), **options)
 
 
-# Colours of OFF files, which trimesh doesn't read
-
-
 OFF_FACES = "3 0 2 1\n3 0 1 3\n3 0 3 2\n3 1 2 3\n"
 CORNERS = ("0 0 0", "1 0 0", "0 1 0", "0 0 1")
 
@@ -286,18 +283,13 @@ def test_colours_of_an_off_files_vertices(tmp_path, head, colors):
         ("COFF", " nan 0 0 1", "", "vertices"),
     ],
 )
-def test_other_colours_of_an_off_file_are_reported(
-    tmp_path, caplog, head, of_vertices, of_faces, warned
-):
-    path = tmp_path / "a.off"
+def test_other_colours_of_an_off_file(tmp_path, caplog, head, of_vertices, of_faces, warned):
     vertices = "".join(f"{corner}{of_vertices}\n" for corner in CORNERS)
-    path.write_text(f"{head}\n4 4 6\n" + vertices + OFF_FACES.replace("\n", f"{of_faces}\n"))
-    assert not load_mesh(path).has_colors
+    faces = OFF_FACES.replace("\n", f"{of_faces}\n")
+    (tmp_path / "a.off").write_text(f"{head}\n4 4 6\n{vertices}{faces}")
+    assert not load_mesh(tmp_path / "a.off").has_colors
     found = f"colours of its {warned} aren't read" in caplog.text
     assert found if warned else "colours" not in caplog.text
-
-
-# Real meshes
 
 
 def test_the_bundled_toy_is_found_by_its_name_and_faces_the_front(tmp_path, monkeypatch):

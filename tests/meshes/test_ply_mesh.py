@@ -20,12 +20,8 @@ TEXTURE = ["comment TextureFile t.png"]
 
 
 def ply(folder, *, faces, columns=(), corners=None, comments=(), binary=True, more=()):
-    """Write a square.
-
-    Args:
-        columns: (name, type, struct's code, values) of the vertices.
-        corners: texture coordinates of all vertices, written for the corners of the faces.
-        more: (name, type, struct's code, values) of the faces.
+    """Write a square: (name, type, struct's code, values) are ``columns`` of the vertices or
+    ``more`` of the faces, ``corners`` texture coordinates of vertices, written for the corners.
     """
     Image.fromarray(TEXELS).save(folder / "t.png")
     columns = [(axis, "float", "f", SQUARE[:, i]) for i, axis in enumerate("xyz")] + [*columns]
@@ -77,16 +73,13 @@ def test_texture_coordinates_of_vertices_and_corners(tmp_path, binary, faces):
     assert mesh.faces.shape == (1, 3) and mesh.texture is not None
 
 
-def test_vertices_at_seams_are_divided(tmp_path):
+def test_seams_and_several_textures(tmp_path):
     corners = ply(tmp_path, faces=TRIANGLES, corners=UV, comments=TEXTURE).read_bytes()
     at = corners.rindex(UV[0].tobytes())
     moved = corners[:at] + np.float32([0.75, 0.25]).tobytes() + corners[at + 8 :]
     (tmp_path / "a.ply").write_bytes(moved)
     (part,) = read_parts(tmp_path / "a.ply")
-    assert len(part.vertices) == 5
-
-
-def test_several_textures(tmp_path):
+    assert len(part.vertices) == 5  # those at the seam are divided
     Image.fromarray(TEXELS[::-1]).save(tmp_path / "other.png")
     comments = [*TEXTURE, "comment TextureFile other.png"]
     more = [("texnumber", "int", "i", [0, 1])]
@@ -131,10 +124,7 @@ def test_doubles_keep_their_digits(tmp_path):
         (lambda text: text[:-1], "truncated"),
         (lambda text: text[:-14], "truncated"),
         (lambda text: text[:-4] + struct.pack("<I", 4), "a vertex beyond the last of 4"),
-        (
-            lambda text: text.replace(b"face 2", b"face 9999999"),
-            "9999999 rows of .face.",
-        ),
+        (lambda text: text.replace(b"face 2", b"face 9999999"), "9999999 rows of .face."),
         (lambda text: text.replace(b"face 2", b"face 3"), "truncated"),
         (lambda text: text.replace(b"float z", b"float w"), "its vertices have no x, y, z"),
     ],

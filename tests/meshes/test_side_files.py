@@ -28,13 +28,11 @@ def gltf_beside(tmp_path, uri="picture%20one.png"):
     return tmp_path / "a.gltf"
 
 
-def test_pictures_and_buffers_are_found(tmp_path):
+def test_pictures_and_buffers_are_found_and_a_missing_one_is_named(tmp_path, caplog):
     (tmp_path / "picture one.png").write_bytes(png(FOUR))
-    np.testing.assert_allclose(color_at(gltf_beside(tmp_path), 0.2, 0.8), RED / 255)
-
-
-def test_a_missing_texture_is_named_and_leaves_grey(tmp_path, caplog):
     path = gltf_beside(tmp_path)
+    np.testing.assert_allclose(color_at(path, 0.2, 0.8), RED / 255)
+    (tmp_path / "picture one.png").unlink()
     np.testing.assert_allclose(color_at(path, 0.2, 0.8), HALF)
     assert "names the file 'picture one.png', which does not exist" in caplog.text
     np.testing.assert_allclose(PointCloudPrior({"path": str(path)})("a fox").colors, HALF)
@@ -55,20 +53,18 @@ def test_a_fifo_beside_a_mesh_is_refused(kind, tmp_path):
         path.write_text(f"mtllib {'fifo.png' if kind == 'mtl' else 'a.mtl'}\n" + TRIANGLE)
         (tmp_path / "a.mtl").write_text("newmtl m\nmap_Kd fifo.png\n")
     caught = []
-    thread = threading.Thread(target=lambda: caught.append(error_of(path)), daemon=True)
+
+    def load():
+        try:
+            load_mesh(path)
+        except UserError as error:
+            caught.append(str(error))
+
+    thread = threading.Thread(target=load, daemon=True)
     thread.start()
     thread.join(20)
     assert caught and "not a regular file" in caught[0]
 
-
-def error_of(path):
-    try:
-        load_mesh(path)
-    except UserError as error:
-        return str(error)
-
-
-# ---- OBJ -----------------------------------------------------------------------------------------
 
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nusemtl m\nf 1/1 2/2 3/3\n"
 

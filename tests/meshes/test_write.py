@@ -100,14 +100,11 @@ def test_the_material_is_rough_and_not_metallic(unlit, tmp_path):
     assert ("extensions" in found["materials"][0]) == unlit
 
 
-def test_an_obj_names_its_files_and_every_position_once(tmp_path):
+def test_an_obj_names_its_files_and_every_position_once_and_normals_point_outwards(tmp_path):
     write_textured_mesh(tmp_path / "box.obj", MESH)
     lines = (tmp_path / "box.obj").read_text().splitlines()
     assert lines[0] == "mtllib box.mtl" and sum(line.startswith("v ") for line in lines) == 8
     assert "map_Kd box.png" in (tmp_path / "box.mtl").read_text().splitlines()
-
-
-def test_normals_point_outwards_and_are_unit():
     joined = welded(MESH)
     assert len(joined.positions) == 8
     np.testing.assert_allclose(np.linalg.norm(joined.normals, axis=1), 1)

@@ -23,6 +23,17 @@ from threestudio_gaussiandreamer.surface.bake import (
 from threestudio_gaussiandreamer.surface.fusion import Renders
 
 FOVY = math.radians(50)
+BALL = trimesh.creation.icosphere(subdivisions=2)
+
+
+def on_ball(atlas):
+    return Mesh(BALL.vertices[atlas.rows], atlas.faces, uv=atlas.uv)
+
+
+def front():
+    """A camera in front."""
+    orbit = Orbit(*(torch.tensor([value]) for value in (0.0, 0.0, 3.0, FOVY)))
+    return orbit.c2w.double().numpy()
 
 
 def cameras(count, turn=0.0):
@@ -35,18 +46,21 @@ def cameras(count, turn=0.0):
 
 @pytest.mark.parametrize("unwrapped", [in_charts, in_grid])
 def test_renders_of_the_baked_mesh_are_those_it_was_baked_from(unwrapped):
-    ball = trimesh.creation.icosphere(subdivisions=2)
-    painted = Mesh(ball.vertices, ball.faces, vertex_colors=(0.5 + 0.4 * ball.vertices))
+    painted = Mesh(BALL.vertices, BALL.faces, vertex_colors=(0.5 + 0.4 * BALL.vertices))
     caster, size = MeshCaster(painted), 160
     images = caster.render_views([(c2w, FOVY) for c2w in cameras(16)], size, size, supersample=1)
     renders = Renders(cameras(16), np.round(255 * images).astype(np.uint8), FOVY)
-    atlas = unwrapped(ball.vertices, ball.faces, 160)
-    mesh = Mesh(ball.vertices[atlas.rows], atlas.faces, uv=atlas.uv)
+    atlas = unwrapped(BALL.vertices, BALL.faces, 160)
+    mesh = on_ball(atlas)
     baked = MeshCaster(mesh._replace(texture=bake(mesh, renders, 160)))
     unseen = [(c2w, FOVY) for c2w in cameras(5, turn=60)]
     ours, truth = (each.render_views(unseen, 96, 96) for each in (baked, caster))
-    error = np.square(ours - truth).mean()
-    assert -10 * np.log10(error) > 40
+    assert -10 * np.log10(np.square(ours - truth).mean()) > 40
+    assert 0 <= atlas.uv.min() and atlas.uv.max() <= 1  # the corners of the faces are kept
+    corners = np.sort(atlas.rows[atlas.faces], axis=1)
+    np.testing.assert_array_equal(corners, np.sort(BALL.faces, axis=1))
+    again = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    assert again.volume == pytest.approx(BALL.volume)  # and their orientation
 
 
 def test_what_is_hidden_takes_nothing():
@@ -56,13 +70,10 @@ def test_what_is_hidden_takes_nothing():
     faces = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]])
     square = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * [0.4, 0.9] + 0.05
     mesh = Mesh(vertices, faces, uv=np.concatenate([square, square + [0.5, 0]]))
-    orbit = Orbit(*(torch.tensor([value]) for value in (0.0, 0.0, 3.0, FOVY)))
-    rgba = np.zeros((1, 64, 64, 4), np.uint8)
-    rgba[...] = [200, 40, 10, 255]
-    texture = bake(mesh, Renders(orbit.c2w.double().numpy(), rgba, FOVY), 32)
+    rgba = np.full((1, 64, 64, 4), [200, 40, 10, 255], np.uint8)
+    texture = bake(mesh, Renders(front(), rgba, FOVY), 32)
     assert (texture[4:-4, 4:12] == [200, 40, 10]).all()
-    caster = MeshCaster(mesh)
-    _, face, _ = caster.visible(orbit.c2w[0].double().numpy(), FOVY, 64, 64)
+    _, face, _ = MeshCaster(mesh).visible(front()[0], FOVY, 64, 64)
     assert set(np.unique(face)) <= {-1, 0, 1}
 
 
@@ -77,23 +88,14 @@ def test_gaps_take_the_mean_of_their_surroundings():
 
 
 def test_a_hidden_face_takes_the_colour_of_the_nearest_one():
-    ball = trimesh.creation.icosphere(subdivisions=2)
-    atlas = in_grid(ball.vertices, ball.faces, 120)
-    mesh = Mesh(ball.vertices[atlas.rows], atlas.faces, uv=atlas.uv)
+    mesh = on_ball(in_grid(BALL.vertices, BALL.faces, 120))
     painted = mesh._replace(vertex_colors=np.where(mesh.vertices[:, :1] > 0, [1, 0, 0], [0, 0, 1]))
-    orbit = Orbit(*(torch.tensor([value]) for value in (0.0, 0.0, 3.0, FOVY)))
-    c2w = orbit.c2w.double().numpy()
-    images = MeshCaster(painted).render_views([(c2w[0], FOVY)], 96, 96, supersample=1)
-    seen_from_the_front = Renders(c2w, np.round(255 * images).astype(np.uint8), FOVY)
-    baked = mesh._replace(texture=bake(mesh, seen_from_the_front, 120))
+    images = MeshCaster(painted).render_views([(front()[0], FOVY)], 96, 96, supersample=1)
+    renders = Renders(front(), np.round(255 * images).astype(np.uint8), FOVY)
+    baked = mesh._replace(texture=bake(mesh, renders, 120))
     behind = np.flatnonzero(mesh.vertices[mesh.faces].mean(axis=1)[:, 0] < 0)
     colors = surface_colors(baked, behind, np.full((len(behind), 3), 1 / 3))
     assert (colors[:, 0] > 0.9).all() and (colors[:, 2] < 0.1).all()
-
-
-# ---- texture coordinates -------------------------------------------------------------------------
-
-BALL = trimesh.creation.icosphere(subdivisions=2)
 
 
 def texels_of(corners, size):
@@ -105,16 +107,6 @@ def texels_of(corners, size):
     columns, rows = first.T
     pairs = [(x, y) for x in (columns, right) for y in (rows, down)]
     return {texel for x, y in pairs for texel in zip(x, y, strict=True)}
-
-
-@pytest.mark.parametrize("method", [in_charts, in_grid])
-def test_faces_keep_their_corners_and_lie_in_the_texture(method):
-    found = method(BALL.vertices, BALL.faces, 128)
-    assert 0 <= found.uv.min() and found.uv.max() <= 1
-    corners = np.sort(found.rows[found.faces], axis=1)
-    np.testing.assert_array_equal(corners, np.sort(BALL.faces, axis=1))
-    again = trimesh.Trimesh(BALL.vertices[found.rows], found.faces, process=False)
-    assert again.volume == pytest.approx(BALL.volume)  # the orientation is kept too
 
 
 def test_triangles_of_the_grid_share_no_texel():

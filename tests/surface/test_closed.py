@@ -30,9 +30,9 @@ def welded(vertices, faces):
     return positions, rows.reshape(-1)[faces]
 
 
-def boxes_with_a_common_edge():
+def two_boxes(offset):
     box = trimesh.creation.box()
-    return welded(*joined((box.vertices, box.faces), (box.vertices + [1, 1, 0], box.faces)))
+    return welded(*joined((box.vertices, box.faces), (box.vertices + offset, box.faces)))
 
 
 def test_small_parts_and_cavities_are_dropped():
@@ -43,12 +43,10 @@ def test_small_parts_and_cavities_are_dropped():
     np.testing.assert_array_equal(kept[1], faces)
     assert kept[2] == 1  # a cavity can't be seen
 
-
-@pytest.mark.parametrize(("radius", "dropped"), [(0.5, 0), (0.11, 0), (0.095, 1)])
-def test_parts_above_the_share_stay(radius, dropped):
-    two = joined(ball(), ball(radius, 2, (2, 0, 0)))
-    _, faces, count = without_small_parts(*two, 0.01)
-    assert count == dropped and (len(faces) == len(two[1])) == (not dropped)
+    for radius, dropped in ((0.5, 0), (0.11, 0), (0.095, 1)):
+        two = joined(ball(), ball(radius, 2, (2, 0, 0)))
+        _, faces, count = without_small_parts(*two, 0.01)
+        assert count == dropped and (len(faces) == len(two[1])) == (not dropped)
 
 
 @pytest.mark.parametrize("factor", [2.0**-20, 2.0**20])
@@ -63,43 +61,33 @@ def test_simplified_meshes_stay_closed_and_keep_their_size_at_any_scale(factor):
         assert found.volume == pytest.approx(4.12, rel=0.08)
 
 
-def test_a_mesh_of_few_faces_is_left_as_it_is():
+def test_a_mesh_of_few_faces_is_left_as_it_is_and_what_cant_be_closed_is_refused():
     vertices, faces = ball(subdivisions=1)
     again = simplified(vertices, faces, 5000)
     assert len(again[1]) == len(faces) and is_closed(again[1])
     np.testing.assert_allclose(np.sort(again[0], axis=0), np.sort(vertices, axis=0))
-
-
-def test_what_cant_be_closed_is_refused():
     parts = joined(*(ball(subdivisions=1, place=(3 * k, 0, 0)) for k in range(60)))
     with pytest.raises(UserError, match="can't be closed with 100 faces"):
         simplified(*parts, 100)
-    vertices, faces = ball(subdivisions=1)  # one with a hole
     with pytest.raises(UserError, match="closed with 5000 faces"):
-        simplified(vertices, faces[1:], 5000)
+        simplified(vertices, faces[1:], 5000)  # with a hole
 
 
-def test_boxes_that_share_an_edge_are_separated():
-    vertices, faces = boxes_with_a_common_edge()
+def test_boxes_that_share_an_edge_or_a_corner_are_separated():
+    vertices, faces = two_boxes([1, 1, 0])
     assert not is_closed(faces)
     moved, apart = separated(vertices, faces)
     assert is_closed(apart) and is_closed(welded(moved, apart)[1])
     parts = trimesh.Trimesh(moved, apart, process=False).split()
     assert len(parts) == 2
     assert all(part.volume == pytest.approx(1, abs=0.1) for part in parts)
-
-
-def test_boxes_that_share_a_corner_are_separated():
-    box = trimesh.creation.box()
-    touching = welded(*joined((box.vertices, box.faces), (box.vertices + 1, box.faces)))
-    moved, apart = separated(*touching)
+    moved, apart = separated(*two_boxes(1))
     assert len(moved) == 16 and len(np.unique(moved, axis=0)) == 16 and is_closed(apart)
 
 
 def test_a_fold_is_dropped():
     _, faces = ball(subdivisions=1)
-    fold = [[0, 1, 2], [2, 1, 0], [3, 3, 4]]
-    kept = without_folds(np.concatenate([faces, [[90, 91, 92], [92, 91, 90], fold[2]]]))
+    kept = without_folds(np.concatenate([faces, [[90, 91, 92], [92, 91, 90], [3, 3, 4]]]))
     np.testing.assert_array_equal(kept, faces)
 
 

@@ -29,9 +29,9 @@ def views_of_a_ball(elevations):
     yield from zip(viewmats, Ks, depth * alpha, torch.zeros_like(depth), alpha, strict=True)
 
 
-def fused(elevations, resolution=32):
+def fused(views, resolution=32):
     fusion = DepthFusion(-torch.full((3,), RADIUS), torch.full((3,), RADIUS), resolution)
-    for view in views_of_a_ball(elevations):
+    for view in views:
         fusion.add(*view)
     return fusion
 
@@ -42,7 +42,7 @@ def radii(fusion):
 
 
 def test_the_distance_is_zero_at_the_surface():
-    fusion = fused([-60.0, -30, 0, 15, 30, 60, -15, 45, 75, -75, 5, -45])
+    fusion = fused(views_of_a_ball([-60.0, -30, 0, 15, 30, 60, -15, 45, 75, -75, 5, -45]))
     field, distance = fusion.field(), radii(fusion) - RADIUS
     assert (field[distance > fusion.cell] > 0).all()
     assert (field[distance < -fusion.cell] < 0).all()
@@ -51,7 +51,9 @@ def test_the_distance_is_zero_at_the_surface():
 
 
 def test_what_no_view_sees_is_inside_and_the_border_outside():
-    field = fused([60.0, 70, 80]).field()  # from above: the underside is never seen
+    field = fused(
+        views_of_a_ball([60.0, 70, 80])
+    ).field()  # from above: the underside is never seen
     x, y, z = (n // 2 for n in field.shape)
     assert field[x, y, z] < 0 and field[x, y, 4] < 0
     for axis in range(3):
@@ -64,10 +66,7 @@ def test_an_uncertain_depth_counts_less():
         (viewmat, K, depth - 0.2 * alpha, torch.full_like(depth, 1.0), alpha)
         for viewmat, K, depth, _, alpha in views
     ]
-    fusion = DepthFusion(-torch.full((3,), RADIUS), torch.full((3,), RADIUS), 32)
-    for view in [*views, *wrong]:
-        fusion.add(*view)
-    right = fused([0.0, 20, 40, -20, -40]).field()
+    fusion, right = fused([*views, *wrong]), fused(views).field()
     near = np.abs(radii(fusion) - RADIUS) < fusion.cell
     assert np.abs(fusion.field()[near] - right[near]).mean() < 0.05
 
@@ -75,7 +74,4 @@ def test_an_uncertain_depth_counts_less():
 @pytest.mark.parametrize("alpha", [0.3, 0.6])
 def test_outlines_are_at_half_the_opacity(alpha):
     views = [(*view[:4], alpha * view[4]) for view in views_of_a_ball([0.0, 30, -30, 60])]
-    fusion = DepthFusion(-torch.full((3,), RADIUS), torch.full((3,), RADIUS), 16)
-    for view in views:
-        fusion.add(*view)
-    assert (fusion.field() < 0).any() == (alpha > 0.5)
+    assert (fused(views, 16).field() < 0).any() == (alpha > 0.5)

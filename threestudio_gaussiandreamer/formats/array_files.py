@@ -32,8 +32,7 @@ def read_arrays(
 
     Args:
         kind: what the file is, for messages ("motion file").
-        required: names of arrays that must be in the file.
-        optional: names of arrays that may be missing; other arrays are not read.
+        required, optional: names of arrays that must or may be in it; others are not read.
 
     Raises:
         UserError: the file is neither NPZ nor NPY nor a pickle, is damaged, lacks a required array

@@ -29,6 +29,8 @@ PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 BITS = (11, 10, 11)
 SH_REACH = 4.0
 """Harmonics above degree 0 are clipped to [-SH_REACH, SH_REACH]."""
+MAX_STORED_LOG = 20.0
+"""Logarithms of scales are clipped to plus and minus this, as other readers expect."""
 
 
 def write_compressed_ply(
@@ -129,7 +131,7 @@ def _packed(
     gaussians: Gaussians,
 ) -> tuple[Float[np.ndarray, "C 3 2 3"], Integer[np.ndarray, "N 4"]]:
     """Return minima and maxima of each chunk, filled up with the last Gaussian, and the words."""
-    scales = gaussians.log_scales.clip(-20, 20)  # as other readers expect
+    scales = gaussians.log_scales.clip(-MAX_STORED_LOG, MAX_STORED_LOG)
     values = np.stack([gaussians.means, scales, sh0_to_rgb(gaussians.sh[:, 0])], axis=1)
     count, missing = len(values), -len(values) % CHUNK
     values = np.pad(values, ((0, missing), (0, 0), (0, 0)), "edge") if missing else values

@@ -1,9 +1,8 @@
 """Gaussians in GLB files by the glTF extension KHR_gaussian_splatting, plain or as SPZ.
 
-Plain files follow the ratified extension: scales and opacities are linear, quaternions xyzw,
-harmonics with the Condon-Shortley phase as in PLY files, all float32. ``COLOR_0`` lets programs
-without the extension show coloured points. Axes are glTF's, y up, front +z. ``extras`` of the asset
-hold antialiasing and notes.
+Scales and opacities are linear, quaternions xyzw, harmonics with the Condon-Shortley phase as in a
+PLY, all float32; axes are y up, front +z. ``COLOR_0`` lets programs without the extension show
+coloured points. ``extras`` of the asset hold antialiasing and notes.
 
 Files with an SPZ in a buffer view are written as CesiumJS reads them, which takes SPZ's coordinates
 for glTF's. The draft of that extension wants them half a turn apart; files of programs that follow

@@ -313,7 +313,7 @@ def _read_colors(table: PlyTable) -> Float[np.ndarray, "N 3"]:
     diffuse = ("diffuse_red", "diffuse_green", "diffuse_blue")
     for names in (EXACT_COLORS, COLORS, diffuse, ("r", "g", "b")):
         if table.has(names):
-            return unit_colors(table[names], table.types[names[0]], table.path)
+            return unit_colors(table[names], table.types[names[0]])
     if table.has(SH_CONSTANT):
         return sh0_colors(table[SH_CONSTANT])
     logger.warning("%s has no colours: grey is used", table.path)
@@ -321,10 +321,10 @@ def _read_colors(table: PlyTable) -> Float[np.ndarray, "N 3"]:
 
 
 def unit_colors(
-    colors: Float[np.ndarray, "N 3"], stored_type: np.dtype, path: str | os.PathLike
+    colors: Float[np.ndarray, "N 3"], stored_type: np.dtype
 ) -> Float[np.ndarray, "N 3"]:
     """Convert colours to [0, 1], of integers of 8 or 16 bits, or numbers up to 1. A ``stored_type``
-    of 1 or 2 bytes says which, else the values do; UserError if they fit none of these ranges.
+    of 1 or 2 bytes says which, else the values do; Unreadable if they fit none of these ranges.
     """
     integer = np.issubdtype(stored_type, np.integer)
     finite = colors[np.isfinite(colors)]
@@ -337,11 +337,9 @@ def unit_colors(
         full = 65535
     else:
         full = 1
-    if low < MIN_UNIT * full or high > MAX_UNIT * full:
-        raise UserError(
-            f"{str(path)!r}: its colours range from {low:g} to {high:g}; integers from 0 to 255, "
-            "or to 65535 where they have 16 bits, or numbers from 0 to 1 were expected"
-        )
+    said = f"its colours range from {low:g} to {high:g}; integers from 0 to 255, or to 65535 where "
+    said += "they have 16 bits, or numbers from 0 to 1 were expected"
+    require(low >= MIN_UNIT * full and high <= MAX_UNIT * full, said)
     return colors / np.float32(full)
 
 

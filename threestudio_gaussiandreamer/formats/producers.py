@@ -84,13 +84,10 @@ def producer_axes(name: str, kind: str) -> Axes:
 
 
 def from_producer(cloud: StoredCloud, name: str, suffix: str = ".ply") -> StoredCloud:
-    """Return the cloud of a producer's file with y up and its front towards +z.
+    """Return the cloud of a producer's file, with this extension, with y up and its front at +z.
 
     The producer's axes are those of its PLYs. Formats with axes of their own were turned on the
     way from a PLY by their definition, except those that the producer writes in a PLY's axes.
-
-    Args:
-        suffix: the file's extension.
 
     Raises:
         UserError: the producer is unknown, or doesn't write Gaussians.

@@ -36,18 +36,17 @@ def reading(path: str | PathLike, kind: str) -> Iterator[Path]:
             yield path
     except (UserError, MemoryError):
         raise
-    except ImportError as error:  # of a package that reads the format
-        raise UserError(f"cannot read {where}: {error}") from error
-    except Unreadable as error:
-        raise UserError(f"{where}: {error}") from error
-    except OSError as error:
-        other = f" ({error.filename})" if error.filename not in (None, str(path)) else ""
-        raise UserError(f"cannot read {where}: {error.strerror or error}{other}") from error
     except Exception as error:  # parsers raise errors of many types
         reason = f"{type(error).__name__}: {error}"[:200]
-        raise UserError(
-            f"{where}: it is truncated, damaged or of another format ({reason})"
-        ) from error
+        said = f"{where}: it is truncated, damaged or of another format ({reason})"
+        if isinstance(error, ImportError):  # of a package that reads the format
+            said = f"cannot read {where}: {error}"
+        elif isinstance(error, Unreadable):
+            said = f"{where}: {error}"
+        elif isinstance(error, OSError):
+            other = f" ({error.filename})" if error.filename not in (None, str(path)) else ""
+            said = f"cannot read {where}: {error.strerror or error}{other}"
+        raise UserError(said) from error
 
 
 def require(fits: bool, problem: str) -> None:

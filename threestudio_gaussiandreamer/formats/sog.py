@@ -4,9 +4,9 @@ in a zip archive (developer.playcanvas.com, "The SOG Format").
 Gaussian i, along a Morton curve, is pixel i of each image but the palette's. The axes are those of
 the PLY, as splat-transform writes and reads them (-y up), though the specification says y up.
 
-Version 2 is written. Also read is version 1, which has no codebooks: the bytes of scales, sh0 and
-shN are steps between ``mins`` and ``maxs``, those of sh0's alpha of the logit of the opacity; and
-files without an archive, by their ``meta.json``, from whose folder alone images are read."""
+Version 2 is written. Also read are version 1, without codebooks: the bytes of scales, sh0, whose
+alpha is the logit of the opacity, and shN are steps between ``mins`` and ``maxs``; and files
+without an archive, by their ``meta.json``, from whose folder alone images are read."""
 
 import io
 import json

@@ -1,12 +1,10 @@
 """USDA text of one ParticleField3DGaussianSplat prim, the Gaussians of OpenUSD from 26.03 on.
 
 Scales and opacities are linear, quaternions (w, x, y, z), coefficients of a Gaussian one after the
-other, all float32 with 9 digits. Axes: y up, front +z; one unit is one metre. Antialiasing and the
-notes are in the layer's ``customLayerData``.
-
-Text of one such prim, with one line for each attribute, also inside a USDZ, is read and written
-without a library; all else is read by OpenUSD where it is installed. Other attributes and the unit
-of the layer are ignored."""
+other, all float32 with 9 digits; y up, front +z; one unit is one metre. Antialiasing and the notes
+are in the layer's ``customLayerData``. Text of one such prim, with a line for each attribute, also
+inside a USDZ, is read and written without a library; all else is read by OpenUSD where it is
+installed. Other attributes and the unit of the layer are ignored."""
 
 import io
 import os
@@ -79,8 +77,7 @@ def write_usda(path: str | os.PathLike, gaussians: Gaussians, notes: Sequence[st
 
 def write_usdz(path: str | os.PathLike, gaussians: Gaussians, notes: Sequence[str] = ()) -> None:
     """Write a USDZ, which phones open: a zip archive of one USDA layer, not compressed, whose
-    content begins at a multiple of 64 bytes. Arguments and errors are those of :func:`write_usda`,
-    and the layer may have 2 GiB at most.
+    content begins at a multiple of 64 bytes; the rest is as for :func:`write_usda`.
     """
     gaussians = finite(gaussians, str(path))
     layer = zipfile.ZipInfo(LAYER)  # without a date, so that files are reproducible

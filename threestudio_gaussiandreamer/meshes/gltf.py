@@ -373,7 +373,7 @@ class _Scene:
             require(known, f"a face names a vertex beyond the last of {count}")
         self.document.budget.spend_geometry(0, len(corners) // (3 if mode == TRIANGLES else 1))
         faces = _faces(mode, corners.astype(np.int64))
-        positions = self._attribute(primitive, "POSITION", ("VEC3",), count, weights)
+        positions = self._attribute(primitive, "POSITION", count, weights)
         world, colors = self.worlds[index], None
         if "skin" in node:
             vertices = self._skinned(node["skin"], attributes, positions)
@@ -384,9 +384,7 @@ class _Scene:
             if np.linalg.det(world[:3, :3]) < 0:
                 faces = faces[:, ::-1]  # glTF: a mirrored node reverses the winding of its faces
         if "COLOR_0" in attributes:
-            kinds = ("VEC3", "VEC4")
-            found = self._attribute(primitive, "COLOR_0", kinds, count, weights, normalize=True)
-            colors = unit_rgb(found)
+            colors = unit_rgb(self._attribute(primitive, "COLOR_0", count, weights))
         surface = self._surface(primitive.get("material"))
         if surface.factor is not None:  # times COLOR_0
             own = 1 if colors is None else colors
@@ -398,7 +396,7 @@ class _Scene:
         if name not in attributes:
             log.warning("%s has a texture for %s, which is missing", self.document.path, name)
             return part
-        uv = self._attribute(primitive, name, ("VEC2",), count, weights)
+        uv = self._attribute(primitive, name, count, weights)
         uv = np.nan_to_num(uv).clip(-LARGEST_UV, LARGEST_UV)
         if surface.transform is not None:
             moved = uv @ surface.transform[:, :2].T + surface.transform[:, 2]
@@ -407,19 +405,13 @@ class _Scene:
         return part._replace(uv=upwards, texture=surface.texture, tiles=(surface.tile,))
 
     def _attribute(
-        self,
-        primitive: dict[str, Any],
-        name: str,
-        kinds: tuple[str, ...],
-        count: int,
-        weights: Float[np.ndarray, " T"],
-        *,
-        normalize: bool = False,
+        self, primitive: dict[str, Any], name: str, count: int, weights: Float[np.ndarray, " T"]
     ) -> Float[np.ndarray, "V W"]:
         """Return an attribute of the vertices with its morph targets added (float32)."""
+        kinds = {"POSITION": ("VEC3",), "COLOR_0": ("VEC3", "VEC4")}.get(name, ("VEC2",))
 
         def rows(index: Any) -> np.ndarray:
-            values = self.document.accessor(index, kinds).floats(normalize=normalize)
+            values = self.document.accessor(index, kinds).floats(normalize=name == "COLOR_0")
             require(len(values) == count, f"{name} has {len(values)} rows for {count} vertices")
             return values
 

@@ -79,13 +79,13 @@ def load_mesh(
             "point-cloud prior"
         )
     mesh = _drop_bad_vertices(merged(parts), path)
-    if not len(mesh.vertices):
-        raise UserError(f"no face of the mesh {str(path)!r} is usable: all have a NaN or infinity")
-    low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+    vertices = mesh.vertices if len(mesh.vertices) else np.zeros((1, 3))  # no face is usable
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
     half = (high - low).max() / 2
-    centred = (mesh.vertices - (low + high) / 2) / (half or 1.0)
+    centred = (vertices - (low + high) / 2) / (half or 1.0)
     if not half > 0 or not face_areas(mesh._replace(vertices=centred)).sum() > 0:
-        raise UserError(f"the mesh {str(path)!r} has no surface: all its faces have zero area")
+        said = "all its faces have zero area, or a NaN or infinity"
+        raise UserError(f"the mesh {str(path)!r} has no surface: {said}")
     return mesh._replace(vertices=scale * centred @ rotation.T)
 
 
@@ -194,7 +194,7 @@ def _of_ply(path: Path, budget: Budget) -> list[Mesh]:
     require(known.all(), said)
     mesh = Mesh(vertices, indices[triangles])
     if table.has(COLORS):
-        colors = unit_colors(table[COLORS], table.types[COLORS[0]], path)
+        colors = unit_colors(table[COLORS], table.types[COLORS[0]])
         finite = _finite(colors, "colours", "they become grey", path)
         colors = np.where(finite[:, None], colors, np.float32(GREY))
         mesh = mesh._replace(vertex_colors=colors)

@@ -166,7 +166,7 @@ def _cloud(path: Path, points: np.ndarray, colors=None, normals=None) -> PointCl
         fits = values is None or shape == (len(points), 3)
         require(fits, f"{name} has shape {shape}: {expected}")
     # float64, since float32 would round points far from the origin before they are centred
-    colors = unit_colors(np.asarray(colors).astype(np.float32), np.asarray(colors).dtype, path)
+    colors = unit_colors(np.asarray(colors).astype(np.float32), np.asarray(colors).dtype)
     normals = None if normals is None else np.asarray(normals, np.float32)
     return PointCloud(np.asarray(points, np.float64), colors, normals)
 

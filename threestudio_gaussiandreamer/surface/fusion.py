@@ -99,38 +99,32 @@ class Renders(NamedTuple):
     """Radians."""
 
 
+@torch.no_grad()
 def render(cloud: Gaussians, views: Views, fusion: Optional[DepthFusion]) -> Renders:
     """Render views of a cloud (tensors), and add the depths to ``fusion``."""
-    count = len(views.viewmats)
+    count, middle = len(views.viewmats), cloud.means.mean(0)
     rgba = np.empty((count, views.size, views.size, 4), np.uint8)
     with tqdm(desc="surface", unit="view", total=count, disable=None, leave=False) as bar:
         for rows in row_batches(views, len(cloud.means)):
-            rgba[rows] = _render(cloud, views, rows, fusion)
+            viewmats = views.viewmats[rows]
+            # relative to the cloud's middle: squares of large depths lose the deviation's digits
+            depths = torch.einsum("bj,nj->bn", viewmats[:, 2, :3], cloud.means - middle)
+            black = torch.zeros(len(rows), 5, device=depths.device)
+            moments = torch.stack([depths, depths.square()], dim=-1)
+            out = rasterize_views(cloud, views, rows, black, channels=moments)
+            averages = out.image / out.alpha.clamp_min(1e-6)
+            colors, mean, square = averages.split([3, 1, 1], dim=-1)
+            if fusion is not None:
+                origin = torch.einsum("bj,j->b", viewmats[:, 2, :3], middle) + viewmats[:, 2, 3]
+                deviation = (square - mean.square()).clamp_min(0).sqrt()
+                pictures = (mean + origin[:, None, None, None], deviation, out.alpha)
+                for row, *maps in zip(rows, *pictures, strict=True):
+                    maps = (values[..., 0] for values in maps)
+                    fusion.add(views.viewmats[row], views.Ks[row], *maps)
+            picture = torch.cat([colors, out.alpha], dim=-1).clamp(0, 1)
+            rgba[rows] = (255 * picture).round().byte().cpu().numpy()
             bar.update(len(rows))
     return Renders(opengl(views), rgba)
-
-
-@torch.no_grad()
-def _render(
-    cloud: Gaussians, views: Views, rows: Tensor, fusion: Optional[DepthFusion]
-) -> UInt8[np.ndarray, "B S S 4"]:
-    """Return the pictures of some of the views, after adding their depths to ``fusion``."""
-    viewmats = views.viewmats[rows]
-    # relative to the views' centre, since squares of large depths lose the digits of the deviation
-    depths = torch.einsum("bj,nj->bn", viewmats[:, 2, :3], cloud.means - cloud.means.mean(0))
-    black = torch.zeros(len(rows), 5, device=depths.device)
-    moments = torch.stack([depths, depths.square()], dim=-1)
-    out = rasterize_views(cloud, views, rows, black, channels=moments)
-    colors, mean, square = (out.image / out.alpha.clamp_min(1e-6)).split([3, 1, 1], dim=-1)
-    if fusion is not None:
-        origin = torch.einsum("bj,j->b", viewmats[:, 2, :3], cloud.means.mean(0))
-        origin = (origin + viewmats[:, 2, 3])[:, None, None, None]
-        deviation = (square - mean.square()).clamp_min(0).sqrt()
-        pictures = (mean + origin, deviation, out.alpha)
-        for row, *maps in zip(rows, *pictures, strict=True):
-            fusion.add(views.viewmats[row], views.Ks[row], *(values[..., 0] for values in maps))
-    rgba = torch.cat([colors, out.alpha], dim=-1).clamp(0, 1)
-    return (255 * rgba).round().byte().cpu().numpy()
 
 
 def opengl(views: Views) -> Float[np.ndarray, "V 4 4"]:

@@ -29,7 +29,7 @@ from ..gaussians.surface import MIN_OPACITY, gaussian_surface
 from ..gaussians.views import EPS2D, views_around
 from ..meshes.mesh import Mesh
 from .bake import bake, faces_that_fit, unwrap
-from .closed import Faces, Vertices, simplified, without_small_parts
+from .closed import simplified, without_small_parts
 from .fusion import DepthFusion, render
 
 METHODS = ("fusion", "density")
@@ -108,7 +108,16 @@ def mesh_from_gaussians(
     views = views_around(cloud, count, size, sines=SINES, distances=(DISTANCE,))
     eps2d = EPS2D if options.eps2d is None else options.eps2d
     renders = render(cloud, views._replace(eps2d=eps2d, antialias=bool(options.antialias)), fusion)
-    vertices, faces = _extracted(gaussians, fusion, options)
+    if fusion is None:
+        vertices, faces, *_ = gaussian_surface(gaussians, resolution=options.resolution)
+    else:
+        from skimage.measure import marching_cubes
+
+        vertices, faces, distances = np.zeros((0, 3)), np.zeros((0, 3), np.int64), fusion.field()
+        if (distances < 0).any():  # with all its parts, normals outwards
+            vertices, faces, *_ = marching_cubes(distances, 0.0, gradient_direction="ascent")
+            vertices = vertices * fusion.cell + fusion.origin.double().cpu().numpy()
+            faces = faces[:, ::-1].astype(np.int64)
     vertices, faces, specks = without_small_parts(vertices, faces, MIN_COMPONENT)
     if not len(faces):
         raise _no_surface(gaussians)
@@ -129,20 +138,3 @@ def _no_surface(gaussians: Gaussians) -> UserError:
         "the Gaussians form no surface: no view is covered to more than half; of "
         f"{count} Gaussians {visible} have an opacity of {MIN_OPACITY} or more"
     )
-
-
-def _extracted(
-    gaussians: Gaussians, fusion: Optional[DepthFusion], options: MeshOptions
-) -> tuple[Vertices, Faces]:
-    """Return the closed surface with all its parts, normals outwards; empty where there is none."""
-    if fusion is None:
-        surface = gaussian_surface(gaussians, resolution=options.resolution)
-        return surface.vertices, surface.faces
-    from skimage.measure import marching_cubes
-
-    distances = fusion.field()
-    if not (distances < 0).any():
-        return np.zeros((0, 3)), np.zeros((0, 3), np.int64)
-    vertices, faces, _, _ = marching_cubes(distances, 0.0, gradient_direction="ascent")
-    origin = fusion.origin.double().cpu().numpy()
-    return vertices * fusion.cell + origin, faces[:, ::-1].astype(np.int64)
