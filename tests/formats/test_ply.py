@@ -2,6 +2,7 @@
 
 import struct
 import time
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -13,11 +14,15 @@ from threestudio_gaussiandreamer.formats.ply import write_table
 
 
 def assert_same(arrays, expected):
-    for name in expected._fields:
-        a, b = getattr(arrays, name), getattr(expected, name)
-        assert a is b is None or (
-            a.dtype == np.float32 and a.shape == b.shape and a.tobytes() == b.tobytes()
-        ), name
+    for a, b in zip(arrays, expected, strict=True):
+        assert a is b is None or (a.dtype, a.shape) == (np.float32, b.shape)
+        assert a is None or a.tobytes() == b.tobytes()
+
+
+def text(folder, names, *rows):
+    """A text of vertices with these properties, floats where they have no type."""
+    properties = [name if " " in name else f"float {name}" for name in names]
+    return saved(folder, header("ascii", len(rows), properties) + "\n".join(rows))
 
 
 class TestGaussians:
@@ -27,6 +32,10 @@ class TestGaussians:
             expected = gaussians(count, degree)
             ply.write_gaussians(tmp_path / "a.ply", expected)
             assert_same(ply.read_gaussians(tmp_path / "a.ply"), expected)
+            points = ply.read_points(tmp_path / "a.ply")  # as their coloured centres
+            np.testing.assert_array_equal(points.points, expected.means)
+            colors = (0.5 + 0.28209479 * expected.sh[:, 0]).clip(0, 1)
+            np.testing.assert_allclose(points.colors, colors, atol=1e-6)
         arrays = gaussians(4)
         arrays.means[0] = [-0.0, 1e-45, 3.4e38]
         arrays.logit_opacities[:2] = [np.inf, -np.inf]
@@ -78,9 +87,8 @@ class TestGaussians:
         ply.write_points(tmp_path / "points.ply", cloud())
         with pytest.raises(UserError, match="lack f_dc_0.*plain points"):
             ply.read_gaussians(tmp_path / "points.ply")
-        without = [f"float {name}" for name in ply.GAUSSIAN if name != "scale_1"]
         with pytest.raises(UserError, match="lack scale_1"):
-            ply.read_gaussians(saved(tmp_path, header("ascii", 0, without)))
+            ply.read_gaussians(text(tmp_path, [x for x in ply.GAUSSIAN if x != "scale_1"]))
 
     def test_names_of_cloudcompare_are_known(self, tmp_path):
         """A cloud that was edited there, also one that 3dgsconverter prepared for it."""
@@ -92,8 +100,8 @@ class TestGaussians:
             assert_same(ply.read_gaussians(tmp_path / "a.ply"), arrays)
 
     def test_2d_gaussians_are_flat(self, tmp_path, caplog):
-        names = [f"float {name}" for name in ply.GAUSSIAN if name != "scale_2"]
-        path = saved(tmp_path, header("ascii", 1, names) + "1 2 3 0 0 0 4 5 6 1 0 0 0")
+        names = [name for name in ply.GAUSSIAN if name != "scale_2"]
+        path = text(tmp_path, names, "1 2 3 0 0 0 4 5 6 1 0 0 0")
         assert ply.is_gaussian_ply(path)
         np.testing.assert_allclose(ply.read_gaussians(path).log_scales, [[5, 6, np.log(1e-6)]])
         arrays = gaussians(5)
@@ -106,9 +114,8 @@ class TestGaussians:
 
     def test_the_3d_filter_is_applied(self, tmp_path):
         """Variances grow by the filter's; the integral of a Gaussian stays."""
-        names = [f"float {name}" for name in (*ply.GAUSSIAN, "filter_3D")]
         row = f"0 0 0 0 0 0 0 {np.log(3)} {np.log(2)} {np.log(6)} 1 0 0 0 4"
-        read = ply.read_gaussians(saved(tmp_path, header("ascii", 1, names) + row))
+        read = ply.read_gaussians(text(tmp_path, [*ply.GAUSSIAN, "filter_3D"], row))
         sizes = np.sqrt([3**2 + 4**2, 2**2 + 4**2, 6**2 + 4**2])
         np.testing.assert_allclose(np.exp(read.log_scales), [sizes], rtol=1e-6)
         opacity = 0.5 * 3 * 2 * 6 / sizes.prod()
@@ -116,10 +123,9 @@ class TestGaussians:
 
     def test_bytes_stand_for_the_constant_harmonics(self, tmp_path):
         """As nerfstudio's exporter writes with --ply-color-mode rgb."""
-        others = [f"float {name}" for name in ply.GAUSSIAN if not name.startswith("f_dc")]
-        colors = [f"uchar {name}" for name in ply.COLORS]
-        row = "0 0 0 1 2 3 4 1 0 0 0 255 0 51"
-        path = saved(tmp_path, header("ascii", 1, others + colors) + row)
+        names = [name for name in ply.GAUSSIAN if not name.startswith("f_dc")]
+        names += [f"uchar {name}" for name in ply.COLORS]
+        path = text(tmp_path, names, "0 0 0 1 2 3 4 1 0 0 0 255 0 51")
         assert ply.is_gaussian_ply(path)
         read = ply.read_gaussians(path)
         np.testing.assert_allclose(0.5 + 0.28209479 * read.sh[0, 0], [1, 0, 0.2], atol=1e-6)
@@ -146,14 +152,10 @@ class TestGaussians:
                 read(path)
             assert "plain points" not in str(said.value)
 
-    @pytest.mark.parametrize(
-        "rest",
-        [["f_rest_0"], [f"f_rest_{i}" for i in range(6)], ["f_rest_0", "f_rest_1", "f_rest_3"]],
-    )
+    @pytest.mark.parametrize("rest", [[0], range(6), [0, 1, 3]])
     def test_impossible_harmonics_are_refused(self, tmp_path, rest):
-        names = [f"float {name}" for name in (*ply.GAUSSIAN, *rest)]
         with pytest.raises(UserError, match="f_rest"):
-            ply.read_gaussians(saved(tmp_path, header("ascii", 0, names)))
+            ply.read_gaussians(text(tmp_path, [*ply.GAUSSIAN, *(f"f_rest_{i}" for i in rest)]))
 
 
 class TestPoints:
@@ -175,22 +177,20 @@ class TestPoints:
         [
             (["uchar red", "uchar green", "uchar blue"], "255 0 51"),
             (["ushort red", "ushort green", "ushort blue"], "65535 0 13107"),
-            (["float red", "float green", "float blue"], "1.0 0 0.2"),
-            (["float red", "float green", "float blue"], "255 0 51"),
+            (ply.COLORS, "1.0 0 0.2"),
+            (ply.COLORS, "255 0 51"),
             (["uchar diffuse_red", "uchar diffuse_green", "uchar diffuse_blue"], "255 0 51"),
         ],
     )
     def test_colours_of_other_programs(self, tmp_path, properties, values):
-        head = header("ascii", 1, ["float x", "float y", "float z", *properties])
-        text = head + f"1 2 3 {values}\n"
-        read = ply.read_points(saved(tmp_path, text))
+        read = ply.read_points(text(tmp_path, [*ply.MEANS, *properties], f"1 2 3 {values}\n"))
         np.testing.assert_allclose(read.colors, [[1.0, 0.0, 0.2]], atol=1e-6)
         np.testing.assert_array_equal(read.points, [[1, 2, 3]])
 
     def test_line_ends_blank_lines_and_comments(self, tmp_path):
         more = "ascii 1.0\ncomment end_header is below\nobj_info x"
-        text = header().replace("ascii 1.0", more) + "1 2 3\n\n4 5 6"
-        read = ply.read_points(saved(tmp_path, text.replace("\n", "\r\n")))
+        content = header().replace("ascii 1.0", more) + "1 2 3\n\n4 5 6"
+        read = ply.read_points(saved(tmp_path, content.replace("\n", "\r\n")))
         assert read.points.shape == (2, 3)
         np.testing.assert_array_equal(read.colors, np.full((2, 3), 0.5))  # no colours are grey
         binary = header("binary_little_endian").replace("\n", "\r\n").encode()
@@ -211,14 +211,6 @@ class TestPoints:
             content = b"".join(struct.pack(order + kind, *row) for kind, *row in rows) + b"\3"
         found = ply.read_points(saved(tmp_path, head + content)).points
         np.testing.assert_array_equal(found, [[1, 2, 3], [4, 5, 6]])
-
-    def test_gaussians_are_read_as_their_coloured_centres(self, tmp_path):
-        arrays = gaussians(30)
-        ply.write_gaussians(tmp_path / "a.ply", arrays)
-        read = ply.read_points(tmp_path / "a.ply")
-        np.testing.assert_array_equal(read.points, arrays.means)
-        colors = (0.5 + 0.28209479 * arrays.sh[:, 0]).clip(0, 1)
-        np.testing.assert_allclose(read.colors, colors, atol=1e-6)
 
 
 BINARY, FACE = "binary_little_endian", "element face 1\nproperty list uchar int i"
@@ -247,6 +239,12 @@ class TestDamage:
         started = time.process_time()
         assert len(ply.read_points(path).points) == 2
         assert time.process_time() - started < 1.5
+        head = header(before=before.replace("1000000", "20000")).encode()
+        path = saved(tmp_path, head + b"3 10000 10001 10002\n" * 20_000 + b"1 2 3\n4 5 6\n")
+        tracemalloc.start()
+        assert len(ply.read_points(path).points) == 2
+        assert tracemalloc.get_traced_memory()[1] < 6 * path.stat().st_size
+        tracemalloc.stop()
 
     @pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian"])
     def test_more_than_was_announced_is_reported(self, tmp_path, encoding, caplog):

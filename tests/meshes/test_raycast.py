@@ -196,17 +196,17 @@ FOCAL = 20.0
 PLACES = np.arange(-16, 16) + 0.5
 
 
-def draw(vertices, faces, c2w=None, rows=PLACES, columns=PLACES):
-    """Return the hits of a camera, by default at the origin along -z."""
+def draw(vertices, faces, rows=PLACES, columns=PLACES):
+    """Return the hits of a camera at the origin along -z."""
     mesh = np.array(vertices, dtype=float), np.array(faces)
-    return zbuffer_hits(*mesh, np.eye(4) if c2w is None else c2w, FOCAL, rows, columns)
+    return zbuffer_hits(*mesh, np.eye(4), FOCAL, rows, columns)
 
 
-def cast(vertices, faces, rows=PLACES, columns=PLACES):
+def cast(vertices, faces):
     """Return the nearest face of each sample by intersecting every ray with every triangle (Moeller
     and Trumbore 1997), in float64.
     """
-    y, x = np.meshgrid(-rows / FOCAL, columns / FOCAL, indexing="ij")
+    y, x = np.meshgrid(-PLACES / FOCAL, PLACES / FOCAL, indexing="ij")
     rays = np.stack([x, y, -np.ones_like(x)], axis=-1)[:, :, None]
     a, b, c = np.moveaxis(np.array(vertices, dtype=float)[np.array(faces)], 1, 0)
     p = np.cross(rays, c - a)

@@ -193,10 +193,11 @@ def read_usda(path: str | os.PathLike) -> tuple[Gaussians, list[str]]:
         arrays = {name: _array(found.get(name, ("", b"[]"))[1], name) for name in ARRAYS}
         degree = found.get(DEGREE, ("", b"3"))[1].decode("ascii", "replace")
         gaussians = _built(degree, arrays, linear, str(file))
-        up = axes[0].decode().lower() if axes else USDA_UP
+        if axes[:1] == [b"Z"]:
+            gaussians = rotate(gaussians, rotation_between("z", USDA_UP))
         said = NOTES.search(metadata)
         notes = re.findall(rb'"([^"]*)"', said[1]) if said else []
-        return _upright(gaussians, up), [note.decode("ascii", "replace") for note in notes]
+        return gaussians, [note.decode("ascii", "replace") for note in notes]
 
 
 def _text(path: Path) -> bytes:
@@ -216,11 +217,6 @@ def _text(path: Path) -> bytes:
     return magic + b"\n" + re.sub(rb"(?m)^[ \t]*#.*", b"", rest)
 
 
-def _upright(gaussians: Gaussians, up: str) -> Gaussians:
-    """Return Gaussians of a layer with y up."""
-    return gaussians if up == USDA_UP else rotate(gaussians, rotation_between(up, USDA_UP))
-
-
 def _read_by_openusd(path: Path) -> tuple[Gaussians, list[str]]:
     """Read all prims of a stage."""
     from pxr import Usd, UsdGeom
@@ -235,9 +231,10 @@ def _read_by_openusd(path: Path) -> tuple[Gaussians, list[str]]:
         if prim.GetTypeName() == SCHEMA
     ]
     require(bool(parts), f"none of its prims is a {SCHEMA}")
-    notes = stage.GetRootLayer().customLayerData.get("notes", [])
-    up = UsdGeom.GetStageUpAxis(stage).lower()
-    return _upright(joined(parts), up), [str(note) for note in notes]
+    notes, gaussians = stage.GetRootLayer().customLayerData.get("notes", []), joined(parts)
+    if (up := UsdGeom.GetStageUpAxis(stage).lower()) != USDA_UP:
+        gaussians = rotate(gaussians, rotation_between(up, USDA_UP))
+    return gaussians, [str(note) for note in notes]
 
 
 def _of_prim(prim: Any, now: Any, path: Path) -> Gaussians:

@@ -217,12 +217,8 @@ def _wrapped(coordinate: np.ndarray, wrap: int) -> np.ndarray:
 def sample_surface(
     mesh: Mesh, count: int, generator: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Draw ``count`` points uniformly from the surface.
-
-    Of duplicate faces only the first is sampled, so that their area counts once.
-
-    Returns:
-        points (count, 3), face_index (count,) and barycentric (count, 3).
+    """Draw ``count`` points uniformly from the surface: points (count, 3), face_index (count,) and
+    barycentric (count, 3). Of duplicate faces only the first is sampled.
     """
     areas = face_areas(mesh) * ~repeated_faces(mesh)
     face_index = generator.choice(len(areas), size=count, p=areas / areas.sum())

@@ -34,8 +34,8 @@ consulted: dict[str, Optional[tuple[int, int]]] = {}
 
 
 class Budget:
-    """The remaining memory budget of the mesh ``path``, bytes: increased by the size of every file
-    that is read, reduced by decoded content.
+    """The memory in bytes that a mesh may take: more with every file that is read, less with what
+    is decoded.
     """
 
     def __init__(self, path: Path) -> None:

@@ -112,8 +112,7 @@ def render(cloud: Gaussians, views: Views, fusion: Optional[DepthFusion]) -> Ren
             black = torch.zeros(len(rows), 5, device=depths.device)
             moments = torch.stack([depths, depths.square()], dim=-1)
             out = rasterize_views(cloud, views, rows, black, channels=moments)
-            averages = out.image / out.alpha.clamp_min(1e-6)
-            colors, mean, square = averages.split([3, 1, 1], dim=-1)
+            colors, mean, square = (out.image / out.alpha.clamp_min(1e-6)).split([3, 1, 1], dim=-1)
             if fusion is not None:
                 origin = torch.einsum("bj,j->b", viewmats[:, 2, :3], middle) + viewmats[:, 2, 3]
                 deviation = (square - mean.square()).clamp_min(0).sqrt()
