@@ -1,7 +1,5 @@
 """The cloud: its start from points, its size, its learning rates, its checkpoint."""
 
-from types import SimpleNamespace
-
 import pytest
 import torch
 
@@ -63,10 +61,7 @@ def test_the_cloud_takes_its_size_from_the_checkpoint_and_never_asks_the_prior(
     sphere_points, tmp_path
 ):
     geometry = started(sphere_points, sh_degree=2, densify={"enabled": True})
-    means2d = torch.zeros(1, 400, 2, requires_grad=True)
-    means2d.grad, seen = torch.ones(1, 400, 2), torch.full((1, 400), 0.5)
-    out = SimpleNamespace(means2d=means2d, radii=seen, contribution=seen)
-    DensityControl(geometry).after_backward(out, 64, 64)
+    geometry.gradient_sum.fill_(2.0)
     torch.save(geometry.state_dict(), tmp_path / "c.pt")
     other = GaussianCloud({"sh_degree": 2, "prior_type": "no-such-prior"})
     other.load_state_dict(torch.load(tmp_path / "c.pt", weights_only=True))

@@ -282,14 +282,13 @@ def cloud_page(
         raise UserError(f"--eps2d: expected a number of square pixels from 0 on, got {eps2d:g}")
     stored, run = read_any(source, up), RunFiles.around(source)
     require_page_size(len(stored.gaussians.means), str(source))
+    # the scores are those of the last export
+    quality = decibels(run and run.psnr("result", step_of(source.resolve().parent)))
     if run:
         settings = run.settings
-        # the scores are those of the last export
-        quality = decibels(run.psnr("result", step_of(source.resolve().parent)))
     else:  # the cloud's units aren't known
         near = NEAR * bounds(stored.gaussians.tensors())[1]
         settings = RenderSettings(near=near, far=math.inf, antialias=stored.antialiased)
-        quality = ""
     given = {"eps2d": eps2d, "antialias": antialias, "bound_colors": bound_colors}
     given["alpha_min"] = preset and PRESETS[preset]
     options = PageOptions(

@@ -30,8 +30,7 @@ SCORES = {"psnr": "dB", "ssim": "SSIM", "multi_face": "multi-face", "gaussians":
 MAX_COMMANDS, MAX_POINTS, VALIDATION_PICTURES = 10, 400, 8
 TIMES = "times.json"
 """What the launcher notes of each stage: its name, when it began, and its seconds."""
-SECTIONS = ("data", "system", "trainer", "checkpoint")
-USERS = ("name", "tag", "seed", "description", "exp_root_dir", "use_timestamp")
+USERS = "data system trainer checkpoint name tag seed description exp_root_dir use_timestamp"
 """Keys at the top level that users set; the others are computed."""
 MAX_DEPTH = 3
 """Folders between the gallery's and a run's: an experiment's, and a sweep's above it."""
@@ -140,7 +139,7 @@ def config_changes(folder: Path) -> list[tuple[str, Any, Any]]:
     return [
         (key, base.get(key, "–"), value)
         for key, value in leaves(read_yaml(folder / "parsed.yaml"))
-        if (key in USERS or key.partition(".")[0] in SECTIONS)
+        if key.partition(".")[0] in USERS.split()
         and "${" not in str(base.get(key))  # which refers to another value
         and (key not in base or base[key] != value)
     ]
