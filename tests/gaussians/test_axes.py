@@ -1,4 +1,6 @@
-"""Gaussians in other axes: a camera that is rotated with the object sees the same image."""
+"""Gaussians in other axes: a camera that is rotated with the object sees the same image; and the
+conversions of the type that holds them.
+"""
 
 import numpy as np
 import pytest
@@ -6,7 +8,7 @@ import torch
 
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.gaussians.axes import AXES, FRONTS, rotate, rotation_between
-from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
+from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians, opaque, usable
 from threestudio_gaussiandreamer.gaussians.sh import sh_to_colors
 from threestudio_gaussiandreamer.splatting import rasterize
 
@@ -61,3 +63,32 @@ def test_front_and_top_of_the_world_in_each_file():
 def test_harmonics_that_have_no_rotation_here_are_refused():
     with pytest.raises(UserError, match="degree 4 can't be converted to other axes: degree 3"):
         rotate(some(4), AXES["z"])
+
+
+# the type that holds Gaussians -------------------------------------------------------------------
+
+
+def test_tensors_and_arrays_convert_back_and_forth_without_gradients():
+    gaussians = some(1)
+    tensors = gaussians.tensors().map(lambda values: values.requires_grad_())
+    back = tensors.arrays()
+    for ours, theirs in zip(back, gaussians, strict=True):
+        assert ours.dtype == np.float32 and ours.tobytes() == theirs.tobytes()
+    halves = gaussians.map(lambda values: torch.from_numpy(values).double())
+    assert all(values.dtype == torch.float32 for values in halves.tensors())
+
+
+def test_usable_lets_infinite_logarithms_pass_where_they_mean_zero_or_one():
+    gaussians = some(1, 8)
+    gaussians.means[0, 0] = np.nan
+    gaussians.quats[1, 0] = np.inf
+    gaussians.sh[2, 1, 0] = -np.inf
+    gaussians.logit_opacities[3:6] = [np.nan, np.inf, -np.inf]
+    gaussians.log_scales[6:, 0] = [np.inf, -np.inf]
+    assert usable(gaussians).tolist() == [False] * 4 + [True, True, False, True]
+
+
+def test_opaque_at_zero_keeps_every_number():
+    gaussians = some(1, 4)._replace(logit_opacities=np.float32([np.nan, -np.inf, 0, 1]))
+    assert opaque(gaussians, 0).tolist() == [False, True, True, True]
+    assert opaque(gaussians, 0.5).tolist() == [False, False, True, True]

@@ -1,4 +1,6 @@
-"""Hidden Gaussians are removed first, and the search for the smallest cloud terminates."""
+"""Hidden Gaussians are removed first, recovery never makes the rest worse, and the search for the
+smallest cloud terminates.
+"""
 
 import pytest
 import torch
@@ -14,13 +16,65 @@ from threestudio_gaussiandreamer.gaussians.simplify import (
     simplify,
     view_importance,
 )
-from threestudio_gaussiandreamer.gaussians.views import views_around
+from threestudio_gaussiandreamer.gaussians.views import psnr_to_original, render_all, views_around
 
 
 def recovery(cloud, size):
     """Recover with two steps on eight views, validated on eight others."""
     views = (views_around(cloud, 8, size, turn=turn) for turn in (0.0, 45.0))
     return Recovery(cloud, *views, steps=2)
+
+
+def test_recovery_pays():
+    cloud = ball()
+    train_views, val_views = (views_around(cloud, n, 48, turn=t) for n, t in ((16, 0), (8, 45)))
+    images, before = render_all(cloud, train_views), render_all(cloud, val_views)
+    pruned = keep_best(cloud, view_importance(cloud, train_views), 200)
+    recovered = recover.recover(pruned, train_views, images, 40, 0)
+    gain = psnr_to_original(recovered, val_views, before)
+    assert gain - psnr_to_original(pruned, val_views, before) > 1.0
+
+
+@pytest.mark.parametrize(
+    ("count", "bearable", "tried"),
+    [
+        (580, [1.0], [1]),
+        (580, [1 / 16] * 3, [1, 1 / 4, 1 / 16]),
+        (580, [0.0] * 4, [1, 1 / 4, 1 / 16, 1 / 64]),
+        (200, [1 / 16] * 5 + [1.0] * 3, [1, 1 / 4, 1 / 16, 1 / 4, 1 / 16, 1 / 4, 1, 1]),
+    ],
+)
+def test_a_recovery_never_lowers_the_quality(monkeypatch, count, bearable, tried):
+    """It is repeated with smaller rates, near those of the one before, and skipped if none is small
+    enough.
+    """
+    cloud, scales, bearable = ball(), [], iter(bearable)
+
+    def recover_with(cloud, views, images, steps, seed, sh_reach, lr_scale):
+        scales.append(lr_scale)
+        return cloud if lr_scale <= next(bearable) else cloud._replace(sh=cloud.sh + 1)
+
+    monkeypatch.setattr(recover, "recover", recover_with)
+    monkeypatch.setattr(simplifying, "merge_duplicates", lambda values, at_least: values)
+    fitted = recovery(cloud, 32)
+    found = simplify(cloud, Budget(count=count), fitted)
+    assert scales == tried
+    if count == 580:
+        kept = keep_best(cloud, view_importance(cloud, fitted.train_views), count)
+        assert all(torch.equal(a, b) for a, b in zip(found, kept, strict=True))
+
+
+def test_a_recovery_of_many_gaussians_takes_fewer_steps(monkeypatch):
+    taken = []
+    rest = lambda cloud, views, images, steps, *_: taken.append(steps) or cloud  # noqa: E731
+    monkeypatch.setattr(recover, "recover", rest)
+    monkeypatch.setattr(recover, "MOST", 200)
+    cloud = ball()
+    fitted = recovery(cloud, 16)
+    fitted.steps = 9
+    for count in (100, 200, 600):
+        fitted(cloud.rows(slice(count)), 0)
+    assert taken == [9, 9, 3]
 
 
 def test_any_quality_ends_the_search():
