@@ -107,13 +107,16 @@ VIDEO = (
 
 @pytest.mark.slow
 @pytest.mark.skipif(chromium() is None, reason="no Chromium is installed")
-def test_a_browser_shows_the_index_of_a_run(save):
+def test_a_browser_and_a_phone_show_the_index_of_a_run(save):
     index = save.parent / "index.html"
     with open_page(index) as page:
         page.evaluate("document.querySelectorAll('img').forEach(image => image.loading = 'eager')")
         widths = page.evaluate(f"Promise.all({IMAGES})")
         assert len(widths) >= 3 and min(widths) > 0
         assert page.evaluate(VIDEO) == 32  # H.264 in yuv420p, which every browser plays
+        phone = {"width": 320, "height": 600, "deviceScaleFactor": 1, "mobile": True}
+        page.call("Emulation.setDeviceMetricsOverride", **phone)
+        assert page.evaluate("document.documentElement.scrollWidth") <= 320
         assert page.problems == []
         folder = save.parent.resolve().as_uri() + "/"
         assert all(x.startswith((folder, "data:", "blob:")) for x in page.requests)
