@@ -7,6 +7,7 @@ Reads the source with :mod:`ast` and writes the parts between the markers of
 import ast
 import functools
 import re
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -17,21 +18,15 @@ PACKAGE = ROOT / NAME
 PAGE = ROOT / "docs/architecture.md"
 
 
-class Ring(NamedTuple):
-    """A layer of the package; its rooms import from it and from the rings before it."""
-
-    name: str
-    rooms: tuple[str, ...]
-
-
 MATHS = ("core", "gaussians", "formats", "splatting", "diffusion", "meshes", "cameras", "metrics")
-RINGS = (
-    Ring("0 maths", MATHS),
-    Ring("1 host", ("host", "models")),
-    Ring("2 parts", ("prompts", "priors", "guidance", "surface", "exporters")),
-    Ring("3 training", ("training", "prune", "view", "convert")),
-    Ring("4 programs", ("launch", "farm", "evaluation", "evaluate", "toybox")),
-)
+RINGS = {
+    "0 maths": MATHS,
+    "1 host": ("host", "models"),
+    "2 parts": ("prompts", "priors", "guidance", "surface", "exporters"),
+    "3 training": ("training", "prune", "view", "convert"),
+    "4 programs": ("launch", "farm", "evaluation", "evaluate", "toybox"),
+}
+"""Layers of the package; the rooms of one import from it and from those before it."""
 
 
 class Step(NamedTuple):
@@ -75,7 +70,7 @@ def modules() -> frozenset[str]:
 
 def ring_of() -> dict[str, int]:
     """Map each room to the index of its ring."""
-    return {room: index for index, ring in enumerate(RINGS) for room in ring.rooms}
+    return {room: index for index, rooms in enumerate(RINGS.values()) for room in rooms}
 
 
 def imports(path: Path) -> Iterator[tuple[str, bool]]:
@@ -102,13 +97,9 @@ def imported(node: ast.AST, path: Path) -> list[str]:
 
 def arrows() -> dict[tuple[str, str], int]:
     """Count the import statements from one room to another."""
-    found: dict[tuple[str, str], int] = {}
-    for path in sources():
-        for name, _ in imports(path):
-            pair = (room_of(path), name.split(".")[1] if name.startswith(NAME + ".") else "")
-            if pair[1] and pair[0] != pair[1]:
-                found[pair] = found.get(pair, 0) + 1
-    return found
+    ours = [(room_of(p), name) for p in sources() for name, _ in imports(p) if f"{NAME}." in name]
+    pairs = ((room, name.split(".")[1]) for room, name in ours)
+    return Counter(pair for pair in pairs if pair[0] != pair[1])
 
 
 def purpose(room: str) -> str:
@@ -128,12 +119,11 @@ def diagram() -> str:
     path of a step, and an arrow per import from one ring to the next lower one.
     """
     lines, ring = ["```mermaid", "flowchart TB"], ring_of()
-    for index, (name, rooms) in reversed(list(enumerate(RINGS))):
+    for index, (name, rooms) in reversed(list(enumerate(RINGS.items()))):
         lines.append(f'  subgraph ring{index}["{name}"]')
         for room in rooms:
-            numbers = [
-                str(i) for i, s in enumerate(STEPS, 1) if room_of(PACKAGE / s.module) == room
-            ]
+            path = enumerate(STEPS, 1)
+            numbers = [str(i) for i, s in path if room_of(PACKAGE / s.module) == room]
             steps = f" ({', '.join(numbers)})" if numbers else ""
             lines.append(f'    {room}["{label(room)}{steps}"]')
         lines.append("  end")
@@ -145,8 +135,8 @@ def diagram() -> str:
 def rooms_table() -> str:
     """Return a Markdown table of every room: ring, purpose, modules."""
     rows = ["| room | ring | what it is for | modules |", "| --- | --- | --- | --- |"]
-    for index, ring in reversed(list(enumerate(RINGS))):
-        for room in ring.rooms:
+    for index, rooms in reversed(list(enumerate(RINGS.values()))):
+        for room in rooms:
             folder = PACKAGE / room
             files = sorted(folder.glob("*.py")) if folder.is_dir() else []
             names = " ".join(f"`{f.stem}`" for f in files if f.stem != "__init__")

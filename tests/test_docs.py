@@ -19,6 +19,7 @@ ROOT = Path(__file__).parent.parent
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 TEXTS = {str(path.relative_to(ROOT)): path.read_text() for path in DOCUMENTS}
 LINKED = [*DOCUMENTS, *sorted((ROOT / "reports").glob("*.md"))]
+LAUNCH = r"(?:^|python )(?:launch\.py|gaussiandreamer) (.*--config.*)"
 EXTENSIONS = re.compile(
     "spiral-prior|one-color|front-first|variant.behind|smooth_depth|needles|relocate|density.every"
     "|,extent|sky-background|background.lr"
@@ -37,10 +38,9 @@ def launches() -> list[list[str]]:
     for text in TEXTS.values():
         for block in blocks(text, "bash") + blocks(text, ""):
             for line in block.replace("\\\n", " ").splitlines():
-                command = re.search(
-                    r"(?:^|python )(?:launch\.py|gaussiandreamer) (.*--config.*)", line
-                )
+                command = re.search(LAUNCH, line)
                 found += [shlex.split(command[1], comments=True)] if command else []
+    assert len(found) >= 3
     return [list(words) for words in dict.fromkeys(map(tuple, found))]
 
 
@@ -66,11 +66,8 @@ def test_files_that_are_named_exist(name):
     """Paths in backticks that begin with a folder of the repository, except what a run writes or a
     user adds.
     """
-    for path in re.findall(
-        r"`((?:configs|tests|benchmarks|docs|threestudio_gaussiandreamer|custom/threestudio)"
-        r"[\w./-]*)`",
-        TEXTS[name],
-    ):
+    folders = "configs|tests|benchmarks|docs|threestudio_gaussiandreamer|custom/threestudio"
+    for path in re.findall(rf"`((?:{folders})[\w./-]*)`", TEXTS[name]):
         assert (ROOT / path).exists(), f"{name} names {path}"
 
 
@@ -79,10 +76,6 @@ def test_make_targets_exist():
     for name, text in TEXTS.items():
         for target in re.findall(r"(?:^|`)make ([a-z][\w-]*)", text, re.MULTILINE):
             assert re.search(rf"^{target}:", makefile, re.MULTILINE), f"{name} names make {target}"
-
-
-def test_the_readme_shows_launches():
-    assert len(launches()) >= 3
 
 
 @pytest.mark.parametrize("arguments", launches(), ids=" ".join)
@@ -105,10 +98,7 @@ def test_the_command_of_the_example_for_ci_is_accepted(tmp_path, monkeypatch):
     check_config(load_config(*map(find_config, args.config), cli_args=args.overrides))
 
 
-@pytest.mark.parametrize("page", tables.PAGES)
-def test_the_measured_tables_are_of_these_numbers(page):
-    assert (ROOT / page).read_text() == tables.text_of(page), "it is stale: run make docs"
-
-
-def test_the_page_of_options_is_of_this_code():
-    assert (ROOT / "docs/options.md").read_text() == options.text(), "it is stale: run make docs"
+@pytest.mark.parametrize("page", ["docs/options.md", *tables.PAGES])
+def test_the_generated_pages_are_of_this_code_and_these_numbers(page):
+    text = tables.text_of(page) if page in tables.PAGES else options.text()
+    assert (ROOT / page).read_text() == text, "it is stale: run make docs"

@@ -29,15 +29,11 @@ def as_python(cell: str) -> str:
     return re.sub(r"^(\s*)!(.*)$", r'\1shell(rf"""\2 """)', cell, flags=re.MULTILINE)
 
 
-def test_it_is_stored_without_outputs():
+def test_it_is_stored_without_outputs_and_its_links_lead_somewhere():
     ids = [cell["id"] for cell in NOTEBOOK["cells"]]
     assert len(set(ids)) == len(ids) and NOTEBOOK["nbformat"] == 4
     for cell in NOTEBOOK["cells"]:
         assert cell.get("outputs", []) == [] and cell.get("execution_count") is None
-
-
-def test_its_links_lead_somewhere():
-    for cell in NOTEBOOK["cells"]:
         for target in re.findall(r"\]\(([^)]+)\)", source(cell)):
             assert (ROOT / "notebooks" / target).is_file(), target
 

@@ -64,7 +64,7 @@ class Drawn(NamedTuple):
 def extreme_scene(seed: int, most: int = 4000) -> Scene:
     """Draw a scene of up to ``most`` Gaussians; a tenth of the scenes contains NaN and infinity."""
     g = torch.Generator().manual_seed(seed)
-    count = _count(g, most)
+    count = _log_uniform(g, most) - 1 if _chance(g, 0.4) else most
     views = int(torch.randint(1, 5, (), generator=g))
     size = _size(g, max(count * views, 1))
     cloud = _cloud(g, count, non_finite=bool(_chance(g, 0.1)))
@@ -111,17 +111,14 @@ def _chance(g: torch.Generator, share: float) -> bool:
     return bool(torch.rand((), generator=g) < share)
 
 
-def _count(g: torch.Generator, most: int) -> int:
-    """Draw a count, uniform in the logarithm, or ``most``."""
-    if not _chance(g, 0.4):
-        return most
-    return int(math.exp(torch.rand((), generator=g).item() * math.log(most + 1))) - 1
+def _log_uniform(g: torch.Generator, most: int) -> int:
+    return int(math.exp(torch.rand((), generator=g).item() * math.log(most + 1)))
 
 
 def _size(g: torch.Generator, work: int) -> tuple[int, int]:
     """Draw a size: 1 x 1, odd, elongated or square, limited by the specification's cost."""
     area = min(max(PIXELS_TIMES_GAUSSIANS // work, 1), 48 * 48)
-    width = min(int(math.exp(torch.rand((), generator=g).item() * math.log(area + 1))), 200)
+    width = min(_log_uniform(g, area), 200)
     width = max(round(math.sqrt(area)) if _chance(g, 0.5) else width, 1)
     return width, max(min(area // width, 200), 1)
 

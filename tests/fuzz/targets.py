@@ -1,12 +1,11 @@
 """All fuzz targets: valid files, how to damage them, and what must hold.
 
 ``exercise`` reads a damaged file with the package and renders the result. It returns if the file
-was read, raises UserError if it was rejected, and :class:`Misread` if the result isn't the file's
+was read, raises UserError if it was rejected, and AssertionError if the result isn't the file's
 content. Any other exception is a crash."""
 
 import contextlib
 import io
-import logging
 import os
 import signal
 import struct
@@ -17,6 +16,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, Optional
+from unittest import mock
 
 import numpy as np
 import torch
@@ -27,10 +27,11 @@ from tests.formats.test_splat import ksplat_file
 from tests.fuzz import mutations, oracles
 from tests.fuzz.mutations import BINARY, TEXT, Mutator, Packing
 from tests.helpers.object_clouds import ball
-from tests.helpers.ply_files import ply_bytes
+from tests.helpers.ply_files import gaussians, ply_bytes
 from threestudio_gaussiandreamer import register_parts
 from threestudio_gaussiandreamer.core.checkpoint_file import load_checkpoint, save_file
 from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.core.logs import logger
 from threestudio_gaussiandreamer.formats import ply
 from threestudio_gaussiandreamer.formats.compressed_ply import read_compressed_ply
 from threestudio_gaussiandreamer.formats.gaussian_files import StoredCloud, read_cloud, write_cloud
@@ -56,10 +57,6 @@ ROOT = Path(__file__).parents[2]
 register_parts()
 
 
-class Misread(Exception):
-    """A damaged file was read as something that it doesn't contain."""
-
-
 class Target(NamedTuple):
     """One reader, or another entry point that takes untrusted input."""
 
@@ -79,20 +76,15 @@ EYE[:, 2, 3] = 3.0
 FOCAL = torch.tensor([[[12.0, 0, 6], [0, 12, 6], [0, 0, 1]]])
 
 
-def require(holds: Any, problem: str) -> None:
-    if not holds:
-        raise Misread(problem)
-
-
 def require_picture(geometry: GaussianCloud) -> None:
     """Require finite pixels and gradients; gradients may overflow for extreme colours."""
     colors = geometry.colors(torch.tensor([[0.0, 0, -3]]))
-    gaussians = geometry.means, geometry.quats, geometry.scales(), geometry.opacities(), colors
-    out = rasterize(*gaussians, EYE, FOCAL, 12, 12)
-    require(all(x.isfinite().all() for x in (out.image, out.alpha, out.depth)), "a pixel")
+    shapes = geometry.means, geometry.quats, geometry.scales(), geometry.opacities()
+    out = rasterize(*shapes, colors, EYE, FOCAL, 12, 12)
+    assert all(x.isfinite().all() for x in (out.image, out.alpha, out.depth)), "a pixel"
     out.image.clamp(-10, 10).sum().backward()
     bright = torch.nan_to_num(geometry.sh0.detach()).abs().max() > 1e10
-    require(bright or geometry.means.grad.isfinite().all(), "a gradient isn't finite")
+    assert bright or geometry.means.grad.isfinite().all(), "a gradient isn't finite"
 
 
 def cloud_of(arrays: Gaussians) -> GaussianCloud:
@@ -104,12 +96,11 @@ def cloud_of(arrays: Gaussians) -> GaussianCloud:
 def require_points(cloud: PointCloud) -> None:
     """Require what every prior guarantees."""
     points, colors, faces = cloud.points, cloud.colors, cloud.faces
-    shapes = {np.shape(points), np.shape(colors), (len(points), 3)}
-    require(len(shapes) == 1 and len(points) > 0, f"shapes {shapes}")
-    require(np.isfinite(points).all() and np.isfinite(colors).all(), "a number isn't finite")
-    require((colors >= 0).all() and (colors <= 1).all(), "colours outside of [0, 1]")
+    assert np.shape(points) == np.shape(colors) == (len(points), 3) and len(points) > 0, "shapes"
+    assert np.isfinite(points).all() and np.isfinite(colors).all(), "a number isn't finite"
+    assert (colors >= 0).all() and (colors <= 1).all(), "colours outside of [0, 1]"
     named = faces is None or not len(faces) or (faces.min() >= 0 and faces.max() < len(points))
-    require(named, "a face names a point that isn't there")
+    assert named, "a face names a point that isn't there"
 
 
 def same(ours: np.ndarray, theirs: np.ndarray, what: str) -> None:
@@ -117,7 +108,7 @@ def same(ours: np.ndarray, theirs: np.ndarray, what: str) -> None:
     with np.errstate(over="ignore", invalid="ignore"):
         ours, theirs = np.asarray(ours, np.float32), np.asarray(theirs).astype(np.float32)
     equal = ours.shape == theirs.shape and np.array_equal(ours, theirs, equal_nan=True)
-    require(equal, f"{what} aren't what the file says")
+    assert equal, f"{what} aren't what the file says"
 
 
 def strictly(read: Callable[[bytes], Any], path: Path) -> Any:
@@ -125,21 +116,7 @@ def strictly(read: Callable[[bytes], Any], path: Path) -> Any:
     try:
         return read(path.read_bytes())
     except oracles.Illegal as error:
-        raise Misread(f"the file was read though it is illegal: {error}") from error
-
-
-@contextlib.contextmanager
-def messages() -> Iterator[list[str]]:
-    """Collect what the package logs."""
-    records: list[str] = []
-    handler = logging.Handler()
-    handler.emit = lambda record: records.append(record.getMessage())
-    logger = logging.getLogger("threestudio_gaussiandreamer")
-    logger.addHandler(handler)
-    try:
-        yield records
-    finally:
-        logger.removeHandler(handler)
+        raise AssertionError(f"the file was read though it is illegal: {error}") from error
 
 
 # ---- PLY files of Gaussians and points -----------------------------------------------------------
@@ -148,9 +125,7 @@ RGB = ("red", "green", "blue")
 
 
 def some_gaussians(count: int, degree: int) -> Gaussians:
-    rng = np.random.default_rng(0)
-    shapes = [(count, 3), (count, 4), (count, 3), (count,), (count, (degree + 1) ** 2, 3)]
-    arrays = Gaussians(*(rng.normal(size=shape).astype(np.float32) for shape in shapes))
+    arrays = gaussians(count, degree)
     return arrays._replace(log_scales=arrays.log_scales - 2)
 
 
@@ -165,13 +140,9 @@ def gaussian_plys() -> list[bytes]:
     seeds = []
     for encoding, degree in (("ascii", 0), ("binary_little_endian", 1), ("binary_big_endian", 0)):
         arrays = some_gaussians(12, degree)
-        rest = arrays.sh[:, 1:].transpose(0, 2, 1).reshape(12, -1)
-        values = [arrays.means, arrays.sh[:, 0], rest, arrays.logit_opacities[:, None]]
-        values += [arrays.log_scales, arrays.quats]
-        names = [*ply.MEANS, *ply.SH_CONSTANT, *(f"f_rest_{i}" for i in range(rest.shape[1]))]
-        names += ["opacity", *ply.LOG_SCALES, *ply.QUATS]
-        table = zip(names, np.concatenate(values, axis=1).T, strict=True)
-        columns = {name: ("float", column) for name, column in table}
+        names = ply.gaussian_properties(arrays.sh.shape[1])
+        table = zip(names, ply.gaussian_columns(arrays).T, strict=True)
+        columns = {name: (kind, column) for (name, kind), column in table}
         seeds.append(ply_bytes(columns, encoding, before=BINARY_FACES if degree else ("", b"")))
     return seeds
 
@@ -194,10 +165,10 @@ def point_plys() -> list[bytes]:
 
 def read_ply(read: Callable, path: Path) -> tuple[Any, oracles.PlyVertices]:
     """Return what the package and the strict reader read."""
-    with messages() as said:
+    with mock.patch.object(logger, "handle") as said:
         found = read(path)
     truth = strictly(oracles.ply_vertices, path)
-    require(not truth.leftover or said, "data after the announced end without a message")
+    assert not truth.leftover or said.called, "data after the announced end without a message"
     return found, truth
 
 
@@ -230,7 +201,7 @@ def exercise_points_ply(path: Path) -> None:
     if named and truth.types["red"] == "B":
         colors = np.stack([truth.columns[name] for name in RGB], 1) / 255
         close = np.allclose(cloud.colors, colors, atol=1e-6, equal_nan=True)
-        require(close, "colours aren't what the file says")
+        assert close, "colours aren't what the file says"
     exercise_points(path)
 
 
@@ -256,12 +227,12 @@ def motion_archives() -> list[bytes]:
 def exercise_motions(path: Path) -> None:
     motions = read_motions(str(path))
     samples, frames, joints, three = motions.positions.shape
-    require(joints in (22, 24) and three == 3 and len(motions.lengths) == samples, "shapes")
+    assert joints in (22, 24) and three == 3 and len(motions.lengths) == samples, "shapes"
     for positions, length in zip(motions.positions, motions.lengths, strict=True):
-        require(0 < length <= frames and np.isfinite(positions[:length]).all(), "frames")
+        assert 0 < length <= frames and np.isfinite(positions[:length]).all(), "frames"
     if path.read_bytes()[:6] == b"\x93NUMPY":
         whole = strictly(oracles.npy_array, path).size == motions.positions.size
-        require(whole, "numbers are missing")
+        assert whole, "numbers are missing"
 
 
 def point_archives() -> list[bytes]:
@@ -281,7 +252,7 @@ def exercise_npy_points(path: Path) -> None:
     with np.errstate(over="ignore", invalid="ignore"):
         numbers = rows[:, :3].astype(np.float32) if rows.dtype.kind in "fiu" else np.zeros((0, 3))
     good = np.isfinite(numbers).all(axis=1)
-    require(len(cloud.points) <= len(good) <= 1.06 * len(cloud.points) + 1, "rows are missing")
+    assert len(cloud.points) <= len(good) <= 1.06 * len(cloud.points) + 1, "rows are missing"
 
 
 def texts() -> list[bytes]:
@@ -318,8 +289,8 @@ def spz_files() -> list[bytes]:
 def exercise_spz(path: Path) -> None:
     arrays, _ = read_spz(path)
     count = int.from_bytes(strictly(oracles.gunzipped, path)[8:12], "little")
-    require(len(arrays.means) == count, f"{len(arrays.means)} Gaussians, but the file says {count}")
-    require(usable(arrays).all(), "values aren't finite")
+    assert len(arrays.means) == count, f"{len(arrays.means)} Gaussians, but the file says {count}"
+    assert usable(arrays).all(), "values aren't finite"
     if count:
         require_picture(cloud_of(arrays))
 
@@ -352,7 +323,7 @@ def exercise_counted(count_of: Callable[[bytes], int]) -> Callable[[Path], None]
 
     def exercise(path: Path) -> None:
         found, announced = len(drawn(path).means), strictly(count_of, path)
-        require(found <= announced, f"{found} Gaussians, but the file says {announced}")
+        assert found <= announced, f"{found} Gaussians, but the file says {announced}"
 
     return exercise
 
@@ -391,9 +362,9 @@ def exercise_means(
         found = read(path).means
         with np.errstate(over="ignore", invalid="ignore"):
             expected = strictly(means_of, path).astype(np.float32)
-            require(found.shape == expected.shape, f"{len(found)} Gaussians, not {len(expected)}")
+            assert found.shape == expected.shape, f"{len(found)} Gaussians, not {len(expected)}"
             close = np.isclose(found, expected, rtol=1e-4, atol=1e-4, equal_nan=True)
-        require(close.all(), "positions aren't those of the file")
+        assert close.all(), "positions aren't those of the file"
         drawn(path)
 
     return exercise
@@ -480,14 +451,14 @@ def exercise_mesh(path: Path) -> None:
     """A prior from the vertices, one from the surface, and a picture by ray casting."""
     mesh = load_mesh(path)
     inside = np.isfinite(mesh.vertices).all() and np.abs(mesh.vertices).max() < 1 + 1e-6
-    require(inside, "vertices outside of the box")
+    assert inside, "vertices outside of the box"
     named = mesh.faces.min() >= 0 and mesh.faces.max() < len(mesh.vertices)
-    require(named, "a face names a vertex that isn't there")
+    assert named, "a face names a vertex that isn't there"
     require_points(MeshPrior({"path": str(path)})("a fox"))
     require_points(MeshPrior({"path": str(path), "num_points": 50})("a fox"))
     c2w = np.array([[0.0, 0, 1, 3], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
     image = MeshCaster(mesh).render(c2w, 0.8, 8, 8, supersample=1)
-    require(np.isfinite(image).all() and image.min() >= 0 and image.max() < 1 + 1e-5, "a pixel")
+    assert np.isfinite(image).all() and image.min() >= 0 and image.max() < 1 + 1e-5, "a pixel"
 
 
 def exercise_ply_mesh(path: Path) -> None:
@@ -526,8 +497,8 @@ def exercise_checkpoint(path: Path) -> None:
     strictly(oracles.checked_archive, path)
     tensors, size = list(_tensors(checkpoint)), path.stat().st_size
     storages = {t.untyped_storage().data_ptr(): t.untyped_storage().nbytes() for t in tensors}
-    require(sum(storages.values()) <= size, f"tensors larger than a file of {size} bytes")
-    require(all(t.numel() * t.element_size() <= size for t in tensors), "a tensor is too large")
+    assert sum(storages.values()) <= size, f"tensors larger than a file of {size} bytes"
+    assert all(t.numel() * t.element_size() <= size for t in tensors), "a tensor is too large"
     state, own = checkpoint["state_dict"].items(), "geometry."
     geometry = GaussianCloud({})
     with lightning_errors(str(path)):
@@ -560,7 +531,7 @@ def exercise_configuration(path: Path) -> None:
     ours, theirs = (config.OmegaConf.to_container(c, resolve=False) for c in (cfg, again))
     for key in ("resume", "new_folder"):  # of this run alone
         ours[key] = theirs[key] = None
-    require(repr(ours) == repr(theirs), "parsed.yaml isn't the same run")
+    assert repr(ours) == repr(theirs), "parsed.yaml isn't the same run"
 
 
 COMMANDS = [
@@ -580,32 +551,21 @@ def exercise_command(path: Path) -> None:
     """Exit code 2 with one message, or 0 where nothing but the work itself would follow."""
     arguments = path.read_bytes().decode("utf-8", errors="surrogateescape").split("\n")
     arguments = [argument for argument in arguments if not argument.startswith("--typecheck")]
-    out, err, environ = io.StringIO(), io.StringIO(), dict(os.environ)
-    try:
-        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err), no_work():
-            code = experiment.main(arguments)
-    finally:
-        os.environ.clear()
-        os.environ.update(environ)
-    require(code in (0, 2), f"exit code {code}")
+    out, err = io.StringIO(), io.StringIO()
+    of_logger = {name: getattr(logger, name) for name in ("propagate", "level")}
+    with (
+        mock.patch.dict(os.environ),
+        mock.patch.multiple(logger, handlers=[*logger.handlers], **of_logger),
+        mock.patch.object(Run, "run", lambda self: 0),
+        warnings.catch_warnings(),
+        contextlib.redirect_stdout(out),
+        contextlib.redirect_stderr(err),
+    ):
+        code = experiment.main(arguments)
+    assert code in (0, 2), f"exit code {code}"
     if code == 2:
-        require("error: " in err.getvalue(), "exit code 2 without a message")
+        assert "error: " in err.getvalue(), "exit code 2 without a message"
         raise UserError(err.getvalue())
-
-
-@contextlib.contextmanager
-def no_work() -> Iterator[None]:
-    """Runs end where the work would begin; logging and warnings are restored."""
-    run, logger = Run.run, logging.getLogger("threestudio_gaussiandreamer")
-    handlers, propagate, level = list(logger.handlers), logger.propagate, logger.level
-    Run.run = lambda self: 0
-    try:
-        with warnings.catch_warnings():
-            yield
-    finally:
-        Run.run = run
-        logger.handlers[:], logger.propagate = handlers, propagate
-        logger.setLevel(level)
 
 
 # ---- the table -----------------------------------------------------------------------------------
@@ -719,7 +679,7 @@ def _run(target: Target, path: Path) -> Outcome:
         return Outcome("read")
     except UserError as error:
         return Outcome("refused", str(error)[:200])
-    except Misread as error:
+    except AssertionError as error:
         return Outcome("failed", f"misread: {error}")
     except Hang:
         return Outcome("failed", f"hang: more than {SECONDS:g} s of CPU time")
