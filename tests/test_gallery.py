@@ -1,6 +1,6 @@
 """The runs of ``tests/helpers/gallery.py``: what each leaves."""
 
-from tests.helpers.tiny_runs import assert_same_training, files
+from tests.helpers.gallery import assert_same_training, files
 
 TESTED = {
     *(f"ckpts/{name}.ckpt" for name in ("epoch=0-step=8", "last")),

@@ -5,7 +5,7 @@ import functools
 import numpy as np
 import pytest
 
-from tests.helpers import tiny_large_guidance, tiny_large_models, tiny_models
+from tests.helpers import tiny_large_guidance, tiny_models
 from tests.helpers.tiny_guidance import make_models, make_prompts
 
 
@@ -45,7 +45,7 @@ def large(tmp_path_factory):
     @functools.cache
     def made(kind):
         name = kind.replace("-", "_")
-        make = getattr(tiny_large_models, name, None) or getattr(tiny_models, name)
+        make = getattr(tiny_models, name, None) or getattr(tiny_models, name)
         folder = make(tmp_path_factory.mktemp("models") / kind)
         text = "stable-diffusion" if kind == "mvdream" else kind
         return folder, tiny_large_guidance.prompts(text, folder)

@@ -11,7 +11,7 @@ import torch.nn.functional as F
 
 from tests.helpers import tiny_guidance as tiny
 from tests.helpers import tiny_large_guidance as large_tiny
-from tests.helpers import tiny_large_models, tiny_models
+from tests.helpers import tiny_models
 from tests.helpers.tiny_guidance import BATCH, Recorder, in_double, relative, renders
 from tests.helpers.tiny_large_guidance import gradient, guidance
 from threestudio_gaussiandreamer.core.errors import UserError
@@ -28,7 +28,7 @@ pytest.importorskip("diffusers")
 SD, XL, SD3, IF = "stable-diffusion", "stable-diffusion-xl", "stable-diffusion-3", "deep-floyd"
 LATENTS = {SD: (0.18215, 0.0), XL: (0.13025, 0.0), SD3: (1.5305, 0.0609)}
 """Scale and shift of each model's latents."""
-POOLED = tiny_large_models.POOLED
+POOLED = tiny_models.POOLED
 
 
 def sigma_of(t, shift=3.0):
@@ -203,7 +203,7 @@ def test_a_gradient_that_overflows_in_the_encoder_is_left_out_and_counted(large,
 def test_a_vae_that_overflows_stays_in_float32(
     large, tmp_path, monkeypatch, half_type, force_upcast
 ):
-    folder = tiny_large_models.stable_diffusion_xl(tmp_path / "xl", force_upcast=force_upcast)
+    folder = tiny_models.stable_diffusion_xl(tmp_path / "xl", force_upcast=force_upcast)
     dtype, prompts = getattr(torch, half_type), large(XL)[1]
     monkeypatch.setattr(text_to_image, "weights_type", lambda *options: dtype)
     guide, rgb = guidance(XL, folder, half_precision_type=half_type), renders()
@@ -290,7 +290,7 @@ def test_the_size_is_the_models_unless_given(large, caplog, kind, trained, other
 
 
 def test_a_shift_that_depends_on_the_picture_is_asked_for(tmp_path):
-    folder = tiny_large_models.stable_diffusion_3(tmp_path / "dynamic")
+    folder = tiny_models.stable_diffusion_3(tmp_path / "dynamic")
     file = folder / "scheduler" / "scheduler_config.json"
     file.write_text(json.dumps(json.loads(file.read_text()) | {"use_dynamic_shifting": True}))
     with pytest.raises(UserError, match="set system.guidance.flow_shift"):

@@ -9,8 +9,8 @@ import torch
 
 from tests.guidance.exact_score_cases import guidance
 from tests.helpers import tiny_guidance as tiny
-from tests.helpers import tiny_large_models
-from tests.helpers.mixture_guidance import MixtureGuidance, latents, mixture_guidance
+from tests.helpers import tiny_models
+from tests.helpers.pixel_guidance import MixtureGuidance, latents, mixture_guidance
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.guidance.exact_score import ExactScoreGuidance
 from threestudio_gaussiandreamer.guidance.mvdream import MVDreamGuidance
@@ -221,7 +221,7 @@ def test_what_has_no_effect_is_refused_before_long_work(mesh_path, given, more, 
 def test_the_default_of_mvdream_is_not_refused_without_guidance(tmp_path):
     """Its ``recon_std_rescale`` is 0.5 unless given."""
     pytest.importorskip("diffusers")
-    folder = str(tiny_large_models.mvdream(tmp_path))
+    folder = str(tiny_models.mvdream(tmp_path))
     name = {"pretrained_model_name_or_path": folder}
     for more in ({"guidance_scale": 1.0}, {"variant_type": "csd-variant"}):
         for given in ({}, {"recon_std_rescale": 0.0}, {"recon_std_rescale": 0.5}):

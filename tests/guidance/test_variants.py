@@ -5,7 +5,7 @@ in three dimensions.
 import pytest
 import torch
 
-from tests.helpers.mixture_guidance import (
+from tests.helpers.pixel_guidance import (
     MODES,
     MixtureGuidance,
     draws,

@@ -10,10 +10,13 @@ import itertools
 import os
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 from unittest import mock
 
+import torch
 from filelock import FileLock
 
+from threestudio_gaussiandreamer.core.checkpoint_file import load_file
 from threestudio_gaussiandreamer.core.errors import UserError
 
 FORMATS = "system.exporter.formats=[ply,compressed-ply,spz,sog,glb,usda,points]"
@@ -92,3 +95,39 @@ class Gallery:
                 )  # fmt: skip
         (self.root / f"{name}.txt").write_text(said.getvalue())
         (self.root / f"{name}.code").write_text(str(code))
+
+
+def only_run() -> Path:
+    """Return the folder of the only run."""
+    (folder,) = Path("outputs/tiny").iterdir()
+    return folder
+
+
+def files(folder: Path) -> set[str]:
+    """List the files below a folder, relative to it."""
+    return {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
+
+
+def assert_same_training(a: Path, b: Path) -> None:
+    """Compare parameters, optimiser and step of two checkpoints bit for bit."""
+    one, other = load_file(a), load_file(b)
+    assert one["epoch"] == other["epoch"] and not differences(one, other)
+
+
+def training_state(checkpoint: dict[str, Any]) -> dict[str, torch.Tensor]:
+    """Return parameters, statistics, moments and the step."""
+    moments = checkpoint["optimizer_states"][0]["state"]
+    found = {
+        f"{i}.{name}": torch.as_tensor(value)
+        for i, state in moments.items()
+        for name, value in state.items()
+    }
+    return {**checkpoint["state_dict"], **found, "step": torch.tensor(checkpoint["global_step"])}
+
+
+def differences(a: dict[str, Any], b: dict[str, Any]) -> int:
+    """Count the tensors of two checkpoints' training states that differ in any bit."""
+    one, other = training_state(a), training_state(b)
+    return len(one.keys() ^ other.keys()) + sum(
+        not torch.equal(one[name], other[name]) for name in one.keys() & other.keys()
+    )

@@ -4,7 +4,7 @@ import pytest
 
 import threestudio_gaussiandreamer
 from tests.helpers import tiny_parts
-from tests.helpers.tiny_runs import only_run
+from tests.helpers.gallery import only_run
 from tests.launch.cases import DEMO, SMALL
 from threestudio_gaussiandreamer.launch.experiment import main
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from tests.helpers.tiny_runs import files
+from tests.helpers.gallery import files
 from tests.training import runs
 from threestudio_gaussiandreamer.core import launcher
 from threestudio_gaussiandreamer.core.command import run_main

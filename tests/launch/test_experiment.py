@@ -8,7 +8,7 @@ import imageio.v3 as iio
 import pytest
 
 from tests.helpers import tiny_parts
-from tests.helpers.tiny_runs import files, only_run
+from tests.helpers.gallery import files, only_run
 from threestudio_gaussiandreamer.core.checkpoint_file import load_file
 from threestudio_gaussiandreamer.launch.config import load_config
 

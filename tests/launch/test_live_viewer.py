@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from tests.helpers.tiny_runs import assert_same_training
+from tests.helpers.gallery import assert_same_training
 from tests.view.clouds import cloud
 from threestudio_gaussiandreamer.launch import live_viewer
 from threestudio_gaussiandreamer.launch.live_viewer import LiveViewer

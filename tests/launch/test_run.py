@@ -5,7 +5,7 @@ import os
 from pathlib import Path
 
 from tests.helpers import tiny_parts
-from tests.helpers.tiny_runs import files, only_run
+from tests.helpers.gallery import files, only_run
 from threestudio_gaussiandreamer.core.checkpoint_file import load_checkpoint
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.launch import callbacks, experiment, run, run_folder

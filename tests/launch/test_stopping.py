@@ -16,7 +16,7 @@ import pytest
 import torch
 
 from tests.helpers import tiny_parts
-from tests.helpers.tiny_runs import assert_same_training, files, only_run
+from tests.helpers.gallery import assert_same_training, files, only_run
 from threestudio_gaussiandreamer.core.checkpoint_file import load_file
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.core.host_copies import DelayedReads, HostCopy

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from tests.helpers import tiny_large_models
+from tests.helpers import tiny_models
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.models.multiview_unet import (
     attend_across_views,
@@ -18,7 +18,7 @@ VIEWS = 4
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    return tiny_large_models.mvdream(tmp_path_factory.mktemp("models") / "mvdream")
+    return tiny_models.mvdream(tmp_path_factory.mktemp("models") / "mvdream")
 
 
 def load(folder, dtype=torch.float32):
@@ -41,7 +41,7 @@ def inputs(rows, seed=0):
 
 def test_the_published_names_give_the_same_network(folder):
     mine = load(folder)
-    original = tiny_large_models.plain_unet(unet_options(tiny_large_models.MULTI_VIEW))
+    original = tiny_models.plain_unet(unet_options(tiny_models.MULTI_VIEW))
     for name, value in original.state_dict().items():
         assert torch.equal(mine.state_dict()[name], value), name
     z, text, cameras = inputs(3)
@@ -76,7 +76,7 @@ def test_views_see_those_of_their_own_object_alone_in_any_order(folder):
 
 
 def test_models_that_do_not_fit_are_reported(tmp_path):
-    folder = tiny_large_models.mvdream(tmp_path / "other", model_channels=64)
+    folder = tiny_models.mvdream(tmp_path / "other", model_channels=64)
     with pytest.raises(UserError, match="(?s)unet of the model in .* can't .*size mismatch"):
         load(folder)
     (folder / "unet" / "diffusion_pytorch_model.safetensors").write_bytes(b"no weights")

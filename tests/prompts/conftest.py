@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from tests.helpers import tiny_large_models, tiny_models
+from tests.helpers import tiny_models
 from threestudio_gaussiandreamer.host import find
 from threestudio_gaussiandreamer.models import model_files
 from threestudio_gaussiandreamer.prompts import prompt_processors  # noqa: F401
@@ -23,8 +23,8 @@ def models(tmp_path_factory):
     return {
         "stable-diffusion": tiny_models.stable_diffusion(folder / "sd"),
         "deep-floyd": tiny_models.deep_floyd(folder / "if"),
-        "stable-diffusion-xl": tiny_large_models.stable_diffusion_xl(folder / "xl"),
-        "stable-diffusion-3": tiny_large_models.stable_diffusion_3(folder / "3"),
+        "stable-diffusion-xl": tiny_models.stable_diffusion_xl(folder / "xl"),
+        "stable-diffusion-3": tiny_models.stable_diffusion_3(folder / "3"),
         "other": tiny_models.stable_diffusion(folder / "other", seed=1),
     }
 

@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 from unittest import mock
 
 import torch
-from torch import Tensor
 
+from tests.helpers.gallery import differences
 from threestudio_gaussiandreamer.launch import experiment
 
 EVERY_STEP = ["checkpoint.every_n_train_steps=1", "trainer.max_steps=5"]
@@ -69,26 +69,7 @@ def launch(folder: Path, *overrides: str, stage: str = "--train", config: Path =
     return Ended(code, out.getvalue(), err.getvalue(), Path(folder) / "demo" / "t")
 
 
-def training_state(checkpoint: dict[str, Any]) -> dict[str, Tensor]:
-    """Return parameters, statistics, moments and the step."""
-    moments = checkpoint["optimizer_states"][0]["state"]
-    found = {
-        f"{i}.{name}": torch.as_tensor(value)
-        for i, state in moments.items()
-        for name, value in state.items()
-    }
-    return {**checkpoint["state_dict"], **found, "step": torch.tensor(checkpoint["global_step"])}
-
-
 def require_equal_ends(measured: Any, one: Ended, other: Ended, what: str) -> None:
     """Measure how many tensors of two runs' last training states differ; fail if any does."""
     differing = differences(one.checkpoint(), other.checkpoint())
     measured(differing, "tensors", what=what, at_most=0)
-
-
-def differences(a: dict[str, Any], b: dict[str, Any]) -> int:
-    """Count the tensors of two checkpoints' training states that differ in any bit."""
-    one, other = training_state(a), training_state(b)
-    return len(one.keys() ^ other.keys()) + sum(
-        not torch.equal(one[name], other[name]) for name in one.keys() & other.keys()
-    )

@@ -8,10 +8,11 @@ from unittest import mock
 import pytest
 import torch
 
+from tests.helpers.gallery import differences
 from tests.stability import scenes
 from tests.stability.backends import slow
 from tests.stability.report import row
-from tests.stability.small_runs import DEMO, Ended, differences, launch
+from tests.stability.small_runs import DEMO, Ended, launch
 from threestudio_gaussiandreamer.cameras import orbit_c2w
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.core.streams import generator

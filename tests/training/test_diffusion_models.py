@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.helpers import tiny_3d_models, tiny_large_models, tiny_models
+from tests.helpers import tiny_3d_models, tiny_models
 from threestudio_gaussiandreamer.formats.gaussian_files import read_cloud
 from threestudio_gaussiandreamer.guidance.text_to_image import TextToImageDistillation
 from threestudio_gaussiandreamer.launch.experiment import main
@@ -46,10 +46,10 @@ def models(tmp_path_factory):
         "epsilon": guided_by(tiny_models.stable_diffusion(folder / "epsilon")),
         "deep_floyd": guided_by(tiny_models.deep_floyd(folder / "if")),
         # the size that the configuration sets is that of the real model
-        "sd3": guided_by(tiny_large_models.stable_diffusion_3(folder / "sd3"))
+        "sd3": guided_by(tiny_models.stable_diffusion_3(folder / "sd3"))
         | {"system.guidance.image_size": 64},
-        "sdxl": guided_by(tiny_large_models.stable_diffusion_xl(folder / "sdxl")),
-        "mvdream": guided_by(tiny_large_models.mvdream(folder / "mvdream")),
+        "sdxl": guided_by(tiny_models.stable_diffusion_xl(folder / "sdxl")),
+        "mvdream": guided_by(tiny_models.mvdream(folder / "mvdream")),
         "shap_e": prior(model=shap_e, num_inference_steps=2, grid_size=24),
         "point_e": prior(checkpoint=base, upsampler=upsampler, num_steps=2, num_points=64)
         | prior(clip=clip),
