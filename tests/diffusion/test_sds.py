@@ -35,27 +35,17 @@ def test_timesteps_cover_the_range_with_both_ends():
         assert set(draws.tolist()) == set(range(max(low, 1), last + 1))
 
 
-def test_classifier_free_guidance_convention():
+def test_weights_guidance_and_loss_by_their_formulas():
+    quarter = torch.tensor([0.25], dtype=torch.float64)
+    for name, value in {"sds": 0.75, "uniform": 1.0, "fantasia3d": 0.375}.items():
+        assert sds.WEIGHTS[name](quarter).item() == value
     cond, uncond = torch.tensor([2.0]), torch.tensor([1.0])
-    assert sds.classifier_free(cond, uncond, 1.0) == cond
-    assert sds.classifier_free(cond, uncond, 0.0) == uncond
-    threestudio = cond + 100 * (cond - uncond)
-    assert sds.classifier_free(cond, uncond, 101.0) == threestudio
-
-
-def test_weights():
-    expected = {"sds": 0.75, "uniform": 1.0, "fantasia3d": 0.375}
-    for name, value in expected.items():
-        assert sds.WEIGHTS[name](torch.tensor([0.25], dtype=torch.float64)).item() == value
-
-
-def test_sds_loss_has_the_gradient_it_is_given():
-    generator = torch.Generator().manual_seed(0)
-    x = torch.randn(4, 3, 8, 8, generator=generator).requires_grad_()
-    grad = torch.randn(4, 3, 8, 8, generator=generator)
-    loss = sds.sds_loss(x, grad)
-    loss.backward()
-    torch.testing.assert_close(x.grad, grad / 4)
+    for scale, expected in ((1.0, cond), (0.0, uncond), (101.0, cond + 100 * (cond - uncond))):
+        assert sds.classifier_free(cond, uncond, scale) == expected  # threestudio's 100 is 101
+    x, grad = torch.randn(2, 4, 3, 8, 8, generator=torch.Generator().manual_seed(0))
+    loss = sds.sds_loss(x.requires_grad_(), grad)
+    (found,) = torch.autograd.grad(loss, x)
+    torch.testing.assert_close(found, grad / 4)
     torch.testing.assert_close(loss.detach(), 0.5 * grad.square().sum() / 4)
 
 

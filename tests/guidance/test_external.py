@@ -25,25 +25,23 @@ class ImageDouble:
         return {"loss_sds": rgb.sum() + elevation.sum(), "kwargs": kwargs}
 
 
-class StrictDouble:
+def strict(rgb, prompt_utils, elevation, azimuth, camera_distances):
     """Takes three entries of the batch and nothing else."""
-
-    def __call__(self, rgb, prompt_utils, elevation, azimuth, camera_distances):
-        return {"loss_sds": rgb.sum(), "prompt_utils": prompt_utils}
+    return {"loss_sds": rgb.sum(), "prompt": prompt_utils}
 
 
-class WrappedDouble:
-    """Passes all arguments on, so that its signature is uninformative."""
-
-    def __call__(self, *args, **kwargs):
-        return OtherNameDouble()(*args, **{"prompt": kwargs.pop("prompt_utils"), **kwargs})
-
-
-class OtherNameDouble:
+def other_name(rgb, prompt, elevation, azimuth, camera_distances, **kwargs):
     """Uses another name for the prompt, which threestudio passes by position."""
+    return {"loss_sds": rgb.sum(), "prompt": prompt}
 
-    def __call__(self, rgb, prompt, elevation, azimuth, camera_distances, **kwargs):
-        return {"loss_sds": rgb.sum(), "prompt": prompt}
+
+def wrapped(*args, **kwargs):
+    """Passes all arguments on, so that its signature is uninformative."""
+    return other_name(*args, **{"prompt": kwargs.pop("prompt_utils"), **kwargs})
+
+
+def part(call):
+    return type("Double", (), {"__call__": staticmethod(call)})()
 
 
 class LearningDouble(nn.Module):
@@ -93,9 +91,8 @@ def test_each_signature_gets_what_it_takes():
 
     others = {"height", "width", "c2w", "mvp_mtx", "comp_rgb_bg", "prompt_utils"}
     assert set(called(ImageDouble())["kwargs"]) == others
-    assert called(StrictDouble())["prompt_utils"] == "prompts"
-    for double in (OtherNameDouble(), WrappedDouble()):
-        assert called(double)["prompt"] == "prompts"
+    for double in (strict, other_name, wrapped):
+        assert called(part(double))["prompt"] == "prompts"
     assert set(called(LearningDouble())) == {"loss_vsd", "loss_lora"}
 
 
@@ -110,16 +107,13 @@ def test_each_signature_gets_what_it_takes():
     ],
 )
 def test_content_that_no_run_can_use_is_named(returned, message):
-    class Odd:
-        def __call__(self, rgb):
-            return returned
-
+    inputs = part(lambda rgb: returned), torch.zeros(1, 2, 2, 3), None, {}
     if message is None:  # a loss that is off may be a plain number
-        out = call_guidance(Odd(), torch.zeros(1, 2, 2, 3), None, {})
+        out = call_guidance(*inputs)
         assert torch.stack([out["loss_sds"], out["loss_off"]]).tolist() == [1, 0]
         return
-    with pytest.raises(UserError, match=f"Odd {message}"):
-        call_guidance(Odd(), torch.zeros(1, 2, 2, 3), None, {})
+    with pytest.raises(UserError, match=f"Double {message}"):
+        call_guidance(*inputs)
 
 
 def test_what_a_guidance_learnt_is_put_back():

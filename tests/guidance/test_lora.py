@@ -7,7 +7,6 @@ import torch
 
 from tests.helpers import tiny_guidance as tiny
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.guidance.stable_diffusion import StableDiffusionGuidance
 from threestudio_gaussiandreamer.guidance.variants import vsd as module
 from threestudio_gaussiandreamer.guidance.variants.vsd import adapted_layers, particle_noise
 
@@ -176,11 +175,3 @@ def test_a_restored_lora_continues_bit_for_bit(models, prompts):
     smaller, _ = vsd(models, rank=2)
     with pytest.raises(UserError, match="had learnt .* resume with the configuration"):
         smaller.variant.restore(smaller, saved)
-
-
-def test_options_that_replace_the_unets_forward_pass_are_refused(models):
-    cfg = {"pretrained_model_name_or_path": str(models["epsilon"]), "variant_type": "vsd-variant"}
-    StableDiffusionGuidance.preflight(cfg)
-    for option in ("enable_torch_compile", "enable_sequential_cpu_offload"):
-        with pytest.raises(UserError, match=f"system.guidance.{option}: vsd-variant trains a LoRA"):
-            StableDiffusionGuidance.preflight(cfg | {option: True})

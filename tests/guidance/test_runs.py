@@ -9,9 +9,12 @@ import yaml
 import tests.guidance.test_external  # noqa: F401  registers test-learning-guidance
 from tests.helpers import tiny_models
 from threestudio_gaussiandreamer import register_parts
+from threestudio_gaussiandreamer.guidance.mock import prompt_color
 from threestudio_gaussiandreamer.host import BaseObject, register
+from threestudio_gaussiandreamer.launch.config import load_config
+from threestudio_gaussiandreamer.launch.config_check import check_config
 from threestudio_gaussiandreamer.launch.experiment import main
-from threestudio_gaussiandreamer.priors.random import RandomPrior
+from threestudio_gaussiandreamer.launch.options import find_config
 
 register_parts()
 
@@ -118,22 +121,34 @@ def assert_resumes(path, folder, *options):
 # --------------------------------------------------------------------------------------------------
 
 
+NOISES = [
+    *("mode=direction-bins", "space=latent", "latent_size=8", "bank_views=12"),
+    *("guidance_scale=7.5", "variant_type=vsd-variant"),
+]
+"""An exact score in which the noise doesn't cancel, with VSD."""
+
+
 @pytest.mark.slow
-def test_a_guidance_that_learns_resumes_as_if_it_had_never_stopped(tmp_path):
-    system = {
-        "guidance_type": "test-learning-guidance",
-        "guidance": {},
-        "loss": {"lambda_vsd": 1.0, "lambda_lora": 1.0},
-    }
-    found = assert_resumes(config(tmp_path / "run.yaml", **system), tmp_path)
-    assert [name for name in found if name.startswith("/guidance")] == [
-        "/guidance/learner.lora.weight"
-    ]
-    weights = torch.load(
-        tmp_path / "parts" / "demo" / "t" / "ckpts" / "last.ckpt", weights_only=True
-    )["guidance"]
-    assert torch.equal(found["/guidance/learner.lora.weight"], weights["learner.lora.weight"])
-    assert not [name for name in found if "frozen" in name]
+@pytest.mark.parametrize("kind", ["own parameters", "moments", "lora"])
+def test_a_guidance_that_learns_resumes_as_if_it_had_never_stopped(tmp_path, monkeypatch, kind):
+    monkeypatch.chdir(tmp_path)
+    system, options, expected = {}, [], {"learner.lora.weight"}
+    if kind == "own parameters":
+        weights = {"lambda_vsd": 1.0, "lambda_lora": 1.0}
+        system = {"guidance_type": "test-learning-guidance", "guidance": {}, "loss": weights}
+    elif kind == "moments":
+        options, expected = [f"system.guidance.{x}" for x in NOISES], {"mean", "square", "weight"}
+    else:
+        pytest.importorskip("diffusers")
+        system = diffusion(tiny_models.stable_diffusion(tmp_path / "model"))
+        options = ["system.guidance.variant_type=vsd-variant"]
+    found = assert_resumes(config(tmp_path / "run.yaml", **system), tmp_path, *options)
+    learnt = {name.removeprefix("/guidance/") for name in found if name.startswith("/guidance")}
+    if kind == "lora":
+        assert {"up.0", "exp_avg_sq.up.0", "camera_in"} <= learnt
+    else:
+        assert learnt == expected
+    assert all(value.isfinite().all() for value in found.values())
 
 
 def test_a_guidance_by_name_gets_the_full_batch_and_all_its_losses_count(tmp_path, capsys):
@@ -149,45 +164,10 @@ def test_a_guidance_by_name_gets_the_full_batch_and_all_its_losses_count(tmp_pat
     assert BATCH_KEYS <= keys
 
 
-NOISES = {
-    "system.guidance.mode": "direction-bins",
-    "system.guidance.space": "latent",
-    "system.guidance.latent_size": 8,
-    "system.guidance.bank_views": 12,
-    "system.guidance.guidance_scale": 7.5,
-}
-"""An exact score in which the noise doesn't cancel."""
-
-
-def options(variant, **more):
-    chosen = NOISES | {"system.guidance.variant_type": variant} | more
-    return [f"{key}={value}" for key, value in chosen.items()]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("variant", ["vsd-variant", "cfd-variant"])
-def test_a_run_with_the_exact_score_resumes_as_if_it_had_never_stopped(tmp_path, variant):
-    found = assert_resumes(config(tmp_path / "run.yaml"), tmp_path, *options(variant))
-    moments = {name for name in found if name.startswith("/guidance")}
-    expected = {"mean", "square", "weight"} if variant == "vsd-variant" else set()
-    assert moments == {f"/guidance/{name}" for name in expected}
-
-
-@pytest.mark.slow
-def test_a_lora_resumes_as_if_it_had_never_stopped(tmp_path, monkeypatch):
-    pytest.importorskip("diffusers")
-    monkeypatch.chdir(tmp_path)
-    model = tiny_models.stable_diffusion(tmp_path / "model")
-    path = config(tmp_path / "run.yaml", **diffusion(model))
-    found = assert_resumes(path, tmp_path, "system.guidance.variant_type=vsd-variant")
-    assert any(name.startswith("/guidance/up.") for name in found)
-    assert any(name.startswith("/guidance/exp_avg_sq.") for name in found)
-    assert all(value.isfinite().all() for value in found.values())
-
-
-def test_a_variant_that_cannot_work_ends_the_run_before_the_prior(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(RandomPrior, "generate", lambda *args: pytest.fail("ran the prior"))
-    blind = {"system.guidance.mode": "view-agnostic"}
-    path = config(tmp_path / "run.yaml")
-    assert run(path, tmp_path, *options("csd-variant", **blind)) == 2
-    assert "csd-variant follows the difference" in capsys.readouterr().err
+def test_the_mock_guidance_takes_the_place_of_stable_diffusion():
+    overrides = ["system.guidance_type=mock-guidance", "system.prompt_processor.prompt=a fox"]
+    cfg = load_config(find_config("gaussiandreamer.yaml"), cli_args=overrides)
+    check_config(cfg)
+    assert cfg.system.guidance.guidance_scale > 1
+    assert "view_dependent_prompting" not in cfg.system.guidance
+    assert prompt_color("a fox") != prompt_color("a ball")

@@ -130,13 +130,6 @@ def test_slicing_keeps_the_activations_of_one_image(models):
     assert sizes[True] < sizes[False] / 20
 
 
-def test_compiling_is_asked_for_once(models, prompts, monkeypatch):
-    asked = []
-    monkeypatch.setattr(torch, "compile", lambda network: asked.append(network) or network)
-    gradient(guidance(models, enable_torch_compile=True), prompts[False], renders())
-    assert [type(network).__name__ for network in asked] == ["UNet2DConditionModel"]
-
-
 def test_a_model_without_one_size_is_asked_for(tmp_path):
     folder = tiny_models.stable_diffusion(tmp_path / "model")
     config = json.loads((folder / "unet" / "config.json").read_text())
@@ -147,11 +140,17 @@ def test_a_model_without_one_size_is_asked_for(tmp_path):
     assert guidance({"epsilon": folder}, image_size=64).image_size == 64
 
 
-def test_an_unusual_guidance_scale_is_told(models, caplog):
-    for scale, warned in ((-5, True), (0, False), (101, False), (1e6, True)):
+def test_an_unusual_guidance_scale_is_told_and_compiling_asked_for_once(
+    models, caplog, monkeypatch
+):
+    asked = []
+    monkeypatch.setattr(torch, "compile", lambda network: asked.append(network) or network)
+    for scale, warned in ((-5, True), (101, False), (1e6, True)):
         caplog.clear()
-        guidance(models, guidance_scale=scale)
+        guide = guidance(models, guidance_scale=scale, enable_torch_compile=scale == -5)
         assert ("guidance_scale" in caplog.text) == warned
+        if scale == -5:
+            assert asked == [guide.unet]
 
 
 def test_a_model_of_another_task_is_refused_before_the_prior(tmp_path):

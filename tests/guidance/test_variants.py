@@ -42,31 +42,30 @@ def both_scores(guidance, z, t):
     return noise_of(z, abar, MODES[:1]), noise_of(z, abar, MODES)
 
 
-@pytest.mark.parametrize("scale", [1.0, 7.5])
-def test_sds_is_the_guided_noise_minus_the_noise(scale):
-    guidance, x = mixture_guidance(guidance_scale=scale), latents()
-    t, a, sigma, noise, z = draws(guidance, x)
-    cond, uncond = both_scores(guidance, z, t)
-    assert_close(error_of(guidance, x), uncond + scale * (cond - uncond) - noise)
-
-
-@pytest.mark.parametrize("share", [0.5, 1.0])
-def test_rescaled_sds_brings_x0_to_the_deviation_of_the_conditional_one(share):
+def rescaled(z, a, sigma, cond, guided, share):
     """eps = (z - a f x0_guided) / sigma, f = share std(x0_cond) / std(x0_guided) + 1 - share."""
-    guidance, x = mixture_guidance(guidance_scale=30.0, recon_std_rescale=share), latents()
-    t, a, sigma, noise, z = draws(guidance, x)
-    cond, uncond = both_scores(guidance, z, t)
-    x0_cond, x0_guided = ((z - sigma * eps) / a for eps in (cond, uncond + 30 * (cond - uncond)))
+    x0_cond, x0_guided = ((z - sigma * eps) / a for eps in (cond, guided))
     deviations = [x0.std(dim=(1, 2, 3), keepdim=True) for x0 in (x0_cond, x0_guided)]
     factor = share * deviations[0] / deviations[1] + 1 - share
-    assert_close(error_of(guidance, x), (z - a * factor * x0_guided) / sigma - noise)
+    return (z - a * factor * x0_guided) / sigma
 
 
-def test_csd_is_the_difference_that_the_condition_makes():
-    guidance, x = mixture_guidance("csd-variant", guidance_scale=7.5), latents()
+@pytest.mark.parametrize(
+    ("variant", "scale", "share"),
+    [("sds", 1.0, 0), ("sds", 7.5, 0), ("sds", 30.0, 0.5), ("sds", 30.0, 1.0), ("csd", 7.5, 0)]
+    + [("vsd", 7.5, 0)],
+)
+def test_the_residual_of_random_noise(variant, scale, share):
+    """That of VSD before any render is that of SDS."""
+    options = {"guidance_scale": scale, "recon_std_rescale": share}
+    guidance, x = mixture_guidance(f"{variant}-variant", **options), latents()
     t, a, sigma, noise, z = draws(guidance, x)
     cond, uncond = both_scores(guidance, z, t)
-    assert_close(error_of(guidance, x), 7.5 * (cond - uncond))
+    guided = uncond + scale * (cond - uncond)
+    if share:
+        guided = rescaled(z, a, sigma, cond, guided, share)
+    expected = scale * (cond - uncond) if variant == "csd" else guided - noise
+    assert_close(error_of(guidance, x), expected)
 
 
 class Negative(MixtureGuidance):
@@ -93,15 +92,6 @@ def test_nfsd_with_a_negative_prompt():
 
 def learn(guidance, x):
     guidance.variant.learn(guidance, x, None, {}, torch.ones(len(x), dtype=torch.bool))
-
-
-def test_vsd_before_any_render_is_sds():
-    x = latents()
-    sds, own = (
-        error_of(mixture_guidance(name, guidance_scale=7.5), x)
-        for name in ("sds-variant", "vsd-variant")
-    )
-    assert torch.equal(sds, own)
 
 
 def test_vsd_subtracts_the_optimal_denoiser_of_the_renders_gaussian(monkeypatch):

@@ -65,6 +65,9 @@ def test_a_lora_is_trained_in_unets_of_single_views(large, kind):
             part.preflight(options)
     else:
         guide = tiny.guidance(kind, folder, variant_type="vsd-variant")
+        for option in ("enable_torch_compile", "enable_sequential_cpu_offload"):
+            with pytest.raises(UserError, match=f"system.guidance.{option}: vsd-variant trains"):
+                guide.preflight(options | {option: True})
         grad, out = tiny.gradient(guide, prompt_utils, renders(), **ring())
         assert grad.isfinite().all() and grad.any() and out["bad_items"] == 0
 

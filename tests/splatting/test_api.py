@@ -103,11 +103,6 @@ def test_non_finite_error_names_attribute_count_and_place(name):
     assert all(word in str(caught.value) for word in (name, " 2 ", place, "nan"))
 
 
-def test_presets_are_numbers():
-    for name in PRESETS:
-        assert torch.equal(call(preset=name).image, call(alpha_min=PRESETS[name]).image)
-
-
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
 def test_half_precision_inputs_are_widened(dtype):
     half = {name: x.to(dtype) for name, x in arguments().items() if torch.is_tensor(x)}
@@ -119,16 +114,15 @@ def test_half_precision_inputs_are_widened(dtype):
     assert half["means"].grad.dtype == dtype and half["means"].grad.abs().sum() > 0
 
 
-def test_float64_stays_float64_and_may_have_float32_cameras():
+def test_layouts_and_types_that_are_converted():
     values = arguments(dtype=torch.float64) | {"viewmats": arguments()["viewmats"]}
     assert call(**values, backend="auto").image.dtype == torch.float64
-
-
-def test_non_contiguous_inputs():
     values = arguments()
     tensors = {name: x for name, x in values.items() if torch.is_tensor(x) and x.dim() > 1}
     strided = {name: x.mT.contiguous().mT for name, x in tensors.items()}
     assert torch.equal(call(**strided).image, call(**values).image)
+    for name in PRESETS:
+        assert torch.equal(call(preset=name).image, call(alpha_min=PRESETS[name]).image)
 
 
 @pytest.mark.parametrize("only", ["colors", "opacities", "background"])
@@ -155,14 +149,11 @@ def test_without_gradients_nothing_is_tracked():
 
 
 def test_an_unavailable_backend_says_why_and_what_to_do(monkeypatch):
+    with pytest.raises(UserError, match="(?s)float32.*float64"):
+        call(**arguments(dtype=torch.float64), backend="cpu")
     monkeypatch.setattr(cpu, "unavailable", lambda: "the library wasn't built")
     with pytest.raises(UserError, match="(?s)'cpu'.*the library wasn't built.*torch"):
         call(backend="cpu")
-
-
-def test_the_native_backend_takes_float32_only():
-    with pytest.raises(UserError, match="(?s)float32.*float64"):
-        call(**arguments(dtype=torch.float64), backend="cpu")
 
 
 def test_auto_prefers_the_native_library_and_says_once_when_it_cannot(monkeypatch, caplog):

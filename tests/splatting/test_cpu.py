@@ -253,13 +253,10 @@ def test_the_last_tile_of_the_tallest_image(threads):
 # ---- the library ---------------------------------------------------------------------------------
 
 
-def test_a_library_of_another_version_is_refused(monkeypatch):
-    monkeypatch.setattr(cpu, "INTERFACE", cpu.INTERFACE + 1)
-    with pytest.raises(OSError, match="earlier version"):
+def test_builds_of_another_version_or_name_are_refused(monkeypatch, force):
+    with monkeypatch.context() as patch, pytest.raises(OSError, match="earlier version"):
+        patch.setattr(cpu, "INTERFACE", cpu.INTERFACE + 1)
         cpu._load(cpu.usable_builds()[0])
-
-
-def test_a_build_that_does_not_exist_is_named(force):
     force("v5")
     with pytest.raises(UserError, match="GAUSSIANDREAMER_ISA=v5, but .* only have .*base"):
         cpu.library()

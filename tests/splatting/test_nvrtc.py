@@ -86,22 +86,16 @@ def test_what_the_compiler_rejects_is_named(monkeypatch):
         nvrtc.compile_unit("blend", "sm_90")
 
 
-@pytest.mark.parametrize(
-    "capability, target",
-    [((7, 5), "sm_75"), ((9, 0), "sm_90"), ((13, 0), "compute_120"), ((8, 7), "compute_86")],
-)
-def test_devices_newer_than_the_compiler_get_the_newest_text(monkeypatch, capability, target):
-    monkeypatch.setattr(nvrtc, "architectures", lambda: [52, 75, 80, 86, 90, 120])
-    assert nvrtc.target_for(capability) == target
-
-
-@pytest.mark.parametrize("known", [[52, 70, 75, 90], [75, 90], [80, 90]])
-def test_devices_that_are_too_old_are_named(monkeypatch, known):
-    monkeypatch.setattr(nvrtc, "architectures", lambda: known)
+def test_devices_newer_than_the_compiler_get_the_newest_text_and_old_ones_are_named(monkeypatch):
     monkeypatch.setattr(nvrtc, "version", lambda: (13, 0))
-    needed = f"needs {max(75, known[0]) / 10} or later: use backend='torch'"
-    with pytest.raises(UserError, match=rf"capability 7\.0;.*CUDA 13\.0, {needed}"):
-        nvrtc.target_for((7, 0))
+    monkeypatch.setattr(nvrtc, "architectures", lambda: [52, 75, 80, 86, 90, 120])
+    targets = {(7, 5): "sm_75", (9, 0): "sm_90", (13, 0): "compute_120", (8, 7): "compute_86"}
+    assert {capability: nvrtc.target_for(capability) for capability in targets} == targets
+    for known in ([52, 70, 75, 90], [75, 90], [80, 90]):
+        monkeypatch.setattr(nvrtc, "architectures", lambda known=known: known)
+        needed = f"needs {max(75, known[0]) / 10} or later: use backend='torch'"
+        with pytest.raises(UserError, match=rf"capability 7\.0;.*CUDA 13\.0, {needed}"):
+            nvrtc.target_for((7, 0))
 
 
 def test_without_a_compiler_it_says_what_to_install(monkeypatch):
@@ -133,24 +127,17 @@ def test_the_release_that_torch_was_built_with_is_tried_first(monkeypatch, tmp_p
 
 
 @needs_nvrtc
-def test_what_was_compiled_once_is_read_from_the_disk(cache, compiled):
-    first = nvrtc.machine_code("blend", "sm_80")
-    assert nvrtc.machine_code("blend", "sm_80") == first and compiled == ["blend"]
-    assert nvrtc.machine_code("blend", "sm_90") != first and compiled == ["blend", "blend"]
-    assert len(list(cache.iterdir())) == 2
-
-
-@needs_nvrtc
-@pytest.mark.parametrize(
-    "damage", [lambda data: data[:-1], lambda data: data[:50] + b"!" + data[51:], lambda data: b""]
-)
-def test_a_damaged_file_is_compiled_again(cache, compiled, damage):
-    nvrtc.machine_code("bin", "sm_80")
+def test_what_was_compiled_once_is_read_from_the_disk_unless_it_is_damaged(cache, compiled):
+    first = nvrtc.machine_code("bin", "sm_80")
+    assert nvrtc.machine_code("bin", "sm_80") == first and compiled == ["bin"]
     (path,) = cache.iterdir()
-    path.write_bytes(damage(path.read_bytes()))
-    again = nvrtc.machine_code("bin", "sm_80")  # with CUDA 12.4, of other bytes in its names
-    assert again[:4] == b"\x7fELF" and compiled == ["bin", "bin"]
-    assert nvrtc.machine_code("bin", "sm_80") == again and len(compiled) == 2
+    whole = path.read_bytes()
+    for count, damaged in enumerate((whole[:-1], whole[:50] + b"!" + whole[51:], b""), 2):
+        path.write_bytes(damaged)
+        again = nvrtc.machine_code("bin", "sm_80")  # with CUDA 12.4, of other bytes in its names
+        assert again[:4] == b"\x7fELF" and compiled == ["bin"] * count
+        assert nvrtc.machine_code("bin", "sm_80") == again and len(compiled) == count
+    assert nvrtc.machine_code("bin", "sm_90") != first and len(list(cache.iterdir())) == 2
 
 
 @needs_nvrtc
@@ -246,24 +233,24 @@ def test_code_that_the_driver_refuses_is_named(driver, monkeypatch):
 
 
 @needs_nvrtc
-def test_a_driver_that_is_too_old_is_named(driver, monkeypatch):
-    monkeypatch.setattr(nvrtc, "version", lambda: (13, 1))
+def test_why_no_gpu_can_be_used(driver, monkeypatch):
+    """A driver that is too old, none, and a compiler that lacks a function: NVRTC before 11.2."""
+
+    def reason(owner, name, value):
+        with monkeypatch.context() as patch:
+            patch.setattr(owner, name, value)
+            for function in (cuda_driver._driver, cuda_driver.unavailable):
+                function.cache_clear()
+            return cuda_driver.unavailable()
+
     ctypes.c_int.in_dll(driver, "fake_release").value = 12040
     advice = "update the driver, or install a torch built for CUDA 12"
     words = f"driver knows CUDA up to 12.4, .* CUDA 13.1: {advice}"
-    assert re.search(words, cuda_driver.unavailable())
-
-
-@needs_nvrtc
-def test_without_a_driver_it_gives_a_message(driver, monkeypatch):
-    monkeypatch.setattr(cuda_driver, "LIBRARY", "libcuda-that-is-not-there.so")
-    assert "libcuda-that-is-not-there.so" in cuda_driver.unavailable()
-
-
-def test_a_compiler_that_lacks_a_function_gives_a_message(driver, monkeypatch):
-    """As NVRTC before CUDA 11.2."""
-    monkeypatch.setattr(nvrtc, "_library", lambda: ctypes.CDLL(library()._name))
-    assert "undefined symbol: nvrtcGetNumSupportedArchs" in cuda_driver.unavailable()
+    assert re.search(words, reason(nvrtc, "version", lambda: (13, 1)))
+    missing = "libcuda-that-is-not-there.so"
+    assert missing in reason(cuda_driver, "LIBRARY", missing)
+    said = reason(nvrtc, "_library", lambda: ctypes.CDLL(library()._name))
+    assert "undefined symbol: nvrtcGetNumSupportedArchs" in said
 
 
 def test_a_torch_without_cuda_gives_a_message(monkeypatch):

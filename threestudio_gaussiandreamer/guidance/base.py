@@ -117,19 +117,14 @@ class ScoreDistillation(BaseObject, ABC):
     """The noise schedule, float64; a subclass may set another in ``configure``."""
     evaluations: int
     """Of the score model, one per item and prompt, since a step began; ``predict`` counts them."""
-
     REPORTS: tuple[str, ...] = ()
     """The keys of :meth:`report`, which ``checkpoint.monitor`` may name."""
-
     UNGUIDED_IGNORES: tuple[str, ...] = ("guidance_interval", "recon_std_rescale")
     """Options that have no effect if ``guidance_scale`` is 1."""
-
     LOSSES: tuple[str, ...] = ("sds",)
     """Names of the losses that a step returns, without the prefix ``loss_``."""
-
     NO_LORA = ""
     """Why ``vsd-variant`` can't be used."""
-
     KNOWS_TRUTH = False
     """Whether instances have an attribute ``truth``, see :func:`.truth_of`."""
 
@@ -460,7 +455,8 @@ def score_pictures(
 ) -> dict[str, Any]:
     """Return pictures (B, H, W, 3) in [0, 1], under threestudio's names: ``imgs_noisy``, the noisy
     latents; denoised in one step with guidance ``imgs_1step``, with the conditional score alone
-    ``imgs_1orig``; in ``EVAL_STEPS`` steps ``imgs_final``; and captions.
+    ``imgs_1orig``; in ``EVAL_STEPS`` steps ``imgs_final``; and captions: noise level, elevation,
+    azimuth and distance of each item.
     """
     size, views = len(noised.t), getattr(guidance.cfg, "n_view", 1)
     count = min(size, max(EVAL_ITEMS // views, 1) * views)
@@ -478,19 +474,15 @@ def score_pictures(
     }
     images = {name: guidance.decode(x).float().movedim(1, -1) for name, x in latents.items()}
     levels = (t / len(guidance.alphas_cumprod)).tolist()
-    return {"bs": count, "noise_levels": levels, "texts": _captions(levels, batch), **images}
-
-
-def _captions(levels: list[float], batch: Batch) -> list[str]:
-    """Write threestudio's captions: noise level, elevation, azimuth and distance of each item."""
-    shown = (("n", "noise", 2), ("e", "elevation", 1), ("a", "azimuth", 1))
-    shown, values = (*shown, ("c", "camera_distances", 2)), {"noise": levels, **batch}
+    shown = {"noise": "n.2f", "elevation": "e.1f", "azimuth": "a.1f", "camera_distances": "c.2f"}
+    values = {"noise": levels, **batch}
     columns = [
-        [f"{letter}{float(value):.{digits}f}" for value in values[name]]
-        for letter, name, digits in shown
+        [f"{form[0]}{float(value):{form[1:]}}" for value in values[name]]
+        for name, form in shown.items()
         if name in values
     ]
-    return ["\n".join(lines) for lines in zip(*columns, strict=True)]
+    texts = ["\n".join(lines) for lines in zip(*columns, strict=True)]
+    return {"bs": count, "noise_levels": levels, "texts": texts, **images}
 
 
 def find_bad_items(grad: Float[Tensor, "B *d"]) -> Bool[Tensor, " B"]:

@@ -153,19 +153,15 @@ class TextToImageDistillation(ScoreDistillation):
         super().configure()
         self.dtype = weights_type(self.cfg, self.device)
         folder = self._find(self.cfg, half=self.dtype != torch.float32)
-        info(
-            f"loading {self.cfg.pretrained_model_name_or_path} in "
-            f"{str(self.dtype).removeprefix('torch.')}"
-        )
+        name, kind = self.cfg.pretrained_model_name_or_path, str(self.dtype).split(".")[-1]
+        info(f"loading {name} in {kind}")
         self.set_schedule(folder)
         self.load_denoiser(folder)
         self.load(folder)
         low, high = USUAL_SCALES if self.scale_width is None else TAKEN_SCALES
         if not low <= self.cfg.guidance_scale <= high:
-            warn(
-                f"system.guidance.guidance_scale={self.cfg.guidance_scale:g}: expected {low} to "
-                f"{high} (1: none) for {self.cfg.pretrained_model_name_or_path}"
-            )
+            given = f"system.guidance.guidance_scale={self.cfg.guidance_scale:g}"
+            warn(f"{given}: expected {low} to {high} (1: none) for {name}")
 
     def set_schedule(self, folder: Path) -> None:
         """Read the noise schedule of the model's training and the prediction type of its UNet."""
@@ -245,13 +241,8 @@ class TextToImageDistillation(ScoreDistillation):
         read: Callable[..., nn.Module] = load_network,
         key: tuple[Hashable, ...] = (),
     ) -> nn.Module:
-        """Load one frozen network of the model, or return a kept one (:func:`.loaded`).
-
-        Args:
-            prepare: moves it to its device and applies options of this part.
-            dtype: number type, in place of this part's.
-            read: has the arguments of :func:`.model_files.load_network`.
-            key: what ``prepare`` depends on, beside the options that begin with ``enable_``.
+        """Load one frozen network of the model, or return a kept one (:func:`.loaded`); ``prepare``
+        moves it to its device, and depends on ``key`` and options that begin with ``enable_``.
         """
         dtype = dtype or self.dtype
 

@@ -12,7 +12,7 @@ import json
 import os
 import threading
 from collections.abc import Callable, Collection
-from concurrent.futures import Future, wait
+from concurrent.futures import Future
 from difflib import get_close_matches
 from functools import partial
 from pathlib import Path
@@ -239,9 +239,7 @@ def _with_timeout(ask: Callable[[], Any]) -> Any:
             answers.set_exception(error)
 
     threading.Thread(target=work, daemon=True).start()
-    if not wait([answers], TIMEOUT).done:
-        raise TimeoutError(f"no answer within {TIMEOUT:g} seconds")
-    return answers.result()
+    return answers.result(TIMEOUT)
 
 
 def explain(source: Source, error: Exception) -> str:

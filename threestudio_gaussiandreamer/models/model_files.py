@@ -201,18 +201,16 @@ def loading_errors(name: str) -> Iterator[None]:
 # --------------------------------------------------------------------------------------------------
 
 
-_kept: dict[Hashable, Any] = {}
+_kept: Optional[dict[Hashable, Any]] = None
+"""By key; None where networks aren't kept."""
 _counts: Counter = Counter()
-_keeps = False
 
 
 def keep_loaded(keep: bool = True) -> None:
     """Keep networks from now on, for processes with several runs, or drop those that were kept."""
-    global _keeps
-    _keeps = keep
+    global _kept
+    _kept = (_kept or {}) if keep else None
     _counts.clear()
-    if not keep:
-        _kept.clear()
 
 
 def loaded(key: tuple[Hashable, ...], load: Callable[[], Any]) -> Any:
@@ -222,13 +220,11 @@ def loaded(key: tuple[Hashable, ...], load: Callable[[], Any]) -> Any:
         key: the network's name for :func:`load_counts`, then all that ``load`` depends on, which
             also changes the network: folder, number type, device and options.
     """
-    if key in _kept:
-        return _kept[key]
-    network = load()
-    _counts[str(key[0])] += 1
-    if _keeps:
-        _kept[key] = network
-    return network
+    kept = {} if _kept is None else _kept
+    if key not in kept:
+        kept[key] = load()
+        _counts[str(key[0])] += 1
+    return kept[key]
 
 
 def load_counts() -> dict[str, int]:

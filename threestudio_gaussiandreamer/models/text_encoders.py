@@ -10,7 +10,6 @@ import hashlib
 import json
 import textwrap
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any, Optional
 
@@ -130,11 +129,10 @@ def with_encoder(
 ) -> Any:
     """Load a CLIP text encoder in float32, call ``run`` with it, and free it."""
 
-    def on_device(device: torch.device) -> Any:
-        load = partial(load_network, encoder_class, folder, component, dtype=torch.float32)
-        return run(loaded((component, str(folder), device), lambda: load().to(device)))
+    def load(device: torch.device) -> Any:
+        return load_network(encoder_class, folder, component, dtype=torch.float32).to(device)
 
-    return _freed(on_device)
+    return _freed(lambda d: run(loaded((component, str(folder), d), lambda: load(d))))
 
 
 def t5_states(

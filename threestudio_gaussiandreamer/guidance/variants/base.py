@@ -36,16 +36,12 @@ class Variant(BaseObject, ABC):
 
     NEEDS_UNCONDITIONAL: ClassVar[bool] = False
     """Whether the unconditional score is needed even if ``guidance_scale`` is 1."""
-
     NEEDS_TEXT: ClassVar[bool] = False
     """Whether the residual vanishes where the conditional score is the unconditional one."""
-
     NEEDS_EMPTY_PROMPT: ClassVar[bool] = False
     """Whether :meth:`.ScoreDistillation.empty_prompt` is called."""
-
     IGNORES: ClassVar[tuple[str, ...]] = ()
     """Options of the guidance that have no effect on the residual."""
-
     RENDERS: ClassVar[tuple[str, ...]] = ()
     """Outputs of the renderer that :meth:`residual` reads from the batch, such as ``depth``."""
 
