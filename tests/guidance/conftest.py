@@ -44,8 +44,7 @@ def large(tmp_path_factory):
 
     @functools.cache
     def made(kind):
-        name = kind.replace("-", "_")
-        make = getattr(tiny_models, name, None) or getattr(tiny_models, name)
+        make = getattr(tiny_models, kind.replace("-", "_"))
         folder = make(tmp_path_factory.mktemp("models") / kind)
         text = "stable-diffusion" if kind == "mvdream" else kind
         return folder, tiny_large_guidance.prompts(text, folder)
