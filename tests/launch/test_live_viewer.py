@@ -2,6 +2,7 @@
 
 import threading
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -10,27 +11,6 @@ from tests.helpers.gallery import assert_same_training
 from tests.view.clouds import cloud
 from threestudio_gaussiandreamer.launch import live_viewer
 from threestudio_gaussiandreamer.launch.live_viewer import LiveViewer
-
-
-class Watched:
-    """A view that a browser looks at, without a server."""
-
-    watched, address = True, "http://test"
-
-    def __init__(self, *args):
-        self.shown, self.cameras, self.pictures = [], 0, []
-
-    def show(self, gaussians, status=""):
-        self.shown.append((len(gaussians.means), status))
-
-    def look_from_front(self, pose): ...
-
-    def show_cameras(self, c2w, fovy, aspect):
-        assert c2w.shape[1:] == (4, 4) and len(fovy) == len(c2w) and aspect == 1
-        self.cameras += 1
-
-    def close(self):
-        self.closed = True
 
 
 class Buttons:
@@ -61,20 +41,15 @@ class Buttons:
 
 
 @pytest.fixture
-def views(monkeypatch):
-    """The views that runs open."""
-    opened = []
-
-    def open_view(*args):
-        opened.append(Watched(*args))
-        return opened[-1]
-
-    monkeypatch.setattr("threestudio_gaussiandreamer.launch.run.LiveView", open_view)
+def view(monkeypatch):
+    """A view that a browser looks at, without a server, for a run."""
+    view = Mock(watched=True, address="http://test", pictures=[])
+    monkeypatch.setattr("threestudio_gaussiandreamer.launch.run.LiveView", lambda *args: view)
     monkeypatch.setattr(live_viewer, "Controls", Buttons)
-    return opened
+    return view
 
 
-def test_the_training_is_the_same_with_a_viewer(launch_demo, views, tmp_path, monkeypatch):
+def test_the_training_is_the_same_with_a_viewer(launch_demo, view, tmp_path, monkeypatch):
     monkeypatch.setattr(Buttons, "pausing", True)
     run = ["use_timestamp=false", "trainer.max_steps=4"]
     assert launch_demo(*run, "tag=off")[0] == 0
@@ -82,8 +57,9 @@ def test_the_training_is_the_same_with_a_viewer(launch_demo, views, tmp_path, mo
     shown = ["viewer.enabled=true", "viewer.updates_per_second=30", "viewer.keep_serving=false"]
     code, err = launch_demo(*run, *shown, "tag=on")
     assert code == 0 and "viewer.updates_per_second is no option any more" in err
-    (view,) = views
-    assert view.shown[-1][1].startswith("step 4, ") and view.cameras > 0 and view.closed
+    assert view.show.call_args.args[1].startswith("step 4, ") and view.close.called
+    c2w, fovy, aspect = view.show_cameras.call_args.args
+    assert c2w.shape[1:] == (4, 4) and len(fovy) == len(c2w) and aspect == 1
     assert len(view.pictures) == 8 and view.pictures[0].dtype == np.uint8
     results = tmp_path / "outputs" / "demo"
     assert_same_training(results / "off/ckpts/last.ckpt", results / "on/ckpts/last.ckpt")
@@ -92,7 +68,7 @@ def test_the_training_is_the_same_with_a_viewer(launch_demo, views, tmp_path, mo
 @pytest.fixture
 def viewer(monkeypatch):
     """A viewer at the start of a training, its trainer, its system and a clock."""
-    made = LiveViewer(Watched(), lambda: False)
+    made = LiveViewer(Mock(watched=True), lambda: False)
     geometry = SimpleNamespace(**cloud(10).gaussians._asdict())
     trainer = SimpleNamespace(global_step=3, callback_metrics={"dB": 20.04})
     made.controls = Buttons(made.view)
@@ -115,7 +91,7 @@ def test_updates_take_at_most_their_share_of_the_time(viewer):
     for later in (0.0, 0.5 / 0.02 - 0.51, 0.02):
         now.value += later
         made.on_train_batch_end(trainer, system, None, {})
-    assert shown == ["step 3, 10 Gaussians, 20.0 dB"] * 2 and not made.view.cameras
+    assert shown == ["step 3, 10 Gaussians, 20.0 dB"] * 2 and not made.view.show_cameras.called
 
 
 def test_a_pause_ends_with_one_step_or_with_a_signal_and_nothing_is_read_without_a_browser(
