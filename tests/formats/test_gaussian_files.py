@@ -2,11 +2,10 @@
 usual axes.
 """
 
-import tracemalloc
-
 import numpy as np
 import pytest
 
+from tests.helpers.memory import memory_below
 from tests.helpers.object_clouds import assert_close, ball, in_order_of
 from tests.helpers.ply_files import gaussians, write_raw_gaussians
 from threestudio_gaussiandreamer import register_parts
@@ -155,9 +154,6 @@ def test_reading_takes_no_more_than_what_is_budgeted(tmp_path, suffix, module, d
     path = tmp_path / f"a{suffix}"
     write_cloud(str(path), StoredCloud(ball(COUNT, degree)))
     FORMATS[suffix].read(path)  # imports
-    tracemalloc.start()
-    FORMATS[suffix].read(path)
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
     each = module.DECODED_BYTES + module.DECODED_BYTES_PER_HARMONIC * (degree + 1) ** 2
-    assert 0.3 * COUNT * each < peak < 1.12 * COUNT * each  # the packed file, too
+    with memory_below(1.12 * COUNT * each, 0.3 * COUNT * each):  # the packed file, too
+        FORMATS[suffix].read(path)

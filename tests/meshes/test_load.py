@@ -6,7 +6,9 @@ import time
 
 import numpy as np
 import pytest
+import trimesh
 from PIL import Image
+from trimesh.visual.material import PBRMaterial
 
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.meshes.load import AXES, find_mesh, load_mesh
@@ -18,7 +20,6 @@ from threestudio_gaussiandreamer.meshes.mesh import (
     surface_colors,
 )
 
-trimesh = pytest.importorskip("trimesh")
 THIRDS = np.full((1, 3), 1 / 3)
 
 
@@ -46,35 +47,20 @@ def test_the_box_is_centred_and_its_longest_half_side_is_the_scale(tmp_path):
         np.testing.assert_allclose(low, -high, atol=1e-6)
 
 
-def arrow(direction, side):
-    """Return a mesh whose farthest vertices distinguish the axes: long along ``direction``, short
-    along ``side``.
-    """
-    third = np.cross(direction, side)
-    return trimesh.Trimesh(
-        [3 * np.array(direction, float), 2 * np.array(side, float), third, [0.0, 0, 0]],
-        [[0, 1, 2], [0, 1, 3], [1, 2, 3]],
-    )
-
-
-@pytest.mark.parametrize(
-    ("name", "up", "front"),
-    [("a.glb", "+y", "+z"), ("a.obj", "+y", "+z"), ("a.ply", "+z", "+x"), ("a.off", "+z", "+x")],
-)
-def test_the_axes_of_formats(tmp_path, name, up, front):
-    path = saved(arrow((0, 0, 1), (0, 1, 0)), tmp_path / name)
-    given = load_mesh(path, up=up, front=front)
-    np.testing.assert_array_equal(load_mesh(path).vertices, given.vertices)
-
-
-@pytest.mark.parametrize(("up", "front"), [("+y", "-x"), ("-z", "+y"), ("+x", None), ("-y", "+z")])
-def test_up_and_front_can_be_given_and_nothing_is_mirrored(tmp_path, up, front):
-    path = saved(arrow((1, 0, 0), (0, 1, 0)), tmp_path / "a.ply")
-    mesh, plain = load_mesh(path, up=up, front=front), load_mesh(path, up="+z", front="+x")
-    front = front or "+y"  # the axis after x
-    turn = np.stack([AXES[front], np.cross(AXES[up], AXES[front]), AXES[up]])
-    np.testing.assert_allclose(mesh.vertices, plain.vertices @ turn.T, atol=1e-12)
-    assert np.isclose(np.linalg.det(turn), 1)
+def test_the_axes_of_formats_and_given_ones(tmp_path):
+    """Nothing is mirrored."""
+    arrow = trimesh.Trimesh(np.diag([3.0, 2, 1]), [[0, 1, 2]])
+    for name in ("a.glb", "a.obj", "a.off", "a.ply"):
+        path = saved(arrow, tmp_path / name)
+        axes = ("+y", "+z") if name in ("a.glb", "a.obj") else ("+z", "+x")
+        given = load_mesh(path, up=axes[0], front=axes[1])
+        np.testing.assert_array_equal(load_mesh(path).vertices, given.vertices)
+    for up, front in (("+y", "-x"), ("-z", "+y"), ("+x", None), ("-y", "+z")):
+        mesh = load_mesh(path, up=up, front=front)
+        front = front or "+y"  # the axis after x
+        turn = np.stack([AXES[front], np.cross(AXES[up], AXES[front]), AXES[up]])
+        np.testing.assert_allclose(mesh.vertices, given.vertices @ turn.T, atol=1e-12)
+        assert np.isclose(np.linalg.det(turn), 1)
 
 
 def test_a_scene_is_merged_with_its_transforms(tmp_path):
@@ -101,7 +87,7 @@ def test_colours_of_vertices_faces_and_materials(tmp_path):
     expected = source.visual.face_colors[:, :3] / 255
     found = [center_color(mesh, face) for face in range(12)]
     np.testing.assert_allclose(found, expected, atol=1e-6)
-    material = trimesh.visual.material.PBRMaterial(baseColorFactor=[255, 0, 55, 255])
+    material = PBRMaterial(baseColorFactor=[255, 0, 55, 255])
     source.visual = trimesh.visual.TextureVisuals(material=material)
     mesh = load_mesh(saved(source, tmp_path / "a.glb"))  # its colour is linear
     expected = [1, 0, 1.055 * (55 / 255) ** (1 / 2.4) - 0.055]
@@ -109,11 +95,10 @@ def test_colours_of_vertices_faces_and_materials(tmp_path):
 
 
 def test_a_texture_is_tinted_by_its_material(tmp_path):
+    white = Image.new("RGB", (2, 2), "white")
     for tint, seen in ([255, 0, 255, 255], [1, 0, 1]), ([102, 102, 102, 255], 1):
-        material = trimesh.visual.material.PBRMaterial(
-            baseColorTexture=Image.new("RGB", (2, 2), "white"),
-            baseColorFactor=tint,  # the second is trimesh's "no colour given"
-        )
+        # the second is trimesh's "no colour given"
+        material = PBRMaterial(baseColorTexture=white, baseColorFactor=tint)
         visual = trimesh.visual.TextureVisuals(uv=np.eye(3, 2), material=material)
         triangle = trimesh.Trimesh(np.eye(3), [[0, 1, 2]], visual=visual, process=False)
         found = center_color(load_mesh(saved(triangle, tmp_path / "a.glb")))

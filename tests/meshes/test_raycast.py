@@ -9,6 +9,7 @@ import sys
 import numpy as np
 import pytest
 import torch
+import trimesh
 
 from threestudio_gaussiandreamer import cameras
 from threestudio_gaussiandreamer.meshes import raycast
@@ -21,7 +22,6 @@ from threestudio_gaussiandreamer.meshes.raycast import (
     zbuffer_hits,
 )
 
-trimesh = pytest.importorskip("trimesh")
 SIDES = {"+x": (0, 0), "+y": (0, 90), "-x": (0, 180), "-y": (0, -90), "+z": (89.9, 0)}
 SIDES["-z"] = (-89.9, 0)
 COLORS = {"+x": (1, 0, 0), "-x": (0, 1, 1), "+y": (0, 1, 0), "-y": (1, 0, 1), "+z": (0, 0, 1)}

@@ -227,7 +227,5 @@ def _read_plain(document: Document, attributes: dict[str, int], inner: dict[str,
         quats=rows(f"{EXTENSION}:ROTATION", "VEC4")[:, [3, 0, 1, 2]],
         log_scales=scales,
         logit_opacities=packing.logits(opacity, packing.FLOAT_OPACITY_MARGIN),
-        sh=np.stack(
-            [rows(semantic, "VEC3") for semantic in _semantics(_harmonics(attributes))], axis=1
-        ),
+        sh=np.stack([rows(name, "VEC3") for name in _semantics(_harmonics(attributes))], axis=1),
     )

@@ -68,7 +68,7 @@ def opacities(logits: Float[np.ndarray, " N"]) -> Float[np.ndarray, " N"]:
 
 
 def opacity_bytes(logits: Float[np.ndarray, " N"], most: int = 254) -> Integer[np.ndarray, " N"]:
-    """Return opacities in steps of 1 / 255, below 1, of which other readers take the logit."""
+    """Return opacities in steps of 1 / 255, up to ``most``; some readers' logit of 255 is inf."""
     return to_byte(255 * opacities(logits)).clip(max=most)
 
 

@@ -108,7 +108,7 @@ def spz_bytes(
 
     Args:
         gaussians: in the axes right, up, back, or with another axis ``up``.
-        notes: ASCII texts for the gzip header, which other readers ignore, but in version 4;
+        notes: ASCII texts for the gzip header, which other readers ignore and version 4 lacks;
             ``packing.ANTIALIASED`` sets the header's flag.
         version: 3 or 4.
         up: a key of ``SYSTEM_OF``, which version 4 records; version 3 can only have the default.
