@@ -228,7 +228,6 @@ def test_a_long_line_takes_linear_time(tmp_path, line):
         ({"up": "z"}, "up axis 'z'"),
         ({"front": "+w"}, "front axis"),
         ({"up": "+z", "front": "-z"}, "along"),
-        ({"scale": 0}, "scale"),
     ],
 )
 def test_bad_options_are_named(tmp_path, options, message):

@@ -69,8 +69,6 @@ def load_mesh(
             more than 5 % of its vertices aren't finite; or ``up`` or ``front`` is invalid.
     """
     path = mesh_file(path)
-    if not scale > 0:
-        raise UserError(f"the scale of a mesh must be greater than 0, not {scale}")
     rotation = pose_rotation(_extension(path), up, front)
     parts = [part for part in read_parts(path) if len(part.faces)]
     if not parts:
