@@ -26,13 +26,13 @@ from tests.architecture import (
 RINGS = ring_of()
 MATHS_MAY_USE = {"torch", "numpy", "scipy", "jaxtyping"} | set(sys.stdlib_module_names)
 LIBRARIES = {  # of ring 0, beyond MATHS_MAY_USE
-    "core": {"imageio", "PIL"},
+    "core": {"imageio_ffmpeg", "PIL"},
     "formats": {"PIL", "pxr", "tqdm", "zstandard"},
     "meshes": {"trimesh", "embreex", "PIL", "tqdm"},
 }
 HOST = {"lightning", "pytorch_lightning", "omegaconf", "threestudio"}
 HEAVY = HOST | set(
-    "trimesh embreex diffusers transformers imageio PIL smplx anny pxr zstandard skimage "
+    "trimesh embreex diffusers transformers PIL smplx anny pxr zstandard skimage "
     "fast_simplification xatlas".split()
 )
 MODULES_AT_THE_TOP = 5
