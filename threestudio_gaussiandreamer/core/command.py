@@ -1,5 +1,6 @@
-"""Run a command-line program: exit codes, and errors in the user's input as one message without a
-traceback."""
+"""Run a command-line program: exit codes, errors in the user's input as one message without a
+traceback, and the signals that stop it: Ctrl-C, SIGTERM, and SIGHUP, which a closed terminal or a
+lost SSH connection sends."""
 
 import contextlib
 import errno
@@ -7,14 +8,14 @@ import importlib
 import os
 import signal
 import sys
+import threading
 import traceback
 from collections.abc import Callable, Collection, Iterator, Sequence
-from typing import Any, Optional
+from typing import Any, NoReturn, Optional
 
 from .errors import Terminated, UserError
 from .extras import error_of_extra
 from .launcher import require_numbers
-from .signals import raised_signals
 
 
 def run_command(
@@ -44,74 +45,40 @@ def run_command(
                 sys.stdout.flush()
                 if not received:
                     return code if isinstance(code, int) else 0
-        except KeyboardInterrupt:  # also raised by handlers that a caller has installed
-            received = received or [signal.SIGINT]
-        except Exception as error:
+        except BaseException as error:
+            # these two are also raised by handlers that a caller has installed
+            if isinstance(error, KeyboardInterrupt):
+                received = received or [signal.SIGINT]
+            elif isinstance(error, Terminated):
+                received = received or [error.code - 128]
             if not received:
                 return exit_code(error, getattr(args, "verbose", False))
-        except SystemExit as stop:
-            if isinstance(stop, Terminated):
-                received = received or [stop.code - 128]
-            if not received:
-                return exit_code(foreign_exit(stop), getattr(args, "verbose", False))
         print("stopped", file=sys.stderr)
     return 128 + received[0]
 
 
-def foreign_exit(stop: SystemExit) -> UserError:
-    """Make the error for a ``sys.exit()`` in a library or extension, whose code may be 0."""
-    *_, place = traceback.extract_tb(stop.__traceback__)
-    return UserError(f"{place.filename}:{place.lineno} ended the run with sys.exit({stop.code!r})")
-
-
-def joined_values(
-    argv: Optional[Sequence[str]], options: Sequence[str], values: Collection[str]
-) -> list[str]:
-    """Join each of these options to the value behind it by ``=``, where argparse would take a value
-    that begins with a hyphen for an option.
-
-    Args:
-        argv: None means the arguments of this process.
-    """
-    joined: list[str] = []
-    for word in sys.argv[1:] if argv is None else argv:
-        # a wrong "-z" too, so that it is a wrong value and no missing one
-        if joined and joined[-1] in options and {word, word.lstrip("-")} & {*values}:
-            joined[-1] += f"={word}"
-        else:
-            joined.append(word)
-    return joined
-
-
 def run_main(module: str) -> int:
-    """Import a module, which may take seconds, and return the exit code of its ``main()``.
-
-    A stop signal during the import ends the process with one line and the signal's exit code.
+    """Import a module, which may take seconds and be stopped, and return the exit code of its
+    ``main()``.
     """
-    received: Sequence[int] = ()
-    try:
-        with raised_signals() as received:
-            require_numbers()
-            main = importlib.import_module(module).main
-    except UserError as error:
-        return exit_code(error)
-    except BaseException:
-        if not received:
-            raise
-    if received:  # also if the import has caught the exception
-        with tolerant_output():
-            print("stopped", file=sys.stderr)
-        return 128 + received[0]
-    return main()
+    mains: list[Callable[[], int]] = []
+
+    def load(_: Any) -> None:
+        require_numbers()
+        mains.append(importlib.import_module(module).main)
+
+    return run_command(lambda _: None, load) or mains[0]()
 
 
-def exit_code(error: Exception, verbose: bool = False) -> int:
+def exit_code(error: BaseException, verbose: bool = False) -> int:
     """Print one message about the error that ended a command, and return the exit code.
 
     Raises:
-        Exception: ``error`` itself, unless it is a UserError, a BrokenPipeError, or about a missing
-            module of an extra.
+        BaseException: ``error`` itself, unless it is a UserError, a BrokenPipeError, a
+            ``sys.exit()``, or about a missing module of an extra.
     """
+    if isinstance(error, SystemExit):
+        error = foreign_exit(error)
     error = error_of_extra(error) or error
     if not isinstance(error, (UserError, BrokenPipeError)):
         raise error
@@ -129,12 +96,80 @@ def exit_code(error: Exception, verbose: bool = False) -> int:
     return 128 + 13  # SIGPIPE, which Windows doesn't have
 
 
+def foreign_exit(stop: SystemExit) -> UserError:
+    """Make the error for a ``sys.exit()`` in a library or extension, whose code may be 0."""
+    *_, place = traceback.extract_tb(stop.__traceback__)
+    return UserError(f"{place.filename}:{place.lineno} ended the run with sys.exit({stop.code!r})")
+
+
+def joined_values(
+    argv: Optional[Sequence[str]], options: Sequence[str], values: Collection[str]
+) -> list[str]:
+    """Join each of these options to the value behind it by ``=``, where argparse would take a value
+    that begins with a hyphen for an option; ``argv`` None means the arguments of this process.
+    """
+    joined: list[str] = []
+    for word in sys.argv[1:] if argv is None else argv:
+        # a wrong "-z" too, so that it is a wrong value and no missing one
+        if joined and joined[-1] in options and {word, word.lstrip("-")} & {*values}:
+            joined[-1] += f"={word}"
+        else:
+            joined.append(word)
+    return joined
+
+
+# -- signals ---------------------------------------------------------------------------------------
+
+
+def set_handlers(handler: Callable[[int, Any], Any]) -> dict[int, Any]:
+    """Install ``handler`` for the stop signals, but SIGHUP if it is ignored, as under ``nohup``;
+    return the earlier handlers, none outside of the main thread, where Python doesn't allow this.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        return {}
+    signals = [signal.SIGINT, signal.SIGTERM]
+    hang_up = getattr(signal, "SIGHUP", None)  # not on Windows
+    if hang_up is not None and signal.getsignal(hang_up) != signal.SIG_IGN:
+        signals.append(hang_up)
+    return {signum: signal.signal(signum, handler) for signum in signals}
+
+
+def restore_handlers(handlers: dict[int, Any]) -> None:
+    """Restore the handlers that :func:`set_handlers` returned, once: the mapping is emptied."""
+    while handlers:
+        signal.signal(*handlers.popitem())
+
+
+def interrupt(signum: int) -> NoReturn:
+    """Raise KeyboardInterrupt for Ctrl-C and :class:`Terminated` for other signals."""
+    raise KeyboardInterrupt if signum == signal.SIGINT else Terminated(128 + signum)
+
+
+@contextlib.contextmanager
+def raised_signals() -> Iterator[list[int]]:
+    """Let stop signals raise exceptions in this context, so that ``finally`` blocks run; yield the
+    list of those received, since an exception during an import may be replaced or lost.
+    """
+    received: list[int] = []
+
+    def stop(signum: int, frame: Any) -> None:
+        received.append(signum)
+        interrupt(signum)
+
+    earlier = set_handlers(stop)
+    try:
+        yield received
+    finally:
+        restore_handlers(earlier)
+
+
+# -- standard output and error ---------------------------------------------------------------------
+
+
 class Tolerant:
     """A text stream that escapes characters which its encoding doesn't have, and whose descriptor
-    becomes the null device after the first write error, for instance when the terminal was closed,
-    or when the output is redirected to a disk that is full.
-
-    A closed pipe still raises BrokenPipeError, which ends the command as usual.
+    becomes the null device after the first write error: the terminal was closed, or the disk is
+    full. A closed pipe still raises BrokenPipeError, which ends the command as usual.
     """
 
     def __init__(self, stream: Any) -> None:
@@ -160,10 +195,8 @@ class Tolerant:
             os.dup2(os.open(os.devnull, os.O_WRONLY), self.stream.fileno())
             # EIO: the terminal is gone, and with it standard error
             if error.errno != errno.EIO and self.stream.fileno() == 1:
-                print(
-                    f"standard output can't be written ({error.strerror}): going on without it",
-                    file=sys.stderr,
-                )
+                said = f"standard output can't be written ({error.strerror}): going on without it"
+                print(said, file=sys.stderr)
 
 
 @contextlib.contextmanager

@@ -3,25 +3,6 @@
 import logging
 import os
 
-logger = logging.getLogger("threestudio_gaussiandreamer")
-
-
-def debug(*args: object, **kwargs: object) -> None:
-    _log(logging.DEBUG, *args, **kwargs)
-
-
-def info(*args: object, **kwargs: object) -> None:
-    _log(logging.INFO, *args, **kwargs)
-
-
-def warn(*args: object, **kwargs: object) -> None:
-    _log(logging.WARNING, *args, **kwargs)
-
-
-def _log(level: int, *args: object, **kwargs: object) -> None:
-    if get_rank() == 0:
-        logger.log(level, *args, **kwargs)
-
 
 def get_rank() -> int:
     """Return a number from the launcher's environment variables that is 0 in the first process
@@ -31,3 +12,8 @@ def get_rank() -> int:
         if key in os.environ:
             return int(os.environ[key])
     return int(os.environ.get("NODE_RANK", 0)) + int(os.environ.get("LOCAL_RANK", 0))
+
+
+logger = logging.getLogger("threestudio_gaussiandreamer")
+logger.addFilter(lambda record: get_rank() == 0)
+debug, info, warn = logger.debug, logger.info, logger.warning

@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any, Optional
 
 from ..core.checkpoint_file import load_file, save_file
+from ..core.command import interrupt, restore_handlers, set_handlers
 from ..core.files import atomic_file
 from ..core.host_copies import flush_reads
-from ..core.signals import interrupt, restore_handlers, set_handlers
 from ..host import info, pl
 from .config import dump_config
 from .run_folder import PARSED

@@ -25,10 +25,9 @@ from torch import Tensor
 from .. import register_parts
 from ..cameras import Orbit
 from ..core import images
-from ..core.command import run_command
+from ..core.command import interrupt, raised_signals, run_command
 from ..core.errors import Terminated, UserError
 from ..core.files import atomic_file, json_text, output_folder
-from ..core.signals import interrupt, raised_signals
 from ..core.streams import generator
 from ..diffusion import sds
 from ..evaluation.asset_metrics import ATTRIBUTES, Asset, Scores, prior_of, rendered, result_of

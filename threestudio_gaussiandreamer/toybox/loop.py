@@ -19,9 +19,9 @@ from torch.optim.swa_utils import AveragedModel
 from torch.utils.data import DataLoader, Dataset
 
 from ..core.checkpoint_file import entries_below, load_file, save_file
+from ..core.command import restore_handlers, set_handlers
 from ..core.errors import UserError
 from ..core.files import atomic_file
-from ..core.signals import restore_handlers, set_handlers
 from ..core.streams import numpy_generator
 from .views import Shards, row_batch
 

@@ -19,11 +19,10 @@ from typing import Optional
 import torch
 from torch import Tensor
 
-from ..core.command import run_command
+from ..core.command import interrupt, run_command
 from ..core.errors import UserError, unknown
 from ..core.files import existing_file, output_folder
 from ..core.options import shown
-from ..core.signals import interrupt
 from ..launch.run_folder import claim
 from ..models.bundled import RECORD
 from ..view.run_files import read_json

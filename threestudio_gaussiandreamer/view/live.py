@@ -13,9 +13,9 @@ from urllib.parse import urlsplit
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from ..core.command import restore_handlers, set_handlers
 from ..core.errors import UserError
 from ..core.extras import require_extra
-from ..core.signals import restore_handlers, set_handlers
 from ..formats.gaussian_files import StoredCloud
 from ..gaussians.axes import WORLD_UP
 from ..gaussians.gaussians import Gaussians
