@@ -13,15 +13,15 @@ Integer end steps count optimiser steps, those written as ``10.0`` epochs. Rando
 endless epoch, in threestudio too, so that with them a schedule in epochs stays at its first value.
 """
 
-import logging
 import math
+from collections.abc import Mapping
 from itertools import pairwise
 from numbers import Real
 from typing import Any, NamedTuple
 
 from .errors import UserError
+from .logs import warn
 
-logger = logging.getLogger(__name__)
 _warned: set[tuple[str, str]] = set()
 FORMS = "a number, [v0, v1, end], [s0, v0, v1, s1] or [s0, v0, v1, s1, v2, s2, ...]"
 
@@ -71,11 +71,9 @@ def validate_schedule(value: Any, name: str = "the schedule") -> Any:
     # once for the part and the launcher, which call the option by its name and by its path
     if schedule.in_epochs and (key := (name.rpartition(".")[2], str(value))) not in _warned:
         _warned.add(key)
-        logger.warning(
-            "%s: its end steps have decimal points and count epochs; random cameras are one "
-            "endless epoch, so that it stays at its first value: write whole numbers to count "
-            "steps",
-            name,
+        warn(
+            f"{name}: its end steps have decimal points and count epochs; random cameras are one "
+            "endless epoch, so that it stays at its first value: write whole numbers to count steps"
         )
     return value
 
@@ -89,41 +87,31 @@ def parse_schedule(value: Any, name: str = "the schedule") -> Schedule:
     """
     if isinstance(value, Schedule):
         return value
-    if _is_number(value):
-        return Schedule([0], [_finite(value, name)], in_epochs=False)
     # OmegaConf's list is neither list nor tuple, but a sequence of plain numbers when iterated
-    if isinstance(value, (str, bytes)) or hasattr(value, "keys") or not hasattr(value, "__len__"):
-        raise UserError(f"{name} is {value!r}; expected {FORMS}")
-    knots = list(value)
+    is_list = hasattr(value, "__len__") and not isinstance(value, (str, bytes, Mapping))
+    knots = list(value) if is_list else [value]
     if len(knots) == 3:
         knots = [0, *knots]
-    if len(knots) < 4 or len(knots) % 2:
-        raise UserError(f"{name} has {len(knots)} elements: {value}; expected {FORMS}")
-    knots = [_finite(knot, name) for knot in knots]
-    # the first pair is (step, value), all later pairs are (value, step)
-    steps, values, ends = [knots[0], *knots[3::2]], [knots[1], *knots[2::2]], knots[3::2]
-    if any(later <= earlier for earlier, later in pairwise(steps)):
-        raise UserError(
-            f"{name}: its steps {steps} must increase (for a hard switch write [500, v0, v1, 501])"
-        )
-    fractional = [isinstance(end, float) for end in ends]
-    if any(fractional) and not all(fractional):
-        raise UserError(
-            f"{name} mixes integer end steps (optimiser steps) and fractional ones (epochs): {ends}"
-        )
-    if broken := [end for end in ends if end != int(end)]:
-        raise UserError(
-            f"{name}: the end step {broken[0]:g} is no whole number of steps or epochs; expected "
-            f"{FORMS}"
-        )
-    return Schedule(steps, values, in_epochs=all(fractional))
+    if not all(map(_is_finite, knots)):
+        problem = ", which isn't made of finite numbers" if is_list else ""
+    elif not is_list:
+        return Schedule([0], knots, in_epochs=False)
+    elif len(knots) < 4 or len(knots) % 2:
+        problem = f", of {len(knots)} elements"
+    else:
+        # the first pair is (step, value), all later pairs are (value, step)
+        steps, values, ends = [knots[0], *knots[3::2]], [knots[1], *knots[2::2]], knots[3::2]
+        kinds = {isinstance(end, float) for end in ends}
+        if any(later <= earlier for earlier, later in pairwise(steps)):
+            problem = ", whose steps don't increase (for a hard switch write [500, v0, v1, 501])"
+        elif len(kinds) > 1:
+            problem = ", which mixes integer end steps (optimiser steps) and decimal ones (epochs)"
+        elif broken := [end for end in ends if end != int(end)]:
+            problem = f", whose end step {broken[0]:g} is no whole number of steps or epochs"
+        else:
+            return Schedule(steps, values, in_epochs=True in kinds)
+    raise UserError(f"{name} is {value!r}{problem}; expected {FORMS}")
 
 
-def _is_number(value: Any) -> bool:
-    return isinstance(value, Real) and not isinstance(value, bool)
-
-
-def _finite(value: Any, name: str) -> float:
-    if not _is_number(value) or not math.isfinite(value):
-        raise UserError(f"{name} contains {value!r}, which isn't a finite number; expected {FORMS}")
-    return value
+def _is_finite(value: Any) -> bool:
+    return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
