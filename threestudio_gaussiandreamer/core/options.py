@@ -27,13 +27,10 @@ RULE = "option"
 MISSING = "???"
 """A text that stands for a value that must be given."""
 SCALARS = {int: "a whole number", float: "a number", bool: "true or false", str: "a text"}
-SWITCHES = {
-    **dict.fromkeys(("true", "yes", "y", "on", "1"), True),
-    **dict.fromkeys(("false", "no", "n", "off", "0"), False),
-}
-FLOAT32_MAX = 3.4028234663852886e38
-FLOAT32_TINY = 1.1754943508222875e-38
-"""Smallest normal float32: smaller positive options could be rounded to zero."""
+SWITCHES = dict.fromkeys(("true", "yes", "y", "on", "1"), True)
+SWITCHES |= dict.fromkeys(("false", "no", "n", "off", "0"), False)
+FLOAT32_MAX, FLOAT32_TINY = 3.4028234663852886e38, 1.1754943508222875e-38
+"""Largest and smallest normal float32: smaller positive options could be rounded to zero."""
 INT64_MAX = 2**63 - 1
 SHOWN = 80
 """Maximum length of a value in a message, characters."""
@@ -104,7 +101,7 @@ def schedule(min: float = -FLOAT32_MAX, max: float = FLOAT32_MAX) -> Rule:
         for number in parse_schedule(validate_schedule(value, path)).values:
             if not min <= number <= max:
                 bound = f"{min:g} or more" if number < min else f"{max:g} or less"
-                raise UserError(f"{path}: expected values of {bound}, got {number:g}")
+                raise wrong(path, f"values of {bound}", number)
 
     return rule(check)
 
@@ -112,18 +109,14 @@ def schedule(min: float = -FLOAT32_MAX, max: float = FLOAT32_MAX) -> Rule:
 def interval(low: float = -FLOAT32_MAX, high: float = FLOAT32_MAX, what: str = "numbers") -> Rule:
     """Accept pairs [a, b] with ``low`` <= a <= b <= ``high``; ``what`` describes the numbers."""
     bounds = [f"from {low:g}"] * (low > -FLOAT32_MAX) + [f"to {high:g}"] * (high < FLOAT32_MAX)
-    return satisfies(
-        " ".join([f"[low, high], {what}", *bounds, "with low <= high"]),
-        lambda v: is_numbers(v, 2) and low <= v[0] <= v[1] <= high,
-    )
+    expected = " ".join([f"[low, high], {what}", *bounds, "with low <= high"])
+    return satisfies(expected, lambda v: is_numbers(v, 2) and low <= v[0] <= v[1] <= high)
 
 
 def each(item: Rule) -> Rule:
     """Accept lists in which every item satisfies the rule ``item``."""
 
     def check(path: str, values: Any) -> None:
-        if not is_list(values):
-            raise wrong(path, "a list", values)
         for i, value in enumerate(values):
             item[RULE](f"{path}[{i}]", value)
 
@@ -183,10 +176,8 @@ def wrong(path: str, expected: str, value: Any) -> UserError:
 
 
 def require_representable(path: str, value: Any) -> None:
-    """Check every number in a value.
-
-    Raises:
-        UserError: an int beyond 64 bits, or a float that isn't finite in float32.
+    """Raise UserError for an int beyond 64 bits, or a float that isn't finite in float32, also
+    inside of mappings and lists.
     """
     if isinstance(value, Mapping):
         for key in value:
@@ -224,18 +215,16 @@ def _filled(config_class: Any, values: Any, prefix: str) -> Any:
         return values
     require_mapping(prefix.rstrip("."), values)
     drop_removed(config_class, values, prefix)
-    options = {option.name: option for option in dataclasses.fields(config_class)}
+    names = [option.name for option in dataclasses.fields(config_class)]
     hints, given = typing.get_type_hints(config_class), {}
     for key, value in values.items():
-        if key not in options:
-            raise unknown("key", key, options, prefix=prefix)
-        if callable(make := options[key].default_factory):
-            _check_table(prefix + key, value, make())
+        if key not in names:
+            raise unknown("key", key, names, prefix=prefix)
         given[key] = _converted(prefix + key, value, hints[key])
     try:
         return config_class(**given)
     except (TypeError, ValueError) as error:  # of __post_init__, or a value is missing
-        raise UserError(_located(str(error), prefix, options)) from error
+        raise UserError(_located(str(error), prefix, names)) from error
 
 
 def _converted(path: str, value: Any, annotation: Any) -> Any:
@@ -247,62 +236,45 @@ def _converted(path: str, value: Any, annotation: Any) -> Any:
             return _converted(path, value, choices[0])
         given = float if type(value) is int and float in choices else type(value)
         if SCALARS.keys() >= {*choices} and given not in inner:
-            expected = " or ".join(SCALARS[choice] for choice in choices)
-            raise wrong(path, expected, value)
-        return value
-    if kind in SCALARS:
+            raise wrong(path, " or ".join(SCALARS[choice] for choice in choices), value)
+    elif kind in SCALARS:
         return _scalar(path, value, kind)
-    if kind in (list, tuple):
-        return _sequence(path, value, kind, inner)
-    if dataclasses.is_dataclass(annotation):
+    elif kind in (list, tuple):
+        if not is_list(value):
+            raise wrong(path, "a list", value)
+        items = inner
+        if kind is list or not inner or Ellipsis in inner:
+            items = [*inner[:1], Any][:1] * len(value)
+        if len(value) != len(items):
+            raise wrong(path, f"a list of {len(items)}", value)
+        pairs = enumerate(zip(value, items, strict=True))
+        return kind(_converted(f"{path}[{i}]", item, type_) for i, (item, type_) in pairs)
+    elif dataclasses.is_dataclass(annotation):
         return _filled(annotation, value, f"{path}.")
-    if kind is dict:
+    elif kind is dict:
         require_mapping(path, value)
         if len(inner) == 2:
             return {key: _converted(f"{path}.{key}", v, inner[1]) for key, v in value.items()}
-    if isinstance(kind, type) and isinstance(value, str):
+    elif isinstance(kind, type) and isinstance(value, str):
+        if issubclass(kind, Path):
+            return Path(value)
         if issubclass(kind, Enum):
             if value not in kind.__members__:
                 raise unknown(path, value, kind.__members__)
             return kind[value]
-        if issubclass(kind, Path):
-            return Path(value)
     return value
 
 
 def _scalar(path: str, value: Any, kind: type) -> Any:
-    error = wrong(path, SCALARS[kind], value)
-    if is_list(value) or isinstance(value, Mapping) or value is None:
-        raise error
     require_representable(path, value)
-    if kind is str:
-        return str(value)
-    if kind is bool:
-        if (switch := str(value).lower()) not in SWITCHES:
-            raise error
-        return SWITCHES[switch]
-    if isinstance(value, bool) or (kind is int and isinstance(value, float)):
-        raise error
+    inexact = kind is int and isinstance(value, float)
+    switch = kind in (int, float) and isinstance(value, bool)
     try:
-        return kind(value)
-    except (TypeError, ValueError):
-        raise error from None
-
-
-def _sequence(path: str, values: Any, kind: type, items: tuple) -> Any:
-    if not is_list(values):
-        raise wrong(path, "a list", values)
-    if kind is list:
-        annotations = items * len(values) or (Any,) * len(values)
-        return [_converted(f"{path}[{i}]", v, annotations[i]) for i, v in enumerate(values)]
-    if items and Ellipsis not in items:
-        if len(values) != len(items):
-            raise wrong(path, f"a list of {len(items)}", values)
-        for i, (value, annotation) in enumerate(zip(values, items, strict=True)):
-            if annotation in (int, float) and isinstance(value, str):
-                raise wrong(f"{path}[{i}]", SCALARS[annotation], value)
-            _converted(f"{path}[{i}]", value, annotation)
-    return tuple(values)
+        if value is None or is_list(value) or isinstance(value, Mapping) or inexact or switch:
+            raise TypeError
+        return SWITCHES[str(value).lower()] if kind is bool else kind(value)
+    except (TypeError, ValueError, KeyError):
+        raise wrong(path, SCALARS[kind], value) from None
 
 
 def require_mapping(path: str, values: Any) -> None:
@@ -330,24 +302,6 @@ def drop_removed(config_class: Any, values: MutableMapping, prefix: str = "") ->
         elif key in options and dataclasses.is_dataclass(options[key].type):
             if isinstance(values[key], Mapping):
                 drop_removed(options[key].type, values[key], f"{prefix}{key}.")
-
-
-def _check_table(path: str, values: Any, default: Any) -> None:
-    """Check an option that is a dictionary by its default, which names its keys and shows their
-    types; one whose default is empty may have any.
-    """
-    if not isinstance(default, Mapping) or not default:
-        return
-    require_mapping(path, values)
-    for key, value in values.items():
-        if key not in default:
-            raise unknown("key", key, default, prefix=f"{path}.")
-        _check_table(f"{path}.{key}", value, default[key])
-        given, expected = (
-            SCALARS.get(float if type(v) is int else type(v)) for v in (value, default[key])
-        )
-        if None not in (given, expected) and given != expected:
-            raise wrong(f"{path}.{key}", expected, value)
 
 
 def _plain(value: Any) -> Any:
@@ -393,25 +347,19 @@ def require_defaults(
     cfg: Any,
     names: Collection[str],
     reason: str,
-    *,
     prefix: str = "",
     neutral: Mapping[str, Any] = MappingProxyType({}),
 ) -> None:
-    """Check that the options ``names``, which have no effect, are at their defaults.
+    """Raise UserError unless the options ``names``, which have no effect, are at their defaults.
 
     Args:
         reason: when that is so, such as "with pose=A".
         neutral: values by name that do nothing, where the default does something.
-
-    Raises:
-        UserError: one of them has another value.
     """
-    for option in dataclasses.fields(config_class):
-        unset = (option.default, neutral.get(option.name, option.default))
-        if option.name in names and getattr(cfg, option.name) not in unset:
-            raise UserError(
-                f"{prefix}{option.name} has no effect {reason}: leave it at {option.default}"
-            )
+    for name in names:
+        default = getattr(config_class, name, None)
+        if getattr(cfg, name, default) not in (default, neutral.get(name, default)):
+            raise UserError(f"{prefix}{name} has no effect {reason}: leave it at {default}")
 
 
 def _located(message: str, prefix: str, names: Collection[str]) -> str:
@@ -423,12 +371,9 @@ def _located(message: str, prefix: str, names: Collection[str]) -> str:
 
 
 def escape(value: Any) -> Any:
-    """Escape each ``${`` in a string, or in the strings of nested lists and dicts, so that
-    OmegaConf resolves it to the original text.
-    """
+    """Escape each ``${`` in the strings of nested lists and dicts for OmegaConf."""
     if isinstance(value, str):
-        # Backslashes are literal except right before "${". The lookbehind makes a run of them match
-        # from its start only, which keeps the search linear in its length.
+        # backslashes are literal except right before "${"; the lookbehind keeps the search linear
         return re.sub(r"(?<!\\)(\\*)\$\{", lambda match: 2 * match[1] + r"\${", value)
     if isinstance(value, dict):
         return {key: escape(item) for key, item in value.items()}

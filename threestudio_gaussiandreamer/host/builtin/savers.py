@@ -3,6 +3,7 @@
 import os
 import re
 import shutil
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Optional
 
@@ -12,6 +13,18 @@ from torch import Tensor
 from ...core import images as pictures
 from ...core.errors import UserError
 from ...core.files import atomic_file, json_text
+
+
+@dataclass
+class WandbOptions:
+    enable: bool = False
+    project: Optional[str] = ""
+    name: Optional[str] = ""
+
+
+@dataclass
+class LoggerOptions:
+    wandb: WandbOptions = field(default_factory=WandbOptions)
 
 
 class SaverMixin:
@@ -42,13 +55,12 @@ class SaverMixin:
 
     def create_loggers(self, loggers: Any) -> None:
         """Make the Weights & Biases logger if ``loggers.wandb.enable``; needs the package wandb."""
-        wandb = loggers.get("wandb")
-        if wandb and wandb.get("enable"):
+        if loggers.wandb.enable:
             try:
                 from lightning.pytorch.loggers import WandbLogger
 
-                names = {key: wandb.get(key) for key in ("project", "name")}
-                self._wandb_logger = WandbLogger(**names)
+                options = loggers.wandb
+                self._wandb_logger = WandbLogger(project=options.project, name=options.name)
             except ModuleNotFoundError as error:
                 raise UserError(
                     "system.loggers.wandb.enable is true, but wandb isn't installed: pip install "

@@ -14,7 +14,7 @@ from ...core.schedule import C
 from .base import Updateable, load_parameters
 from .models import Exporter
 from .registry import find
-from .savers import SaverMixin
+from .savers import LoggerOptions, SaverMixin
 
 
 class BaseSystem(pl.LightningModule, Updateable, SaverMixin):
@@ -24,9 +24,7 @@ class BaseSystem(pl.LightningModule, Updateable, SaverMixin):
 
     @dataclass
     class Config:
-        loggers: dict = field(
-            default_factory=lambda: {"wandb": {"enable": False, "project": "", "name": ""}}
-        )
+        loggers: LoggerOptions = field(default_factory=LoggerOptions)
         loss: dict = field(default_factory=dict)
         optimizer: dict = field(default_factory=dict)
         scheduler: Optional[dict] = None
