@@ -2,18 +2,11 @@
 
 import json
 import math
-import os
-import time
 
 import pytest
 
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.core.files import (
-    atomic_file,
-    existing_file,
-    json_text,
-    remove_abandoned,
-)
+from threestudio_gaussiandreamer.core.files import atomic_file, existing_file, json_text
 
 
 @pytest.mark.parametrize("name", ["a" * 255, "ü" * 127, "\U0001f98a" * 63], ids=["a", "ü", "fox"])
@@ -38,16 +31,6 @@ def test_numbers_that_json_does_not_have_are_null():
     text = json_text(content, indent=1)
     expected = {"psnr": None, "curve": [1.5, None, [2, None]], "name": "a"}
     assert json.loads(text, parse_constant=pytest.fail) == expected
-
-
-def test_only_old_temporary_files_of_the_same_name_are_removed(tmp_path):
-    hours = time.time() - 7200
-    names = {".a[1].npz.1-2.tmp": hours, ".a[1].npz.3-4.tmp": time.time(), ".b.npz.1-2.tmp": hours}
-    for name, changed in names.items():
-        (tmp_path / name).touch()
-        os.utime(tmp_path / name, (changed, changed))
-    remove_abandoned(tmp_path / "a[1].npz")
-    assert {path.name for path in tmp_path.iterdir()} == {".a[1].npz.3-4.tmp", ".b.npz.1-2.tmp"}
 
 
 @pytest.mark.parametrize(

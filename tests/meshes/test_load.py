@@ -314,7 +314,7 @@ def test_a_bundled_mesh_is_suggested_for_a_misspelt_one(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     saved(box(), tmp_path / "toys.glb")
     for name in ("toyy.glb", "to.glb", "Toy.glb", "nowhere/toy.glb"):
-        of_folder = "" if "/" in name else " Near names in '.': toys.glb."
-        said = rf"did you mean the bundled 'toy.glb'\?{of_folder}$"
+        of_folder = "there is no folder" if "/" in name else "near names in '.': toys.glb."
+        said = rf"did you mean the bundled 'toy.glb'\? {of_folder}"
         with pytest.raises(UserError, match=said):
             load_mesh(name)

@@ -4,6 +4,7 @@ checksum and runs no code from the file.
 A file is the zip archive that ``torch.save`` writes, with ``sha256:<hex>`` as the archive's
 comment, the hash of all bytes before the digest. ``torch.load`` can read it too."""
 
+import glob
 import hashlib
 import io
 import math
@@ -13,14 +14,14 @@ import pickle
 import re
 import shutil
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Optional
 
 import torch
 
 from .errors import UserError
-from .files import atomic_file, temporaries_of
+from .files import atomic_file
 from .logs import warn
 
 _MARK = b"sha256:"
@@ -37,7 +38,8 @@ def save_file(path: str | os.PathLike, content: Any) -> None:
     torch.save(content, buffer)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        for stale in temporaries_of(path):  # of processes that were killed while saving
+        # of processes that were killed while saving
+        for stale in path.parent.glob(f".{glob.escape(path.name)}.*.tmp"):
             stale.unlink(missing_ok=True)
     except OSError as error:
         raise UserError(
@@ -58,31 +60,29 @@ def load_file(path: str | os.PathLike, map_location: Any = "cpu") -> Any:
         UserError: there is no such file, or it is damaged or no checkpoint.
     """
     path = Path(os.path.expanduser(path))
-    if path.is_dir():
+    if os.path.isdir(path):
         last = path / "ckpts" / "last.ckpt"
         meant = f": did you mean {last}?" if last.is_file() else _siblings(path / "*")
         raise UserError(f"{path} is a folder, not a checkpoint{meant}")
+    if not os.path.isfile(path):  # reading a FIFO would wait for a writer
+        raise UserError(f"there is no checkpoint {path}{_siblings(path)}")
     try:
-        if not path.is_file():  # reading a FIFO would wait for a writer
-            raise FileNotFoundError(path)
         _verify(path)
         content = torch.load(path, map_location=map_location, weights_only=True)
         _require_stored(content, os.path.getsize(path))
-    except FileNotFoundError as error:
-        raise UserError(f"there is no checkpoint {path}" + _siblings(path)) from error
+        return content
     except pickle.UnpicklingError as error:
         # the first line of torch's message advises to load the file with weights_only=False
         found = re.search(r"GLOBAL (\S+)", str(error))
+        name = f": {found[1]}" if found else ""
         raise UserError(
-            f"{path} holds Python objects that could run code when read, so it isn't read"
-            f"{f': {found[1]}' if found else ''}"
+            f"{path} holds Python objects that could run code when read, so it isn't read{name}"
         ) from error
     except Exception as error:  # of many types for a damaged file
         reason = (str(error).strip() or type(error).__name__).splitlines()[0]
         raise UserError(
             f"{path} isn't a checkpoint, or is damaged: {reason}{_siblings(path)}"
         ) from error
-    return content
 
 
 def _verify(path: Path) -> None:
@@ -107,20 +107,13 @@ def _require_stored(content: Any, size: int) -> None:
     """Raise ValueError if a tensor is larger than the file: one with stride 0 announces any size
     with a few stored numbers.
     """
-    for tensor in _tensors(content):
-        if tensor.numel() * tensor.element_size() > size:
-            raise ValueError(
-                f"it announces a tensor of the shape {tuple(tensor.shape)}, which {size} bytes "
-                "can't hold"
-            )
-
-
-def _tensors(content: Any) -> Iterator[torch.Tensor]:
     if isinstance(content, torch.Tensor):
-        yield content
+        if content.numel() * content.element_size() > size:
+            shape = tuple(content.shape)
+            raise ValueError(f"{size} bytes can't hold a tensor of the shape {shape}")
     elif isinstance(content, (Mapping, list, tuple, set)):
         for item in content.values() if isinstance(content, Mapping) else content:
-            yield from _tensors(item)
+            _require_stored(item, size)
 
 
 def previous_of(path: str | os.PathLike) -> Path:
@@ -133,12 +126,7 @@ def newest_readable(folder: str | os.PathLike) -> Optional[tuple[Path, int]]:
     """Return the intact checkpoint of a folder with the highest step, ``last.ckpt`` among equal
     ones, and that step; None if there is none. Damaged files are reported in the log.
     """
-    by_step = sorted(
-        Path(folder).glob("*.ckpt"),
-        key=lambda path: (_claimed_step(path), path.stem == "last"),
-        reverse=True,
-    )
-    for candidate in by_step:
+    for candidate in sorted(Path(folder).glob("*.ckpt"), key=_claimed_order, reverse=True):
         try:
             return candidate, load_checkpoint(candidate)["global_step"]
         except UserError as error:
@@ -146,15 +134,15 @@ def newest_readable(folder: str | os.PathLike) -> Optional[tuple[Path, int]]:
     return None
 
 
-def _claimed_step(path: Path) -> float:
+def _claimed_order(path: Path) -> tuple[float, bool]:
     """Read the step of a checkpoint without its tensors and without verifying the checksum;
-    infinity if it can't be read, so that it is loaded and reported first.
+    infinity if it can't be read, so that it is loaded and reported first. Then ``last.ckpt``.
     """
     try:
         content = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
-        return int(content["global_step"])
+        return int(content["global_step"]), path.stem == "last"
     except Exception:
-        return math.inf
+        return math.inf, False
 
 
 def load_module_weights(path: str, module_name: Optional[str] = None) -> tuple[dict, int, int]:
@@ -192,12 +180,11 @@ def load_checkpoint(path: str | os.PathLike, map_location: Any = "cpu") -> dict:
     Raises:
         UserError: as in :func:`load_file`, or one of these keys is missing or of a wrong type.
     """
-    checkpoint = load_file(path, map_location)
-    known = checkpoint if isinstance(checkpoint, dict) else {}
+    found = load_file(path, map_location)
+    known = found if isinstance(found, dict) else {}
     kinds = {"epoch": int, "global_step": int, "state_dict": Mapping}
     wrong = [key for key, kind in kinds.items() if not isinstance(known.get(key), kind)]
-    state = () if wrong else known["state_dict"].items()
-    for name, value in state:
+    for name, value in () if wrong else known["state_dict"].items():
         if not (isinstance(name, str) and isinstance(value, torch.Tensor)):
             wrong.append(f"tensor {name!r}")
     if wrong:

@@ -3,27 +3,39 @@
 import json
 import math
 import os
-import time
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from difflib import get_close_matches
-from glob import escape as glob_escape
 from pathlib import Path
 from threading import get_ident
 from typing import Any, BinaryIO
 
 from .errors import UserError
 
-ABANDONED_SECONDS = 3600
-"""Age from which a temporary file is taken for that of a killed process."""
+WEB_PAGE = (
+    "a web page, not the file itself, as an address of a page gives it: download it again by the "
+    "link of the file"
+)
 PLACEHOLDERS = {
     b"version https://git-lfs": "a pointer of Git LFS, not the file itself: run `git lfs pull` "
     "where it is from, or download it again",
-    b"<!doctype html": "a web page, not the file itself, as an address of a page gives it: "
-    "download it again by the link of the file",
+    b"<!doctype html": WEB_PAGE,
+    b"<html": WEB_PAGE,
 }
-PLACEHOLDERS[b"<html"] = PLACEHOLDERS[b"<!doctype html"]
 """What downloads leave in a file's place, by its first bytes in lower case."""
+
+
+def usable_path(path: str | os.PathLike, what: str, *, home: bool = False) -> Path:
+    """Return a path, with ``~`` expanded if ``home``; raise UserError, which names it by ``what``,
+    if it contains NUL or is too long.
+    """
+    try:
+        path = Path(os.path.expanduser(path) if home else path)
+        with suppress(FileNotFoundError, NotADirectoryError):
+            path.lstat()
+    except (OSError, ValueError) as error:
+        raise UserError(f"{what} {_quoted(path)}: not a usable file name ({error})") from error
+    return path
 
 
 def existing_file(path: str | os.PathLike, kind: str, bundled: Collection[str] = ()) -> Path:
@@ -37,20 +49,15 @@ def existing_file(path: str | os.PathLike, kind: str, bundled: Collection[str] =
         UserError: the path doesn't exist or is no regular file; the message lists the files of its
             folder with similar names. Or it is one of ``PLACEHOLDERS``.
     """
-    try:
-        path = Path(path).expanduser()
-        if path.is_file():
-            reason = ""
-        elif path.exists():
-            reason = "is a folder, not a file" if path.is_dir() else "is no regular file"
-            if (path / "meta.json").is_file():
-                reason += "; of an unpacked SOG give the meta.json in it"
-        else:
-            reason = f"does not exist{near_names(path, bundled)}"
-    except (OSError, ValueError, RuntimeError) as error:
-        # the name is too long or contains NUL, or "~user" names an unknown user
-        raise UserError(f"{kind} {str(path)!r}: not a usable file name ({error}).") from error
-    if reason:
+    path = usable_path(path, kind, home=True)
+    reason = "is no regular file"
+    if path.is_dir():
+        has_meta = (path / "meta.json").is_file()
+        hint = "; of an unpacked SOG give the meta.json in it" if has_meta else ""
+        reason = f"is a folder, not a file{hint}"
+    elif not path.exists():
+        reason = f"does not exist; {near_names(path, bundled)}"
+    if not path.is_file():
         raise UserError(f"{kind} {str(path)!r} {reason}")
     require_content(path, f"{kind} {str(path)!r}")
     return path
@@ -71,25 +78,20 @@ def near_names(path: Path, bundled: Collection[str] = ()) -> str:
     """Return the end of the message for a missing file: a bundled file and files in its folder with
     similar names, or files with the same extension.
     """
-    folder = path.parent
-    entries = folder.iterdir() if folder.is_dir() else ()
-    names = sorted(entry.name for entry in entries if entry.is_file())
-    near = get_close_matches(path.name, names, n=3, cutoff=0.5)
-    if meant := get_close_matches(path.name, bundled, n=1, cutoff=0.5):
-        others = f" Near names in {str(folder)!r}: {', '.join(near)}." if near else ""
-        return f"; did you mean the bundled {meant[0]!r}?{others}"
-    if not folder.is_dir():
-        return f": there is no folder {str(folder)!r} either."
-    near = near or [name for name in names if Path(name).suffix == path.suffix][:3]
-    if not near:
-        return f"; no file in {str(folder)!r} has a near name."
-    return f"; near names in {str(folder)!r}: {', '.join(near)}."
+    folder, hint = path.parent, f"there is no folder {str(path.parent)!r} either."
+    if folder.is_dir():
+        names = sorted(entry.name for entry in folder.iterdir() if entry.is_file())
+        near = get_close_matches(path.name, names, n=3, cutoff=0.5)
+        near = near or [name for name in names if Path(name).suffix == path.suffix][:3]
+        hint = f"near names in {str(folder)!r}: {', '.join(near) or 'none'}."
+    meant = get_close_matches(path.name, bundled, n=1, cutoff=0.5)
+    return f"did you mean the bundled {meant[0]!r}? {hint}" if meant else hint
 
 
 @contextmanager
 def atomic_file(path: str | os.PathLike, *, durable: bool = True) -> Iterator[BinaryIO]:
     """Open a binary file for writing that replaces ``path`` only if the block succeeds: a temporary
-    file in the same folder, which is renamed at the end.
+    file ``.<name>.<process>-<thread>.tmp`` in the same folder, which is renamed at the end.
 
     Args:
         durable: also flush it to the disk, so that it is complete even after a power failure.
@@ -98,7 +100,8 @@ def atomic_file(path: str | os.PathLike, *, durable: bool = True) -> Iterator[Bi
         UserError: the folder is missing or can't be written, or the disk is full.
     """
     path = Path(path)
-    temporary = path.with_name(f".{_shortened(path.name)}.{os.getpid()}-{get_ident()}.tmp")
+    start = os.fsencode(path.name)[:100].decode(errors="ignore")  # names have at most 255 bytes
+    temporary = path.with_name(f".{start}.{os.getpid()}-{get_ident()}.tmp")
     try:
         with open(temporary, "wb") as file:
             yield file
@@ -117,22 +120,6 @@ def atomic_file(path: str | os.PathLike, *, durable: bool = True) -> Iterator[Bi
         temporary.unlink(missing_ok=True)
 
 
-def temporaries_of(path: str | os.PathLike) -> Iterator[Path]:
-    """Yield the temporary files of :func:`atomic_file` for ``path``, of any process."""
-    path = Path(path)
-    return path.parent.glob(f".{glob_escape(_shortened(path.name))}.*.tmp")
-
-
-def remove_abandoned(path: str | os.PathLike) -> None:
-    """Delete temporary files that killed processes have left while they wrote ``path``: those that
-    haven't been written for an hour.
-    """
-    for left in temporaries_of(path):
-        with suppress(OSError):  # another process may have deleted it
-            if time.time() - left.stat().st_mtime > ABANDONED_SECONDS:
-                left.unlink()
-
-
 def json_text(content: Any, **options: Any) -> str:
     """Encode as JSON, with ``null`` for numbers that JSON doesn't have: NaN and the infinities."""
     return json.dumps(_without_infinities(content), allow_nan=False, **options)
@@ -146,11 +133,6 @@ def _without_infinities(content: Any) -> Any:
     if isinstance(content, (list, tuple)):
         return [_without_infinities(value) for value in content]
     return content
-
-
-def _shortened(name: str, size: int = 100) -> str:
-    """Cut a file name to at most ``size`` bytes, to stay within the limit with a suffix added."""
-    return name.encode(errors="surrogateescape")[:size].decode(errors="ignore")
 
 
 def through_link(path: str | os.PathLike) -> Path:
@@ -168,20 +150,12 @@ def require_writable(path: str | os.PathLike, what: str) -> None:
         UserError: the name contains NUL or is too long, its folder is missing or can't be written,
             or the path is a folder.
     """
-    path = Path(path)
-    try:
-        path.lstat()
-    except (FileNotFoundError, NotADirectoryError):
-        pass
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise UserError(f"{what}: {_quoted(path)} can't be a file's name: {reason}") from error
+    path = usable_path(path, f"{what}:")
     if not path.parent.is_dir():
         raise UserError(f"{what}: there is no folder {_quoted(path.parent)}")
-    if path.is_dir():
-        raise UserError(f"{what}: {_quoted(path)} can't be written: it is a folder")
-    if not os.access(path.parent, os.W_OK):
-        raise UserError(f"{what}: {_quoted(path)} can't be written: its folder is read-only")
+    if path.is_dir() or not os.access(path.parent, os.W_OK):
+        why = "it is a folder" if path.is_dir() else "its folder is read-only"
+        raise UserError(f"{what}: {_quoted(path)} can't be written: {why}")
 
 
 def require_other_file(
@@ -191,15 +165,14 @@ def require_other_file(
     existing one that it is made from.
     """
     if os.path.exists(source) and os.path.exists(path) and os.path.samefile(source, path):
-        raise UserError(f"{what}: give it another name, so that {_quoted(Path(source))} is kept")
+        raise UserError(f"{what}: give it another name, so that {_quoted(source)} is kept")
 
 
 def is_folder(path: str | os.PathLike) -> bool:
     """Return whether ``path`` is an existing folder; False for what can't be a file's name."""
-    try:
-        return Path(path).expanduser().is_dir()
-    except (OSError, ValueError, RuntimeError):  # too long; NUL; "~user" of an unknown user
-        return False
+    with suppress(ValueError):
+        return os.path.isdir(os.path.expanduser(path))
+    return False
 
 
 def output_folder(path: str | os.PathLike, option: str, files: Collection[str] = ()) -> Path:
@@ -212,14 +185,12 @@ def output_folder(path: str | os.PathLike, option: str, files: Collection[str] =
     Raises:
         UserError: it can't be made or written into.
     """
+    folder = usable_path(path, f"{option}: the folder", home=True)
     try:
-        folder = Path(path).expanduser()
         folder.mkdir(parents=True, exist_ok=True)
-    except (OSError, ValueError, RuntimeError) as error:  # NUL; "~user" of an unknown user
-        why = getattr(error, "strerror", None) or error
-        raise UserError(
-            f"{option}: the folder {_quoted(Path(path))} can't be made: {why}"
-        ) from error
+    except OSError as error:
+        why = error.strerror or error
+        raise UserError(f"{option}: the folder {_quoted(folder)} can't be made: {why}") from error
     if not os.access(folder, os.W_OK | os.X_OK):
         raise UserError(f"{option}: the folder {_quoted(folder)} is read-only")
     for name in files:
@@ -227,17 +198,15 @@ def output_folder(path: str | os.PathLike, option: str, files: Collection[str] =
     return folder
 
 
-def _quoted(path: Path) -> str:
+def _quoted(path: str | os.PathLike) -> str:
     """Quote a path for a message, at most 100 characters of it."""
     text = str(path)
     return repr(text if len(text) <= 100 else f"{text[:80]}...")
 
 
 def _sync_folder(folder: Path) -> None:
-    """Flush a folder to the disk, so that a renaming in it is durable; does nothing on systems that
-    can't open folders (Windows).
-    """
-    with suppress(OSError):  # some network file systems can't either; the file itself is synced
+    """Flush a folder to the disk, so that a renaming in it is durable."""
+    with suppress(OSError):  # Windows and some network file systems can't
         descriptor = os.open(folder, os.O_RDONLY)
         try:
             os.fsync(descriptor)

@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Float, Int, UInt8
 
 from ..cameras import Orbit, orbit_c2w, to_opencv
-from ..core.files import atomic_file, remove_abandoned
+from ..core.files import atomic_file
 from ..core.streams import numpy_generator
 from ..meshes.mesh import Mesh, sample_surface, surface_colors
 from ..meshes.raycast import MeshCaster
@@ -99,7 +99,6 @@ class Shards:
         path = self.path(index)
         if not path.is_file():
             self.folder.mkdir(parents=True, exist_ok=True)
-            remove_abandoned(path)
             shard = self.make(index)
             with atomic_file(path) as file:
                 np.savez(file, **shard._asdict())
