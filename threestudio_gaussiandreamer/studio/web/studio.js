@@ -1,0 +1,233 @@
+"use strict";
+// The page of the studio. What it shows is text, never markup.
+
+const FIELDS = {
+  prompt: "system.prompt_processor.prompt",
+  negative: "system.prompt_processor.negative_prompt",
+  steps: "trainer.max_steps",
+  scale: "system.guidance.guidance_scale",
+  seed: "seed",
+  gain: "system.geometry.prune.gain",
+  count: "system.geometry.budget",
+};
+const MESH = "system.guidance.mesh", PRIOR = "system.geometry.prior";
+const MESHES = /\.(glb|gltf|obj|stl|off|3mf|dae)$/i, GAUSSIANS = /\.(spz|sog|splat|ksplat|usd[acz]?|spz\.glb)$/i;
+
+const $ = (id) => document.getElementById(id);
+let about = { missing: [], limit: 0 }, state = null, shelf = [], chosen = null, file = null, socket = null;
+
+/** Make an element with properties and children, which are elements or texts. */
+function make(tag, properties = {}, ...children) {
+  const element = Object.assign(document.createElement(tag), properties);
+  element.append(...children.filter((child) => child !== null));
+  return element;
+}
+
+const address = (path) => "files/" + path.split("/").map(encodeURIComponent).join("/");
+const say = (text) => { $("message").textContent = text; };
+const ask = (message) => { say(""); socket.send(JSON.stringify(message)); };
+
+function size(bytes) {
+  return bytes < 1e6 ? `${Math.ceil(bytes / 1e3)} kB` : `${(bytes / 1e6).toFixed(1)} MB`;
+}
+
+// ---- the socket ---------------------------------------------------------------------------------
+
+function connect() {
+  socket = new WebSocket(location.href.replace(/^http/, "ws").replace(/[?#].*/, "") + "studio");
+  socket.onmessage = (event) => {
+    const told = JSON.parse(event.data);
+    if (told.about) { about = told.about; mark(); }
+    if (told.shelf) { shelf = told.shelf; showShelf(); }
+    if (told.state) { state = told.state; showState(); }
+    if (told.error !== undefined) say(told.error);
+  };
+  socket.onclose = () => { say("The studio isn't reached; trying again ..."); setTimeout(connect, 1000); };
+  socket.onopen = () => say("");
+}
+
+/** Mark what can't make anything without weights. */
+function mark() {
+  for (const option of $("choice").options)
+    if (about.missing.includes(option.value) && !option.text.endsWith(")")) option.text += " (weights not found)";
+}
+
+// ---- the form -----------------------------------------------------------------------------------
+
+/** Return the launcher's arguments for a prompt. */
+function words(prompt) {
+  const configs = $("choice").value.split(" ").flatMap((name) => ["--config", name]);
+  const given = Object.keys(FIELDS).map((key) => [key, key === "prompt" ? prompt : $(key).value.trim()]);
+  const options = given.filter(([, value]) => value).map(([key, value]) => `${FIELDS[key]}=${value}`);
+  if (file && $("choice").value === "demo.yaml") options.push(`${MESH}=${file.path}`);
+  else if (file) options.push(...startOf(file));
+  return [...configs, "--train", ...options, ...(($("more").value.match(/(?:"[^"]*"|'[^']*'|\S)+/g)) || []).map(
+    (word) => word.replace(/^(["'])(.*)\1$/s, "$2"))];
+}
+
+function startOf({ path, gaussians }) {
+  const kind = gaussians || GAUSSIANS.test(path) ? "gaussians" : MESHES.test(path) ? "mesh" : "point-cloud";
+  const points = kind === "mesh" ? [`${PRIOR}.num_points=3000`] : [];
+  return [`${PRIOR}_type=${kind}-prior`, `${PRIOR}.path=${path}`, ...points];
+}
+
+function start() {
+  const prompts = $("prompt").value.split("\n").map((line) => line.trim()).filter(Boolean);
+  for (const prompt of prompts.length ? prompts : [""])
+    ask({ do: "start", words: words(prompt), label: prompt || (file ? file.name : $("choice").selectedOptions[0].text) });
+}
+
+/** Fill the form from the words of a command. */
+function again(given) {
+  $("form").reset();
+  setFile(null);
+  const configs = [], more = [], keys = Object.fromEntries(Object.entries(FIELDS).map(([key, option]) => [option, key]));
+  for (let i = given.indexOf("--config"); i >= 0 && i < given.length; i++) {
+    const [option, ...rest] = given[i].split("="), value = rest.join("=");
+    if (given[i] === "--config") configs.push(given[++i]);
+    else if (option in keys) $(keys[option]).value = value;
+    else if (option === MESH || option === `${PRIOR}.path`)
+      setFile({ path: value, name: value.split("/").pop(), gaussians: given.includes(`${PRIOR}_type=gaussians-prior`) });
+    else if (![`${PRIOR}_type`, `${PRIOR}.num_points`, "exp_root_dir", "--train"].includes(option)) more.push(given[i]);
+  }
+  const name = configs.join(" ");
+  if (![...$("choice").options].some((option) => option.value === name)) $("choice").append(make("option", { value: name }, name));
+  $("choice").value = name;
+  $("more").value = more.map((word) => (/\s/.test(word) ? `'${word}'` : word)).join(" ");
+  $("prompt").focus();
+}
+
+function setFile(found) {
+  file = found;
+  $("uploaded").hidden = !found;
+  $("file").textContent = found ? found.name : "";
+  $("upload").value = "";
+}
+
+function upload(given) {
+  if (given.size > about.limit) return say(`${given.name} has ${size(given.size)}; at most ${size(about.limit)} can be uploaded`);
+  const carrier = new WebSocket(socket.url.replace(/studio$/, "upload?") + encodeURIComponent(given.name));
+  carrier.onopen = () => carrier.send(given);
+  carrier.onclose = (event) => { if (event.code !== 1000) say(`${given.name} wasn't received`); };
+  carrier.onmessage = (event) => {
+    const told = JSON.parse(event.data);
+    if (told.error) say(told.error);
+    else setFile({ path: told.file, name: given.name, gaussians: told.gaussians });
+    carrier.onclose = null;
+    carrier.close();
+  };
+}
+
+// ---- what is at work ----------------------------------------------------------------------------
+
+function showState() {
+  const { job, last, queue, tool, last_tool: lastTool } = state, now = job || last;
+  $("pause").disabled = $("stop").disabled = !job;
+  $("pause").textContent = job && job.paused ? "Go on" : "Pause";
+  $("run").hidden = !job;
+  if (job) {
+    const { stage, step, steps, count, dB, likeness, left, pictures } = job.status;
+    $("what").textContent = `${job.label}: ${job.paused ? "paused" : stage || "starting"}`;
+    $("progress").value = step ? step / steps : 0;
+    $("numbers").textContent = [
+      step !== undefined && `step ${step} of ${steps}`,
+      count && `${count.toLocaleString("en")} Gaussians`,
+      dB !== undefined && `${dB.toFixed(1)} dB to the object`,
+      likeness !== undefined && `${likeness.toFixed(1)} dB likeness to the 2D model's picture`,
+      left !== null && left !== undefined && `${Math.ceil(left)} s left`,
+    ].filter(Boolean).join(" · ");
+    $("beside-2d").hidden = !pictures;
+    if (pictures && $("picture").dataset.number !== `${job.id} ${pictures}`) {
+      $("picture").dataset.number = `${job.id} ${pictures}`;
+      $("picture").src = `picture?${job.id}.${pictures}`;
+    }
+  }
+  $("lines").textContent = now ? now.lines.join("\n") : "";
+  if (!job && last && last.error && last.id !== showState.said) { showState.said = last.id; say(`${last.label}: ${last.error}`); }
+  if (lastTool && lastTool.error && lastTool.id !== showState.told) { showState.told = lastTool.id; say(`${lastTool.label}: ${lastTool.error}`); }
+  $("tool").textContent = tool ? `${tool.label} ...` : "";
+  $("waiting").hidden = !queue.length;
+  $("queue").replaceChildren(...queue.map(({ id, label }) =>
+    make("li", {}, `${label} `, make("button", { onclick: () => ask({ do: "remove", number: id }), ariaLabel: "Remove from the queue" }, "×"))));
+  for (const place of ["main", "beside"]) $(`caption-${place}`).textContent = state.captions[place];
+  for (const card of $("cards").children) card.classList.toggle("on", [state.shown.main, state.shown.beside].includes(card.dataset.id));
+}
+
+// ---- the shelf ----------------------------------------------------------------------------------
+
+function showShelf() {
+  const wanted = $("filter").value.toLowerCase();
+  const found = shelf.filter((run) => run.prompt.toLowerCase().includes(wanted));
+  $("cards").replaceChildren(...found.slice(0, 200).map(card));
+  if (chosen) choose(shelf.find((run) => run.id === chosen.id) || null);
+  if (state) showState();
+}
+
+function card(run) {
+  const picture = make("img", { loading: "lazy", alt: "" }), still = run.picture ? address(run.picture) : "data:,";
+  picture.src = still;
+  const turn = () => { if (run.turn) picture.src = address(run.turn); }, rest = () => { picture.src = still; };
+  const facts = [run.count && `${run.count.toLocaleString("en")} Gaussians`, run.scores.psnr && `${run.scores.psnr.toFixed(1)} dB`, !run.ended && "not finished"];
+  const button = make("button", { className: "card", onclick: () => { choose(run); if (run.ended) ask({ do: "show", main: run.id }); } },
+    picture, make("span", {}, run.prompt), make("span", {}, make("small", {}, facts.filter(Boolean).join(" · "))));
+  Object.assign(button, { onmouseenter: turn, onfocus: turn, onmouseleave: rest, onblur: rest });
+  button.dataset.id = run.id;
+  return button;
+}
+
+function choose(run) {
+  chosen = run;
+  $("chosen").hidden = !run;
+  if (!run) return;
+  const button = (text, onclick) => make("button", { onclick }, text);
+  const others = make("select", { ariaLabel: "Run to compare with" }, ...shelf.filter((other) => other.ended && other !== run)
+    .map((other) => make("option", { value: other.id }, `${other.prompt} ${other.when.slice(0, 16)}`.slice(-100))));
+  const budget = make("select", { ariaLabel: "Budget" }, ...["psnr", "auto", "count", "bytes"].map((name) => make("option", {}, name)));
+  const value = make("input", { value: "40", size: 6, ariaLabel: "Value of the budget" });
+  budget.onchange = () => { value.value = { psnr: "40", auto: "0.5", count: "1000", bytes: "100kB" }[budget.value]; };
+  const copy = (text) => make("button", { onclick: (event) => navigator.clipboard.writeText(text).then(() => { event.target.textContent = "Copied"; }) }, "Copy");
+  const taken = ["gaussians.sog", "gaussians.glb", "mesh.glb"].filter((name) => !run.files.some((known) => known.name === name));
+  const scores = Object.entries(run.scores).filter(([, score]) => typeof score === "number").map(([name, score]) => `${name} ${+score.toPrecision(5)}`);
+  $("chosen").replaceChildren(
+    make("h2", {}, run.prompt),
+    make("p", {}, make("small", {}, [run.when.slice(0, 16).replace("T", " "), ...scores].join(" · "))),
+    make("p", { className: "buttons" }, button("Again with this changed", () => again(run.words)),
+      run.resumable ? button("Go on from its checkpoint", () => ask({ do: "resume", run: run.id })) : null,
+      button("Delete ...", () => remove(run))),
+    run.ended ? make("p", { className: "buttons" }, button("Compare with", () => ask({ do: "show", main: run.id, beside: others.value || null })), others) : "",
+    run.ended ? make("p", { className: "buttons" }, button("Prune to", () => ask({ do: "prune", run: run.id, budget: budget.value, value: value.value })), budget, value) : "",
+    run.ended ? make("p", { className: "buttons" }, ...taken.map((name) => button(`Make ${name}`, () => ask({ do: "take", run: run.id, name })))) : "",
+    make("ul", { className: "files" }, ...run.files.map(({ name, path, size: bytes }) =>
+      make("li", {}, make("a", { href: address(path), target: "_blank", ...(name.endsWith(".html") ? {} : { download: name }) }, name), ` ${size(bytes)}`,
+        /\/pruned\/.*\.(ply|spz)$/.test(path) ? button("beside", () => ask({ do: "show", main: run.id, beside: path })) : null))),
+    make("details", {}, make("summary", {}, "The command that repeats it"), make("pre", {}, run.command), copy(run.command)),
+    make("details", {}, make("summary", {}, "Settings that differ"), make("pre", {}, run.settings.join("\n"))),
+  );
+}
+
+function remove(run) {
+  $("question").textContent = `Delete ${run.id}?`;
+  $("ask").returnValue = "";
+  $("ask").onclose = () => { if ($("ask").returnValue === "yes") ask({ do: "delete", run: run.id }); };
+  $("ask").showModal();
+}
+
+// ---- start --------------------------------------------------------------------------------------
+
+const dark = matchMedia("(prefers-color-scheme: dark)");
+const paint = () => { $("scene").src = "index.html" + (dark.matches ? "?darkMode" : ""); };
+dark.onchange = paint;
+paint();
+// viser's own panel has nothing to show here
+$("scene").onload = () => $("scene").contentDocument.head.append(make("style", {}, "[class*=mantine-Paper-root] { display: none !important; }"));
+$("form").onsubmit = (event) => { event.preventDefault(); start(); };
+$("form").onkeydown = (event) => { if (event.key === "Enter" && (event.ctrlKey || event.metaKey)) { event.preventDefault(); start(); } };
+$("pause").onclick = () => ask({ do: "pause", paused: !state.job.paused });
+$("stop").onclick = () => ask({ do: "stop" });
+$("clear").onclick = () => ask({ do: "remove" });
+$("refresh").onclick = () => ask({ do: "refresh" });
+$("grow").onclick = () => ask({ do: "show" });
+$("filter").oninput = showShelf;
+$("upload").onchange = () => { if ($("upload").files.length) upload($("upload").files[0]); };
+$("forget").onclick = () => setFile(null);
+connect();
