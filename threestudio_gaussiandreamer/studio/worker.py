@@ -1,12 +1,9 @@
-"""The process of one run of the studio: ``python -m threestudio_gaussiandreamer.studio.worker
-FOLDER ARGUMENTS...`` is the launcher with these arguments, and writes into FOLDER what the studio
-shows: ``status.json``, ``cloud.npz`` and ``picture.png``, each replaced atomically. The training is
-the same bit for bit, since only finished steps are read."""
+"""The process of a run of the studio: ``python -m ...studio.worker FOLDER ARGUMENTS...`` is the
+launcher, which also writes ``status.json``, ``cloud.npz`` and ``picture.png`` into FOLDER. Training
+is the same bit for bit, since only finished steps are read."""
 
-import argparse
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -36,13 +33,12 @@ class Snapshots(pl.Callback):
     """Write the status and the cloud of a training, and a picture of the score model."""
 
     def __init__(self, folder: Path) -> None:
-        self.folder, self.due = folder, dict.fromkeys(SHARES, 0.0)
-        self.began, self.first, self.status = 0.0, 0, {}
+        self.folder, self.due, self.status = folder, dict.fromkeys(SHARES, 0.0), {"pictures": 0}
+        self.began, self.first = 0.0, 0
 
     def setup(self, trainer: Any, pl_module: Any, stage: str) -> None:
-        self.write(
-            stage="starting" if stage == "fit" else "rendering", folder=trainer.default_root_dir
-        )
+        name = "starting" if stage == "fit" else "rendering"
+        self.write(stage=name, folder=trainer.default_root_dir, left=None)
 
     def on_train_start(self, trainer: Any, pl_module: Any) -> None:
         self.began, self.first = time.monotonic(), trainer.global_step
@@ -51,33 +47,27 @@ class Snapshots(pl.Callback):
     def on_train_batch_end(
         self, trainer: Any, pl_module: Any, outputs: Any, batch: Any, *rest: Any
     ) -> None:
-        self.if_due("picture", lambda: self.write_picture(pl_module, batch))
-        self.if_due("cloud", lambda: self.write_cloud(trainer, pl_module))
+        for name, write in (("picture", self.write_picture), ("cloud", self.write_cloud)):
+            start = time.monotonic()
+            if start >= self.due[name]:
+                write(trainer, pl_module, batch)
+                self.due[name] = start + (time.monotonic() - start) / SHARES[name]
 
     def on_train_end(self, trainer: Any, pl_module: Any) -> None:
         self.write_cloud(trainer, pl_module)
 
-    def on_test_batch_end(self, trainer: Any, pl_module: Any, *rest: Any) -> None:
-        self.if_due("cloud", lambda: self.write(stage="rendering", left=None))
-
-    def if_due(self, name: str, write: Callable[[], None]) -> None:
-        start = time.monotonic()
-        if start >= self.due[name]:
-            write()
-            self.due[name] = start + (time.monotonic() - start) / SHARES[name]
-
-    def write_cloud(self, trainer: Any, system: Any) -> None:
-        cloud, step = current_cloud(system), trainer.global_step
+    def write_cloud(self, trainer: Any, system: Any, *rest: Any) -> None:
+        cloud, step, steps = current_cloud(system), trainer.global_step, trainer.max_steps
         with atomic_file(self.folder / "cloud.npz", durable=False) as file:
             np.savez(file, **cloud._asdict())
-        done, steps = step - self.first, trainer.max_steps
-        left = (steps - step) * (time.monotonic() - self.began) / done if done else None
-        quality = {k: float(v) for k, v in trainer.callback_metrics.items() if k in ("dB", "loss")}
-        count = {"count": len(cloud.means), "step": step, "steps": steps, "left": left}
-        self.write(stage="training", **count, **quality)
+        each = (time.monotonic() - self.began) / max(step - self.first, 1)
+        left = (steps - step) * each if step > self.first else None
+        metrics = {k: float(v) for k, v in trainer.callback_metrics.items() if k in ("dB", "loss")}
+        counts = {"count": len(cloud.means), "step": step, "steps": steps}
+        self.write(stage="training", left=left, **counts, **metrics)
 
     @torch.no_grad()
-    def write_picture(self, system: Any, batch: dict[str, Any]) -> None:
+    def write_picture(self, trainer: Any, system: Any, batch: dict[str, Any]) -> None:
         """Draw the first view of a step beside what the score model makes of it in one step."""
         guidance = system.guidance
         if not isinstance(guidance, ScoreDistillation) or getattr(guidance.cfg, "n_view", 1) > 1:
@@ -96,11 +86,10 @@ class Snapshots(pl.Callback):
         guided = guidance.predict_noise(z, t, condition)
         drawn = guidance.decode(sds.predict_x0(z, guided, abar).float()).float().clamp(0, 1)
         drawn = F.interpolate(drawn, render.shape[-2:], mode="bilinear", align_corners=False)
-        self.status["likeness"] = float(psnr(render, drawn))
-        self.status["pictures"] = self.status.get("pictures", 0) + 1
         pair = [rgb_panel(image[0].movedim(0, -1)) for image in (render, drawn)]
         with atomic_file(self.folder / "picture.png", durable=False) as file:
             Image.fromarray(images.grid(pair)).save(file, "png")
+        self.write(likeness=float(psnr(render, drawn)), pictures=self.status["pictures"] + 1)
 
     def write(self, **status: Any) -> None:
         self.status |= status
@@ -112,11 +101,8 @@ def main() -> int:
     """Run the launcher with the arguments behind the folder; return its exit code."""
     limit_openmp_spin()
     folder, *argv = sys.argv[1:]
-
-    def run(args: argparse.Namespace) -> int:
-        return prepare(args, argv, callbacks=[Snapshots(Path(folder))]).run()
-
-    return run_command(parse_arguments, run, argv)
+    own = {"callbacks": [Snapshots(Path(folder))]}
+    return run_command(parse_arguments, lambda args: prepare(args, argv, **own).run(), argv)
 
 
 if __name__ == "__main__":

@@ -13,8 +13,11 @@ const FIELDS = {
 const MESH = "system.guidance.mesh", PRIOR = "system.geometry.prior";
 const MESHES = /\.(glb|gltf|obj|stl|off|3mf|dae)$/i, GAUSSIANS = /\.(spz|sog|splat|ksplat|usd[acz]?|spz\.glb)$/i;
 
+const STOPPED = 130;  // exit code after Ctrl-C
+const PROGRESS = /\d+%\||\?it\/s|\?, \?/;
+
 const $ = (id) => document.getElementById(id);
-let about = { missing: [], limit: 0 }, state = null, shelf = [], chosen = null, file = null, socket = null;
+let about = { missing: [], limit: 0 }, state = null, shelf = [], chosen = null, file = null, sending = "", socket = null;
 
 /** Make an element with properties and children, which are elements or texts. */
 function make(tag, properties = {}, ...children) {
@@ -37,10 +40,10 @@ function connect() {
   socket = new WebSocket(location.href.replace(/^http/, "ws").replace(/[?#].*/, "") + "studio");
   socket.onmessage = (event) => {
     const told = JSON.parse(event.data);
-    if (told.about) { about = told.about; mark(); }
-    if (told.shelf) { shelf = told.shelf; showShelf(); }
-    if (told.state) { state = told.state; showState(); }
-    if (told.error !== undefined) say(told.error);
+    if (told.error !== undefined) return say(told.error);
+    if (told.path) { say(""); return setFile({ ...told, name: sending }); }
+    if (told.shelf) { about = told; shelf = told.shelf; mark(); showShelf(); }
+    else { state = told; showState(); }
   };
   socket.onclose = () => { say("The studio isn't reached; trying again ..."); setTimeout(connect, 1000); };
   socket.onopen = () => say("");
@@ -61,8 +64,13 @@ function words(prompt) {
   const options = given.filter(([, value]) => value).map(([key, value]) => `${FIELDS[key]}=${value}`);
   if (file && $("choice").value === "demo.yaml") options.push(`${MESH}=${file.path}`);
   else if (file) options.push(...startOf(file));
-  return [...configs, "--train", ...options, ...(($("more").value.match(/(?:"[^"]*"|'[^']*'|\S)+/g)) || []).map(
-    (word) => word.replace(/^(["'])(.*)\1$/s, "$2"))];
+  return [...configs, "--train", `exp_root_dir=${about.root}`, ...options, ...split($("more").value)];
+}
+
+/** Split a command line into its words, as a shell does. */
+function split(text) {
+  const words = text.match(/(?:'[^']*'|"[^"]*"|[^\s'"])+/g) || [];
+  return words.map((word) => word.replace(/'([^']*)'|"([^"]*)"/g, "$1$2"));
 }
 
 function startOf({ path, gaussians }) {
@@ -106,19 +114,37 @@ function setFile(found) {
 
 function upload(given) {
   if (given.size > about.limit) return say(`${given.name} has ${size(given.size)}; at most ${size(about.limit)} can be uploaded`);
-  const carrier = new WebSocket(socket.url.replace(/studio$/, "upload?") + encodeURIComponent(given.name));
-  carrier.onopen = () => carrier.send(given);
-  carrier.onclose = (event) => { if (event.code !== 1000) say(`${given.name} wasn't received`); };
-  carrier.onmessage = (event) => {
-    const told = JSON.parse(event.data);
-    if (told.error) say(told.error);
-    else setFile({ path: told.file, name: given.name, gaussians: told.gaussians });
-    carrier.onclose = null;
-    carrier.close();
-  };
+  socket.send(new Blob([given.name.replaceAll("\n", " "), "\n", given]));
+  say(`${given.name} is being sent ...`);
+  sending = given.name;
 }
 
 // ---- what is at work ----------------------------------------------------------------------------
+
+/** Return the lines of a command's output, without its progress bars. */
+function linesOf(job) {
+  const lines = job.text.split("\n").map((line) => line.split("\r").pop().trimEnd());
+  return lines.filter((line) => line && !PROGRESS.test(line));
+}
+
+/** Return the message that a command has ended with; "" if it has succeeded or was stopped. */
+function errorOf(job) {
+  if ([null, 0, STOPPED].includes(job.code)) return "";
+  const lines = linesOf(job), at = lines.findLastIndex((line) => line.startsWith("error: "));
+  if (at >= 0) return lines.slice(at).join("\n");
+  const how = job.code < 0 ? `signal ${-job.code}${job.code === -9 ? " (out of memory?)" : ""}` : `exit code ${job.code}`;
+  return [`the process has failed: ${how}`, ...lines.slice(-4)].join("\n");
+}
+
+function caption(place) {
+  const count = state.counts[place], id = state.shown[place];
+  if (!count) return "";
+  const run = shelf.find((one) => one.id === id);
+  const name = run ? run.prompt : id ? id.split("/").pop() : state.job ? state.job.label : "";
+  return `${name}: ${count.toLocaleString("en")} Gaussians`;
+}
+
+const reported = new Set();
 
 function showState() {
   const { job, last, queue, tool, last_tool: lastTool } = state, now = job || last;
@@ -142,14 +168,17 @@ function showState() {
       $("picture").src = `picture?${job.id}.${pictures}`;
     }
   }
-  $("lines").textContent = now ? now.lines.join("\n") : "";
-  if (!job && last && last.error && last.id !== showState.said) { showState.said = last.id; say(`${last.label}: ${last.error}`); }
-  if (lastTool && lastTool.error && lastTool.id !== showState.told) { showState.told = lastTool.id; say(`${lastTool.label}: ${lastTool.error}`); }
+  $("lines").textContent = now ? linesOf(now).join("\n") : "";
+  for (const ended of [last, lastTool])
+    if (ended && !reported.has(ended.id)) {
+      reported.add(ended.id);
+      if (errorOf(ended)) say(`${ended.label}: ${errorOf(ended)}`);
+    }
   $("tool").textContent = tool ? `${tool.label} ...` : "";
   $("waiting").hidden = !queue.length;
   $("queue").replaceChildren(...queue.map(({ id, label }) =>
     make("li", {}, `${label} `, make("button", { onclick: () => ask({ do: "remove", number: id }), ariaLabel: "Remove from the queue" }, "×"))));
-  for (const place of ["main", "beside"]) $(`caption-${place}`).textContent = state.captions[place];
+  for (const place of ["main", "beside"]) $(`caption-${place}`).textContent = caption(place);
   for (const card of $("cards").children) card.classList.toggle("on", [state.shown.main, state.shown.beside].includes(card.dataset.id));
 }
 
@@ -164,9 +193,9 @@ function showShelf() {
 }
 
 function card(run) {
-  const picture = make("img", { loading: "lazy", alt: "" }), still = run.picture ? address(run.picture) : "data:,";
-  picture.src = still;
-  const turn = () => { if (run.turn) picture.src = address(run.turn); }, rest = () => { picture.src = still; };
+  const picture = make("img", { loading: "lazy", alt: "" }), still = run.picture ? address(run.picture) : "";
+  if (still) picture.src = still;
+  const turn = () => { if (run.turn.length) picture.src = address(run.turn[0]); }, rest = () => { picture.src = still; };
   const facts = [run.count && `${run.count.toLocaleString("en")} Gaussians`, run.scores.psnr && `${run.scores.psnr.toFixed(1)} dB`, !run.ended && "not finished"];
   const button = make("button", { className: "card", onclick: () => { choose(run); if (run.ended) ask({ do: "show", main: run.id }); } },
     picture, make("span", {}, run.prompt), make("span", {}, make("small", {}, facts.filter(Boolean).join(" · "))));
@@ -191,8 +220,11 @@ function choose(run) {
   $("chosen").replaceChildren(
     make("h2", {}, run.prompt),
     make("p", {}, make("small", {}, [run.when.slice(0, 16).replace("T", " "), ...scores].join(" · "))),
-    make("p", { className: "buttons" }, button("Again with this changed", () => again(run.words)),
-      run.resumable ? button("Go on from its checkpoint", () => ask({ do: "resume", run: run.id })) : null,
+    make("p", { className: "buttons" }, button("Again with this changed", () => again(split(run.command))),
+      run.resume ? button("Go on from its checkpoint", () => {
+        const given = split(run.resume);
+        ask({ do: "start", words: given.slice(given.indexOf("--config")), label: run.prompt });
+      }) : null,
       button("Delete ...", () => remove(run))),
     run.ended ? make("p", { className: "buttons" }, button("Compare with", () => ask({ do: "show", main: run.id, beside: others.value || null })), others) : "",
     run.ended ? make("p", { className: "buttons" }, button("Prune to", () => ask({ do: "prune", run: run.id, budget: budget.value, value: value.value })), budget, value) : "",
@@ -222,8 +254,8 @@ paint();
 $("scene").onload = () => $("scene").contentDocument.head.append(make("style", {}, "[class*=mantine-Paper-root] { display: none !important; }"));
 $("form").onsubmit = (event) => { event.preventDefault(); start(); };
 $("form").onkeydown = (event) => { if (event.key === "Enter" && (event.ctrlKey || event.metaKey)) { event.preventDefault(); start(); } };
-$("pause").onclick = () => ask({ do: "pause", paused: !state.job.paused });
-$("stop").onclick = () => ask({ do: "stop" });
+$("pause").onclick = () => ask({ do: "control", paused: !state.job.paused });
+$("stop").onclick = () => ask({ do: "control", stop: true });
 $("clear").onclick = () => ask({ do: "remove" });
 $("refresh").onclick = () => ask({ do: "refresh" });
 $("grow").onclick = () => ask({ do: "show" });
