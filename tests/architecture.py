@@ -24,7 +24,7 @@ RINGS = {
     "1 host": ("host", "models"),
     "2 parts": ("prompts", "priors", "guidance", "surface", "exporters"),
     "3 training": ("training", "prune", "view", "convert"),
-    "4 programs": ("launch", "farm", "evaluation", "evaluate", "toybox"),
+    "4 programs": ("launch", "farm", "evaluation", "evaluate", "toybox", "studio"),
 }
 """Layers of the package; the rooms of one import from it and from those before it."""
 

@@ -1,123 +1,16 @@
-"""A studio in a process of its own, and its page in headless Chromium."""
-
-import json
-import re
-import signal
-import socket
-import subprocess
-import sys
-import time
+"""One studio for all of its tests."""
 
 import pytest
 
 from benchmarks.viewers.browser import chromium
-from benchmarks.viewers.devtools import open_page
-
-SECONDS = 240.0
-"""Longest wait for anything, on a busy machine."""
-
-
-class Tab:
-    """The page of a studio, and what a person does there."""
-
-    def __init__(self, page, address, root, process):
-        self.page, self.address, self.root, self.process = page, address, root, process
-        self.session = page.session
-
-    def js(self, expression):
-        self.page.session = self.session
-        return self.page.evaluate(expression)
-
-    def text(self, name):
-        return self.js(f"document.getElementById('{name}').innerText")
-
-    def press(self, name):
-        self.js(f"document.getElementById('{name}').click()")
-
-    def press_text(self, text):
-        buttons = "[...document.querySelectorAll('#chosen button')]"
-        self.js(f"{buttons}.find(button => button.textContent === '{text}').click()")
-
-    def type(self, name, text):
-        """Replace the text of a field as the keyboard does."""
-        self.js(f"document.getElementById('{name}').focus()")
-        self.js(f"document.getElementById('{name}').select()")
-        self.page.call("Input.insertText", text=text)
-
-    def start(self, prompt, choice="smoke.yaml", more="", **fields):
-        """Fill the form and press Start; tests may choose any configuration."""
-        self.js("document.getElementById('form').reset()")
-        option = f"Object.assign(document.createElement('option'), {{value: '{choice}'}})"
-        self.js(f"document.getElementById('choice').append({option})")
-        self.js(f"document.getElementById('choice').value = '{choice}'")
-        for name, text in {"prompt": prompt, "more": more, **fields}.items():
-            self.js(
-                f"document.getElementById('{name}').closest('details')?.setAttribute('open', '')"
-            )
-            self.type(name, text)
-        self.press("start")
-
-    def until(self, condition):
-        """Wait until a JavaScript expression is true, and return its value."""
-        end = time.monotonic() + SECONDS
-        while time.monotonic() < end:
-            if value := self.js(condition):
-                return value
-            time.sleep(0.1)
-        raise AssertionError(f"{condition}: {self.js('JSON.stringify(state)')}")
-
-    def until_ended(self):
-        """Wait until no run is at work or waits; return the newest entry of the shelf."""
-        self.until("state && !state.job && !state.queue.length")
-        return self.newest()
-
-    def newest(self):
-        return json.loads(self.js("JSON.stringify(shelf[0] || null)"))
-
-    def worker(self):
-        """Return the process id of the run at work."""
-        children = subprocess.run(
-            ["pgrep", "-P", str(self.process.pid)], capture_output=True, text=True, check=True
-        )
-        return int(children.stdout.split()[0])
-
-    def other_tab(self):
-        """Open the page in another tab of the same browser."""
-        self.page.session = None
-        self.page.load(self.address)
-        return Tab(self.page, self.address, self.root, self.process)
-
-    def reload(self):
-        self.page.session = self.session
-        self.page.call("Page.reload")
-        time.sleep(0.5)
-        self.until("document.readyState === 'complete' && state !== null")
+from tests.studio.tab import opened
 
 
 @pytest.fixture(scope="session")
 def studio(tmp_path_factory):
-    """A studio with an empty shelf, open in Chromium."""
+    """A studio with an empty shelf, open in headless Chromium."""
     if chromium() is None:
         pytest.skip("no Chromium is installed")
     pytest.importorskip("viser")
-    root = tmp_path_factory.mktemp("studio") / "outputs"
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    command = [sys.executable, "-m", "threestudio_gaussiandreamer.studio", "--port", str(port)]
-    process = subprocess.Popen(
-        [*command, "--output", str(root)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
-        text=True,
-    )
-    try:
-        line = process.stdout.readline()
-        address = re.search(r"http://\S+\d", line)[0] + "/"
-        with open_page(address, size=(1000, 600)) as page:
-            tab = Tab(page, address, root, process)
-            tab.until("state !== null")
-            yield tab
-    finally:
-        process.send_signal(signal.SIGINT)
-        assert process.wait(SECONDS) == 0
+    with opened(tmp_path_factory.mktemp("studio") / "outputs") as tab:
+        yield tab

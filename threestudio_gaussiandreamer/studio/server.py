@@ -42,8 +42,7 @@ OURS = {"/": "studio.html", "/studio.js": "studio.js", "/studio.css": "studio.cs
 POLICY = "default-src 'self'; style-src 'self' 'unsafe-inline'; base-uri 'none'"
 THEIRS = "sandbox allow-scripts allow-downloads"
 """The policies of our page, and of files of runs, whose pages can't act as ours."""
-LARGEST_UPLOAD = 256 * 2**20
-"""Bytes of one file."""
+LARGEST_UPLOAD = 256 * 2**20  # bytes
 POLL = 0.15
 """Seconds between two looks for something new."""
 MODEL = "pretrained_model_name_or_path"

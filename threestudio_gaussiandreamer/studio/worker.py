@@ -2,6 +2,7 @@
 launcher, which also writes ``status.json``, ``cloud.npz`` and ``picture.png`` into FOLDER. Training
 is the same bit for bit, since only finished steps are read."""
 
+import contextlib
 import sys
 import time
 from pathlib import Path
@@ -10,7 +11,6 @@ from typing import Any
 import numpy as np
 import torch
 import torch.nn.functional as F
-from PIL import Image
 
 from ..core import images
 from ..core.command import run_command
@@ -25,6 +25,8 @@ from ..launch.options import parse_arguments
 from ..metrics import psnr
 from ..training.events import rgb_panel
 
+NOT_FATAL = contextlib.suppress(Exception)
+"""What is only shown must not end a run."""
 SHARES = {"cloud": 0.02, "picture": 0.03}
 """Largest shares of the time that are spent on writing them."""
 
@@ -50,21 +52,21 @@ class Snapshots(pl.Callback):
         for name, write in (("picture", self.write_picture), ("cloud", self.write_cloud)):
             start = time.monotonic()
             if start >= self.due[name]:
-                write(trainer, pl_module, batch)
+                with NOT_FATAL:
+                    write(trainer, pl_module, batch)
                 self.due[name] = start + (time.monotonic() - start) / SHARES[name]
-
-    def on_train_end(self, trainer: Any, pl_module: Any) -> None:
-        self.write_cloud(trainer, pl_module)
 
     def write_cloud(self, trainer: Any, system: Any, *rest: Any) -> None:
         cloud, step, steps = current_cloud(system), trainer.global_step, trainer.max_steps
-        with atomic_file(self.folder / "cloud.npz", durable=False) as file:
+        with NOT_FATAL, atomic_file(self.folder / "cloud.npz", durable=False) as file:
             np.savez(file, **cloud._asdict())
         each = (time.monotonic() - self.began) / max(step - self.first, 1)
         left = (steps - step) * each if step > self.first else None
         metrics = {k: float(v) for k, v in trainer.callback_metrics.items() if k in ("dB", "loss")}
         counts = {"count": len(cloud.means), "step": step, "steps": steps}
         self.write(stage="training", left=left, **counts, **metrics)
+
+    on_train_end = write_cloud
 
     @torch.no_grad()
     def write_picture(self, trainer: Any, system: Any, batch: dict[str, Any]) -> None:
@@ -87,13 +89,12 @@ class Snapshots(pl.Callback):
         drawn = guidance.decode(sds.predict_x0(z, guided, abar).float()).float().clamp(0, 1)
         drawn = F.interpolate(drawn, render.shape[-2:], mode="bilinear", align_corners=False)
         pair = [rgb_panel(image[0].movedim(0, -1)) for image in (render, drawn)]
-        with atomic_file(self.folder / "picture.png", durable=False) as file:
-            Image.fromarray(images.grid(pair)).save(file, "png")
+        images.write(self.folder / "picture.png", images.grid(pair))
         self.write(likeness=float(psnr(render, drawn)), pictures=self.status["pictures"] + 1)
 
     def write(self, **status: Any) -> None:
         self.status |= status
-        with atomic_file(self.folder / "status.json", durable=False) as file:
+        with NOT_FATAL, atomic_file(self.folder / "status.json", durable=False) as file:
             file.write(json_text(self.status).encode())
 
 

@@ -189,6 +189,8 @@ function showShelf() {
   const found = shelf.filter((run) => run.prompt.toLowerCase().includes(wanted));
   $("cards").replaceChildren(...found.slice(0, 200).map(card));
   if (chosen) choose(shelf.find((run) => run.id === chosen.id) || null);
+  else if (showShelf.newest !== undefined && shelf.length && shelf[0].id !== showShelf.newest) choose(shelf[0]);
+  showShelf.newest = shelf.length ? shelf[0].id : "";
   if (state) showState();
 }
 
