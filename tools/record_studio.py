@@ -15,7 +15,7 @@ from tests.studio.tab import Tab, opened
 
 PROMPT = "a red fox with a green scarf"
 SIZE = (1040, 640)
-WIDTH = 640
+WIDTH = 800
 """Pixels of the recording."""
 BETWEEN = 2.0
 """Seconds of the run between two frames."""
@@ -32,6 +32,8 @@ def main(path: Path) -> None:
         frames.append((picture.resize((WIDTH, height), Image.Resampling.LANCZOS), milliseconds))
 
     with tempfile.TemporaryDirectory() as folder, opened(Path(folder), SIZE) as tab:
+        hidden = "'[class*=mantine-Notification] { display: none !important; }'"
+        tab.js(f"$('scene').contentDocument.head.append(make('style', {{}}, {hidden}))")
         for end in range(4, len(PROMPT) + 4, 4):
             tab.type("prompt", PROMPT[:end])
             take(tab, 120)
@@ -50,7 +52,7 @@ def main(path: Path) -> None:
         take(tab, 3000)
     first, *others = [picture for picture, _ in frames]
     times = [milliseconds for _, milliseconds in frames]
-    options = {"append_images": others, "duration": times, "loop": 0, "quality": 60, "method": 6}
+    options = {"append_images": others, "duration": times, "loop": 0, "quality": 70, "method": 6}
     first.save(path, "webp", save_all=True, **options)
     print(f"{path}: {len(frames)} frames, {path.stat().st_size / 1e6:.2f} MB")
 

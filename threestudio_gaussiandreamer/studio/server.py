@@ -43,8 +43,7 @@ POLICY = "default-src 'self'; style-src 'self' 'unsafe-inline'; base-uri 'none'"
 THEIRS = "sandbox allow-scripts allow-downloads"
 """The policies of our page, and of files of runs, whose pages can't act as ours."""
 LARGEST_UPLOAD = 256 * 2**20  # bytes
-POLL = 0.15
-"""Seconds between two looks for something new."""
+POLL = 0.15  # seconds between two looks for something new
 MODEL = "pretrained_model_name_or_path"
 TAKES = {"gaussians.sog": [], "gaussians.glb": ["--gaussians"], "mesh.glb": []}
 """Files that are made when they are asked for, with options of the command that converts."""
@@ -324,6 +323,7 @@ class Studio:
         cameras = [client.camera for client in self.server.get_clients().values()]
         for camera in (self.server.initial_camera, *cameras):
             camera.position, camera.look_at = position, pose.target
+            camera.fov = math.radians(pose.fovy)
 
     def place(self, camera: Any = None) -> None:
         """Keep two clouds side by side for the camera that has moved last."""

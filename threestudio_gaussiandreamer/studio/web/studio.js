@@ -140,7 +140,7 @@ function caption(place) {
   const count = state.counts[place], id = state.shown[place];
   if (!count) return "";
   const run = shelf.find((one) => one.id === id);
-  const name = run ? run.prompt : id ? id.split("/").pop() : state.job ? state.job.label : "";
+  const name = run ? run.prompt : id ? id.split("/").pop() : (state.job || state.last).label;
   return `${name}: ${count.toLocaleString("en")} Gaussians`;
 }
 
