@@ -27,9 +27,8 @@ from ..formats.ply import is_gaussian_ply
 from ..gaussians.axes import WORLD_UP
 from ..gaussians.gaussians import Gaussians
 from ..gaussians.sh import rgb_to_sh0
-from ..launch.folder_lock import claim
 from ..launch.options import find_config
-from ..launch.run_folder import PARSED, resume_command, safe_name
+from ..launch.run_folder import PARSED, claim, resume_command, safe_name
 from ..models.hub import FAMILIES
 from ..view import live
 from ..view.render import camera_of, first_pose
