@@ -90,20 +90,17 @@ def test_vertices_move_rigidly_with_the_joint_that_owns_them(stick_body):
     np.testing.assert_allclose(after.vertices[kept], before.vertices[kept], atol=1e-12)
     weights, none = np.zeros((1, BODY_JOINTS)), np.zeros((0, 3), np.int64)
     weights[0, :2] = 0.25, 0.75  # a blend of weights is the blend of the motions
-    joints, uv = np.zeros((BODY_JOINTS, 3)), np.zeros((0, 2))
-    body, pose = Body(np.array([[1.0, 0, 0]]), none, uv, none, joints, weights), REST.copy()
+    body, pose = Body(np.array([[1.0, 0, 0]]), none, np.zeros((22, 3)), weights), REST.copy()
     pose[1] = Rotation.from_rotvec([0, 0, np.pi / 2]).as_matrix()
     np.testing.assert_allclose(posed(body, pose).vertices, [[0.25, 0.75, 0]], atol=1e-12)
 
 
-def test_the_smallest_rotation_between_directions():
-    for target in np.array([(0, 0, 2.0), (-3.0, 0, 0), (1e-3, 0, 0), (1.0, 2.0, 3.0)]):
-        rotation = swing(np.array([1.0, 0, 0]), target)
-        found = rotation @ [1, 0, 0]
-        np.testing.assert_allclose(found, target / np.linalg.norm(target), atol=1e-9)
-        np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-9)
-        assert np.linalg.det(rotation) == pytest.approx(1)
-    np.testing.assert_array_equal(swing(np.zeros(3), np.ones(3)), np.eye(3))
+@pytest.mark.parametrize("target", [(0, 0, 2.0), (-3.0, 0, 0), (1e-3, 0, 0), (1.0, 2.0, 3.0)])
+def test_the_smallest_rotation_between_directions(target):
+    rotation = swing(np.array([1.0, 0, 0]), np.array(target))
+    np.testing.assert_allclose(rotation[:, 0], target / np.linalg.norm(target), atol=1e-9)
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-9)
+    assert np.linalg.det(rotation) == pytest.approx(1)
 
 
 @needs_anny
@@ -205,14 +202,8 @@ def test_wrong_arrays_are_refused(content, problem, stick_body, tmp_path):
 
 def test_wrong_files_and_frames_are_refused(stick_body, tmp_path):
     path = saved(tmp_path, {"poses": FLAT})
-    (tmp_path / "a.fbx").touch()
-    for file, frame, problem in (
-        (path, FRAMES, "has 5 frames, numbered from 0; there is no 5"),
-        (tmp_path / "a.bvh", 0, "does not exist"),
-        (tmp_path / "a.fbx", 0, r"format of the pose file .*\.fbx"),
-    ):
-        with pytest.raises(UserError, match=problem):
-            read_pose(str(file), stick_body, frame=frame)
+    with pytest.raises(UserError, match="has 5 frames, numbered from 0; there is no 5"):
+        read_pose(str(path), stick_body, frame=FRAMES)
 
 
 # BVH ----------------------------------------------------------------------------------------------

@@ -16,8 +16,8 @@ from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.host import NAME, find
 from threestudio_gaussiandreamer.models import model_files, text_encoders
 from threestudio_gaussiandreamer.models.text_encoders import T5_LENGTH, unpack
-from threestudio_gaussiandreamer.prompts.known_words import WORDS_FILE
 from threestudio_gaussiandreamer.prompts.prompt_processors import StableDiffusionPromptProcessor
+from threestudio_gaussiandreamer.prompts.prompts import WORDS_FILE
 
 diffusers = pytest.importorskip("diffusers")
 KINDS = ("stable-diffusion", "deep-floyd")
@@ -261,7 +261,7 @@ def test_the_prompt_library(fox, tmp_path):
             fox(prompt="lib:bald_eagel")
     for content in ('{"a": 1}', '{"a": "a fox"}', "[", "[3]", "3"):
         file.write_text(content)
-        with pytest.raises(UserError, match="must be a list of texts"):
+        with pytest.raises(UserError, match="prompt library .*prompt_library.json.: "):
             fox(prompt="lib:fox")
 
 

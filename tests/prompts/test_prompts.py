@@ -4,7 +4,7 @@ import pytest
 
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.host import find
-from threestudio_gaussiandreamer.prompts.known_words import WORDS_FILE, warn_of_unknown_words
+from threestudio_gaussiandreamer.prompts.prompts import WORDS_FILE, warn_of_unknown_words
 
 TEXTS = ["1984", "yes", "a fox: red", "robot #1", "[a] b", "'quoted\" text", "a/../../x"]
 TEXTS += ["🦊 fox", " spaces ", "x" * 4096, "two\nlines", "", "${x}", "${oc.env:HOME}"]
@@ -33,7 +33,7 @@ def test_view_dependent_prompts_are_in_the_order_of_the_host():
 @pytest.mark.parametrize(
     "options, match",
     [
-        ({"prompt_file": "prompt.txt"}, "prompt.txt' can't be read as UTF-8 .* position 3"),
+        ({"prompt_file": "prompt.txt"}, "prompt.txt': .*codec.* position 3"),
         ({"prompt_file": "promt.txt"}, "does not exist; near names.*prompt.txt"),
         ({"prompt_file": "prompt.txt", "prompt": "a fox"}, "both prompt and prompt_file"),
     ],

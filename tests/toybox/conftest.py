@@ -21,6 +21,7 @@ def small_sizes() -> Iterator[None]:
         patch.setattr(models, "POINTS_LAYERS", 1)
         patch.setattr(models.Judge, "CHANNELS", (8, 8, 8, 8))
         patch.setattr(views, "POINTS", 300)
+        patch.setattr(views, "OBJECTS", 4)
         patch.setattr(views, "HELD_OUT_OBJECTS", 4)
         patch.setattr(loop, "LOG_EVERY", 1)
         patch.setattr(loop, "WARMUP", 1)

@@ -9,12 +9,9 @@ from pathlib import Path
 from threestudio_gaussiandreamer.toybox import loop
 from threestudio_gaussiandreamer.toybox.train import STAGES
 
-OBJECTS = 4
-"""Of a shard."""
-
 
 def options(folder: Path, **more) -> loop.Options:
-    return loop.Options(folder=Path(folder), pool=2, shard_objects=OBJECTS, batch=4, **more)
+    return loop.Options(folder=Path(folder), pool=2, batch=4, **more)
 
 
 def training(folder: Path, name: str, **more) -> loop.Training:

@@ -65,7 +65,7 @@ def test_a_stage_is_measured_on_withheld_objects(folder, name):
     numbers = stage.evaluate(stage.model.eval())
     assert numbers and all(np.isfinite(value) for value in numbers.values())
     if name == "judge":  # on both sorts of pictures
-        cast, gaussians = stage.held_out
+        cast, gaussians = stage.held_out()
         assert torch.equal(cast.labels, gaussians.labels)
         assert not torch.equal(cast.images, gaussians.images)
 
@@ -84,13 +84,6 @@ def test_a_stop_signal_saves_and_stops_and_no_other_stage_begins(tmp_path, monke
     assert main([str(tmp_path), *options]) == 129 and capsys.readouterr().err == "stopped\n"
     assert load_file(tmp_path / "text.pt")["images"] == 4 and not (tmp_path / "clip.pt").exists()
     assert signal.getsignal(number) == earlier
-
-
-def test_a_stage_is_trained_by_one_process_at_a_time(tmp_path, capsys):
-    claimed = claim(tmp_path / "locks" / "judge")
-    assert main([str(tmp_path), "--stages", "judge"]) == 2 and not (tmp_path / "judge.pt").exists()
-    assert "another process trains the stage 'judge'" in capsys.readouterr().err
-    claimed.release()
 
 
 def test_a_gradient_that_is_not_finite_stops_before_it_is_saved(folder, tmp_path):
@@ -130,12 +123,11 @@ def test_a_time_limit_ends_a_stage_and_lowers_the_rate_before(folder, tmp_path):
     [
         ("", "FOLDER: the folder"),
         ("--stages unett", "did you mean 'unet'"),
-        ("--pool -3", "--pool -3: expected 1 or more"),
-        ("--device cuda", "sees no GPU"),
+        ("--pool -3", "--pool -3: expected a number from 1"),
+        ("--device cuda", "unknown device 'cuda'"),
         ("--device cpuu", "unknown device 'cpuu': did you mean 'cpu'"),
-        ("--minutes nan", "--minutes nan: expected more than 0"),
-        ("--seed 1000", "--seed 1000: expected 0 to 999"),
-        ("--workers -1", "--workers -1: expected 0 or more"),
+        ("--minutes nan", "--minutes nan: expected a number from"),
+        ("--seed 1000", "--seed 1000: expected a number from 0 to 999"),
     ],
 )
 def test_bad_options_are_one_message(tmp_path, capsys, arguments, message):
@@ -144,9 +136,16 @@ def test_bad_options_are_one_message(tmp_path, capsys, arguments, message):
     assert message in capsys.readouterr().err
 
 
+def test_a_stage_is_trained_by_one_process_at_a_time(tmp_path, capsys):
+    claimed = claim(tmp_path / "locks" / "judge")
+    assert main([str(tmp_path), "--stages", "judge"]) == 2 and not (tmp_path / "judge.pt").exists()
+    assert "another process trains the stage 'judge'" in capsys.readouterr().err
+    claimed.release()
+
+
 @pytest.mark.slow  # starts processes
 def test_worker_processes_make_the_same_shards_and_batches(folder, tmp_path):
-    place = loop.Options(folder=tmp_path, pool=2, shard_objects=1)
+    place = loop.Options(folder=tmp_path, pool=2)
     sorts = place.shards, *judge_stage.judge_shards(place)
     render_shards(sorts, count=2, workers=1)
     assert set(place.shards.folder.iterdir()) == {one.path(i) for one in sorts for i in (0, 1)}
@@ -161,7 +160,7 @@ def test_worker_processes_make_the_same_shards_and_batches(folder, tmp_path):
 
 def test_the_judge_has_data_of_its_own(tmp_path):
     """Its seeds are no other stage's, and most of its batches show Gaussians."""
-    there = loop.Options(folder=tmp_path, seed=3, pool=1, shard_objects=1)
+    there = loop.Options(folder=tmp_path, seed=3, pool=1)
     casts, splats = judge_stage.judge_shards(there)
     assert len({there.shards.seed, casts.seed, splats.seed}) == 3
     data = STAGES["judge"](there).data()

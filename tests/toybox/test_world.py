@@ -5,11 +5,11 @@ import pytest
 import torch
 
 from threestudio_gaussiandreamer.meshes.load import AXES
-from threestudio_gaussiandreamer.prompts.view_prompts import view_directions
 from threestudio_gaussiandreamer.toybox import views, words, world
+from threestudio_gaussiandreamer.toybox.demo import contact_sheet
 from threestudio_gaussiandreamer.toybox.kinds import ACCESSORIES, KINDS
+from threestudio_gaussiandreamer.toybox.loop import StepData
 from threestudio_gaussiandreamer.toybox.tokens import LENGTH, write_tokenizer
-from threestudio_gaussiandreamer.toybox.world_sheet import LINE, contact_sheet, main, world_sheet
 
 MANY = 400
 
@@ -62,7 +62,8 @@ def test_every_kind_has_a_mesh_inside_the_sphere_with_patterns_on_all_sides(kind
         assert u[u < share].max() < share * (1 - 1 / world.SIZE) and v.max() < 1 - 1 / world.SIZE
 
 
-def test_accessories_and_patterns_show_in_their_colors():
+def test_accessories_patterns_and_parts_show_in_their_colors():
+    """A part without a colour of its own has the pattern, but is darker."""
     for kind in ("fox", "house", "robot"):
         for name in ACCESSORIES:
             attributes = world.Attributes(kind, "blue", accessory=name, accessory_color="lime")
@@ -72,8 +73,6 @@ def test_accessories_and_patterns_show_in_their_colors():
         mug = world.Attributes("mug", "blue", pattern, "yellow")
         assert share_of(mug, "blue") > 0.1 and share_of(mug, "yellow") > 0.1
 
-
-def test_a_part_without_a_color_has_the_pattern_but_is_darker():
     def sail(**part):
         points = points_of(world.Attributes("boat", "blue", "checkered", "yellow", **part))
         return points[points[:, 2] > 0.2]
@@ -139,15 +138,6 @@ def test_prompts_name_what_there_is(drawn):
 )
 def test_other_prompts_are_read(prompt, attributes):
     assert words.attributes_in(prompt) == attributes
-
-
-@pytest.mark.parametrize("elevation", [-10.0, 59.9, 60.1])
-def test_directions_are_those_of_the_prompt_processors(elevation):
-    directions = view_directions(left_and_right=True)
-    for azimuth in np.arange(-180.0, 180.0, 7.5):
-        angles = (torch.tensor([elevation]), torch.tensor([azimuth]), torch.ones(1))
-        expected = [d for d in directions if bool(d.condition(*angles))][-1]
-        assert words.direction(elevation, azimuth) == expected.name
 
 
 # Tokenizer ----------------------------------------------------------------------------------
@@ -220,30 +210,16 @@ def test_backgrounds_are_fixed_but_for_the_asked_share(shards):
 
 
 def test_a_batch_is_a_function_of_its_step(shards):
-    first = [views.row_batch(shards, "x", 5, 2, step) for step in range(9)]
-    again_index, again_rows = views.row_batch(shards, "x", 5, 2, 6)
-    assert first[6][0] == again_index and np.array_equal(first[6][1], again_rows)
+    data = StepData(shards, 5, 2, "x", lambda index, rows, rng: (index, rows))
+    first, again = [data[step] for step in range(9)], data[6]
+    assert first[6][0] == again[0] and np.array_equal(first[6][1], again[1])
     # 24 pictures are four batches of 5: the same shard, no picture twice
     assert [index for index, _ in first] == [0] * 4 + [1] * 4 + [0]
     assert len(set(np.concatenate([rows for _, rows in first[:4]]))) == 20
 
 
-# The sheet ----------------------------------------------------------------------------------
-
-
-def test_the_sheet_shows_every_object_with_its_prompt():
-    sheet = world_sheet(12)
-    cell = views.SIZE + 5 * LINE + 3  # five lines of the longest prompt
-    assert sheet.shape == (2 * cell, 10 * views.SIZE, 3)
-    texts = sheet[views.SIZE : cell, : 10 * views.SIZE]
-    assert all((part < 128).any() for part in np.split(texts, 10, axis=1))
-    assert (sheet[cell:, 2 * views.SIZE :] == 255).all()
+def test_texts_of_a_sheet_are_wrapped_below_the_pictures():
     pictures = torch.ones(2, 3, 64, 64)
-    heights = [len(contact_sheet(pictures, text, columns=2)) for text in ((), ("a", "word " * 60))]
-    assert heights == [64, 64 + 30 * 11 + 3]  # two words a line
-
-
-def test_bad_options_of_the_sheet_are_one_message(tmp_path, capsys):
-    for name, message in (("a.txt", "the name of a PNG"), ("none/a.png", "there is no folder")):
-        assert main([str(tmp_path / name)]) == 2
-        assert message in capsys.readouterr().err
+    sheets = [contact_sheet(pictures, text, columns=2) for text in ((), ("a", "word " * 60))]
+    assert [len(sheet) for sheet in sheets] == [64, 64 + 30 * 11 + 3]  # two words a line
+    assert (sheets[1][:64] == 255).all() and (sheets[1][64:, 64:] < 128).any()

@@ -15,6 +15,7 @@ from tests.helpers import tiny_3d_models, tiny_models
 from threestudio_gaussiandreamer.formats.gaussian_files import read_cloud
 from threestudio_gaussiandreamer.guidance.text_to_image import TextToImageDistillation
 from threestudio_gaussiandreamer.launch.experiment import main
+from threestudio_gaussiandreamer.priors import shap_e
 
 pytest.importorskip("diffusers")
 pytestmark = pytest.mark.slow
@@ -40,7 +41,6 @@ def models(tmp_path_factory):
     folder = tmp_path_factory.mktemp("models")
     base, upsampler = tiny_3d_models.point_e(folder / "point-e")
     clip = tiny_3d_models.clip(folder / "clip")
-    shap_e = tiny_3d_models.shap_e(folder / "shap-e")
     body = tiny_3d_models.body_model(folder / "body.npz")
     return {
         "epsilon": guided_by(tiny_models.stable_diffusion(folder / "epsilon")),
@@ -50,7 +50,7 @@ def models(tmp_path_factory):
         | {"system.guidance.image_size": 64},
         "sdxl": guided_by(tiny_models.stable_diffusion_xl(folder / "sdxl")),
         "mvdream": guided_by(tiny_models.mvdream(folder / "mvdream")),
-        "shap_e": prior(model=shap_e, num_inference_steps=2, grid_size=24),
+        "shap_e": prior(model=tiny_3d_models.shap_e(folder / "shap-e")),
         "point_e": prior(checkpoint=base, upsampler=upsampler, num_steps=2, num_points=64)
         | prior(clip=clip),
         "motion": prior(motion=motion(folder), body_model=body, clip=clip, num_points=400),
@@ -71,6 +71,12 @@ def motion(folder):
     texts, lengths = np.array(["Someone waves"]), np.array([4])
     np.savez(folder / "results.npz", motion=frames, text=texts, lengths=lengths)
     return folder / "results.npz"
+
+
+@pytest.fixture(autouse=True)
+def small_shap_e(monkeypatch):
+    monkeypatch.setattr(shap_e, "STEPS", 2)
+    monkeypatch.setattr(shap_e, "GRID_SIZE", 24)
 
 
 @pytest.fixture

@@ -13,19 +13,17 @@ age           ``baby``, ``child``, ``young``, ``old``, or a number from 0 (baby)
 muscle, weight, height, proportions
               MakeHuman's other parameters, 0 to 1: the middle is the average; proportions from
               ideal to uncommon
-texture       an image in MakeHuman's texture layout, as its skins have it, for ``color: null``
 scale         half the longest side (the height, when it stands), world units
 num_points    points uniform over the surface (the released code), or 0 for the vertices (the paper)
-color         ``random`` (the paper), ``grey``, [r, g, b] in [0, 1], or null for the texture, grey
-              without one
+color         ``random`` (the paper), ``grey`` (null too) or [r, g, b] in [0, 1]
 ground, ...   see ``priors/base.py``
 ============  ======================================================================================
 
 As in ``body-prior`` the points are recentred by their mean. Of the package only the data are used
 (CC0, ``docs/models.md``): its own model takes minutes to build and leaves a cache of a gigabyte.
 
-Limits: the prompt is not read. Skinning is linear, so that strongly bent joints lose volume. The
-body wears no clothes and has no hair; hands and face are at rest."""
+Limits: the prompt is not read. Strongly bent joints lose volume. The body wears no clothes and has
+no hair; hands and face are at rest."""
 
 import gzip
 import json
@@ -38,32 +36,19 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..core.errors import UserError, unknown
+from ..core.errors import UserError
 from ..core.extras import missing_extra
-from ..core.files import existing_file
-from ..core.options import (
-    Rule,
-    in_range,
-    is_number,
-    is_whole,
-    one_of,
-    require_defaults,
-    rule,
-    satisfies,
-)
-from ..formats.reading import reading
+from ..core.options import Rule, at_least, in_range, is_number, one_of, require_defaults, satisfies
 from ..gaussians.point_cloud import PointCloud
 from ..host import register
 from ..meshes.mesh import Mesh
-from ..meshes.side_files import Budget, decode_texture
 from .base import COLOR, SCALE, Prior, points
-from .body_pose import INDEX, POSES, SIDES, SUFFIXES, TO_BODY, Body, posed, read_pose, world_mesh
+from .body_pose import INDEX, POSES, SIDES, TO_BODY, Body, posed, read_pose, world_mesh
 from .mesh import centred, colored_cloud
 
 GENDERS = {"male": 0.0, "neutral": 0.5, "female": 1.0}
 AGES = {"baby": 0.0, "child": 1 / 3, "young": 2 / 3, "old": 1.0}
 SHARE = in_range(0, 1)
-FRAME = satisfies("a whole number from 0", lambda value: is_whole(value) and value >= 0)
 
 
 def named_share(names: dict[str, float]) -> Rule:
@@ -72,13 +57,6 @@ def named_share(names: dict[str, float]) -> Rule:
         f"{', '.join(map(repr, names))} or a number from 0 to 1",
         lambda v: v in names if isinstance(v, str) else is_number(v) and 0 <= v <= 1,
     )
-
-
-def check_pose(path: str, pose: str) -> None:
-    """Raise UserError unless ``pose`` is the name of a pose or of a file of poses."""
-    if pose not in POSES and Path(pose).suffix.lower() not in SUFFIXES:
-        choices = [*POSES, *(f"a {suffix} file" for suffix in SUFFIXES)]
-        raise UserError(f"{path}: {unknown('pose', pose, choices)}")
 
 
 class Person(NamedTuple):
@@ -98,8 +76,8 @@ class AnnyPrior(Prior):
 
     @dataclass
     class Config(Prior.Config):
-        pose: str = field(default="A", metadata=rule(check_pose))
-        frame: int = field(default=0, metadata=FRAME)
+        pose: str = "A"
+        frame: int = field(default=0, metadata=at_least(0))
         pose_up: str = field(default="auto", metadata=one_of(("auto", *TO_BODY)))
         gender: Any = field(default="neutral", metadata=named_share(GENDERS))
         age: Any = field(default="young", metadata=named_share(AGES))
@@ -107,13 +85,13 @@ class AnnyPrior(Prior):
         weight: float = field(default=0.5, metadata=SHARE)
         height: float = field(default=0.5, metadata=SHARE)
         proportions: float = field(default=0.5, metadata=SHARE)
-        texture: str = ""
         scale: float = field(default=1.0, metadata=SCALE)
         num_points: int = field(default=50_000, metadata=points(0))
         color: Any = field(default="random", metadata=COLOR)
         REMOVED: ClassVar[dict[str, Any]] = {
             **Prior.Config.REMOVED,
             "face_front": (True, "the body is turned to face the front"),
+            "texture": ("", "without a color the body is grey"),
         }
 
         @staticmethod
@@ -126,21 +104,14 @@ class AnnyPrior(Prior):
 
     def preflight(self) -> None:
         data_folder()
-        if self.cfg.texture:
-            existing_file(self.cfg.texture, "texture")
-            if self.cfg.color is not None:
-                shown = f"color={self.cfg.color}"
-                raise UserError(f"texture: it isn't shown with {shown}: set color=null")
         if self.cfg.pose not in POSES:
             self._pose(load_body(self._person()))
 
     def generate(self, prompt: str, generator: np.random.Generator) -> PointCloud:
         cfg, body = self.cfg, load_body(self._person())
         body = posed(body, self._pose(body))
-        mesh = Mesh(body.vertices, body.faces)
-        if cfg.texture and cfg.color is None:
-            mesh = textured(mesh, body, cfg.texture)
-        return centred(colored_cloud(world_mesh(mesh, body.joints, cfg.scale), cfg, generator))
+        mesh = world_mesh(Mesh(body.vertices, body.faces), body.joints, cfg.scale)
+        return centred(colored_cloud(mesh, cfg, generator))
 
     def _person(self) -> Person:
         cfg = self.cfg
@@ -151,19 +122,21 @@ class AnnyPrior(Prior):
         return read_pose(self.cfg.pose, body, frame=self.cfg.frame, up=self.cfg.pose_up)
 
 
-def textured(mesh: Mesh, body: Body, path: str) -> Mesh:
-    """Return the body with a texture; vertices at its seams are doubled."""
-    with reading(path, "texture") as file:
-        texture = decode_texture(file.read_bytes(), "of the body", Budget(file))
-    corners = np.stack([body.faces, body.face_uv], axis=-1).reshape(-1, 2)
-    pairs, faces = np.unique(corners, axis=0, return_inverse=True)
-    vertices, uv = mesh.vertices[pairs[:, 0]], body.uv[pairs[:, 1]]
-    return mesh._replace(vertices=vertices, faces=faces.reshape(-1, 3), uv=uv, texture=texture)
-
-
 # MakeHuman's data: the base mesh, the targets that shape it, and the rig --------------------------
 
 RACES = {"african": 1 / 3, "asian": 1 / 3, "caucasian": 1 / 3}
+PARAMETERS = {
+    "gender": "male female", "age": "baby child young old",
+    "muscle": "minmuscle averagemuscle maxmuscle", "weight": "minweight averageweight maxweight",
+    "height": "minheight maxheight", "proportions": "idealproportions uncommonproportions",
+}  # fmt: skip
+"""The names of each parameter's values, evenly spaced from 0 to 1."""
+TARGETS = {
+    "universal-": "gender age muscle weight",
+    "": "race gender age",
+    "height/": "gender age muscle weight height",
+    "proportions/": "gender grown muscle weight proportions",  # babies have none
+}
 METRES = 0.1
 """The files' unit."""
 GROUPS = ("body", "helper-l-eye", "helper-r-eye")
@@ -183,8 +156,8 @@ BONES = {joint: [bone] for joint, bone in CENTRAL.items()} | {
     for joint, bones in PAIRED.items()
 }
 """The bones of the rig that begin at each joint of SMPL; later bones move with them."""
-Groups = dict[str, Int[np.ndarray, "F 4 2"]]
-"""Faces by group; the corners of a face are (vertex, uv) pairs."""
+Groups = dict[str, Int[np.ndarray, "F 4"]]
+"""Faces by group."""
 
 
 def data_folder() -> Path:
@@ -203,7 +176,7 @@ def load_body(person: Person) -> Body:
     """
     folder = data_folder()
     try:
-        shape, uv, groups = read_base_mesh(folder / "3dobjs" / "base.obj")
+        shape, groups = read_base_mesh(folder / "3dobjs" / "base.obj")
         for name, weight in target_weights(person).items():
             rows, offsets = read_target(folder / "targets" / f"{name}.target.gz")
             shape[rows] += weight * offsets
@@ -212,12 +185,10 @@ def load_body(person: Person) -> Body:
         bones = rig.get("bones", rig)
         quads = np.concatenate([groups[group] for group in GROUPS])
         corners = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
-        used, faces = np.unique(corners[:, :, 0], return_inverse=True)
+        used, faces = np.unique(corners, return_inverse=True)
         return Body(
             vertices=METRES * shape[used],
             faces=faces.reshape(-1, 3),
-            uv=uv,
-            face_uv=corners[:, :, 1],
             joints=METRES * joint_positions(bones, groups, shape),
             weights=joint_weights(bones, skin["weights"], len(shape))[used],
         )
@@ -233,26 +204,14 @@ def target_weights(person: Person) -> dict[str, float]:
     """Return the weights of all targets that a person needs, by file name without extension: the
     products of the interpolation weights of their parameters.
     """
-    gender = shares(person.gender, "male", "female")
-    age = shares(person.age, "baby", "child", "young", "old")
-    muscle, weight = (
-        shares(getattr(person, name), f"min{name}", f"average{name}", f"max{name}")
-        for name in ("muscle", "weight")
-    )
-    height = shares(person.height, "minheight", "maxheight")
-    proportions = shares(person.proportions, "idealproportions", "uncommonproportions")
-    grown = {name: share for name, share in age.items() if name != "baby"}  # babies have none
-    factors = {
-        "universal-": (gender, age, muscle, weight),
-        "": (RACES, gender, age),
-        "height/": (gender, age, muscle, weight, height),
-        "proportions/": (gender, grown, muscle, weight, proportions),
-    }
+    parts = {name: shares(v, *PARAMETERS[name].split()) for name, v in person._asdict().items()}
+    grown = {name: share for name, share in parts["age"].items() if name != "baby"}
+    parts |= {"race": RACES, "grown": grown}
     found = {}
-    for prefix, of in factors.items():
-        for combination in product(*(named.items() for named in of)):
-            names, weights = zip(*combination, strict=True)
-            found[f"macrodetails/{prefix}{'-'.join(names)}"] = float(np.prod(weights))
+    for prefix, names in TARGETS.items():
+        for combination in product(*(parts[name].items() for name in names.split())):
+            kinds, weights = zip(*combination, strict=True)
+            found[f"macrodetails/{prefix}{'-'.join(kinds)}"] = float(np.prod(weights))
     return found
 
 
@@ -270,21 +229,19 @@ def read_target(path: Path) -> tuple[Int[np.ndarray, " N"], Float[np.ndarray, "N
     return values[:, 0].astype(np.int64), values[:, 1:]
 
 
-def read_base_mesh(path: Path) -> tuple[Float[np.ndarray, "V 3"], Float[np.ndarray, "T 2"], Groups]:
-    """Read an OBJ of quads, in its unit: vertices, texture coordinates, and groups of faces."""
-    vertices, uv, groups, group = [], [], {}, ""
+def read_base_mesh(path: Path) -> tuple[Float[np.ndarray, "V 3"], Groups]:
+    """Read an OBJ of quads, in its unit: vertices, and groups of faces."""
+    vertices, groups, group = [], {}, ""
     for line in path.read_text("utf-8").splitlines():
         kind, *words = line.split() or [""]
         if kind == "v":
             vertices.append(words)
-        elif kind == "vt":
-            uv.append(words[:2])
         elif kind == "g":
             group = words[0]
         elif kind == "f":
-            groups.setdefault(group, []).append([word.split("/")[:2] for word in words])
+            groups.setdefault(group, []).append([word.split("/")[0] for word in words])
     quads = {name: np.array(faces, np.int64) - 1 for name, faces in groups.items()}
-    return np.array(vertices, np.float64), np.array(uv, np.float64), quads
+    return np.array(vertices, np.float64), quads
 
 
 def joint_positions(
@@ -295,7 +252,7 @@ def joint_positions(
     def head(bone: str) -> np.ndarray:  # the rig defines it as a mean of vertices
         place = bones[bone]["head"]
         if place["strategy"] == "CUBE":
-            return vertices[np.unique(groups[place["cube_name"]][:, :, 0])].mean(axis=0)
+            return vertices[np.unique(groups[place["cube_name"]])].mean(axis=0)
         single = place["strategy"] == "VERTEX"
         return vertices[[place["vertex_index"]] if single else place["vertex_indices"]].mean(axis=0)
 

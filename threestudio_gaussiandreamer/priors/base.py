@@ -15,7 +15,7 @@ Each prior is a registered subclass of :class:`Prior` that implements :meth:`~Pr
 import logging
 from abc import abstractmethod
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Optional
+from typing import Any, ClassVar, NoReturn, Optional
 
 import numpy as np
 from jaxtyping import Float
@@ -37,19 +37,19 @@ POINT_BYTES = 128
 """Memory per point, bytes, at least: position, colour and the parameters of its Gaussian."""
 
 
-def is_color(value: Any) -> bool:
-    """Return whether ``value`` is null, "grey", "random" or three numbers in [0, 1]."""
-    if value is None or value in ("grey", "random"):
-        return True
-    return is_numbers(value, 3) and all(0 <= number <= 1 for number in value)
-
-
 def points(low: int) -> Rule:
     """Return the rule for a number of points: ``low`` or more, and few enough for the memory."""
     return count_of("points", low, POINT_BYTES)
 
 
-COLOR = satisfies("null, 'grey', 'random' or [red, green, blue] in [0, 1]", is_color)
+COLOR = satisfies(
+    "null, 'grey', 'random' or [red, green, blue] in [0, 1]",
+    lambda value: (
+        value in (None, "grey", "random")
+        or is_numbers(value, 3)
+        and all(0 <= number <= 1 for number in value)
+    ),
+)
 SCALE = positive("world units", most=1e6)
 
 
@@ -159,12 +159,11 @@ def file_axes(cfg: Any, kind: str) -> tuple[str, Optional[str]]:
 
 
 def chosen_colors(color: Any, count: int, rng: np.random.Generator) -> Float[np.ndarray, "P 3"]:
-    """Return ``count`` colours: uniformly random in [0, 1] if ``color`` is "random",
-    else all equal to it: "grey" or three numbers in [0, 1].
-    """
+    """Return ``count`` colours, by an option of the rule ``COLOR``; null is grey."""
     if color == "random":
         return rng.random((count, 3), np.float32)
-    return np.tile(np.float32([GREY] * 3 if color == "grey" else list(color)), (count, 1))
+    same = [GREY] * 3 if color in (None, "grey") else list(color)
+    return np.tile(np.float32(same), (count, 1))
 
 
 def points_of(prior: Any, prompt: str) -> PointCloud:
@@ -182,34 +181,36 @@ def validated(cloud: PointCloud, name: str) -> PointCloud:
             all arrays (P, 3), faces don't name three of the points each, more than 5 % of the rows
             are not finite, or most colours are far outside [0, 1], as those from 0 to 255 are.
     """
+
+    def refuse(problem: str) -> NoReturn:
+        raise UserError(f"{name} gave {problem}")
+
     if not isinstance(cloud, PointCloud):
-        raise UserError(f"{name} returned {type(cloud).__name__}; expected a PointCloud")
+        refuse(f"{type(cloud).__name__}; expected a PointCloud")
     try:
         points, colors = _as_array(cloud.points), _as_array(cloud.colors)
         normals = None if cloud.normals is None else _as_array(cloud.normals)
         faces = None if cloud.faces is None else _as_array(cloud.faces, None)
     except (TypeError, ValueError, RuntimeError) as error:
-        raise UserError(f"{name} gave something else than arrays: {error}") from error
+        refuse(f"something else than arrays: {error}")
     given = {"points": points, "colours": colors, "normals": normals}
     shapes = {kind: values.shape for kind, values in given.items() if values is not None}
     if points.ndim != 2 or set(shapes.values()) != {(len(points), 3)}:
         found = ", ".join(f"{kind} {shape}" for kind, shape in shapes.items())
-        raise UserError(f"{name} gave {found}; expected (P, 3) for all")
+        refuse(f"{found}; expected (P, 3) for all")
     if not len(points):
-        raise UserError(f"{name} gave no points: its source is empty")
+        refuse("no points: its source is empty")
     if faces is not None:
         faces = faces if faces.size else np.zeros((0, 3), np.int64)
         whole = faces.ndim == 2 and faces.shape[1] == 3 and faces.dtype.kind in "iu"
         if not whole or not ((faces >= 0) & (faces < len(points))).all():
-            raise UserError(
-                f"{name} gave faces {faces.shape} of type {faces.dtype}; expected integers (F, 3) "
-                f"from 0 to {len(points) - 1}"
-            )
+            found = f"faces {faces.shape} of type {faces.dtype}"
+            refuse(f"{found}; expected integers (F, 3) from 0 to {len(points) - 1}")
     finite = np.isfinite(points).all(axis=1) & np.isfinite(colors).all(axis=1)
     outside = (colors[finite] < -0.25) | (colors[finite] > 2)  # a model's may be slightly outside
     if finite.any() and outside.any(axis=1).mean() > 0.5:
         low, high = colors[finite].min(), colors[finite].max()
-        raise UserError(f"{name} gave colours from {low:g} to {high:g}; expected [0, 1]")
+        refuse(f"colours from {low:g} to {high:g}; expected [0, 1]")
     if not finite.all():
         report_non_finite(int((~finite).sum()), len(points), name)
         if faces is not None:  # those all of whose corners are kept

@@ -2,7 +2,7 @@
 
 Bodies have y up and look along +z, the left side at +x, as SMPL, HumanML3D and MakeHuman have them.
 A pose is the rotation of every joint's part of the body from the rest pose, (22, 3, 3), in the
-body's axes. Skinning is linear (linear blend skinning). Poses are read from
+body's axes. Skinning is linear. Poses are read from
 
 * NPZ with ``poses`` (F, 3 J), as AMASS has them, or with ``global_orient`` (F, 3) and ``body_pose``
   (F, 63 or 69), as smplx's arguments; the frames' dimension may be missing;
@@ -12,10 +12,9 @@ body's axes. Skinning is linear (linear blend skinning). Poses are read from
 J is 22, 24, 52 or 55 joints in the order of SMPL, SMPL-H or SMPL-X, of which the first 22 are used.
 y is up, but in files with AMASS's frame rate, where z is.
 
-Programs name joints in a BVH differently ("LeftUpLeg", "lThigh", "mixamorig:LeftUpLeg", "thigh.L",
-"L_Hip"). The names are split into a side and a part; the tables list the parts of each joint. Any
-further joints, as fingers, are ignored, and neither the file's unit nor its rest pose matter, since
-the body takes only directions from the positions."""
+Programs name joints in a BVH differently ("LeftUpLeg", "lThigh", "thigh.L", "L_Hip"); names are
+split into a side and a part. Further joints, as fingers, are ignored, and neither the file's unit
+nor its rest pose matter, since the body takes only directions from the positions."""
 
 import re
 from pathlib import Path
@@ -81,10 +80,6 @@ class Body(NamedTuple):
 
     vertices: Float[np.ndarray, "V 3"]
     faces: Int[np.ndarray, "F 3"]
-    uv: Float[np.ndarray, "T 2"]
-    """v upwards."""
-    face_uv: Int[np.ndarray, "F 3"]
-    """Rows of ``uv`` at the corners of each face."""
     joints: Float[np.ndarray, "22 3"]
     weights: Float[np.ndarray, "V 22"]
     """By how much each vertex moves with each joint; rows sum to 1."""
@@ -210,8 +205,8 @@ def _unit(vector: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
 
 def facing(joints: Float[np.ndarray, "K 3"]) -> Float[np.ndarray, "3 3"]:
     """Return the rotation about the world's z axis after which a body with these joints (y up)
-    faces +x: the horizontal direction perpendicular to the sum of the vectors from the left to the
-    right hip and shoulder. If that sum is vertical or zero, the body isn't rotated.
+    faces +x, perpendicular to the sum of the vectors from the left to the right hip and shoulder;
+    the identity if that sum is vertical or zero.
     """
     joints = joints[:, Z_UP]
     across = (joints[[2, 17]] - joints[[1, 16]]).sum(axis=0)  # hips and shoulders
@@ -282,10 +277,10 @@ def read_pose(
     """
     if path in POSES:
         return named_pose(body, path)
+    suffix = Path(path).suffix.lower()
+    if suffix not in SUFFIXES:
+        raise unknown("pose", path, [*POSES, *(f"a {known} file" for known in SUFFIXES)])
     with reading(path, "pose file") as file:
-        suffix = file.suffix.lower()
-        if suffix not in SUFFIXES:
-            raise unknown(f"format of the pose file {path!r}:", suffix, SUFFIXES)
         if suffix == ".bvh":
             pose, stated = pose_of_positions(body, read_bvh(file, frame)), "y"
         else:
@@ -353,8 +348,7 @@ def read_bvh(path: Path, frame: int) -> dict[str, Float[np.ndarray, "3"]]:
 
     hierarchy, _, motion = path.read_text(encoding="utf-8", errors="replace").partition("MOTION")
     require("ROOT" in hierarchy, "its hierarchy has no joints")
-    rows = [line for line in motion.splitlines() if line.strip()]
-    rows = [line for line in rows if not line.lstrip().startswith("Frame")]
+    rows = [line for line in motion.splitlines() if line.strip() and "Frame" not in line]
     require_frame(frame, len(rows), f"BVH file {str(path)!r}")
     count = sum(len(words.split()) for words in re.findall(r"CHANNELS +\d+(.*)", hierarchy))
     values = _numbers(rows[frame].split(), count)
@@ -382,11 +376,8 @@ def read_bvh(path: Path, frame: int) -> dict[str, Float[np.ndarray, "3"]]:
                 expected = f"expected different ones of {', '.join(CHANNELS)}"
                 require(fits, f"it has channels {' '.join(words[1:])}; {expected}")
             place = [channels.get(name, o) for name, o in zip(CHANNELS, offset, strict=False)]
-            rotations = [name for name in channels if name.endswith("rotation")]
-            if rotations:
-                axes = "".join(name[0] for name in rotations)
-                degrees = [channels[name] for name in rotations]
-                turn = Rotation.from_euler(axes, degrees, degrees=True)
+            if turns_by := {name[0]: v for name, v in channels.items() if "rotation" in name}:
+                turn = Rotation.from_euler("".join(turns_by), [*turns_by.values()], degrees=True)
             if above[-1] is not None:
                 place = positions[above[-1]] + turns[above[-1]].apply(place)
                 turn = turns[above[-1]] * turn
@@ -420,10 +411,10 @@ def joint_names(names: list[str]) -> dict[str, int]:
 def split_name(name: str) -> tuple[str, str]:
     """Split a joint's name into its side ("left", "right" or "") and its part in lower case.
 
-    >>> split_name("mixamorig:LeftUpLeg"), split_name("thigh.L"), split_name("lShldr")
-    (('left', 'upleg'), ('left', 'thigh'), ('left', 'shldr'))
+    >>> split_name("mixamorig:LeftUpLeg"), split_name("thigh.L")
+    (('left', 'upleg'), ('left', 'thigh'))
     """
-    words = [str(word).lower() for word in WORDS.findall(PREFIX.sub("", name))]
+    words = [word.lower() for word in WORDS.findall(PREFIX.sub("", name))]
     found = next((word for word in words if word in ("left", "l", "right", "r")), "")
     side = {"l": "left", "r": "right"}.get(found[:1], "")
     if side:

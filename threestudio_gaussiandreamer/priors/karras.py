@@ -18,6 +18,7 @@ conventions of the published samplers (openai/point-e, openai/shap-e, MIT)."""
 
 import math
 import pickle
+import textwrap
 import zipfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -30,8 +31,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from ..core.errors import UserError
-from ..core.files import existing_file
 from ..core.options import one_of, positive
+from ..formats.reading import Unreadable, reading, require
 from ..gaussians.point_cloud import PointCloud
 from ..meshes.load import AXES
 from ..models.clip import load_text_encoder, load_tokenizer, text_condition
@@ -131,11 +132,9 @@ def guided_denoiser(
     """Return a denoiser from a network of discrete timesteps.
 
     Args:
-        network: if ``scale`` isn't 1, its batch has each item twice, first with the prompt, then
-            without.
+        network: if ``scale`` isn't 1, its batch has all items with the prompt, then without.
         scale: 1 for no guidance; else ``x0 = x0_none + scale (x0_prompt - x0_none)``. As in the
-            published samplers, each estimate is clamped to [-1, 1] before they are combined, and
-            the result isn't clamped.
+            published samplers, the estimates are clamped to [-1, 1], the result isn't.
         prediction: whether the network predicts x0 or the noise.
     """
 
@@ -210,31 +209,25 @@ def read_state_dict(path: str, kind: str) -> dict[str, Tensor]:
     Raises:
         UserError: the file is missing, unreadable, refused, or holds no tensors by name.
     """
-    file = existing_file(path, kind)
-    try:
+    with reading(path, kind) as file:
         if file.suffix == ".safetensors":
             from safetensors.torch import load_file
 
             content = load_file(file)
         else:  # zip files are memory-mapped, so that unused tensors (optimiser state) aren't read
             mapped = zipfile.is_zipfile(file)
-            content = torch.load(file, map_location="cpu", weights_only=True, mmap=mapped)
-    except Exception as error:  # torch raises various exceptions for damaged pickles
-        problem = f"can't be read: {type(error).__name__}"
-        if isinstance(error, pickle.UnpicklingError):
-            problem = (
-                "holds more than tensors, or is no file of PyTorch, and is not unpickled, since "
-                "that could run code"
-            )
-        reason = str(error).strip().partition("\n")[0][:200]
-        raise UserError(f"{kind} {path!r} {problem}: {reason}") from error
-    state = content.get(WRAPPER, content) if isinstance(content, Mapping) else {}
-    if not state or not all(isinstance(value, Tensor) for value in state.values()):
-        raise UserError(
-            f"{kind} {path!r} holds no weights by name: a state dict, or a dict with "
-            f"{WRAPPER!r}, was expected"
-        )
-    return dict(state)
+            try:
+                content = torch.load(file, map_location="cpu", weights_only=True, mmap=mapped)
+            except pickle.UnpicklingError as error:  # torch's message recommends to run it
+                unsafe = (
+                    "it is no file of PyTorch, or holds more than tensors, which could run code"
+                )
+                raise Unreadable(unsafe) from error
+        state = content.get(WRAPPER, content) if isinstance(content, Mapping) else {}
+        weights = bool(state) and all(isinstance(value, Tensor) for value in state.values())
+        expected = f"a state dict, or a dict with {WRAPPER!r}, was expected"
+        require(weights, f"it holds no weights by name: {expected}")
+        return dict(state)
 
 
 def load_exactly(module: nn.Module, state: Mapping[str, Tensor], what: str) -> None:
@@ -246,6 +239,5 @@ def load_exactly(module: nn.Module, state: Mapping[str, Tensor], what: str) -> N
     try:
         module.load_state_dict(state)
     except RuntimeError as error:
-        problems = " ".join(str(error).split()).partition(": ")[2]
-        problems = problems if len(problems) < 400 else f"{problems[:400]} ..."
+        problems = textwrap.shorten(str(error).partition(":")[2], 400)
         raise UserError(f"{what} does not fit the model: {problems}") from error

@@ -15,7 +15,6 @@ candidates         in place of a motion: mesh files of posed bodies, of which CL
                    that fits the prompt best (the paper's appendix)
 clip               any CLIP in transformers' format, a folder or an id of the hub
 motion_text        the motion of the prompt; null: found by the rules of ``motion_text.py``
-max_residual_mm    the mean distance of the joints from the motion's above which a fit is an error
 scale              half the longest side, world units
 num_points         points uniform over the surface (the released code), or 0 for the vertices (the
                    paper)
@@ -25,17 +24,16 @@ ground, ...        see ``priors/base.py``
 =================  =================================================================================
 
 Files of motions are MDM's ``results.npy``, a pickled dict, of which no code is run, or an NPZ, with
-``motion`` (S, J, 3, F), and optionally ``text`` (S,) strings and ``lengths`` (S,) frames; or an NPY
-with (S, J, 3, F), or one motion as (J, 3, F) or (F, J, 3). J is 22 (HumanML3D) or 24 joints in
-SMPL's order; metres, y up, as HumanML3D has them. The body is turned to face +x.
+``motion`` (S, J, 3, F), and optionally ``lengths`` (S,) in frames; or an NPY with (S, J, 3, F), or
+one motion as (J, 3, F) or (F, J, 3). J is 22 (HumanML3D) or 24 joints in SMPL's order; metres, y
+up. The body is turned to face +x. A fit that is off by more than 50 mm in the mean is an error.
 
-The motion itself comes from MDM, outside this package: for "Iron man kicks with his left leg" ask
-it for "Someone kicks with the left leg". ``python -m threestudio_gaussiandreamer.priors.motion_text
-"<prompt>"`` prints that sentence.
+The motion itself comes from MDM, outside this package; ``motion_text.py`` prints the sentence to
+ask it for.
 
 The body model is the user's own file of SMPL, SMPL-H or SMPL-X, whose first 22 joints are the same,
-with smplx's kinematics. What is minimised to fit it, over the rotations of all joints (axis-angle),
-a translation and a few shape coefficients, summed over the frames, which share nothing:
+with smplx's kinematics. What is minimised over the rotations of all joints (axis-angle), a
+translation and a few shape coefficients, summed over the frames, which share nothing:
 
     sum_j |joint_j - target_j|^2 / s^2 + pose |theta|^2 + shape |beta|^2
         + limits sum max(0, low - theta, theta - high)^2,   s = 10 mm
@@ -44,9 +42,7 @@ The limits keep knees and elbows from bending backwards, which positions alone w
 the whole body is placed, then the pose is fitted under a strong prior, then under the final one."""
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import partial
 from typing import Any, ClassVar, List, NamedTuple, Optional
 
 import numpy as np
@@ -59,7 +55,7 @@ from ..core.devices import torch_threads
 from ..core.errors import UserError
 from ..core.extras import require_extra
 from ..core.files import existing_file
-from ..core.options import at_least, is_whole, positive, satisfies
+from ..core.options import at_least, is_whole, satisfies
 from ..formats.array_files import read_arrays
 from ..formats.reading import reading, require
 from ..gaussians.point_cloud import PointCloud
@@ -81,6 +77,8 @@ NUM_FRAMES = 16
 """Frames of each motion that CLIP chooses from, evenly spaced."""
 ROUGH, FINE = 80, 300
 """Iterations of the fit for CLIP's pictures (error about 15 mm) and for the result (1 mm)."""
+MAX_RESIDUAL_MM = 50.0
+"""Mean distance of the joints from the motion's above which a fit is an error."""
 LIGHT = np.array([0.7, 0.35, 0.62])
 FRAME = satisfies(
     "'clip' or a number from 0", lambda value: value == "clip" or is_whole(value) and value >= 0
@@ -93,7 +91,6 @@ class Motions(NamedTuple):
 
     positions: Float[np.ndarray, "S F J 3"]
     """Metres, y up."""
-    texts: Optional[list[str]]
     lengths: list[int]
     """Number of valid frames of each sample; later frames are padding."""
 
@@ -105,7 +102,7 @@ def read_motions(path: str) -> Motions:
         UserError: missing, of another layout, without frames, or not finite.
     """
     with reading(path, "motion file") as file:
-        arrays = read_arrays(file, "motion file", ["motion"], ["text", "lengths"])
+        arrays = read_arrays(file, "motion file", ["motion"], ["lengths"])
         positions = _sample_frame_joint(arrays["motion"])
         samples, frames = positions.shape[:2]
         lengths = arrays.get("lengths", np.full(samples, frames))
@@ -117,8 +114,7 @@ def read_motions(path: str) -> Motions:
         for sample, length in zip(positions, lengths, strict=True):
             finite = np.isfinite(sample[:length]).all()
             require(finite, "it has positions that are NaN or infinite: make it again")
-    texts = None if "text" not in arrays else [str(text) for text in np.atleast_1d(arrays["text"])]
-    return Motions(positions, texts, lengths.tolist())
+    return Motions(positions, lengths.tolist())
 
 
 def _sample_frame_joint(motion: np.ndarray) -> Float[np.ndarray, "S F J 3"]:
@@ -151,7 +147,6 @@ class MotionPrior(Prior):
         candidates: List[str] = field(default_factory=list)
         clip: str = "openai/clip-vit-large-patch14"
         motion_text: Optional[str] = None
-        max_residual_mm: float = field(default=50.0, metadata=positive("millimetres"))
         scale: float = field(default=1.0, metadata=SCALE)
         num_points: int = field(default=50_000, metadata=points(0))
         color: Any = field(default="random", metadata=COLOR)
@@ -164,6 +159,7 @@ class MotionPrior(Prior):
             "up": ("auto", "it is that of the kind of the candidates' files"),
             "front": (None, "it is that of the kind of the candidates' files"),
             "device": ("auto", "it is the run's device"),
+            "max_residual_mm": (MAX_RESIDUAL_MM, f"it is {MAX_RESIDUAL_MM:g}"),
         }
 
         @staticmethod
@@ -210,8 +206,6 @@ class MotionPrior(Prior):
         """Return the body of the chosen frame, with z up, facing +x, centred and scaled."""
         cfg, motions = self.cfg, read_motions(self.cfg.motion)
         model = load_body_model(cfg.body_model)
-        if motions.texts:
-            info(f"{cfg.motion}: {', '.join(sorted(set(motions.texts)))}")
         choices = offered_frames(motions, cfg.sample, cfg.frame)
         targets = np.stack([motions.positions[choice] for choice in choices])
         names = [f"motion {sample}, frame {frame}" for sample, frame in choices]
@@ -235,11 +229,10 @@ class MotionPrior(Prior):
         (residuals,), (mesh,) = fitted(targets[[best]], FINE)
         worst, mean = int(residuals.argmax()), residuals.mean()
         found = f"{mean:.1f} mm mean, {residuals[worst]:.1f} mm at the {JOINTS[worst]}"
-        if mean > cfg.max_residual_mm:
+        if mean > MAX_RESIDUAL_MM:
             raise UserError(
                 f"SMPL does not fit {names[best]}: its joints are off by {found}: are the "
-                "positions in metres, y up and in SMPL's order? Choose another frame or raise "
-                f"max_residual_mm ({cfg.max_residual_mm:g})"
+                "positions in metres, y up and in SMPL's order? Choose another frame"
             )
         info(f"SMPL fitted to {names[best]}: {found}")
         return mesh
@@ -256,9 +249,7 @@ class MotionPrior(Prior):
 
 
 def offered_frames(motions: Motions, sample: Optional[int], frame: Any) -> list[tuple[int, int]]:
-    """Return the (motion, frame) pairs to choose from: of one motion, or of all if ``sample`` is
-    None; one frame, or evenly spaced ones if ``frame`` is "clip".
-    """
+    """Return the (motion, frame) pairs to choose from, as the options say."""
     count = len(motions.lengths)
     if sample is not None and sample >= count:
         raise UserError(f"sample: the file has {count} motions, from 0; there is no {sample}")
@@ -291,7 +282,7 @@ FIELDS = ("v_template", "shapedirs", "posedirs", "J_regressor", "weights", "kint
 """Arrays of a body model's file that are used."""
 SMPL_JOINTS, SHAPES = 24, 10
 """Joints of SMPL, and the shape coefficients that are used."""
-TRUNK = (0, 1, 2, 3, 6, 9, 13, 14, 16, 17)
+TRUNK = [0, 1, 2, 3, 6, 9, 13, 14, 16, 17]
 """Pelvis, hips, spine, collars and shoulders, which move almost as one."""
 UNIT = 0.01
 """Metres on a joint that weigh as one unit of the priors."""
@@ -369,32 +360,37 @@ def fit_bodies(
             model has no more.
         iterations: the most of the last stage.
     """
-    require_extra("smpl", "smplx")
     joints = len(model.parents)
     wanted = _tensor(targets)[:, : SMPL_JOINTS if joints == SMPL_JOINTS else BODY_JOINTS]
     frames = len(wanted)
     pose = torch.zeros(frames, joints, 3, dtype=torch.float64)
     pose[:, 0], translation = _placed(model, wanted)
     shape = torch.zeros(frames, model.shape_directions.shape[-1], dtype=torch.float64)
-    body = pose, shape, translation
+    body = [tensor.requires_grad_() for tensor in (pose, shape, translation)]
+
+    def errors() -> Tensor:
+        return posed_joints(model, *body)[:, : wanted.shape[1]] - wanted
+
     with torch_threads(1):
         for weight, share in FIT_STAGES:
-            _minimise(body, partial(energy, model, body, wanted, weight), int(share * iterations))
-    found = posed_joints(model, *body)[:, : wanted.shape[1]]
-    return BodyFit(*body, (1000 * (found - wanted).norm(dim=-1)).numpy())
+            optimiser = torch.optim.LBFGS(
+                [pose, translation, shape],  # the order is that of the sums in the line search
+                max_iter=int(share * iterations),
+                history_size=20,
+                line_search_fn="strong_wolfe",
+                tolerance_change=1e-5,
+            )
 
+            def energy(weight: float = weight, optimiser: Any = optimiser) -> Tensor:
+                optimiser.zero_grad()
+                data = (errors() / UNIT).square().sum()
+                priors = weight * pose[:, 1:].square().sum() + SHAPE_WEIGHT * shape.square().sum()
+                value = data + priors + LIMITS_WEIGHT * beyond_limits(pose)
+                value.backward()
+                return value
 
-def energy(
-    model: BodyModel, body: tuple[Tensor, Tensor, Tensor], wanted: Tensor, weight: float
-) -> Tensor:
-    """Compute the objective of the fit, with this weight of the pose prior, summed over the frames.
-    ``body`` is pose, shape and translation.
-    """
-    pose, shape, _ = body
-    found = posed_joints(model, *body)[:, : wanted.shape[1]]
-    data = ((found - wanted) / UNIT).square().sum()
-    priors = weight * pose[:, 1:].square().sum() + SHAPE_WEIGHT * shape.square().sum()
-    return data + priors + LIMITS_WEIGHT * beyond_limits(pose)
+            optimiser.step(energy)
+    return BodyFit(*(t.detach() for t in body), (1000 * errors().norm(dim=-1)).detach().numpy())
 
 
 def beyond_limits(pose: Float[Tensor, "F J 3"]) -> Tensor:
@@ -432,44 +428,23 @@ def posed_vertices(model: BodyModel, fit: BodyFit) -> Float[np.ndarray, "F V 3"]
     return (vertices + fit.translation[:, None]).numpy()
 
 
-def _placed(
-    model: BodyModel, wanted: Float[Tensor, "F K 3"]
-) -> tuple[Float[Tensor, "F 3"], Float[Tensor, "F 3"]]:
-    """Return the rotation (axis-angle) and translation that bring the resting trunk nearest to the
-    wanted one (Kabsch 1976).
+def _placed(model: BodyModel, wanted: Float[Tensor, "F K 3"]) -> tuple[Tensor, Tensor]:
+    """Return the rotations (axis-angle) and translations, (F, 3), that bring the resting trunk
+    nearest to the wanted one (Kabsch 1976).
     """
     from scipy.spatial.transform import Rotation
 
-    rest = (model.joint_regressor @ model.template)[list(TRUNK)]
-    there = wanted[:, list(TRUNK)]
+    joints = model.joint_regressor @ model.template
+    rest, root, there = joints[TRUNK], joints[0], wanted[:, TRUNK]
     moved = there - there.mean(1, keepdim=True)
     covariance = torch.einsum("fkc,kd->fcd", moved, rest - rest.mean(0))
     u, _, vt = torch.linalg.svd(covariance)
     signs = torch.ones(len(wanted), 3, dtype=wanted.dtype)
     signs[:, 2] = torch.linalg.det(u @ vt).sign()
     rotation = u @ (signs[:, :, None] * vt)
-    root = (model.joint_regressor @ model.template)[0]  # the body turns about its first joint
+    # the body turns about its first joint
     translation = there.mean(1) - torch.einsum("fcd,d->fc", rotation, rest.mean(0) - root) - root
     return _tensor(Rotation.from_matrix(rotation.numpy()).as_rotvec()), translation
-
-
-def _minimise(body: tuple[Tensor, ...], loss: Callable[[], Tensor], iterations: int) -> None:
-    """Minimise ``loss`` over the tensors of ``body`` with L-BFGS, in place."""
-    for tensor in body:
-        tensor.requires_grad_(True)
-    options = {"history_size": 20, "line_search_fn": "strong_wolfe", "tolerance_change": 1e-5}
-    # the order of the parameters is that of the sums in the line search
-    optimiser = torch.optim.LBFGS([body[0], body[2], body[1]], max_iter=iterations, **options)
-
-    def closure() -> Tensor:
-        optimiser.zero_grad()
-        value = loss()
-        value.backward()
-        return value
-
-    optimiser.step(closure)
-    for tensor in body:
-        tensor.requires_grad_(False)
 
 
 def _check(arrays: dict[str, np.ndarray]) -> None:

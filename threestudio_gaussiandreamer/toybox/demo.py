@@ -18,8 +18,9 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any, Optional
 
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from .. import register_parts
@@ -30,14 +31,13 @@ from ..core.errors import Terminated, UserError
 from ..core.files import atomic_file, json_text, output_folder
 from ..core.streams import generator
 from ..diffusion import sds
-from ..evaluation.asset_metrics import ATTRIBUTES, Asset, Scores, prior_of, rendered, result_of
+from ..evaluation.asset_metrics import ATTRIBUTES, Scores, prior_of, rendered, result_of
 from ..host import find
 from ..launch.run_folder import RunFolder, claim, claim_new
 from ..models.bundled import NAME, is_export
 from ..view.run_files import read_json
 from . import recognition
 from .views import BACKGROUND, SIZE
-from .world_sheet import contact_sheet
 
 PROMPTS = (
     "a red fox with a green scarf",
@@ -51,10 +51,10 @@ GUIDANCE, SAMPLE_STEPS = 3.0, 25
 """Guidance scale and steps of the 2D model's own pictures."""
 RECORD, SHEET, TABLE = "demo.json", "sheet.png", "table.md"
 STAGES = ("prior", "result", "2D model")
+LINE = 11
+"""Pixels from line to line of the sheet's texts."""
 NAME_LENGTH, TABLE_LENGTH = 40, 60
 """Of a prompt in the name of its folder and in the table, characters."""
-
-
 Stages = dict[str, tuple[Float[Tensor, "V 3 s s"], dict[str, float]]]
 """Pictures and scores of one prompt, by stage."""
 
@@ -70,14 +70,10 @@ def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
     add("--models", default=NAME, help="toybox, or a folder of toybox.export")
     add("--output", default="outputs/demo", help="folder for a new folder of results")
     args = parser.parse_intermixed_args(argv)
-    args.options = [word for word in args.prompts if is_option(word)]
-    args.prompts = [word for word in args.prompts if not is_option(word)] or list(PROMPTS)
+    # a prompt has a space before its first =, if any
+    args.options = [word for word in args.prompts if re.match(r"[^ ]*=", word)]
+    args.prompts = [word for word in args.prompts if word not in args.options] or list(PROMPTS)
     return args
-
-
-def is_option(word: str) -> bool:
-    """Return whether an argument is key=value; a prompt has a space before its first =, if any."""
-    return "=" in word and " " not in word.partition("=")[0]
 
 
 def run(args: argparse.Namespace) -> int:
@@ -161,13 +157,14 @@ def launch(options: list[str]) -> int:
     program = [sys.executable, "-m", "threestudio_gaussiandreamer.launch.experiment"]
     with raised_signals() as received:
         process = subprocess.Popen([*program, "--config", "toybox.yaml", "--train", *options])
-        try:
-            code = process.wait()
-        except KeyboardInterrupt:
-            code = process.wait()
-        except Terminated:
-            process.terminate()
-            code = process.wait()
+        code = None
+        while code is None:
+            try:
+                code = process.wait()
+            except KeyboardInterrupt:
+                pass
+            except Terminated:
+                process.terminate()
     if received:
         print("the same command continues", flush=True)
         interrupt(received[0])
@@ -194,15 +191,12 @@ def stages_of(prompt: str, place: Path, models: str, scores: Scores) -> Stages:
     """Draw and score the prior, the result and the 2D model's own samples."""
     result = result_of(place, prompt)
     assets = {"prior": prior_of(place, result), "result": result}
-    found = {name: (shown(asset), scores.of_asset(asset)) for name, asset in assets.items()}
-    own = samples(models, prompt, recognition.views(), guidance_scale=GUIDANCE)
+    found, views = {}, recognition.views()
+    for name, asset in assets.items():
+        pictures = rendered(asset, views.rows(SHOWN), SIZE, background=BACKGROUND)
+        found[name] = torch.from_numpy(pictures).movedim(-1, 1), scores.of_asset(asset)
+    own = samples(models, prompt, views, guidance_scale=GUIDANCE)
     return found | {"2D model": (own[SHOWN], scores.of_pictures(own, prompt))}
-
-
-def shown(asset: Asset) -> Float[Tensor, "V 3 s s"]:
-    """Render an asset from SHOWN."""
-    pictures = rendered(asset, recognition.views().rows(SHOWN), SIZE, background=BACKGROUND)
-    return torch.from_numpy(pictures).movedim(-1, 1)
 
 
 @torch.no_grad()
@@ -243,6 +237,28 @@ def sheet(prompts: Sequence[str], stages: Sequence[Stages]) -> Any:
     first = [f"{name}: {prompt}" for prompt in prompts for name in STAGES]
     texts = [text for one in first for text in (one, *[""] * (len(SHOWN) - 1))]
     return contact_sheet(pictures, texts, columns=len(STAGES) * len(SHOWN))
+
+
+def contact_sheet(
+    images: Float[Tensor, "N 3 H W"], texts: Sequence[str] = (), columns: int = 10
+) -> UInt8[np.ndarray, "h w 3"]:
+    """Arrange pictures (values in [0, 1]) in rows, each with its whole text below it."""
+    from PIL import Image, ImageDraw
+
+    height, width = images.shape[-2:]
+    wrapped = [textwrap.wrap(text, width // 6) for text in texts] or [[]] * len(images)
+    most = max(map(len, wrapped), default=0)
+    cell = height + (most * LINE + 3 if most else 0)
+    rows = -(-len(images) // columns)
+    sheet = Image.new("RGB", (columns * width, rows * cell), "white")
+    draw = ImageDraw.Draw(sheet)
+    pixels = (images.clamp(0, 1) * 255).round().byte().movedim(1, -1).cpu().numpy()
+    for index, image in enumerate(pixels):
+        x, y = index % columns * width, index // columns * cell
+        sheet.paste(Image.fromarray(image), (x, y))
+        for line, words in enumerate(wrapped[index]):
+            draw.text((x + 2, y + height + line * LINE), words, fill="black")
+    return np.asarray(sheet)
 
 
 def table(prompts: Sequence[str], runs: Sequence[Path], stages: Sequence[Stages]) -> str:

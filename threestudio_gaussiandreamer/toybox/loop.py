@@ -7,8 +7,9 @@ import itertools
 import math
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Optional
 
@@ -23,7 +24,8 @@ from ..core.command import restore_handlers, set_handlers
 from ..core.errors import UserError
 from ..core.files import atomic_file
 from ..core.streams import numpy_generator
-from .views import Shards, row_batch
+from . import views
+from .views import Shards
 
 EMA_DECAY = 0.999
 WARMUP, DECAY_SHARE = 200, 0.3
@@ -38,26 +40,35 @@ LOG_EVERY, SAVE_SECONDS = 50, 300.0
 
 
 @dataclass(frozen=True)
-class StepData(Dataset, ABC):
-    """The batches of one stage, indexed by step. It is sent to worker processes."""
+class StepData(Dataset):
+    """The batches of one stage, indexed by step. It is sent to worker processes.
+
+    Each pass over a shard visits its rows (pictures, or objects) in random order; an incomplete
+    last batch is dropped.
+    """
 
     shards: Shards
     batch: int
     pool: int
     """Number of shards that are visited cyclically."""
-    stream: ClassVar[str]
+    stream: str
     """Name of the streams of random numbers."""
-    per_object: ClassVar[bool] = False
+    make: Callable[[int, np.ndarray, np.random.Generator], Any]
+    """Makes the batch of these rows of a shard, given by its index: a named tuple of tensors and
+    numbers.
+    """
+    per_object: bool = False
     """Whether rows are objects instead of pictures."""
 
     def __getitem__(self, step: int) -> Any:
-        stream, per_object = f"{self.stream}-rows", self.per_object
-        place = row_batch(self.shards, stream, self.batch, self.pool, step, per_object=per_object)
-        return self.make(*place, numpy_generator(self.shards.seed, f"{self.stream}-batch", step))
-
-    @abstractmethod
-    def make(self, index: int, rows: np.ndarray, rng: np.random.Generator) -> Any:
-        """Make the batch of these rows of shard ``index``: a named tuple of tensors and numbers."""
+        seed, count = self.shards.seed, self.shards.objects
+        count *= 1 if self.per_object else self.shards.views
+        batch = min(self.batch, count)
+        visit, place = divmod(step, count // batch)
+        rows = numpy_generator(seed, f"{self.stream}-rows", visit).permutation(count)
+        rows = rows[place * batch : (place + 1) * batch]
+        rng = numpy_generator(seed, f"{self.stream}-batch", step)
+        return self.make(visit % self.pool, rows, rng)
 
 
 @dataclass(frozen=True)
@@ -66,8 +77,8 @@ class MixedData(Dataset):
     own order, without gaps.
     """
 
-    first: StepData
-    second: StepData
+    first: Dataset
+    second: Dataset
     every: int
 
     def __getitem__(self, step: int) -> Any:
@@ -125,7 +136,6 @@ class Options:
     device: str = "cpu"
     pool: int = 40
     """Number of shards, which a stage visits in a cycle."""
-    shard_objects: int = 256
     precision: str = "float32"
     """Either "float32", or "bfloat16" for autocast on GPUs and on CPUs that multiply it."""
     batch: Optional[int] = None
@@ -135,7 +145,7 @@ class Options:
 
     @property
     def shards(self) -> Shards:
-        return Shards(self.folder / "shards", self.seed, objects=self.shard_objects)
+        return Shards(self.folder / "shards", self.seed, objects=views.OBJECTS)
 
 
 class Stage(ABC):
@@ -163,7 +173,18 @@ class Stage(ABC):
 
     @abstractmethod
     def data(self) -> Dataset:
-        """Return the batches, indexed by step, on the CPU."""
+        """Return the batches, indexed by step, on the CPU: :meth:`steps` of a function."""
+
+    def steps(
+        self, make: Callable[..., Any], *given: Any, shards: Optional[Shards] = None, **more: Any
+    ) -> StepData:
+        """Return the batches ``make(shards, *given, index, rows, rng)`` of these shards, by default
+        the stage's own; ``more`` are further fields of :class:`StepData`.
+        """
+        shards, fields = shards or self.shards, {"stream": self.name, "batch": self.batch} | more
+        return StepData(
+            shards, pool=self.options.pool, make=partial(make, shards, *given), **fields
+        )
 
     def batches(self, step: int) -> Iterator[Any]:
         """Yield the batches from ``step`` on, on the stage's device."""
@@ -235,7 +256,7 @@ class Training:
         ends it earlier: a checkpoint is saved, and ``signum`` is the signal's number.
         """
         self.target, self.limit = images or self.stage.images, seconds
-        earlier = set_handlers(self._on_signal)
+        earlier = set_handlers(lambda number, frame: setattr(self, "signum", number))
         saved = logged = started = time.monotonic()
         progress, metrics = self.progress, []
         try:
@@ -338,9 +359,6 @@ class Training:
         self.progress.measured = measured = self.stage.evaluate(self.ema.module.eval())
         place = f"{self.stage.name}  {self.progress.images}  withheld objects:"
         print(place, _text(measured), flush=True)
-
-    def _on_signal(self, number: int, frame: Any) -> None:
-        self.signum = number
 
 
 def _text(numbers: dict[str, float]) -> str:

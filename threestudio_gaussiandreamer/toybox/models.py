@@ -181,14 +181,13 @@ class Judge(nn.Module):
 
 
 IGNORED = -100
-"""The label of classes that losses ignore."""
+"""The label of classes that torch's losses ignore."""
 
 
 def classified(logits: dict[str, Tensor], labels: Int[Tensor, "B L"]) -> tuple[Tensor, Tensor]:
     """Return the mean cross entropy over the attributes, and the share recognised."""
     pairs = list(zip(logits.values(), labels.unbind(1), strict=True))
-    summed = {"ignore_index": IGNORED, "reduction": "sum"}
-    sums = [F.cross_entropy(value.float(), label, **summed) for value, label in pairs]
+    sums = [F.cross_entropy(value.float(), label, reduction="sum") for value, label in pairs]
     known = (labels != IGNORED).sum(dim=0).clamp(min=1)  # a batch may have no label of a column
     loss = (torch.stack(sums) / known).mean()
     right = torch.stack([(value.argmax(-1) == label).sum() for value, label in pairs]).sum()

@@ -1,6 +1,5 @@
 """Training the text-to-points model in Point-E's format, on CLIP's text features."""
 
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,6 +14,7 @@ from . import models
 from .clip_stage import text_features, trained_clip
 from .loop import Stage, StepData, normal, torch_generator
 from .tokens import object_prompts, open_tokenizer, token_ids
+from .views import Shards
 from .world import RADIUS
 
 POINTS, TIMESTEPS, EMPTY_SHARE = 256, 1024, 0.1
@@ -30,24 +30,22 @@ class PointsBatch(NamedTuple):
     empty: Bool[Tensor, " B"]
 
 
-@dataclass(frozen=True)
-class PointsData(StepData):
-    tokenizer: Any
-    stream, per_object = "points", True
-
-    def make(self, index: int, rows: np.ndarray, rng: np.random.Generator) -> PointsBatch:
-        shard = self.shards.get(index)
-        texts = object_prompts(shard.labels[rows * self.shards.views], rng)
-        chosen = rng.permuted(np.tile(np.arange(shard.points.shape[1]), (len(rows), 1)), axis=1)
-        places = np.take_along_axis(shard.points[rows], chosen[:, :POINTS, None], axis=1)
-        points = network_units(torch.from_numpy(places).float())
-        return PointsBatch(
-            points,
-            normal(rng, points.shape),
-            sds.stratified_timesteps(len(rows), TIMESTEPS, torch_generator(rng)),
-            token_ids(self.tokenizer, texts),
-            torch.from_numpy(rng.uniform(size=len(rows)) < EMPTY_SHARE),
-        )
+def points_batch(
+    shards: Shards, tokenizer: Any, index: int, rows: np.ndarray, rng: np.random.Generator
+) -> PointsBatch:
+    """Draw points, a timestep, noise and a prompt for each of these objects."""
+    shard = shards.get(index)
+    texts = object_prompts(shard.labels[rows * shards.views], rng)
+    chosen = rng.permuted(np.tile(np.arange(shard.points.shape[1]), (len(rows), 1)), axis=1)
+    places = np.take_along_axis(shard.points[rows], chosen[:, :POINTS, None], axis=1)
+    points = network_units(torch.from_numpy(places).float())
+    return PointsBatch(
+        points,
+        normal(rng, points.shape),
+        sds.stratified_timesteps(len(rows), TIMESTEPS, torch_generator(rng)),
+        token_ids(tokenizer, texts),
+        torch.from_numpy(rng.uniform(size=len(rows)) < EMPTY_SHARE),
+    )
 
 
 class PointsStage(Stage):
@@ -65,8 +63,8 @@ class PointsStage(Stage):
         width, layers = models.POINTS_WIDTH, models.POINTS_LAYERS
         return BaseModel(width=width, layers=layers, features=models.FEATURES)
 
-    def data(self) -> PointsData:
-        return PointsData(self.shards, self.batch, self.options.pool, self.tokenizer)
+    def data(self) -> StepData:
+        return self.steps(points_batch, self.tokenizer, per_object=True)
 
     def loss(self, model: nn.Module, batch: PointsBatch) -> tuple[Tensor, dict[str, Tensor]]:
         condition = self.condition(batch.ids) * ~batch.empty[:, None]

@@ -13,15 +13,14 @@ multi_face   share of the views that the judge takes for views from another quad
 
 import functools
 import math
-from pathlib import Path
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..cameras import Orbit
-from ..core.errors import UserError
-from ..models.bundled import JUDGE, NAME, model_part
+from ..models.bundled import JUDGE, model_part
+from ..priors.karras import load_exactly, read_state_dict
 from .kinds import ALIKE_FROM_ALL_SIDES
 from .models import Judge
 from .views import DISTANCE, FOVY_DEG, LABELS
@@ -45,21 +44,8 @@ def load_judge(name: str) -> Judge:
     Raises:
         UserError: there is no such file, or it doesn't hold a judge.
     """
-    from safetensors import SafetensorError
-    from safetensors.torch import load_file
-
-    path, judge = Path(model_part(name, JUDGE)).expanduser(), Judge()
-    try:
-        weights = load_file(str(path))
-        judge.load_state_dict({name: value.float() for name, value in weights.items()})
-    except FileNotFoundError:
-        raise UserError(
-            f"there is no judge at {str(path)!r}: give {NAME}, or the export of a training that "
-            "has one (make train-toybox)"
-        ) from None
-    except (OSError, SafetensorError, RuntimeError) as error:
-        reason = str(error).partition("\n")[0]  # torch lists every parameter that differs
-        raise UserError(f"{str(path)!r} isn't a judge of the toybox: {reason}") from error
+    path, judge = model_part(name, JUDGE), Judge()
+    load_exactly(judge, read_state_dict(path, "judge of the toybox"), f"judge {path!r}")
     return judge.eval()
 
 

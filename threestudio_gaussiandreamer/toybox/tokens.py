@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ..core.errors import UserError
 from ..core.files import atomic_file, existing_file, output_folder
-from ..prompts.known_words import WORDS_FILE
+from ..prompts.prompts import WORDS_FILE
 from . import words
 from .views import Shard, attributes_of
 
@@ -27,11 +27,13 @@ LENGTH = 32
 
 def write_tokenizer(folder: Path, words: Sequence[str]) -> None:
     """Write the vocabulary, merges and configuration of a CLIPTokenizer into ``folder``, and the
-    list of ``words`` that prompts/known_words.py reads.
+    list of ``words`` that prompts/prompts.py reads.
     """
+    from tokenizers.pre_tokenizers import ByteLevel
+
     output_folder(folder, "the tokenizer")
     merges = word_merges(words)
-    letters = byte_letters()
+    letters = sorted(ByteLevel.alphabet())
     pieces = [*letters, *(f"{letter}</w>" for letter in letters), *map("".join, merges)]
     tokens = {token: index for index, token in enumerate([*pieces, START, END])}
     special = {"bos_token": START, "eos_token": END, "unk_token": END, "pad_token": END}
@@ -72,13 +74,6 @@ def word_merges(words: Sequence[str]) -> list[tuple[str, str]]:
         split = [_merged(pieces, best) for pieces in split]
         merges.append(best)
     return merges
-
-
-def byte_letters() -> list[str]:
-    """Return the 256 letters that stand for bytes in GPT-2's and CLIP's vocabularies."""
-    ranges = ("!~", "¡¬", "®ÿ")
-    printable = [chr(i) for a, b in ranges for i in range(ord(a), ord(b) + 1)]
-    return [*printable, *(chr(256 + i) for i in range(256 - len(printable)))]
 
 
 def _merged(pieces: list[str], pair: tuple[str, str]) -> list[str]:
@@ -167,8 +162,6 @@ def view_prompts(
     Args:
         opposite: name the opposite direction instead.
     """
-    texts = object_prompts(shard.labels[rows], rng)
-    names = _directions(shard, rows)
-    if opposite:
-        names = [words.OPPOSITE[name] for name in names]
+    texts, names = object_prompts(shard.labels[rows], rng), _directions(shard, rows)
+    names = [words.OPPOSITE[name] for name in names] if opposite else names
     return [f"{text}, {name} view" for text, name in zip(texts, names, strict=True)]

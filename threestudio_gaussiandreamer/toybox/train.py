@@ -7,6 +7,7 @@ command continues a training that was stopped anywhere.
 import argparse
 import dataclasses
 import functools
+import json
 import math
 import os
 import sys
@@ -23,6 +24,7 @@ from ..core.command import interrupt, run_command
 from ..core.errors import UserError, unknown
 from ..core.files import existing_file, output_folder
 from ..core.options import shown
+from ..formats.reading import reading
 from ..launch.run_folder import claim
 from ..models.bundled import RECORD
 from ..view.run_files import read_json
@@ -38,6 +40,12 @@ from .views import Shards
 IN_ORDER = TextStage, ClipStage, AutoencoderStage, UNetStage, PointsStage, JudgeStage
 STAGES: dict[str, type[Stage]] = {stage.name: stage for stage in IN_ORDER}
 """In the order of training: later ones need earlier ones."""
+RANGES = {
+    **dict.fromkeys(("images", "batch", "pool"), (1, math.inf)),
+    **{"workers": (0, math.inf), "minutes": (0.001, math.inf)},
+    "seed": (0, SEED_OFFSET - 1),  # larger ones are of the objects that the judge learns from
+}
+"""Of the options."""
 
 
 def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
@@ -67,20 +75,12 @@ def options_of(args: argparse.Namespace) -> Options:
     for name in args.stages:
         if name not in STAGES:
             raise unknown("stage", name, STAGES)
-    for name, least in {"images": 1, "batch": 1, "pool": 1, "workers": 0}.items():
+    for name, (low, high) in RANGES.items():
         value = getattr(args, name)
-        if value is not None and value < least:
-            raise UserError(f"--{name} {shown(value)}: expected {least} or more")
-    if not 0 <= args.seed < SEED_OFFSET:
-        raise UserError(
-            f"--seed {shown(args.seed)}: expected 0 to {SEED_OFFSET - 1}; larger seeds are of the "
-            "objects that the judge learns from"
-        )
-    if not args.minutes > 0:
-        raise UserError(f"--minutes {args.minutes}: expected more than 0")
-    if args.device.startswith("cuda") and not torch.cuda.is_available():
-        raise UserError(f"--device {args.device}: PyTorch sees no GPU here; give cpu")
-    devices = ["cpu", "cuda", *(f"cuda:{i}" for i in range(torch.cuda.device_count()))]
+        if value is not None and not low <= value <= high:
+            raise UserError(f"--{name} {shown(value)}: expected a number from {low} to {high}")
+    gpus = [f"cuda:{i}" for i in range(torch.cuda.device_count())]
+    devices = ["cpu", *["cuda"][: len(gpus)], *gpus]
     if args.device not in devices:
         raise unknown("device", args.device, devices)
     given = {field.name for field in dataclasses.fields(Options)} & set(vars(args))
@@ -127,10 +127,8 @@ def start_from(weights: Path, options: Options) -> None:
     Raises:
         UserError: a file is missing or damaged, or holds another model.
     """
-    path = existing_file(weights / RECORD, "record of the toybox's weights")
-    record = read_json(path, dict)
-    if not record or not all(isinstance(seen, dict) for seen in record.values()):
-        raise UserError(f"the record of the toybox's weights {str(path)!r} is damaged")
+    with reading(weights / RECORD, "record of the toybox's weights") as path:
+        record = {name: dict(seen) for name, seen in json.loads(path.read_bytes()).items()}
     if not (options.folder / "tokenizer" / tokens.SETTINGS).is_file():
         source = weights / "stable-diffusion" / "tokenizer"
         existing_file(source / tokens.SETTINGS, "tokenizer")

@@ -2,7 +2,7 @@
 
 import functools
 import hashlib
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,11 +17,12 @@ from ..core.files import atomic_file
 from ..core.streams import generator, numpy_generator
 from ..diffusion import sds
 from ..models.multiview_unet import views_attended_together
-from . import models, words
+from ..prompts.view_prompts import THRESHOLDS
+from . import models
 from .clip_stage import trained_clip
-from .loop import MixedData, Stage, StepData, averaged_weights, moved, normal, torch_generator
+from .loop import MixedData, Stage, averaged_weights, moved, normal, torch_generator
 from .tokens import joined_prompts, open_tokenizer, token_ids, training_prompts, view_prompts
-from .views import SIZE, with_backgrounds
+from .views import SIZE, Shards, with_backgrounds
 
 RANDOM_BACKGROUNDS = 0.05
 """Of the pictures; with 0.5 score distillation produced haze around the object."""
@@ -46,41 +47,31 @@ class UNetBatch(NamedTuple):
     """Number of consecutive pictures whose self-attention is joined."""
 
 
-@dataclass(frozen=True)
-class UNetData(StepData):
-    tokenizer: Any
-    moments: tuple[Path, ...]
-    """The files of the shards' posteriors."""
-    stream = "unet"
+def unet_batch(
+    shards: Shards,
+    tokenizer: Any,
+    moments: Sequence[Path],
+    views: int,
+    index: int,
+    rows: np.ndarray,
+    rng: np.random.Generator,
+) -> UNetBatch:
+    """Draw a prompt, latents and noise for each of these pictures, and a timestep; with ``views``
+    above 1, rows are objects, whose views have one timestep.
 
-    def make(self, index: int, rows: np.ndarray, rng: np.random.Generator) -> UNetBatch:
-        texts = training_prompts(self.shards.get(index), rows, rng)
-        return self._noised(index, rows, texts, rng, views=1)
-
-    def _noised(
-        self, index: int, rows: np.ndarray, texts: list[str], rng: np.random.Generator, views: int
-    ) -> UNetBatch:
-        """Draw a timestep for each object of ``views`` pictures, then latents and noise."""
-        t = sds.stratified_timesteps(len(rows) // views, TIMESTEPS, torch_generator(rng))
-        mean, std = kept_moments(self.moments[index])[:, torch.from_numpy(rows)].float()
-        latents = mean + std * normal(rng, mean.shape)
-        noise = normal(rng, mean.shape)
-        ids = token_ids(self.tokenizer, texts)
-        return UNetBatch(latents, noise, t.repeat_interleave(views), ids, views)
-
-
-@dataclass(frozen=True)
-class JoinedViewsData(UNetData):
-    """Batches of objects, all views of each at one timestep."""
-
-    stream = "unet-joined"
-    per_object = True
-
-    def make(self, index: int, rows: np.ndarray, rng: np.random.Generator) -> UNetBatch:
-        views = self.shards.views
-        texts = joined_prompts(self.shards.get(index), rows, views, rng)
-        pictures = (rows[:, None] * views + np.arange(views)).reshape(-1)
-        return self._noised(index, pictures, texts, rng, views)
+    Args:
+        moments: the files of the shards' posteriors.
+    """
+    if views == 1:
+        texts = training_prompts(shards.get(index), rows, rng)
+    else:
+        texts = joined_prompts(shards.get(index), rows, views, rng)
+        rows = (rows[:, None] * views + np.arange(views)).reshape(-1)
+    t = sds.stratified_timesteps(len(rows) // views, TIMESTEPS, torch_generator(rng))
+    mean, std = kept_moments(moments[index])[:, torch.from_numpy(rows)].float()
+    latents = mean + std * normal(rng, mean.shape)
+    noise = normal(rng, mean.shape)
+    return UNetBatch(latents, noise, t.repeat_interleave(views), token_ids(tokenizer, texts), views)
 
 
 @functools.lru_cache(maxsize=MOMENTS_IN_MEMORY)
@@ -108,26 +99,23 @@ class UNetStage(Stage):
         clip = trained_clip(folder, len(self.tokenizer), "text")
         self.text_model = clip.text_model.to(self.device)
         self.vae = frozen_autoencoder(folder).to(self.device)
-        self.encoder_digest = digest(self.vae.encoder)
+        digest = hashlib.sha256()
+        for name, value in sorted(self.vae.encoder.state_dict().items()):
+            digest.update(name.encode() + value.cpu().contiguous().numpy().tobytes())
+        self.encoder_digest = digest.hexdigest()
         betas = models.scheduler().betas.double()
         self.alphas_cumprod = torch.cumprod(1 - betas, dim=0).to(self.device)
         self.constants[LATENT_SCALE] = latent_scale(kept_moments(self._moments(0)))
         return models.unet()
 
-    @property
-    def scale(self) -> float:
-        """The factor that scales latents to unit variance."""
-        return self.constants[LATENT_SCALE]
-
     def data(self) -> Dataset:
         pool = tqdm(range(self.options.pool), "latents", unit="shard", disable=None)
-        moments = tuple(self._moments(index) for index in pool)
-        rest = (self.options.pool, self.tokenizer, moments)
-        singles = UNetData(self.shards, self.batch, *rest)
-        objects = self.batch // self.shards.views
-        if not objects:
+        given = self.tokenizer, [self._moments(index) for index in pool]
+        singles, views = self.steps(unet_batch, *given, 1), self.shards.views
+        objects = {"batch": self.batch // views, "stream": "unet-joined", "per_object": True}
+        if not objects["batch"]:
             return singles
-        return MixedData(singles, JoinedViewsData(self.shards, objects, *rest), SINGLE_EVERY)
+        return MixedData(singles, self.steps(unet_batch, *given, views, **objects), SINGLE_EVERY)
 
     def loss(self, model: nn.Module, batch: UNetBatch) -> tuple[Tensor, dict[str, Tensor]]:
         abar, errors = self.alphas_cumprod[batch.t], self._errors(model, batch)
@@ -138,7 +126,11 @@ class UNetStage(Stage):
 
     def _errors(self, model: nn.Module, batch: UNetBatch) -> Float[Tensor, " B"]:
         """Return the squared errors of v."""
-        abar, noise, x = self.alphas_cumprod[batch.t], batch.noise, batch.latents * self.scale
+        abar, noise, x = (
+            self.alphas_cumprod[batch.t],
+            batch.noise,
+            batch.latents * self.constants[LATENT_SCALE],
+        )
         z = sds.diffuse(x, noise, abar)
         v = sds.per_item(abar.sqrt(), x) * noise - sds.per_item((1 - abar).sqrt(), x) * x
         with torch.no_grad():
@@ -149,16 +141,13 @@ class UNetStage(Stage):
 
     @torch.no_grad()
     def evaluate(self, model: nn.Module) -> dict[str, float]:
-        """Return the errors of v at a timestep where prompts decide the view, with prompts of the
-        pictures' own directions, and of the opposite ones.
-        """
-        return {name: float(self._errors(model, batch).mean()) for name, batch in self.held_out}
+        """Return the errors of v where prompts decide the view, with own and opposite prompts."""
+        return {name: float(self._errors(model, batch).mean()) for name, batch in self.held_out()}
 
-    @functools.cached_property
     def held_out(self) -> list[tuple[str, UNetBatch]]:
         """Return pictures of withheld objects with prompts of their own and of opposite views."""
         shard = self.shards.held_out_shard()
-        rows = np.flatnonzero(shard.elevation < words.OVERHEAD)[:HELD_OUT]
+        rows = np.flatnonzero(shard.elevation < THRESHOLDS["overhead_threshold"])[:HELD_OUT]
         rng = numpy_generator(self.options.seed, "unet-held-out")
         latents = self._posteriors(shard.rgba[rows], rng, random_share=0)[0].cpu()
         noise = torch.randn(latents.shape, generator=generator(self.options.seed, "unet-held-out"))
@@ -198,8 +187,8 @@ class UNetStage(Stage):
 
 
 def truncated_weight(abar: Float[Tensor, " B"]) -> Float[Tensor, " B"]:
-    """Return the weight of v's squared error, (min(SNR, gamma) + 1) / (SNR + 1). High noise levels
-    keep their weight: only there does the prompt decide between left and right.
+    """Return the weight of v's squared error, (min(SNR, gamma) + 1) / (SNR + 1). Only at the high
+    noise levels, which keep it, does the prompt decide between left and right.
     """
     snr = abar / (1 - abar)
     return (snr.clamp(max=SNR_GAMMA) + 1) / (snr + 1)
@@ -209,14 +198,6 @@ def latent_scale(moments: Float[Tensor, "2 N 4 h w"]) -> float:
     """Return the factor that brings latents to unit variance."""
     mean, std = moments.double()
     return float((mean.var() + std.square().mean()) ** -0.5)
-
-
-def digest(module: nn.Module) -> str:
-    """Return a fingerprint of a network's weights."""
-    found = hashlib.sha256()
-    for name, value in sorted(module.state_dict().items()):
-        found.update(name.encode() + value.detach().cpu().contiguous().numpy().tobytes())
-    return found.hexdigest()
 
 
 def frozen_autoencoder(folder: Any) -> nn.Module:

@@ -210,19 +210,3 @@ def render_gaussians(
     drawn = rasterize(*gaussians, viewmats, Ks, SIZE, SIZE, preset="fast", eps2d=eps2d)
     alpha = drawn.alpha.reshape(*drawn.image.shape[:-1], 1)
     return torch.cat([drawn.image, alpha], dim=-1).clamp(0, 1).numpy()
-
-
-def row_batch(
-    shards: Shards, stream: str, batch: int, pool: int, step: int, *, per_object: bool = False
-) -> tuple[int, Int[np.ndarray, " B"]]:
-    """Return (shard, rows) of the batch of ``step``, a function of (seed, stream, step), where
-    ``pool`` shards are visited cyclically.
-
-    Each pass over a shard visits its rows (pictures, or objects) in random order; an incomplete
-    last batch is dropped.
-    """
-    rows = shards.objects * (1 if per_object else shards.views)
-    batch = min(batch, rows)
-    visit, place = divmod(step, rows // batch)
-    order = numpy_generator(shards.seed, stream, visit).permutation(rows)
-    return visit % pool, order[place * batch : (place + 1) * batch]

@@ -7,7 +7,9 @@ from collections.abc import Iterable, Mapping
 from typing import Optional
 
 import numpy as np
+import torch
 
+from ..prompts.view_prompts import direction_indices, view_directions
 from .world import COLORS, Attributes
 
 NOUNS: dict[str, tuple[str, ...]] = {
@@ -75,9 +77,7 @@ OPPOSITE = {
     "overhead": "overhead",
 }
 """The directions of views, each with the opposite one."""
-FRONT_HALF = BACK_HALF = 45.0
-OVERHEAD = 60.0
-"""Thresholds of the prompt processors, degrees."""
+DIRECTIONS = view_directions(left_and_right=True)
 UNNAMED_SIDE_SHARE = 0.1
 """Fraction of the side views whose prompts say "side view", as threestudio's do."""
 EMPTY_SHARE, PLAIN_SHARE, PREFIX_SHARE = 0.1, 0.2, 0.04
@@ -87,17 +87,11 @@ of ...").
 
 
 def direction(elevation: float, azimuth: float) -> str:
-    """Return the direction of a view (degrees), with the prompt processors' thresholds and
+    """Return the direction of a view (degrees), as the prompt processors name it with
     ``view_dependent_left_and_right``.
     """
-    shifted = (azimuth + 180) % 360 - 180
-    if elevation > OVERHEAD:
-        return "overhead"
-    if abs(shifted) < FRONT_HALF:
-        return "front"
-    if abs(shifted) > 180 - BACK_HALF:
-        return "back"
-    return "left side" if shifted >= 0 else "right side"
+    view = torch.tensor([[elevation], [azimuth], [1.0]], dtype=torch.float64)
+    return DIRECTIONS[int(direction_indices(DIRECTIONS, *view))].name
 
 
 def describe(attributes: Attributes, rng: np.random.Generator) -> str:
