@@ -55,10 +55,7 @@ SCALE = positive("world units", most=1e6)
 
 def preflight_prior(prior: Any, keep_attributes: bool) -> None:
     """Check within seconds that a prior can run, and, if ``keep_attributes``, that every attribute
-    of its Gaussians can be taken; other hosts' priors have no check.
-
-    Raises:
-        UserError: a requirement, such as a file, is missing, or its options exclude that.
+    of its Gaussians can be taken; other hosts' priors have no check. Raise UserError if not.
     """
     if hasattr(prior, "preflight"):
         require_method(type(prior), "preflight")
@@ -152,8 +149,8 @@ class FilePrior(Prior):
 
 
 def file_axes(cfg: Any, kind: str) -> tuple[str, Optional[str]]:
-    """Return the axes of the file that are up and the front: those of the options, or of the
-    producer, which must write files of this ``kind`` (see ``formats/producers.py``).
+    """Return the file's axes that are up and the front, by the options or the producer, which must
+    write files of this ``kind``.
     """
     return producer_axes(cfg.producer, kind) if cfg.producer else (cfg.up, cfg.front)
 
@@ -177,9 +174,8 @@ def validated(cloud: PointCloud, name: str) -> PointCloud:
     [0, 1].
 
     Raises:
-        UserError: it isn't a PointCloud, there are no points, points, colours and normals aren't
-            all arrays (P, 3), faces don't name three of the points each, more than 5 % of the rows
-            are not finite, or most colours are far outside [0, 1], as those from 0 to 255 are.
+        UserError: it is empty or no PointCloud of arrays (P, 3) with faces among the points, more
+            than 5 % of the rows are not finite, or most colours are far outside [0, 1].
     """
 
     def refuse(problem: str) -> NoReturn:

@@ -110,11 +110,8 @@ def named_pose(body: Body, name: str) -> Float[np.ndarray, "22 3 3"]:
 def pose_of_rotations(
     body: Body, local: Float[np.ndarray, "22 3 3"]
 ) -> Float[np.ndarray, "22 3 3"]:
-    """Return the pose in which the joints are rotated as SMPL's.
-
-    Args:
-        local: rotation of each joint relative to its parent, from a T-pose; the first one that of
-            the whole body.
+    """Return the pose in which each joint is rotated relative to its parent, from a T-pose, as
+    SMPL's; the first rotation is that of the whole body.
     """
     turned = local.copy()
     for joint, parent in enumerate(PARENTS):
@@ -134,11 +131,8 @@ def pose_of_rotations(
 def pose_of_positions(
     body: Body, positions: dict[str, Float[np.ndarray, "3"]]
 ) -> Float[np.ndarray, "22 3 3"]:
-    """Return the pose in which hips, chest and limbs point as those of a skeleton of any size.
-
-    Args:
-        positions: of joints, by their names in ``JOINTS``; those in ``NEEDED`` must be there, and
-            "pelvis", "lower spine", "neck", "head" and the ends of the limbs may be.
+    """Return the pose in which hips, chest and limbs point as those of a skeleton of any size, of
+    which at least the positions of the joints in ``NEEDED`` are known.
     """
     from scipy.spatial.transform import Rotation, Slerp
 
@@ -159,8 +153,8 @@ def pose_of_positions(
 
 
 def part_frame(positions: dict[str, Float[np.ndarray, "3"]], part: str) -> Float[np.ndarray, "3 3"]:
-    """Return the orientation of the hips ("hip") or of the chest ("shoulder"): its columns are the
-    directions to the left, up and to the front.
+    """Return the directions to the left, up and to the front, as columns, of the hips ("hip") or
+    of the chest ("shoulder").
     """
     left, right = positions[f"left {part}"], positions[f"right {part}"]
     low, chest = (
@@ -257,10 +251,9 @@ PAIRED = {
     "elbow": ("forearm", "lowerarm", "lowarm", "elbow", "lowerarm1"),
     "wrist": ("wrist", "hand"),
 }
-"""Parts of the names of each joint, the most specific one first: "foot" is the ankle in files
-without an "ankle", and "shoulder" the upper arm in those without an "arm"."""
+"""Parts of the names of each joint, the most specific one first."""
 LARGEST = 1e9
-"""Largest number that is plausible, in any unit; squares of larger ones could overflow."""
+"""Squares of larger numbers could overflow."""
 
 
 def read_pose(
@@ -272,8 +265,7 @@ def read_pose(
         up: the file's axis that is up: "y", "z", "-y", or "auto".
 
     Raises:
-        UserError: the file is missing, of another format, damaged, not finite, or has no such
-            frame.
+        UserError: the file is missing, damaged, of another format, or has no such frame.
     """
     if path in POSES:
         return named_pose(body, path)

@@ -26,12 +26,10 @@ MAX_FILES = 1000
 
 
 def cached_cloud(prior: Any, prompt: str, save_dir: Optional[str]) -> PointCloud:
-    """Return ``prior(prompt)``, read from ``save/prior/points.npz`` if that file is of the same
-    prior, options, files, prompt and seed, and the files beside a mesh (textures, materials) are
-    as they were.
-
-    ``points.ply`` is written beside it, for inspection. If ``save_dir`` is None, nothing is read or
-    written."""
+    """Return ``prior(prompt)``, read from ``save/prior/points.npz`` if that is of the same prior,
+    options, prompt and seed, and all files are as they were; ``points.ply`` beside it is for
+    inspection. If ``save_dir`` is None, nothing is read or written.
+    """
     if save_dir is None:
         return points_of(prior, prompt)
     path, key = Path(save_dir) / "prior" / "points.npz", cache_key(prior, prompt)

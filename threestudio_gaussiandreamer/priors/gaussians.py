@@ -15,10 +15,7 @@ ground, ...   see ``priors/base.py``; not with all attributes
 ============  ======================================================================================
 
 Called as any prior it gives the centres and the colours of the constant harmonic, from which points
-are grown; the geometry may instead take every attribute from :meth:`GaussiansPrior.gaussians` and
-continue that training.
-
-Limits: the prompt is not read."""
+are grown; the geometry may instead continue from all attributes. The prompt is not read."""
 
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -13,8 +13,7 @@ front                the axis of the model's space that looks at azimuth 0; z is
 The networks were trained with discrete timesteps of a variance-preserving process, ``z_t =
 sqrt(abar_t) x0 + sqrt(1 - abar_t) eps``; the sampler works on ``x = x0 + sigma eps``, which equals
 ``z_t / sqrt(abar_t)`` at ``sigma^2 = (1 - abar_t) / abar_t``. Implemented from Algorithm 2 of
-Karras et al. 2022, "Elucidating the design space of diffusion-based generative models", with the
-conventions of the published samplers (openai/point-e, openai/shap-e, MIT)."""
+Karras et al. 2022, with the conventions of the published samplers (openai/point-e, MIT)."""
 
 import math
 import pickle
@@ -203,11 +202,8 @@ def read_state_dict(path: str, kind: str) -> dict[str, Tensor]:
     """Return the tensors of a checkpoint by name: of a ``.safetensors`` file, or of a pickle, which
     is read with ``weights_only``, so that it can't run code.
 
-    Args:
-        kind: what the file is, for messages ("Shap-E checkpoint").
-
     Raises:
-        UserError: the file is missing, unreadable, refused, or holds no tensors by name.
+        UserError: the file (``kind`` names it) is missing, refused, or holds no tensors by name.
     """
     with reading(path, kind) as file:
         if file.suffix == ".safetensors":
@@ -231,10 +227,8 @@ def read_state_dict(path: str, kind: str) -> dict[str, Tensor]:
 
 
 def load_exactly(module: nn.Module, state: Mapping[str, Tensor], what: str) -> None:
-    """Load ``state`` into ``module``, converted to its dtype.
-
-    Raises:
-        UserError: names are missing or unknown, or shapes differ; the message lists some of them.
+    """Load ``state`` into ``module``, converted to its dtype; raise UserError if names or shapes
+    differ.
     """
     try:
         module.load_state_dict(state)

@@ -23,11 +23,8 @@ ground, ...       see ``priors/base.py``
 ================  ==================================================================================
 
 The points of a body are recentred by their mean. Random colours are uniform in [0, 1]; those of the
-released code are divided by 255, a flat grey.
-
-Limits: the prompt is not read. Few vertices make a sparse start: give ``num_points`` for a
-low-polygon mesh. At ``scale`` above 1.5 the nearest cameras of the paper's range (1.5 to 4.0) are
-inside a body."""
+released code are divided by 255, a flat grey. Limits: the prompt is not read. A low-polygon mesh
+makes a sparse start: give ``num_points``."""
 
 import logging
 from dataclasses import dataclass, field

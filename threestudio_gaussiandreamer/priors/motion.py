@@ -96,10 +96,8 @@ class Motions(NamedTuple):
 
 
 def read_motions(path: str) -> Motions:
-    """Return the motions of an NPZ or NPY file.
-
-    Raises:
-        UserError: missing, of another layout, without frames, or not finite.
+    """Return the motions of a file; raise UserError if it is missing, of another layout, without
+    frames, or not finite.
     """
     with reading(path, "motion file") as file:
         arrays = read_arrays(file, "motion file", ["motion"], ["lengths"])
@@ -326,10 +324,8 @@ class BodyFit(NamedTuple):
 
 
 def load_body_model(path: str) -> BodyModel:
-    """Read the user's body model, an NPZ or SMPL's own PKL, of which no code is run.
-
-    Raises:
-        UserError: missing, or not a body model; the message says what to do.
+    """Read the user's body model, an NPZ or SMPL's own PKL, of which no code is run; raise
+    UserError if it is missing or not a body model.
     """
     kind = "body model (the NPZ or PKL of SMPL, SMPL-H or SMPL-X)"
     with reading(path, kind) as file:
@@ -353,12 +349,8 @@ def load_body_model(path: str) -> BodyModel:
 def fit_bodies(
     model: BodyModel, targets: Float[np.ndarray, "F K 3"], *, iterations: int = 300
 ) -> BodyFit:
-    """Return bodies whose joints are where ``targets`` has them.
-
-    Args:
-        targets: 22 or 24 joints in SMPL's order, metres, y up; the last two of 24 are used when the
-            model has no more.
-        iterations: the most of the last stage.
+    """Return bodies whose joints are where ``targets`` has them: 22 or 24 in SMPL's order, metres,
+    y up. The last two of 24 are used when the model has no more.
     """
     joints = len(model.parents)
     wanted = _tensor(targets)[:, : SMPL_JOINTS if joints == SMPL_JOINTS else BODY_JOINTS]

@@ -57,9 +57,8 @@ CHANNELS = 6
 """x, y, z, red, green, blue of a point; the networks give these and as many for the variance."""
 SCALES = torch.tensor([2.0] * 3 + [2 / 255] * 3)[:, None]
 BIASES = torch.tensor([0.0] * 3 + [-1.0] * 3)[:, None]
-"""Per channel: the inputs of the networks are ``points * SCALES + BIASES``, in [-1, 1], of
-positions in [-0.5, 0.5] and colours in [0, 255].
-"""
+"""The networks' inputs are ``points * SCALES + BIASES``, of positions in [-0.5, 0.5] and colours in
+[0, 255]."""
 CHECKPOINT = required(
     "Point-E's weights are a file that you download; set checkpoint to base_40m_textvec.pt"
 )
@@ -270,10 +269,8 @@ def timestep_embedding(timesteps: Real[Tensor, " B"], width: int) -> Float[Tenso
 
 
 def load_network(kind: type[PointTransformer], path: str) -> Any:
-    """Load a network of this kind in evaluation mode. Its sizes are read from the weights' shapes.
-
-    Raises:
-        UserError: the file can't be read, or is of another model.
+    """Load a network of this kind in evaluation mode; its sizes are those of the weights. Raise
+    UserError if the file can't be read, or is of another model.
     """
     state = read_state_dict(path, kind.title)
     layers = len({name.split(".")[2] for name in state if name.startswith("backbone.resblocks.")})

@@ -1,9 +1,7 @@
 """Train CLIP: first the text encoder, to recognise an object's attributes in its prompt, then the
-image encoder, on the features of the trained text encoder, which stay fixed ("locked" text, after
-Zhai et al. 2022).
+image encoder, on the fixed features of the trained text encoder (after Zhai et al. 2022).
 
-Small encoders learn to associate colours with parts from classifiers much earlier than from the
-contrastive loss.
+Classifiers teach small encoders which colour belongs to which part, much earlier than contrast.
 """
 
 import re
@@ -25,7 +23,7 @@ from . import models, words
 from .loop import Stage, StepData, averaged_weights, is_trained, moved
 from .models import IGNORED, accuracies, classified
 from .tokens import open_tokenizer, token_ids, training_prompts, view_prompts
-from .views import LABELS, VIEWS, Shards, label_row, random_angles, with_backgrounds
+from .views import LABELS, VIEWS, Shards, draw_orbit, label_row, with_backgrounds
 from .world import draw_attributes
 
 HELD_OUT = 512
@@ -52,7 +50,7 @@ class TextData(Dataset):
         rng = numpy_generator(self.seed, "text-batch", start, int(self.held_out))
         for index in range(start, start + self.batch):
             attributes = draw_attributes(self.seed, index, held_out=self.held_out)
-            elevation, azimuth = random_angles(rng)
+            elevation, azimuth = map(float, draw_orbit(1, rng)[:2])
             text = words.prompt_of(attributes, elevation, azimuth, rng)
             texts.append(text or words.describe(attributes, rng))
             labels.append(label_row(attributes, azimuth))

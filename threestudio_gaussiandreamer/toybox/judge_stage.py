@@ -1,8 +1,7 @@
 """Train the judge, a classifier that evaluates the other networks, on data of a separate seed.
 
-Most of its pictures show objects as Gaussians with errors, as results of score distillation; a
-classifier that has seen only ray-cast pictures takes their blurred edges for other colours. No
-network of the toybox takes part in these renders.
+Most of its pictures show objects as Gaussians with errors, as results of score distillation, whose
+blurred edges a classifier of ray-cast pictures alone takes for other colours.
 """
 
 import dataclasses
@@ -22,8 +21,7 @@ from .models import Judge, accuracies, classified
 from .views import Shards, render_gaussians, with_backgrounds
 
 SEED_OFFSET = 1000
-"""Added to the seed, so that the judge and the other networks have no training pictures in common.
-"""
+"""Added to the seed, so that the judge has training pictures of its own."""
 CAST_EVERY = 3
 """One step in so many is of ray-cast pictures, the others of renders of Gaussians."""
 SPLATS_VERSION = 1
@@ -33,8 +31,7 @@ COUNT = (800, 4000)
 WAVES, WAVELENGTH = 6, (0.15, 0.8)
 """Number of plane waves of a smooth error, and the range of their lengths, world units."""
 COLOR_SHIFT, SHAPE_SHIFT = 0.06, 0.025
-"""Largest standard deviations of smooth displacements of the pattern and of the shape, world units.
-"""
+"""Largest deviations of smooth displacements of the pattern and of the shape, world units."""
 BLENDED = 12
 """Largest number of neighbouring points whose colours are averaged."""
 COLOR_ERROR, COLOR_NOISE = 0.08, 0.12

@@ -1,6 +1,5 @@
 """The training loop of all networks of the toybox, with an exponential moving average of the
-weights. All random draws are functions of (seed, stage, step), so a resumed training gives the same
-result as an uninterrupted one.
+weights. All random draws are functions of (seed, stage, step), so that a training resumes exactly.
 """
 
 import itertools
@@ -29,9 +28,7 @@ from .views import Shards
 
 EMA_DECAY = 0.999
 WARMUP, DECAY_SHARE = 200, 0.3
-"""Steps of the linear warm-up of the learning rate, and the last fraction of a training, over which
-it decreases linearly to zero.
-"""
+"""Steps of the rate's linear warm-up, and the last fraction of a training, where it decreases."""
 CLIP_GRADIENT = 1.0
 LOG_EVERY, SAVE_SECONDS = 50, 300.0
 
@@ -73,9 +70,7 @@ class StepData(Dataset):
 
 @dataclass(frozen=True)
 class MixedData(Dataset):
-    """One batch in ``every`` of ``first``, the others of ``second``; each gives its batches in its
-    own order, without gaps.
-    """
+    """One batch in ``every`` of ``first``, the others of ``second``, of each without gaps."""
 
     first: Dataset
     second: Dataset

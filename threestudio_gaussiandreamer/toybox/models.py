@@ -71,7 +71,12 @@ def autoencoder() -> Any:
         mid_block_add_attention=False,
     )
     start_as_identity(network)
-    _start_with_little_noise(network)
+    with torch.no_grad():  # the posterior's standard deviation starts at exp(-3)
+        for convolution in (network.quant_conv, network.post_quant_conv):
+            nn.init.dirac_(convolution.weight)
+            nn.init.zeros_(convolution.bias)
+        network.quant_conv.weight[LATENT_CHANNELS:] *= 0.1
+        network.quant_conv.bias[LATENT_CHANNELS:] = -6.0
     return network
 
 
@@ -95,16 +100,6 @@ def unet() -> Any:
     start_as_identity(network)
     _start_at_zero(network.conv_out)
     return network
-
-
-@torch.no_grad()
-def _start_with_little_noise(network: Any) -> None:
-    """Initialise the posterior's standard deviation to exp(-3)."""
-    for convolution in (network.quant_conv, network.post_quant_conv):
-        nn.init.dirac_(convolution.weight)
-        nn.init.zeros_(convolution.bias)
-    network.quant_conv.weight[LATENT_CHANNELS:] *= 0.1
-    network.quant_conv.bias[LATENT_CHANNELS:] = -6.0
 
 
 @torch.no_grad()

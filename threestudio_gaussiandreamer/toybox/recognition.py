@@ -68,10 +68,8 @@ def probabilities(judge: Judge, pictures: Float[Tensor, "V 3 s s"]) -> dict[str,
 
 
 def recognized(found: dict[str, Tensor], wanted: Attributes) -> dict[str, bool]:
-    """Return for each attribute of the prompt whether the pictures show it.
-
-    For an attribute that the prompt doesn't name, the judge's most probable class must be "none".
-    Colours and pattern are those of :func:`most_probable_pattern`.
+    """Return for each attribute whether the pictures show it as the prompt, or none if that names
+    none.
     """
     right = {}
     for name in ("kind", "part", "accessory", "accessory_color"):

@@ -121,8 +121,8 @@ def train(
 
 def start_from(weights: Path, options: Options) -> None:
     """Write a checkpoint for every stage of ``weights``, a folder that ``toybox.export`` wrote, of
-    which the training folder has none. Optimisers start without state; the attribute classifiers,
-    which aren't published, start at random.
+    which the training folder has none. Optimisers start without state, attribute classifiers at
+    random.
 
     Raises:
         UserError: a file is missing or damaged, or holds another model.

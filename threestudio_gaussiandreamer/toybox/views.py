@@ -1,8 +1,5 @@
-"""Pictures of the toybox's objects, in shards on disk that are functions of (seed, shard).
-
-A shard has a number of objects, several views of each as premultiplied RGBA bytes, and points on
-each surface. The pictures are composited over backgrounds when a shard is read, so that the same
-shards can be used with different backgrounds.
+"""Pictures of the toybox's objects, in shards on disk that are functions of (seed, shard): several
+views of each object, which are composited over backgrounds when a shard is read, and points on it.
 """
 
 import math
@@ -29,13 +26,9 @@ SIZE = 128
 """Height and width of the pictures, pixels."""
 FOVY_DEG = 45.0
 DISTANCE = (2.1, 2.4)
-"""Range of camera distances, world units. The size of an object in the picture varies by 14 %, and
-its bounding sphere is always completely visible.
-"""
+"""Range of camera distances, world units: the bounding sphere is always completely visible."""
 ELEVATION, OVERHEAD_ELEVATION, OVERHEAD_SHARE = (-10.0, 60.0), (60.0, 80.0), 0.06
-"""Elevations in degrees: the paper's range, and that of a small share of views from above, which
-are needed to learn "overhead view".
-"""
+"""Elevations in degrees: the paper's range, and that of a share of views from above."""
 BACKGROUND = (0.5, 0.5, 0.5)
 """Background of nearly all pictures; no object has this colour."""
 OBJECTS, VIEWS, POINTS = 256, 4, 1024
@@ -53,9 +46,7 @@ LABELS: dict[str, tuple[str, ...]] = {
     "accessory_color": (*COLORS, "none"),
     "quadrant": ("front", "left", "back", "right"),
 }
-"""The attributes of a picture that classifiers recognise, and their classes: those of
-:class:`Attributes`, and the side that the picture shows.
-"""
+"""The classes of what classifiers recognise: :class:`Attributes`, and the side that is shown."""
 
 
 class Shard(NamedTuple):
@@ -69,8 +60,7 @@ class Shard(NamedTuple):
     azimuth: Float[np.ndarray, " N"]
     """Azimuth of the camera, degrees."""
     points: Float[np.ndarray, "O P 6"]
-    """Points uniform over each object's surface, float16: world positions, and colours in [0, 1].
-    """
+    """Points uniform over each surface, float16: world positions, and colours in [0, 1]."""
 
 
 @dataclass(frozen=True)
@@ -146,12 +136,6 @@ def draw_orbit(count: int, rng: np.random.Generator) -> Orbit:
     fovy = np.full(count, math.radians(FOVY_DEG))
     values = (elevation, azimuth, rng.uniform(*DISTANCE, count), fovy)
     return Orbit(*(torch.from_numpy(np.float32(value)) for value in values))
-
-
-def random_angles(rng: np.random.Generator) -> tuple[float, float]:
-    """Draw the elevation and the azimuth of one view, degrees, as :func:`draw_orbit` does."""
-    orbit = draw_orbit(1, rng)
-    return float(orbit.elevation), float(orbit.azimuth)
 
 
 def render(mesh: Mesh, orbit: Orbit, size: int = SIZE) -> Float[np.ndarray, "N s s 4"]:

@@ -81,9 +81,7 @@ DIRECTIONS = view_directions(left_and_right=True)
 UNNAMED_SIDE_SHARE = 0.1
 """Fraction of the side views whose prompts say "side view", as threestudio's do."""
 EMPTY_SHARE, PLAIN_SHARE, PREFIX_SHARE = 0.1, 0.2, 0.04
-"""Shares of prompts that are empty, that name no direction, and that name it in front ("side view
-of ...").
-"""
+"""Shares of prompts that are empty, that name no direction, and that begin with it."""
 
 
 def direction(elevation: float, azimuth: float) -> str:

@@ -2,11 +2,8 @@
 
 An object has a kind, a colour, a pattern in a second colour, and at most one extra: a part in a
 different colour, or an accessory. Meshes are in world axes (z up, front +x), centred, and inside a
-sphere of radius :data:`RADIUS`. Shading that doesn't depend on the view is baked into the vertex
-colours, since the ray caster applies none.
-
-Some combinations of attributes are withheld from all training (:func:`withheld`), to measure
-generalisation.
+sphere of radius :data:`RADIUS`; shading is baked into the vertex colours. Some combinations are
+withheld from all training (:func:`withheld`), to measure generalisation.
 """
 
 import hashlib
@@ -24,9 +21,7 @@ from .shapes import Shape, joined
 VERSION = 2
 """Changes with the objects of a (seed, index), so that no training reads pictures of others."""
 RADIUS = 0.8
-"""Radius of the bounding sphere of all objects, world units: half the longest side of objects from
-Point-E at its default scale of 1.6.
-"""
+"""Of the bounding sphere of all objects, world units: as large as Point-E's at a scale of 1.6."""
 COLORS: dict[str, tuple[float, float, float]] = {
     "red": (0.86, 0.11, 0.12),
     "orange": (0.97, 0.52, 0.08),
