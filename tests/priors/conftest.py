@@ -49,9 +49,8 @@ def motion_file(bodies, body):
 def assets(tmp_path_factory):
     """Write small sources: a body-like capsule, a coloured mesh, points and Gaussians."""
     folder = tmp_path_factory.mktemp("assets")
-    body = trimesh.creation.capsule(height=1.0, radius=0.3)  # along z
-    turn = trimesh.transformations.rotation_matrix(-np.pi / 2, [1, 0, 0])
-    body.apply_transform(turn)  # now along y, as OBJ has it
+    body = trimesh.creation.capsule(height=1.0, radius=0.3)  # along z, for OBJ along y
+    body.apply_transform(trimesh.transformations.rotation_matrix(-np.pi / 2, [1, 0, 0]))
     body.export(folder / "body.obj")
     box = trimesh.creation.box(extents=[2, 1, 0.5]).subdivide().subdivide()
     box.visual.vertex_colors = (255 * (box.vertices / 2 + 0.5).clip(0, 1)).astype(np.uint8)

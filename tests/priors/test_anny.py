@@ -15,7 +15,7 @@ from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.host import find
 from threestudio_gaussiandreamer.priors import anny as module
 from threestudio_gaussiandreamer.priors.anny import Person, load_body, shares, target_weights
-from threestudio_gaussiandreamer.priors.body_pose import JOINTS
+from threestudio_gaussiandreamer.priors.body_pose import JOINTS, POSES, SIDES, named_pose, posed
 
 PERSON = Person(gender=0.3, age=0.2, muscle=0.7, weight=0.2, height=0.8, proportions=0.3)
 VERTICES = Path(__file__).with_name("anny_vertices.csv")
@@ -154,6 +154,12 @@ def test_a_real_body_has_the_size_of_a_human_and_walks_upright(real_body, monkey
     assert joints["left shoulder"][0] > 0.1 > -0.1 > joints["right shoulder"][0]
     assert joints["left foot"][2] > joints["left ankle"][2] + 0.05  # toes in front
     np.testing.assert_allclose(real_body.weights.sum(axis=1), 1, atol=1e-6)
+    feet = [JOINTS.index(f"{side} {part}") for side in SIDES for part in ("ankle", "foot")]
+    for name in POSES:
+        found = posed(real_body, named_pose(real_body, name))
+        top, low = found.vertices[:, 1].argmax(), found.vertices[:, 1].argmin()
+        assert real_body.weights[top, JOINTS.index("head")] > 0.9
+        assert real_body.weights[low, feet].sum() > 0.9
     monkeypatch.setattr(module, "load_body", lambda person: real_body)
     points = make(pose="walking", num_points=4000)("").points
     height = np.ptp(points[:, 2])

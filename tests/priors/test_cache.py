@@ -89,8 +89,12 @@ def test_a_changed_texture_beside_a_mesh_runs_the_prior_again(tmp_path, monkeypa
 
 def test_changed_code_runs_the_prior_again(tmp_path):
     """Of a file, and of another file of the same package."""
+    path, other = tmp_path / "own.py", tmp_path / "shapes.py"
+    code = f"from {__name__} import CountingPrior\nclass Own(CountingPrior):\n    pass\n"
 
-    def key_of(path) -> str:
+    def key_of(text: str, other_text: str) -> str:
+        path.write_text(text)
+        other.write_text(other_text)
         spec = importlib.util.spec_from_file_location("parts_of_a_user", path)
         module = importlib.util.module_from_spec(spec)
         with pytest.MonkeyPatch.context() as patch:
@@ -98,14 +102,8 @@ def test_changed_code_runs_the_prior_again(tmp_path):
             spec.loader.exec_module(module)
             return cache_key(module.Own({}), "")
 
-    code = f"from {__name__} import CountingPrior\nclass Own(CountingPrior):\n    pass\n"
-    path, other, keys = tmp_path / "own.py", tmp_path / "shapes.py", []
-    for text, other_text in ((code, "a = 1"), (code, "a = 2"), (f"{code}# other\n", "a = 2")):
-        path.write_text(text)
-        other.write_text(other_text)
-        keys.append(key_of(path))
+    keys = [key_of(*texts) for texts in ((code, "1"), (code, "2"), (f"{code}# other\n", "2"))]
     assert keys[0] == keys[1] != keys[2]
     (tmp_path / "__init__.py").touch()
-    keys.append(key_of(path))
-    other.write_text("a = 3")
-    assert len({*keys, key_of(path)}) == 4
+    keys += [key_of(f"{code}# other\n", "2"), key_of(f"{code}# other\n", "3")]
+    assert len(set(keys)) == 4

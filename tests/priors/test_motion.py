@@ -55,9 +55,8 @@ class TestContract(PriorContract):
         ("a photo of Eve raising her right hand", "Someone is raising the right hand"),
         ("A knight is running quickly", "Someone is running quickly"),
         ("a zombie lying on its back. Unreal engine", "Someone is lying on the back"),
-        ("The flying dutchman punches their enemy", "Someone punches the enemy"),
+        ("The flying dutchman PUNCHES their enemy", "Someone punches the enemy"),
         ("two soldiers march", "Someone marches"),
-        ("An astronaut DANCES", "Someone dances"),
         ("Spiderman", None),
         ("kick", None),  # no subject
         ("", None),
@@ -99,6 +98,12 @@ def test_layouts_of_motions(motion_file, body, tmp_path):
 ZEROS = np.zeros((1, 22, 3, 5))
 
 
+def body_with(name, value, *place):
+    arrays = tiny.body_arrays()
+    arrays[name][place] = value
+    return arrays
+
+
 @pytest.mark.parametrize(
     "content, message",
     [
@@ -110,6 +115,11 @@ ZEROS = np.zeros((1, 22, 3, 5))
         ({"motion": np.full((1, 22, 3, 5), np.nan)}, "NaN"),
         ({"motion": np.zeros((2, 22, 3, 5)), "lengths": np.array([5])}, "lengths must be 2"),
         ({"motion": ZEROS, "lengths": np.array([6])}, "from 1 to 5"),
+        ({"v_template": ZEROS}, "no array 'shapedirs'"),
+        (tiny.body_arrays() | {"weights": np.zeros((9, 20))}, "arrays.*fit each other"),
+        (body_with("v_template", np.nan, 0), "damaged"),
+        (body_with("kintree_table", 5, 0, 5), "damaged"),
+        (body_with("f", 10**6, 0, 0), "damaged"),
     ],
 )
 def test_other_files_are_refused(tmp_path, content, message):
@@ -118,7 +128,8 @@ def test_other_files_are_refused(tmp_path, content, message):
     else:
         np.savez(tmp_path / "motion.npz", **content)
     with pytest.raises(UserError, match=message):
-        read_motions(str(tmp_path / "motion.npz"))
+        read = load_body_model if "v_template" in list(content) else read_motions
+        read(str(tmp_path / "motion.npz"))
     with pytest.raises(UserError, match="near names.*motion.npz"):
         read_motions(str(tmp_path / "motions.npz"))
 
@@ -181,18 +192,15 @@ def test_candidates_are_chosen_for_the_prompt(tmp_path, clip, asked):
 
 
 def test_pictures_show_the_front_and_both_sides():
-    """A plate facing +x fills the middle image and is narrower in the others; the background is
-    white.
-    """
+    """A plate that faces +x is widest in the middle one, one that faces +y is thin there."""
     plate = trimesh.creation.box(extents=[0.02, 1, 1])
     front, side = (
-        body_pictures(Mesh(np.asarray(plate.vertices)[:, order], np.asarray(plate.faces)))
+        (body_pictures(Mesh(plate.vertices[:, order], np.asarray(plate.faces))) < 0.99).all(-1)
         for order in ([0, 1, 2], [1, 0, 2])
     )
-    assert front.shape == (3, 224, 224, 3) and front[:, 0, 0].min() == 1
-    covered = [(picture < 0.99).all(-1).mean() for picture in front]
-    assert covered[1] > 1.2 * covered[0] and covered[1] > 1.2 * covered[2]
-    assert (side[1] < 0.99).all(-1).mean() < 0.2 * covered[1]
+    assert front.shape == (3, 224, 224) and not front[:, 0, 0].any()  # white
+    left, middle, right = front.mean(axis=(1, 2))
+    assert middle > 1.2 * max(left, right) and side[1].mean() < 0.2 * middle
 
 
 # The body in the world ----------------------------------------------------------------------------
@@ -324,30 +332,16 @@ def test_bodies_with_hands_are_read(tmp_path, body):
     assert posed_vertices(model, fit).shape == (1, vertices, 3)
 
 
-@pytest.mark.parametrize(
-    "change, message",
-    [
-        (lambda arrays: arrays.pop("posedirs"), "no array 'posedirs'"),
-        (lambda arrays: arrays.update(weights=arrays["weights"][:, :20]), "arrays.*fit each other"),
-        (lambda arrays: arrays["v_template"].__setitem__(0, np.nan), "damaged"),
-        (lambda arrays: arrays["kintree_table"].__setitem__((0, 5), 5), "damaged"),
-        (lambda arrays: arrays["f"].__setitem__((0, 0), 10**6), "damaged"),
-    ],
-)
-def test_other_body_files_are_refused(tmp_path, change, message):
-    arrays = tiny.body_arrays()
-    change(arrays)
-    np.savez(tmp_path / "body.npz", **arrays)
-    with pytest.raises(UserError, match=message):
-        load_body_model(str(tmp_path / "body.npz"))
-
-
 def test_known_poses_and_surfaces_are_found(body):
     """The twist of the bones follows from the prior, and hardly moves the surface of thin tubes."""
+    from smplx.lbs import lbs
+
     pose = random_poses(4)
     shape = torch.zeros(4, 10, dtype=torch.float64)
     shape[:, 0] = torch.linspace(-1, 1, 4)
     translation = torch.linspace(-2, 2, 12, dtype=torch.float64).reshape(4, 3)
+    _, joints = lbs(shape, pose.flatten(1), *body[:-1])
+    np.testing.assert_allclose(joints_of(body, pose, shape), joints.numpy(), atol=1e-12)
     fit = fit_bodies(body, joints_of(body, pose, shape, translation)[:, :22])
     assert fit.residuals.shape == (4, 22)
     assert fit.residuals.mean() < 2 and fit.residuals.max() < 8  # mm; the pose prior pulls a little
@@ -361,14 +355,6 @@ def test_known_poses_and_surfaces_are_found(body):
     apart = np.linalg.norm(posed_vertices(body, fit) - truth, axis=-1)
     assert apart.mean() < 0.02  # metres; tubes are 8 cm thick
     assert fit.residuals.shape == (2, 24) and fit.residuals.mean() < 2
-
-
-def test_smplx_agrees_that_posed_joints_are_those_of_the_body(body):
-    from smplx.lbs import lbs
-
-    pose, shape = random_poses(2), torch.full((2, 10), 0.5, dtype=torch.float64)
-    _, joints = lbs(shape, pose.flatten(1), *body[:-1])
-    np.testing.assert_allclose(joints_of(body, pose, shape), joints.numpy(), atol=1e-12)
 
 
 def test_knees_bend_forwards(body):

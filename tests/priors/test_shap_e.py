@@ -23,6 +23,7 @@ from threestudio_gaussiandreamer.priors.shap_e import (
 )
 
 PARTS = ("text_encoder", "tokenizer")
+QKV = "wrapped.backbone.resblocks.0.attn.c_qkv"
 
 
 @pytest.fixture(autouse=True)
@@ -153,13 +154,6 @@ def test_what_latents_depend_on(folder):
     assert all((other - base).abs().max() > 1e-4 for other in others)
 
 
-def test_options(folder):
-    wrong = {"guidance_scale": 0.0, "scale": 0.0}
-    for option, value in (wrong | {"colors": "srgb", "front": "up"}).items():
-        with pytest.raises(UserError, match=option.split("_")[0]):
-            make(folder, **{option: value})
-
-
 # Cap3D's checkpoint -------------------------------------------------------------------------------
 
 
@@ -205,20 +199,11 @@ def test_converted_weights_are_the_original_network(finetuned, folder):
     assert (sampled(folder) - sampled(folder, checkpoint=str(path))).abs().max() > 1e-4
 
 
-BLOCKS = "wrapped.backbone.resblocks"
-
-
 @pytest.mark.parametrize(
     "change, message",
     [
         (lambda state: state.pop("wrapped.ln_pre.bias"), 'Missing key.*"norm_in.bias"'),
-        (
-            lambda state: state.update({"wrapped.extra.weight": torch.zeros(1)}),
-            'ed key.*"extra.weight"',
-        ),
-        (lambda state: state.update({"wrapped.ln_pre.bias": torch.zeros(7)}), "size mismatch"),
-        (lambda state: state.update({f"{BLOCKS}.0.attn.c_qkv.bias": torch.zeros(7)}), "c_qkv.bias"),
-        (lambda state: state.clear(), "no weights by name"),
+        (lambda state: state.update({f"{QKV}.bias": torch.zeros(7)}), 'ed key.*c_qkv.bias"'),
     ],
 )
 def test_every_key_is_accounted_for(finetuned, change, message):
@@ -243,6 +228,9 @@ def weights_of(folder, part):
 )
 def test_an_incomplete_folder_or_checkpoint_is_named(copy, missing, monkeypatch):
     assert make(copy).preflight() is None
+    for option, value in {"scale": 0.0, "colors": "srgb", "front": "up"}.items():
+        with pytest.raises(UserError, match=option):
+            make(copy, **{option: value})
     monkeypatch.setattr(ShapEPrior, "_sample", lambda *args: pytest.fail("sampled"))
     with pytest.raises(UserError, match="Shap-E checkpoint"):
         make(copy, checkpoint="nothing.pth")("a fox")
@@ -253,7 +241,6 @@ def test_an_incomplete_folder_or_checkpoint_is_named(copy, missing, monkeypatch)
 
 
 def test_a_bin_is_read_when_allowed(copy, folder):
-    """As on the hub's main branch."""
     from safetensors.torch import load_file
 
     weights = weights_of(copy, "shap_e_renderer")

@@ -41,23 +41,16 @@ def changed(model, folder, **settings):
     return copy
 
 
-# What the encoders give
-# --------------------------------------------------------------------------------------------------
+# What the encoders give ---------------------------------------------------------------------------
 
 
-def test_the_embeddings_are_those_of_diffusers_stable_diffusion(models, fox):
-    folder, out = models["stable-diffusion"], fox()
-    pipe = diffusers.StableDiffusionPipeline.from_pretrained(folder, local_files_only=True)
-    cond, uncond = pipe.encode_prompt("a fox", "cpu", 1, True, negative_prompt="ugly")
-    assert_same(out.text_embeddings, cond)
-    assert_same(out.uncond_text_embeddings, uncond)
-
-
-def test_the_embeddings_are_those_of_diffusers_deep_floyd(models):
-    folder = models["deep-floyd"]
-    out = processed(folder, "deep-floyd", prompt=" a Fox")
-    pipe = diffusers.IFPipeline.from_pretrained(folder, local_files_only=True, watermarker=None)
-    cond, uncond = pipe.encode_prompt(" a Fox", device="cpu", negative_prompt="ugly")
+@pytest.mark.parametrize(("kind", "pipeline"), zip(KINDS, ("StableDiffusion", "IF"), strict=True))
+def test_the_embeddings_are_those_of_diffusers(models, kind, pipeline):
+    out = processed(models[kind], kind, prompt=" a Fox")
+    options = {"local_files_only": True} | ({"watermarker": None} if pipeline == "IF" else {})
+    pipe = getattr(diffusers, f"{pipeline}Pipeline").from_pretrained(models[kind], **options)
+    given = {"device": "cpu", "num_images_per_prompt": 1, "do_classifier_free_guidance": True}
+    cond, uncond = pipe.encode_prompt(" a Fox", **given, negative_prompt="ugly")
     assert_same(out.text_embeddings, cond)
     assert_same(out.uncond_text_embeddings, uncond)
 
@@ -110,9 +103,7 @@ def test_the_embeddings_are_those_of_diffusers_stable_diffusion_3(models, use_t5
 
 
 def test_tokens_of_stable_diffusion_2(models, fox, tmp_path, caplog):
-    """Its tokenizer pads with "!" (0); one of its two files contradicts this, and reading that one
-    would change every embedding.
-    """
+    """Its tokenizer pads with "!" (0), which one of its two files contradicts."""
     from transformers import AutoTokenizer
 
     folder = models["stable-diffusion"]
@@ -168,8 +159,7 @@ def test_a_damaged_model_is_reported_and_its_code_not_offered_to_be_run(
         processed(folder)
 
 
-# The cache
-# --------------------------------------------------------------------------------------------------
+# The cache ----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("kind", ["stable-diffusion", "stable-diffusion-xl", "stable-diffusion-3"])
@@ -179,9 +169,7 @@ def test_the_second_time_the_encoder_is_not_loaded(models, kind, monkeypatch):
     # the prompt, four directions, the negative prompt
     assert len(files) == 6 and all(path.suffix == ".safetensors" for path in files)
     assert len(first.text_embeddings_vd.unique(dim=0)) == 4
-    monkeypatch.setattr(
-        text_encoders, "load_network", lambda *args, **options: pytest.fail("loaded again")
-    )
+    monkeypatch.setattr(text_encoders, "load_network", lambda *_, **__: pytest.fail("loaded"))
     second = processed(models[kind], kind)
     assert torch.equal(first.text_embeddings_vd, second.text_embeddings_vd)
 
@@ -207,9 +195,7 @@ def test_a_cache_folder_is_checked_before_the_encoder_is_loaded(fox, tmp_path, m
     fox(cache_dir="other", use_cache=False)
     assert not (tmp_path / "other").exists()
     fox(cache_dir="cache")
-    monkeypatch.setattr(
-        text_encoders, "load_network", lambda *args, **options: pytest.fail("loaded")
-    )
+    monkeypatch.setattr(text_encoders, "load_network", lambda *_, **__: pytest.fail("loaded"))
     with pytest.raises(UserError, match="cache_dir.*can't be made: Not a directory"):
         fox(cache_dir="file/cache")
     # a read-only cache that holds all embeddings is enough
@@ -222,8 +208,7 @@ def test_a_cache_folder_is_checked_before_the_encoder_is_loaded(fox, tmp_path, m
         fox(cache_dir="cache", prompt="another fox")
 
 
-# Which prompt
-# --------------------------------------------------------------------------------------------------
+# Which prompt -------------------------------------------------------------------------------------
 
 
 def test_prompts_of_the_user(models, fox, tmp_path, caplog):
@@ -232,14 +217,10 @@ def test_prompts_of_the_user(models, fox, tmp_path, caplog):
     assert fox(prompt="", prompt_file="prompt.txt").prompt == text
     copy = changed(models["stable-diffusion"], tmp_path / "model")
     (copy / WORDS_FILE).write_text("a\n")
-    out = processed(
-        copy, view_dependent_left_and_right=True, prompt_side="a flank", prompt_back="a tail"
-    )
-    assert out.prompts_vd == ["a flank"] * 2 + [
-        "a fox, front view",
-        "a tail",
-        "a fox, overhead view",
-    ]
+    given = {"prompt_side": "a flank", "prompt_back": "a tail"}
+    out = processed(copy, view_dependent_left_and_right=True, **given)
+    front, overhead = (f"a fox, {name} view" for name in ("front", "overhead"))
+    assert out.prompts_vd == ["a flank", "a flank", front, "a tail", overhead]
     assert "'fox'" in caplog.text and "'tail'" in caplog.text  # which this model doesn't know
     with pytest.raises(UserError, match="no prompt"):
         fox(prompt="  ")
@@ -265,8 +246,7 @@ def test_the_prompt_library(fox, tmp_path):
             fox(prompt="lib:fox")
 
 
-# Models
-# --------------------------------------------------------------------------------------------------
+# Models -------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -57,15 +57,11 @@ def test_perp_neg_by_hand():
     computed here.
     """
     out = output()
-    embeddings, weights = out.get_text_embeddings_perp_neg(
-        *views((0.0, -30.0), (10.0, 120.0), (80.0, 10.0))
-    )
+    where = views((0.0, -30.0), (10.0, 120.0), (80.0, 10.0))
+    embeddings, weights = out.get_text_embeddings_perp_neg(*where)
     side, front, back, overhead = out.text_embeddings_vd
-    positive, uncond, negative = (
-        embeddings[:3],
-        embeddings[3:6],
-        embeddings[6:].unflatten(0, (3, 2)),
-    )
+    positive, uncond = embeddings[:3], embeddings[3:6]
+    negative = embeddings[6:].unflatten(0, (3, 2))
     torch.testing.assert_close(positive[0], 2 / 3 * front + 1 / 3 * side)
     torch.testing.assert_close(positive[1], 2 / 3 * side + 1 / 3 * back)
     assert torch.equal(positive[2], overhead)
@@ -86,10 +82,9 @@ def test_perp_neg_of_left_and_right_sides():
     angles = views((0.0, 30.0), (0.0, -30.0), (0.0, 120.0), (0.0, -120.0))
     embeddings, weights = out.get_text_embeddings_perp_neg(*angles)
     positive, negative = embeddings[:4], embeddings[8:].unflatten(0, (4, 2))
-    for row, (one, other) in enumerate(
-        [(front, left), (front, right), (left, back), (right, back)]
-    ):
+    between = [(front, left), (front, right), (left, back), (right, back)]
+    for row, (one, other) in enumerate(between):
         torch.testing.assert_close(positive[row], 2 / 3 * one + 1 / 3 * other)
-    for row, pair in enumerate([(front, left), (front, right), (left, front), (right, front)]):
-        assert torch.equal(negative[row], torch.stack(pair))
+    pairs = [(front, left), (front, right), (left, front), (right, front)]
+    assert torch.equal(negative, torch.stack([torch.stack(pair) for pair in pairs]))
     assert torch.equal(weights[0], weights[1]) and torch.equal(weights[2], weights[3])

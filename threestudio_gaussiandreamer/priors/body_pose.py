@@ -54,8 +54,6 @@ NEEDED = [f"{side} {joint}" for side in SIDES for joint in ("hip", "knee", "shou
 """Joints without whose positions there is no pose."""
 Z_UP = [2, 0, 1]
 """The axes of z up, front +x, among those of y up, front +z."""
-LEAST_EXTENT = 1e-6
-"""Smallest width and height of hips and chest, relative to their sum."""
 POSES: dict[str, dict[str, tuple[float, float, float]]] = {
     "A": {"left shoulder": (0, 0, -45), "right shoulder": (0, 0, 45)},
     "T": {},
@@ -163,10 +161,10 @@ def part_frame(positions: dict[str, Float[np.ndarray, "3"]], part: str) -> Float
     high = positions.get("neck", chest)
     if part == "hip":
         high = positions.get("lower spine", high)
-    across = _unit(left - right)
+    across, width = _unit(left - right), np.linalg.norm(left - right)
     rise = (high - low) - ((high - low) @ across) * across
-    size = np.linalg.norm(high - low) + np.linalg.norm(left - right)
-    if min(np.linalg.norm(left - right), np.linalg.norm(rise)) <= LEAST_EXTENT * size:
+    size = np.linalg.norm(high - low) + width
+    if min(width, np.linalg.norm(rise)) <= 1e-6 * size:
         raise UserError(
             f"the pose has its {part}s and spine on one line: there is no front; choose another "
             "frame or file"
@@ -252,8 +250,6 @@ PAIRED = {
     "wrist": ("wrist", "hand"),
 }
 """Parts of the names of each joint, the most specific one first."""
-LARGEST = 1e9
-"""Squares of larger numbers could overflow."""
 
 
 def read_pose(
@@ -421,7 +417,8 @@ def _numbers(words: list[str], count: int) -> Float[np.ndarray, " N"]:
         values = np.array(words, np.float64)
     except ValueError:
         values = np.array([np.nan])
-    fits = len(values) == count and (np.abs(values) < LARGEST).all()
+    # squares of larger ones could overflow
+    fits = len(values) == count and (np.abs(values) < 1e9).all()
     line = " ".join(words)[:80]
     require(fits, f"{count} finite numbers were expected in the line {line!r}")
     return values

@@ -59,9 +59,7 @@ def cache_key(prior: Any, prompt: str) -> str:
 
 
 def _files(options: Any) -> Iterator[tuple[str, int, int]]:
-    """Yield name, size and time of change of the files that options name, or that are below the
-    folders that they name.
-    """
+    """Yield name, size and time of change of the files that options name, or in such folders."""
     values = options.values() if isinstance(options, dict) else options
     for value in values:
         if isinstance(value, (dict, list, tuple)):
@@ -75,9 +73,7 @@ def _files(options: Any) -> Iterator[tuple[str, int, int]]:
 
 
 def _code(kind: type) -> Iterator[tuple[str, str]]:
-    """Yield name and digest of the source files of a class and those it is derived from, with all
-    files of their folders that are packages.
-    """
+    """Yield name and digest of the source files of a class and its bases, in packages of all."""
     modules = {base.__module__ for base in kind.__mro__}
     found = [getattr(sys.modules.get(name), "__file__", None) for name in sorted(modules)]
     for file in map(Path, filter(None, found)):

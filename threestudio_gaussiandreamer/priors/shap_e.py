@@ -194,16 +194,14 @@ RENAMED = {
     "mlp.c_proj": "ff.net.2",
 }
 """OpenAI's names of layers, and diffusers'."""
-UNUSED_BY_SHAP_E = ("clip_mean", "clip_std")
-"""Parameters that diffusers' class has for another model."""
 
 
 def load_original_prior(prior: nn.Module, path: str) -> None:
     """Replace the weights of diffusers' ``prior`` by those in OpenAI's format."""
     heads = prior.config.num_attention_heads
     state = to_diffusers(read_state_dict(path, "Shap-E checkpoint"), heads)
-    own = prior.state_dict()
-    state.update({name: own[name] for name in UNUSED_BY_SHAP_E if name in own})
+    # parameters that diffusers' class has for another model
+    state.update({k: v for k, v in prior.state_dict().items() if k in ("clip_mean", "clip_std")})
     load_exactly(prior, state, f"Shap-E checkpoint {path!r}")
 
 

@@ -29,9 +29,7 @@ PERP_NEG = {
   share of "side".
 """
 THRESHOLDS = {"front_threshold": 45.0, "back_threshold": 45.0, "overhead_threshold": 60.0}
-"""threestudio's half the width of front and back, and the elevation above which a view is overhead,
-degrees.
-"""
+"""threestudio's half widths of front and back, and the elevation above which views are overhead."""
 
 
 class Direction(NamedTuple):

@@ -88,8 +88,9 @@ def run(args: argparse.Namespace) -> int:
     root = output_folder(args.output, "--output")
     recognition.load_judge(args.models)  # a missing file is reported before the training
     claimed = open_folder(root, {key: vars(args)[key] for key in ("prompts", "options", "models")})
+    names = (re.sub(r"[^a-z0-9]+", "_", p.lower())[:NAME_LENGTH] for p in args.prompts)
     try:
-        runs = [run_folder(claimed.path, i, prompt) for i, prompt in enumerate(args.prompts, 1)]
+        runs = [claimed.path / "runs" / f"prompt{i}_{name}" for i, name in enumerate(names, 1)]
         for index in range(len(runs)):
             if code := train(claimed.path, index, runs[index], args):
                 return code
@@ -113,12 +114,6 @@ def open_folder(root: Path, record: dict[str, Any]) -> RunFolder:
 
 
 # ---- training ------------------------------------------------------------------------------------
-
-
-def run_folder(folder: Path, number: int, prompt: str) -> Path:
-    """Return the folder of a prompt's run."""
-    words = re.sub(r"[^a-z0-9]+", "_", prompt.lower())[:NAME_LENGTH]
-    return folder / "runs" / f"prompt{number}_{words}"
 
 
 def train(folder: Path, index: int, place: Path, args: argparse.Namespace) -> int:
@@ -181,7 +176,11 @@ def write_results(folder: Path, args: argparse.Namespace, runs: list[Path]) -> N
     text = table(args.prompts, runs, stages)
     with atomic_file(folder / TABLE) as file:
         file.write(f"{text}\n".encode())
-    images.write(folder / SHEET, sheet(args.prompts, stages))
+    pictures = torch.cat([each[name][0] for each in stages for name in STAGES])
+    first = [f"{name}: {prompt}" for prompt in args.prompts for name in STAGES]
+    texts = [text for one in first for text in (one, *[""] * (len(SHOWN) - 1))]
+    sheet = contact_sheet(pictures, texts, columns=len(STAGES) * len(SHOWN))
+    images.write(folder / SHEET, sheet)
     print(f"\n{text}\n\n{folder / SHEET}\n{folder / TABLE}")
     for place in runs:
         print(*(str(path) for path in sorted(place.glob("save/it*-export/view.html"))))
@@ -229,14 +228,6 @@ def samples(
         lambda z, t: guidance.predict_noise(z, t, condition), noise, t, abar, steps=SAMPLE_STEPS
     )
     return guidance.decode(latents).cpu()
-
-
-def sheet(prompts: Sequence[str], stages: Sequence[Stages]) -> Any:
-    """Arrange a row of pictures for each prompt: three of each stage."""
-    pictures = torch.cat([each[name][0] for each in stages for name in STAGES])
-    first = [f"{name}: {prompt}" for prompt in prompts for name in STAGES]
-    texts = [text for one in first for text in (one, *[""] * (len(SHOWN) - 1))]
-    return contact_sheet(pictures, texts, columns=len(STAGES) * len(SHOWN))
 
 
 def contact_sheet(

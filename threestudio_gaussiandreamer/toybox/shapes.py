@@ -70,7 +70,10 @@ def box(role: str, center, half, taper=(1.0, 1.0), axis=(0, 0, 1)) -> Shape:
         [[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]]
     )
     vertices = corners[quads].reshape(-1, 3)
-    normals = np.repeat(_quad_normals(corners[quads]), 4, axis=0)
+    a, b, c, d = np.moveaxis(corners[quads], 1, 0)
+    normals = np.cross(c - a, d - b)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
+    normals = np.repeat(normals, 4, axis=0)
     (x, y, z), (nx, ny, nz) = vertices.T, np.abs(normals.T)
     flat = nz > 0.9
     uv = np.stack([np.where(~flat & (nx > ny), y, x), np.where(flat, y, z)], 1)
@@ -153,8 +156,3 @@ def _grid_faces(rows: int, columns: int) -> Int[np.ndarray, "F 3"]:
     a = (i * columns + j).reshape(-1)
     quads = np.stack([a, a + columns, a + columns + 1, a + 1], 1)
     return np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
-
-
-def _quad_normals(quads: Float[np.ndarray, "Q 4 3"]) -> Float[np.ndarray, "Q 3"]:
-    normal = np.cross(quads[:, 2] - quads[:, 0], quads[:, 3] - quads[:, 1])
-    return normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)

@@ -81,11 +81,9 @@ def kept_moments(path: Path) -> Float[Tensor, "2 N 4 s s"]:
 
 
 class UNetStage(Stage):
-    """Train v-prediction with the weights SNR + 1 of Salimans and Ho (2022), where the SNR is
-    truncated as in Hang et al. (2023).
-
-    In most steps the self-attention joins the views of an object, as in MVDream (Shi et al. 2023,
-    section 3.1), so that their prompts have to tell the directions apart.
+    """Train v-prediction with the weights SNR + 1 of Salimans and Ho (2022), truncated as in Hang
+    et al. (2023). In most steps the self-attention joins the views of an object, as in MVDream (Shi
+    et al. 2023), so that their prompts have to tell the directions apart.
     """
 
     name = "unet"

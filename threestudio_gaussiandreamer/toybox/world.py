@@ -11,7 +11,7 @@ import itertools
 from typing import NamedTuple, Optional
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from ..core.streams import numpy_generator
 from ..meshes.mesh import Mesh
@@ -119,30 +119,18 @@ def object_mesh(attributes: Attributes, rng: np.random.Generator) -> Mesh:
     roles = np.array(names)
     like_body = (roles == "part") & (not attributes.part)
     stretch = rng.uniform(0.85, 1.15)
+    low, high = shape.vertices.min(axis=0), shape.vertices.max(axis=0)
+    vertices = shape.vertices - (low + high) / 2
+    # half-Lambert light from above, never below AMBIENT, and darker on parts like the body
+    light = AMBIENT + (1 - AMBIENT) * (0.5 + 0.5 * shape.normals @ LIGHT)
+    light = np.where(like_body, PART_SHADE, 1.0) * light
     return Mesh(
-        vertices=_centred(shape.vertices),
+        vertices=vertices * (RADIUS / np.linalg.norm(vertices, axis=1).max()),
         faces=shape.faces,
         uv=_texture_coordinates(attributes.pattern, shape, roles, like_body, stretch),
         texture=texture(attributes),
-        vertex_colors=_shading(shape.normals, like_body),
+        vertex_colors=np.repeat(light[:, None], 3, axis=1).astype(np.float32),
     )
-
-
-def _centred(vertices: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, "V 3"]:
-    """Centre the bounding box at the origin, and scale the farthest vertex to distance RADIUS."""
-    vertices = vertices - (vertices.min(axis=0) + vertices.max(axis=0)) / 2
-    return vertices * (RADIUS / np.linalg.norm(vertices, axis=1).max())
-
-
-def _shading(
-    normals: Float[np.ndarray, "V 3"], like_body: Bool[np.ndarray, " V"]
-) -> Float[np.ndarray, "V 3"]:
-    """Return half-Lambert light from above, never below AMBIENT, and darker on parts that have the
-    body's colours.
-    """
-    light = AMBIENT + (1 - AMBIENT) * (0.5 + 0.5 * normals @ LIGHT)
-    light = np.where(like_body, PART_SHADE, 1.0) * light
-    return np.repeat(light[:, None], 3, axis=1).astype(np.float32)
 
 
 # Texture: the pattern's PERIODS^2 periods, and to the right of them a column of cells, each plain
