@@ -57,6 +57,7 @@ SECTIONS = {
 GIVEN = {
     **{"prompt": "a ball", "pretrained_model_name_or_path": "a model", "checkpoint": "base.pt"},
     **{"path": "fox.ply", "mesh": "toy.glb", "motion": "results.npz", "body_model": "body.npz"},
+    "texture": "skin.png",
 }
 """Values in place of an empty default, which no run can have."""
 PROCESSORS = {"gaussiandreamer-mvdream-": "gaussiandreamer-stable-diffusion-"}
