@@ -69,7 +69,11 @@ def test_files_of_other_programs_have_the_axes_of_their_format(tmp_path, caplog)
     assert [read_cloud(str(tmp_path / name)).up for name in ("a.spz", "a.glb")] == ["y", "y"]
 
 
-def test_mistakes(tmp_path):
+def test_mistakes_and_harmonics_above_degree_3(tmp_path, caplog):
+    path, whole = str(tmp_path / "whole.ply"), cloud(degree=4)
+    write_raw_gaussians(path, whole)
+    np.testing.assert_array_equal(read_cloud(path).gaussians.sh, whole.sh[:, :16])
+    assert "harmonics of degree 4 a part is left out: 3 is the highest" in caplog.text
     said = r"OUT: expected the name of a .ply, .* or .usdz file, got 'a.obj'"
     with pytest.raises(UserError, match=said):
         write_cloud("a.obj", StoredCloud(cloud()))
@@ -90,13 +94,6 @@ def test_scenes_in_levels_of_detail_are_refused_with_what_converts_them(tmp_path
         read_cloud(str(tmp_path / name))
     with pytest.raises(UserError, match=said):
         find("gaussians-prior")({"path": str(tmp_path / name)}).preflight()
-
-
-def test_harmonics_above_degree_3_are_left_out(tmp_path, caplog):
-    path, whole = str(tmp_path / "a.ply"), cloud(degree=4)
-    write_raw_gaussians(path, whole)
-    np.testing.assert_array_equal(read_cloud(path).gaussians.sh, whole.sh[:, :16])
-    assert "harmonics of degree 4 a part is left out: 3 is the highest" in caplog.text
 
 
 @pytest.mark.parametrize(

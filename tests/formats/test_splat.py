@@ -27,9 +27,7 @@ def test_a_record_put_together_by_hand_is_read(tmp_path):
     np.testing.assert_allclose(0.5 + 0.28209479 * read.sh[0, 0], [1, 0, 128 / 255], atol=1e-6)
     np.testing.assert_allclose(1 / (1 + np.exp(-read.logit_opacities)), [0.2], atol=1e-6)
     np.testing.assert_allclose(read.quats, [[127 / 128, 0, -1, 0]])
-
-
-def test_rows_that_cant_be_drawn_are_left_out(tmp_path):
+    # rows that can't be drawn are left out
     nan, negative = struct.pack("<f", np.nan), struct.pack("<f", -1)
     bad = nan + RECORD[4:] + RECORD[:12] + negative + RECORD[16:]
     read = read_cloud(str(stored(tmp_path, RECORD + bad)))
@@ -106,12 +104,10 @@ def test_all_levels_and_sections_are_read(tmp_path, level):
     for at, cloud in enumerate([clouds[0], clouds[1]._replace(sh=padded)]):
         rows = np.arange(at * COUNT, (at + 1) * COUNT)
         assert_close(cloud, read.gaussians.rows(rows), **steps)
-
-
-def test_a_scale_that_float16_rounds_to_0_is_flat(tmp_path):
+    # a scale that float16 rounds to 0 is flat
     cloud = ball(COUNT, 1)
     cloud.log_scales[:, 2] = -30
-    read = read_cloud(str(ksplat_file(tmp_path / "a.ksplat", 1, [cloud]))).gaussians
+    read = read_cloud(str(ksplat_file(tmp_path / "a.ksplat", max(level, 1), [cloud]))).gaussians
     assert len(read.means) == COUNT and (read.log_scales[:, 2] < np.log(1e-6)).all()
 
 

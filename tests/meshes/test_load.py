@@ -38,7 +38,13 @@ def center_color(mesh, face=0):
     return surface_colors(mesh, np.array([face]), THIRDS)[0]
 
 
-def test_the_box_is_centred_and_its_longest_half_side_is_the_scale(tmp_path):
+def test_a_scene_is_merged_and_centred_and_its_longest_half_side_is_the_scale(tmp_path):
+    scene = trimesh.Scene()
+    scene.add_geometry(box(), transform=trimesh.transformations.translation_matrix([0, 0, 3]))
+    scene.add_geometry(box())
+    mesh = load_mesh(saved(scene, tmp_path / "scene.glb"))
+    assert len(mesh.faces) == 24
+    np.testing.assert_allclose(np.ptp(mesh.vertices, axis=0), [2, 0.5, 0.5], atol=1e-6)
     for unit in (1, 1e3):
         made = box((2 * unit, 5 * unit, unit), (100 * unit, -3, 7))
         mesh = load_mesh(saved(made, tmp_path / "box.stl"), scale=1.5)
@@ -61,15 +67,13 @@ def test_the_axes_of_formats_and_given_ones(tmp_path):
         turn = np.stack([AXES[front], np.cross(AXES[up], AXES[front]), AXES[up]])
         np.testing.assert_allclose(mesh.vertices, given.vertices @ turn.T, atol=1e-12)
         assert np.isclose(np.linalg.det(turn), 1)
-
-
-def test_a_scene_is_merged_with_its_transforms(tmp_path):
-    scene = trimesh.Scene()
-    scene.add_geometry(box(), transform=trimesh.transformations.translation_matrix([0, 0, 3]))
-    scene.add_geometry(box())
-    mesh = load_mesh(saved(scene, tmp_path / "scene.glb"))
-    assert len(mesh.faces) == 24
-    np.testing.assert_allclose(np.ptp(mesh.vertices, axis=0), [2, 0.5, 0.5], atol=1e-6)
+    for up, front, said in (
+        ("z", None, "up axis"),
+        ("auto", "+w", "front axis"),
+        ("+z", "-z", "along"),
+    ):
+        with pytest.raises(UserError, match=said):
+            load_mesh(path, up=up, front=front)
 
 
 def test_colours_of_vertices_faces_and_materials(tmp_path):
@@ -163,10 +167,7 @@ def test_objects_as_programs_write_them_are_read(tmp_path):
         "  v\t0 0 0\nv 1 0 0\nV 0 1 0\nf -3 -2 -1\n\tF 1//1 2//1 3//1\nvn 0 0 1\n"
     )
     assert len(load_mesh(tmp_path / "b.obj").faces) == 2
-
-
-def test_faces_of_an_obj_that_count_backwards(tmp_path):
-    """From vertices that others follow, as generators write one part after the other."""
+    # faces count backwards from vertices that others follow, as generators write parts
     first, second = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvn 0 0 1\n", "v 0 0 1\nv 1 0 1\nvt 1 1\n"
     backwards, absolute = ("-3/-1/-1 -2/-1 -1", "-2/-1 2 -4"), ("1/1/1 2/1 3", "4/2 2 2")
     found = []
@@ -220,19 +221,6 @@ def test_a_long_line_takes_linear_time(tmp_path, line):
     with pytest.raises(UserError, match="a.obj"):
         load_mesh(tmp_path / "a.obj")
     assert time.process_time() - started < 2  # a quadratic search takes minutes
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"up": "z"}, "up axis 'z'"),
-        ({"front": "+w"}, "front axis"),
-        ({"up": "+z", "front": "-z"}, "along"),
-    ],
-)
-def test_bad_options_are_named(tmp_path, options, message):
-    with pytest.raises(UserError, match=message):
-        load_mesh(saved(box(), tmp_path / "a.ply"), **options)
 
 
 OFF_FACES = "3 0 2 1\n3 0 1 3\n3 0 3 2\n3 1 2 3\n"
