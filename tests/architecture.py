@@ -43,7 +43,7 @@ STEPS = (
     Step("training/data.py", "GaussianDreamerDataModule", "draw the cameras of step k"),
     Step("training/system.py", "training_step", "render, score, sum the losses, backward"),
     Step("training/renderer.py", "forward", "convert host cameras to OpenCV, composite"),
-    Step("splatting/api.py", "rasterize", "validate, choose a backend, splat"),
+    Step("splatting/backends.py", "rasterize", "validate, choose a backend, splat"),
     Step("guidance/base.py", "ScoreDistillation", "encode, add noise, predict, weigh, clip"),
     Step("diffusion/sds.py", "diffuse", "the formulas of score distillation"),
     Step("training/density.py", "DensityControl", "clone, split and drop Gaussians after the step"),

@@ -130,16 +130,6 @@ def test_slicing_keeps_the_activations_of_one_image(models):
     assert sizes[True] < sizes[False] / 20
 
 
-def test_a_model_without_one_size_is_asked_for(tmp_path):
-    folder = tiny_models.stable_diffusion(tmp_path / "model")
-    config = json.loads((folder / "unet" / "config.json").read_text())
-    for trained in (None, [8, 8]):
-        (folder / "unet" / "config.json").write_text(json.dumps(config | {"sample_size": trained}))
-        with pytest.raises(UserError, match="set system.guidance.image_size"):
-            guidance({"epsilon": folder})
-    assert guidance({"epsilon": folder}, image_size=64).image_size == 64
-
-
 def test_an_unusual_guidance_scale_is_told_and_compiling_asked_for_once(
     models, caplog, monkeypatch
 ):
@@ -153,11 +143,23 @@ def test_an_unusual_guidance_scale_is_told_and_compiling_asked_for_once(
             assert asked == [guide.unet]
 
 
-def test_a_model_of_another_task_is_refused_before_the_prior(tmp_path):
-    from diffusers import UNet2DConditionModel
+def test_models_that_cannot_be_used_are_refused(tmp_path):
+    from diffusers import FlowMatchEulerDiscreteScheduler, UNet2DConditionModel
 
-    folder = tiny_models.stable_diffusion(tmp_path / "other")
+    folder = tiny_models.stable_diffusion(tmp_path / "other", prediction="flow_prediction")
+    with pytest.raises(UserError, match="prediction_type.*did you mean 'v_prediction'"):
+        guidance({"epsilon": folder})
+    FlowMatchEulerDiscreteScheduler().save_pretrained(folder / "scheduler")
+    with pytest.raises(UserError, match="no beta_schedule"):
+        guidance({"epsilon": folder})
+    folder = tiny_models.stable_diffusion(tmp_path / "model")
     config = UNet2DConditionModel.load_config(folder / "unet")
+    for trained in (None, [8, 8]):
+        text = json.dumps(dict(config) | {"sample_size": trained})
+        (folder / "unet" / "config.json").write_text(text)
+        with pytest.raises(UserError, match="set system.guidance.image_size"):
+            guidance({"epsilon": folder})
+    assert guidance({"epsilon": folder}, image_size=64).image_size == 64
     for other in ({"in_channels": 9}, {"class_embed_type": "timestep"}):
         UNet2DConditionModel.from_config(config | other).save_pretrained(folder / "unet")
         said = "needs other inputs than text .*" + " ".join(map(str, *other.items()))
@@ -165,16 +167,8 @@ def test_a_model_of_another_task_is_refused_before_the_prior(tmp_path):
             guidance({"epsilon": folder})
 
 
-def test_a_scheduler_of_another_process_is_refused(tmp_path):
-    from diffusers import FlowMatchEulerDiscreteScheduler
-
-    folder = tiny_models.stable_diffusion(tmp_path / "flow", prediction="flow_prediction")
-    with pytest.raises(UserError, match="prediction_type.*did you mean 'v_prediction'"):
-        guidance({"epsilon": folder})
-    FlowMatchEulerDiscreteScheduler().save_pretrained(folder / "scheduler")
-    with pytest.raises(UserError, match="no beta_schedule"):
-        guidance({"epsilon": folder})
-    if NAME == "builtin":  # inside threestudio its own part has this name
+def test_the_name_of_threestudio_is_this_part_where_it_is_not_the_host():
+    if NAME == "builtin":
         part = stable_diffusion.StableDiffusionGuidance
         assert find("stable-diffusion-guidance") is part
 

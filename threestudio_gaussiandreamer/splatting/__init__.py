@@ -1,7 +1,6 @@
 """Differentiable splatting of 3-D Gaussians: one image model, several backends."""
 
-from .api import rasterize
-from .backends import available_backends
+from .backends import available_backends, rasterize
 from .scene import Rasterized, RasterizeOptions
 from .validation import PRESETS
 

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from threestudio_gaussiandreamer.splatting.cuda import nvrtc
-from threestudio_gaussiandreamer.splatting.cuda.stages import NOWHERE
+from threestudio_gaussiandreamer.splatting.cuda.backend import NOWHERE
 
 FOLDER = Path(__file__).parent
 # Nothing is fused but what the kernels fuse on purpose; reading four floats as one is usual in

@@ -218,12 +218,10 @@ class LoRAParticles(nn.Module):
         for name, parameter in own.items() if state else ():
             parameter.copy_(state[name])
             if f"step.{name}" in state:
-                found = {key: state[f"{key}.{name}"].clone() for key in MOMENTS}
+                moments = {key: state[f"{key}.{name}"].clone() for key in MOMENTS}
                 # Adam expects its step count on the CPU
-                self.optimizer.state[parameter] = {
-                    key: value.cpu() if key == "step" else value.to(parameter)
-                    for key, value in found.items()
-                }
+                moved = {key: moments[key].to(parameter) for key in MOMENTS[:2]}
+                self.optimizer.state[parameter] = moved | {"step": moments["step"].cpu()}
 
 
 def adapted_layers(network: nn.Module) -> list[nn.Linear]:
