@@ -39,7 +39,7 @@ doesn't bound colours, were repeated after its growing radius became a share of 
 their seconds are those of the
 first measurement, on the same processor as the other rows', with as many Gaussians and steps. All
 seconds of direction bins and view-blind scores were measured before the distances to their pictures
-became [scalar products](../threestudio_gaussiandreamer/guidance/picture_bank.py), and are longer
+became [scalar products](../threestudio_gaussiandreamer/guidance/exact_score.py), and are longer
 than now.
 
 What was measured to choose these settings: [answered questions](answered.md#quality).

@@ -6,11 +6,19 @@ import numpy as np
 import pytest
 import torch
 
+from tests.diffusion.test_exact_score import denoised
 from tests.guidance.exact_score_cases import batch, guidance, step, uniform
 from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.diffusion import exact_score as closed_form
 from threestudio_gaussiandreamer.diffusion import sds
 from threestudio_gaussiandreamer.guidance import exact_score
-from threestudio_gaussiandreamer.guidance.exact_score import ExactScoreGuidance
+from threestudio_gaussiandreamer.guidance.exact_score import (
+    Bank,
+    ExactScoreGuidance,
+    composite,
+    mixture_of,
+    scores,
+)
 from threestudio_gaussiandreamer.meshes.raycast import MeshCaster
 from threestudio_gaussiandreamer.splatting.cpu import backend as cpu
 
@@ -200,3 +208,59 @@ def test_one_of_the_two_predictions_counts_as_one_evaluation(mesh_path):
     assert torch.equal(guide.conditional(z, t, condition), both[0])
     assert torch.equal(guide.unconditional(z, t, condition), both[1])
     assert guide.evaluations == 8
+
+
+# The modes of mixtures
+# --------------------------------------------------------------------------------------------------
+
+
+MEMBERS = torch.tensor(
+    [[True, True, False, True, False, True, True], [False] * 6 + [True], [True] * 7]
+)
+"""Of each item, in the bank."""
+ABAR = sds.sd_alphas_cumprod()[torch.tensor([20, 300, 900])]
+
+
+@pytest.fixture(params=["pixel", "latent"])
+def bank(request):
+    rgba = (255 * uniform(7, 8, 8, 4, seed=0)).byte()
+    pixels = rgba.movedim(-1, 1) / 255
+    if request.param == "pixel":
+        return Bank.of(rgba, pixels, closed_form.LinearLatent())
+    pooled = torch.nn.functional.avg_pool2d(pixels, 2)
+    latent = closed_form.LinearLatent(2, closed_form.COLOR_MATRIX)
+    return Bank.of(rgba, pooled, latent.normalised(pooled[:, :3]))
+
+
+def predicted(mixtures, z, abar, conditional):
+    eps, perplexity, unconditional = scores(z.flatten(1), abar, mixtures)
+    return (eps, perplexity) if conditional else (unconditional(), None)
+
+
+@pytest.mark.parametrize("guided", [False, True])
+@pytest.mark.parametrize("size, pictures_at_a_time", [(1, 100), (1, 3), (8, 1)])
+def test_scores_are_those_of_pictures_composited_on_the_background_of_each_item(
+    bank, monkeypatch, size, guided, pictures_at_a_time
+):
+    elements = bank.pictures.layers[0].numel()
+    monkeypatch.setattr(closed_form, "CPU_CHUNK_ELEMENTS", pictures_at_a_time * elements)
+    backgrounds = uniform(len(MEMBERS), size, size, 3, seed=1)
+    z = bank.latent.encode(composite(bank.rgba[: len(MEMBERS)], backgrounds)) + 0.1
+    own = z.flip(0)
+    items = zip(own, MEMBERS, backgrounds, strict=True)
+    mixtures = [mixture_of(*item, bank, guided) for item in items]
+    of_a_color = size == 1  # whose items have the same pictures
+    for conditional in (True, False) if guided else (True,):
+        together = predicted(mixtures, z, ABAR, conditional) if of_a_color else None
+        for i in range(len(MEMBERS)):
+            item = slice(i, i + 1)
+            pictures = bank.rgba[MEMBERS[i]] if conditional else bank.rgba
+            modes = bank.latent.encode(composite(pictures, backgrounds[item]))
+            modes = torch.cat([own[item], modes])
+            alone = predicted(mixtures[item], z[item], ABAR[item], conditional)
+            expected = denoised(z[item].flatten(1).double(), ABAR[item], modes.flatten(1).double())
+            for found in (alone, together and [None if x is None else x[item] for x in together]):
+                if found is not None:
+                    torch.testing.assert_close(found[0].double(), expected[0], rtol=0, atol=1e-4)
+                    if conditional:
+                        torch.testing.assert_close(found[1], expected[1], rtol=1e-3, atol=0)
