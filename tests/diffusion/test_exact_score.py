@@ -51,30 +51,12 @@ def test_eps_is_the_score_of_the_density(modes, dims, t, seed):
     assert (perplexity >= 1 - 1e-9).all() and (perplexity <= modes + 1e-9).all()
 
 
-def test_one_mode_gives_a_weighted_squared_error_without_noise():
-    """K = 1: eps_hat - eps = (a / sigma) (x - x_1), independent of eps."""
-    x, target, noise = randn(3, 4, 50)
-    abar = ABAR[torch.tensor([20, 300, 600, 980])]
-    eps, _ = denoised(sds.diffuse(x, noise, abar), abar, target[:, None])
-    expected = (abar / (1 - abar)).sqrt()[:, None] * (x - target)
-    torch.testing.assert_close(eps - noise, expected, rtol=0, atol=1e-6)
-
-
 def test_the_perplexity_counts_the_modes_that_share_z():
     z, bank, abar = 1e4 * randn(3, 6), randn(7, 6, seed=1), ABAR[torch.tensor([0, 400, 999])]
     assert torch.isfinite(denoised(z, abar, bank)[0]).all()
     corners = torch.eye(4, dtype=torch.float64)
     for z, t, modes in ((torch.zeros_like(corners[:1]), 500, 4), (1e3 * corners[:1], 0, 1)):
         assert math.isclose(denoised(z, ABAR[t : t + 1], corners)[1], modes, abs_tol=1e-12)
-
-
-def test_ddim_from_noise_lands_on_an_image_of_the_bank():
-    bank, z = 3 * randn(6, 40), randn(8, 40, seed=1)
-    t = torch.full((8,), 999)
-    samples = sds.ddim_sample(lambda z, t: denoised(z, ABAR[t], bank)[0], z, t, ABAR, steps=100)
-    nearest = torch.cdist(samples, bank).min(dim=1)
-    assert nearest.values.max() < 1e-6
-    assert len(nearest.indices.unique()) > 1
 
 
 def test_items_are_independent_with_shared_and_with_separate_banks():
