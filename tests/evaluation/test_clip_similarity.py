@@ -58,9 +58,7 @@ def test_the_views_are_the_papers():
 
 @pytest.fixture(scope="module")
 def scored(clip, tmp_path_factory):
-    """Two results that are scored with three seeds; what was printed and written. A path isn't
-    UTF-8, and a link is in the place of the report.
-    """
+    """Two results, one's path not UTF-8, scored with three seeds; a link is the report."""
     folder = tmp_path_factory.mktemp("scored")
     names = [folder / "0.ply", Path(os.fsdecode(os.fsencode(folder) + b"/caf\xe9.ply"))]
     plys = [str(save(name, blob(seed=i))) for i, name in enumerate(names)]

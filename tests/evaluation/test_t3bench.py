@@ -12,9 +12,7 @@ register_parts()
 
 
 def t3bench_pose(v):
-    """Return the camera that T3Bench describes: towards the centre, the image's top towards +z, or
-    +y near the poles.
-    """
+    """Return T3Bench's camera: towards the centre, +z up, or +y near the poles."""
     back = v / np.linalg.norm(v)
     up = np.array([0.0, 0.0, 1.0]) if abs(back[2]) < 0.99 else np.array([0.0, 1.0, 0.0])
     right = np.cross(up, back)

@@ -58,9 +58,7 @@ class HangingPrior(MeshPrior):
 
 
 def write_farm(folder: Path, count: int, steps: int = 12) -> list[str]:
-    """Write model, configuration and prompt list of a farm of ``count`` assets below ``folder``;
-    return the arguments of the command but for ``--out``.
-    """
+    """Write a farm of ``count`` assets; return the arguments of the command but ``--out``."""
     model = folder / "model"
     if not model.is_dir():
         tiny_models.stable_diffusion(model)
@@ -142,9 +140,7 @@ def cluster():
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory, cluster):
-    """A farm whose worker was killed, whose driver was killed, and which was then left alone: on a
-    cluster of its own, with a long folder for temporary files and with proxies that are dead.
-    """
+    """A farm whose worker and driver were killed, and which was then left alone."""
     folder = tmp_path_factory.mktemp("farm")
     farm = Farm(folder, write_farm(folder, COUNT, STEPS))
     process = farm.start(cluster=cluster)

@@ -1,6 +1,4 @@
-"""The farm's folder, also in memory and on an S3 server that runs on this machine, and the records
-of its assets.
-"""
+"""The farm's folder, also in memory and on an S3 server, and the records of its assets."""
 
 import json
 import os
@@ -178,9 +176,7 @@ def test_the_newer_checkpoint_wins_on_every_machine(memory, machine):
 def test_every_machine_goes_on_with_the_checkpoint_of_its_configuration(
     memory, machine, tmp_path, monkeypatch
 ):
-    """What a stopped worker has saved is there for others; what was made with the low-memory
-    configuration only for those that use it.
-    """
+    """What the low-memory configuration made is only for those that use it."""
     seen = []
 
     def stopped(self, job, folder, attempt):

@@ -1,7 +1,4 @@
-"""Strict reference readers, written from the formats' specifications only.
-
-Each takes a file's bytes and returns their content, or raises :class:`Illegal` if the file is
-invalid. The package's readers must return the same content."""
+"""Strict readers, written from the formats' specifications, which raise :class:`Illegal`."""
 
 import ast
 import hashlib

@@ -1,6 +1,4 @@
-"""A sample of `make fuzz`: damaged files for every reader and corpus/, the files of earlier
-defects; extreme Gaussians through every backend; random sequences of operations on a cloud.
-"""
+"""A sample of `make fuzz`, and corpus/, the files of earlier defects."""
 
 import contextlib
 import functools
@@ -11,8 +9,6 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 import torch
-from hypothesis import HealthCheck, settings
-from hypothesis.stateful import run_state_machine_as_test
 
 from tests.fuzz.scenes import (
     Drawn,
@@ -24,7 +20,7 @@ from tests.fuzz.scenes import (
     fault_of,
     well_posed,
 )
-from tests.fuzz.sequences import CloudSequence
+from tests.fuzz.sequences import CloudSequence, run_sequences
 from tests.fuzz.targets import TARGETS, Target, outcome_of, outcomes, seeds
 from tests.stability.backends import BACKENDS, cuda_on_the_host, each_backend
 
@@ -114,12 +110,6 @@ def test_wrong_renders_and_backends_that_differ_are_detected():
     assert "image" in disagreement({"one": one, "other": shifted})
     wrong = Drawn(other.out, other.grads | {"means": torch.flip(other.grads["means"], [1])})
     assert "means" in disagreement({"one": one, "other": wrong})
-
-
-def run_sequences(count: int, **options) -> None:
-    options |= {"derandomize": True, "deadline": None, "database": None}
-    options |= {"stateful_step_count": 20, "suppress_health_check": list(HealthCheck)}
-    run_state_machine_as_test(CloudSequence, settings=settings(max_examples=count, **options))
 
 
 def test_no_sequence_breaks_a_cloud(monkeypatch):

@@ -1,8 +1,4 @@
-"""A gallery of tiny runs of ``smoke.yaml``, each made once for all tests and all workers.
-
-Ask for it with the fixtures ``gallery`` (``gallery("trained")`` returns a folder to be read only)
-and ``copied`` (``copied("trained")`` returns a copy of the test's own).
-"""
+"""Tiny runs of ``smoke.yaml``, each made once for all tests and workers, and their comparison."""
 
 import contextlib
 import io
@@ -50,9 +46,7 @@ def fails_after(calls: int, function: Callable) -> Callable:
 
 
 class Gallery:
-    """``Gallery(root)(name)`` returns the folder of a finished run, which it makes if no worker has
-    done so.
-    """
+    """``Gallery(root)(name)`` returns the folder of a run, which it makes if no worker has."""
 
     def __init__(self, root: Path):
         self.root = root

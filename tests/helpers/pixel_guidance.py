@@ -1,6 +1,4 @@
-"""Score distillation without a score model, on pixels, and from a mixture of Gaussians in three
-dimensions, in float64.
-"""
+"""Score distillation on pixels, and from a mixture of Gaussians in 3D, in float64."""
 
 import math
 
@@ -80,9 +78,7 @@ def latents(batch=5, seed=0):
 
 
 def draws(guidance, x):
-    """Return t, a and sigma of a step as (B, 1, 1, 1), its noise, and the noisy latents, from the
-    random draws of SDS but with formulas of their own.
-    """
+    """Return t, a and sigma (B, 1, 1, 1) of a step, its noise, and the noisy latents of SDS."""
     t, abar = guidance.draw_timesteps(x)
     a, sigma = (value.sqrt().reshape(-1, 1, 1, 1) for value in (abar, 1 - abar))
     noise = guidance.normal(x, "noise").double()

@@ -1,7 +1,4 @@
-"""The contract of every kernel, as a class of tests to subclass: the float64 specification on
-ordinary and extreme clouds, empty views, uses of autograd. ``tests/stability/test_rasteriser.py``
-has the limits of numbers, order and transparency for every backend.
-"""
+"""The contract of every kernel, a class to subclass: as the specification in float64 draws."""
 
 import math
 
@@ -99,10 +96,7 @@ class KernelContract:
         compare(backend, cloud, cameras(2, 34, 18), 34, 18, BACKGROUND, preset="accurate")
 
     def test_thousands_of_gaussians_on_hundreds_of_tiles(self, backend):
-        """Against the torch backend in float64, which is exact and many times faster than the
-        specification, but for pixels in which two depths, or an alpha and its threshold, changed
-        places.
-        """
+        """Against torch in float64, many times faster than the specification."""
         cloud, camera = random_cloud(8000, seed=5, size=0.02), cameras(2, 160, 144)
         truth = specified(cloud, *camera, 160, 144, BACKGROUND, backend="torch")
         ours = draw(backend, cloud, camera, 160, 144, BACKGROUND)
@@ -160,9 +154,7 @@ class KernelContract:
         height=st.integers(1, 40),
     )
     def test_random_clouds(self, backend, seed, n, size, stretch, width, height):
-        """Any size and shape. A few pixels may fall on the other side of a threshold, so the median
-        error is tested.
-        """
+        """Any size and shape; the median, since a few pixels may fall beyond a threshold."""
         cloud = random_cloud(n, seed, size=size, stretch=stretch)
         camera = cameras(1 + seed % 3, width, height)
         ours = draw(backend, cloud, camera, width, height)
@@ -174,9 +166,7 @@ class KernelContract:
             assert n == 0 or distance.median() <= SINGLE * largest, name
 
     def test_gradient_of_a_needle(self, backend):
-        """1000 : 1 at an angle. The determinant of its covariance cancels in float32 unless it is
-        factored. A needle's edge moves by its length times any error of the angle.
-        """
+        """1000 : 1 at an angle: the determinant cancels in float32 unless it is factored."""
         cloud = one_gaussian((0.02, -0.03, 2.0), (0.5, 5e-4, 5e-4), 0.7)._replace(quats=TILTED)
         compare(backend, cloud, front_camera(64, 64, 200.0), 64, 64, tolerance=1e-3, alpha_min=1e-5)
 
@@ -205,9 +195,7 @@ class KernelContract:
 
     @pytest.mark.parametrize("channels", [2, 3])
     def test_gradients_may_come_in_any_layout(self, backend, channels):
-        """As from a convolution: the operation after the render decides the memory layout of its
-        gradient.
-        """
+        """The operation after the render decides the memory layout of its gradient."""
         cloud, view = random_cloud(50, seed=14).to(torch.float32), single(14, 12, views=2)
         cloud = cloud._replace(colors=cloud.colors[:, :channels])
         weights, grads = torch.randn(2, 12, 14, channels), []

@@ -1,6 +1,4 @@
-"""Clouds and cameras for the splatting tests; renders by a backend, compared with those of the
-specification in float64.
-"""
+"""Clouds and cameras, and their renders, compared with the specification's in float64."""
 
 import math
 from collections.abc import Iterator
@@ -26,9 +24,7 @@ repeatable = settings(
 
 
 def rasterize(*arguments, **options) -> Rasterized:
-    """Draw with `splatting.rasterize`, also the scales and opacities that it refuses: the image
-    model and the kernels are defined for all.
-    """
+    """Draw also the scales and opacities that `splatting.rasterize` refuses."""
     with mock.patch.object(validation, "check_ranges"):
         return splatting.rasterize(*arguments, **options)
 
@@ -63,9 +59,7 @@ def scene_of(cloud: Cloud, viewmats: Tensor, Ks: Tensor, width: int, height: int
 def random_cloud(
     n: int, seed: int = 0, channels: int = 3, size: float = 0.15, stretch: float = 0.6
 ) -> Cloud:
-    """Draw a float64 cloud in a ball of radius 1 around the origin, moderately anisotropic, with
-    any opacity below the cap.
-    """
+    """Draw a float64 cloud in a ball of radius 1, moderately anisotropic, below the cap."""
     g = torch.Generator().manual_seed(seed)
     means = torch.randn(n, 3, generator=g, dtype=torch.float64) * 0.4
     quats = torch.randn(n, 4, generator=g, dtype=torch.float64)
@@ -85,9 +79,7 @@ EXTREMES = {
 
 
 def extreme_cloud(seed: int, n: int, extremes: dict[str, list[float]] = EXTREMES) -> Cloud:
-    """Half of the entries are picked from ``extremes``, the others are ordinary; the second half's
-    means coincide with the first's.
-    """
+    """Half of the entries are from ``extremes``; the second half's means are the first's."""
     g = torch.Generator().manual_seed(seed)
     cloud = random_cloud(n, seed)
     for name, x in zip(NAMES, cloud, strict=True):
@@ -112,9 +104,7 @@ def stacks_on_one_pixel(n: int = 10_000) -> Iterator[Cloud]:
 def cameras(
     views: int, width: int, height: int, distance: float = 3.0, fov=50.0, dtype=torch.float64
 ) -> tuple[Tensor, Tensor]:
-    """Return viewmats and Ks on a circle around the origin that look at it; ``fov`` vertical,
-    degrees; square pixels.
-    """
+    """Return viewmats and Ks on a circle that look at the origin; ``fov`` vertical, degrees."""
     focal = 0.5 * height / math.tan(math.radians(fov) / 2)
     K = [[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]
     Ks = torch.tensor(K, dtype=dtype).expand(views, 3, 3)
@@ -131,9 +121,7 @@ def cameras(
 
 
 def front_camera(width: int, height: int, focal: float) -> tuple[Tensor, Tensor]:
-    """Return a camera at the origin that looks along +z, so that camera and world coordinates are
-    equal.
-    """
+    """Return a camera at the origin that looks along +z."""
     Ks = torch.tensor([[[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]]]).double()
     return torch.eye(4, dtype=torch.float64)[None], Ks
 
@@ -184,9 +172,7 @@ def error(a: Tensor, b: Tensor) -> float:
 
 
 def trimmed_error(a: Tensor, b: Tensor, kept: float = 0.995) -> float:
-    """Return the same without the worst rows: a Gaussian at a threshold may fall on its other side
-    in another precision.
-    """
+    """Return the same without the worst rows, of Gaussians at a threshold."""
     a, b = a.double().reshape(len(a), -1), b.double().reshape(len(b), -1)
     distance = (a - b).norm(dim=1)
     rows = distance <= distance.quantile(kept)
@@ -215,9 +201,7 @@ _specified: dict[tuple, Run] = {}
 
 
 def specified(cloud: Cloud, *view, **options) -> Run:
-    """Return what the specification, or the ``backend`` of the options, draws in float64; computed
-    once for all kernels.
-    """
+    """Return what the specification draws in float64; computed once for all kernels."""
     options = {"backend": "reference"} | options
     values = [*cloud, *view, *options.values()]
     key = *options, *(x.numpy().tobytes() if isinstance(x, Tensor) else x for x in values)
@@ -227,9 +211,7 @@ def specified(cloud: Cloud, *view, **options) -> Run:
 
 
 def compare(backend: str, cloud: Cloud, camera, *view, tolerance: float = SINGLE, **options) -> Run:
-    """Assert that images and gradients, those of the cameras included, are within float32 rounding
-    of the specification in float64; ``view`` is width, height and perhaps a background.
-    """
+    """Assert images and gradients within float32 rounding of the specification in float64."""
     truth = specified(cloud, *camera, *view, camera_gradient=True, **options)
     ours = draw(backend, cloud, camera, *view, camera_gradient=True, **options)
     for name in ("image", "alpha", "depth", "means2d", "contribution"):

@@ -1,6 +1,4 @@
-"""threestudio's own SDI and VSD beside this package's, with the same networks, timesteps and noise:
-prints the relative error of each result as JSON. Runs in threestudio's environment.
-"""
+"""threestudio's own SDI and VSD beside ours: prints the relative errors as JSON."""
 
 import itertools
 import json
@@ -85,9 +83,7 @@ def compare_steps(models):
 
 
 class GivenNetworks(VSD):
-    """threestudio's VSD with the UNet and the LoRA of one of our guidances, on given latents. The
-    UNet's own prediction is that of the noise, which it requires; the LoRA's is the model's.
-    """
+    """threestudio's VSD with the UNet, of noise, and the LoRA of one of our guidances."""
 
     def configure(self, ours, folder):
         self.weights_dtype, self.single_model, self.grad_clip_val = torch.float32, False, None

@@ -1,9 +1,4 @@
-"""Tiny models with the file formats of the real ones for the 3D priors: CLIP, Shap-E, Point-E and a
-body in SMPL's format.
-
-Weights are random except where results must be predictable: Shap-E's renderer gives one known shape
-for any latents, and the body's joints and limbs are at a person's positions.
-"""
+"""Tiny CLIP, Shap-E, Point-E and SMPL in the real ones' formats, with known shapes."""
 
 from pathlib import Path
 
@@ -24,9 +19,7 @@ SHAPE_HALF_SIDES = np.array([0.2, 0.3, 0.5])
 
 
 def clip(folder: Path, seed: int = 0) -> Path:
-    """Write a complete CLIP in the layout of ``openai/clip-vit-large-patch14``: one file of
-    weights, and the tokenizer's.
-    """
+    """Write a complete CLIP in the layout of ``openai/clip-vit-large-patch14``."""
     from transformers import CLIPConfig, CLIPModel
 
     torch.manual_seed(seed)
@@ -47,9 +40,7 @@ def clip(folder: Path, seed: int = 0) -> Path:
 
 
 def shap_e(folder: Path, seed: int = 0) -> Path:
-    """Write what ``ShapEPipeline.save_pretrained`` writes; the scheduler has the published
-    configuration.
-    """
+    """Write what ``ShapEPipeline.save_pretrained`` writes."""
     from diffusers import HeunDiscreteScheduler, ShapEPipeline
     from transformers import CLIPTextModelWithProjection, CLIPTokenizer
 
@@ -82,9 +73,7 @@ def shap_e_prior(heads: int = 2, layers: int = 2):
 
 
 def _shap_e_renderer():
-    """Make a renderer whose signed distance is that of an octahedron: 1 - |x|/a - |y|/b - |z|/c,
-    with |.| from pairs of SiLUs.
-    """
+    """Make a renderer of an octahedron, 1 - |x|/a - |y|/b - |z|/c, |.| from pairs of SiLUs."""
     from diffusers.pipelines.shap_e.renderer import ShapERenderer
 
     names, shapes = ("nerstf.mlp.0.weight", "nerstf.mlp.1.weight"), ((8, 93), (8, 8))
@@ -116,9 +105,7 @@ def _shap_e_renderer():
 
 
 def marching_cubes_tables() -> tuple[torch.Tensor, torch.Tensor]:
-    """Return triangles (256, 5, 3) of edges and a mask (256, 5) of the used ones, for each set of
-    positive corners. Corner x + 2y + 4z; edges 0-3 along x, 4-7 along y, 8-11 along z.
-    """
+    """Return triangles (256, 5, 3) of edges by axis, and a mask (256, 5), by corners."""
     from skimage.measure import marching_cubes
 
     places = np.array([(c & 1, c >> 1 & 1, c >> 2) for c in range(8)])
@@ -138,9 +125,7 @@ def marching_cubes_tables() -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def point_e(folder: Path, seed: int = 0) -> tuple[Path, Path]:
-    """Write ``base_40m_textvec.pt`` and ``upsample_40m.pt``, with one block each and random last
-    layers.
-    """
+    """Write ``base_40m_textvec.pt`` and ``upsample_40m.pt`` with one block each."""
     from threestudio_gaussiandreamer.priors.point_e import BaseModel, Upsampler
 
     torch.manual_seed(seed)
@@ -166,9 +151,7 @@ RING = 8
 
 
 def body_arrays(seed: int = 0) -> dict[str, np.ndarray]:
-    """Return a body of tubes around the bones, with the arrays of SMPL's file; two shape
-    coefficients, height and width.
-    """
+    """Return a body of tubes with the arrays of SMPL's file; two shapes: height and width."""
     vertices, faces, owners = [], [], []
     for joint in range(1, 24):
         tube, tube_faces = _tube(JOINTS[PARENTS[joint]], JOINTS[joint])
@@ -198,9 +181,7 @@ def body_model(path: Path) -> Path:
 
 
 def _tube(start: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return a closed tube of 4 cm radius: two rings, whose means are the bone's ends, and their
-    centres.
-    """
+    """Return a closed tube of 4 cm radius: two rings around the bone's ends, and these."""
     along = (end - start) / np.linalg.norm(end - start)
     side = np.cross(along, [0.0, 0.0, 1.0] if abs(along[2]) < 0.9 else [1.0, 0.0, 0.0])
     side /= np.linalg.norm(side)
@@ -215,9 +196,7 @@ def _tube(start: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _regressor(vertices: np.ndarray) -> np.ndarray:
-    """Return the regressor in which each joint is the mean of its own vertices: the centres of
-    tubes that end in it.
-    """
+    """Return the regressor in which each joint is the mean of its own vertices."""
     distance = np.linalg.norm(vertices[None] - JOINTS[:, None], axis=-1)
     regressor = (distance < 1e-9).astype(np.float64)
     return regressor / regressor.sum(axis=1, keepdims=True)

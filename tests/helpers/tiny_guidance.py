@@ -43,9 +43,7 @@ def prompts_of(kind, folder, **options):
 
 
 def make_prompts(models):
-    """Make embeddings of one prompt, without and with Perp-Neg; they don't depend on the prediction
-    type.
-    """
+    """Make embeddings of one prompt, without and with Perp-Neg."""
     folder, found = models["epsilon"], {}
     for perp in (False, True):
         options = {"negative_prompt": "ugly", "use_perp_neg": perp}

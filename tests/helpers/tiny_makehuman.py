@@ -35,9 +35,7 @@ def tiny_makehuman(folder: Path, *persons: Person) -> Path:
 
 
 def tubes() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return vertices, quads and the joint that owns each vertex: a tube from each joint's parent,
-    whose rings have the joints as their means.
-    """
+    """Return vertices, quads, and owners: a tube, with the joints as means, for each bone."""
     vertices, quads, owners = [], [], []
     angles = 2 * np.pi * np.arange(SIDES) / SIDES
     for joint in range(1, BODY_JOINTS):

@@ -1,10 +1,4 @@
-"""Tiny models with random weights and the files of the real ones, each in a folder in diffusers'
-format.
-
-Every file is laid out as on the hub (safetensors weights, tokenizer files as published, scheduler
-configurations of the real models), so the code that loads these loads the real ones. Only the sizes
-differ.
-"""
+"""Tiny models with random weights, laid out as the published ones in diffusers' format."""
 
 import json
 from io import BytesIO
@@ -66,9 +60,7 @@ STABLE_DIFFUSION_2_1 = Sizes(
 def stable_diffusion(
     folder: Path, *, prediction: str = "epsilon", seed: int = 0, sizes: Sizes = TINY
 ) -> Path:
-    """Write a tiny Stable Diffusion 2.1: UNet on 8x8x4 latents, VAE 64x64 to 8x8; ``prediction``:
-    epsilon, v_prediction.
-    """
+    """Write a tiny Stable Diffusion 2.1 on 8x8x4 latents; epsilon or v_prediction."""
     from diffusers import UNet2DConditionModel
 
     torch.manual_seed(seed)
@@ -112,9 +104,7 @@ def _stable_diffusion_scheduler(prediction: str) -> Any:
 
 
 def deep_floyd(folder: Path, *, seed: int = 0) -> Path:
-    """Write a tiny DeepFloyd IF, stage 1: UNet on 16x16 pixels with six output channels, T5
-    encoder.
-    """
+    """Write a tiny DeepFloyd IF, stage 1, on 16x16 pixels, with a T5 encoder."""
     from diffusers import DDPMScheduler, UNet2DConditionModel
 
     torch.manual_seed(seed)
@@ -141,9 +131,7 @@ def deep_floyd(folder: Path, *, seed: int = 0) -> Path:
 
 
 def listen_to_text(unet: torch.nn.Module) -> None:
-    """Scale up the output of the cross-attention: with PyTorch's initial weights two prompts give
-    nearly equal images.
-    """
+    """Scale up the cross-attention: with initial weights two prompts are nearly equal."""
     for name, weight in unet.named_parameters():
         if name.endswith(("attn2.to_v.weight", "add_v_proj.weight")):
             weight.data *= 10
@@ -215,9 +203,7 @@ def t5_text_encoder(folder: Path, width: int = TEXT_WIDTH, *, suffix: str = "") 
 
 
 def _publish_clip(path: Path) -> None:
-    """Write the names of the published files: with the prefix that transformers 5 omits, and the
-    positions that earlier versions saved.
-    """
+    """Write the published names: with the prefix, and positions of earlier versions."""
     from safetensors.torch import load_file, save_file
 
     tensors = load_file(path)
@@ -237,9 +223,7 @@ def _rename(path: Path, names: dict[str, str]) -> None:
 
 
 def _byte_vocabulary() -> dict[str, int]:
-    """Return CLIP's byte-level vocabulary with few merges: each byte, each byte at a word's end,
-    two merges, start and end.
-    """
+    """Return CLIP's byte-level vocabulary with two merges."""
     printable = [i for a, b in ("!~", "¡¬", "®ÿ") for i in range(ord(a), ord(b) + 1)]
     letters = [*map(chr, printable), *(chr(256 + i) for i in range(256 - len(printable)))]
     tokens = [*letters, *(letter + "</w>" for letter in letters)]
@@ -347,9 +331,7 @@ def stable_diffusion_3(folder: Path, *, seed: int = 0) -> Path:
 
 
 def mvdream(folder: Path, *, seed: int = 0, **settings: Any) -> Path:
-    """Write a tiny MVDream in the layout of its conversion: Stable Diffusion 2.1, its UNet in
-    CompVis's names with cameras, and the code of that UNet, which must not run.
-    """
+    """Write a tiny MVDream as it was converted, with the code of its UNet, which must not run."""
     from safetensors.torch import save_file
 
     from threestudio_gaussiandreamer.models.multiview_unet import unet_options

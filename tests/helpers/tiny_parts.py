@@ -1,6 +1,4 @@
-"""A system of a few parameters with all hooks of a real one, for tests of the launcher; also
-loadable as an extension.
-"""
+"""A system of a few parameters with all hooks of a real one, also loadable as an extension."""
 
 import os
 import signal

@@ -1,6 +1,4 @@
-"""The prune command: budgets are met on unseen views, a second run changes nothing, and wrong
-options are rejected before any work.
-"""
+"""The prune command: budgets are met on unseen views, and wrong options refused."""
 
 import json
 

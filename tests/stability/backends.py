@@ -1,6 +1,4 @@
-"""The backends that the stability tests use: those of this machine, and the CUDA kernels in
-emulation if they can be compiled for it.
-"""
+"""The backends of the stability tests: this machine's, and the CUDA kernels in emulation."""
 
 import pytest
 import torch

@@ -8,6 +8,7 @@ from unittest import mock
 import pytest
 import torch
 
+from tests.fuzz.sequences import CloudSequence, run_sequences
 from tests.helpers.gallery import differences
 from tests.stability import scenes
 from tests.stability.backends import slow
@@ -181,89 +182,14 @@ def test_a_transparent_cloud_shrinks_to_the_floor(budget, measured):
     measured(counts[-1], "left of 200 transparent ones", at_least=64)
 
 
-class Ledger:
-    """Give every Gaussian an id, in its colour and in all its moments, and check them later."""
-
-    def __init__(self, geometry: GaussianCloud, optimizer: torch.optim.Optimizer) -> None:
-        self.geometry, self.optimizer = geometry, optimizer
-
-    def states(self) -> list[tuple[torch.nn.Parameter, dict]]:
-        """Return parameters and their state, of those that have it."""
-        state = self.optimizer.state
-        return [(p, state[p]) for p in self.geometry.parameters() if p.numel() and p in state]
-
-    def steps(self) -> list[float]:
-        return [state["step"].item() for _, state in self.states()]
-
-    def write(self, ids: torch.Tensor) -> None:
-        self.geometry.sh0.data[:] = ids[:, None, None]
-        for parameter, state in self.states():
-            moments = spelt(ids, parameter)
-            state |= {"exp_avg": moments, "exp_avg_sq": 2 * moments}
-
-    def ids(self) -> torch.Tensor:
-        return self.geometry.sh0[:, 0, 0].detach().clone()
-
-    def is_new(self) -> torch.Tensor:
-        """Return which have no moments; those of all others must be their own, bit for bit."""
-        held = {id(p) for group in self.optimizer.param_groups for p in group["params"]}
-        assert held == {id(p) for p in self.geometry.parameters() if p.numel()}
-        assert {id(p) for p in self.optimizer.state} <= held
-        (first, _), *_ = states = self.states()
-        is_new = (self.optimizer.state[first]["exp_avg"].reshape(len(first), -1) == 0).all(1)
-        for parameter, state in states:
-            past = spelt(torch.where(is_new, 0.0, self.ids()), parameter)
-            assert torch.equal(state["exp_avg"], past)
-            assert torch.equal(state["exp_avg_sq"], 2 * past)
-        return is_new
-
-
-def spelt(ids: torch.Tensor, parameter: torch.Tensor) -> torch.Tensor:
-    return ids.reshape(-1, *[1] * (parameter.dim() - 1)).expand_as(parameter).clone()
-
-
 @row("A3", "Optimiser state mismatch")
-@pytest.mark.parametrize("first_seed", [0, *slow(20, 40, 60, 80)])
-def test_moments_follow_their_gaussian(first_seed, measured):
-    """Random rounds of all operations; in a third of the sequences before any step."""
-    for seed in range(first_seed, first_seed + 20):
-        new, gone = random_rounds(seed)
-        assert new > 5 and gone > 5
+@pytest.mark.parametrize("sequences", [5, *slow(50)])
+def test_moments_follow_their_gaussian(sequences, measured, monkeypatch):
+    """Random sequences of all operations, some of which begin before any step."""
+    monkeypatch.setattr(CloudSequence, "steps", 0)
+    run_sequences(sequences)
+    assert CloudSequence.steps > 10 * sequences
     measured("to the bit")
-
-
-def random_rounds(seed: int) -> tuple[int, int]:
-    """Run 5 rounds; return how many Gaussians were created and removed."""
-    g = torch.Generator().manual_seed(seed)
-    rules = EVERY_STEP | {"grad_threshold": 0.6, "split_scale": 0.018, "min_opacity": 0.3}
-    limits = {"min_gaussians": 5, "max_gaussians": 40, "budget": (None, 20)[seed // 2 % 2]}
-    prune = {"start": 0, "stop": 99, "every": 2}
-    geometry = started(30, sh_degree=seed % 2, **limits, densify=rules, prune=prune)
-    optimizer = torch.optim.Adam([{**group, "lr": 0.0} for group in geometry.parameter_groups()])
-    ledger, new, gone = Ledger(geometry, optimizer), 0, 0
-    for round_ in range(1, 6):
-        n = len(geometry)
-        geometry.log_scales.data = -4.0 + 0.2 * torch.randn(n, 3, generator=g)
-        geometry.logit_opacities.data = torch.randn(n, generator=g)
-        if round_ > 1 or seed % 3:
-            for parameter in geometry.parameters():
-                parameter.grad = torch.ones_like(parameter)
-            optimizer.step()
-        steps, ids, gradient = ledger.steps(), torch.arange(1.0, n + 1), torch.rand(n, generator=g)
-        ledger.write(ids)
-        geometry.gradient_sum.copy_(gradient)  # as if one view had seen every Gaussian
-        geometry.gradient_count.fill_(1)
-        geometry.contribution.copy_(torch.rand(n, generator=g))
-        DensityControl(geometry).after_step(optimizer, round_)
-        left = ledger.ids()
-        assert steps == ledger.steps()
-        if steps:
-            is_new = ledger.is_new()
-            assert len(left[~is_new].unique()) == int((~is_new).sum())  # no history is duplicated
-            assert torch.isin(left[is_new], ids[gradient > 0.6]).all()  # parents were selected
-            new += int(is_new.sum())
-        gone += n - len(left.unique())
-    return new, gone
 
 
 @row("A3", "Lost step")

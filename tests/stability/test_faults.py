@@ -1,6 +1,4 @@
-"""A0: faults of other projects' code. Each test holds ours to the bar and shows that an emulation
-of the fault breaks it.
-"""
+"""A0: faults of other projects' code, which ours doesn't have and an emulation shows."""
 
 import functools
 import math

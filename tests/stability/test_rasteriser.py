@@ -1,6 +1,4 @@
-"""A1: renders and gradients at the limits of numbers, sizes and shapes, by every backend, float32
-against float64.
-"""
+"""A1: renders and gradients at the limits of numbers, sizes and shapes, against float64."""
 
 import functools
 import itertools

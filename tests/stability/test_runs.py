@@ -410,9 +410,7 @@ def test_the_guidance_without_weights_asks_no_network(tmp_path, monkeypatch, mea
 
 
 def config_classes():
-    """Return the Config of everything registered by this package by name, nested dataclasses
-    included.
-    """
+    """Return the Config of every part of this package by name, nested dataclasses included."""
     found = {}
     for name in host.names():
         part = host.find(name)
@@ -425,9 +423,7 @@ def config_classes():
 
 
 def names_that_are_read():
-    """Return attributes, words of strings, and parameters in the package's code, except in
-    docstrings.
-    """
+    """Return attributes, words of strings and parameters in the package's code."""
     read = {f"prompt_{direction}" for direction in ("front", "side", "back", "overhead")}  # getattr
     for path in PACKAGE.rglob("*.py"):
         tree = ast.parse(path.read_text())

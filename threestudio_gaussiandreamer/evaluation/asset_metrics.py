@@ -27,8 +27,6 @@ from .clip_similarity import Protocol, open_clip, protocol_for, score
 from .image_reward import SOURCES, ImageReward
 from .results import Result, find_result, read_result, render_views
 
-Color = tuple[float, float, float]
-
 
 class Asset(NamedTuple):
     """A finished cloud."""
@@ -137,14 +135,13 @@ class Recognized(Metric):
         self.judge = shared_judge(args.judge)
 
     def score(self, asset: Asset) -> dict[str, float]:
-        pictures = rendered(asset, recognition.views(), SIZE, background=BACKGROUND)
+        pictures = rendered(asset, recognition.views(), SIZE, BACKGROUND)
         views = torch.from_numpy(pictures).movedim(-1, 1)
         return self.of_pictures(views, asset.prompt) or dict.fromkeys(self.columns, math.nan)
 
     def of_pictures(self, views: Float[Tensor, "V 3 s s"], prompt: str) -> dict[str, float]:
         """Score pictures from the judge's views; empty if the prompt names no object."""
-        wanted = attributes_in(prompt)
-        if wanted is None:
+        if (wanted := attributes_in(prompt)) is None:
             return {}
         return self.compared(recognition.probabilities(self.judge, views), wanted)
 
@@ -174,7 +171,7 @@ METRICS: dict[str, type[Metric]] = {
 
 
 def rendered(
-    asset: Asset, orbit: Orbit, size: int, *, background: Optional[Color] = None
+    asset: Asset, orbit: Orbit, size: int, background: Optional[tuple[float, float, float]] = None
 ) -> Float[np.ndarray, "V s s 3"]:
     """Render an asset in [0, 1], on the run's background unless another is given."""
     result = asset.result

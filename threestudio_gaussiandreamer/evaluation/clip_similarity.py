@@ -89,9 +89,8 @@ def open_clip(folder: str) -> PictureText:
             f"--clip {folder}: expected a folder, for instance after `hf download "
             "openai/clip-vit-large-patch14 --local-dir clip`"
         )
-    return PictureText(
-        clip_source(folder, option="--clip", allow_bin=True), get_device(), allow_bin=True
-    )
+    source = clip_source(folder, option="--clip", allow_bin=True)
+    return PictureText(source, get_device(), allow_bin=True)
 
 
 def score(

@@ -97,31 +97,25 @@ def start_workers(ray: Any, count: int, gpus: int, setting: Setting) -> list[Any
     environment = {"OMP_NUM_THREADS": str(cores), "OMP_WAIT_POLICY": "passive"}
     if not gpus:
         environment["CUDA_VISIBLE_DEVICES"] = ""
-    actor = ray.remote(
-        num_cpus=cores,
-        num_gpus=gpus,
-        max_restarts=-1,
-        max_task_retries=-1,  # Ray also counts attempts to reach a process that is restarting
-        runtime_env={"env_vars": environment},
-    )(Worker)
+    # Ray also counts attempts to reach a process that is restarting
+    endless = {"max_restarts": -1, "max_task_retries": -1}
+    resources = {"num_cpus": cores, "num_gpus": gpus, "runtime_env": {"env_vars": environment}}
+    actor = ray.remote(**resources, **endless)(Worker)
     workers = [actor.remote() for _ in range(count)]
     try:
         ray.get([worker.hello.remote(setting) for worker in workers], timeout=SECONDS_TO_ANSWER)
     except ray.exceptions.RayError as error:
-        said = getattr(error, "cause", None) or (
-            f"each machine needs threestudio-gaussiandreamer {__version__}: {error}"
-        )
+        needed = f"each machine needs threestudio-gaussiandreamer {__version__}: {error}"
+        said = getattr(error, "cause", None) or needed
         raise UserError(f"a worker can't start: {said}") from error
     return workers
 
 
 class Driver:
-    """Gives all remaining assets to the workers.
+    """Gives the assets that are left, ``jobs``, to idle workers.
 
     Args:
         ray: the module, connected to a cluster.
-        workers: handles of :class:`.worker.Worker`.
-        jobs: the assets that aren't finished; it is advanced when a worker is idle.
         hang: seconds without a finished step after which a worker is restarted.
         total: number of assets of the farm, ``done`` of which were finished before.
     """

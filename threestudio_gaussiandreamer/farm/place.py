@@ -82,9 +82,7 @@ class Place:
 
     @contextlib.contextmanager
     def reached(self, may_lack: bool = False) -> Iterator[None]:
-        """Raise Unreachable for errors of a URL, which its file system has tried again; a file that
-        ``may_lack`` still raises FileNotFoundError, as a bucket that doesn't exist does.
-        """
+        """Raise Unreachable for errors of a URL, but not for a file that ``may_lack``."""
         try:
             yield
         except Exception as error:  # each file system of fsspec has its own
@@ -113,8 +111,8 @@ class Place:
             return [content if isinstance(content, bytes) else None for content in found]
 
     def read_json(self, *names: str) -> list[Optional[dict[str, Any]]]:
-        """Return the contents of JSON files of the farm; None for those that don't exist. Raises
-        UserError for one that isn't an object, or no record.
+        """Return the contents of JSON files; None for those that don't exist. Raises UserError for
+        one that isn't an object, or no record.
         """
         found = []
         for name, content in zip(names, self.read(names), strict=True):

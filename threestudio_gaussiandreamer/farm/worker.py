@@ -257,6 +257,8 @@ def outcome_of(error: Exception) -> dict[str, Any]:
 
 def result_of(job: Job, folder: Path, run: Any) -> dict[str, Any]:
     """Return what a finished run has made, and where."""
+    import torch
+
     geometry, files = run.system.geometry, RunFiles(folder)
     page = files.export and files.export / "view.html"
     made = {"picture": files.picture, "page": page if page and page.is_file() else None}
@@ -269,7 +271,7 @@ def result_of(job: Job, folder: Path, run: Any) -> dict[str, Any]:
         "scores": {name: measured[name] for name in SCORES if is_number(measured.get(name))},
         "steps": run.trainer.global_step,
         "gaussians": len(geometry) if hasattr(geometry, "__len__") else 0,
-        "megabytes": peak_megabytes(),
+        "megabytes": round(torch.cuda.max_memory_allocated() / 2**20, 1),
         "bytes": sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()),
         "saves_memory": job.saves_memory,
         "host": socket.gethostname(),
@@ -290,17 +292,3 @@ def digest(folder: Path) -> str:
         content = hashlib.sha256(path.read_bytes()).hexdigest()
         total.update(f"{path.relative_to(folder).as_posix()} {content}\n".encode())
     return total.hexdigest()
-
-
-def peak_megabytes() -> float:
-    """Return the peak of the GPU's memory in this asset; without one, of this process so far."""
-    import torch
-
-    if torch.cuda.is_available():
-        return round(torch.cuda.max_memory_allocated() / 2**20, 1)
-    try:
-        import resource
-    except ImportError:  # Windows
-        return 0.0
-    unit = 1 if sys.platform == "darwin" else 1024  # bytes
-    return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 2**20, 1)

@@ -1,6 +1,4 @@
-"""An emulated GPU: compiles the package's CUDA source for the host, so that tests run kernels and
-launch code unchanged.
-"""
+"""An emulated GPU: the package's CUDA source, compiled for the host unchanged."""
 
 import ctypes
 import functools
