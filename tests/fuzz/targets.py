@@ -165,10 +165,13 @@ def point_plys() -> list[bytes]:
 
 def read_ply(read: Callable, path: Path) -> tuple[Any, oracles.PlyVertices]:
     """Return what the package and the strict reader read."""
-    with mock.patch.object(logger, "handle") as said:
+    listener = mock.Mock(level=0)
+    with mock.patch.object(logger, "handlers", [listener]):
         found = read(path)
     truth = strictly(oracles.ply_vertices, path)
-    assert not truth.leftover or said.called, "data after the announced end without a message"
+    assert not truth.leftover or listener.handle.called, (
+        "data after the announced end without a message"
+    )
     return found, truth
 
 
