@@ -8,11 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as np_strategies
 
-from threestudio_gaussiandreamer.gaussians.grow import (
-    grow,
-    longest_side,
-    nearest_distance_scales,
-)
+from threestudio_gaussiandreamer.gaussians import neighbours
+from threestudio_gaussiandreamer.gaussians.grow import grow, longest_side, nearest_distance_scales
+from threestudio_gaussiandreamer.gaussians.neighbours import NeighbourSearch
 from threestudio_gaussiandreamer.gaussians.point_cloud import PointCloud
 
 FINITE = st.floats(width=32, allow_nan=False, allow_infinity=False)
@@ -91,11 +89,11 @@ def test_the_cap_is_exact_and_keeps_a_uniform_choice():
 # The first scales ---------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("rule, neighbours", [("nearest", 1), ("rms3", 3)])
-def test_scales_equal_brute_force(rule, neighbours):
+@pytest.mark.parametrize("rule, count", [("nearest", 1), ("rms3", 3)])
+def test_scales_equal_brute_force(rule, count):
     points = rng().uniform(-1, 1, (200, 3))
     distances = np.linalg.norm(points[:, None] - points[None], axis=2)
-    nearest = np.sort(distances, axis=1)[:, 1 : neighbours + 1]
+    nearest = np.sort(distances, axis=1)[:, 1 : count + 1]
     scales = nearest_distance_scales(points, rule)
     np.testing.assert_allclose(scales, np.sqrt((nearest**2).mean(1)), rtol=1e-6)  # float32
     assert scales.dtype == np.float32
@@ -127,3 +125,44 @@ def test_copies_get_the_median_of_the_distinct_points():
 def test_scales_are_always_positive_and_finite(points, rule):
     scales = nearest_distance_scales(points, rule)
     assert scales.shape == (len(points),) and np.isfinite(scales).all() and (scales > 0).all()
+
+
+# Nearest neighbours -------------------------------------------------------------------------------
+
+
+def random_points(count, dimensions=3, seed=0):
+    """Return random points; those of fewer dimensions lie in a plane or on a line."""
+    points = rng(seed).standard_normal((count, 3))
+    points[:, dimensions:] = 0.25
+    return points
+
+
+def distances(queries, points):
+    return np.linalg.norm(queries[:, None] - points, axis=2)
+
+
+@pytest.mark.parametrize("dimensions", [3, 2, 1])
+@pytest.mark.parametrize("count", [1, 4])
+def test_the_neighbours_of_points_are_the_nearest(monkeypatch, dimensions, count):
+    monkeypatch.setattr(neighbours, "QUERIES_AT_ONCE", 50)
+    points = random_points(170, dimensions)
+    apart = distances(points, points)
+    rows = []
+    for some, found, nearest in NeighbourSearch(points).of_points(count):
+        rows += some.tolist()
+        assert np.allclose(found, np.sort(apart[some])[:, :count], atol=1e-15)
+        assert np.allclose(apart[some[:, None], nearest], found, atol=1e-15)
+    assert sorted(rows) == list(range(170))
+
+
+def test_queries_beyond_the_reach_have_no_neighbour(monkeypatch):
+    monkeypatch.setattr(neighbours, "QUERIES_AT_ONCE", 50)
+    points, queries = random_points(60), random_points(120, seed=1)
+    apart = distances(queries, points)
+    found, rows = NeighbourSearch(points).nearest(queries, 0.5)
+    near = apart.min(axis=1) < 0.5
+    assert 20 < near.sum() < 100
+    assert np.array_equal(rows[near], apart.argmin(axis=1)[near])
+    assert np.allclose(found[near], apart.min(axis=1)[near])
+    assert np.isinf(found[~near]).all() and (rows[~near] == -1).all()
+    assert len(NeighbourSearch(points).nearest(queries[:0], 0.5)[0]) == 0
