@@ -25,8 +25,6 @@ from .render import Pose, camera_of, first_pose, require_gaussians
 
 LARGEST_HALF = 6e4
 """Covariances are clipped to this, since viser stores them in half precision (65504 at most)."""
-FLIP_YZ = np.diag([1.0, -1.0, -1.0])
-"""From OpenGL's camera axes (y up, looks along -z) to OpenCV's (y down, looks along z)."""
 
 
 def require_server(host: str, port: int) -> None:
@@ -100,7 +98,8 @@ class LiveView:
             names = [f"/cameras/{i}" for i in range(len(c2w))]
             self._frustums = [add(name, fov=1, aspect=1, scale=0.15) for name in names]
         for frustum, pose, angle in zip(self._frustums, c2w, fovy, strict=True):
-            frustum.wxyz = viser.transforms.SO3.from_matrix(pose[:3, :3] @ FLIP_YZ).wxyz
+            turned = pose[:3, :3] * (1, -1, -1)  # viser's cameras are OpenCV's
+            frustum.wxyz = viser.transforms.SO3.from_matrix(turned).wxyz
             frustum.position = pose[:3, 3]
             frustum.fov, frustum.aspect = float(angle), aspect
 

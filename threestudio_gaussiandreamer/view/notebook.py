@@ -15,12 +15,10 @@ MAX_BYTES = 20_000_000
 
 
 class EmbeddedPage(NamedTuple):
-    """A page that a notebook shows in the output of a cell."""
+    """HTML that a notebook shows in the output of a cell; ``height`` in pixels."""
 
     content: str
-    """HTML."""
     height: int
-    """Pixels."""
 
     def _repr_html_(self) -> str:
         # ASCII, so that the scripts keep the hashes of their policy in any encoding; the sandbox

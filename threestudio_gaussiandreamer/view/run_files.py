@@ -198,7 +198,6 @@ def read_yaml(path: Path) -> dict[str, Any]:
 
 # ---- Gaussians -----------------------------------------------------------------------------------
 
-CHECKPOINT_ENDINGS = (".ckpt", ".pt", ".pth")
 TENSORS = ("means", "quats", "log_scales", "logit_opacities", "sh0", "sh_rest")
 GSPLATS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 CHECKPOINTS = {
@@ -219,7 +218,7 @@ def read_any(source: Path, up: Optional[str] = None, option: str = "PATH") -> St
     Raises:
         UserError: the file is none of Gaussians, or damaged.
     """
-    if source.suffix in CHECKPOINT_ENDINGS:
+    if source.suffix in (".ckpt", ".pt", ".pth"):
         gaussians, run = drawable(from_checkpoint(source), str(source)), RunFiles.around(source)
         antialiased = run is not None and run.antialiased
         return StoredCloud(gaussians, up or WORLD_UP, antialiased=antialiased)
