@@ -32,35 +32,24 @@ class InstancePreflight(WeightsGuidance):
         """Take no options."""
 
 
-def check(guidance_type, guidance=(), prompts="plain-prompt-processor", **prior):
-    options = {"prompt_processor_type": prompts, "prompt_processor": {}}
-    cfg = options | {"guidance_type": guidance_type, "guidance": dict(guidance)}
-    preflight_parts(GaussianCloud(prior), SimpleNamespace(**cfg))
+WRONG = {
+    "^system.guidance: weights 'missing.bin' does not exist": ("test-weights-guidance", {}),
+    "InstancePreflight.preflight needs @classmethod": ("test-instance-preflight-guidance", {}),
+    "^system.guidance: mesh 'no.glb' does not exist": ("exact-score-guidance", {"mesh": "no.glb"}),
+    "^system.guidance: unknown mesh format of": ("exact-score-guidance", {"mesh": __file__}),
+}
 
 
-def test_a_guidance_gets_options_that_are_not_given_before_any_folder_is_made(
-    tmp_path, monkeypatch
-):
+@pytest.mark.parametrize("message", WRONG)
+def test_what_a_guidance_lacks_is_named_before_any_folder_is_made(message, tmp_path, monkeypatch):
+    """Also of options that aren't given, and after what the prior lacks."""
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(UserError, match="^system.guidance: weights 'missing.bin' does not exist"):
-        check("test-weights-guidance", prompts="gaussiandreamer-stable-diffusion-prompt-processor")
-    assert not [*tmp_path.iterdir()]
-
-
-def test_a_preflight_of_another_kind_is_named():
-    with pytest.raises(UserError, match="InstancePreflight.preflight needs @classmethod"):
-        check("test-instance-preflight-guidance")
-
-
-@pytest.mark.parametrize(
-    ("mesh", "message"),
-    [("no.glb", "mesh 'no.glb' does not exist"), (__file__, "unknown mesh format of")],
-)
-def test_the_mesh_of_a_guidance_is_checked(mesh, message):
-    with pytest.raises(UserError, match=f"^system.guidance: {message}"):
-        check("exact-score-guidance", {"mesh": mesh})
-
-
-def test_the_prior_is_checked_first():
+    prompts = "gaussiandreamer-stable-diffusion-prompt-processor"
+    cfg = SimpleNamespace(prompt_processor_type=prompts, prompt_processor={})
+    cfg.guidance_type, cfg.guidance = WRONG[message]
+    with pytest.raises(UserError, match=message):
+        preflight_parts(GaussianCloud({}), cfg)
     with pytest.raises(UserError, match="^system.geometry.prior: mesh 'no.glb' does not exist"):
-        check("test-weights-guidance", prior_type="mesh-prior", prior={"path": "no.glb"})
+        cloud = GaussianCloud({"prior_type": "mesh-prior", "prior": {"path": "no.glb"}})
+        preflight_parts(cloud, cfg)
+    assert not [*tmp_path.iterdir()]
