@@ -3,7 +3,7 @@ flow, Stable Diffusion 3 or 3.5 (Esser et al. 2024).
 
 The transformer predicts the velocity v = eps - x of the path z = (1 - sigma) x + sigma eps, which
 is converted to the noise of a diffusion with the same ratio of picture and noise
-(``diffusion/rectified_flow.py``): all options and all variants but VSD apply.
+(``diffusion/sds.py``): all options and all variants but VSD apply.
 With ``weighting_strategy: rectified_flow`` the gradient is that of RFDS (Yang et al. 2024,
 "Text-to-image rectified flow as plug-and-play priors", arXiv 2406.03293, the baseline loss),
 
@@ -26,7 +26,7 @@ from typing import Any, Optional
 
 from ..core.errors import UserError
 from ..core.options import in_range, one_of
-from ..diffusion import rectified_flow, sds
+from ..diffusion import sds
 from ..host import register
 from ..models.hub import STABLE_DIFFUSION_3 as FAMILY
 from ..models.model_files import load_settings
@@ -65,8 +65,8 @@ class StableDiffusion3Guidance(StableDiffusionGuidance):
             )
         self.prediction_type = "velocity"
         shift = config.shift if self.cfg.flow_shift is None else self.cfg.flow_shift
-        sigmas = rectified_flow.shifted_sigmas(config.num_train_timesteps, shift)
-        self.set_alphas_cumprod(rectified_flow.abar_of_sigma(sigmas))
+        sigmas = sds.shifted_sigmas(config.num_train_timesteps, shift)
+        self.set_alphas_cumprod(sds.abar_of_sigma(sigmas))
 
     def load_denoiser(self, folder: Path) -> None:
         from diffusers import SD3Transformer2DModel
@@ -88,11 +88,11 @@ class StableDiffusion3Guidance(StableDiffusionGuidance):
 
     def run_network(self, z: Latents, t: Timesteps, embeddings: Embeddings) -> Latents:
         abar = self._abar[t]
-        sigma = rectified_flow.sigma_of_abar(abar)
+        sigma = sds.sigma_of_abar(abar)
         width = self.transformer.config.pooled_projection_dim
         tokens, pooled = unpack(embeddings.to(self.dtype), width)
         return self.transformer(
-            hidden_states=rectified_flow.on_path(z, abar).to(self.dtype),
+            hidden_states=sds.on_path(z, abar).to(self.dtype),
             timestep=(sigma * len(self.alphas_cumprod)).float(),
             encoder_hidden_states=tokens,
             pooled_projections=pooled,
