@@ -22,7 +22,7 @@ from tests.fuzz.scenes import (
 )
 from tests.fuzz.sequences import CloudSequence, run_sequences
 from tests.fuzz.targets import TARGETS, Target, outcome_of, outcomes, seeds
-from tests.stability.backends import BACKENDS, cuda_on_the_host, each_backend
+from tests.stability.backends import BACKENDS, backends_of, cuda_on_the_host
 
 pytestmark = pytest.mark.slow
 
@@ -81,7 +81,7 @@ def stand_in_for_a_gpu(monkeypatch) -> None:
         cuda_on_the_host(monkeypatch)
 
 
-@each_backend
+@pytest.mark.parametrize("backend", backends_of())
 def test_nothing_that_is_drawn_is_nan(backend, stand_in_for_a_gpu):
     faults = {seed: fault_of(scene(seed), backend) for seed in SCENES}
     assert not any(faults.values()), faults

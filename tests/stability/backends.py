@@ -27,9 +27,6 @@ def slow(*values) -> list:
     return [pytest.param(value, marks=pytest.mark.slow) for value in values]
 
 
-each_backend = pytest.mark.parametrize("backend", backends_of())
-
-
 def cuda_on_the_host(monkeypatch: pytest.MonkeyPatch) -> None:
     """Make the backend "cuda" accept CPU tensors and run its kernels in emulation."""
     host = HostDevice()

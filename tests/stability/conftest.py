@@ -5,7 +5,7 @@ import inspect
 import json
 import logging
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Optional
 
@@ -54,17 +54,10 @@ def measured(record_property) -> Callable[..., None]:
 
 
 @pytest.fixture
-def said() -> Iterator[list[str]]:
-    """Collect the package's log messages, also if the launcher has its own handler."""
-    messages: list[str] = []
-    listener, logger = logging.Handler(), logging.getLogger("threestudio_gaussiandreamer")
-    listener.emit = lambda record: messages.append(record.getMessage())
-    level = logger.level
-    logger.addHandler(listener)
-    logger.setLevel(logging.INFO)
-    yield messages
-    logger.removeHandler(listener)
-    logger.setLevel(level)
+def said(caplog) -> pytest.LogCaptureFixture:
+    """Collect log messages, also the package's of level INFO."""
+    caplog.set_level(logging.INFO, "threestudio_gaussiandreamer")
+    return caplog
 
 
 @pytest.fixture

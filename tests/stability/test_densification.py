@@ -116,7 +116,7 @@ def test_a_trained_cloud_that_is_too_large_keeps_what_contributes(tmp_path, meas
     geometry = GaussianCloud({**prior, "max_gaussians": 150})
     geometry.initialize("a prompt")
     assert len(geometry) == 150
-    assert any("has 400 Gaussians; keeping the 150" in message for message in said)
+    assert "has 400 Gaussians; keeping the 150" in said.text
     views = views_around(drawn(trained), 4, 64, turn=30)
 
     def psnr_to_trained(cloud: Gaussians) -> float:
@@ -141,7 +141,7 @@ def test_the_floor_keeps_what_contributes_most(rules, measured, said):
     rest = *statistics, DensifyConfig(grad_threshold=1e9, **rules), 64, 500_000, rng
     change = densify.densify_and_prune(geometry.parameters_by_name(), *rest)
     assert torch.equal(change.parents, geometry.contribution.topk(64).indices.sort().values)
-    (message,) = said
+    (message,) = said.messages
     assert message.startswith("only 0 of 200 Gaussians would be left: the 64 that contribute most")
     measured(len(change.parents), "left", at_least=64)
 

@@ -170,9 +170,7 @@ def _read(source: Path, args: argparse.Namespace) -> StoredCloud:
 
 
 def of_degree(stored: StoredCloud, degree: Optional[int]) -> StoredCloud:
-    """Return the cloud without harmonics above a degree; as it is if there are none. What it has
-    been pruned to isn't known then.
-    """
+    """Return the cloud without harmonics above a degree, and then without ``pruned_to``."""
     if degree is None or stored.gaussians.sh_degree <= degree:
         return stored
     sh = stored.gaussians.sh[:, : COEFFICIENTS[degree]]

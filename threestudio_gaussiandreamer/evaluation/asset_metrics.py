@@ -39,9 +39,7 @@ class Asset(NamedTuple):
 
 
 class Metric:
-    """A metric of finished assets; constructed once with the arguments of the command, before the
-    first render. ``score`` returns the columns of one asset.
-    """
+    """A metric, made from the command's arguments; ``score`` returns the columns of an asset."""
 
     columns: ClassVar[tuple[str, ...]]
     undefined: ClassVar[str] = ""

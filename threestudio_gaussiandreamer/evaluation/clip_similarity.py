@@ -73,10 +73,7 @@ def has_own_cameras(clip: Optional[str]) -> bool:
 
 
 def protocol_for(clip: Optional[str], **options: Any) -> Protocol:
-    """Return the paper's protocol with some options replaced; for the toybox's CLIP with the
-    cameras of its training, since the paper's distance makes objects smaller than it has ever seen
-    them.
-    """
+    """Return the paper's protocol with options replaced; the toybox's CLIP has its own cameras."""
     if has_own_cameras(clip):
         options |= {"radius": sum(DISTANCE) / 2, "fovy_deg": FOVY_DEG, "size": SIZE}
     return Protocol(**options)
@@ -96,9 +93,7 @@ def open_clip(folder: str) -> PictureText:
 def score(
     result: Result, prompt: str, item: int, clip: PictureText, protocol: Protocol
 ) -> tuple[Float[np.ndarray, " S"], list[np.ndarray]]:
-    """Return one result's score for each seed, and the views of the first one, uint8; a view that
-    several seeds draw is rendered once.
-    """
+    """Return a result's score for each seed, and the views of the first one, uint8."""
     draws = [protocol.draw(seed, item) for seed in protocol.seeds]
     needed = np.unique(np.concatenate(draws))
     orbit = protocol.orbit.rows(needed)

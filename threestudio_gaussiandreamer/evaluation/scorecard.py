@@ -62,9 +62,7 @@ def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
 
 
 def run(args: argparse.Namespace) -> None:
-    """Check files, prompts and output, then score all assets and write the scorecard; assets that
-    can't be scored are an error after it.
-    """
+    """Score all assets and write the scorecard; what can't be scored is an error after it."""
     register_parts()
     metrics, failed = open_metrics(args), []
     first = find_results(args.folders, failed)
@@ -103,9 +101,7 @@ def open_metrics(args: argparse.Namespace) -> list[Metric]:
 
 
 def find_results(folders: Sequence[str], failed: list[str]) -> list[Result]:
-    """Find the finished runs in these folders, also behind links; a run in several of them once.
-    ``failed`` gets the messages of runs without a file of Gaussians.
-    """
+    """Find the finished runs in folders, each once; ``failed`` gets messages about others."""
     places: dict[Path, str] = {}
     for folder in folders:
         runs = list(run_folders(Path(folder).expanduser()))

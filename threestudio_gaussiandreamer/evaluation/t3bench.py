@@ -89,9 +89,7 @@ def _icosphere():
 
 
 def towards_origin(positions: Float[np.ndarray, "V 3"]) -> Float[torch.Tensor, "V 4 4"]:
-    """Return OpenGL ``c2w`` matrices of cameras that look at the origin, with +z up, or +y near the
-    poles, as in T3Bench.
-    """
+    """Return OpenGL ``c2w`` of cameras that look at the origin, +z up, or +y near the poles."""
     place = torch.from_numpy(positions).float()
     at_pole = (place[:, 2] / place.norm(dim=1)).abs() >= NEAR_POLE
     up = torch.where(at_pole[:, None], torch.tensor([0.0, 1.0, 0.0]), torch.tensor([0.0, 0.0, 1.0]))
@@ -99,9 +97,7 @@ def towards_origin(positions: Float[np.ndarray, "V 3"]) -> Float[torch.Tensor, "
 
 
 def normalized(arrays: Gaussians) -> Gaussians:
-    """Translate and scale a cloud so that the centres of its visible Gaussians have mean 0 and lie
-    in [-1, 1]^3.
-    """
+    """Translate and scale a cloud: its visible centres have mean 0 and lie in [-1, 1]^3."""
     visible = opaque(arrays, MIN_OPACITY)
     means = arrays.means[visible] if visible.any() else arrays.means
     centre = means.mean(axis=0)

@@ -1,6 +1,4 @@
-"""Connect to Ray and start the workers; hand assets to them, note what became of these, and watch
-for workers that hang. Ray restarts a worker that was killed or whose machine is gone, and hands it
-the asset again."""
+"""Ray's cluster: workers, which asset each makes, what became of it, and those that hang."""
 
 import os
 import socket
@@ -144,9 +142,7 @@ class Driver:
         self.bar = tqdm(total=self.total, initial=self.done, unit="asset", disable=None, ncols=110)
 
     def run(self) -> None:
-        """Make the assets; raises UserError if the results can't be written, or the first assets
-        all fail with one message. Ctrl-C is raised when the workers have written checkpoints.
-        """
+        """Make the assets; raises UserError for an obstacle, and Ctrl-C after the checkpoints."""
         due = 0.0
         try:
             self.fill()

@@ -52,9 +52,7 @@ class AnotherRow(UserError):
 
 
 class Place:
-    """A farm's folder on a disk that all its machines share, or below a URL; raises UserError for a
-    URL whose protocol, package or server isn't there.
-    """
+    """A farm's folder, on a disk of all its machines or below a URL; raises UserError."""
 
     def __init__(self, out: str | os.PathLike) -> None:
         import fsspec
@@ -111,9 +109,7 @@ class Place:
             return [content if isinstance(content, bytes) else None for content in found]
 
     def read_json(self, *names: str) -> list[Optional[dict[str, Any]]]:
-        """Return the contents of JSON files; None for those that don't exist. Raises UserError for
-        one that isn't an object, or no record.
-        """
+        """Return JSON files, None for missing ones; raises UserError for what is no record."""
         found = []
         for name, content in zip(names, self.read(names), strict=True):
             try:
@@ -160,9 +156,7 @@ class Place:
         return {"state": FINISHED, **record} if ours else None
 
     def fetch_checkpoint(self, row: Row, saves_memory: bool) -> None:
-        """Bring the last checkpoint that was made with one configuration beside what this machine
-        has of the asset; ``resume=auto`` takes the one with the highest step.
-        """
+        """Bring the last checkpoint of one configuration beside what this machine has."""
         if self.remote:
             folder = self.work_folder(row)
             self.uploaded = _written(folder / LAST)  # may be older than the other
@@ -192,9 +186,7 @@ class Place:
             self.remove(part_of(row, saves_memory) for saves_memory in (False, True))
 
     def records(self, rows: Iterable[Row]) -> Iterator[tuple[Row, dict[str, Any]]]:
-        """Yield each row with the record of its asset: the content of ``result.json``, else of
-        ``failed.json``, with ``state``. What hasn't been begun costs nothing but one listing.
-        """
+        """Yield each row with its ``result.json``, else its ``failed.json``, and ``state``."""
         begun = self.names(ASSETS) | (self.names(PARTS) if self.remote else set())
         rows = iter(rows)
         while batch := list(islice(rows, BATCH)):

@@ -128,9 +128,7 @@ def repeat_command(recipe: Recipe, job: Job) -> str:
 
 
 def check_recipe(recipe: Recipe, rows: Iterable[Row]) -> Recipe:
-    """Check all rows; return the recipe with the low-memory configuration, if that is valid with
-    the farm's. Errors name the line of the row.
-    """
+    """Check all rows; return the recipe, with the low-memory configuration if that is valid."""
     from .. import register_parts
     from ..launch.parts import load_extensions
 
@@ -169,9 +167,7 @@ def check_job(recipe: Recipe, job: Job) -> None:
 
 
 def unfinished(place: Place, prompts: Path, total: int) -> tuple[int, Iterator[Job]]:
-    """Return the number of finished assets of a prompt list with ``total`` rows, and the others;
-    raises AnotherRow for an asset whose record is of another row.
-    """
+    """Return how many rows are finished, and the others; raises AnotherRow for a changed one."""
     finished: set[int] = set()
     begun: dict[int, tuple[float, bool]] = {}
     rows = place.records(read_rows(prompts))
@@ -187,9 +183,7 @@ def unfinished(place: Place, prompts: Path, total: int) -> tuple[int, Iterator[J
 
 
 def require_same_farm(place: Place, recipe: Recipe, *, before_ray: bool = False) -> None:
-    """Check that a folder is new or of the same farm, and note the farm in a new one;
-    ``before_ray`` without what depends on the machines, and without a note.
-    """
+    """Check that a folder is new, which is noted but ``before_ray``, or of the same farm."""
     ours = {
         "version": __version__,
         "configurations": [

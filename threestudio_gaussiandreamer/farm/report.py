@@ -94,9 +94,7 @@ def table_line(row: Row, record: dict[str, Any], price: Optional[float]) -> dict
 
 
 def tables(stack: ExitStack, folder: Path) -> Callable[[list[dict[str, Any]]], None]:
-    """Begin ``table.csv``, and ``table.parquet`` where pyarrow is installed; return the function
-    that writes lines to them. They are complete when ``stack`` is closed.
-    """
+    """Begin ``table.csv`` and, with pyarrow, ``table.parquet``; return what writes lines."""
     # closed before its file would be
     text = io.TextIOWrapper(stack.enter_context(atomic_file(folder / CSV)), "utf-8", newline="")
     stack.callback(text.detach)

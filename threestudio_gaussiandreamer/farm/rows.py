@@ -41,9 +41,7 @@ class Row(NamedTuple):
 
 
 def read_rows(path: Path) -> Iterator[Row]:
-    """Yield the rows of a prompt list; the format follows from the extension. Raises UserError for
-    a missing or invalid file, whose message names the line.
-    """
+    """Yield the rows of a prompt list; raises UserError, whose message names the line."""
     existing_file(path, "prompt list")
     suffix = path.suffix.lower()
     if suffix not in FORMATS:
@@ -67,9 +65,7 @@ def read_rows(path: Path) -> Iterator[Row]:
 
 
 def check_rows(path: Path) -> int:
-    """Return the number of rows of a prompt list; raises UserError as :func:`read_rows`, for a list
-    without prompts, and for two rows of one name.
-    """
+    """Return the number of rows; raises UserError also for none, and for two of one name."""
     lines: dict[bytes, int] = {}
     for row in read_rows(path):
         # a digest, since a set of a million names takes less memory so

@@ -64,9 +64,7 @@ class Worker:
     is_ready = False
 
     def hello(self, setting: Setting) -> None:
-        """Prepare this process; raises UserError if this machine has another version of the
-        package, or not the folder that the farm was started in.
-        """
+        """Prepare this process; raises UserError for another version, or a missing folder."""
         if self.is_ready:
             return
         name, host = "threestudio-gaussiandreamer", socket.gethostname()

@@ -121,9 +121,7 @@ def _spent(stored: StoredCloud, reached: float) -> float:
 
 
 def remaining_budget(asked: Budget, stored: StoredCloud) -> Budget:
-    """Return the part of a PSNR budget that earlier pruning has not used; if all of it is used, a
-    budget that keeps all Gaussians. The error of earlier pruning counts for a gain, too.
-    """
+    """Return the part of a PSNR budget that earlier pruning, also an error for a gain, has left."""
     if stored.pruned_to is None:
         return asked
     asked = asked._replace(error=asked.error + error_of(stored.pruned_to))
@@ -158,9 +156,7 @@ def _count_within(size: int, stored: StoredCloud, suffix: str, where: str) -> in
 def _simplify(
     stored: StoredCloud, budget: Budget, options: PruneOptions, suffix: str
 ) -> tuple[StoredCloud, float]:
-    """Prune within a budget; return the cloud, and a lower bound of its stored values' PSNR to the
-    given cloud, dB.
-    """
+    """Prune; return the cloud and a lower bound of its stored values' PSNR to the given one."""
     from tqdm import tqdm
 
     cloud = stored.gaussians.tensors(get_device())
