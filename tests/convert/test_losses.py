@@ -7,11 +7,7 @@ import pytest
 
 from tests.helpers.object_clouds import ball
 from threestudio_gaussiandreamer.convert.losses import compare, losses, reference
-from threestudio_gaussiandreamer.formats.gaussian_files import (
-    StoredCloud,
-    read_cloud,
-    write_cloud,
-)
+from threestudio_gaussiandreamer.formats.gaussian_files import StoredCloud, read_cloud, write_cloud
 
 
 def said(cloud, suffix, version=3, **more):

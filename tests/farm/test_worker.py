@@ -11,13 +11,7 @@ from threestudio_gaussiandreamer import __version__
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.farm import worker
 from threestudio_gaussiandreamer.farm.board import Beat, Board
-from threestudio_gaussiandreamer.farm.place import (
-    FAILED,
-    STOPPED,
-    AnotherRow,
-    Place,
-    Unreachable,
-)
+from threestudio_gaussiandreamer.farm.place import FAILED, STOPPED, AnotherRow, Place, Unreachable
 from threestudio_gaussiandreamer.farm.recipe import Job, Recipe, Source
 from threestudio_gaussiandreamer.farm.rows import Row
 from threestudio_gaussiandreamer.farm.worker import (

@@ -31,9 +31,7 @@ def cuda_on_the_host(monkeypatch: pytest.MonkeyPatch) -> None:
     """Make the backend "cuda" accept CPU tensors and run its kernels in emulation."""
     host = HostDevice()
     monkeypatch.setitem(
-        backends.BACKENDS,
-        "cuda",
-        backends.Backend(cuda, ("cpu",), (torch.float32,)),
+        backends.BACKENDS, "cuda", backends.Backend(cuda, ("cpu",), (torch.float32,))
     )
     monkeypatch.setattr(cuda_driver, "unavailable", lambda: None)
     monkeypatch.setattr(cuda_driver, "device", lambda device: host)

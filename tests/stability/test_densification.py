@@ -130,9 +130,7 @@ def test_a_trained_cloud_that_is_too_large_keeps_what_contributes(tmp_path, meas
 
 @row("A3", "Collapse to 0")
 @pytest.mark.parametrize(
-    "rules",
-    [{"min_opacity": 1.1}, {"min_opacity": 0.05, "max_scale": 1e-6}],
-    ids=str,
+    "rules", [{"min_opacity": 1.1}, {"min_opacity": 0.05, "max_scale": 1e-6}], ids=str
 )
 def test_the_floor_keeps_what_contributes_most(rules, measured, said):
     geometry = started()
