@@ -94,6 +94,7 @@ def demo():
         ("trainer.overfit_batches=2", "trainer.overfit_batches: expected no value, since views"),
         ("trainer.accelerator=cpu", "trainer.accelerator is set by --gpu"),
         ("checkpoint.every_n_epochs=1", "checkpoint: Combination of parameters"),
+        ("checkpoint.filename='{step'", "checkpoint.filename: expected '}' before end of string"),
         ("checkpoint.dirpath=x", "checkpoint.dirpath is set by exp_root_dir"),
         ("viewer={prot: 80}", "unknown key 'viewer.prot': did you mean 'viewer.port'"),
         ("viewer={port: 0}", "viewer.port: expected a number from 1 to 65535, got 0"),

@@ -31,6 +31,15 @@ def test_what_is_no_source_in_custom_is_neither_loaded_nor_copied(launch):
     assert copied == {"part.py", "package/__init__.py", "package/inner.py"}
 
 
+def test_a_source_that_can_not_be_read_is_left_out_of_the_copy(monkeypatch, tmp_path):
+    for name in ("secret.py", "part.py", ".hidden.py", "data.npy"):
+        (tmp_path / name).touch()
+    read, folder = Path.read_bytes, tmp_path
+    secret = lambda path: read(folder if path.name == "secret.py" else path)  # noqa: E731
+    monkeypatch.setattr(Path, "read_bytes", secret)
+    assert callbacks.read_sources(tmp_path, Path("code")) == {Path("code/part.py"): b""}
+
+
 def test_the_record_holds_what_was_read_and_said(launch, monkeypatch):
     """Of a configuration that is deleted meanwhile and whose name is no UTF-8; in the place of the
     copy is a pipe, where writing would wait for a reader.

@@ -15,7 +15,7 @@ from ..core.checkpoint_file import load_file, save_file
 from ..core.command import interrupt, restore_handlers, set_handlers
 from ..core.files import atomic_file
 from ..core.host_copies import flush_reads
-from ..host import info, pl
+from ..host import info, pl, warn
 from .config import dump_config
 from .run_folder import PARSED
 
@@ -119,7 +119,10 @@ def read_sources(source: Path, destination: Path) -> dict[Path, bytes]:
         is_hidden = any(part.startswith((".", "__pycache__")) for part in name.parts)
         # an editor's lock (a broken link) or a FIFO is no file
         if path.suffix in SOURCE_ENDINGS and not is_hidden and path.is_file():
-            found[destination / name] = path.read_bytes()
+            try:
+                found[destination / name] = path.read_bytes()
+            except OSError as error:
+                warn(f"{path} isn't copied to {destination}: {error.strerror}")
     return found
 
 

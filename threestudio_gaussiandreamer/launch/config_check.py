@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from dataclasses import field, make_dataclass
 from typing import Any
 
+import torch
 from omegaconf import OmegaConf
 
 from ..core.distributed import require_shareable
@@ -92,7 +93,9 @@ def check_config(cfg: Any) -> None:
         logged = system.logged(parse_structured(system.Config, cfg.system, "system."))
         if logged is not None and monitor not in logged | {"epoch", "step"}:
             raise unknown("checkpoint.monitor", monitor, logged)
-    build("checkpoint", pl.callbacks.ModelCheckpoint, plain(cfg.checkpoint))
+    checkpointing = build("checkpoint", pl.callbacks.ModelCheckpoint, plain(cfg.checkpoint))
+    numbers = dict.fromkeys(("epoch", "step"), torch.tensor(0))  # files are named in the end
+    build("checkpoint.filename", checkpointing.format_checkpoint_name, {"metrics": numbers})
     options = {key: v for key, v in plain(cfg.trainer).items() if key not in NEEDS_PROCESSES}
     build("trainer", pl.Trainer, {**options, "devices": 1, "logger": False})
 
