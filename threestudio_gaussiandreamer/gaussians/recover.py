@@ -80,9 +80,8 @@ class Recovery:
         self.first_scale = 0  # index into LR_SCALES
 
     def __call__(self, cloud: Gaussians, round_number: int) -> Round:
-        """Recover with the largest learning rates that don't lower the validation PSNR; not at all
-        if all do. Successive rounds need similar rates, so the search starts one step above the
-        previous round's.
+        """Recover with the largest rates that don't lower the validation PSNR, if any does.
+        The search starts one step above the previous round's rates.
         """
         constant = cloud.sh[:, :1].clamp(-self.sh_reach, self.sh_reach)
         cloud = best = cloud._replace(sh=torch.cat([constant, cloud.sh[:, 1:]], 1))

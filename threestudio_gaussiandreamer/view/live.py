@@ -44,9 +44,7 @@ def require_server(host: str, port: int) -> None:
 
 
 class LiveView:
-    """A server that shows one cloud, which may change, below a title; raises UserError as
-    :func:`require_server` does.
-    """
+    """A server that shows one cloud, which may change; raises as :func:`require_server`."""
 
     def __init__(self, host: str, port: int, title: str) -> None:
         require_server(host, port)
@@ -115,9 +113,7 @@ class LiveView:
 
 
 class Controls:
-    """The buttons of a training run in a view's panel. Browsers set the flags from the server's
-    threads; the training reads them.
-    """
+    """The buttons of a training run in a view's panel, pressed in the server's threads."""
 
     def __init__(self, view: LiveView) -> None:
         gui = view.server.gui

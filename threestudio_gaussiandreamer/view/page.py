@@ -123,7 +123,7 @@ def require_page_size(count: int, name: str) -> None:
 
 
 def _checked(shown: Shown, name: str) -> Shown:
-    """Drop what can't be drawn, as the exporters do, and check the number that is left."""
+    """Drop what can't be drawn, as the exporters do, and check how many are left."""
     gaussians = finite(shown.cloud.gaussians.arrays(), name)
     require_page_size(len(gaussians.means), name)
     return shown._replace(cloud=shown.cloud._replace(gaussians=gaussians))

@@ -112,9 +112,7 @@ class RunFiles:
 
     @property
     def picture(self) -> Optional[Path]:
-        """The poster of the last export, else a picture of the last test views, or of a validation;
-        None if there is none.
-        """
+        """The poster of the last export, else a picture of the last test views or validation."""
         poster = [self.export / "poster.png"] if self.export else []
         views = sorted(self.save.glob("it*-test/0.png"), key=lambda path: step_of(path.parent))
         validations = sorted(self.save.glob("it*.png"), key=step_of)
@@ -122,9 +120,7 @@ class RunFiles:
         return next(filter(Path.is_file, found), None)
 
     def psnr(self, key: str, step: Optional[int] = None) -> Optional[float]:
-        """Return dB of the "prior" or "result" on held-out views; None if they aren't known, or not
-        of ``step``.
-        """
+        """Return dB of the "prior" or "result" on held-out views; None if unknown at ``step``."""
         found = section(self.scores, key)
         known = isinstance(found.get("psnr"), float) and step in (None, found.get("step"))
         return found["psnr"] if known else None
