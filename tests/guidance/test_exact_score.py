@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from tests.diffusion.test_exact_score import denoised
-from tests.guidance.exact_score_cases import batch, guidance, step, uniform
+from tests.guidance.conftest import batch, guidance, step, uniform
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.diffusion import exact_score as closed_form
 from threestudio_gaussiandreamer.diffusion import sds

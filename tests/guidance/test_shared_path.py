@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from tests.guidance.exact_score_cases import step, uniform
+from tests.guidance.conftest import step, uniform
 from threestudio_gaussiandreamer.core import streams
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.core.host_copies import HostCopy, flush_reads

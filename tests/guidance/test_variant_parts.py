@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from tests.guidance.exact_score_cases import guidance
+from tests.guidance.conftest import guidance
 from tests.helpers import tiny_guidance as tiny
 from tests.helpers.pixel_guidance import MixtureGuidance, latents, mixture_guidance
 from threestudio_gaussiandreamer.core.errors import UserError
