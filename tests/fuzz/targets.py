@@ -460,7 +460,7 @@ def exercise_mesh(path: Path) -> None:
     require_points(MeshPrior({"path": str(path)})("a fox"))
     require_points(MeshPrior({"path": str(path), "num_points": 50})("a fox"))
     c2w = np.array([[0.0, 0, 1, 3], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
-    image = MeshCaster(mesh).render(c2w, 0.8, 8, 8, supersample=1)
+    image = MeshCaster(mesh).render_views([(c2w, 0.8)], 8, 8, supersample=1)
     assert np.isfinite(image).all() and image.min() >= 0 and image.max() < 1 + 1e-5, "a pixel"
 
 

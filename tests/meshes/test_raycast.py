@@ -61,13 +61,17 @@ def sphere(radius=1.0, subdivisions=5):
     return Mesh(np.array(source.vertices), np.array(source.faces))
 
 
+def picture(caster, c2w, fovy, height, width, supersample=2):
+    return caster.render_views([(c2w, fovy)], height, width, supersample=supersample)[0]
+
+
 @both
 def test_the_silhouette_of_a_sphere(distance=3.0, fovy=40.0, height=80, width=120):
     """In perspective a sphere of radius r at distance d subtends the angle asin(r / d): a disc of
     radius f tan of it.
     """
     view = look(20, 30, distance), math.radians(fovy)
-    image = MeshCaster(sphere(0.8)).render(*view, height, width, supersample=4)
+    image = picture(MeshCaster(sphere(0.8)), *view, height, width, supersample=4)
     focal = height / (2 * math.tan(math.radians(fovy) / 2))
     radius = focal * math.tan(math.asin(0.8 / distance))
     # the icosphere's edges lie 5e-4 inside; 16 samples a pixel leave about 0.2 % of the area
@@ -83,9 +87,9 @@ def test_sides_of_a_cube_are_seen_upright_and_not_mirrored():
     """From the front, +y is on the right and +z on top."""
     caster = MeshCaster(cube())
     for side, angles in SIDES.items():
-        image = caster.render(look(*angles, 3), math.radians(40), 32, 32)
+        image = picture(caster, look(*angles, 3), math.radians(40), 32, 32)
         np.testing.assert_allclose(image[16, 16], [*COLORS[side], 1], atol=1e-6)
-    image = caster.render(look(30, 30, 3), math.radians(40), 64, 64)
+    image = picture(caster, look(30, 30, 3), math.radians(40), 64, 64)
     red, green, blue = image[..., 0] > 0.1, image[..., 1] > 0.9, image[..., 2] > 0.9
     assert np.nonzero(green & ~red & (image[..., 2] < 0.1))[1].mean() > 36  # +y
     assert np.nonzero(blue & ~red)[0].mean() < 24  # +z
@@ -97,7 +101,7 @@ def test_a_point_lands_where_the_intrinsics_say():
     mesh = sphere(0.02, 2)
     mesh = mesh._replace(vertices=mesh.vertices + position)
     c2w, fovy, height, width = look(25, 70, 2.5), math.radians(50), 60, 100
-    image = MeshCaster(mesh).render(c2w, fovy, height, width, supersample=8)
+    image = picture(MeshCaster(mesh), c2w, fovy, height, width, supersample=8)
     viewmats, Ks = cameras.to_opencv(torch.tensor(c2w)[None], torch.tensor([fovy]), height, width)
     projected = Ks[0].double() @ (viewmats[0, :3, :3] @ torch.tensor(position) + viewmats[0, :3, 3])
     weights = image[..., 3] / image[..., 3].sum()
@@ -109,17 +113,17 @@ def test_a_point_lands_where_the_intrinsics_say():
 @both
 def test_colour_is_premultiplied_and_supersampling_is_the_mean_of_a_larger_picture(monkeypatch):
     caster = MeshCaster(cube())
-    image = caster.render(look(0, 0, 3), math.radians(40), 30, 30, supersample=4)
+    image = picture(caster, look(0, 0, 3), math.radians(40), 30, 30, supersample=4)
     edge = (image[..., 3] > 0) & (image[..., 3] < 1)
     assert edge.any()
     np.testing.assert_allclose(image[..., 0], image[..., 3], atol=1e-6)  # the front is red
     over = over_background(image, np.array([0.0, 1.0, 0.0]))
     np.testing.assert_allclose(over[..., :2].sum(axis=-1), 1, atol=1e-6)
     view = look(30, 40, 2.5), math.radians(50)
-    large = caster.render(*view, 48, 72, 1).reshape(16, 3, 24, 3, 4).mean(axis=(1, 3))
-    np.testing.assert_allclose(caster.render(*view, 16, 24, 3), large, atol=1e-6)
+    large = picture(caster, *view, 48, 72, 1).reshape(16, 3, 24, 3, 4).mean(axis=(1, 3))
+    np.testing.assert_allclose(picture(caster, *view, 16, 24, 3), large, atol=1e-6)
     monkeypatch.setattr(raycast, "RAYS_PER_CAST", 1)
-    np.testing.assert_allclose(caster.render(*view, 16, 24, 3), large, atol=1e-6)
+    np.testing.assert_allclose(picture(caster, *view, 16, 24, 3), large, atol=1e-6)
 
 
 @both
@@ -127,11 +131,11 @@ def test_cameras_inside_beside_and_away():
     caster = MeshCaster(cube())
     inside, away = look(10, 20, 0.1), look(10, 20, 3)
     away[:3, :3] *= [-1, 1, -1]  # looks the other way
-    assert caster.render(inside, 1.0, 8, 8)[..., 3].min() == 1
-    assert caster.render(away, 1.0, 8, 8).max() == 0
+    assert picture(caster, inside, 1.0, 8, 8)[..., 3].min() == 1
+    assert picture(caster, away, 1.0, 8, 8).max() == 0
     beside = look(0, 0, 3)
     beside[1, 3] += 50
-    assert caster.render(beside, 1.0, 8, 8).max() == 0
+    assert picture(caster, beside, 1.0, 8, 8).max() == 0
 
 
 @pytest.mark.parametrize("terminal", [True, False])
@@ -144,7 +148,7 @@ def test_many_views_are_the_single_views(terminal, capfd, monkeypatch):
     together = caster.render_views(views, 12, 18, supersample=2)
     assert not capfd.readouterr().err
     for image, view in zip(together, views, strict=True):
-        np.testing.assert_array_equal(image, caster.render(*view, 12, 18, 2))
+        np.testing.assert_array_equal(image, picture(caster, *view, 12, 18, 2))
     assert caster.render_views([], 12, 18).shape == (0, 12, 18, 4)
     caster.render_views(views[:2], 4, 4, progress="bank of views")
     assert ("bank of views" in capfd.readouterr().err) == terminal
@@ -169,7 +173,7 @@ def test_the_cache_casts_each_picture_once_and_drops_the_oldest_use(monkeypatch)
     c2w, fovy = orbit_tensors(0, 90, 0)
     first = cache(c2w, fovy, 10, 12)
     assert cast == [2]
-    expected = caster.render(c2w[1].numpy(), float(fovy[1]), 10, 12, 2)
+    expected = picture(caster, c2w[1].numpy(), float(fovy[1]), 10, 12, 2)
     np.testing.assert_allclose(first[1] / 255.0, expected, atol=0.5 / 255 + 1e-6)
     cast.clear()
     assert first.dtype == torch.uint8 and torch.equal(cache(c2w, fovy, 10, 12), first) and not cast

@@ -46,23 +46,6 @@ class MeshCaster:
         self._hits = _fastest_hits(mesh)
         self._vertices = mesh.vertices.astype(np.float32)
 
-    def render(
-        self,
-        c2w: Float[np.ndarray, "4 4"],
-        fovy: float,
-        height: int,
-        width: int,
-        supersample: int = 2,
-    ) -> Float[np.ndarray, "H W 4"]:
-        """Render premultiplied colour and coverage in [0, 1], float32.
-
-        Args:
-            c2w: OpenGL camera to world.
-            fovy: vertical field of view, radians.
-            supersample: each pixel is the mean of a regular supersample x supersample grid.
-        """
-        return self.render_views([(c2w, fovy)], height, width, supersample=supersample)[0]
-
     def render_views(
         self,
         cameras: Iterable[tuple[np.ndarray, float]],
@@ -72,8 +55,12 @@ class MeshCaster:
         supersample: int = 2,
         progress: str = "",
     ) -> Float[np.ndarray, "N H W 4"]:
-        """Render several cameras (c2w, fovy) in threads on all cores; see :meth:`render`. Terminals
-        show a bar with the label ``progress`` unless it is empty.
+        """Render premultiplied colour and coverage in [0, 1], float32, in threads on all cores.
+
+        Args:
+            cameras: OpenGL camera to world (4, 4), and vertical field of view, radians.
+            supersample: each pixel is the mean of a regular supersample x supersample grid.
+            progress: label of a bar that terminals show; empty for none.
         """
         from tqdm import tqdm
 

@@ -141,8 +141,7 @@ def draw_orbit(count: int, rng: np.random.Generator) -> Orbit:
 def render(mesh: Mesh, orbit: Orbit, size: int = SIZE) -> Float[np.ndarray, "N s s 4"]:
     """Ray cast the mesh from these cameras; return premultiplied RGBA in [0, 1]."""
     cameras = zip(orbit_c2w(*orbit[:3]).numpy(), orbit.fovy.tolist(), strict=True)
-    caster = MeshCaster(mesh)
-    return np.stack([caster.render(c2w, fovy, size, size) for c2w, fovy in cameras])
+    return MeshCaster(mesh).render_views(cameras, size, size)
 
 
 def surface_points(mesh: Mesh, rng: np.random.Generator) -> Float[np.ndarray, "P 6"]:
