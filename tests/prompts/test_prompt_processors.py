@@ -32,10 +32,10 @@ def assert_same(mine, tokens, pooled=None):
         torch.testing.assert_close(value, expected, rtol=1e-5, atol=1e-5)
 
 
-def changed(model, folder, **settings):
-    """Return a copy of a model with other settings of its tokenizer."""
+def changed(model, folder, part="tokenizer/tokenizer_config", **settings):
+    """Return a copy of a model with other settings of its tokenizer, or of another ``part``."""
     copy = Path(shutil.copytree(model, folder))
-    file = copy / "tokenizer" / "tokenizer_config.json"
+    file = copy / f"{part}.json"
     known = json.loads(file.read_text()) | settings
     file.write_text(json.dumps({k: value for k, value in known.items() if value is not None}))
     return copy
@@ -68,10 +68,7 @@ def test_the_embeddings_are_those_of_diffusers_stable_diffusion_xl(models, tmp_p
         assert_same(out.uncond_text_embeddings, uncond, pooled_uncond)
         assert bool(out.uncond_text_embeddings.any()) == bool(negative)
     # a model that was trained with an empty prompt gets one, though the cache is the same
-    other = Path(shutil.copytree(folder, tmp_path / "other"))
-    index = json.loads((other / "model_index.json").read_text())
-    index["force_zeros_for_empty_prompt"] = False
-    (other / "model_index.json").write_text(json.dumps(index))
+    other = changed(folder, tmp_path / "other", "model_index", force_zeros_for_empty_prompt=False)
     assert processed(other, kind, negative_prompt="").uncond_text_embeddings.any()
     assert not processed(folder, kind, negative_prompt="").uncond_text_embeddings.any()
 
@@ -81,12 +78,11 @@ def test_the_embeddings_are_those_of_diffusers_stable_diffusion_3(models, use_t5
     folder, kind = models["stable-diffusion-3"], "stable-diffusion-3"
     out = processed(folder, kind, use_t5=use_t5)
     without = {} if use_t5 else {"text_encoder_3": None, "tokenizer_3": None}
-    pipe = diffusers.StableDiffusion3Pipeline.from_pretrained(
+    load = diffusers.StableDiffusion3Pipeline.from_pretrained
+    given = {"device": "cpu", "negative_prompt": "ugly"}
+    cond, uncond, pooled, pooled_uncond = load(
         folder, local_files_only=True, **without
-    )
-    cond, uncond, pooled, pooled_uncond = pipe.encode_prompt(
-        "a fox", None, None, device="cpu", negative_prompt="ugly"
-    )
+    ).encode_prompt("a fox", None, None, **given)
     assert_same(out.text_embeddings, cond, pooled)
     assert_same(out.uncond_text_embeddings, uncond, pooled_uncond)
     assert bool(out.text_embeddings[0, -T5_LENGTH - 1 : -1].any()) == use_t5

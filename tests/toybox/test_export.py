@@ -41,22 +41,14 @@ def hidden_states(stage, texts):
     return stage.text_model(token_ids(stage.tokenizer, texts)).last_hidden_state
 
 
-@pytest.fixture
-def prompts(exported):
-    processor = find("gaussiandreamer-stable-diffusion-prompt-processor")
-    model = str(exported / "stable-diffusion")
-    cfg = {"pretrained_model_name_or_path": model, "prompt": PROMPT, "negative_prompt": ""}
-    return processor({**cfg, "use_cache": False})()
+def part(exported, kind, **options):
+    model = {"pretrained_model_name_or_path": str(exported / "stable-diffusion")}
+    return find(f"gaussiandreamer-stable-diffusion-{kind}")(model | options)
 
 
-@pytest.fixture
-def guidance(exported):
-    model = str(exported / "stable-diffusion")
-    guide = find("gaussiandreamer-stable-diffusion-guidance")
-    return guide({"pretrained_model_name_or_path": model, "guidance_scale": 7.5})
-
-
-def test_the_prompt_processor_gives_the_tokens_of_the_training(prompts, unet_stage):
+def test_the_prompt_processor_gives_the_tokens_of_the_training(exported, unet_stage):
+    options = {"prompt": PROMPT, "negative_prompt": "", "use_cache": False}
+    prompts = part(exported, "prompt-processor", **options)()
     texts = [PROMPT, "", f"{PROMPT}, side view", f"{PROMPT}, overhead view"]
     expected = hidden_states(unet_stage, texts)
     found = [prompts.text_embeddings, prompts.uncond_text_embeddings]
@@ -64,7 +56,8 @@ def test_the_prompt_processor_gives_the_tokens_of_the_training(prompts, unet_sta
     assert torch.allclose(torch.cat(found), expected, **HALF)
 
 
-def test_the_guidance_sees_what_the_training_saw(guidance, prompts, unet_stage):
+def test_the_guidance_sees_what_the_training_saw(exported, unet_stage):
+    guidance = part(exported, "guidance", guidance_scale=7.5)
     assert guidance.prediction_type == "v_prediction"
     assert guidance.image_size == 128
     assert torch.allclose(guidance.alphas_cumprod, unet_stage.alphas_cumprod)

@@ -184,10 +184,9 @@ def test_a_shard_is_a_function_of_seed_and_index(shards):
         attributes = views.attributes_of(shard.labels[row])
         assert attributes == world.draw_attributes(0, row // 4)
         assert np.array_equal(shard.labels[row], views.label_row(attributes, shard.azimuth[row]))
-    attributes = world.Attributes("fox", "red")
-    names = views.LABELS["quadrant"]
     for azimuth, name in ((0, "front"), (44, "front"), (46, "left"), (180, "back"), (-90, "right")):
-        assert names[views.label_row(attributes, azimuth)[-1]] == name
+        row = views.label_row(world.Attributes("fox", "red"), azimuth)
+        assert views.LABELS["quadrant"][row[-1]] == name
 
 
 def test_objects_fill_the_picture_and_are_not_cut(shards):

@@ -24,7 +24,7 @@ from ..core.command import interrupt, run_command
 from ..core.errors import UserError, unknown
 from ..core.files import existing_file, output_folder
 from ..core.options import shown
-from ..formats.reading import reading
+from ..formats.reading import reading, require
 from ..launch.run_folder import claim
 from ..models.bundled import RECORD
 from ..view.run_files import read_json
@@ -129,6 +129,7 @@ def start_from(weights: Path, options: Options) -> None:
     """
     with reading(weights / RECORD, "record of the toybox's weights") as path:
         record = {name: dict(seen) for name, seen in json.loads(path.read_bytes()).items()}
+        require(bool(record), "it names no network")
     if not (options.folder / "tokenizer" / tokens.SETTINGS).is_file():
         source = weights / "stable-diffusion" / "tokenizer"
         existing_file(source / tokens.SETTINGS, "tokenizer")
