@@ -5,9 +5,9 @@ import resource
 import subprocess
 import sys
 import time
-import zipfile
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from tests.studio.test_studio import fetched, file_of
@@ -18,7 +18,6 @@ FOX = "a red fox with a green scarf"
 TOY = Path(__file__).parents[2] / "threestudio_gaussiandreamer/assets/toy.glb"
 QUICK = "trainer.max_steps=12 data.n_test_views=2 data.eval_width=64 data.eval_height=64 "
 QUICK += "data.train_views=8 system.evaluation.views=2 system.evaluation.size=64"
-BOMB = b"0" * 2**30
 HEADER = (
     b"ply\nformat binary_little_endian 1.0\nelement vertex 170000000\nproperty float x\n"
     b"property float y\nproperty float z\nend_header\n" + b"\0" * 100
@@ -84,9 +83,7 @@ def test_an_uploaded_mesh_is_reproduced_as_by_the_command_line(studio, tmp_path)
 def test_a_hostile_upload_is_refused_in_the_command_lines_words(name, studio, tmp_path, capfd):
     path = tmp_path / name
     if name == "bomb.npz":
-        with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
-            for member in ("points.npy", "colors.npy"):
-                archive.writestr(member, BOMB)
+        np.savez_compressed(path, points=np.zeros((10_000_000, 3), np.float32))
     elif name == "header.ply":
         path.write_bytes(HEADER)
     else:
@@ -103,6 +100,15 @@ def test_a_hostile_upload_is_refused_in_the_command_lines_words(name, studio, tm
     said = capfd.readouterr().err.rpartition("error: ")[2].strip()
     assert said in studio.text("message")
     assert studio.process.poll() is None
+
+
+def test_unknown_words_and_missing_weights_are_told_as_by_the_command_line(studio):
+    studio.start("a blurple fox", choice="toybox.yaml")
+    studio.until("$('advice').textContent.includes(\"wasn't trained on 'blurple' (near: purple\")")
+    studio.press("stop")
+    studio.until_ended()
+    studio.start("a fox", choice="gaussiandreamer.yaml")
+    studio.until("$('message').textContent.includes('hf download')")
 
 
 def test_a_file_that_is_too_large_is_not_sent(studio):

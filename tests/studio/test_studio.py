@@ -2,6 +2,7 @@
 
 import json
 import os
+import resource
 import signal
 import socket
 import time
@@ -129,6 +130,19 @@ def test_errors_are_those_of_the_command_line(studio, capfd):
     studio.start("a ball", more="trainer.max_stepz=3")
     studio.until("$('message').textContent.includes('error:')")
     assert expected in studio.text("message")
+
+
+def test_a_full_disk_is_told_and_ends_the_run_only(studio):
+    """A limit of the size of files, which the run's process inherits, stands for the disk."""
+    _, most = resource.prlimit(studio.process.pid, resource.RLIMIT_FSIZE)
+    resource.prlimit(studio.process.pid, resource.RLIMIT_FSIZE, (20_000, most))
+    try:
+        studio.start("a cone", more="data.n_test_views=1")
+        studio.until("$('message').textContent.includes('error:')")
+        assert "File too large" in studio.text("message")
+    finally:
+        resource.prlimit(studio.process.pid, resource.RLIMIT_FSIZE, (most, most))
+    assert studio.process.poll() is None
 
 
 def test_deleting_asks_first_and_deletes_runs_only(studio, made):

@@ -44,8 +44,8 @@ THEIRS = "sandbox allow-scripts allow-downloads"
 LARGEST_UPLOAD = 256 * 2**20  # bytes
 POLL = 0.15  # seconds between two looks for something new
 MODEL = "pretrained_model_name_or_path"
-TAKES = {"gaussians.sog": [], "gaussians.glb": ["--gaussians"], "mesh.glb": []}
-"""Files that are made when they are asked for, with options of the command that converts."""
+TAKES = {"gaussians.glb": ["--gaussians"]}
+"""Options of the command that converts, for files that need some."""
 
 
 def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
@@ -214,7 +214,7 @@ class Studio:
     def do_take(self, run: str, name: str) -> None:
         """Make a file of a run that isn't there yet."""
         cloud = cloud_file(self.path_of(run))
-        words = [str(cloud), str(cloud.with_name(name)), *TAKES[name]]
+        words = [str(cloud), str(cloud.with_name(Path(name).name)), *TAKES.get(name, ())]
         self.tools.add(Job(name, words, "convert", self.do_refresh))
 
     def do_prune(self, run: str, budget: str, value: str) -> None:

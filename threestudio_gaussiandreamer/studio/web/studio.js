@@ -162,6 +162,7 @@ function showState() {
       likeness !== undefined && `${likeness.toFixed(1)} dB likeness to the 2D model's picture`,
       left !== null && left !== undefined && `${Math.ceil(left)} s left`,
     ].filter(Boolean).join(" · ");
+    $("advice").textContent = linesOf(job).filter((line) => /wasn't trained on/.test(line)).join("\n");
     $("beside-2d").hidden = !pictures;
     if (pictures && $("picture").dataset.number !== `${job.id} ${pictures}`) {
       $("picture").dataset.number = `${job.id} ${pictures}`;
@@ -217,7 +218,7 @@ function choose(run) {
   const value = make("input", { value: "40", size: 6, ariaLabel: "Value of the budget" });
   budget.onchange = () => { value.value = { psnr: "40", auto: "0.5", count: "1000", bytes: "100kB" }[budget.value]; };
   const copy = (text) => make("button", { onclick: (event) => navigator.clipboard.writeText(text).then(() => { event.target.textContent = "Copied"; }) }, "Copy");
-  const taken = ["gaussians.sog", "gaussians.glb", "mesh.glb"].filter((name) => !run.files.some((known) => known.name === name));
+  const taken = ["gaussians.spz", "gaussians.sog", "gaussians.glb", "mesh.glb"].filter((name) => !run.files.some((known) => known.name === name));
   const scores = Object.entries(run.scores).filter(([, score]) => typeof score === "number").map(([name, score]) => `${name} ${+score.toPrecision(5)}`);
   $("chosen").replaceChildren(
     make("h2", {}, run.prompt),
