@@ -80,6 +80,7 @@ function startOf({ path, gaussians }) {
 }
 
 function start() {
+  if (!state.job) ask({ do: "show" });
   const prompts = $("prompt").value.split("\n").map((line) => line.trim()).filter(Boolean);
   for (const prompt of prompts.length ? prompts : [""])
     ask({ do: "start", words: words(prompt), label: prompt || (file ? file.name : $("choice").selectedOptions[0].text) });
@@ -101,7 +102,7 @@ function again(given) {
   const name = configs.join(" ");
   if (![...$("choice").options].some((option) => option.value === name)) $("choice").append(make("option", { value: name }, name));
   $("choice").value = name;
-  $("more").value = more.map((word) => (/\s/.test(word) ? `'${word}'` : word)).join(" ");
+  $("more").value = more.map((word) => (/[\s"']/.test(word) ? `'${word.replaceAll("'", `'"'"'`)}'` : word)).join(" ");
   $("prompt").focus();
 }
 
