@@ -120,7 +120,6 @@ def test_memory_after_twenty_runs_is_that_after_two(studio):
     sizes = []
     for index in range(20):
         studio.start(f"ball {index}", more="trainer.max_steps=2 data.n_test_views=1")
-        studio.until("state.job")
         studio.until_ended()
         status = Path(f"/proc/{studio.process.pid}/status").read_text()
         sizes.append(int(status.partition("VmRSS:")[2].split()[0]) / 1024)

@@ -196,7 +196,8 @@ class Studio:
         folder = self.root / "uploads" / hashlib.sha256(content).hexdigest()[:12]
         folder.mkdir(parents=True, exist_ok=True)
         path = Path(name.decode())
-        path = folder / f"{safe_name(path.stem)}{safe_name(path.suffix)[-12:]}"
+        ending = path.suffix[:12] if path.suffix[1:].isalnum() else ""
+        path = folder / f"{safe_name(path.stem)}{ending}"
         with atomic_file(path) as target:
             target.write(content)
         # a PLY is a mesh, points or Gaussians
