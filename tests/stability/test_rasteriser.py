@@ -632,7 +632,7 @@ def test_a_non_finite_gaussian_is_named(measured):
     cloud, view = random_cloud(300, seed=6).to(torch.float32), cameras(1, 8, 8, dtype=torch.float32)
     for name in NAMES:
         count = getattr(cloud, name)[[7, 9]].numel()
-        with pytest.raises(UserError, match=rf"{name} holds {count} .*\(7") as caught:
+        with pytest.raises(UserError, match=rf"{name} must be finite; got {count} .*\(7") as caught:
             bad = corrupted(cloud, name, [7, 9], math.nan)
             rasterize(*bad, *view, 8, 8, non_finite="error")
         assert "nan" in str(caught.value)

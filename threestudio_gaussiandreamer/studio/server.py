@@ -351,7 +351,7 @@ class Studio:
         if stamp == self.stamp:
             return
         self.stamp = stamp
-        with np.load(path) as arrays:
+        with np.load(path, allow_pickle=False) as arrays:
             if path == cloud:
                 gaussians = Gaussians(*(arrays[name] for name in Gaussians._fields))
             else:
