@@ -10,8 +10,7 @@ from jaxtyping import Float, Int
 
 from ..core.errors import UserError
 
-Vertices = Float[np.ndarray, "V 3"]
-Faces = Int[np.ndarray, "F 3"]
+Vertices, Faces = Float[np.ndarray, "_ 3"], Int[np.ndarray, "_ 3"]  # functions change how many
 Pairs = tuple[Int[np.ndarray, " P"], Int[np.ndarray, " P"]]
 """Half-edges that run from the lower vertex index to the higher, and their partners."""
 AGGRESSIVENESS = (7, 5, 3, 1)
