@@ -45,6 +45,6 @@ def test_what_the_use_raises_is_raised_once(arrive):
     reads.submit(torch.tensor(1), fail)
     reads.submit(torch.tensor(2), used.append)
     with pytest.raises(ValueError, match="1"):
-        reads.flush()
-    reads.flush()
+        reads.poll(wait=True)
+    reads.poll(wait=True)
     assert used == [2]

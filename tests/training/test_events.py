@@ -46,7 +46,7 @@ def test_numbers_that_arrive_late_are_logged_at_their_own_step(trainer, monkeypa
     trainer.global_step, trainer.current_epoch = 11, 1
     log.write(trainer, {"loss": torch.tensor(2.0)})
     assert not logged(trainer) and not trainer.progress_bar_metrics
-    log.reads.flush()
+    log.reads.poll(wait=True)
     assert logged(trainer) == [(9, {"loss": 1, "epoch": 0}), (10, {"loss": 2, "epoch": 1})]
     assert trainer.progress_bar_metrics == {"loss": 1.0}
 

@@ -50,22 +50,18 @@ def draw_shared(count: int, draw: Callable[[int], Tensor]) -> Tensor:
 def require_shareable(
     views: int, option: str, *, together: int = 1, processes: Optional[int] = None
 ) -> None:
-    """Check that the processes can share the views of a step equally.
+    """Raise UserError, which names ``option``, unless the processes can share the views of a step
+    equally, of which ``together`` consecutive ones stay in one process.
 
     Args:
-        option: names the option in the message.
-        together: so many consecutive views stay in one process.
         processes: how many there will be; by default those that there are.
-
-    Raises:
-        UserError: there are fewer views than processes, or their number is no multiple.
     """
     size = processes or world_size()
     if views % (size * together):
-        too_few = "fewer than" if views < size * together else "no multiple of"
+        relation = "fewer than" if views < size * together else "no multiple of"
         groups = f" in groups of {together}" if together > 1 else ""
         raise UserError(
-            f"{option} is {views}, {too_few} the {size} processes that share the views of a step"
+            f"{option} is {views}, {relation} the {size} processes that share the views of a step"
             f"{groups}: set {option} to {size * together} or a multiple, or use as many processes "
             f"as divide {views // together}"
         )

@@ -21,7 +21,7 @@ def extras() -> dict[str, list[str]]:
     try:
         requirements = metadata.requires("threestudio-gaussiandreamer") or []
     except metadata.PackageNotFoundError:
-        requirements = []
+        return found
     for line in requirements:
         extra = re.search(r"extra == ['\"](.+?)['\"]", line)
         if extra and extra[1] not in FOR_TESTS:

@@ -41,34 +41,22 @@ class DelayedReads:
         self._pending: deque[tuple[HostCopy, Callable[[Tensor], None]]] = deque()
 
     def submit(self, values: Tensor, use: Callable[[Tensor], None]) -> None:
-        """Call ``use`` with these values, now or in a later call of a method, which raises what it
-        raises.
-        """
+        """Call ``use`` with these values, now or in a later call of a method."""
         self._pending.append((HostCopy(values), use))
         self.poll()
 
-    def poll(self) -> None:
-        """Use the values that have arrived."""
-        while self._pending and self._pending[0][0].ready():
-            self._call_first()
-
-    def flush(self) -> None:
-        """Wait for all values that have been submitted."""
-        while self._pending:
-            self._call_first()
-
-    def _call_first(self) -> None:
-        copy, use = self._pending.popleft()
-        use(copy.values())
+    def poll(self, wait: bool = False) -> None:
+        """Use the values that have arrived, or with ``wait`` all that have been submitted."""
+        while self._pending and (wait or self._pending[0][0].ready()):
+            copy, use = self._pending.popleft()
+            use(copy.values())
 
 
 def flush_reads(*parts: Any) -> None:
-    """Wait for the values that parts have submitted to their ``reads``; other parts are left out.
-    Raises what the use of a value raises.
-    """
+    """Wait for the values that parts have submitted to their ``reads``, if they have any."""
     for part in parts:
         if isinstance(reads := getattr(part, "reads", None), DelayedReads):
-            reads.flush()
+            reads.poll(wait=True)
 
 
 def to_device(values: Tensor, device: torch.device | str) -> Tensor:

@@ -1,6 +1,7 @@
 """The environment variables by which torchrun, SLURM and others number the processes of a run."""
 
 import os
+import re
 from collections.abc import Mapping
 
 from .errors import UserError
@@ -16,15 +17,12 @@ SLURM = ("SLURM_PROCID", "SLURM_LOCALID", "SLURM_NODEID")
 
 
 def require_numbers(environment: Mapping[str, str] = os.environ) -> None:
-    """Check the variables before Lightning is imported, which reads some of them at once.
-
-    Raises:
-        UserError: one isn't a whole number.
+    """Raise UserError if a variable isn't a whole number, before Lightning is imported, which reads
+    some of them at once.
     """
     for name in (*INDICES, *SIZES):
-        text, lowest = environment.get(name), int(name in SIZES)
-        whole = text is None or text.isascii() and text.isdigit() and len(text) < 20
-        if not whole or text is not None and int(text) < lowest:
+        text, lowest = environment.get(name, "1"), int(name in SIZES)
+        if not re.fullmatch("[0-9]{1,19}", text) or int(text) < lowest:
             raise UserError(
                 f"the environment variable {name} is {text!r}; expected a whole number from "
                 f"{lowest} on, as torchrun or SLURM sets it: `unset {name}` for a single process"
@@ -39,25 +37,26 @@ def require_launcher(environment: Mapping[str, str] = os.environ) -> None:
             machines have different numbers of processes.
     """
     require_numbers(environment)
-    by_torchrun, by_slurm = "TORCHELASTIC_RUN_ID" in environment, many_tasks(environment)
+    by_torchrun = "TORCHELASTIC_RUN_ID" in environment
+    by_one = by_torchrun or many_tasks(environment)
     first, names, program, sizes = "SLURM_NTASKS", SLURM, "srun", SIZES[2:]
     if by_torchrun:
         first, names, program, sizes = "TORCHELASTIC_RUN_ID", TORCHRUN, "torchrun", SIZES[:2]
     missing = [name for name in names if name not in environment]
-    if missing and (by_torchrun or by_slurm):
+    if missing and by_one:
         raise UserError(
             f"the environment variable {first} is set, but not {', '.join(missing)}: start the "
             f"command with {program}, or `unset {first}` for a single process"
         )
     size, step = (int(environment.get(name, 1)) for name in sizes)
-    if size % step and (by_torchrun or by_slurm):
+    if size % step and by_one:
         raise UserError(
             f"the environment variable {sizes[0]} is {size}, no multiple of {sizes[1]}, which is "
             f"{step}: give each machine as many processes"
         )
     for name, started, hint in (
         ("RANK", by_torchrun, "start the command with torchrun"),
-        ("SLURM_PROCID", by_slurm or by_torchrun, "give srun --job-name and --ntasks-per-node"),
+        ("SLURM_PROCID", by_one, "give srun --job-name and --ntasks-per-node"),
     ):
         if not started and int(environment.get(name, 0)):
             raise UserError(

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from .errors import UserError
-from .options import Rule, is_whole, rule, shown
+from .options import Rule, is_whole, rule, wrong
 
 CGROUP_LIMIT = Path("/sys/fs/cgroup/memory.max")
 
@@ -24,22 +24,19 @@ def memory_bytes() -> int:
 def main_memory() -> int:
     """Return the bytes of the machine's or its container's memory, which a GPU's isn't part of."""
     try:
-        pages, size = os.sysconf("SC_PHYS_PAGES"), os.sysconf("SC_PAGE_SIZE")
+        total = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     except (AttributeError, ValueError, OSError):  # not a POSIX system
         return 2**40
     limit = CGROUP_LIMIT.read_text(encoding="utf-8").strip() if CGROUP_LIMIT.is_file() else "max"
-    return min(pages * size, int(limit)) if limit.isdigit() else pages * size
+    return min(total, int(limit)) if limit.isdigit() else total
 
 
 def require_memory(options: str, needed: float, what: str) -> None:
-    """Check that approximately ``needed`` bytes fit into memory.
+    """Raise UserError if about ``needed`` bytes exceed :func:`memory_bytes`.
 
     Args:
         options: the names of the options that determine the size, for the message.
         what: names the data in the message, such as "24 pictures of 256 x 256 pixels".
-
-    Raises:
-        UserError: ``needed`` exceeds :func:`memory_bytes`.
     """
     if needed > memory_bytes():
         raise UserError(
@@ -55,7 +52,7 @@ def count_of(things: str, low: int, bytes_each: int) -> Rule:
 
     def check(path: str, value: Any) -> None:
         if not is_whole(value) or value < low:
-            raise UserError(f"{path}: expected {low} or more {things}, got {shown(value)}")
+            raise wrong(path, f"{low} or more {things}", value)
         require_memory(path, bytes_each * value, f"{value} {things}")
 
     return rule(check)

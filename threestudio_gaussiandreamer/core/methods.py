@@ -18,25 +18,19 @@ def find_method(owner: type, name: str) -> Any:
 
 
 def require_method(owner: type, name: str, *parameters: str, more: bool = False) -> None:
-    """Check that the instances of a class have a method that takes some positional arguments.
-
-    Args:
-        parameters: names of the arguments, without ``self``.
-        more: the method may need further arguments.
-
-    Raises:
-        UserError: there is none, it is abstract, or it takes other arguments.
+    """Raise UserError unless the instances of a class have a method that takes positional arguments
+    of these names; with ``more`` it may need further ones.
     """
     call = f"{name}({', '.join([*parameters, *['...'] * more])})"
     found, method = find_method(owner, name), getattr(owner, name, None)
     if found is None or not callable(method):
         raise UserError(f"{owner.__name__} has no {call}")
-    # bound already, or an object that an instance doesn't bind, such as functools.partial
-    takes_no_self = isinstance(found, (classmethod, staticmethod)) or not hasattr(found, "__get__")
+    # not bound already, nor an object that an instance doesn't bind, such as functools.partial
+    binds = hasattr(found, "__get__") and not isinstance(found, (classmethod, staticmethod))
     signature = inspect.signature(method)
     try:
         bind = signature.bind_partial if more else signature.bind
-        bind(*(parameters if takes_no_self else ("self", *parameters)))
+        bind(*["self"] * binds, *parameters)
     except TypeError as error:
         raise UserError(
             f"{owner.__name__} has {name}{signature}, which is called as {call}: {error}"
@@ -50,10 +44,8 @@ def require_class_method(owner: type, name: str) -> None:
 
 
 def require_dataclass(owner: Any) -> None:
-    """Check the options of a part, ``Config``.
-
-    Raises:
-        UserError: it has what would be ignored: options without the decorator or without a type.
+    """Raise UserError if the options of a part, ``Config``, have what would be ignored: options
+    without the decorator or without a type.
     """
     config, types = owner.Config, inspect.get_annotations(owner.Config)
     names = [

@@ -4,6 +4,7 @@ in one place don't change those elsewhere. Numbers are drawn on the CPU, so they
 device."""
 
 import hashlib
+from typing import Any
 
 import numpy as np
 import torch
@@ -29,17 +30,10 @@ def numpy_generator(seed: int, stream: str, step: int = 0, item: int = 0) -> np.
 
 
 def normal_per_item(
-    shape: tuple[int, ...],
-    seed: int,
-    stream: str,
-    step: int,
-    device: torch.device | str = "cpu",
-    first: int = 0,
+    shape: tuple[int, ...], seed: int, stream: str, step: int, device: Any = "cpu", first: int = 0
 ) -> Tensor:
-    """Draw standard normal numbers (float32) of ``shape`` (B, ...).
-
-    Each of the B items, which are numbered from ``first``, has its own stream, so its numbers don't
-    depend on B.
+    """Draw standard normal numbers (float32) of ``shape`` (B, ...). Each of the B items, which are
+    numbered from ``first``, has its own stream, so its numbers don't depend on B.
     """
     items = torch.empty(shape)
     for b, item in enumerate(items, first):

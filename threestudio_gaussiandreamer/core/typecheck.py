@@ -21,9 +21,7 @@ def install() -> None:
 
 
 def check(function: Callable) -> Callable:
-    """Wrap ``function`` so that it raises TypeError when an array among its arguments or its result
-    doesn't match the annotation.
-    """
+    """Let ``function`` raise TypeError when an array doesn't match its annotation."""
     signature = inspect.signature(function)
 
     def require(value: Any, annotation: Any, what: str) -> None:

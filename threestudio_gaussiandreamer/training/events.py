@@ -52,7 +52,7 @@ class StepLog:
         self.reads.submit(torch.cat(flat or [torch.empty(0, dtype=torch.float64)]), log)
         # a monitored number must be that of the step whose checkpoint is written
         if any(getattr(saver, "monitor", None) for saver in trainer.checkpoint_callbacks):
-            self.reads.flush()
+            self.reads.poll(wait=True)
 
 
 def log_scores(
