@@ -20,12 +20,8 @@ from threestudio_gaussiandreamer.launch.callbacks import AtomicCheckpointIO
 
 
 def content(step: int = 7, size: int = 2000) -> dict:
-    return {
-        "state_dict": {"means": torch.arange(float(size)) + step},
-        "epoch": 0,
-        "global_step": step,
-        "note": "text",
-    }
+    state = {"means": torch.arange(float(size)) + step}
+    return {"state_dict": state, "epoch": 0, "global_step": step, "note": "text"}
 
 
 def same(a: dict, b: dict) -> bool:
@@ -34,14 +30,11 @@ def same(a: dict, b: dict) -> bool:
     )
 
 
-def test_plain_torch_reads_it_and_so_do_we(tmp_path):
+def test_plain_torch_and_this_package_read_each_others_files(tmp_path):
     save_file(tmp_path / "a.ckpt", content())
     assert same(load_checkpoint(tmp_path / "a.ckpt"), content())
     assert same(torch.load(tmp_path / "a.ckpt", weights_only=True), content())
     assert os.listdir(tmp_path) == ["a.ckpt"]
-
-
-def test_a_checkpoint_of_plain_torch_is_read_too(tmp_path):
     torch.save(content(), tmp_path / "a.ckpt")
     assert same(load_checkpoint(tmp_path / "a.ckpt"), content())
 
@@ -50,17 +43,12 @@ def test_the_file_that_is_replaced_is_kept(tmp_path):
     path = tmp_path / "last.ckpt"
     for step in (1, 2, 3):
         save_file(path, content(step))
-    assert load_file(path)["global_step"] == 3
-    assert (
-        previous_of(path).name == "last-prev.ckpt"
-        and load_file(previous_of(path))["global_step"] == 2
-    )
+    assert previous_of(path).name == "last-prev.ckpt"
+    assert [load_file(p)["global_step"] for p in (path, previous_of(path))] == [3, 2]
 
 
 def test_a_kill_between_keeping_and_replacing_leaves_nothing_behind(tmp_path):
-    """In that state the kept file and the last one are hard links to one file, and renaming one to
-    the other has no effect.
-    """
+    """The kept file and the last one are hard links to one file then."""
     path = tmp_path / "last.ckpt"
     save_file(path, content(1))
     os.link(path, previous_of(path))
@@ -105,9 +93,7 @@ def test_a_damaged_file_names_its_neighbours(tmp_path):
 
 
 def test_the_newest_of_a_folder_is_the_one_with_most_steps(tmp_path):
-    """Not by name or time: a copied folder doesn't preserve their order, and a kill may happen
-    between two files of one save.
-    """
+    """Not by name or time, which a copied folder doesn't preserve."""
     for name, step in (("last", 4), ("epoch=0-step=6", 6), ("epoch=0-step=2", 2)):
         save_file(tmp_path / f"{name}.ckpt", content(step))
     (tmp_path / "foreign.ckpt").write_bytes(b"no checkpoint at all")
@@ -125,10 +111,7 @@ def test_code_in_a_pickle_is_not_executed(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     torch.save({"state_dict": {}, "epoch": 0, "global_step": 0, "x": Bomb()}, "bomb.ckpt")
     (tmp_path / "bare.ckpt").write_bytes(pickle.dumps(Bomb()))
-    for name, message in (
-        ("bomb.ckpt", "could run code"),
-        ("bare.ckpt", "isn't a checkpoint"),
-    ):
+    for name, message in ("bomb.ckpt", "could run code"), ("bare.ckpt", "isn't a checkpoint"):
         with pytest.raises(UserError, match=message):
             AtomicCheckpointIO().load_checkpoint(name, weights_only=False)
     assert not (tmp_path / "exploded").exists()
@@ -143,10 +126,8 @@ def test_a_foreign_file_is_not_a_checkpoint(tmp_path, foreign):
 
 def test_a_missing_file_lists_what_is_there(tmp_path):
     save_file(tmp_path / "last.ckpt", content())
-    with pytest.raises(
-        UserError,
-        match="there is no checkpoint .*lst.ckpt; others in this folder, not checked: .*last.ckpt",
-    ):
+    others = "others in this folder, not checked: .*last.ckpt"
+    with pytest.raises(UserError, match=f"there is no checkpoint .*lst.ckpt; {others}"):
         load_file(tmp_path / "lst.ckpt")
     os.mkfifo(tmp_path / "fifo.ckpt")
     with pytest.raises(UserError, match="there is no checkpoint .*fifo.ckpt"):
@@ -164,16 +145,12 @@ def test_a_full_disk_leaves_the_earlier_file_and_no_temporary_one(tmp_path):
             save_file(tmp_path / "last.ckpt", content(2, size=200_000))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-    assert (
-        os.listdir(tmp_path) == ["last.ckpt"]
-        and load_file(tmp_path / "last.ckpt")["global_step"] == 1
-    )
+    assert os.listdir(tmp_path) == ["last.ckpt"]
+    assert load_file(tmp_path / "last.ckpt")["global_step"] == 1
 
 
 def test_a_tensor_that_repeats_a_number_is_refused(tmp_path):
-    """Copying it to a contiguous tensor would exhaust the memory; a weight that two layers share
-    is fine.
-    """
+    """A copy of it would exhaust the memory; a weight that two layers share is fine."""
     base = torch.zeros(1000)
     torch.save({str(i): base[:] for i in range(2)}, tmp_path / "two.ckpt")
     assert load_file(tmp_path / "two.ckpt").keys() == {"0", "1"}
