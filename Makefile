@@ -73,7 +73,7 @@ train-toybox: $(VENV)/ready-for-models       ## train small models on generated 
 	$(BIN)/python -m threestudio_gaussiandreamer.toybox.export $(TOYBOX) $(TOYBOX)/models
 
 toybox-sheet: $(VENV)/ready-for-models       ## docs/images/toybox-world.png: 100 objects of the toybox
-	$(BIN)/python -m benchmarks.quality.toybox_world docs/images/toybox-world.png
+	$(BIN)/python -m tools.toybox_world docs/images/toybox-world.png
 
 charts: $(VENV)/ready-for-charts   ## docs/charts/*.png from the committed numbers beside them
 	$(ENVIRON) $(BIN)/python -m benchmarks.splatting.chart_splatting --from-csv

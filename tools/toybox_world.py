@@ -1,4 +1,4 @@
-"""Draw 100 objects of the toybox: ``python -m benchmarks.quality.toybox_world FILE.png``."""
+"""Draw 100 objects of the toybox: ``python -m tools.toybox_world FILE.png``."""
 
 import sys
 from pathlib import Path
