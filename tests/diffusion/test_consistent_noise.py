@@ -6,11 +6,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
-from threestudio_gaussiandreamer.cameras import (
-    focal_length,
-    orbit_c2w,
-    surface_points,
-)
+from threestudio_gaussiandreamer.cameras import focal_length, orbit_c2w, surface_points
 from threestudio_gaussiandreamer.diffusion.consistent_noise import (
     LATTICES,
     PRIMES,
@@ -98,9 +94,7 @@ def test_the_background_has_noise_of_its_own_in_each_view_and_draw():
 
 
 def test_cells_are_cubes_of_each_lattice():
-    """The hash of the coordinates, point by point in Python's integers; a pixel is the sum of its
-    cells in all lattices.
-    """
+    """The hash by Python's integers; a pixel is the sum of its cells in all lattices."""
     depth, opacity, c2w, fovy = view = ball([30.0, 200.0], 16)
     focal = focal_length(fovy, 16)
     points, size = surface_points(depth[..., 0], c2w, focal), cell_size(c2w, focal)

@@ -83,9 +83,7 @@ def test_distances_in_chunks_are_the_distances(monkeypatch):
 
 
 def test_logits_in_float32_at_512_are_stable():
-    """The logits of float32 images, nearly equal so that they cancel, are within 0.01 nat of those
-    of differences.
-    """
+    """Nearly equal, so that they cancel: within 0.01 nat of those of differences."""
     size, abar = 3 * 512 * 512, ABAR[20:21]
     bank = torch.rand(2, size, generator=torch.Generator().manual_seed(0)) * 2 - 1
     bank[1] = bank[0] + 1e-3 * randn(size, seed=1, dtype=torch.float32)

@@ -1,6 +1,4 @@
-"""DDIM inversion, and its noise from a table: standard normal, a function of (seed, stream, step,
-part, item).
-"""
+"""DDIM inversion, and its noise from a table: a function of (seed, stream, step, part, item)."""
 
 import functools
 import itertools
@@ -77,10 +75,6 @@ def test_items_at_timestep_0_stay_even_if_the_model_returns_its_input():
         for now, later in itertools.pairwise(timesteps):
             expected = sds.ddim_step(expected[None], expected[None], ABAR[[now]], ABAR[[later]])[0]
         torch.testing.assert_close(z[item], expected)
-
-
-# Noise from a table
-# --------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")

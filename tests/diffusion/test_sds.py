@@ -84,10 +84,6 @@ def test_every_prediction_type_is_converted_to_the_noise():
         torch.testing.assert_close(found, eps, rtol=0, atol=1e-12)
 
 
-# A rectified flow as a diffusion
-# --------------------------------------------------------------------------------------------------
-
-
 SIGMA = torch.tensor([0.002, 0.3, 0.6, 0.95, 0.999], dtype=torch.float64)
 
 

@@ -71,9 +71,6 @@ def test_a_missing_or_other_file_is_named(tmp_path, name, content, said):
         ImageReward(str(folder), CPU)
 
 
-# ---- T3Bench's quality ---------------------------------------------------------------------------
-
-
 def test_the_best_smoothed_vertex_counts_with_its_best_camera():
     import trimesh
 

@@ -136,9 +136,6 @@ def test_wrong_input_is_named(tmp_path, judge, capsys, arguments, message):
     assert message in capsys.readouterr().err
 
 
-# -- intervals over prompts and paired differences ------------------------------------------------
-
-
 def test_the_interval_of_many_values_is_that_of_the_normal_distribution():
     values = np.random.default_rng(0).normal(3.0, 2.0, 400)
     found, error = bootstrap(values), values.std() / math.sqrt(len(values))

@@ -1,6 +1,4 @@
-"""NPY, NPZ and pickled dicts from untrusted sources: what NumPy wrote is read to the bit; wrong
-headers are rejected, and no code is run.
-"""
+"""NPY, NPZ and pickled dicts from untrusted sources: exact, and no code is run."""
 
 import io
 import os

@@ -1,6 +1,4 @@
-"""Files of Gaussians: comments are kept, axes are stated, and files of other programs have their
-usual axes.
-"""
+"""Files of Gaussians: comments are kept, axes are stated, other programs' have their usual ones."""
 
 import numpy as np
 import pytest

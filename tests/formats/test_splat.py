@@ -1,6 +1,4 @@
-"""``.splat`` files, 32 bytes a Gaussian, as antimatter15's viewer reads them, and ``.ksplat`` files
-by GaussianSplats3D's description of its buffer.
-"""
+"""``.splat`` files as antimatter15's viewer reads them, ``.ksplat`` files as GaussianSplats3D's."""
 
 import struct
 

@@ -1,6 +1,4 @@
-"""USD files: as OpenUSD's own parser reads them (optional: ``pip install usd-core``), and as this
-package does.
-"""
+"""USD files as OpenUSD's own parser reads them (``pip install usd-core``), and as we do."""
 
 import struct
 import sys

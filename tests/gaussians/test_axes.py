@@ -1,6 +1,4 @@
-"""Gaussians in other axes: a camera that is rotated with the object sees the same image; and the
-conversions of the type that holds them.
-"""
+"""Gaussians in other axes look the same from a camera that is rotated with them."""
 
 import numpy as np
 import pytest
@@ -43,10 +41,7 @@ def test_rotated_gaussians_look_the_same_from_a_rotated_camera(up, degree):
 
 
 def test_front_and_top_of_the_world_in_each_file():
-    """The world has the front along +x, its left along +y, and +z up. In -y-up files the front is
-    along -z: a camera of these files (x right, y down, z forward) in front of the object looks
-    along +z.
-    """
+    """In -y-up files the front is along -z: a camera (x right, y down) there looks along +z."""
     front, left, up = np.eye(3)
     for axis, expected in {
         "y": ([0, 0, 1], [1, 0, 0], [0, 1, 0]),
@@ -63,9 +58,6 @@ def test_front_and_top_of_the_world_in_each_file():
 def test_harmonics_that_have_no_rotation_here_are_refused():
     with pytest.raises(UserError, match="degree 4 can't be converted to other axes: degree 3"):
         rotate(some(4), AXES["z"])
-
-
-# the type that holds Gaussians -------------------------------------------------------------------
 
 
 def test_tensors_and_arrays_convert_back_and_forth_without_gradients():

@@ -82,9 +82,7 @@ def test_which_gaussians_are_dropped_and_what_the_floor_keeps(caplog):
 
 
 def test_the_room_of_faint_gaussians_is_used_in_the_same_round():
-    """Ten at a cap of ten, three of them faint: the three others with the largest gradients are
-    cloned.
-    """
+    """Three of ten are faint: the three others with the largest gradients are cloned."""
     params = cloud(10)
     params["logit_opacities"].data[:3] = -5.0
     change = densified(params, torch.linspace(1, 2, 10), most=10)
@@ -92,9 +90,7 @@ def test_the_room_of_faint_gaussians_is_used_in_the_same_round():
 
 
 def test_the_threshold_means_the_same_at_any_resolution_batch_and_loss_scale():
-    """The loss of a view doesn't depend on these; its gradient in pixels, averaged and scaled,
-    does.
-    """
+    """Of a view's loss; its gradient in pixels is averaged and scaled."""
     device_units = torch.rand(1, 20, 2)
     for width, height, batch, scale in [(128, 128, 1, 1.0), (512, 256, 4, 65536.0)]:
         pixels = device_units / torch.tensor([width / 2, height / 2]) / batch * scale

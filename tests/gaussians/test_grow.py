@@ -1,6 +1,4 @@
-"""Algorithm 1 of the paper: growing, colour perturbation and initial scales, degenerate clouds
-included.
-"""
+"""Algorithm 1 of the paper: growing, colour perturbation and initial scales."""
 
 import numpy as np
 import pytest
@@ -86,9 +84,6 @@ def test_the_cap_is_exact_and_keeps_a_uniform_choice():
     assert len(grown(sphere(), 50_000, 0.05, max_points=0).points) == 0
 
 
-# The first scales ---------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("rule, count", [("nearest", 1), ("rms3", 3)])
 def test_scales_equal_brute_force(rule, count):
     points = rng().uniform(-1, 1, (200, 3))
@@ -125,9 +120,6 @@ def test_copies_get_the_median_of_the_distinct_points():
 def test_scales_are_always_positive_and_finite(points, rule):
     scales = nearest_distance_scales(points, rule)
     assert scales.shape == (len(points),) and np.isfinite(scales).all() and (scales > 0).all()
-
-
-# Nearest neighbours -------------------------------------------------------------------------------
 
 
 def random_points(count, dimensions=3, seed=0):

@@ -1,6 +1,4 @@
-"""Gradual pruning: exact counts, redundant Gaussians first; ``auto`` stops before the quality
-suffers.
-"""
+"""Gradual pruning: exact counts, redundant Gaussians first."""
 
 import math
 
@@ -155,10 +153,7 @@ def test_samples_are_taken_where_a_round_will_ask_for_them():
     assert due == [52, 848]
 
 
-@pytest.mark.parametrize(
-    ("saved", "count"),
-    [(0.0, 80), (0.5, 80), (0.95, 95), (1.5, 100)],
-)
+@pytest.mark.parametrize(("saved", "count"), [(0.0, 80), (0.5, 80), (0.95, 95), (1.5, 100)])
 def test_a_round_of_auto_drops_fewer_the_more_it_costs(saved, count):
     """``saved``: the cost of a whole round, in units of that where rounds end."""
     removal, error = torch.ones(100), 7.0
@@ -169,9 +164,7 @@ def test_a_round_of_auto_drops_fewer_the_more_it_costs(saved, count):
 
 
 def test_auto_drops_idle_gaussians_also_where_a_round_costs_too_much():
-    """The ten that save less than a hundredth of their part of the error, and no more than a round
-    may drop.
-    """
+    """Those that save less than a hundredth of their part of the error."""
     removal = torch.ones(100)
     removal[:10] = 1e-4
     assert importance.needed_count(torch.arange(100.0), removal, 7.0, 0.5, 0.8).count == 90

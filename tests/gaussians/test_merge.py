@@ -1,6 +1,4 @@
-"""Duplicates are merged into one Gaussian that renders like both; all others are unchanged, bit for
-bit.
-"""
+"""Duplicates become one Gaussian that renders like both; all others keep their bits."""
 
 import pytest
 import torch

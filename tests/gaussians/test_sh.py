@@ -17,9 +17,7 @@ def directions(n=50, seed=0):
 
 
 def by_scipy(dirs, degree):
-    """Compute real harmonics from associated Legendre functions (with the Condon-Shortley phase)
-    and cos, sin of m phi.
-    """
+    """Real harmonics from associated Legendre functions (Condon-Shortley phase)."""
     x, y, z = (dirs / dirs.norm(dim=-1, keepdim=True)).numpy().T
     phi, basis = np.arctan2(y, x), []
     for band in range(degree + 1):

@@ -1,6 +1,4 @@
-"""Hidden Gaussians are removed first, recovery never makes the rest worse, and the search for the
-smallest cloud terminates.
-"""
+"""Hidden Gaussians go first, recovery never makes the rest worse, and the search ends."""
 
 import math
 
@@ -54,9 +52,7 @@ def test_recovery_pays():
     ],
 )
 def test_a_recovery_never_lowers_the_quality(monkeypatch, count, bearable, tried):
-    """It is repeated with smaller rates, near those of the one before, and skipped if none is small
-    enough.
-    """
+    """It is repeated with smaller rates, and skipped if none is small enough."""
     cloud, scales, bearable = ball(), [], iter(bearable)
 
     def recover_with(cloud, views, images, steps, seed, sh_reach, lr_scale):
@@ -134,9 +130,7 @@ def test_grey_gaussians_are_not_lost_before_grey():
 
 
 def test_a_large_cloud_loses_its_hidden_gaussians_without_a_recovery(monkeypatch):
-    """Rounds would drop a fifth of all first; here fewer are left before the first recovery, and
-    before the first ranking, which takes a backward pass.
-    """
+    """Fewer are left before the first recovery and the first ranking."""
     fitted, ranked, original = [], [], recover.recover
 
     def counted(cloud, *rest):
@@ -185,9 +179,6 @@ def test_a_large_cloud_is_pruned_at_once_to_what_its_images_need(monkeypatch, ne
     assert len(asked) <= simplifying.BISECTIONS + 1
 
 
-# views around Gaussians of any size --------------------------------------------------------------
-
-
 @pytest.mark.parametrize("unit", [1e-6, 1e-3, 1e3, 1e14])
 def test_clouds_in_other_units_give_equal_views(unit):
     """The near and far planes clip no cloud given in millimetres."""
@@ -212,8 +203,7 @@ def test_a_constant_harmonic_gives_the_images_of_zero_higher_ones():
 
 
 @pytest.mark.parametrize(
-    ("gaussians", "sizes"),
-    [(0, [4, 2]), (500_000, [4, 2]), (1_000_000, [2] * 3), (10**7, [1] * 6)],
+    ("gaussians", "sizes"), [(0, [4, 2]), (500_000, [4, 2]), (1_000_000, [2] * 3), (10**7, [1] * 6)]
 )
 def test_fewer_views_of_a_large_cloud_are_rendered_at_once(gaussians, sizes):
     batches = row_batches(views_around(ball(), 6, 16), gaussians)

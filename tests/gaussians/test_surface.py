@@ -53,9 +53,7 @@ def test_a_solid_ball_is_one_closed_surface():
 
 @pytest.mark.parametrize(("count", "scale"), [(4000, 0.02), (16000, 0.002)])
 def test_the_surface_is_at_the_gaussians_for_any_overlap(count, scale):
-    """Within 1.2 standard deviations of the Gaussians and a cell; unevenly spread points add a
-    little.
-    """
+    """Within 1.2 standard deviations of the Gaussians and a cell."""
     surface = gaussian_surface(ball(count, scale=scale), resolution=64)
     spread = np.hypot(scale, 1 / 64)
     away = np.abs(distances(surface) - 0.5)

@@ -186,9 +186,7 @@ def test_sizes_that_do_not_fit_are_named(mesh_path):
 
 
 def test_a_view_without_its_direction_in_the_bank_beside_others_with_guidance(mesh_path):
-    """The bank has no view from above, so the mixtures of such a view are the same, and its guided
-    score is the conditional one.
-    """
+    """The bank has no view from above: such a view's guided score is the conditional one."""
     guide = guidance(mesh_path, mode="direction-bins", guidance_scale=7.5)
     views = batch(0.0, 0.0)
     views["elevation"][1] = 80.0
@@ -208,10 +206,6 @@ def test_one_of_the_two_predictions_counts_as_one_evaluation(mesh_path):
     assert torch.equal(guide.conditional(z, t, condition), both[0])
     assert torch.equal(guide.unconditional(z, t, condition), both[1])
     assert guide.evaluations == 8
-
-
-# The modes of mixtures
-# --------------------------------------------------------------------------------------------------
 
 
 MEMBERS = torch.tensor(

@@ -45,9 +45,7 @@ def part(call):
 
 
 class LearningDouble(nn.Module):
-    """Like VSD: a module with frozen and trainable weights, a ``forward``, and a loss for the
-    latter.
-    """
+    """Like VSD: a module with frozen and trainable weights, and a loss for the latter."""
 
     def __init__(self):
         super().__init__()

@@ -70,9 +70,7 @@ def test_the_lora_is_in_every_attention_and_starts_as_the_unet(models, prompts):
 
 @pytest.mark.parametrize("prediction", tiny.PREDICTIONS)
 def test_the_error_is_the_guided_noise_minus_that_of_the_merged_lora(models, prompts, prediction):
-    """The UNet with the additions merged into its weights and the camera in the class embedding, v
-    converted to the noise. tests/host/test_real_variants.py runs threestudio's own code.
-    """
+    """The camera in the class embedding; tests/host/test_real_variants.py runs threestudio's."""
     guide, particles = vsd(models, prediction)
     with_values(particles)
     latents, noised, condition = inputs(guide, prompts)
@@ -98,9 +96,7 @@ def test_the_error_is_the_guided_noise_minus_that_of_the_merged_lora(models, pro
 
 
 def test_the_lora_follows_the_gradient_of_the_mean_squared_error(models, prompts, monkeypatch):
-    """Without the camera: the gradient that Adam gets, against autograd through the merged
-    weights.
-    """
+    """Adam's gradient, without the camera, against autograd through the merged weights."""
     monkeypatch.setattr(module, "CAMERA_DROPOUT", 1.0)
     guide, particles = vsd(models)
     with_values(particles)
@@ -152,10 +148,6 @@ def test_an_evaluation_does_not_train_and_bad_items_are_not_learnt(models, promp
     assert learn(guide, latents, condition, good)["lora_error"] > 0
     assert all(value.isfinite().all() for value in particles.state().values())
     assert learn(guide, latents, condition, ~GOOD) == {}
-
-
-# State
-# --------------------------------------------------------------------------------------------------
 
 
 def test_a_restored_lora_continues_bit_for_bit(models, prompts):

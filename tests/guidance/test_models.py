@@ -1,6 +1,4 @@
-"""The guidances of all models with tiny ones: their gradients against float64 by the papers'
-formulas, half precision, what the networks get, sizes of images, and models that are refused.
-"""
+"""The guidances of all models with tiny ones, against float64 by the papers' formulas."""
 
 import json
 import math
@@ -101,10 +99,6 @@ def test_the_gradient_is_that_of_a_float64_reference(large, models, kind, size, 
     expected = reference_gradient(kind, model, prompts, rgb, scale=scale, **more)
     # guidance 100 magnifies the rounding of float32 (6e-8) a hundredfold; measured 1e-6 to 3e-6
     assert relative(mine, expected) < 1e-5
-
-
-# Half precision
-# --------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -214,10 +208,6 @@ def test_a_vae_that_overflows_stays_in_float32(
     assert relative(mine, reference_gradient(XL, folder, prompts, rgb, scale=100.0)) < 0.5
 
 
-# What the networks get
-# --------------------------------------------------------------------------------------------------
-
-
 def test_the_unet_of_xl_gets_the_pooled_embedding_and_the_sizes(large):
     model, prompts = large(XL)
     guide = guidance(XL, model, image_size=128)
@@ -261,10 +251,6 @@ def test_the_variance_that_the_unet_of_if_also_predicts_is_left_out(large):
     expected = DDPMScheduler.from_pretrained(model, subfolder="scheduler").alphas_cumprod.double()
     torch.testing.assert_close(guide.alphas_cumprod, expected, rtol=1e-3, atol=0)
     assert guide.alphas_cumprod[-1] < 1e-8 and guide.text_width == tiny_models.TEXT_WIDTH  # of T5
-
-
-# Sizes, and what is refused
-# --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

@@ -41,9 +41,7 @@ def gradient(guide, prompt_utils, rgb, **options):
 
 
 def test_the_cameras_are_mvdreams():
-    """Its ``get_camera`` turns an orbit with y up, azimuth 0 at +z, to z up by (x, y, z) -> (x, -z,
-    y); the front of its pictures is azimuth 90, at +x.
-    """
+    """An orbit with y up, turned by (x, y, z) -> (x, -z, y); the front is azimuth 90, at +x."""
     elevation, azimuth = torch.tensor([0.0, 15.0, -30.0]), torch.tensor([0.0, 70.0, -160.0])
     mine = camera_matrices(orbit_c2w(elevation, azimuth, torch.tensor([1.0, 2.5, 4.0])))
     assert mine[0].tolist() == pytest.approx(
@@ -79,9 +77,7 @@ def test_the_network_gets_the_cameras_of_all_rows_and_one_timestep_per_object(mo
 
 @pytest.mark.parametrize("share", [0.0, 0.5])
 def test_the_gradient_towards_known_views_is_the_closed_form(model, prompts, share):
-    """One latent per view, of zero width: x0 is exact whatever the noise, and the gradient with the
-    weight "x0" is x - x1. Without guidance there is nothing to rescale.
-    """
+    """One latent per view, of zero width: with the weight "x0" the gradient is x - x1."""
     targets = torch.randn(4, 4, 8, 8, generator=torch.Generator().manual_seed(1))
     cameras = camera_matrices(ring()["c2w"])
     guide = tiny.guidance(

@@ -103,9 +103,7 @@ def flat(content, name=""):
 
 
 def assert_resumes(path, folder, *options):
-    """Assert that five steps at once, and three and two with more validation, end with the same
-    checkpoint bit for bit.
-    """
+    """Assert that five steps, and three and two, end with the same checkpoint bit for bit."""
     assert run(path, folder / "whole", *options, "trainer.max_steps=5") == 0
     assert run(path, folder / "parts", *options, "trainer.val_check_interval=1") == 0
     last = folder / "parts" / "demo" / "t" / "ckpts" / "last.ckpt"
@@ -115,10 +113,6 @@ def assert_resumes(path, folder, *options):
     assert whole.keys() == parts.keys()
     assert not [name for name in whole if not torch.equal(whole[name], parts[name])]
     return whole
-
-
-# Whole runs
-# --------------------------------------------------------------------------------------------------
 
 
 NOISES = [

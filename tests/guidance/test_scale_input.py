@@ -1,6 +1,4 @@
-"""UNets that take the guidance scale as an input: one evaluation per view, the published embedding,
-and all that needs the unconditional prediction.
-"""
+"""UNets that take the guidance scale as an input: one evaluation per view."""
 
 from types import SimpleNamespace
 

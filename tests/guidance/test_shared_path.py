@@ -16,13 +16,8 @@ from threestudio_gaussiandreamer.guidance.base import NonFiniteScore, ScoreDisti
 pytest.importorskip("embreex")
 
 
-# The shared path
-
-
 class Stub(ScoreDistillation):
-    """Predict the noise plus the latent (so that the gradient is w x), or what ``corrupt`` returns
-    for it.
-    """
+    """Predict the noise plus the latent (a gradient w x), or what ``corrupt`` makes of it."""
 
     corrupt = staticmethod(lambda eps, step: eps)
     unconditional = None

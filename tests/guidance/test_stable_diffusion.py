@@ -1,6 +1,4 @@
-"""Stable Diffusion's guidance: Perp-Neg's pairing, schedules, non-finite predictions, options,
-pictures.
-"""
+"""Stable Diffusion's guidance: Perp-Neg's pairing, schedules, options, pictures."""
 
 import json
 
@@ -19,10 +17,6 @@ from threestudio_gaussiandreamer.guidance.types import view_of_row
 from threestudio_gaussiandreamer.host import NAME, find
 
 pytest.importorskip("diffusers")
-
-
-# Prompts
-# --------------------------------------------------------------------------------------------------
 
 
 def test_one_forward_pass_and_no_decoding_per_step(models, prompts):
@@ -61,10 +55,6 @@ def test_perp_neg_takes_away_only_what_is_perpendicular():
     assert float((change * (negative - uncond[:, None]).sum(1)).sum()) < 0
 
 
-# Randomness and schedules
-# --------------------------------------------------------------------------------------------------
-
-
 def test_the_same_step_draws_the_same_and_looking_changes_nothing(models, prompts):
     guide, rgb = tiny.guidance(models), tiny.renders()
     guide.update_step(0, 7)
@@ -96,10 +86,6 @@ def test_the_models_own_schedule_is_used(models, tmp_path):
     roots = torch.linspace(0.00085**0.5, 0.012**0.5, 1000, dtype=torch.float64)
     expected, found = torch.cumprod(1 - roots**2, 0), tiny.guidance(models).alphas_cumprod
     torch.testing.assert_close(found, expected, rtol=1e-5, atol=0)  # diffusers' are float32
-
-
-# Options
-# --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -171,10 +157,6 @@ def test_the_name_of_threestudio_is_this_part_where_it_is_not_the_host():
     if NAME == "builtin":
         part = stable_diffusion.StableDiffusionGuidance
         assert find("stable-diffusion-guidance") is part
-
-
-# Sizes of images
-# --------------------------------------------------------------------------------------------------
 
 
 def test_halving_is_the_mean_of_four_pixels_and_more_loses_none():

@@ -1,6 +1,4 @@
-"""Variants as parts: found by registered name, checked before any long work, the same for every
-guidance.
-"""
+"""Variants as parts: found by name, checked before any long work."""
 
 import math
 
@@ -43,10 +41,6 @@ def test_a_checkpoint_of_another_variant_is_refused():
     guide.variant.restore(guide, {})
     with pytest.raises(UserError, match="had learnt 1 tensors that aren't those"):
         guide.variant.restore(guide, {"mean": torch.zeros(3)})
-
-
-# The shared options
-# --------------------------------------------------------------------------------------------------
 
 
 class OneOfBoth(MixtureGuidance):
@@ -151,10 +145,6 @@ def test_a_variant_with_the_old_name_of_the_method_is_told_and_works(caplog):
     assert "Named.error is called residual now" in caplog.text
     residual, _ = Named({}).residual(None, latents(), None, {})
     assert torch.equal(residual, 0.25 * latents())
-
-
-# What limits the cost of variants, and what is refused
-# --------------------------------------------------------------------------------------------------
 
 
 NOISIEST = {"min_step_percent": 0.98, "max_step_percent": 0.98}

@@ -1,6 +1,4 @@
-"""Each variant of score distillation against its closed form, in float64, on a mixture of Gaussians
-in three dimensions.
-"""
+"""Each variant against its closed form, in float64, on a mixture of Gaussians in 3D."""
 
 import pytest
 import torch
@@ -86,10 +84,6 @@ def test_nfsd_with_a_negative_prompt():
     assert_close(error_of(guidance, x), expected)
 
 
-# VSD
-# --------------------------------------------------------------------------------------------------
-
-
 def learn(guidance, x):
     guidance.variant.learn(guidance, x, None, {}, torch.ones(len(x), dtype=torch.bool))
 
@@ -112,15 +106,8 @@ def test_vsd_subtracts_the_optimal_denoiser_of_the_renders_gaussian(monkeypatch)
     assert_close(error_of(guidance, x), uncond + 7.5 * (cond - uncond) - own)
 
 
-# Inversions
-# --------------------------------------------------------------------------------------------------
-
-
 def test_sdi_with_fresh_noise_follows_the_formulas_step_by_step():
-    """One item, by threestudio's formulas on this package's timesteps: each step with a share of
-    the deviation of DDPM's reverse step, guidance in its convention, and x minus the denoised z_t.
-    tests/host/test_real_variants.py runs threestudio's own code.
-    """
+    """By threestudio's formulas on our timesteps; tests/host/test_real_variants.py runs its own."""
     options = {"guidance_scale": 8.5, "weighting_strategy": "x0"}
     guidance, x = mixture_guidance("sdi-variant", step=11, **options), latents(1)
     (t,), _ = guidance.draw_timesteps(x)
@@ -165,10 +152,6 @@ def test_ism_inverts_with_the_unconditional_score_and_subtracts_it():
         cond, uncond = scores(step(z, before, s, t), t)
         expected.append(uncond + 7.5 * (cond - uncond) - before)
     assert_close(error_of(guidance, x), torch.stack(expected))
-
-
-# Noise that is consistent across views
-# --------------------------------------------------------------------------------------------------
 
 
 def test_cfd_uses_the_surfaces_noise():

@@ -87,9 +87,7 @@ def test_the_second_set_of_coordinates_is_taken(saved):
     ],
 )
 def test_texture_transforms(transform, uv, saved):
-    """Scale, then rotate, then move; rotations are counter-clockwise as the picture is seen, where
-    v grows downwards (what three.js and Blender show).
-    """
+    """Scale, rotate counter-clockwise as the picture is seen (three.js, Blender), then move."""
     corner = np.float32([0.1, 0.2])
     if uv is None:
         c, s = np.cos(np.pi / 6), np.sin(np.pi / 6)
@@ -296,9 +294,7 @@ def test_the_end_of_an_accessor_is_found_where_64_bits_overflow(saved):
 
 @pytest.mark.parametrize("many", [False, True])
 def test_textures_and_instances_count_together(many, saved, monkeypatch):
-    """A small file whose two images, or 2,000 nodes of one mesh, are refused before they are made;
-    one image, or 500 nodes, are read.
-    """
+    """Two images, or 2,000 nodes of one mesh, are refused before they are made."""
     monkeypatch.setattr(budget, "FIXED_BYTES", 1 << 20 if many else 1_200_000)
     monkeypatch.setattr(budget, "BYTES_PER_FILE_BYTE", 0)
     flat = np.zeros((64, 64, 3) if many else (256, 256, 3), np.uint8)

@@ -132,9 +132,7 @@ def test_a_merged_scene_has_the_colours_of_its_parts():
 
 
 def test_texels_are_bilinear_and_repeat():
-    """Values at texel centres are the texels', halfway between two their mean; outside [0, 1] the
-    texture repeats.
-    """
+    """Values at texel centres are the texels'; outside [0, 1] the texture repeats."""
     image = [[[255, 0, 0], [0, 255, 0]], [[0, 0, 255], [255, 255, 255]]]
     places = np.float32([[0.25, 0.75], [0.5, 0.75], [0.75, 0.25], [1.25, -0.25], [0.0, 0.75]])
     uv, faces = np.repeat(places, 3, axis=0), np.arange(15).reshape(5, 3)
@@ -152,9 +150,7 @@ def test_surface_distances_of_a_sphere(tmp_path):
 
 
 def test_objects_as_programs_write_them_are_read(tmp_path):
-    """Blanks, tabs, carriage returns, continued lines, exponents, colours, texture coordinates of
-    three numbers, polygons, other statements.
-    """
+    """Blanks, tabs, carriage returns, continued lines, exponents, colours, polygons."""
     text = (
         "# made by hand\r\nmtllib none.mtl\no box\nv 0 0.0 -.0 1 0 0\nv  1e0\t0 0 0 1 0 \nv 1 "
         "1.5E-0 0 0 0 1\nv +0 1 0 1 1 1\n"

@@ -20,9 +20,7 @@ TEXTURE = ["comment TextureFile t.png"]
 
 
 def ply(folder, *, faces, columns=(), corners=None, comments=(), binary=True, more=()):
-    """Write a square: (name, type, struct's code, values) are ``columns`` of the vertices or
-    ``more`` of the faces, ``corners`` texture coordinates of vertices, written for the corners.
-    """
+    """Write a square: ``columns`` (name, type, code, values) of vertices, ``more`` of faces."""
     Image.fromarray(TEXELS).save(folder / "t.png")
     columns = [(axis, "float", "f", SQUARE[:, i]) for i, axis in enumerate("xyz")] + [*columns]
     head = ["ply", f"format {'binary_little_endian' if binary else 'ascii'} 1.0", *comments]

@@ -1,6 +1,4 @@
-"""The ray caster: perspective, colours and coverage are as the cameras say, by Embree and by the
-z-buffer; the z-buffer sees what single rays see.
-"""
+"""The ray caster sees what the cameras say, by Embree and by the z-buffer."""
 
 import logging
 import math
@@ -67,9 +65,7 @@ def picture(caster, c2w, fovy, height, width, supersample=2):
 
 @both
 def test_the_silhouette_of_a_sphere(distance=3.0, fovy=40.0, height=80, width=120):
-    """In perspective a sphere of radius r at distance d subtends the angle asin(r / d): a disc of
-    radius f tan of it.
-    """
+    """Radius r at distance d subtends the angle asin(r / d): a disc of radius f tan of it."""
     view = look(20, 30, distance), math.radians(fovy)
     image = picture(MeshCaster(sphere(0.8)), *view, height, width, supersample=4)
     focal = height / (2 * math.tan(math.radians(fovy) / 2))
@@ -207,9 +203,7 @@ def draw(vertices, faces, rows=PLACES, columns=PLACES):
 
 
 def cast(vertices, faces):
-    """Return the nearest face of each sample by intersecting every ray with every triangle (Moeller
-    and Trumbore 1997), in float64.
-    """
+    """Intersect every ray with every triangle (Moeller and Trumbore 1997), in float64."""
     y, x = np.meshgrid(-PLACES / FOCAL, PLACES / FOCAL, indexing="ij")
     rays = np.stack([x, y, -np.ones_like(x)], axis=-1)[:, :, None]
     a, b, c = np.moveaxis(np.array(vertices, dtype=float)[np.array(faces)], 1, 0)

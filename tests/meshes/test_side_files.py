@@ -164,9 +164,7 @@ def test_a_texture_of_an_obj_that_is_no_picture_is_refused(name, content, tmp_pa
 
 @pytest.mark.parametrize("picture, expected", [(None, [1, 0.5, 0]), (np.uint16([[0x8080]]), 0.5)])
 def test_an_obj_s_material(picture, expected, tmp_path, caplog):
-    """If an image is missing, the material's colour is used; 16-bit images aren't clipped
-    to white.
-    """
+    """Without the image its colour is used; 16-bit images aren't clipped to white."""
     kd = "Kd 1 0.5 0\n" if picture is None else ""
     (tmp_path / "a.mtl").write_text(f"newmtl m\n{kd}map_Kd p.png\n")
     (tmp_path / "a.obj").write_text("mtllib a.mtl\n" + TRIANGLE)

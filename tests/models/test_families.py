@@ -1,6 +1,4 @@
-"""Families of models: recognised by the settings of their network or by file names, and refused by
-name.
-"""
+"""Families of models are recognised by their network or file names, and refused by name."""
 
 import json
 

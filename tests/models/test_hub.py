@@ -1,6 +1,4 @@
-"""Finding models: folders, the hub's cache, and a hub that is available, slow, broken or absent.
-The hub is a small server in this process.
-"""
+"""Finding models: folders, the cache, and a hub (a server here), also broken or absent."""
 
 import json
 import socket
@@ -114,17 +112,11 @@ def online(model, tmp_path, monkeypatch):
 
 
 def connect_to(monkeypatch, cache, address):
-    """Point the library, which has already read its environment, at a test hub and an
-    empty cache.
-    """
+    """Point the library, which has read its environment, at a test hub and an empty cache."""
     monkeypatch.setenv("HF_ENDPOINT", address)
     monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_OFFLINE", False)
     monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_CACHE", str(cache / "cache"))
     monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_DISABLE_XET", True)
-
-
-# Folders
-# --------------------------------------------------------------------------------------------------
 
 
 def test_a_local_folder_needs_no_network(model, monkeypatch):
@@ -202,10 +194,6 @@ def test_weights_that_are_missing_are_not_made_up(model, tmp_path):
         model_files.load_network(UNet2DConditionModel, folder, "unet")
 
 
-# The hub
-# --------------------------------------------------------------------------------------------------
-
-
 def test_only_what_is_needed_is_downloaded_and_then_read_from_the_disk(online, monkeypatch):
     folder = hub.find_model("people/tiny", IMAGE)
     wanted = {f"{part}/diffusion_pytorch_model.safetensors" for part in ("unet", "vae")}
@@ -268,10 +256,6 @@ def test_without_the_libraries_the_extra_is_named(monkeypatch):
     said = r"needs diffusers .*pip install 'threestudio-gaussiandreamer\[diffusion\]'"
     with pytest.raises(UserError, match=said):
         require_extra("diffusion", "json", "diffusers")
-
-
-# Networks that a process keeps
-# --------------------------------------------------------------------------------------------------
 
 
 def test_a_network_is_loaded_once_for_each_key_if_networks_are_kept_and_again_after_an_error():

@@ -145,9 +145,6 @@ def test_without_gradients_nothing_is_tracked():
     assert not out.image.requires_grad and not out.means2d.requires_grad
 
 
-# ---- who computes --------------------------------------------------------------------------------
-
-
 def test_an_unavailable_backend_says_why_and_what_to_do(monkeypatch):
     with pytest.raises(UserError, match="(?s)float32.*float64"):
         call(**arguments(dtype=torch.float64), backend="cpu")

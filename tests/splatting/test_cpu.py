@@ -1,6 +1,4 @@
-"""The CPU kernel against the float64 specification, in every build that this machine can run: equal
-images, gradients and bits.
-"""
+"""The CPU kernel against the float64 specification, in every build that this machine can run."""
 
 import functools
 import os
@@ -48,9 +46,7 @@ pytestmark = pytest.mark.skipif(cpu.unavailable() is not None, reason=str(cpu.un
 
 @functools.cache
 def emulated() -> tempfile.TemporaryDirectory:
-    """Compile the build of 16 lanes for processors without AVX-512, whose intrinsics are emulated,
-    once per process, into a folder that lives as long as the result.
-    """
+    """Compile the build of 16 lanes with emulated AVX-512 intrinsics, once per process."""
     target, source = tempfile.TemporaryDirectory(), cpu.FOLDER / "rasterize.cpp"
     includes = ["-include", str(HEADER), f"-I{cpu.FOLDER.parent / 'shared'}"]
     library = str(pathlib.Path(target.name, "libsplat_v4.so"))
@@ -98,14 +94,8 @@ class TestCpuKernel(KernelContract):
     pass
 
 
-# ---- the two passes ------------------------------------------------------------------------------
-
-
 def test_buffers_that_were_used_before_change_nothing(isa):
-    """Faint Gaussians are drawn up to the last of a tile's three chunks, opaque ones in their place
-    only in the first; the second drawing gets the buffers of the first. Without a background, whose
-    gradient isn't exact behind opaque Gaussians.
-    """
+    """Faint Gaussians take all three chunks of a tile, opaque ones in their place the first."""
     faint = random_cloud(1200, seed=6, size=0.6)
     faint.opacities.mul_(0.02)
     opaque = faint._replace(opacities=torch.full_like(faint.opacities, 0.9))
@@ -127,9 +117,6 @@ def test_both_passes_stop_at_the_same_gaussian(isa):
             assert torch.equal(drawn.out.contribution[0] > 0, drawn.grads["colors"].any(1))
 
 
-# ---- the same bits -------------------------------------------------------------------------------
-
-
 def test_the_number_of_threads_changes_no_bit(isa):
     """Also with more Gaussians than one task takes, and more threads than views."""
     cloud, camera = random_cloud(9000, seed=10, size=0.03), cameras(3, 150, 90)
@@ -140,13 +127,8 @@ def test_the_number_of_threads_changes_no_bit(isa):
     assert all(equal(results[0], other) for other in results[1:])
 
 
-# ---- as a torch function -------------------------------------------------------------------------
-
-
 def test_backward_frees_its_memory(monkeypatch):
-    """The buffers of a backward pass are freed with the saved tensors, not with the graph's last
-    tensor.
-    """
+    """With the saved tensors, not with the graph's last tensor."""
     states, create = weakref.WeakSet(), cpu._State
     monkeypatch.setattr(cpu, "_State", lambda *x: states.add(state := create(*x)) or state)
     cloud, camera = random_cloud(30).to(torch.float32), cameras(1, 12, 12, dtype=torch.float32)
@@ -248,9 +230,6 @@ def test_the_last_tile_of_the_tallest_image(threads):
         sums.append(out.alpha[0, -64:].flatten())
         assert out.alpha.sum() == sums[-1].sum() > 0.1
     torch.testing.assert_close(*sums, rtol=0, atol=1e-6)
-
-
-# ---- the library ---------------------------------------------------------------------------------
 
 
 def test_builds_of_another_version_or_name_are_refused(monkeypatch, force):

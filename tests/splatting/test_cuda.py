@@ -1,9 +1,4 @@
-"""The CUDA backend in emulation: its kernels run on the host, thread by thread, against the float64
-specification.
-
-`cuda_shim/device.py` replaces the GPU and runs the source that NVRTC compiles; the Python code
-around it is the package's own.
-"""
+"""The CUDA kernels, emulated on the host by `cuda_shim`, against the float64 specification."""
 
 from types import SimpleNamespace
 
@@ -34,9 +29,7 @@ pytestmark = pytest.mark.skipif(unavailable() is not None, reason=str(unavailabl
 
 @pytest.fixture(autouse=True)
 def device(monkeypatch):
-    """Return the backend on CPU tensors, with a device that tests may replace; nothing is learnt
-    from earlier calls.
-    """
+    """Return the backend on CPU tensors, with a device that tests may replace."""
     devices = [HostDevice()]
     on_the_cpu = backends.Backend(cuda, ("cpu",), (torch.float32,))
     monkeypatch.setitem(backends.BACKENDS, "cuda", on_the_cpu)
@@ -58,9 +51,6 @@ class TestCudaKernels(KernelContract):
         return "cuda"
 
 
-# ---- the same bits -------------------------------------------------------------------------------
-
-
 def scene(device, cloud=None, **options):
     """Render 3 x 2 tiles per view with all features, on a new device."""
     device(**options)
@@ -80,8 +70,7 @@ def opaque_cloud() -> Cloud:
 
 
 each_cloud = pytest.mark.parametrize(
-    "cloud",
-    [pytest.param(None, id="thin"), pytest.param(opaque_cloud(), id="opaque", marks=SLOW)],
+    "cloud", [pytest.param(None, id="thin"), pytest.param(opaque_cloud(), id="opaque", marks=SLOW)]
 )
 
 
@@ -119,9 +108,6 @@ def test_the_emulation_detects_faults(kernel):
         assert kernel == "faulty_race" and not torch.equal(out["forward"], out["backward"])
 
 
-# ---- room for the lists --------------------------------------------------------------------------
-
-
 @pytest.fixture
 def lists(monkeypatch):
     """Record the lists of every render."""
@@ -133,9 +119,7 @@ def lists(monkeypatch):
 def test_a_picture_that_needs_more_room_than_expected_is_right_to_the_bit(
     device, monkeypatch, lists
 ):
-    """Rendered without lists, differentiated with complete ones; when the count has arrived, the
-    capacity suffices.
-    """
+    """Rendered without lists, differentiated with complete ones."""
     monkeypatch.setattr(cuda, "STEP", 64)
     known = scene(device)
     for estimate in cuda._estimates.values():
@@ -180,9 +164,7 @@ def test_capacity_follows_the_count():
 
 @pytest.mark.parametrize("most", [1500, 900])
 def test_short_memory_means_fewer_views_at_a_time(device, monkeypatch, most):
-    """Three views have 1904 intersections, about 600 each. The bits are the same, and the second
-    call doesn't try all at once.
-    """
+    """Three views have 1904 intersections; the second call doesn't try all at once."""
     monkeypatch.setattr(cuda, "STEP", 64)
     known, tries = scene(device), []
     for _ in range(2):

@@ -1,6 +1,4 @@
-"""The CUDA kernels compile for every architecture without spilling, are cached, and are loaded by
-the driver.
-"""
+"""The CUDA kernels compile without spilling, are cached, and are loaded by the driver."""
 
 import contextlib
 import ctypes
@@ -39,9 +37,6 @@ def compiled(monkeypatch):
         nvrtc, "compile_unit", lambda unit, target: units.append(unit) or compile_unit(unit, target)
     )
     return units
-
-
-# ---- the compiler --------------------------------------------------------------------------------
 
 
 def units():
@@ -123,9 +118,6 @@ def test_the_release_that_torch_was_built_with_is_tried_first(monkeypatch, tmp_p
         assert ours[0].endswith(first) and len(ours) == 2
 
 
-# ---- the cache -----------------------------------------------------------------------------------
-
-
 @needs_nvrtc
 def test_what_was_compiled_once_is_read_from_the_disk_unless_it_is_damaged(cache, compiled):
     first = nvrtc.machine_code("bin", "sm_80")
@@ -165,14 +157,9 @@ def test_whatever_changes_the_code_changes_its_name(monkeypatch):
     assert len(names) == 7
 
 
-# ---- the driver ----------------------------------------------------------------------------------
-
-
 @pytest.fixture
 def driver(monkeypatch, cache):
-    """Provide a driver that runs kernels on the host, and a torch that sees one GPU of compute
-    capability 9.0.
-    """
+    """Provide a driver that runs kernels on the host, and a torch that sees one GPU."""
     if unavailable() is not None:
         pytest.skip(unavailable())
     fake = ctypes.CDLL(library()._name)
@@ -207,9 +194,7 @@ def driver(monkeypatch, cache):
 
 @needs_nvrtc
 def test_a_picture_by_way_of_the_driver(driver, monkeypatch, compiled):
-    """Compiled, loaded, and launched, in autograd's thread too: equal to the torch backend within
-    rounding.
-    """
+    """Compiled, loaded, and launched, in autograd's thread too."""
     on_the_cpu = backends.Backend(cuda, ("cpu",), (torch.float32,))
     monkeypatch.setitem(backends.BACKENDS, "cuda", on_the_cpu)
     monkeypatch.setattr(cuda, "_estimates", {})

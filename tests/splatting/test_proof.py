@@ -23,9 +23,6 @@ CPU = torch.device("cpu")
 DEFAULT = next(iter(proof.OPTIONS))
 
 
-# ---- kernels that are broken in some way ---------------------------------------------------------
-
-
 def nothing(*_) -> None:
     """Change nothing."""
 
@@ -106,14 +103,9 @@ class NamedDevice(HostDevice):
     describe = driver.Gpu.describe
 
 
-# ---- the comparison ------------------------------------------------------------------------------
-
-
 @pytest.fixture
 def use(monkeypatch, tmp_path):
-    """Let "auto" find a GPU, on the CPU; returns a function that begins a new start with another
-    device.
-    """
+    """Let "auto" find a GPU, on the CPU; returns a function that begins a start with a device."""
     monkeypatch.setenv("GAUSSIANDREAMER_CACHE", str(tmp_path / "cubins"))
     cuda = backends.Backend(proof.kernels, ("cpu",), (torch.float32,), proof)
     found = {"cuda": cuda, "torch": backends.BACKENDS["torch"]}

@@ -1,6 +1,4 @@
-"""The specification against closed forms, numpy loops, finite differences, and an independent
-implementation.
-"""
+"""The specification against closed forms, loops, finite differences, and another implementation."""
 
 import math
 import sys
@@ -36,15 +34,10 @@ def draw(cloud, camera, width, height, **options):
     return rasterize(*cloud, *camera, width, height, **{**SPECIFICATION, **options})
 
 
-# ---- forward: closed forms -----------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("side", [-1, 1])
 @pytest.mark.parametrize("beyond", [0.8, 1.2])
 def test_the_jacobian_is_clamped_30_percent_beyond_the_image(side, beyond):
-    """With the principal point off centre; an axis-aligned Gaussian has variance ``(f/z)^2 (sx^2 +
-    slope^2 sz^2) + eps2d``.
-    """
+    """Aligned with the axes, the variance is ``(f/z)^2 (sx^2 + slope^2 sz^2) + eps2d``."""
     width, focal, z, centre = 20, 10.0, 2.0, 7.0
     limit = ((width - centre) / focal if side > 0 else centre / focal) + 0.3 * 0.5 * width / focal
     Ks = torch.tensor([[[focal, 0, centre], [0, focal, 5.0], [0, 0, 1]]], dtype=torch.float64)
@@ -59,9 +52,7 @@ def test_the_jacobian_is_clamped_30_percent_beyond_the_image(side, beyond):
 
 
 def by_hand(cloud: Cloud, viewmat, K, width, height, alpha_min, alpha_max, stop, eps2d=0.3):
-    """Loop over pixels and Gaussians with textbook matrices: rotation by Rodrigues, covariance
-    inverted by numpy.
-    """
+    """Loop over pixels and Gaussians, with Rodrigues' rotations and numpy's inverse."""
     means, quats, scales, opacities, colors = (x.numpy() for x in cloud)
     viewmat, K, splats = viewmat.numpy(), K.numpy(), []
     for i in range(len(means)):
@@ -123,17 +114,12 @@ def test_radii_bound_what_is_drawn():
     assert reach <= out.radii.item() <= reach + 1
 
 
-# ---- gradients -----------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     "n, antialias, fast",
     [pytest.param(1, False, False, marks=pytest.mark.slow), (12, False, True), (30, True, True)],
 )
 def test_gradients_of_all_inputs_equal_finite_differences(n, antialias, fast):
-    """gradcheck in float64, cutoffs off: attributes, background and cameras, through image, alpha
-    and depth.
-    """
+    """Attributes, background and cameras, through image, alpha and depth; cutoffs off."""
     cloud, (viewmats, Ks) = random_cloud(n, seed=n, size=0.3), cameras(2, 5, 4)
     background = torch.tensor([[0.1, 0.6, 0.3], [0.9, 0.2, 0.5]], dtype=torch.float64)
 
@@ -147,9 +133,7 @@ def test_gradients_of_all_inputs_equal_finite_differences(n, antialias, fast):
 
 
 def test_means2d_gradient_is_per_view_and_in_pixels_before_downsampling():
-    """Shifting the principal point of a view shifts its means2d and nothing else, so the gradients
-    must add up to that slope.
-    """
+    """Shifting the principal point of a view shifts its means2d and nothing else."""
     cloud, (viewmats, Ks) = random_cloud(20, seed=9, size=0.1), cameras(2, 12, 10, distance=6.0)
     grads = run(cloud, viewmats, Ks, 12, 10, downsample=2, **TRUTH).grads["means2d"]
 
@@ -197,9 +181,6 @@ def test_chunks_of_pixels_change_nothing(monkeypatch):
         assert error(parts.grads[name], grad) < ROUNDING, name
 
 
-# ---- what can't be drawn -------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("backend", ["reference", "torch"])
 @pytest.mark.parametrize("name, place, value", [("view", (1, 2), math.nan), ("K", (0, 0), 1e30)])
 def test_a_camera_that_is_not_finite_or_overflows_affects_its_own_view_only(
@@ -216,14 +197,9 @@ def test_a_camera_that_is_not_finite_or_overflows_affects_its_own_view_only(
     assert all(torch.equal(bad.grads[name], good.grads[name]) for name in NAMES)
 
 
-# ---- an implementation that we did not write -----------------------------------------------------
-
-
 @pytest.fixture
 def gsplat(monkeypatch):
-    """Import gsplat's plain-torch functions; the two CUDA-only functions of nerfacc that they call
-    are replaced by plain torch.
-    """
+    """Import gsplat's plain-torch functions, with plain torch in place of nerfacc."""
     torch_impl = pytest.importorskip("gsplat.cuda._torch_impl", reason="pip install gsplat")
 
     monkeypatch.setitem(sys.modules, "nerfacc", gsplat_reference.nerfacc())
@@ -232,9 +208,7 @@ def gsplat(monkeypatch):
 
 @pytest.mark.parametrize("antialias", [False, True])
 def test_gsplat_draws_the_same_and_has_the_same_gradients(gsplat, antialias):
-    """With its cap .999 and threshold 1/255 (our preset fast). Its early termination is exclusive,
-    ours is not, so it is off here.
-    """
+    """With its cap and threshold; without early termination, which is exclusive there."""
     width, height, views = 10, 8, 2
     cloud = random_cloud(25, seed=14, size=0.25)
     viewmats, Ks = cameras(views, width, height)
@@ -261,9 +235,7 @@ def test_gsplat_draws_the_same_and_has_the_same_gradients(gsplat, antialias):
 
 
 def pairs_of_gsplat(means2d, conics, opacities, depths, width, height):
-    """Return (Gaussian, pixel, image) of every alpha >= 1/255, by image, pixel, depth, as its CUDA
-    helper would.
-    """
+    """Return (Gaussian, pixel, image) of every alpha >= 1/255, by image, pixel, depth."""
     y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
     d = torch.stack([x, y], -1).reshape(1, -1, 1, 2) - means2d[:, None]
     a, b, c = conics[:, None].unbind(-1)

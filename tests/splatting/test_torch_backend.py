@@ -1,6 +1,4 @@
-"""The tiled torch backend against the specification: equal values in bounded memory, for
-any cloud.
-"""
+"""The tiled torch backend against the specification: equal values in bounded memory."""
 
 import pytest
 import torch
@@ -85,9 +83,7 @@ WITH_BRIGHT_COLORS = EXTREMES | {"colors": [*EXTREMES["colors"], 1e3]}
 @repeatable
 @given(seed=st.integers(0, 10**6), n=st.integers(1, 60), antialias=st.booleans())
 def test_extreme_clouds(seed, n, antialias):
-    """Needles, discs, points, behind the camera, NaN, coincident, transparent, opaque: equal in
-    float64, finite in float32.
-    """
+    """Equal in float64, finite in float32."""
     cloud, camera = extreme_cloud(seed, n, WITH_BRIGHT_COLORS), cameras(2, 19, 13)
     both = [
         run(cloud, *camera, 19, 13, backend=b, antialias=antialias) for b in ("torch", "reference")
@@ -112,13 +108,8 @@ def test_a_pixel_behind_an_alpha_of_one_has_finite_gradients():
     assert all(grad.isfinite().all() and grad.abs().max() < 1e3 for grad in result.grads.values())
 
 
-# ---- how it works --------------------------------------------------------------------------------
-
-
 def test_small_budgets_change_nothing(monkeypatch):
-    """Many slices, tests, blocks, steps and parts of the projection: code paths that only large
-    scenes take.
-    """
+    """Many slices, tests, blocks, steps and parts, as only large scenes take."""
     cloud, camera = random_cloud(60, seed=7, size=0.3), cameras(2, 37, 29)
     splits = []
     monkeypatch.setattr(torch_backend, "PROJECTED_AT_ONCE", 30)
@@ -136,9 +127,7 @@ def test_small_budgets_change_nothing(monkeypatch):
 
 
 def test_blocks_and_saved_tensors_are_bounded(monkeypatch):
-    """No tensor of the size pixels x splats is kept for backward, and no block exceeds
-    its budget.
-    """
+    """No tensor of the size pixels x splats is kept for the backward pass."""
     cloud, camera = random_cloud(400, seed=8, size=1.0), cameras(1, 64, 64)
     sizes, saved = [], []
     original = torch_backend._block

@@ -1,6 +1,4 @@
-"""Runs of a few steps through the launcher: against the painted box of ``conftest.py``, or with a
-mock guidance (copy it for your own tests).
-"""
+"""Runs of a few steps: against the painted box, or with a mock guidance (to be copied)."""
 
 from dataclasses import dataclass
 from pathlib import Path

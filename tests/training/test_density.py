@@ -49,9 +49,7 @@ def sampled(density, removal, error):
 
 
 def test_a_round_of_auto_says_what_more_would_gain_and_so_does_the_end():
-    """Those that a round drops save a fortieth of the error: at this cost the round keeps all. The
-    end of the run has the gain of the last round that dropped some, if there was one.
-    """
+    """Those that a round drops save a fortieth of the error: at this cost it keeps all."""
     density = sampled(control(budget="auto"), torch.full((10,), 0.0125), 1.0)
     density.cloud.started_with.fill_(10)
     needed = after_step(density)

@@ -1,8 +1,4 @@
-"""The shipped configurations, trained from the first stage to the last with tiny random models in
-the real ones' files.
-
-Nothing on the path is replaced: only the models and sizes are smaller than those of a user.
-"""
+"""The shipped configurations trained with tiny random models in the real ones' files."""
 
 import csv
 from importlib.util import find_spec
@@ -63,9 +59,7 @@ def prior(**options):
 
 
 def motion(folder):
-    """Return a motion in MDM's layout (samples, joints, 3, frames): the body raises an arm, in
-    metres.
-    """
+    """Return a motion in MDM's layout (samples, joints, 3, frames), metres: an arm is raised."""
     frames = np.repeat(tiny_3d_models.JOINTS[None, :22, :, None], 4, axis=3)
     frames[0, 20, 1] += np.linspace(0, 0.1, 4)
     texts, lengths = np.array(["Someone waves"]), np.array([4])
@@ -102,10 +96,7 @@ def train(configs, options):
 
 
 def assert_trained(folder, rate, ground=0):
-    """Assert that all images, files and losses exist, and that every point of the prior moved by
-    what Adam allows at this rate; return those points. The last ``ground`` of them are the last
-    Gaussians too.
-    """
+    """Assert that all results exist, and points moved as Adam allows at this rate; return those."""
     save = folder / "save"
     cloud = read_cloud(str(save / f"it{STEPS}-export" / "gaussians.ply")).in_axes("z").gaussians
     points = np.load(save / "prior" / "points.npz")["points"]

@@ -39,9 +39,7 @@ def test_each_point_becomes_one_gaussian_as_the_paper_says(sphere_points):
 
 
 def test_the_object_grows_first_and_the_ground_is_added_then():
-    """The ground is wider than the object: it would enlarge the box and the radius, and would grow
-    itself.
-    """
+    """The wider ground would enlarge the box and the radius, and would grow itself."""
     prior = {"num_points": 400, "size": 0.7}
     options = {"prior_type": "random-prior", "grow": {"num_candidates": 20_000, "radius": 0.04}}
     ground = {"ground": True, "ground_points": 100, "ground_size": 3.0}

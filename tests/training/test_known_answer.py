@@ -1,6 +1,4 @@
-"""On images of exactly M Gaussians, starting from 4 M with duplicates and floaters, `budget: auto`
-keeps at most 1.2 M.
-"""
+"""Of M Gaussians' images, from 4 M with duplicates and floaters, `auto` keeps at most 1.2 M."""
 
 import math
 
@@ -46,9 +44,7 @@ def torus(seed: int) -> Gaussians:
 
 
 def with_copies_and_floaters(true: Gaussians) -> Gaussians:
-    """Add copies, moved by about a third of the thinnest axis, and floaters as opaque as the rest,
-    in a box without cameras; all in random order.
-    """
+    """Add copies, moved by a third of the thinnest axis, and floaters, in random order."""
     rng = torch.Generator().manual_seed(0)
     thinnest = true.log_scales.exp().amin(1, keepdim=True)
     shifts = [0.3 * thinnest * torch.randn(M, 3, generator=rng) for _ in range(2)]

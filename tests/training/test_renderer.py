@@ -76,10 +76,7 @@ def test_depth_and_normals_are_computed_when_they_are_read():
 @pytest.mark.parametrize(
     ("background", "message"),
     [
-        (
-            lambda dirs: torch.zeros(3),
-            r"returned a tensor \(3,\); expected a tensor of colours",
-        ),
+        (lambda dirs: torch.zeros(3), r"returned a tensor \(3,\); expected a tensor of colours"),
         (lambda dirs: None, r"returned NoneType; expected a tensor of colours \(2, 4, 5, 3\)"),
     ],
 )
@@ -88,9 +85,6 @@ def test_a_background_of_another_shape_or_type_is_named(background, message):
     c2w, fovy = torch.eye(4).expand(2, 4, 4), torch.ones(2)
     with pytest.raises(UserError, match=message):
         SplattingRenderer._composite(SimpleNamespace(background=background), out, c2w, fovy)
-
-
-# backgrounds --------------------------------------------------------------------------------------
 
 
 def test_fixed_is_the_colour_in_training_and_evaluation():

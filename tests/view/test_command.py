@@ -1,6 +1,4 @@
-"""``python -m threestudio_gaussiandreamer.view``: any cloud becomes a page, rendered like its run;
-errors give one message.
-"""
+"""The command ``view``: any cloud becomes a page, rendered like its run."""
 
 import html
 import json
@@ -132,9 +130,6 @@ def test_a_run_gets_an_index_and_a_page_and_a_folder_of_runs_a_gallery(run_folde
     assert "run/index.html" in (run_folder.parent / "index.html").read_text()
 
 
-# -- in the output of a notebook's cell ----------------------------------------------------------
-
-
 @pytest.fixture
 def ply(tmp_path):
     path = tmp_path / "a “box”.ply"
@@ -193,9 +188,6 @@ def test_the_frame_draws_and_can_be_turned(tmp_path, ply):
         page.evaluate(wait)  # the pose is written into the address when the view has been still
         assert page.screenshot() != before
         assert page.problems == []
-
-
-# -- files and checkpoints -----------------------------------------------------------------------
 
 
 def checkpoint(folder):

@@ -88,9 +88,6 @@ def test_what_can_not_be_shown_is_left_out_or_refused(monkeypatch, caplog):
             page(Shown(stored, "result"), options())
 
 
-# -- the data: every float to the bit, or rounded where it is for comparison -----------------------
-
-
 def unpacked(data: bytes, count: int) -> np.ndarray:
     """Return the columns (P, N), as the page's scripts do."""
     planes = np.frombuffer(zlib.decompress(data), np.uint8).reshape(-1, 4, count)
@@ -115,9 +112,6 @@ def test_a_coarse_cloud_is_a_fraction_of_the_size_and_hardly_moves():
     assert len(packed(rounded)) < 0.4 * len(packed(gaussians._replace(sh=gaussians.sh[:, :1])))
     point = cloud(1).gaussians
     assert np.allclose(coarse(point).means, point.means)
-
-
-# -- the first view: it shows the whole cloud, as large as that allows -----------------------------
 
 
 def stored(means, scale=0.03, logit=3.0) -> StoredCloud:

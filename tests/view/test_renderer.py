@@ -1,6 +1,4 @@
-"""The page in headless Chromium: it draws what our rasteriser draws, saves what the exporters
-write, asks for nothing, and runs no code of a prompt.
-"""
+"""The page in headless Chromium: it draws and saves what we do, and runs no code of a prompt."""
 
 import base64
 import json

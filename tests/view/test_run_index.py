@@ -1,6 +1,4 @@
-"""The index of a run and the gallery: what they show of what is there, and that no file of a run
-can add markup or break them.
-"""
+"""The index of a run and the gallery; no file of a run can add markup or break them."""
 
 import json
 import os
