@@ -92,6 +92,11 @@ class Tab:
         self.page.load(self.address)
         return Tab(self.page, self.address, self.root, self.process)
 
+    def to_front(self):
+        """Show this tab, since one behind another gets no events of dialogs."""
+        self.page.session = self.session
+        self.page.call("Page.bringToFront")
+
     def reload(self):
         self.page.session = self.session
         self.page.call("Page.reload")

@@ -100,6 +100,7 @@ def test_a_long_run_survives_reloads_and_tabs_and_its_death_leaves_the_studio(st
     other.until("state.job.paused && $('pause').textContent === 'Go on'")
     time.sleep(0.5)
     step = other.js("state.job.status.step")
+    studio.to_front()
     studio.reload()
     assert studio.js("state.job.status.step") == step
     studio.press("pause")

@@ -17,10 +17,8 @@ from ..view.run_files import read_json
 PACKAGE, WORKER = __package__.partition(".")[0], "studio.worker"
 ENVIRONMENT = {"HF_HUB_OFFLINE": "1", "PYTHONUNBUFFERED": "1"}
 """No request leaves the machine: the message about missing weights has the command for them."""
-TAIL, LABEL = 8000, 200
-"""Bytes of the output and characters of a label that pages show."""
+TAIL, LABEL = 8000, 200  # bytes of the output and characters of a label that pages show
 FOLDERS = tempfile.TemporaryDirectory(prefix="studio-")
-numbers = count(1)
 
 
 @dataclass
@@ -33,7 +31,7 @@ class Job:
     argv: Sequence[str]
     module: str = WORKER
     done: Callable[[], Any] = lambda: None
-    number: int = field(default_factory=lambda: next(numbers))
+    number: int = field(default_factory=count(1).__next__)
     future: Optional[Future] = None
     process: Optional[subprocess.Popen] = None
     paused: bool = False
@@ -101,7 +99,6 @@ class Lane:
 
     @property
     def last(self) -> Optional[Job]:
-        """The job that has ended last."""
         ended = (job for job in self._jobs if job.future.done() and not job.future.cancelled())
         return next(reversed([*ended]), None)
 

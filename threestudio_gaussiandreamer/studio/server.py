@@ -81,7 +81,7 @@ class Studio:
         self.stamp = (0, 0)
         self.missing = [family.config for family in FAMILIES if not has_weights(family.config)]
         self.do_refresh()
-        self.counts, self.handles, self.right, self.half = {}, {}, np.eye(3)[1], 1.0
+        self.counts, self.handles, self.camera, self.half = {}, {}, None, 1.0
         live.require_server(host, port)
         import viser.transforms
 
@@ -103,9 +103,7 @@ class Studio:
 
     @contextlib.contextmanager
     def routes(self, host: str) -> Iterator[None]:
-        """Let the viser server that is started in this context answer further requests and sockets,
-        and accept messages of :data:`LARGEST_UPLOAD`: viser has no option for it.
-        """
+        """Let the viser server that is started in this context answer requests of our page, too."""
         import websockets.asyncio.server as module
         from websockets.datastructures import Headers
         from websockets.http11 import Response
@@ -326,12 +324,17 @@ class Studio:
             camera.fov = math.radians(pose.fovy)
 
     def place(self, camera: Any = None) -> None:
-        """Keep two clouds side by side for the camera that has moved last."""
-        if camera is not None:
-            self.right = self.rotation(camera.wxyz).as_matrix()[:, 0]
-        shift = (len(self.handles) - 1) * 1.2 * self.half * self.right
+        """Let the camera that has moved last see two clouds side by side from one direction."""
+        self.camera = camera or self.camera
+        if self.camera is None:
+            return
+        right, down, _ = self.rotation(self.camera.wxyz).as_matrix().T
+        apart = (len(self.handles) - 1) * 1.2 * self.half
+        angle = math.atan2(apart, np.linalg.norm(self.camera.position - self.camera.look_at))
         for name, handle in list(self.handles.items()):
-            handle.position = -shift if name == "main" else shift
+            sign = -1 if name == "main" else 1
+            handle.position = sign * apart * right
+            handle.wxyz = self.rotation.exp(sign * angle * down).wxyz
 
     async def look(self) -> None:
         """Show the current run whenever it has changed and a browser is connected."""
