@@ -34,9 +34,19 @@ class Own(DensityRule):
 OWN_DENSITY = "system.geometry.density_type=own-density"
 
 
-def test_an_own_density_rule_is_called_around_every_step(tmp_path, monkeypatch):
+REGULARISER = """
+import torch
+from threestudio_gaussiandreamer.host import register
+
+@register("mine-regulariser")
+"""
+OWN_REGULARISER = "system.loss.lambda_mine=1"
+
+
+def test_own_parts_are_called_in_every_step(tmp_path, monkeypatch):
+    """A density rule around the gradients, which those of a regulariser reach."""
     monkeypatch.chdir(tmp_path)
-    source = """
+    rule = """
     def before_backward(self, pictures, step, error):
         self.calls = [pictures["comp_rgb"].requires_grad, step]
     def after_backward(self, out, width, height, loss_scale):
@@ -49,34 +59,21 @@ def test_an_own_density_rule_is_called_around_every_step(tmp_path, monkeypatch):
         change = select(same, highest(self.cloud.opacities().detach(), count))
         self.cloud.apply_change(change, optimizer)
 """
-    assert run(DENSITY + source, OWN_DENSITY) == 0
-    expected = [f"[True, {n}, True, 16, {n + 1}]" for n in range(3)]
-    assert Path("calls").read_text().splitlines() == expected
-    ply = next(Path("outputs").rglob("gaussians.ply")).read_bytes()
-    assert f"element vertex {300 - 30}".encode() in ply[:200]
-
-
-REGULARISER = """
-import torch
-from threestudio_gaussiandreamer.host import register
-
-@register("mine-regulariser")
-"""
-OWN_REGULARISER = "system.loss.lambda_mine=1"
-
-
-def test_gradients_of_a_regulariser_reach_what_it_reads_of_the_cloud(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    source = """
+    regulariser = """
 def own(out):
     sums = {name: out[name].sum() for name in ("means", "scales", "opacities")}
-    open("shapes", "w").write(" ".join(str(tuple(out[name].shape)) for name in sums))
+    open("shapes", "a").write(" ".join(str(tuple(out[name].shape)) for name in sums) + "\\n")
     return sum(sums.values())
 """
     # against the guidance's far smaller gradients: every opacity and size falls, x + y + z too
     rates = [f"system.geometry.lr_{name}=0.5" for name in ("means", "scales", "opacities")]
-    assert run(REGULARISER + source, "system.loss.lambda_mine=1e6", *rates) == 0
-    assert Path("shapes").read_text() == "(300, 3) (300, 3) (300,)"
+    source = DENSITY + rule + REGULARISER + regulariser
+    assert run(source, OWN_DENSITY, "system.loss.lambda_mine=1e6", *rates) == 0
+    expected = [f"[True, {n}, True, 16, {n + 1}]" for n in range(3)]
+    assert Path("calls").read_text().splitlines() == expected
+    assert Path("shapes").read_text().startswith("(300, 3) (300, 3) (300,)\n(290, 3)")
+    ply = next(Path("outputs").rglob("gaussians.ply")).read_bytes()
+    assert f"element vertex {300 - 30}".encode() in ply[:200]
     state = torch.load(next(Path("outputs").rglob("last.ckpt")), weights_only=True)["state_dict"]
     assert (state["geometry.logit_opacities"] < torch.logit(torch.tensor(0.1)) - 1).all()
     assert (state["geometry.means"].sum(1) < -3).all()

@@ -16,8 +16,6 @@ from threestudio_gaussiandreamer.launch.config import dump_config, load_config
 from threestudio_gaussiandreamer.launch.run_folder import safe_name
 
 PROMPT = "system.prompt_processor.prompt"
-
-
 PROMPTS = [
     *("1984", "~", "a fox: red", "robot #1", "${x}", "\\${a} \\\\${b}\\", 'it\'s a "fox"'),
     *("../../etc/passwd", "a \U0001f98a fox", "-x --train", "two\nlines", "x" * 4096, ""),
@@ -33,9 +31,7 @@ def test_sections_interpolations_and_overrides(folder):
     assert (cfg.data.views, cfg.seed, cfg.tag) == (3, 7, "a_red_ball")
     assert re.fullmatch(r"outputs/tiny/a_red_ball@\d{8}-\d{6}", cfg.trial_dir)
     assert os.listdir(folder) == ["tiny.yaml"]
-
-
-def test_later_files_and_the_command_line_win(folder):
+    # later files and the command line win
     Path("more.yaml").write_text("seed: 4\ntrainer: {max_steps: 9}\ndata: null\n")
     cfg = load_config("tiny.yaml", "more.yaml", cli_args=["seed=5"])
     assert (cfg.seed, cfg.trainer.max_steps, cfg.trainer.log_every_n_steps) == (5, 9, 2)
@@ -44,17 +40,9 @@ def test_later_files_and_the_command_line_win(folder):
 
 def test_resolvers_of_threestudio(folder):
     expected = {
-        "add:1,2": 3,
-        "sub:1,2": -1,
-        "mul:3,2": 6,
-        "div:1,2": 0.5,
-        "idiv:5,2": 2,
-        "basename:a/b.yaml": "b.yaml",
-        "rmspace:'a b',_": "a_b",
-        "tuple2:3": [3.0, 3.0],
-        "gt0:1": True,
-        "not:true": False,
-        "cmaxgt0:[0,0.0,1.0,5]": True,
+        **{"add:1,2": 3, "sub:1,2": -1, "mul:3,2": 6, "div:1,2": 0.5, "idiv:5,2": 2},
+        **{"basename:a/b.yaml": "b.yaml", "rmspace:'a b',_": "a_b", "tuple2:3": [3.0, 3.0]},
+        **{"gt0:1": True, "not:true": False, "cmaxgt0:[0,0.0,1.0,5]": True},
         "cmaxgt0orcmaxgt0:0,0.0": False,
         "calc_exp_lr_decay_rate:0.25,2": 0.5,
     }
@@ -70,9 +58,7 @@ def test_resolvers_of_threestudio(folder):
         ("=3", "isn't an override"),
         ("~system", "isn't an override"),
         ("data.views=[1", "the value of data.views isn't valid YAML"),
-        ("nmae=x", "unknown key 'nmae': did you mean 'name'"),
         ("seed=x", "seed: expected a whole number, got 'x'"),
-        ("trainer=3", "trainer is 3; expected keys and values"),
         ("system=3", "system is 3; expected keys and values"),
         ("system=???", "no value for system"),
         ("system=[]", "system is a list in one and a section in another"),
@@ -97,18 +83,19 @@ def test_missing_values_are_all_named(folder):
     assert load_config("open.yaml", "data.yaml", cli_args=given).system.a == "x"
 
 
+LAUGHS = b"".join(
+    b"a%d: &a%d [%s]\n" % (i, i, b", ".join(9 * [b"*a%d" % (i - 1) if i else b"x"]))
+    for i in range(9)
+)
+"""Nine levels of nine references each."""
+
+
 @pytest.mark.parametrize(
     ("content", "message"),
     [
         (b"a: " + 500 * b"[" + 500 * b"]", "at most 32 levels deep"),
         (b"a: &a [*a]", "hold fewer than"),
-        (
-            b"".join(
-                b"a%d: &a%d [%s]\n" % (i, i, b", ".join(9 * [b"*a%d" % (i - 1) if i else b"x"]))
-                for i in range(9)
-            ),
-            "hold fewer than",
-        ),
+        (LAUGHS, "hold fewer than"),
         (b"a: &a {b: 1}\nc: {<<: *a}\non: 3", "has a key that isn't a word, on"),
         (b"a: [1", "isn't valid YAML: line 1, column 6: expected"),
         (b"name: a\nname: b", "isn't valid YAML: line 2"),
@@ -116,7 +103,6 @@ def test_missing_values_are_all_named(folder):
         (b"\x89PNG\r\n\x1a\n", "isn't valid YAML: 'utf-8' codec can't decode"),
         (b"a:\n\tb: 1", "line 2, column 1"),
         (b"seed: " + 5000 * b"9", "isn't valid YAML: Exceeds the limit"),
-        (b"- a", "must hold sections and keys"),
         (b"prompt: a fox: red", "isn't valid YAML: line 1, column 14"),
     ],
 )
@@ -167,8 +153,6 @@ def test_the_name_of_a_name_is_itself(text, times):
 
 
 def test_a_name_that_cannot_be_a_folders_is_reported(folder, caplog):
-    load("name=a_b")
-    assert "can't be a folder's" not in caplog.text
     cfg = load("name=a/b")
     said = f"name is 'a/b', which can't be a folder's: the run is in {cfg.exp_dir}"
     assert said in caplog.text
@@ -202,10 +186,10 @@ def test_paths_may_hold_what_yaml_reads_otherwise(folder):
 # -- folders ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("timestamp", ["../..", "/../x", "a/b", "a\\b", r'"x\0y"'])
-def test_a_timestamp_never_leaves_the_output_root(folder, timestamp):
-    with pytest.raises(UserError, match="timestamp is .*; expected a part of a folder's name"):
-        load(f"timestamp={timestamp}")
+def test_a_timestamp_never_leaves_the_output_root(folder):
+    for timestamp in ("../..", "/../x", "a/b", "a\\b", r'"x\0y"'):
+        with pytest.raises(UserError, match="timestamp is .*; expected a part of a folder's name"):
+            load(f"timestamp={timestamp}")
     with pytest.raises(UserError, match="timestamp is '..'"):
         load("tag=", "timestamp='..'")
 
@@ -243,8 +227,6 @@ def test_resume_auto_takes_the_newest_run_of_the_tag(folder):
     save_file(cfg.resume, checkpoint)
     Path(cfg.resume).write_bytes(b"damaged")
     assert load("resume=auto").resume == cfg.trial_dir + "/ckpts/last-prev.ckpt"
-
-
-def test_the_parsed_file_does_not_resume_again(folder):
+    # and the parsed file does not resume again
     dump_config("parsed.yaml", load("resume=a.ckpt"))
     assert load_config("parsed.yaml").resume is None
