@@ -8,7 +8,6 @@ from tests.helpers.painted_ball import painted_ball
 from tests.helpers.pruning import FAST
 from threestudio_gaussiandreamer.convert.command import main
 from threestudio_gaussiandreamer.formats.gaussian_files import (
-    WRITTEN,
     StoredCloud,
     read_cloud,
     write_cloud,
@@ -18,26 +17,11 @@ from threestudio_gaussiandreamer.meshes.mesh import vertex_surface_colors
 from threestudio_gaussiandreamer.prune import command as prune
 from threestudio_gaussiandreamer.view import command as view
 
-GAUSSIANS = {".glb": ["--gaussians"]}
-"""Without it a .glb is a mesh."""
-
 
 @pytest.fixture
 def source(tmp_path):
     write_cloud(str(tmp_path / "in.ply"), StoredCloud(ball(60, 1), "z", 40.0))
     return tmp_path / "in.ply"
-
-
-@pytest.mark.parametrize("suffix", WRITTEN)
-def test_every_format_is_written(source, tmp_path, capsys, suffix):
-    out = tmp_path / f"out{suffix}"
-    assert main([str(source), str(out), *GAUSSIANS.get(suffix, ())]) == 0
-    size = out.stat().st_size
-    assert f"60 Gaussians of degree 1, {size / 1000:.3g} kB" in capsys.readouterr().out
-    read, before = read_cloud(str(out)), ball(60, 1)
-    means = read.in_axes("z").gaussians.means
-    nearest = [np.abs(before.means - mean).sum(axis=1).min() for mean in means]
-    assert max(nearest) < 5e-3 and read.pruned_to == 40
 
 
 def test_a_check_that_cannot_be_made_writes_nothing(tmp_path, capsys):
@@ -53,6 +37,8 @@ def test_a_check_that_cannot_be_made_writes_nothing(tmp_path, capsys):
 def test_what_is_lost_and_the_decibels_are_printed(source, tmp_path, capsys):
     assert main([str(source), str(tmp_path / "a.spz"), "--check", "--size", "64"]) == 0
     said = capsys.readouterr().out
+    size = (tmp_path / "a.spz").stat().st_size
+    assert f"60 Gaussians of degree 1, {size / 1000:.3g} kB" in said
     assert "lost: positions are rounded" in said and "lost: harmonics above degree 0" in said
     assert "dB in 8 views of 64 x 64 pixels" in said
     options = ["--gaussians", "--check", "--size", "64"]
@@ -103,7 +89,6 @@ def test_dropped_harmonics_are_named_and_measured(tmp_path, capsys):
         (["in.ply", "a.glb", "--spz-version", "4"], "--spz-version: OUT is a .glb file"),
         (["in.ply", "a.glb", "--from", "lgm", "--up", "z"], "--from and --up both say"),
         (["in.ply", "a.glb", "--view-size", "1"], "--view-size: expected a number"),
-        (["in.ply", "a.glb", "--harmonics", "4"], "--harmonics: expected"),
         (["in.ply", "a.glb", "--check", "--size", "2"], "--size: expected"),
         (["in.ply", "a.spz", "--size", "64"], "--size: has no effect without --check"),
         (["in.ply", "a.spz", "--gaussians"], "--gaussians: OUT is a .spz file, which always holds"),
@@ -111,14 +96,11 @@ def test_dropped_harmonics_are_named_and_measured(tmp_path, capsys):
         (["in.ply", "a.glb", "--faces", "5"], "--faces: expected a number from 100"),
         (["in.ply", "a.spz", "--faces", "500"], "--faces: OUT is a file of Gaussians"),
         (["in.ply", "a.glb", "--gaussians", "--unlit"], "--unlit: OUT is a file of Gaussians"),
-        (["in.ply", "nowhere/a.obj"], "OUT: there is no folder 'nowhere'"),
         (["empty.ply", "a.glb"], "empty.ply holds no Gaussians that can be drawn"),
-        (["text.ply", "a.glb"], "not a PLY file"),
         (["in.ply", "a.glb", "--up-out", "z"], "--up-out: OUT is a .glb file"),
         (["in.ply", "a.spz", "--up-out", "-y"], "--up-out: OUT is a .spz file"),
         (["in.ply", "a.spz", "--up-out", "z", "--spz-version", "4"], "--up-out: OUT is a .spz"),
         (["in.ply", "a.glb", "--from", "blender"], "invalid choice"),
-        (["in.ply", "a.ply", "--up-out", "-z"], "invalid choice"),
     ],
 )
 def test_errors_are_found_before_anything_is_written(
@@ -126,8 +108,7 @@ def test_errors_are_found_before_anything_is_written(
 ):
     monkeypatch.chdir(tmp_path)
     write_cloud("empty.ply", StoredCloud(ball(0)))
-    for name in ("text", "text.ply"):
-        (tmp_path / name).write_text("hello")
+    (tmp_path / "text").write_text("hello")
     (tmp_path / "device.ply").symlink_to("/dev/null")
     (tmp_path / "lost.ply").symlink_to(tmp_path / "unplugged/a.ply")
     before = sorted(tmp_path.iterdir())

@@ -21,7 +21,7 @@ def test_a_row_comes_after_the_farm_and_the_prompt_last():
     assert args.overrides == chosen
 
 
-def test_the_command_that_repeats_an_asset_has_its_prompt_threads_and_configurations():
+def test_the_command_that_repeats_an_asset_has_its_prompt_threads_and_configurations(tmp_path):
     words = shlex.split(recipe.repeat_command(RECIPE, JOB))
     assert words[0] == "OMP_NUM_THREADS=2" and "demo.yaml" in words
     assert "launch.py" not in words  # this process wasn't started by it
@@ -31,6 +31,15 @@ def test_the_command_that_repeats_an_asset_has_its_prompt_threads_and_configurat
     names = [source.name for source in recipe.all_sources(saving, job)]
     assert names == ["a.yaml", "demo.yaml", "low.yaml"]
     assert "low.yaml" in recipe.repeat_command(saving, job)
+    # of a farm on S3 the command can be run too
+    (tmp_path / "s3.yaml").write_text("exp_root_dir: s3://bucket/runs")
+    sources = tuple(map(recipe.read_config, ("demo.yaml", str(tmp_path / "s3.yaml"))))
+    farm = RECIPE._replace(sources=sources, overrides=())
+    words = shlex.split(recipe.repeat_command(farm, Job(Row("fox", "a fox"))))
+    args = parse_arguments(words[words.index("--config") :])
+    cfg = load_config(*map(find_config, args.config), cli_args=args.overrides)
+    check_config(cfg)
+    assert cfg.exp_root_dir == "outputs"
 
 
 def test_the_digest_is_of_names_and_contents(tmp_path):
@@ -43,14 +52,3 @@ def test_the_digest_is_of_names_and_contents(tmp_path):
     (folder / "report.json").write_text("seconds")
     (folder / "pruned").mkdir()
     assert len(digests) == 3 and digest(tmp_path) in digests
-
-
-def test_the_command_that_repeats_an_asset_of_a_farm_on_s3_can_be_run(tmp_path):
-    (tmp_path / "s3.yaml").write_text("exp_root_dir: s3://bucket/runs")
-    sources = tuple(map(recipe.read_config, ("demo.yaml", str(tmp_path / "s3.yaml"))))
-    farm = RECIPE._replace(sources=sources, overrides=())
-    words = shlex.split(recipe.repeat_command(farm, Job(Row("fox", "a fox"))))
-    args = parse_arguments(words[words.index("--config") :])
-    cfg = load_config(*map(find_config, args.config), cli_args=args.overrides)
-    check_config(cfg)
-    assert cfg.exp_root_dir == "outputs"

@@ -103,7 +103,6 @@ COUNT = ["--count", "9"]
     ("files", "options", "said"),
     [
         ("in.ply out.ply", ["--bytes", "1"], "--bytes: 1 are too few for one Gaussian, which"),
-        ("in.ply out.ply", ["--within", "0.1"], "--within: give quality (--quality) too, the PSNR"),
         ("in.ply out.ply", [*COUNT, "--quality", "35"], "--quality: has no effect without the"),
         ("in.ply out.ply", ["--within", "1", "--quality", "nan"], "--quality: expected a finite"),
         ("in.ply out.ply", [], "one of the arguments"),
@@ -117,7 +116,6 @@ COUNT = ["--count", "9"]
         ("in.ply picture.ply", COUNT, "error: OUT.png:"),
         ("in.ply a\0b.ply", COUNT, "error: OUT: "),
         (f"in.ply {'x' * 249}.ply", COUNT, "error: OUT.json: "),
-        ("in.ply none/out.ply", COUNT, "error: OUT: there is no folder"),
         ("dim.ply out.ply", ["--psnr", "40", *FAST], "none of the 600 Gaussians is visible in any"),
         ("huge.ply out.ply", COUNT, "the largest scale is"),
     ],

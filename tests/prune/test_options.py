@@ -49,16 +49,16 @@ def test_sizes_and_decibels_are_read_with_their_units():
 @pytest.mark.parametrize(
     ("given", "said"),
     [
-        ({"count": "0"}, "--count: expected a whole number from 1 on"),
-        ({"count": "1.5"}, "--count: expected a whole number"),
-        ({"count": "many"}, "--count: expected a whole number from 1 on, got 'many'"),
+        *(
+            ({"count": n}, "--count: expected a whole number from 1 on, got")
+            for n in ("0", "1.5", "x")
+        ),
         *(({"bytes": text}, "--bytes: expected a size such as") for text in ("2 potatoes", "1e3")),
         ({"bytes": "9" * 30 + "G"}, "below 2^63 bytes"),
         ({"bytes": "9" * 400}, "expected a number"),
         ({"psnr": "nan"}, "--psnr: expected a number"),
         ({"psnr": "-3"}, "--psnr: expected a number above 0 (dB), got -3"),
         ({"within": "0", "quality": 35}, "--within: expected a number from 0.001 to 30 (dB), "),
-        ({"within": "5000", "quality": 35}, "--within: expected a number"),
         *(({"auto": text}, "--auto: expected a") for text in ("0", "6", "nan")),
     ],
 )
@@ -71,9 +71,6 @@ def test_a_budget_that_is_none_is_named(given, said):
 def test_a_gain_is_a_budget():
     assert budget_of(PruneOptions(auto="0.25dB"), "--")[-2:] == (0.25, pytest.approx(1e-4))
     assert budget_of(PruneOptions(auto=1, quality=30.0), "--")[-2:] == (1.0, pytest.approx(1e-3))
-
-
-def test_auto_may_stand_anywhere():
     for words in ("--auto in.ply out.ply", "in.ply out.ply --auto"):
         assert parse(words.split()).auto == "0.5"
     assert parse("in.ply --auto 1dB o".split()).auto == "1dB"
