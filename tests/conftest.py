@@ -8,16 +8,13 @@ os.environ.setdefault("HF_HUB_OFFLINE", "1")
 # the tests' tensors are the CPU's; what needs a GPU is in benchmarks/splatting/gpu_check.py
 os.environ["CUDA_VISIBLE_DEVICES"] = ""
 
-import shutil
 import signal
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import settings
 
-from tests.helpers.gallery import Gallery
 from threestudio_gaussiandreamer.core import logs
 from threestudio_gaussiandreamer.gaussians.point_cloud import PointCloud
 
@@ -43,19 +40,6 @@ def no_traces_of_runs(monkeypatch):
     """
     monkeypatch.setenv("PL_GLOBAL_SEED", "0")
     monkeypatch.setattr(logs.logger, "propagate", True)
-
-
-@pytest.fixture(scope="session")
-def gallery(tmp_path_factory) -> Gallery:
-    """Finished tiny runs, to be read only: ``gallery("trained")`` is the folder of one."""
-    base = tmp_path_factory.getbasetemp()
-    return Gallery((base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "gallery")
-
-
-@pytest.fixture
-def copied(gallery, tmp_path) -> Callable[[str], Path]:
-    """``copied("trained")`` returns the test's own copy of a run of the gallery."""
-    return lambda name: Path(shutil.copytree(gallery(name), tmp_path / name))
 
 
 @pytest.fixture

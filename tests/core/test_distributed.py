@@ -90,19 +90,6 @@ def test_a_view_has_the_same_numbers_in_whichever_process(processes):
         assert torch.equal(drawn, shared[rows])
 
 
-@pytest.mark.parametrize(
-    ("views", "size", "said"),
-    [
-        (1, 2, "data.batch_size is 1, fewer than the 2 processes"),
-        (4, 3, "data.batch_size is 4, no multiple of the 3 processes .* to 3 or a multiple"),
-    ],
-)
-def test_views_that_cant_be_shared_are_refused(processes, views, size, said):
-    processes(0, size)
-    with pytest.raises(UserError, match=said):
-        TrainCameras(CameraConfig(batch_size=views))
-
-
 def test_views_that_a_model_sees_together_stay_in_one_process(processes):
     processes(1, 2)
     with pytest.raises(UserError, match="in groups of 4: set data.batch_size to 8"):

@@ -3,7 +3,7 @@
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any, List, NamedTuple, Optional, Union
+from typing import Any, List, Optional, Union
 
 import numpy as np
 import pytest
@@ -53,17 +53,6 @@ def test_dimensions_with_the_same_name_are_the_same():
         paint(POINTS, POINTS[:4])
     with pytest.raises(TypeError, match="return value"):
         paint(POINTS, POINTS, scale=2)
-
-
-def test_named_tuples_and_classes_pass_through():
-    class Pair(NamedTuple):
-        a: Tensor
-
-    @jaxtyped(typechecker=check)
-    def make(a: Tensor) -> Pair:
-        return Pair(a)
-
-    assert make(POINTS).a is POINTS
 
 
 @pytest.mark.slow
