@@ -133,6 +133,7 @@ def test_errors_are_those_of_the_command_line(studio, capfd):
     assert expected in studio.text("message")
 
 
+@pytest.mark.slow
 def test_a_full_disk_is_told_and_ends_the_run_only(studio):
     """A limit of the size of files, which the run's process inherits, stands for the disk."""
     _, most = resource.prlimit(studio.process.pid, resource.RLIMIT_FSIZE)
