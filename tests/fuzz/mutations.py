@@ -1,5 +1,6 @@
 """Damage valid files at random, from a seed; half of the packed ones (zip, gzip, GLB) inside."""
 
+import gzip
 import io
 import json
 import re
@@ -11,6 +12,8 @@ from typing import Any, NamedTuple, Optional
 
 import numpy as np
 import zstandard
+
+from tests.helpers.gltf_builder import glb_bytes
 
 NUMBERS = (
     b"0 -0 1 -1 2 3 255 256 65535 65536 -2147483648 2147483647 4294967295 9223372036854775807 "
@@ -207,32 +210,17 @@ def _unglb(data: bytes) -> list[tuple[str, bytes]]:
     return pieces
 
 
-def _glb(pieces: list[tuple[str, bytes]]) -> bytes:
-    chunks = b""
-    for name, content in pieces:
-        content += (b" " if name == "JSON" else b"\0") * (-len(content) % 4)
-        kind = name.encode("latin-1").ljust(4, b"\0")
-        chunks += struct.pack("<I4s", len(content), kind) + content
-    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
-
-
-def _gunzip(data: bytes) -> list[tuple[str, bytes]]:
-    return [("data", zlib.decompress(data, 16 + zlib.MAX_WBITS))]
-
-
-def _gzip(pieces: list[tuple[str, bytes]]) -> bytes:
-    deflate = zlib.compressobj(6, zlib.DEFLATED, 16 + zlib.MAX_WBITS)
-    return deflate.compress(pieces[0][1]) + deflate.flush()
-
-
 def _unply(data: bytes) -> list[tuple[str, bytes]]:
     head, end, body = data.partition(b"end_header\n")
     return [("header", head + end), ("body", body)]
 
 
 ZIP = Packing(_unzip, _zip)
-GZIP = Packing(_gunzip, _gzip)
-GLB = Packing(_unglb, _glb, text=("JSON",))
+GZIP = Packing(
+    lambda data: [("data", zlib.decompress(data, 16 + zlib.MAX_WBITS))],
+    lambda pieces: gzip.compress(pieces[0][1], mtime=0),
+)
+GLB = Packing(_unglb, glb_bytes, text=("JSON",))
 PLY = Packing(_unply, lambda pieces: b"".join(part for _, part in pieces), text=("header",))
 UNPACKABLE = (
     *(ValueError, IndexError, OSError, zipfile.BadZipFile, zlib.error, struct.error),

@@ -1,8 +1,4 @@
-"""All fuzz targets: valid files, how to damage them, and what must hold.
-
-``exercise`` reads a damaged file with the package and renders the result. It returns if the file
-was read, raises UserError if it was rejected, and AssertionError if the result isn't the file's
-content. Any other exception is a crash."""
+"""All fuzz targets: valid files, how to damage them, and what must hold."""
 
 import contextlib
 import io
@@ -14,6 +10,7 @@ import traceback
 import tracemalloc
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple, Optional
 from unittest import mock
@@ -28,6 +25,7 @@ from tests.fuzz import mutations, oracles
 from tests.fuzz.mutations import BINARY, TEXT, Mutator, Packing
 from tests.helpers.object_clouds import ball
 from tests.helpers.ply_files import gaussians, ply_bytes
+from tests.helpers.splatting_scenes import NAMES
 from threestudio_gaussiandreamer import register_parts
 from threestudio_gaussiandreamer.core.checkpoint_file import load_checkpoint, save_file
 from threestudio_gaussiandreamer.core.errors import UserError
@@ -63,6 +61,7 @@ class Target(NamedTuple):
     suffix: str
     seeds: Callable[[], list[bytes]]
     exercise: Callable[[Path], None]
+    """Read a file and render it; raise UserError if it was refused, AssertionError if misread."""
     mutators: list[Mutator] = BINARY
     packing: Optional[Packing] = None
     traced: bool = True
@@ -99,8 +98,12 @@ def require_points(cloud: PointCloud) -> None:
     assert np.shape(points) == np.shape(colors) == (len(points), 3) and len(points) > 0, "shapes"
     assert np.isfinite(points).all() and np.isfinite(colors).all(), "a number isn't finite"
     assert (colors >= 0).all() and (colors <= 1).all(), "colours outside of [0, 1]"
-    named = faces is None or not len(faces) or (faces.min() >= 0 and faces.max() < len(points))
-    assert named, "a face names a point that isn't there"
+    if faces is not None and len(faces):
+        require_vertices(faces, points)
+
+
+def require_vertices(faces: np.ndarray, points: np.ndarray) -> None:
+    assert faces.min() >= 0 and faces.max() < len(points), "a face names a point that isn't there"
 
 
 def same(ours: np.ndarray, theirs: np.ndarray, what: str) -> None:
@@ -169,9 +172,7 @@ def read_ply(read: Callable, path: Path) -> tuple[Any, oracles.PlyVertices]:
     with mock.patch.object(logger, "handlers", [listener]):
         found = read(path)
     truth = strictly(oracles.ply_vertices, path)
-    assert not truth.leftover or listener.handle.called, (
-        "data after the announced end without a message"
-    )
+    assert not truth.leftover or listener.handle.called, "data after the end without a message"
     return found, truth
 
 
@@ -187,11 +188,9 @@ def exercise_gaussians_ply(path: Path) -> None:
     if rest:
         higher = stacked(rest).reshape(truth.count, 3, -1).transpose(0, 2, 1)
         sh = np.concatenate([sh, higher], 1)
-    same(arrays.means, stacked(ply.MEANS), "means")
-    same(arrays.log_scales, stacked(ply.LOG_SCALES), "scales")
-    same(arrays.quats, stacked(ply.QUATS), "rotations")
-    same(arrays.logit_opacities, columns["opacity"], "opacities")
-    same(arrays.sh, sh, "harmonics")
+    places = (stacked(names) for names in (ply.MEANS, ply.QUATS, ply.LOG_SCALES))
+    for found, true, name in zip(arrays, (*places, columns["opacity"], sh), NAMES, strict=True):
+        same(found, true, name)
     prior = GaussiansPrior({"path": str(path)})
     require_points(prior("a fox"))
     require_picture(cloud_of(prior.gaussians("a fox")))
@@ -269,24 +268,22 @@ def texts() -> list[bytes]:
 # ---- compact formats of Gaussians ----------------------------------------------------------------
 
 
-def files(suffix: str, *shapes: tuple[int, int], **options: Any) -> Callable[[], list[bytes]]:
-    """Return a writer of files of a format, of (count, degree) each."""
-
-    def write() -> list[bytes]:
-        with tempfile.TemporaryDirectory() as folder:
-            path, made = Path(folder, f"a{suffix}"), []
-            for count, degree in shapes or [(12, 0), (9, 1)]:
-                cloud = StoredCloud(some_gaussians(count, degree), antialiased=degree == 1)
-                write_cloud(str(path), cloud, **options)
-                made.append(path.read_bytes())
-            return made
-
-    return write
+def files(
+    suffix: str, shapes: Sequence[tuple[int, int]] = ((12, 0), (9, 1)), **options: Any
+) -> list[bytes]:
+    """Return files of a format, of (count, degree) each."""
+    made = []
+    with tempfile.TemporaryDirectory() as folder:
+        for count, degree in shapes:
+            cloud = StoredCloud(some_gaussians(count, degree), antialiased=degree == 1)
+            write_cloud(f"{folder}/a{suffix}", cloud, **options)
+            made.append(Path(folder, f"a{suffix}").read_bytes())
+    return made
 
 
 def spz_files() -> list[bytes]:
-    first, second, third = (some_gaussians(*shape) for shape in ((12, 0), (9, 1), (3, 3)))
-    return [spz_bytes(first), spz_bytes(second, ["up: y"]), spz_bytes(third)]
+    clouds = (((12, 0),), ((9, 1), ["up: y"]), ((3, 3),))
+    return [spz_bytes(some_gaussians(*shape), *comments) for shape, *comments in clouds]
 
 
 def exercise_spz(path: Path) -> None:
@@ -321,14 +318,10 @@ def drawn(path: Path) -> Gaussians:
     return gaussians
 
 
-def exercise_counted(count_of: Callable[[bytes], int]) -> Callable[[Path], None]:
-    """Return a check that no more Gaussians are read than the strict reader finds in the file."""
-
-    def exercise(path: Path) -> None:
-        found, announced = len(drawn(path).means), strictly(count_of, path)
-        assert found <= announced, f"{found} Gaussians, but the file says {announced}"
-
-    return exercise
+def exercise_counted(count_of: Callable[[bytes], int], path: Path) -> None:
+    """Require that no more Gaussians are read than the strict reader finds in the file."""
+    found, announced = len(drawn(path).means), strictly(count_of, path)
+    assert found <= announced, f"{found} Gaussians, but the file says {announced}"
 
 
 def spz_count(data: bytes) -> int:
@@ -356,21 +349,16 @@ def exercise_splat(path: Path) -> None:
     drawn(path)
 
 
-def exercise_means(
-    read: Callable[[Path], Gaussians], means_of: Callable[[bytes], np.ndarray]
-) -> Callable[[Path], None]:
-    """Return a check that every position is the one that the strict reader finds."""
-
-    def exercise(path: Path) -> None:
-        found = read(path).means
-        with np.errstate(over="ignore", invalid="ignore"):
-            expected = strictly(means_of, path).astype(np.float32)
-            assert found.shape == expected.shape, f"{len(found)} Gaussians, not {len(expected)}"
-            close = np.isclose(found, expected, rtol=1e-4, atol=1e-4, equal_nan=True)
-        assert close.all(), "positions aren't those of the file"
-        drawn(path)
-
-    return exercise
+def exercise_means(read: Callable, means_of: Callable[[bytes], np.ndarray], path: Path) -> None:
+    """Require that every position is the one that the strict reader finds."""
+    found = read(path)
+    found = (found if isinstance(found, Gaussians) else found[0]).means
+    with np.errstate(over="ignore", invalid="ignore"):
+        expected = strictly(means_of, path).astype(np.float32)
+        assert found.shape == expected.shape, f"{len(found)} Gaussians, not {len(expected)}"
+        close = np.isclose(found, expected, rtol=1e-4, atol=1e-4, equal_nan=True)
+    assert close.all(), "positions aren't those of the file"
+    drawn(path)
 
 
 def _unsog(data: bytes) -> list[tuple[str, bytes]]:
@@ -423,31 +411,24 @@ SOG, SPZ_4 = Packing(_unsog, _sog), Packing(_unspz, _spz)
 # ---- meshes --------------------------------------------------------------------------------------
 
 
-def meshes(kind: str) -> Callable[[], list[bytes]]:
-    """Return a writer of a box with a texture, with colours, and as two objects of a scene."""
+def meshes(kind: str) -> list[bytes]:
+    """Return a box with a texture, with colours, and as two objects of a scene."""
+    import trimesh
 
-    def write() -> list[bytes]:
-        import trimesh
-
-        rng = np.random.default_rng(0)
-        image = Image.fromarray(rng.integers(0, 255, (4, 4, 3), dtype=np.uint8))
-        textured, by_vertex, by_face = (trimesh.creation.box((1, 0.7, 0.5)) for _ in range(3))
-        visual, material = trimesh.visual, None
-        if kind == "glb":
-            material = visual.material.PBRMaterial(baseColorTexture=image)
-        uv = textured.vertices[:, :2] + 0.5
-        textured.visual = visual.TextureVisuals(uv=uv, image=image, material=material)
-        by_vertex.visual.vertex_colors = rng.integers(0, 255, (8, 4))
-        by_face.visual.face_colors = rng.integers(0, 255, (12, 4))
-        scene = trimesh.Scene([by_vertex])
-        moved = trimesh.transformations.translation_matrix([0, 2, 0])
-        scene.add_geometry(textured, transform=moved)
-        sources = {"glb": [textured, by_vertex, scene], "obj": [textured, by_vertex]}
-        sources["ply"] = [by_vertex, by_face]
-        seeds = [source.export(file_type=kind) for source in sources.get(kind, [by_vertex])]
-        return [seed.encode() if isinstance(seed, str) else seed for seed in seeds]
-
-    return write
+    rng = np.random.default_rng(0)
+    image = Image.fromarray(rng.integers(0, 255, (4, 4, 3), dtype=np.uint8))
+    textured, by_vertex, by_face = (trimesh.creation.box((1, 0.7, 0.5)) for _ in range(3))
+    visual, uv = trimesh.visual, textured.vertices[:, :2] + 0.5
+    material = visual.material.PBRMaterial(baseColorTexture=image) if kind == "glb" else None
+    textured.visual = visual.TextureVisuals(uv=uv, image=image, material=material)
+    by_vertex.visual.vertex_colors = rng.integers(0, 255, (8, 4))
+    by_face.visual.face_colors = rng.integers(0, 255, (12, 4))
+    scene = trimesh.Scene([by_vertex])
+    scene.add_geometry(textured, transform=trimesh.transformations.translation_matrix([0, 2, 0]))
+    sources = {"glb": [textured, by_vertex, scene], "obj": [textured, by_vertex]}
+    sources["ply"] = [by_vertex, by_face]
+    seeds = [source.export(file_type=kind) for source in sources.get(kind, [by_vertex])]
+    return [seed.encode() if isinstance(seed, str) else seed for seed in seeds]
 
 
 def exercise_mesh(path: Path) -> None:
@@ -455,10 +436,9 @@ def exercise_mesh(path: Path) -> None:
     mesh = load_mesh(path)
     inside = np.isfinite(mesh.vertices).all() and np.abs(mesh.vertices).max() < 1 + 1e-6
     assert inside, "vertices outside of the box"
-    named = mesh.faces.min() >= 0 and mesh.faces.max() < len(mesh.vertices)
-    assert named, "a face names a vertex that isn't there"
-    require_points(MeshPrior({"path": str(path)})("a fox"))
-    require_points(MeshPrior({"path": str(path), "num_points": 50})("a fox"))
+    require_vertices(mesh.faces, mesh.vertices)
+    for options in ({}, {"num_points": 50}):
+        require_points(MeshPrior({"path": str(path), **options})("a fox"))
     c2w = np.array([[0.0, 0, 1, 3], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
     image = MeshCaster(mesh).render_views([(c2w, 0.8)], 8, 8, supersample=1)
     assert np.isfinite(image).all() and image.min() >= 0 and image.max() < 1 + 1e-5, "a pixel"
@@ -538,15 +518,15 @@ def exercise_configuration(path: Path) -> None:
 
 
 COMMANDS = [
-    "--config\ndemo.yaml\n--train\n--gpu\ncpu\ntrainer.max_steps=1200\n"
-    "system.prompt_processor.prompt=a fox: red, 1984\nseed=3\ntag=t",
-    "--config\ndemo.yaml\n--config\ndemo-draft.yaml\n--export\n"
-    "resume=outputs/demo/x/ckpts/last.ckpt\nsystem.geometry.prior_type=random-prior\n"
-    "data.elevation_range=[-10,60]\nsystem.geometry.densify={enabled: true, start: 9, stop: 99}",
-    "--config\ngaussiandreamer\n--test\n--verbose\nsystem.prompt_processor.prompt=1984\n"
-    "name=a b\nuse_timestamp=false\nsystem.guidance.max_step_percent=[0,0.98,0.5,500]\n"
-    "system.geometry.lr_means=1e-4\nsystem.exporter.formats=[ply,points]\n"
-    "checkpoint.save_last=true\ndata.batch_size=${seed}\nseed=2",
+    b"--config\ndemo.yaml\n--train\n--gpu\ncpu\ntrainer.max_steps=1200\n"
+    b"system.prompt_processor.prompt=a fox: red, 1984\nseed=3\ntag=t",
+    b"--config\ndemo.yaml\n--config\ndemo-draft.yaml\n--export\n"
+    b"resume=outputs/demo/x/ckpts/last.ckpt\nsystem.geometry.prior_type=random-prior\n"
+    b"data.elevation_range=[-10,60]\nsystem.geometry.densify={enabled: true, start: 9, stop: 99}",
+    b"--config\ngaussiandreamer\n--test\n--verbose\nsystem.prompt_processor.prompt=1984\n"
+    b"name=a b\nuse_timestamp=false\nsystem.guidance.max_step_percent=[0,0.98,0.5,500]\n"
+    b"system.geometry.lr_means=1e-4\nsystem.exporter.formats=[ply,points]\n"
+    b"checkpoint.save_last=true\ndata.batch_size=${seed}\nseed=2",
 ]
 
 
@@ -579,48 +559,44 @@ def npy_files() -> list[bytes]:
 
 
 PLY, ZIP, GLB = mutations.PLY, mutations.ZIP, mutations.GLB
-count_spz, count_glb = exercise_counted(spz_count), exercise_counted(glb_count)
-read_archive = exercise_means(lambda path: read_sog(path)[0], oracles.sog_means)
-read_layer = exercise_means(lambda path: read_usda(path)[0], oracles.usda_means)
-read_compressed = exercise_means(read_compressed_ply, oracles.compressed_means)
-compressed_files = files(".compressed.ply", (12, 0), (260, 1))
+count_spz, count_glb = (partial(exercise_counted, count) for count in (spz_count, glb_count))
+read_archive = partial(exercise_means, read_sog, oracles.sog_means)
+read_layer = partial(exercise_means, read_usda, oracles.usda_means)
+read_sections = partial(exercise_means, read_ksplat, oracles.ksplat_means)
+read_compressed = partial(exercise_means, read_compressed_ply, oracles.compressed_means)
+compressed_files = partial(files, ".compressed.ply", [(12, 0), (260, 1)])
 TARGETS: dict[str, Target] = {
     "ply-gaussians": Target(".ply", gaussian_plys, exercise_gaussians_ply, packing=PLY),
     "ply-points": Target(".ply", point_plys, exercise_points_ply, packing=PLY),
-    "ply-mesh": Target(".ply", meshes("ply"), exercise_ply_mesh, packing=PLY),
-    "glb": Target(".glb", meshes("glb"), exercise_mesh, packing=GLB),
-    "obj": Target(".obj", meshes("obj"), exercise_mesh, TEXT),
-    "stl": Target(".stl", meshes("stl"), exercise_mesh),
-    "off": Target(".off", meshes("off"), exercise_mesh, TEXT),
+    "ply-mesh": Target(".ply", partial(meshes, "ply"), exercise_ply_mesh, packing=PLY),
+    "glb": Target(".glb", partial(meshes, "glb"), exercise_mesh, packing=GLB),
+    "obj": Target(".obj", partial(meshes, "obj"), exercise_mesh, TEXT),
+    "stl": Target(".stl", partial(meshes, "stl"), exercise_mesh),
+    "off": Target(".off", partial(meshes, "off"), exercise_mesh, TEXT),
     "checkpoint": Target(".ckpt", checkpoints, exercise_checkpoint, packing=ZIP),
     "configuration": Target(".yaml", configurations, exercise_configuration, TEXT, traced=False),
-    "command-line": Target(
-        ".txt", lambda: [text.encode() for text in COMMANDS], exercise_command, TEXT, traced=False
-    ),
+    "command-line": Target(".txt", COMMANDS.copy, exercise_command, TEXT, traced=False),
     "motion": Target(".npz", motion_archives, exercise_motions, packing=ZIP),
     "points-npz": Target(".npz", point_archives, exercise_points, packing=ZIP),
     "points-npy": Target(".npy", npy_files, exercise_npy_points),
     "points-text": Target(".xyz", texts, exercise_points, TEXT),
     "spz": Target(".spz", spz_files, exercise_spz, packing=mutations.GZIP),
-    "spz-4": Target(".spz", files(".spz", spz_version=4), count_spz, packing=SPZ_4),
-    "sog": Target(".sog", files(".sog"), read_archive, packing=SOG),
-    "ksplat": Target(
-        ".ksplat", ksplats, exercise_means(lambda path: read_ksplat(path)[0], oracles.ksplat_means)
-    ),
-    "glb-gaussians": Target(".glb", files(".glb"), count_glb, packing=GLB),
+    "spz-4": Target(".spz", partial(files, ".spz", spz_version=4), count_spz, packing=SPZ_4),
+    "sog": Target(".sog", partial(files, ".sog"), read_archive, packing=SOG),
+    "ksplat": Target(".ksplat", ksplats, read_sections),
+    "glb-gaussians": Target(".glb", partial(files, ".glb"), count_glb, packing=GLB),
     "compressed-ply": Target(".compressed.ply", compressed_files, read_compressed, packing=PLY),
     "splat": Target(".splat", splats, exercise_splat),
-    "usda": Target(".usda", files(".usda"), read_layer, TEXT),
+    "usda": Target(".usda", partial(files, ".usda"), read_layer, TEXT),
 }
-_KNOWN: dict[str, list[bytes]] = {}
 
 
+@cache
 def seeds(name: str) -> list[bytes]:
     """Return the valid files; one is read, which imports, before memory is measured."""
-    if name not in _KNOWN:
-        _KNOWN[name] = TARGETS[name].seeds()
-        outcome_of(TARGETS[name]._replace(traced=False), _KNOWN[name][0])
-    return _KNOWN[name]
+    valid = TARGETS[name].seeds()
+    outcome_of(TARGETS[name]._replace(traced=False), valid[0])
+    return valid
 
 
 def mutant(name: str, seed: int, index: int) -> bytes:
@@ -638,9 +614,8 @@ FIXED_BYTES, PER_BYTE = 24 << 20, 64
 
 
 class Outcome(NamedTuple):
-    """The outcome of one input: "refused" with a UserError, "read" correctly, or "failed"."""
-
     kind: str
+    """ "refused" with a UserError, "read" correctly, or "failed"."""
     detail: str = ""
 
 
@@ -694,10 +669,7 @@ def _run(target: Target, path: Path) -> Outcome:
 
 @contextlib.contextmanager
 def _time_limit(seconds: float) -> Iterator[None]:
-    def stop(signum: int, frame: object) -> None:
-        raise Hang
-
-    earlier = signal.signal(signal.SIGPROF, stop)
+    earlier = signal.signal(signal.SIGPROF, mock.Mock(side_effect=Hang))
     signal.setitimer(signal.ITIMER_PROF, seconds)
     try:
         yield

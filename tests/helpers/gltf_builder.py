@@ -91,12 +91,17 @@ class Gltf:
     def glb(self):
         """Return the bytes of the file."""
         self.document["buffers"] = [{"byteLength": len(self.binary)}]
-        text = json.dumps(self.document).encode()
-        chunks = b""
-        for kind, data, blank in ((b"JSON", text, b" "), (b"BIN\0", self.binary, b"\0")):
-            data += blank * (-len(data) % 4)
-            chunks += struct.pack("<I4s", len(data), kind) + data
-        return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+        return glb_bytes([("JSON", json.dumps(self.document).encode()), ("BIN", self.binary)])
+
+
+def glb_bytes(pieces):
+    """Return a GLB of chunks, whose names are their types."""
+    chunks = b""
+    for name, content in pieces:
+        content += (b" " if name == "JSON" else b"\0") * (-len(content) % 4)
+        kind = name.encode("latin-1").ljust(4, b"\0")
+        chunks += struct.pack("<I4s", len(content), kind) + content
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
 
 
 def png(picture):

@@ -1,9 +1,10 @@
 """Tiny models with random weights, laid out as the published ones in diffusers' format."""
 
 import json
+from collections.abc import Callable
 from io import BytesIO
 from pathlib import Path
-from typing import Any, NamedTuple, Optional
+from typing import Any, NamedTuple
 
 import torch
 from torch import nn
@@ -70,14 +71,10 @@ def stable_diffusion(
     listen_to_text(unet)
     unet.save_pretrained(folder / "unet")
     vae(folder, sizes.vae, latent_channels=4)
-    _rename(folder / "vae" / "diffusion_pytorch_model.safetensors", PUBLISHED_VAE_NAMES)
+    _rename(folder / "vae" / "diffusion_pytorch_model.safetensors", _published_vae)
     clip_text_encoder(folder, sizes.text_width)
-    scheduler = _stable_diffusion_scheduler(prediction)
-    scheduler.save_pretrained(folder / "scheduler")
-    components = {"unet": "UNet2DConditionModel", "vae": "AutoencoderKL"}
-    components |= {"text_encoder": "CLIPTextModel", "tokenizer": "CLIPTokenizer"}
-    components |= {"scheduler": type(scheduler).__name__, **NO_CHECKER}
-    return write_index(folder, "StableDiffusionPipeline", components, requires_safety_checker=False)
+    _stable_diffusion_scheduler(prediction).save_pretrained(folder / "scheduler")
+    return write_index(folder, "StableDiffusionPipeline", **NO_CHECKER)
 
 
 def vae(folder: Path, sizes: dict[str, Any] = TINY.vae, **options: Any) -> None:
@@ -90,7 +87,7 @@ def vae(folder: Path, sizes: dict[str, Any] = TINY.vae, **options: Any) -> None:
 
 
 def _stable_diffusion_scheduler(prediction: str) -> Any:
-    """Write the published scheduler: PNDM for 2.1-base, DDIM for 2.1 (768, v-prediction)."""
+    """Make the published scheduler: PNDM for 2.1-base, DDIM for 2.1 (768, v-prediction)."""
     from diffusers import DDIMScheduler, PNDMScheduler
 
     trained = {"beta_start": 0.00085, "beta_end": 0.012, "beta_schedule": "scaled_linear"}
@@ -124,10 +121,7 @@ def deep_floyd(folder: Path, *, seed: int = 0) -> Path:
     options = {"beta_schedule": "squaredcos_cap_v2", "prediction_type": "epsilon"}
     options |= {"variance_type": "learned_range", "thresholding": True, "sample_max_value": 1.5}
     DDPMScheduler(**options).save_pretrained(folder / "scheduler")
-    components = {"unet": "UNet2DConditionModel", "text_encoder": "T5EncoderModel"}
-    components |= {"tokenizer": "T5Tokenizer", "scheduler": "DDPMScheduler"}
-    components |= {"watermarker": None, **NO_CHECKER}
-    return write_index(folder, "IFPipeline", components, requires_safety_checker=False)
+    return write_index(folder, "IFPipeline", watermarker=[None, None], **NO_CHECKER)
 
 
 def listen_to_text(unet: torch.nn.Module) -> None:
@@ -152,7 +146,8 @@ def clip_text_encoder(
     config = clip_text_config(width, projection or 512, hidden_act="gelu", pad_token_id=0)
     encoder = (CLIPTextModelWithProjection if projection else CLIPTextModel)(config)
     encoder.save_pretrained(folder / f"text_encoder{suffix}")
-    _publish_clip(folder / f"text_encoder{suffix}" / "model.safetensors")
+    positions = {"text_model.embeddings.position_ids": torch.arange(77)[None]}  # earlier versions'
+    _rename(folder / f"text_encoder{suffix}" / "model.safetensors", _published_clip, **positions)
     special = clip_tokenizer(folder / f"tokenizer{suffix}")
     path = folder / f"tokenizer{suffix}" / "special_tokens_map.json"
     write_json(path, special | {"pad_token": "!"})
@@ -173,8 +168,8 @@ def clip_tokenizer(folder: Path) -> dict[str, str]:
     folder.mkdir(parents=True, exist_ok=True)
     write_json(folder / "vocab.json", _byte_vocabulary())
     (folder / "merges.txt").write_text("#version: 0.2\nf o\nfo x</w>\n", encoding="utf-8")
-    start, end = "<|startoftext|>", "<|endoftext|>"
-    special = {"bos_token": start, "eos_token": end, "unk_token": end}
+    end = "<|endoftext|>"
+    special = {"bos_token": "<|startoftext|>", "eos_token": end, "unk_token": end}
     options = {"pad_token": end, "model_max_length": 77, "do_lower_case": True}
     options |= {"tokenizer_class": "CLIPTokenizer"}
     write_json(folder / "tokenizer_config.json", special | options)
@@ -202,24 +197,21 @@ def t5_text_encoder(folder: Path, width: int = TEXT_WIDTH, *, suffix: str = "") 
     T5EncoderModel(config).save_pretrained(folder / f"text_encoder{suffix}")
 
 
-def _publish_clip(path: Path) -> None:
-    """Write the published names: with the prefix, and positions of earlier versions."""
+def _published_clip(name: str) -> str:
+    return "text_model." * (not name.startswith(("text_model.", "text_projection."))) + name
+
+
+def _published_vae(name: str) -> str:
+    for new, old in PUBLISHED_VAE_NAMES.items():
+        name = name.replace(new, old)
+    return name
+
+
+def _rename(path: Path, published: Callable[[str], str], **added: torch.Tensor) -> None:
     from safetensors.torch import load_file, save_file
 
-    tensors = load_file(path)
-    prefix = "" if any(name.startswith("text_model.") for name in tensors) else "text_model."
-    tensors = {prefix + name: tensor for name, tensor in tensors.items()}
-    tensors["text_model.embeddings.position_ids"] = torch.arange(77)[None]
-    save_file(tensors, path, metadata={"format": "pt"})
-
-
-def _rename(path: Path, names: dict[str, str]) -> None:
-    from safetensors.torch import load_file, save_file
-
-    tensors = load_file(path)
-    for new, old in names.items():
-        tensors = {name.replace(new, old): tensor for name, tensor in tensors.items()}
-    save_file(tensors, path, metadata={"format": "pt"})
+    tensors = {published(name): tensor for name, tensor in load_file(path).items()}
+    save_file(tensors | added, path, metadata={"format": "pt"})
 
 
 def _byte_vocabulary() -> dict[str, int]:
@@ -242,17 +234,18 @@ def _sentencepiece() -> bytes:
     return model.getvalue()
 
 
-NO_CHECKER = {"safety_checker": None, "feature_extractor": None}
+NO_CHECKER = dict.fromkeys(("safety_checker", "feature_extractor"), [None, None])
+NO_CHECKER |= {"requires_safety_checker": False}
 
 
-def write_index(
-    folder: Path, pipeline: str, components: dict[str, Optional[str]], **options: Any
-) -> Path:
-    """Write ``model_index.json``; ``components`` are the classes by name."""
+def write_index(folder: Path, pipeline: str, **options: Any) -> Path:
+    """Write ``model_index.json``, with the class of each component that was saved."""
     index = {"_class_name": pipeline, "_diffusers_version": "0.8.0", **options}
-    for name, kind in components.items():
+    for path in folder.glob("*/*config.json"):
+        config, name = json.loads(path.read_text(encoding="utf-8")), path.parent.name
         library = "transformers" if name.startswith(("text_encoder", "tokenizer")) else "diffusers"
-        index[name] = [kind and library, kind]
+        kind = config.get("_class_name") or config.get("tokenizer_class")
+        index[name] = [library, kind or config["architectures"][0]]
     write_json(folder / "model_index.json", index)
     return folder
 
@@ -282,13 +275,10 @@ def stable_diffusion_xl(folder: Path, *, seed: int = 0, force_upcast: bool = Tru
 
     torch.manual_seed(seed)
     unet = UNet2DConditionModel(
-        **TINY.unet,
-        cross_attention_dim=sum(CLIP_WIDTHS),
-        use_linear_projection=True,
-        addition_embed_type="text_time",
-        addition_time_embed_dim=8,
+        **TINY.unet, cross_attention_dim=sum(CLIP_WIDTHS), use_linear_projection=True,
+        addition_embed_type="text_time", addition_time_embed_dim=8,
         projection_class_embeddings_input_dim=6 * 8 + POOLED,
-    )
+    )  # fmt: skip
     listen_to_text(unet)
     unet.save_pretrained(folder / "unet")
     vae(folder, latent_channels=4, scaling_factor=0.13025, force_upcast=force_upcast)
@@ -296,12 +286,7 @@ def stable_diffusion_xl(folder: Path, *, seed: int = 0, force_upcast: bool = Tru
     clip_text_encoder(folder, CLIP_WIDTHS[1], suffix="_2", projection=POOLED)
     betas = {"beta_start": 0.00085, "beta_end": 0.012, "beta_schedule": "scaled_linear"}
     EulerDiscreteScheduler(**betas, steps_offset=1).save_pretrained(folder / "scheduler")
-    components = {"unet": "UNet2DConditionModel", "vae": "AutoencoderKL"}
-    components |= {"text_encoder": "CLIPTextModel", "text_encoder_2": "CLIPTextModelWithProjection"}
-    components |= dict.fromkeys(("tokenizer", "tokenizer_2"), "CLIPTokenizer")
-    components |= {"scheduler": "EulerDiscreteScheduler"}
-    zeros = {"force_zeros_for_empty_prompt": True}
-    return write_index(folder, "StableDiffusionXLPipeline", components, **zeros)
+    return write_index(folder, "StableDiffusionXLPipeline", force_zeros_for_empty_prompt=True)
 
 
 def stable_diffusion_3(folder: Path, *, seed: int = 0) -> Path:
@@ -322,12 +307,7 @@ def stable_diffusion_3(folder: Path, *, seed: int = 0) -> Path:
         clip_text_encoder(folder, width, suffix=suffix, projection=POOLED)
     t5_text_encoder(folder, T5_WIDTH, suffix="_3")
     FlowMatchEulerDiscreteScheduler(shift=3.0).save_pretrained(folder / "scheduler")
-    components = {"transformer": "SD3Transformer2DModel", "vae": "AutoencoderKL"}
-    clip = ("text_encoder", "text_encoder_2"), "CLIPTextModelWithProjection"
-    components |= dict.fromkeys(*clip) | {"text_encoder_3": "T5EncoderModel"}
-    components |= dict.fromkeys(("tokenizer", "tokenizer_2"), "CLIPTokenizer")
-    components |= {"tokenizer_3": "T5Tokenizer", "scheduler": "FlowMatchEulerDiscreteScheduler"}
-    return write_index(folder, "StableDiffusion3Pipeline", components)
+    return write_index(folder, "StableDiffusion3Pipeline")
 
 
 def mvdream(folder: Path, *, seed: int = 0, **settings: Any) -> Path:

@@ -26,6 +26,14 @@ class CorruptedScore(TowardsGrey):
         return eps, None
 
 
+def score_gradient(guidance: CorruptedScore, rgb: Tensor, step: int = 0) -> tuple[Tensor, dict]:
+    """Return the gradient at a step with respect to the images, and the guidance's output."""
+    guidance.update_step(0, step)
+    image = rgb.clone().requires_grad_()
+    out = guidance(image)
+    return torch.autograd.grad(out["loss_sds"], image)[0], out
+
+
 def seeded(seed: int = 0) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
 

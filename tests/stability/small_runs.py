@@ -5,6 +5,7 @@ import csv
 import io
 import json
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 from unittest import mock
@@ -28,7 +29,6 @@ SMALL = [
 
 
 class Ended(NamedTuple):
-    code: int
     out: str
     err: str
     folder: Path
@@ -54,8 +54,10 @@ class Ended(NamedTuple):
         return [float(row[name]) for row in rows if row.get(name)]
 
 
-def launch(folder: Path, *overrides: str, stage: str = "--train", config: Path = DEMO) -> Ended:
-    """Run the small demo below ``folder`` and restore the environment."""
+def launch(
+    folder: Path, *overrides: str, stage: str = "--train", config: Path = DEMO, code: int = 0
+) -> Ended:
+    """Run the small demo below ``folder``, which ends with ``code``; restore the environment."""
     out, err = io.StringIO(), io.StringIO()
     prior = any(option.startswith("system.geometry.prior_type=") for option in overrides)
     small = [o for o in SMALL if not (prior and o.startswith("system.geometry.prior."))]
@@ -65,8 +67,17 @@ def launch(folder: Path, *overrides: str, stage: str = "--train", config: Path =
         contextlib.redirect_stdout(out),
         contextlib.redirect_stderr(err),
     ):
-        code = experiment.main([*arguments, *small, *overrides])
-    return Ended(code, out.getvalue(), err.getvalue(), Path(folder) / "demo" / "t")
+        found = experiment.main([*arguments, *small, *overrides])
+    assert found == code and "Traceback" not in err.getvalue(), f"{found}: {err.getvalue()}"
+    return Ended(out.getvalue(), err.getvalue(), Path(folder) / "demo" / "t")
+
+
+def refused(folder: Path, *overrides: str, words: Sequence[str], **options: Any) -> Ended:
+    """Run, and require exit code 2 and one error message, with these words."""
+    ended = launch(folder, *overrides, code=2, **options)
+    assert sum(line.startswith("error: ") for line in ended.err.splitlines()) == 1, ended.err
+    assert all(word in ended.err for word in words), ended.err
+    return ended
 
 
 def require_equal_ends(measured: Any, one: Ended, other: Ended, what: str) -> None:

@@ -14,7 +14,7 @@ import trimesh
 from tests.helpers.ply_files import ply_bytes, rng
 from tests.stability.report import row
 from tests.stability.scenes import ball
-from tests.stability.small_runs import launch
+from tests.stability.small_runs import refused
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
 from threestudio_gaussiandreamer.gaussians.grow import (
@@ -63,21 +63,24 @@ def picture(geometry: GaussianCloud, frame: GaussianCloud | None = None) -> torc
     return render_all(cloud, views_around(seen, 3, 64))
 
 
-def write_ply(
+def write(
     path: Path, points: np.ndarray, colors: np.ndarray | None = None, faces: np.ndarray | tuple = ()
 ) -> Path:
-    names = [*"xyz", *(["red", "green", "blue"] if colors is not None else [])]
+    """Write what a file of this suffix can hold: .obj without colours, .xyz and .npz no faces."""
     rows = points if colors is None else np.concatenate([points, colors], axis=1)
-    columns = {name: ("float", column) for name, column in zip(names, rows.T, strict=True)}
-    text = f"element face {len(faces)}\nproperty list uchar int vertex_indices"
-    body = b"".join(b"3 %d %d %d\n" % tuple(face) for face in faces)
-    path.write_bytes(ply_bytes(columns, after=(text, body)))
-    return path
-
-
-def write_obj(path: Path, points: np.ndarray, faces: np.ndarray) -> Path:
-    lines = [f"v {x!r} {y!r} {z!r}\n" for x, y, z in points.tolist()]
-    path.write_text("".join([*lines, *(f"f {a + 1} {b + 1} {c + 1}\n" for a, b, c in faces)]))
+    columns = zip((*"xyz", "red", "green", "blue"), rows.T, strict=False)
+    if path.suffix == ".obj":
+        lines = [f"v {x!r} {y!r} {z!r}\n" for x, y, z in points.tolist()]
+        path.write_text("".join([*lines, *(f"f {a + 1} {b + 1} {c + 1}\n" for a, b, c in faces)]))
+    elif path.suffix == ".xyz":
+        np.savetxt(path, rows, "%.9g")
+    elif path.suffix == ".npz":
+        np.savez(path, points=points, colors=colors)
+    else:
+        text = f"element face {len(faces)}\nproperty list uchar int vertex_indices"
+        body = b"".join(b"3 %d %d %d\n" % tuple(face) for face in faces)
+        columns = {name: ("float", column) for name, column in columns}
+        path.write_bytes(ply_bytes(columns, after=(text, body)))
     return path
 
 
@@ -177,15 +180,15 @@ NOTHING = {
 def test_an_empty_mesh_ends_the_run_at_its_start(name, tmp_path, measured):
     """The command gives a message that names the file, exit code 2, and no folder."""
     (tmp_path / name).write_text(NOTHING[name])
-    ended = launch(tmp_path / "outputs", f"system.geometry.prior.path={tmp_path / name}")
-    (message,) = [line for line in ended.err.splitlines() if line.startswith("error")]
-    assert ended.code == 2 and name in message and not (tmp_path / "outputs").exists()
+    given = f"system.geometry.prior.path={tmp_path / name}"
+    ended = refused(tmp_path / "outputs", given, words=[name])
+    assert name in ended.err.partition("error: ")[2] and not (tmp_path / "outputs").exists()
     measured("exit 2, file named, no folder")
 
 
 @row("A2", "Empty mesh, zero faces, one vertex")
 def test_an_empty_point_cloud_is_named(tmp_path, measured):
-    path = write_ply(tmp_path / "empty.ply", np.zeros((0, 3)))
+    path = write(tmp_path / "empty.ply", np.zeros((0, 3)))
     with pytest.raises(UserError, match="empty|no points"):
         initialized("point-cloud-prior", path)
     measured("points: named error")
@@ -199,40 +202,30 @@ def corrupted(values: np.ndarray, share: float) -> np.ndarray:
     return values
 
 
-def write_source(source: str, folder: Path, points, colors, faces) -> Path:
-    if source == "mesh without colours":
-        return write_obj(folder / "a.obj", points, faces)
-    if source == "rows of text":
-        np.savetxt(folder / "a.xyz", np.concatenate([points, colors], axis=1), "%.9g")
-        return folder / "a.xyz"
-    return write_ply(folder / "a.ply", points, colors, faces if source == "mesh" else ())
-
-
-COLOURED = ["mesh", "points", "rows of text"]
+COLOURED = [("mesh", "ply"), ("point-cloud", "ply"), ("point-cloud", "xyz")]
 
 
 @row("A2", "NaN/Inf vertices, NaN colours")
-@pytest.mark.parametrize(
-    "source, what",
-    [("mesh without colours", "vertices"), *itertools.product(COLOURED, ["vertices", "colours"])],
-)
+@pytest.mark.parametrize("what, source", [
+    ("vertices", ("mesh", "obj")), *itertools.product(["vertices", "colours"], COLOURED)
+])  # fmt: skip
 def test_a_few_bad_rows_are_counted_and_many_refused(source, what, tmp_path, measured, said):
     """A vertex of kept faces without a colour becomes grey; otherwise its point is dropped."""
-    prior_type = "mesh-prior" if source.startswith("mesh") else "point-cloud-prior"
-    points, faces = ball_mesh()
+    (kind, suffix), (points, faces) = source, ball_mesh()
     arrays = {"vertices": points, "colours": rng().random(points.shape)}
 
     def with_bad(share: float) -> GaussianCloud:
         changed = arrays | {what: corrupted(arrays[what], share)}
-        path = write_source(source, tmp_path, *changed.values(), faces)
-        return initialized(prior_type, path, enabled=False)
+        own = faces if kind == "mesh" else ()
+        path = write(tmp_path / f"a.{suffix}", *changed.values(), own)
+        return initialized(f"{kind}-prior", path, enabled=False)
 
     geometry = with_bad(0.01)
-    kept = 642 if source == "mesh" and what == "colours" else 636
+    kept = 642 if kind == "mesh" and what == "colours" else 636
     assert len(geometry) == kept
     assert all(parameter.isfinite().all() for parameter in geometry.parameters())
     grey = (geometry.colors(torch.zeros(1, 3)) == 0.5).all(1).sum()
-    assert what == "vertices" or grey == (6 if source == "mesh" else 0)
+    assert what == "vertices" or grey == (6 if kind == "mesh" else 0)
     assert "6 of 642" in said.text
     with pytest.raises(UserError, match="at most 5 %"):
         with_bad(0.06)
@@ -240,18 +233,13 @@ def test_a_few_bad_rows_are_counted_and_many_refused(source, what, tmp_path, mea
 
 
 @row("A2", "No colours")
-@pytest.mark.parametrize("source", ["mesh", "point-cloud", "ply"])
-def test_without_colours_the_cloud_is_grey_with_a_message(source, tmp_path, measured, said):
+@pytest.mark.parametrize(
+    "kind, suffix", [("mesh", "obj"), ("point-cloud", "xyz"), ("point-cloud", "ply")]
+)
+def test_without_colours_the_cloud_is_grey_with_a_message(kind, suffix, tmp_path, measured, said):
     points, faces = ball_mesh()
-    path = tmp_path / {"mesh": "a.obj", "point-cloud": "a.xyz"}.get(source, "a.ply")
-    if source == "mesh":
-        write_obj(path, points, faces)
-    elif source == "point-cloud":
-        np.savetxt(path, points)
-    else:
-        write_ply(path, points)
-    prior_type = "mesh-prior" if source == "mesh" else "point-cloud-prior"
-    colors = initialized(prior_type, path, **GROWING).colors(torch.zeros(1, 3)).detach()
+    path = write(tmp_path / f"a.{suffix}", points, faces=faces if kind == "mesh" else ())
+    colors = initialized(f"{kind}-prior", path, **GROWING).colors(torch.zeros(1, 3)).detach()
     given, grown = colors[: len(points)], colors[len(points) :]
     measured((given - 0.5).abs().max(), "off grey", at_most=1e-6)
     assert len(grown) > 300 and grown.std() > 0.05
@@ -275,10 +263,7 @@ def test_neither_unit_nor_place_matters(unit, kind, tmp_path, measured):
     points, faces = ball_mesh()
 
     def written(points: np.ndarray) -> Path:
-        if kind == "obj":
-            return write_obj(tmp_path / "a.obj", points, faces)
-        np.savez(tmp_path / "a.npz", points=points, colors=rng().random(points.shape))
-        return tmp_path / "a.npz"
+        return write(tmp_path / f"a.{kind}", points, rng().random(points.shape), faces)
 
     usual, expected = initialized_from(written(points))
     for shift in (0.0, 1e4):
@@ -343,7 +328,7 @@ def test_a_surface_is_sampled_uniformly_for_any_triangulation(repeated, tmp_path
     if repeated == "with copied vertices":
         again, points = again + len(points), np.concatenate([points, points])
     faces = faces if repeated == "not" else np.concatenate([faces, again])
-    mesh = load_mesh(write_ply(tmp_path / "square.ply", points, faces=faces))
+    mesh = load_mesh(write(tmp_path / "square.ply", points, faces=faces))
     sampled, face_index, _ = sample_surface(mesh, 5000, rng())
     areas = face_areas(mesh)
     assert (areas == 0).sum() >= 18 and (areas[face_index] > 0).all()

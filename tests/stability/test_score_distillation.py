@@ -11,8 +11,8 @@ from lightning.pytorch.plugins import MixedPrecision
 
 from tests.stability.backends import slow
 from tests.stability.report import RESULTS, row
-from tests.stability.scenes import CorruptedScore, orbit, seeded, started
-from tests.stability.small_runs import EVERY_STEP, Ended, launch, require_equal_ends
+from tests.stability.scenes import CorruptedScore, orbit, score_gradient, seeded, started
+from tests.stability.small_runs import EVERY_STEP, Ended, launch, refused, require_equal_ends
 from threestudio_gaussiandreamer import cameras
 from threestudio_gaussiandreamer.cameras import Orbit
 from threestudio_gaussiandreamer.core.errors import UserError
@@ -33,10 +33,7 @@ from threestudio_gaussiandreamer.training.system import GaussianDreamerSystem
 def gradient(corrupted):
     guidance = CorruptedScore({"guidance_scale": 1.0})
     guidance.corrupted = {0: corrupted}
-    rgb = torch.rand(4, 8, 8, 3, generator=seeded()).requires_grad_()
-    out = guidance(rgb)
-    out["loss_sds"].backward()
-    return rgb.grad, out
+    return score_gradient(guidance, torch.rand(4, 8, 8, 3, generator=seeded()))
 
 
 @row("A4", "fp16 overflow in VAE/UNet")
@@ -68,11 +65,10 @@ def test_bad_steps_are_counted_and_the_tenth_in_a_row_ends_the_run(tmp_path, mon
     both = {step: {0: math.nan, 1: math.nan} for step in range(5, 50)}
     monkeypatch.setattr(CorruptedScore, "corrupted", {1: {0: math.nan}, 3: {1: math.inf}} | both)
     steps = "trainer.max_steps=50", "checkpoint.every_n_train_steps=14"
-    ended = launch(tmp_path, *CORRUPTED, *steps)
-    assert ended.code == 2 and "NaN or infinity in 10 steps in a row (step 14" in ended.err
-    assert "Traceback" not in ended.err and finite_cloud(ended)
+    words = ["NaN or infinity in 10 steps in a row (step 14"]
+    ended = refused(tmp_path, *CORRUPTED, *steps, words=words)
     logged = ended.logged("train/bad_items")
-    assert logged[:6] == [0, 1, 0, 1, 0, 2], logged
+    assert finite_cloud(ended) and logged[:6] == [0, 1, 0, 1, 0, 2], logged
     measured("counted in the log; named error after 10")
 
 
@@ -87,9 +83,8 @@ def test_bad_steps_end_the_run_also_if_they_are_known_late(
     bad = {step: {0: math.nan} for step in range(3, 50)}
     monkeypatch.setattr(CorruptedScore, "corrupted", bad)
     options = ["trainer.max_steps=16", f"checkpoint.every_n_train_steps={every}"]
-    ended = launch(tmp_path, *CORRUPTED, *options)
-    assert ended.code == 2 and "NaN or infinity in 10 steps in a row (step 12" in ended.err
-    logged = ended.logged("train/bad_items")
+    words = ["NaN or infinity in 10 steps in a row (step 12"]
+    logged = refused(tmp_path, *CORRUPTED, *options, words=words).logged("train/bad_items")
     assert logged == [0] * 3 + [1] * (steps - 3), logged
     measured("named error, and all steps in the log")
 
@@ -116,7 +111,6 @@ def test_any_loss_scale_trains_the_same_bits_as_float32(
 ):
     """Powers of two are exact: a difference could only come from half precision."""
     ended = scaled_run(tmp_path, monkeypatch, scale, *EVERY_STEP)
-    assert ended.code == 0, ended.err
     require_equal_ends(measured, whole, ended, "different from float32")
 
 
@@ -125,7 +119,7 @@ def test_steps_that_are_skipped_are_counted_and_reported(tmp_path, monkeypatch, 
     """At a loss scale of 2^127 gradients overflow until it was halved twice."""
     options = "trainer.max_steps=5", "system.geometry.densify.enabled=true"
     ended = scaled_run(tmp_path, monkeypatch, 2.0**127, *options)
-    assert ended.code == 0 and finite_cloud(ended), ended.err
+    assert finite_cloud(ended)
     checkpoint = ended.checkpoint()
     skipped = checkpoint["global_step"] - int(checkpoint["optimizer_states"][0]["state"][0]["step"])
     assert skipped >= 2 and ended.err.count("gradients overflowed at the loss scale") == skipped
@@ -217,14 +211,12 @@ DENSIFYING = [
 def require_same_when_resumed(measured, folder, run: Ended, step: int, *options) -> None:
     """Resume, in another folder, from the checkpoint that the run wrote at ``step``."""
     ended = launch(folder, *options, f"resume={run.folder}/ckpts/epoch=0-step={step}.ckpt")
-    assert ended.code == 0, ended.err
     require_equal_ends(measured, run, ended, "different")
 
 
 @pytest.fixture(scope="module")
 def over_the_edge(tmp_path_factory) -> Ended:
     ended = launch(tmp_path_factory.mktemp("edge"), *EDGE)
-    assert ended.code == 0, ended.err
     assert [ended.logged("train/max_step")[step] for step in (4, 5, 6)] == [980, 980, 550]
     return ended
 
@@ -241,7 +233,6 @@ def test_resumed_at_the_edge_of_every_schedule(step, over_the_edge, tmp_path, me
 def random_streams(tmp_path_factory) -> Ended:
     """A run that draws everything at every step."""
     ended = launch(tmp_path_factory.mktemp("streams"), *DENSIFYING)
-    assert ended.code == 0, ended.err
     assert len(ended.checkpoint()["state_dict"]["geometry.means"]) > 130
     return ended
 
@@ -268,7 +259,6 @@ def test_validation_changes_nothing(views, every, random_streams, tmp_path, monk
     validated = ["trainer.limit_val_batches=1.0", f"trainer.val_check_interval={every}"]
     validated += [f"data.n_val_views={views}"]
     ended = launch(tmp_path, *DENSIFYING, *validated)
-    assert ended.code == 0, ended.err
     assert len(seen) == views * (9 // every)
     require_equal_ends(measured, random_streams, ended, "different")
 
@@ -295,7 +285,7 @@ RANDOM_START = [f"system.geometry.prior{x}" for x in ("_type=random-prior", ".sh
 def trained(folder, steps, size, *options) -> Ended:
     """Train long enough for a result, with timesteps up to 0.55 after five twelfths."""
     middle = steps * 5 // 12
-    ended = launch(
+    return launch(
         folder,
         *(f"system.geometry.lr_{name}=[0,{a},{b},{steps}]" for name, (a, b) in RATES.items()),
         *(f"data.{side}={size}" for side in ("width", "height")),
@@ -304,8 +294,6 @@ def trained(folder, steps, size, *options) -> Ended:
         f"system.guidance.max_step_percent=[{middle},0.98,0.55,{middle + 1}]",
         "system.geometry.lr_means_unit=world", *options,
     )  # fmt: skip
-    assert ended.code == 0, ended.err
-    return ended
 
 
 @pytest.mark.slow
@@ -448,7 +436,6 @@ def test_training_with_extreme_cameras_logs_each_items_gradient(tmp_path, monkey
             chosen = orbit(*batch)
             with_cameras(patch, lambda _, chosen=chosen: (chosen, chosen.c2w))
             ended = launch(tmp_path / name, *options)
-        assert ended.code == 0, ended.err
         ordinary.append(ended.logged("train/grad_norm_0")[0])
     assert finite_cloud(ended)
     norms = [ended.logged(f"train/grad_norm_{i}") for i in range(len(views))]
@@ -468,6 +455,5 @@ def test_an_empty_view_in_a_batch(empty, tmp_path, monkeypatch, measured):
 
     with_cameras(monkeypatch, turned_around)
     rules = "system.geometry.densify={enabled: true, start: 1, every: 1, stop: 9}"
-    ended = launch(tmp_path, "trainer.max_steps=3", rules)
-    assert ended.code == 0 and finite_cloud(ended), ended.err
+    assert finite_cloud(launch(tmp_path, "trainer.max_steps=3", rules))
     measured("all steps succeed")
