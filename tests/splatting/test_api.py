@@ -19,12 +19,8 @@ from threestudio_gaussiandreamer.splatting.cpu import backend as cpu
 
 def arguments(n=6, views=2, dtype=torch.float32):
     viewmats, Ks = cameras(views, 10, 8)
-    return random_cloud(n).to(dtype)._asdict() | {
-        "viewmats": viewmats.to(dtype),
-        "Ks": Ks.to(dtype),
-        "width": 10,
-        "height": 8,
-    }
+    view = {"viewmats": viewmats.to(dtype), "Ks": Ks.to(dtype), "width": 10, "height": 8}
+    return random_cloud(n).to(dtype)._asdict() | view
 
 
 def call(**changes):
@@ -37,12 +33,23 @@ def usable():
     return [name for name, reason in available_backends().items() if reason is None]
 
 
-def test_shapes_of_the_outputs():
+def test_shapes_of_the_outputs_and_layouts_and_types_that_are_converted():
     out = call(downsample=2)
     shapes = {name: tuple(getattr(out, name).shape) for name in out._fields}
     images = {"image": (2, 4, 5, 3), "alpha": (2, 4, 5, 1), "depth": (2, 4, 5, 1)}
     assert shapes == images | {"means2d": (2, 6, 2), "radii": (2, 6), "contribution": (2, 6)}
     assert not out.radii.requires_grad and not out.contribution.requires_grad
+    with torch.no_grad():
+        out = call(means=arguments()["means"].requires_grad_())
+    assert not out.image.requires_grad and not out.means2d.requires_grad
+    values = arguments(dtype=torch.float64) | {"viewmats": arguments()["viewmats"]}
+    assert call(**values, backend="auto").image.dtype == torch.float64
+    values = arguments()
+    tensors = {name: x for name, x in values.items() if torch.is_tensor(x) and x.dim() > 1}
+    strided = {name: x.mT.contiguous().mT for name, x in tensors.items()}
+    assert torch.equal(call(**strided).image, call(**values).image)
+    for name in PRESETS:
+        assert torch.equal(call(preset=name).image, call(alpha_min=PRESETS[name]).image)
 
 
 @pytest.mark.parametrize(
@@ -50,8 +57,6 @@ def test_shapes_of_the_outputs():
     [
         ({"quats": torch.zeros(6, 3)}, ["quats", "(6, 4)", "(6, 3)"]),
         ({"scales": torch.zeros(5, 3)}, ["scales", "(6, 3)", "(5, 3)"]),
-        ({"opacities": torch.zeros(6, 1)}, ["opacities", "(6,)", "(6, 1)"]),
-        ({"means": torch.zeros(6, 2)}, ["means", "(6, 3)", "(6, 2)"]),
         ({"means": torch.zeros(())}, ["means", "(N, 3)", "single number"]),
         ({"colors": torch.zeros(3, 6, 3)}, ["colors", "(2, 6, 3)", "(3, 6, 3)"]),
         ({"colors": torch.zeros(6, 0)}, ["colour channel", "(6, 0)"]),
@@ -64,7 +69,6 @@ def test_shapes_of_the_outputs():
         ({"scales": torch.zeros(6, 3, dtype=torch.float64)}, ["scales", "float64"]),
         ({"quats": torch.zeros(6, 4, device="meta")}, ["quats", "device", "meta"]),
         ({"means": torch.zeros(6, 3, device="meta")}, ["means", "meta", "no values"]),
-        ({"width": 0}, ["width", "at least 1", "0"]),
         ({"height": 8.0}, ["height", "8.0"]),
         ({"width": True}, ["width", "True"]),
         ({"height": 2_100_000}, ["height", "at most 1048560"]),
@@ -103,28 +107,6 @@ def test_non_finite_error_names_attribute_count_and_place(name):
     assert all(word in str(caught.value) for word in (name, " 2 ", place, "nan"))
 
 
-@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
-def test_half_precision_inputs_are_widened(dtype):
-    half = {name: x.to(dtype) for name, x in arguments().items() if torch.is_tensor(x)}
-    wide = {name: value.float() for name, value in half.items()}
-    half["means"].requires_grad_()
-    out = call(**half)
-    out.image.sum().backward()
-    assert out.image.dtype == torch.float32 and torch.equal(out.image, call(**wide).image)
-    assert half["means"].grad.dtype == dtype and half["means"].grad.abs().sum() > 0
-
-
-def test_layouts_and_types_that_are_converted():
-    values = arguments(dtype=torch.float64) | {"viewmats": arguments()["viewmats"]}
-    assert call(**values, backend="auto").image.dtype == torch.float64
-    values = arguments()
-    tensors = {name: x for name, x in values.items() if torch.is_tensor(x) and x.dim() > 1}
-    strided = {name: x.mT.contiguous().mT for name, x in tensors.items()}
-    assert torch.equal(call(**strided).image, call(**values).image)
-    for name in PRESETS:
-        assert torch.equal(call(preset=name).image, call(alpha_min=PRESETS[name]).image)
-
-
 @pytest.mark.parametrize("only", ["colors", "opacities", "background"])
 @pytest.mark.parametrize("backend", list(backends.BACKENDS))
 def test_means2d_has_a_gradient_if_any_input_has(only, backend):
@@ -139,21 +121,12 @@ def test_means2d_has_a_gradient_if_any_input_has(only, backend):
     assert out.means2d.grad.abs().sum() > 0
 
 
-def test_without_gradients_nothing_is_tracked():
-    with torch.no_grad():
-        out = call(means=arguments()["means"].requires_grad_())
-    assert not out.image.requires_grad and not out.means2d.requires_grad
-
-
-def test_an_unavailable_backend_says_why_and_what_to_do(monkeypatch):
+def test_an_unavailable_backend_says_why_and_auto_says_it_once(monkeypatch, caplog):
     with pytest.raises(UserError, match="(?s)float32.*float64"):
         call(**arguments(dtype=torch.float64), backend="cpu")
     monkeypatch.setattr(cpu, "unavailable", lambda: "the library wasn't built")
     with pytest.raises(UserError, match="(?s)'cpu'.*the library wasn't built.*torch"):
         call(backend="cpu")
-
-
-def test_auto_prefers_the_native_library_and_says_once_when_it_cannot(monkeypatch, caplog):
     chosen = []
     for module, name in ((cpu, "cpu"), (torch_backend, "torch")):
         monkeypatch.setattr(module, "rasterize", lambda *_, name=name: chosen.append(name))

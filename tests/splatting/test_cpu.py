@@ -127,7 +127,7 @@ def test_the_number_of_threads_changes_no_bit(isa):
     assert all(equal(results[0], other) for other in results[1:])
 
 
-def test_backward_frees_its_memory(monkeypatch):
+def test_backward_frees_its_memory_and_threads_may_draw_at_once(monkeypatch):
     """With the saved tensors, not with the graph's last tensor."""
     states, create = weakref.WeakSet(), cpu._State
     monkeypatch.setattr(cpu, "_State", lambda *x: states.add(state := create(*x)) or state)
@@ -136,10 +136,6 @@ def test_backward_frees_its_memory(monkeypatch):
     assert len(states) == 1
     out.image.sum().backward()
     assert len(states) == 0 and out.image.grad_fn is not None
-
-
-def test_the_library_is_used_from_several_threads_at_once():
-    """Autograd and data loaders use their own threads."""
     clouds = [random_cloud(200, seed=n) for n in range(4)]
     alone = [draw("cpu", cloud, cameras(2, 60, 40), 60, 40) for cloud in clouds]
     # one stand-in for all threads, whose own would be left behind
@@ -194,15 +190,12 @@ def test_threads_that_are_not_there(text):
     assert done.returncode == 0, done.stderr
 
 
-def test_more_memory_than_there_is_is_a_named_error():
+def test_more_memory_than_there_is_or_the_container_has_is_a_named_error(monkeypatch, tmp_path):
     """At least 2.6e9 pairs of Gaussian and tile: beyond 32 bits and the memory of any machine."""
     cloud, camera = random_cloud(40_000), cameras(1, 8192, 8192, dtype=torch.float32)
     cloud = cloud._replace(scales=torch.full((40_000, 3), 1e3)).to(torch.float32)
     with pytest.raises(UserError, match="GiB"), torch.no_grad():
         rasterize(*cloud, *camera, 8192, 8192, backend="cpu")
-
-
-def test_the_limit_is_the_memory_of_the_container(monkeypatch, tmp_path):
     cloud = random_cloud(50_000).to(torch.float32)
     scene = *cloud, *cameras(4, 256, 256, dtype=torch.float32), 256, 256
     build = os.environ.get("GAUSSIANDREAMER_ISA") or cpu.usable_builds()[0]
@@ -232,16 +225,13 @@ def test_the_last_tile_of_the_tallest_image(threads):
     torch.testing.assert_close(*sums, rtol=0, atol=1e-6)
 
 
-def test_builds_of_another_version_or_name_are_refused(monkeypatch, force):
+def test_builds_of_another_version_or_name_and_none_are_refused(monkeypatch, force, tmp_path):
     with monkeypatch.context() as patch, pytest.raises(OSError, match="earlier version"):
         patch.setattr(cpu, "INTERFACE", cpu.INTERFACE + 1)
         cpu._load(cpu.usable_builds()[0])
     force("v5")
     with pytest.raises(UserError, match="GAUSSIANDREAMER_ISA=v5, but .* only have .*base"):
         cpu.library()
-
-
-def test_without_a_library_it_says_what_to_do(monkeypatch, tmp_path):
     monkeypatch.setattr(cpu, "FOLDER", tmp_path)
     cpu.library.cache_clear()
     try:

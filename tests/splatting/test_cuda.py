@@ -133,7 +133,7 @@ def test_a_picture_that_needs_more_room_than_expected_is_right_to_the_bit(
     assert [x.capacity >= 1904 for x in lists] == [True, False, False, True]
 
 
-def test_only_the_first_picture_of_a_size_waits(device):
+def test_only_the_first_picture_of_a_size_waits_and_capacity_follows_the_count(device):
     cloud, camera = random_cloud(50).to(torch.float32), cameras(2, 40, 24, dtype=torch.float32)
     host = device()
     host.arrived = False
@@ -146,10 +146,6 @@ def test_only_the_first_picture_of_a_size_waits(device):
         assert host.waits == 4, "the three numbers that have arrived are read"
         rasterize(*cloud, *camera, 40, 25, backend="cuda")
     assert host.waits == 5
-
-
-def test_capacity_follows_the_count():
-    """Up at once, down slowly, and proportional to the Gaussians."""
     estimate, host = cuda.CapacityEstimate(views=2), HostDevice()
 
     def room(*totals, gaussians=1000):
@@ -201,9 +197,6 @@ def test_without_memory_for_one_view_there_is_a_picture_but_no_gradient(device, 
     assert torch.equal(known.contribution, short.contribution)
     with pytest.raises(UserError, match=r"overlap \d+ tiles .* GiB .* fewer or smaller Gaussians"):
         short.image.sum().backward()
-
-
-def test_more_splats_than_can_be_numbered_are_refused():
     for shape in ((5000, 500_000), (70_000, 1)):
         with pytest.raises(UserError, match="fewer views"):
             cuda.rasterize(SimpleNamespace(shape=shape), None)

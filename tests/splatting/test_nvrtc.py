@@ -81,19 +81,7 @@ def test_what_the_compiler_rejects_is_named(monkeypatch):
         nvrtc.compile_unit("blend", "sm_90")
 
 
-def test_devices_newer_than_the_compiler_get_the_newest_text_and_old_ones_are_named(monkeypatch):
-    monkeypatch.setattr(nvrtc, "version", lambda: (13, 0))
-    monkeypatch.setattr(nvrtc, "architectures", lambda: [52, 75, 80, 86, 90, 120])
-    targets = {(7, 5): "sm_75", (9, 0): "sm_90", (13, 0): "compute_120", (8, 7): "compute_86"}
-    assert {capability: nvrtc.target_for(capability) for capability in targets} == targets
-    for known in ([52, 70, 75, 90], [75, 90], [80, 90]):
-        monkeypatch.setattr(nvrtc, "architectures", lambda known=known: known)
-        needed = f"needs {max(75, known[0]) / 10} or later: use backend='torch'"
-        with pytest.raises(UserError, match=rf"capability 7\.0;.*CUDA 13\.0, {needed}"):
-            nvrtc.target_for((7, 0))
-
-
-def test_without_a_compiler_it_says_what_to_install(monkeypatch):
+def test_what_the_compiler_torch_and_the_device_need_of_each_other(monkeypatch, tmp_path):
     monkeypatch.setenv("GAUSSIANDREAMER_NVRTC", "/no/such/libnvrtc.so")
     nvrtc._library.cache_clear()
     try:
@@ -101,10 +89,6 @@ def test_without_a_compiler_it_says_what_to_install(monkeypatch):
             nvrtc.version()
     finally:
         nvrtc._library.cache_clear()
-
-
-def test_the_release_that_torch_was_built_with_is_tried_first(monkeypatch, tmp_path):
-    """Both may be installed; a driver of CUDA 12 can't load what the NVRTC of CUDA 13 produces."""
     builtins = "cuda_nvrtc/lib/libnvrtc-builtins.so.12.8"
     for place in ("cu13/lib/libnvrtc.so.13", "cuda_nvrtc/lib/libnvrtc.so.12", builtins):
         (tmp_path / "nvidia" / place).parent.mkdir(parents=True, exist_ok=True)
@@ -116,10 +100,27 @@ def test_the_release_that_torch_was_built_with_is_tried_first(monkeypatch, tmp_p
         monkeypatch.setattr(torch.version, "cuda", release)
         ours = [path for path in nvrtc._candidates() if str(tmp_path) in path]
         assert ours[0].endswith(first) and len(ours) == 2
+    monkeypatch.setattr(nvrtc, "version", lambda: (13, 0))
+    monkeypatch.setattr(nvrtc, "architectures", lambda: [52, 75, 80, 86, 90, 120])
+    targets = {(7, 5): "sm_75", (9, 0): "sm_90", (13, 0): "compute_120", (8, 7): "compute_86"}
+    assert {capability: nvrtc.target_for(capability) for capability in targets} == targets
+    for known in ([52, 70, 75, 90], [75, 90], [80, 90]):
+        monkeypatch.setattr(nvrtc, "architectures", lambda known=known: known)
+        needed = f"needs {max(75, known[0]) / 10} or later: use backend='torch'"
+        with pytest.raises(UserError, match=rf"capability 7\.0;.*CUDA 13\.0, {needed}"):
+            nvrtc.target_for((7, 0))
+    monkeypatch.setattr(torch.version, "cuda", None)
+    cuda_driver.unavailable.cache_clear()
+    try:
+        assert "without CUDA" in available_backends()["cuda"]
+    finally:
+        cuda_driver.unavailable.cache_clear()
 
 
 @needs_nvrtc
-def test_what_was_compiled_once_is_read_from_the_disk_unless_it_is_damaged(cache, compiled):
+def test_what_was_compiled_once_is_read_from_the_disk_by_a_name_of_all_that_matters(
+    cache, compiled, tmp_path, monkeypatch, caplog
+):
     first = nvrtc.machine_code("bin", "sm_80")
     assert nvrtc.machine_code("bin", "sm_80") == first and compiled == ["bin"]
     (path,) = cache.iterdir()
@@ -130,26 +131,14 @@ def test_what_was_compiled_once_is_read_from_the_disk_unless_it_is_damaged(cache
         assert again[:4] == b"\x7fELF" and compiled == ["bin"] * count
         assert nvrtc.machine_code("bin", "sm_80") == again and len(compiled) == count
     assert nvrtc.machine_code("bin", "sm_90") != first and len(list(cache.iterdir())) == 2
-
-
-@needs_nvrtc
-def test_a_cache_that_cannot_be_written_costs_time_only(tmp_path, monkeypatch, caplog):
     (tmp_path / "file").touch()
     monkeypatch.setenv("GAUSSIANDREAMER_CACHE", str(tmp_path / "file" / "folder"))
     with caplog.at_level(logging.WARNING):
         assert nvrtc.machine_code("bin", "sm_80")[:4] == b"\x7fELF"
     assert "can't be kept" in caplog.text and "file" in caplog.text
-
-
-@needs_nvrtc
-def test_whatever_changes_the_code_changes_its_name(monkeypatch):
     names = {nvrtc._key("bin", "sm_80"), nvrtc._key("blend", "sm_80"), nvrtc._key("bin", "sm_86")}
-    changes = {
-        "source": lambda unit: "other",
-        "headers": lambda: {"splat_math.h": "other"},
-        "version": lambda: (99, 0),
-        "OPTIONS": ("-O0",),
-    }
+    changes = {"source": lambda unit: "other", "headers": lambda: {"splat_math.h": "other"}}
+    changes |= {"version": lambda: (99, 0), "OPTIONS": ("-O0",)}
     for name, other in changes.items():
         with monkeypatch.context() as patch:
             patch.setattr(nvrtc, name, other)
@@ -210,16 +199,11 @@ def test_a_picture_by_way_of_the_driver(driver, monkeypatch, compiled):
 
 
 @needs_nvrtc
-def test_code_that_the_driver_refuses_is_named(driver, monkeypatch):
+def test_code_that_the_driver_refuses_and_why_no_gpu_can_be_used(driver, monkeypatch):
     monkeypatch.setattr(nvrtc, "machine_code", lambda unit, target: b"nonsense")
     loading = r"loading blend.cu for sm_90 \(NVRTC of CUDA .*, driver of CUDA 99.0\)"
     with pytest.raises(UserError, match=rf"{loading}: .*invalid \(200\)"):
         cuda_driver.device(torch.device("cuda")).launch("blend", (1, 1), 256)
-
-
-@needs_nvrtc
-def test_why_no_gpu_can_be_used(driver, monkeypatch):
-    """A driver that is too old, none, and a compiler that lacks a function: NVRTC before 11.2."""
 
     def reason(owner, name, value):
         with monkeypatch.context() as patch:
@@ -236,12 +220,3 @@ def test_why_no_gpu_can_be_used(driver, monkeypatch):
     assert missing in reason(cuda_driver, "LIBRARY", missing)
     said = reason(nvrtc, "_library", lambda: ctypes.CDLL(library()._name))
     assert "undefined symbol: nvrtcGetNumSupportedArchs" in said
-
-
-def test_a_torch_without_cuda_gives_a_message(monkeypatch):
-    monkeypatch.setattr(torch.version, "cuda", None)
-    cuda_driver.unavailable.cache_clear()
-    try:
-        assert "without CUDA" in available_backends()["cuda"]
-    finally:
-        cuda_driver.unavailable.cache_clear()

@@ -94,7 +94,7 @@ def test_a_cloud_equals_loops_written_by_hand(cutoffs):
     np.testing.assert_allclose(out.contribution[0], largest, rtol=1e-9, atol=1e-12)
 
 
-def test_downsampling_is_the_mean_of_boxes():
+def test_downsampling_is_the_mean_of_boxes_and_radii_bound_what_is_drawn():
     cloud, camera = random_cloud(50, seed=7), cameras(2, 12, 10)
     background = torch.tensor([0.2, 0.4, 0.8], dtype=torch.float64)
     full, half = (draw(cloud, camera, 12, 10, background=background, downsample=d) for d in (1, 2))
@@ -103,10 +103,6 @@ def test_downsampling_is_the_mean_of_boxes():
         assert torch.allclose(getattr(half, name), boxes, atol=1e-14), name
     assert torch.equal(half.means2d, full.means2d)
     assert torch.equal(half.contribution, full.contribution)
-
-
-def test_radii_bound_what_is_drawn():
-    """All pixels with alpha >= alpha_min are within the radius, which is tight along one axis."""
     cloud = one_gaussian((0.1, -0.05, 2.0), (0.3, 0.1, 0.1), 0.9)
     out = draw(cloud, front_camera(64, 64, 40.0), 64, 64, alpha_min=1 / 255)
     places = out.alpha[0, ..., 0].nonzero().flip(1) + 0.5
@@ -114,25 +110,7 @@ def test_radii_bound_what_is_drawn():
     assert reach <= out.radii.item() <= reach + 1
 
 
-@pytest.mark.parametrize(
-    "n, antialias, fast",
-    [pytest.param(1, False, False, marks=pytest.mark.slow), (12, False, True), (30, True, True)],
-)
-def test_gradients_of_all_inputs_equal_finite_differences(n, antialias, fast):
-    """Attributes, background and cameras, through image, alpha and depth; cutoffs off."""
-    cloud, (viewmats, Ks) = random_cloud(n, seed=n, size=0.3), cameras(2, 5, 4)
-    background = torch.tensor([[0.1, 0.6, 0.3], [0.9, 0.2, 0.5]], dtype=torch.float64)
-
-    def f(*inputs):
-        options = {"background": inputs[6], "antialias": antialias} | TRUTH
-        out = rasterize(*inputs[:6], Ks, 5, 4, **options)
-        return out.image, out.alpha, out.depth
-
-    inputs = (*cloud.leaves(), viewmats.requires_grad_(), background.requires_grad_())
-    assert torch.autograd.gradcheck(f, inputs, eps=1e-6, atol=1e-7, rtol=1e-5, fast_mode=fast)
-
-
-def test_means2d_gradient_is_per_view_and_in_pixels_before_downsampling():
+def test_means2d_gradient_is_per_view_in_pixels_and_absgrad_adds_up_absolute_values():
     """Shifting the principal point of a view shifts its means2d and nothing else."""
     cloud, (viewmats, Ks) = random_cloud(20, seed=9, size=0.1), cameras(2, 12, 10, distance=6.0)
     grads = run(cloud, viewmats, Ks, 12, 10, downsample=2, **TRUTH).grads["means2d"]
@@ -150,9 +128,6 @@ def test_means2d_gradient_is_per_view_and_in_pixels_before_downsampling():
             # Central differences of a loss of order 10 with this step are good to 1e-8.
             found = grads[view, :, axis].sum().item()
             assert found == pytest.approx(slope, rel=1e-5, abs=1e-7)
-
-
-def test_absgrad_adds_up_absolute_values_over_pixels():
     cloud, camera = random_cloud(6, seed=10, size=0.3), cameras(2, 4, 3)
     leaves = cloud.leaves()
     out = rasterize(*leaves, *camera, 4, 3, absgrad=True, **SPECIFICATION)
