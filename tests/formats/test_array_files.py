@@ -68,10 +68,7 @@ class Runs:
         (pickle.dumps({"a": np.ones(9)})[:-40], "is truncated, damaged"),
         (b"\x80\2Nr\xff\xff\xff\x7f.", "fill the memory"),
         (b"\x80\2cposix\nsystem\nX\4\0\0\0trueb.", "is truncated, damaged"),
-        (
-            pickle.dumps({"a": scipy.sparse.csc_matrix((10**6, 10**6))}),
-            "sparse matrix .* of memory",
-        ),
+        (pickle.dumps({"a": scipy.sparse.csc_matrix((10**6, 10**6))}), "sparse matrix .* memory"),
     ],
 )
 def test_pickles_run_no_code(tmp_path, monkeypatch, data, said):
@@ -104,15 +101,12 @@ HEADER = "{'descr': '<f8', 'fortran_order': False, 'shape': (%s,)}"
     [
         b"",
         b"PK",
-        b"hello",
-        b"\x93NUMPY",
         b"\x93NUMPY\2\0\xff\xff\xff\x7f{}",
         b"\x93NUMPY\7\0",
         npy(HEADER % 3, bytes(16)),
         npy(HEADER % 3, bytes(32)),
         npy(HEADER % 10**15, bytes(16)),
         npy(HEADER % -1, b""),
-        npy("{", b""),
         npy("[" * 500, b""),
         npy("{'descr': 'x', 'fortran_order': 1, 'shape': ()}", b""),
         zipped(npy(HEADER % 3, bytes(32))),

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from tests.helpers.object_clouds import ball
+from tests.helpers.ply_files import saved
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.formats.compressed_ply import (
     LIMITS,
@@ -38,13 +39,8 @@ WORDS = struct.pack(
 BY_HAND = header() + BOUNDS + WORDS
 
 
-def stored(folder, data):
-    (folder / "a.compressed.ply").write_bytes(data)
-    return folder / "a.compressed.ply"
-
-
-def test_a_file_put_together_by_hand_is_read(tmp_path):
-    read = read_compressed_ply(stored(tmp_path, BY_HAND))
+def test_a_file_put_together_by_hand_is_read_and_harmonics_are_clipped(tmp_path):
+    read = read_compressed_ply(saved(tmp_path, BY_HAND, "a.compressed.ply"))
     np.testing.assert_allclose(read.means, [[2, 0, 8 * 1023 / 2047]], rtol=1e-6)
     np.testing.assert_allclose(read.log_scales, [[-5, -2, -3]], rtol=1e-6)
     half = 2**-0.5
@@ -53,11 +49,8 @@ def test_a_file_put_together_by_hand_is_read(tmp_path):
     np.testing.assert_allclose(colors, [1, 0.2, 0.4 + 0.2 * 128 / 255], atol=1e-6)
     np.testing.assert_allclose(1 / (1 + np.exp(-read.logit_opacities)), [0.2], atol=1e-6)
     data = header(limits=LIMITS[:12]) + BOUNDS[:48] + WORDS  # colours without limits are fractions
-    colors = 0.5 + C0 * read_compressed_ply(stored(tmp_path, data)).sh[0, 0]
+    colors = 0.5 + C0 * read_compressed_ply(saved(tmp_path, data, "a.compressed.ply")).sh[0, 0]
     np.testing.assert_allclose(colors, [1, 0, 128 / 255], atol=1e-6)
-
-
-def test_harmonics_are_clipped_and_the_two_layouts_are_told_apart(tmp_path):
     cloud = ball(3, 1)
     cloud.sh[0, 1], cloud.sh[1, 1] = 9, -9
     write_compressed_ply(tmp_path / "small.ply", cloud)
@@ -86,4 +79,4 @@ def test_harmonics_are_clipped_and_the_two_layouts_are_told_apart(tmp_path):
 )
 def test_damaged_files_are_refused(tmp_path, data, said):
     with pytest.raises(UserError, match=f"a.compressed.ply': .*{said}"):
-        read_compressed_ply(stored(tmp_path, data))
+        read_compressed_ply(saved(tmp_path, data, "a.compressed.ply"))

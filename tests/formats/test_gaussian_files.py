@@ -35,7 +35,7 @@ def cloud(count=60, degree=0):
 
 
 @pytest.mark.parametrize("up", AXES)
-def test_a_ply_keeps_all_bits_and_says_what_is_up_and_an_spz_is_y_up(tmp_path, up):
+def test_a_ply_keeps_all_bits_and_says_what_is_up(tmp_path, up):
     path, stored = str(tmp_path / "a.ply"), StoredCloud(cloud(degree=1), up, 40.0)
     write_cloud(path, stored)
     read = read_cloud(path)
@@ -45,11 +45,6 @@ def test_a_ply_keeps_all_bits_and_says_what_is_up_and_an_spz_is_y_up(tmp_path, u
     assert (tmp_path / "a.ply").stat().st_size == file_size(stored, ".ply")
     assert read_comments(path) == [f"up: {up}", "pruned to the likeness, dB: 40"]
     write_cloud(str(tmp_path / "a.spz"), stored)
-    read = read_cloud(str(tmp_path / "a.spz"))
-    assert (read.up, read.pruned_to) == ("y", 40)
-    back = read.in_axes(up).gaussians.means
-    order = [np.abs(stored.gaussians.means - mean).sum(1).argmin() for mean in back]
-    np.testing.assert_allclose(back, stored.gaussians.means[order], atol=0.005)
     assert (tmp_path / "a.spz").stat().st_size == file_size(stored, ".spz")
 
 

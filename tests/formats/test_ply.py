@@ -7,9 +7,18 @@ import numpy as np
 import pytest
 
 from tests.helpers.memory import memory_below
-from tests.helpers.ply_files import cloud, gaussians, header, rng, saved, write_raw_gaussians
+from tests.helpers.ply_files import (
+    cloud,
+    gaussians,
+    header,
+    ply_bytes,
+    rng,
+    saved,
+    write_raw_gaussians,
+)
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.formats import ply
+from threestudio_gaussiandreamer.formats.compressed_ply import write_compressed_ply
 from threestudio_gaussiandreamer.formats.ply import write_table
 
 
@@ -61,19 +70,12 @@ class TestGaussians:
 
     def test_doubles_in_any_order_and_extra_ones(self, tmp_path):
         expected = gaussians(7, degree=1)
-        names = [*ply.GAUSSIAN, *(f"f_rest_{i}" for i in range(9)), "segment"]
-        columns = dict(zip(ply.MEANS, expected.means.T, strict=True))
-        columns |= {"opacity": expected.logit_opacities, "segment": np.arange(7)}
-        columns |= {f"f_dc_{i}": expected.sh[:, 0, i] for i in range(3)}
-        columns |= {f"scale_{i}": expected.log_scales[:, i] for i in range(3)}
-        columns |= {f"rot_{i}": expected.quats[:, i] for i in range(4)}
+        names = [name for name, _ in ply.gaussian_properties(4)]
+        columns = dict(zip(names, ply.gaussian_columns(expected).T, strict=True))
         columns |= {f"f_rest_{i}": expected.sh[:, 1 + i % 3, i // 3] for i in range(9)}
-        names = list(rng().permutation(names))
-        rows = np.zeros(7, [(name, ">f8") for name in names])
-        for name in names:
-            rows[name] = columns[name]
-        head = header("binary_big_endian", 7, [f"double {name}" for name in names]).encode()
-        path = saved(tmp_path, head + rows.tobytes())
+        columns["segment"] = np.arange(7)
+        columns = {name: ("double", columns[name]) for name in rng().permutation([*columns])}
+        path = saved(tmp_path, ply_bytes(columns, "binary_big_endian"))
         assert_same(ply.read_gaussians(path), expected)
         assert ply.is_gaussian_ply(path)
 
@@ -90,7 +92,7 @@ class TestGaussians:
         with pytest.raises(UserError, match="lack scale_1"):
             ply.read_gaussians(text(tmp_path, [x for x in ply.GAUSSIAN if x != "scale_1"]))
 
-    def test_names_of_cloudcompare_are_known(self, tmp_path):
+    def test_cloudcompares_names_the_3d_filter_and_colours_as_bytes_are_known(self, tmp_path):
         """A cloud that was edited there, also one that 3dgsconverter prepared for it."""
         arrays, properties = gaussians(5, 1), ply.gaussian_properties(4)
         for prefix in ("scalar_", "scalar_scal_"):
@@ -98,8 +100,21 @@ class TestGaussians:
             write_table(tmp_path / "a.ply", names, ply.gaussian_columns(arrays))
             assert ply.is_gaussian_ply(tmp_path / "a.ply")
             assert_same(ply.read_gaussians(tmp_path / "a.ply"), arrays)
+        row = f"0 0 0 0 0 0 0 {np.log(3)} {np.log(2)} {np.log(6)} 1 0 0 0 4"
+        read = ply.read_gaussians(text(tmp_path, [*ply.GAUSSIAN, "filter_3D"], row))
+        sizes = np.sqrt([3**2 + 4**2, 2**2 + 4**2, 6**2 + 4**2])
+        np.testing.assert_allclose(np.exp(read.log_scales), [sizes], rtol=1e-6)
+        opacity = 0.5 * 3 * 2 * 6 / sizes.prod()
+        np.testing.assert_allclose(1 / (1 + np.exp(-read.logit_opacities)), [opacity], rtol=1e-5)
+        names = [name for name in ply.GAUSSIAN if not name.startswith("f_dc")]
+        names += [f"uchar {name}" for name in ply.COLORS]
+        path = text(tmp_path, names, "0 0 0 1 2 3 4 1 0 0 0 255 0 51")
+        assert ply.is_gaussian_ply(path)
+        read = ply.read_gaussians(path)
+        np.testing.assert_allclose(0.5 + 0.28209479 * read.sh[0, 0], [1, 0, 0.2], atol=1e-6)
+        np.testing.assert_array_equal(read.log_scales, [[2, 3, 4]])
 
-    def test_2d_gaussians_are_flat(self, tmp_path, caplog):
+    def test_2d_gaussians_are_flat_and_rows_of_zeros_are_left_out(self, tmp_path, caplog):
         names = [name for name in ply.GAUSSIAN if name != "scale_2"]
         path = text(tmp_path, names, "1 2 3 0 0 0 4 5 6 1 0 0 0")
         assert ply.is_gaussian_ply(path)
@@ -111,27 +126,6 @@ class TestGaussians:
         np.testing.assert_allclose(read.log_scales[:, 2], np.log(1e-6))
         np.testing.assert_array_equal(read.log_scales[:, :2], arrays.log_scales[:, :2])
         assert "inf.ply: 2D Gaussians, without a third scale: read as flat ones" in caplog.text
-
-    def test_the_3d_filter_is_applied(self, tmp_path):
-        """Variances grow by the filter's; the integral of a Gaussian stays."""
-        row = f"0 0 0 0 0 0 0 {np.log(3)} {np.log(2)} {np.log(6)} 1 0 0 0 4"
-        read = ply.read_gaussians(text(tmp_path, [*ply.GAUSSIAN, "filter_3D"], row))
-        sizes = np.sqrt([3**2 + 4**2, 2**2 + 4**2, 6**2 + 4**2])
-        np.testing.assert_allclose(np.exp(read.log_scales), [sizes], rtol=1e-6)
-        opacity = 0.5 * 3 * 2 * 6 / sizes.prod()
-        np.testing.assert_allclose(1 / (1 + np.exp(-read.logit_opacities)), [opacity], rtol=1e-5)
-
-    def test_bytes_stand_for_the_constant_harmonics(self, tmp_path):
-        """As nerfstudio's exporter writes with --ply-color-mode rgb."""
-        names = [name for name in ply.GAUSSIAN if not name.startswith("f_dc")]
-        names += [f"uchar {name}" for name in ply.COLORS]
-        path = text(tmp_path, names, "0 0 0 1 2 3 4 1 0 0 0 255 0 51")
-        assert ply.is_gaussian_ply(path)
-        read = ply.read_gaussians(path)
-        np.testing.assert_allclose(0.5 + 0.28209479 * read.sh[0, 0], [1, 0, 0.2], atol=1e-6)
-        np.testing.assert_array_equal(read.log_scales, [[2, 3, 4]])
-
-    def test_rows_of_zeros_are_left_out(self, tmp_path, caplog):
         arrays = gaussians(6, degree=1)
         for values in arrays:
             values[[1, 4]] = 0
@@ -141,15 +135,10 @@ class TestGaussians:
         assert "a.ply: 2 of 6 rows hold nothing but zeros: left out" in caplog.text
 
     def test_a_compressed_ply_is_named_in_the_message(self, tmp_path):
-        """PlayCanvas' layout: chunks of bounds, then four packed numbers per Gaussian."""
-        ends = [f"{end}_{axis}" for end in ("min", "max") for axis in "xyz"]
-        bounds = "\n".join(f"property float {name}" for name in ends)
-        packed = [f"uint packed_{name}" for name in ("position", "rotation", "scale", "color")]
-        head = header("binary_little_endian", 1, packed, before=f"element chunk 1\n{bounds}")
-        path = saved(tmp_path, head.encode() + bytes(6 * 4 + 4 * 4))
+        write_compressed_ply(tmp_path / "a.ply", gaussians(3))
         for read in (ply.read_gaussians, ply.read_points):
             with pytest.raises(UserError, match="compressed PLY: convert it by") as said:
-                read(path)
+                read(tmp_path / "a.ply")
             assert "plain points" not in str(said.value)
 
     @pytest.mark.parametrize("rest", [[0], range(6), [0, 1, 3]])
@@ -218,17 +207,12 @@ BINARY, FACE = "binary_little_endian", "element face 1\nproperty list uchar int 
 
 class TestDamage:
     @pytest.mark.parametrize(
-        ("kind", "code", "length"),
-        [
-            ("char", "b", -1),
-            ("float", "f", np.nan),
-            ("double", "d", np.inf),
-            ("uint", "I", 2**32 - 1),
-        ],
+        ("kind", "length"),
+        [("char", -1), ("float", np.nan), ("double", np.inf), ("uint", 2**32 - 1)],
     )
-    def test_invalid_lengths_of_lists(self, tmp_path, kind, code, length):
+    def test_invalid_lengths_of_lists(self, tmp_path, kind, length):
         head = header(BINARY, before=f"element face 1\nproperty list {kind} int vertex_indices")
-        content = struct.pack("<" + code, length) + bytes(40)
+        content = np.array(length, "<" + ply.NUMBER_TYPES[kind]).tobytes() + bytes(40)
         with pytest.raises(UserError, match="file.ply.*(list|integer)"):
             ply.read_points(saved(tmp_path, head.encode() + content))
 
@@ -258,7 +242,6 @@ class TestDamage:
         "content, problem",
         [
             ("", "not a PLY"),
-            ("solid cube", "not a PLY"),
             ("ply\n", "no end"),
             ("ply\n" + "comment x\n" * 200_000, "no end"),
             ("ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\n", "no end"),
@@ -268,7 +251,6 @@ class TestDamage:
             (header(count=1, before="element vertex 1\nproperty float x"), "are vertex, vertex"),
             (header(count=1, before=FACE) + "3 0 1\n1 2 3\n", "it is truncated"),
             (header(count=-1), "unknown line"),
-            (header(count="1" * 30), "unknown line"),
             (header(count=0).replace("vertex", "point"), "its elements are point"),
             (header(properties=["float x", "quad y"]), "number type"),
             (header(properties=["float x", "float x"]), "same name"),

@@ -65,7 +65,7 @@ def test_a_producers_export_puts_up_and_front_where_the_table_says(name, kind, a
     np.testing.assert_allclose(export @ axes[1], VECTORS[found.front], atol=1e-9)
 
 
-def test_every_generator_is_among_the_exports():
+def test_every_generator_is_among_the_exports_and_others_have_axes_or_are_refused():
     others = {"3dgs", "nerfstudio", "supersplat"}  # conventions of programs that generate nothing
     kinds = {(name, kind) for name, kind, *_ in EXPORTS}
     assert kinds == {
@@ -74,6 +74,17 @@ def test_every_generator_is_among_the_exports():
         for kind in (GAUSSIANS, MESH)
         if name not in others and getattr(known, kind)
     }
+    with pytest.raises(UserError, match="unknown producer 'triposplt': did you mean 'triposplat'"):
+        from_producer(StoredCloud(ball(1)), "triposplt")
+    with pytest.raises(UserError, match="'triposr' stands for files of meshes.* are 3dgs, "):
+        from_producer(StoredCloud(ball(1)), "triposr")
+    with pytest.raises(UserError, match="'diffsplat' stands for files of Gaussians.*hunyuan3d"):
+        producer_axes("diffsplat", MESH)
+    raw = StoredCloud(ball(9), "y")
+    found = from_producer(raw, "supersplat", ".spz").gaussians.means
+    np.testing.assert_allclose(found, raw.gaussians.means * [1, -1, -1], atol=1e-6)
+    for name, up in (("3dgs", "-y"), ("lgm", "y"), ("nerfstudio", "z")):
+        np.testing.assert_allclose(to_y_up(producer_axes(name, GAUSSIANS)), AXES[up], atol=1e-12)
 
 
 @pytest.mark.parametrize("name", producers_of(GAUSSIANS))
@@ -97,20 +108,3 @@ def test_formats_with_axes_of_their_own_come_from_a_turned_ply(tmp_path, name, s
     expected = from_producer(source, name).gaussians.means
     nearest = np.linalg.norm(found.gaussians.means[:, None] - expected, axis=2).min(axis=1)
     assert nearest.max() < 1e-3
-
-
-def test_an_spz_of_supersplat_has_the_axes_of_its_ply_and_plain_axes_agree_with_the_option_up():
-    raw = StoredCloud(ball(9), "y")
-    found = from_producer(raw, "supersplat", ".spz").gaussians.means
-    np.testing.assert_allclose(found, raw.gaussians.means * [1, -1, -1], atol=1e-6)
-    for name, up in (("3dgs", "-y"), ("lgm", "y"), ("nerfstudio", "z")):
-        np.testing.assert_allclose(to_y_up(producer_axes(name, GAUSSIANS)), AXES[up], atol=1e-12)
-
-
-def test_an_unknown_producer_and_one_of_other_files_are_refused():
-    with pytest.raises(UserError, match="unknown producer 'triposplt': did you mean 'triposplat'"):
-        from_producer(StoredCloud(ball(1)), "triposplt")
-    with pytest.raises(UserError, match="'triposr' stands for files of meshes.* are 3dgs, "):
-        from_producer(StoredCloud(ball(1)), "triposr")
-    with pytest.raises(UserError, match="'diffsplat' stands for files of Gaussians.*hunyuan3d"):
-        producer_axes("diffsplat", MESH)

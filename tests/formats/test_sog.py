@@ -57,7 +57,7 @@ def path(tmp_path):
     return tmp_path / "a.sog"
 
 
-def test_the_images_are_laid_out_as_published(path, tmp_path):
+def test_the_images_are_laid_out_as_published_and_their_names_lead_nowhere(path, tmp_path):
     """Decoded by Pillow, by the formulas of the specification; mode and notes are kept."""
     write_sog(tmp_path / "b.sog", ball(9), [ANTIALIASED, "one", "two"])
     assert sog.read_sog(tmp_path / "b.sog")[1] == ["one", "two", ANTIALIASED]
@@ -78,9 +78,6 @@ def test_the_images_are_laid_out_as_published(path, tmp_path):
     tags = pixels["quats.webp"][:, 3]
     assert ((tags >= 252) & (tags <= 255)).all() and len(set(tags)) == 4
     assert (meta["count"], meta["version"]) == (50, 2)
-
-
-def test_names_of_members_lead_nowhere(path, tmp_path):
     means = members(path)["means_l.webp"]
     name = "../../outside.webp"
     meta = json.loads(members(path)["meta.json"])
@@ -97,7 +94,6 @@ def test_names_of_members_lead_nowhere(path, tmp_path):
         ({"meta": {"count": 10**9}}, "1000000000 Gaussians would take .* of memory"),
         ({"meta": {"count": 70}}, "has 64 pixels, too few for 70 Gaussians"),
         ({"meta": {"count": -1}}, "count should be 0 or more"),
-        ({"meta": {"count": "9"}}, "count should be 0 or more"),
         ({"meta": {"version": 3}}, "it is of version 3; version 1 or 2 was expected"),
         ({"meta": {"means": None}}, "damaged"),
         ({"meta": {"sh0": {"codebook": [0.0] * 255, "files": ["sh0.webp"]}}}, "256 numbers"),
@@ -115,15 +111,16 @@ def test_names_of_members_lead_nowhere(path, tmp_path):
         ({"shN_centroids__webp": image((8, 8))}, "palette of 50 entries can't have 8 x 8"),
         ({"shN_labels__webp": image((8, 8)), "meta": {"shN": NO_PALETTE}}, "damaged"),
     ],
-    ids=range(20),
+    ids=range(19),
 )
 def test_damaged_files_are_refused(path, changes, said):
     with pytest.raises(UserError, match=said):
         read_sog(repacked(path, **changes))
 
 
-def test_bombs_cost_no_memory(path):
+def test_bombs_cost_no_memory_and_what_is_no_archive_is_refused(path):
     """In the archive, as JSON, and a lossless image of one colour, 16383 x 16383, of few bytes."""
+    data = bytearray(path.read_bytes())
     bits = 16382 | 16382 << 14 | 1 << 28
     body = b"VP8L" + struct.pack("<IBI", 20, 0x2F, bits) + bytes(15)
     image = b"RIFF" + struct.pack("<I", 4 + len(body)) + b"WEBP" + body
@@ -136,10 +133,6 @@ def test_bombs_cost_no_memory(path):
         repacked(path, zipfile.ZIP_DEFLATED, **changes)
         with memory_below(4 << 20), pytest.raises(UserError, match=said):
             read_sog(path)
-
-
-def test_damage_and_what_is_no_archive_are_refused(path):
-    data = bytearray(path.read_bytes())
     data[data.index(b"WEBPVP8L") + 40] ^= 1  # seen by the checksum
     no_zip = "a.sog': .*not a zip file"
     contents = [(bytes(data), "CRC"), (b"", no_zip), (b"PK\x03\x04", no_zip), (bytes(99), no_zip)]
@@ -230,7 +223,3 @@ def test_many_values_are_kept_better_than_by_equal_steps():
     steps = np.linspace(values.min(), values.max(), 256)
     equal = steps[np.abs(values[:, None] - steps).argmin(1)]
     assert ((book[rows] - values) ** 2).mean() < 0.2 * ((equal - values) ** 2).mean()
-    nearest = np.abs(values[:500, None] - book).argmin(1)
-    np.testing.assert_allclose(book[rows[:500]], book[nearest])
-    book, rows = scalar_codebook(np.zeros((0, 3), np.float32))
-    assert book.shape == (256,) and rows.shape == (0, 3)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from tests.helpers.object_clouds import assert_close, ball
+from tests.helpers.ply_files import saved
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.formats.gaussian_files import StoredCloud, read_cloud, write_cloud
 from threestudio_gaussiandreamer.formats.splat import read_ksplat, read_splat
@@ -13,13 +14,8 @@ from threestudio_gaussiandreamer.formats.splat import read_ksplat, read_splat
 RECORD = struct.pack("<6f8B", 1, -2, 3, 0.5, 1, 2, 255, 0, 128, 51, 255, 128, 0, 128)
 
 
-def stored(folder, data):
-    (folder / "a.splat").write_bytes(data)
-    return folder / "a.splat"
-
-
 def test_a_record_put_together_by_hand_is_read(tmp_path):
-    read, _ = read_splat(stored(tmp_path, RECORD))
+    read, _ = read_splat(saved(tmp_path, RECORD, "a.splat"))
     np.testing.assert_array_equal(read.means, [[1, -2, 3]])
     np.testing.assert_allclose(read.log_scales, np.log([[0.5, 1, 2]]), rtol=1e-6)
     np.testing.assert_allclose(0.5 + 0.28209479 * read.sh[0, 0], [1, 0, 128 / 255], atol=1e-6)
@@ -28,14 +24,14 @@ def test_a_record_put_together_by_hand_is_read(tmp_path):
     # rows that can't be drawn are left out
     nan, negative = struct.pack("<f", np.nan), struct.pack("<f", -1)
     bad = nan + RECORD[4:] + RECORD[:12] + negative + RECORD[16:]
-    read = read_cloud(str(stored(tmp_path, RECORD + bad)))
+    read = read_cloud(str(saved(tmp_path, RECORD + bad, "a.splat")))
     assert len(read.gaussians.means) == 1 and read.up == "-y"
 
 
 def test_other_sizes_are_refused_and_it_is_not_written(tmp_path):
     for size in (0, 1, 33):
         with pytest.raises(UserError, match=f"32 bytes, one record a Gaussian, not {size}"):
-            read_splat(stored(tmp_path, bytes(size)))
+            read_splat(saved(tmp_path, bytes(size), "a.splat"))
     with pytest.raises(UserError, match="expected the name of a .ply, .* got"):
         write_cloud(str(tmp_path / "b.splat"), StoredCloud(ball(1)))
 

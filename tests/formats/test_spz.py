@@ -127,7 +127,7 @@ def test_both_versions_hold_the_same_and_files_are_small_and_reproducible():
     assert all(np.array_equal(a, b) for a, b in zip(*found, strict=True))
 
 
-def test_extremes_are_stored_within_the_formats_reach():
+def test_extremes_are_stored_within_the_formats_reach_and_nan_is_refused():
     arrays = cloud(4)
     arrays.log_scales[:] = [[-np.inf] * 3, [-50] * 3, [50] * 3, [0] * 3]
     arrays.logit_opacities[:] = [np.inf, -np.inf, 50, -50]
@@ -143,6 +143,11 @@ def test_extremes_are_stored_within_the_formats_reach():
     np.testing.assert_allclose(read.means, arrays.means, atol=0.001)
     # Niantic's reader takes the logit of the byte over 255
     assert sorted(gzip.decompress(spz_bytes(arrays))[16 + 4 * 9 :][:4]) == [0, 0, 254, 254]
+    arrays = cloud(20)
+    arrays.means[3], arrays.sh[5] = np.nan, np.inf
+    for bad in (arrays, cloud(1)._replace(sh=np.zeros((1, 25, 3), np.float32))):
+        with pytest.raises(UserError, match="can't hold NaN, infinity, or harmonics above degree"):
+            spz_bytes(bad)
 
 
 def test_one_gaussian_beyond_the_range_is_clipped_and_the_rest_stays_precise(tmp_path, caplog):
@@ -160,17 +165,6 @@ def test_one_gaussian_beyond_the_range_is_clipped_and_the_rest_stays_precise(tmp
     write_spz(tmp_path / "b.spz", far._replace(log_scales=far.log_scales - 20))
     read = read_spz(tmp_path / "b.spz")
     assert not caplog.text and np.abs(read.means.mean(axis=0) - 1e6).max() < 1
-
-
-def test_what_is_not_finite_is_left_out_of_the_file(tmp_path, caplog):
-    arrays = cloud(20)
-    arrays.means[3], arrays.sh[5] = np.nan, np.inf
-    write_spz(tmp_path / "a.spz", arrays)
-    assert len(read_spz(tmp_path / "a.spz").means) == 18
-    assert caplog.text.count("a.spz: 2 of 20 Gaussians hold NaN or infinity: left out") == 1
-    for bad in (arrays, cloud(1)._replace(sh=np.zeros((1, 25, 3), np.float32))):
-        with pytest.raises(UserError, match="can't hold NaN, infinity, or harmonics above degree"):
-            spz_bytes(bad)
 
 
 def axes(number):
@@ -234,10 +228,8 @@ SIZES = [18, 2, 6, 6, 8, 18]
     ("data", "said"),
     [
         (b"", "damaged or of another format"),
-        (b"ply\nformat", "damaged or of another format"),
         (packed(b"short"), "damaged or of another format"),
         (packed(BY_HAND)[:-20], "it is truncated"),
-        (packed(BY_HAND)[:-1], "it is truncated"),
         (packed(BY_HAND)[:-8] + bytes(8), "incorrect data check"),
         (b"NGSP" + bytes(40), "isn't an SPZ file of version 1 to 4"),
         (with_header(magic=b"NGSX"), "isn't an SPZ file of version 1 to 4"),
@@ -247,18 +239,16 @@ SIZES = [18, 2, 6, 6, 8, 18]
         (with_header(count=2**32 - 1), "of memory"),
         (version_4()[:-1], "truncated or damaged"),
         (version_4()[:20], "damaged or of another format"),
-        (version_4()[:40], "damaged"),
         (version_4() + b"\0", "truncated or damaged"),
         (version_4(streams=5), "its table of blocks is damaged"),
         (version_4(count=2**32 - 1), "of memory"),
         (version_4(degree=5), "degree 5 are announced"),
         (version_4(sizes=[*SIZES[:-1], 17]), "truncated or damaged"),
         (version_4([*BLOCKS[:-1], HARMONICS + b"\0"], sizes=SIZES), "of another size"),
-        (version_4([*BLOCKS[:-1], HARMONICS[1:]], sizes=SIZES), "of another size"),
         (version_4().replace(b"\x28\xb5\x2f\xfd", b"abcd"), "Zstd"),
         (version_4(flags=2, extension=axes(17)), "axes has the number 17: 1 to 16"),
     ],
-    ids=range(24),
+    ids=range(20),
 )
 def test_damaged_and_foreign_files_are_refused(tmp_path, data, said):
     with pytest.raises(UserError, match=f"a.spz': .*{said}"):

@@ -68,8 +68,20 @@ def test_openusd_reads_what_was_written(tmp_path, degree):
     assert stage.GetDefaultPrim().IsValid() and len(field.GetPositionsAttr().Get()) == 0
 
 
-def test_axes_are_y_up_and_what_openusd_writes_is_read(tmp_path):
-    """Its layout has documentation, other attributes, metadata and comments."""
+def test_texts_of_several_lines_z_up_and_what_openusd_writes_are_read(tmp_path):
+    """NVIDIA's converter writes such a comment, and OpenUSD other texts."""
+    cloud = ball(9, 1)
+    write_usda(tmp_path / "a.usda", cloud, ["a note"])
+    text = (tmp_path / "a.usda").read_text()
+    text = text.replace("#usda 1.0\n(", '#usda 1.0\n(\n    """Source file:\nupAxis = "X" a.ply"""')
+    text = text.replace("elementSize", "doc = '''one\n) two'''\n        elementSize")
+    (tmp_path / "b.usda").write_text(text)
+    read, notes = read_usda(tmp_path / "b.usda")
+    assert_close(cloud, read, means=0, sh=0, log_scales=1e-6, opacities=1e-6)
+    assert notes == ["a note"]
+    (tmp_path / "b.usda").write_text(text.replace('upAxis = "Y"', 'upAxis = "Z"'))
+    in_z = StoredCloud(read_usda(tmp_path / "b.usda")[0], "y").in_axes("z").gaussians
+    assert_close(cloud, in_z, opacities=1e-6)
     one = ball(1)
     one.means[:] = [[4.0, 1.0, 2.0]]  # front, left, up in our world
     write_cloud(str(tmp_path / "one.usda"), StoredCloud(one))
@@ -88,22 +100,6 @@ def test_axes_are_y_up_and_what_openusd_writes_is_read(tmp_path):
     read, notes = read_usda(tmp_path / "b.usda")
     assert_close(cloud, read, means=0, sh=0, log_scales=1e-6, opacities=1e-6)
     assert notes == ["a note"]
-
-
-def test_texts_of_several_lines_and_z_up_are_read(tmp_path):
-    """NVIDIA's converter writes such a comment, and OpenUSD other texts."""
-    cloud = ball(9, 1)
-    write_usda(tmp_path / "a.usda", cloud, ["a note"])
-    text = (tmp_path / "a.usda").read_text()
-    text = text.replace("#usda 1.0\n(", '#usda 1.0\n(\n    """Source file:\nupAxis = "X" a.ply"""')
-    text = text.replace("elementSize", "doc = '''one\n) two'''\n        elementSize")
-    (tmp_path / "b.usda").write_text(text)
-    read, notes = read_usda(tmp_path / "b.usda")
-    assert_close(cloud, read, means=0, sh=0, log_scales=1e-6, opacities=1e-6)
-    assert notes == ["a note"]
-    (tmp_path / "b.usda").write_text(text.replace('upAxis = "Y"', 'upAxis = "Z"'))
-    in_z = StoredCloud(read_usda(tmp_path / "b.usda")[0], "y").in_axes("z").gaussians
-    assert_close(cloud, in_z, opacities=1e-6)
 
 
 MINIMAL = """def ParticleField3DGaussianSplat "G"
@@ -146,7 +142,7 @@ def test_linear_colours_become_display_values(tmp_path, place, caplog):
     assert "linear colours become sRGB" in caplog.text
 
 
-def test_a_usdz_is_as_phones_want_it(tmp_path):
+def test_a_usdz_is_as_phones_want_it_and_read_without_openusd(tmp_path, monkeypatch):
     """One layer, not compressed, at a multiple of 64 bytes; files are the same each time."""
     cloud = ball(300, 1)
     for name in ("a.usdz", "b.usdz"):
@@ -170,6 +166,12 @@ def test_a_usdz_is_as_phones_want_it(tmp_path):
         for read in (read_usda, read_usd):
             with pytest.raises(UserError, match=f"{number}.usdz': .*{said}"):
                 read(tmp_path / f"{number}.usdz")
+    monkeypatch.setitem(sys.modules, "pxr", None)
+    (tmp_path / "a.usdc").write_bytes(b"PXR-USDC" + bytes(100))
+    with pytest.raises(UserError, match="pip install usd-core"):
+        read_usd(tmp_path / "a.usdc")
+    write_usdz(tmp_path / "a.usdz", ball(20))
+    assert len(read_usd(tmp_path / "a.usdz")[0].means) == 20
 
 
 def by_openusd(path):
@@ -179,7 +181,7 @@ def by_openusd(path):
     return read_usd(path.with_suffix(".usdc"))[0]
 
 
-def test_binary_files_are_read(tmp_path):
+def test_binary_files_are_read_and_what_openusd_cant_read_is_said(tmp_path):
     cloud = ball(20, 3)
     stored = StoredCloud(cloud, "y", pruned_to=40.0, antialiased=True)
     write_cloud(str(tmp_path / "a.usda"), stored)
@@ -188,6 +190,20 @@ def test_binary_files_are_read(tmp_path):
     assert (read.up, read.pruned_to, read.antialiased) == ("y", 40, True)
     write_usda(tmp_path / "b.usda", ball(0))
     assert by_openusd(tmp_path / "b.usda").means.shape == (0, 3)
+    pytest.importorskip("pxr", reason="usd-core isn't installed")
+    write_usda(tmp_path / "a.usda", ball(20))
+    by_openusd(tmp_path / "a.usda")
+    cut = (tmp_path / "a.usdc").read_bytes()[:900]
+    (tmp_path / "b.usdc").write_bytes(cut)
+    with pytest.raises(UserError, match="b.usdc.*OpenUSD: .*corrupt"):
+        read_usd(tmp_path / "b.usdc")
+    (tmp_path / "c.usda").write_text('#usda 1.0\ndef Sphere "a"\n{\n}\n')
+    with pytest.raises(UserError, match="c.usda'.*none of its prims is a ParticleField3DGauss"):
+        read_usd(tmp_path / "c.usda")
+    text = (tmp_path / "a.usda").read_text().replace("Degree = 0", "Degree = 1")
+    (tmp_path / "d.usda").write_text(text)
+    with pytest.raises(UserError, match="has 20 values, expected 80"):
+        read_usd(tmp_path / "d.usda")
 
 
 def test_scenes_with_transforms_and_half_precision_are_read(tmp_path):
@@ -221,32 +237,6 @@ def test_scenes_with_transforms_and_half_precision_are_read(tmp_path):
     means = (2 * moved.means + shift).astype(np.float32)
     moved = moved._replace(means=means, log_scales=moved.log_scales + np.log(2))
     assert_close(moved, read.rows(slice(20, 40)), **rough | {"means": 4e-3})
-
-
-def test_what_openusd_cant_read_either_is_said(tmp_path):
-    pytest.importorskip("pxr", reason="usd-core isn't installed")
-    write_usda(tmp_path / "a.usda", ball(20))
-    by_openusd(tmp_path / "a.usda")
-    cut = (tmp_path / "a.usdc").read_bytes()[:900]
-    (tmp_path / "b.usdc").write_bytes(cut)
-    with pytest.raises(UserError, match="b.usdc.*OpenUSD: .*corrupt"):
-        read_usd(tmp_path / "b.usdc")
-    (tmp_path / "c.usda").write_text('#usda 1.0\ndef Sphere "a"\n{\n}\n')
-    with pytest.raises(UserError, match="c.usda'.*none of its prims is a ParticleField3DGauss"):
-        read_usd(tmp_path / "c.usda")
-    text = (tmp_path / "a.usda").read_text().replace("Degree = 0", "Degree = 1")
-    (tmp_path / "d.usda").write_text(text)
-    with pytest.raises(UserError, match="has 20 values, expected 80"):
-        read_usd(tmp_path / "d.usda")
-
-
-def test_without_openusd_the_package_is_named(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "pxr", None)
-    (tmp_path / "a.usdc").write_bytes(b"PXR-USDC" + bytes(100))
-    with pytest.raises(UserError, match="pip install usd-core"):
-        read_usd(tmp_path / "a.usdc")
-    write_usdz(tmp_path / "a.usdz", ball(20))
-    assert len(read_usd(tmp_path / "a.usdz")[0].means) == 20
 
 
 @pytest.mark.parametrize(

@@ -38,7 +38,7 @@ def center_color(mesh, face=0):
     return surface_colors(mesh, np.array([face]), THIRDS)[0]
 
 
-def test_a_scene_is_merged_and_centred_and_its_longest_half_side_is_the_scale(tmp_path):
+def test_a_scene_is_merged_centred_scaled_and_turned_to_its_axes(tmp_path):
     scene = trimesh.Scene()
     scene.add_geometry(box(), transform=trimesh.transformations.translation_matrix([0, 0, 3]))
     scene.add_geometry(box())
@@ -51,10 +51,6 @@ def test_a_scene_is_merged_and_centred_and_its_longest_half_side_is_the_scale(tm
         low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
         np.testing.assert_allclose(high, [0.6, 1.5, 0.3], atol=2e-6)  # STL holds float32
         np.testing.assert_allclose(low, -high, atol=1e-6)
-
-
-def test_the_axes_of_formats_and_given_ones(tmp_path):
-    """Nothing is mirrored."""
     arrow = trimesh.Trimesh(np.diag([3.0, 2, 1]), [[0, 1, 2]])
     for name in ("a.glb", "a.obj", "a.off", "a.ply"):
         path = saved(arrow, tmp_path / name)
@@ -67,11 +63,8 @@ def test_the_axes_of_formats_and_given_ones(tmp_path):
         turn = np.stack([AXES[front], np.cross(AXES[up], AXES[front]), AXES[up]])
         np.testing.assert_allclose(mesh.vertices, given.vertices @ turn.T, atol=1e-12)
         assert np.isclose(np.linalg.det(turn), 1)
-    for up, front, said in (
-        ("z", None, "up axis"),
-        ("auto", "+w", "front axis"),
-        ("+z", "-z", "along"),
-    ):
+    wrong = ("z", None, "up axis"), ("auto", "+w", "front axis"), ("+z", "-z", "along")
+    for up, front, said in wrong:
         with pytest.raises(UserError, match=said):
             load_mesh(path, up=up, front=front)
 
@@ -96,9 +89,6 @@ def test_colours_of_vertices_faces_and_materials(tmp_path):
     mesh = load_mesh(saved(source, tmp_path / "a.glb"))  # its colour is linear
     expected = [1, 0, 1.055 * (55 / 255) ** (1 / 2.4) - 0.055]
     np.testing.assert_allclose(center_color(mesh), expected, atol=1e-6)
-
-
-def test_a_texture_is_tinted_by_its_material(tmp_path):
     white = Image.new("RGB", (2, 2), "white")
     for tint, seen in ([255, 0, 255, 255], [1, 0, 1]), ([102, 102, 102, 255], 1):
         # the second is trimesh's "no colour given"
@@ -109,12 +99,10 @@ def test_a_texture_is_tinted_by_its_material(tmp_path):
         np.testing.assert_allclose(found, seen, atol=1e-6)
 
 
-def test_a_merged_scene_has_the_colours_of_its_parts():
+def test_a_merged_scene_has_the_colours_of_its_parts_and_texels_are_bilinear():
     """Two textures of other sizes, one repeating, colours of vertices, of faces, and none."""
-    rng, corners = (
-        np.random.default_rng(0),
-        np.float64([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]),
-    )
+    rng = np.random.default_rng(0)
+    corners = np.float64([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
     plain, uv = Mesh(corners, np.array([[0, 1, 2], [0, 2, 3]])), corners[:, :2].astype(np.float32)
     pictures = [rng.integers(0, 256, (*size, 3), np.uint8) for size in ((3, 5), (1, 2))]
     parts = [plain._replace(uv=uv, texture=pictures[0])]
@@ -129,10 +117,6 @@ def test_a_merged_scene_has_the_colours_of_its_parts():
     assert len(mesh.tiles) == 2
     found = surface_colors(mesh, faces, weights)
     np.testing.assert_allclose(found, np.concatenate(expected), atol=1e-6)
-
-
-def test_texels_are_bilinear_and_repeat():
-    """Values at texel centres are the texels'; outside [0, 1] the texture repeats."""
     image = [[[255, 0, 0], [0, 255, 0]], [[0, 0, 255], [255, 255, 255]]]
     places = np.float32([[0.25, 0.75], [0.5, 0.75], [0.75, 0.25], [1.25, -0.25], [0.0, 0.75]])
     uv, faces = np.repeat(places, 3, axis=0), np.arange(15).reshape(5, 3)
@@ -149,7 +133,7 @@ def test_surface_distances_of_a_sphere(tmp_path):
     np.testing.assert_allclose(SurfaceDistance(mesh)(points), [0.5, 1.0, 0.0], atol=0.012)
 
 
-def test_objects_as_programs_write_them_are_read(tmp_path):
+def test_objects_and_stl_files_as_programs_write_them_are_read(tmp_path):
     """Blanks, tabs, carriage returns, continued lines, exponents, colours, polygons."""
     text = (
         "# made by hand\r\nmtllib none.mtl\no box\nv 0 0.0 -.0 1 0 0\nv  1e0\t0 0 0 1 0 \nv 1 "
@@ -172,10 +156,6 @@ def test_objects_as_programs_write_them_are_read(tmp_path):
         found.append(load_mesh(tmp_path / "a.obj"))
     np.testing.assert_array_equal(found[0].vertices, found[1].vertices)
     np.testing.assert_array_equal(found[0].faces, found[1].faces)
-
-
-def test_a_binary_stl_may_begin_like_text_and_have_more_bytes(tmp_path):
-    """As SolidWorks and scanners write it."""
     triangle = np.array([0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1, 0], "<f4").tobytes() + b"\0\0"
     for header in (bytes(80), b"solid base".ljust(80, b"\0")):
         (tmp_path / "a.stl").write_bytes(header + b"\1\0\0\0" + triangle + bytes(30))

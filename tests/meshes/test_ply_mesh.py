@@ -71,7 +71,7 @@ def test_texture_coordinates_of_vertices_and_corners(tmp_path, binary, faces):
     assert mesh.faces.shape == (1, 3) and mesh.texture is not None
 
 
-def test_seams_and_several_textures(tmp_path):
+def test_seams_several_textures_and_the_digits_of_doubles(tmp_path):
     corners = ply(tmp_path, faces=TRIANGLES, corners=UV, comments=TEXTURE).read_bytes()
     at = corners.rindex(UV[0].tobytes())
     moved = corners[:at] + np.float32([0.75, 0.25]).tobytes() + corners[at + 8 :]
@@ -84,6 +84,12 @@ def test_seams_and_several_textures(tmp_path):
     parts = read_parts(ply(tmp_path, faces=TRIANGLES, corners=UV, comments=comments, more=more))
     np.testing.assert_array_equal([part.texture[0, 0] for part in parts], TEXELS[:, 0])
     assert [len(part.faces) for part in parts] == [1, 1]
+    far = [(axis, "double", "d", SQUARE[:, i] + 5e6) for i, axis in enumerate("xyz")]
+    text = ply(tmp_path, faces=TRIANGLES, columns=far).read_bytes()
+    for axis in "xyz":
+        text = text.replace(f"property float {axis}".encode(), f"property float a{axis}".encode())
+    (tmp_path / "a.ply").write_bytes(text)
+    np.testing.assert_array_equal(read_parts(tmp_path / "a.ply")[0].vertices, SQUARE + 5e6)
 
 
 @pytest.mark.parametrize("colored", [True, False])
@@ -105,15 +111,6 @@ def test_colours_of_faces(tmp_path, faces):
     (part,) = read_parts(ply(tmp_path, faces=faces, more=more))
     expected = np.float32([[1, 0, 0], [0, 0.2, 0]])
     np.testing.assert_allclose(part.face_colors, expected[[0] + [1] * (len(part.faces) - 1)])
-
-
-def test_doubles_keep_their_digits(tmp_path):
-    far = [(axis, "double", "d", SQUARE[:, i] + 5e6) for i, axis in enumerate("xyz")]
-    text = ply(tmp_path, faces=TRIANGLES, columns=far).read_bytes()
-    for axis in "xyz":
-        text = text.replace(f"property float {axis}".encode(), f"property float a{axis}".encode())
-    (tmp_path / "a.ply").write_bytes(text)
-    np.testing.assert_array_equal(read_parts(tmp_path / "a.ply")[0].vertices, SQUARE + 5e6)
 
 
 @pytest.mark.parametrize(

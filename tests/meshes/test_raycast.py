@@ -79,7 +79,7 @@ def test_the_silhouette_of_a_sphere(distance=3.0, fovy=40.0, height=80, width=12
 
 
 @both
-def test_sides_of_a_cube_are_seen_upright_and_not_mirrored():
+def test_a_cube_is_seen_upright_not_mirrored_and_from_inside():
     """From the front, +y is on the right and +z on top."""
     caster = MeshCaster(cube())
     for side, angles in SIDES.items():
@@ -89,6 +89,14 @@ def test_sides_of_a_cube_are_seen_upright_and_not_mirrored():
     red, green, blue = image[..., 0] > 0.1, image[..., 1] > 0.9, image[..., 2] > 0.9
     assert np.nonzero(green & ~red & (image[..., 2] < 0.1))[1].mean() > 36  # +y
     assert np.nonzero(blue & ~red)[0].mean() < 24  # +z
+    caster = MeshCaster(cube())
+    inside, away = look(10, 20, 0.1), look(10, 20, 3)
+    away[:3, :3] *= [-1, 1, -1]  # looks the other way
+    assert picture(caster, inside, 1.0, 8, 8)[..., 3].min() == 1
+    assert picture(caster, away, 1.0, 8, 8).max() == 0
+    beside = look(0, 0, 3)
+    beside[1, 3] += 50
+    assert picture(caster, beside, 1.0, 8, 8).max() == 0
 
 
 @both
@@ -120,18 +128,6 @@ def test_colour_is_premultiplied_and_supersampling_is_the_mean_of_a_larger_pictu
     np.testing.assert_allclose(picture(caster, *view, 16, 24, 3), large, atol=1e-6)
     monkeypatch.setattr(raycast, "RAYS_PER_CAST", 1)
     np.testing.assert_allclose(picture(caster, *view, 16, 24, 3), large, atol=1e-6)
-
-
-@both
-def test_cameras_inside_beside_and_away():
-    caster = MeshCaster(cube())
-    inside, away = look(10, 20, 0.1), look(10, 20, 3)
-    away[:3, :3] *= [-1, 1, -1]  # looks the other way
-    assert picture(caster, inside, 1.0, 8, 8)[..., 3].min() == 1
-    assert picture(caster, away, 1.0, 8, 8).max() == 0
-    beside = look(0, 0, 3)
-    beside[1, 3] += 50
-    assert picture(caster, beside, 1.0, 8, 8).max() == 0
 
 
 @pytest.mark.parametrize("terminal", [True, False])
@@ -239,7 +235,7 @@ def test_triangles_through_the_camera_plane_are_what_single_rays_see(seed):
     np.testing.assert_allclose(found[1], expected[1], atol=1e-9)  # of a few units, in float64
 
 
-def test_what_is_nearer_than_the_near_plane_is_not_seen():
+def test_what_is_too_near_behind_on_edge_or_degenerate_is_not_seen():
     """One corner of the triangle is before that plane; the rest of it is visible."""
     vertices = np.array([[-1.0, -1, -1], [1, -1, -1], [0, 1, -1]])
     vertices *= np.array([[0.5], [2], [2]]) * raycast.NEAR
@@ -247,9 +243,6 @@ def test_what_is_nearer_than_the_near_plane_is_not_seen():
     seen = (nearest >= 0) & (-(weights @ vertices)[..., 2] > raycast.NEAR)
     assert 0 < seen.sum() < (nearest >= 0).sum()
     np.testing.assert_array_equal(draw(vertices, [[0, 1, 2]])[0], np.where(seen, 0, -1))
-
-
-def test_behind_on_edge_and_degenerate_triangles_are_not_seen():
     behind, on_edge = [[-9, -9, 1], [9, -9, 1], [0, 9, 1]], [[0, 0, -1], [0, 0, -5], [0, 9, -2]]
     line, point = [[-1, -1, -2], [0, 0, -2], [1, 1, -2]], [[0, 0, -2]] * 3
     for triangle in (behind, on_edge, line, point):
@@ -259,16 +252,12 @@ def test_behind_on_edge_and_degenerate_triangles_are_not_seen():
     assert draw(behind, [[0, 1, 2]], columns=PLACES[:0])[0].shape == (32, 0)
 
 
-def test_both_sides_are_seen_and_the_nearer_one_wins():
+def test_both_sides_are_seen_the_nearer_one_wins_and_neighbours_leave_no_gap():
     near, far = [[-9, -9, -2], [9, -9, -2], [0, 9, -2]], [[-9, -9, -3], [9, -9, -3], [0, 9, -3]]
     for faces in ([[0, 1, 2], [3, 4, 5]], [[2, 1, 0], [5, 4, 3]]):
         assert draw(near + far, faces)[0][16, 16] == 0
         assert draw(far + near, faces)[0][16, 16] == 1
     assert draw(near + near, [[0, 1, 2], [3, 4, 5]])[0][16, 16] == 0  # of equals the first
-
-
-def test_neighbours_leave_no_gap_on_samples_of_their_edges():
-    """A fan whose edges pass exactly through samples: its inside is covered completely."""
     around = ((8, 0), (8, 8), (0, 8), (-8, 8), (-8, 0), (-8, -8), (0, -8), (8, -8))
     ring = [[x, y, -FOCAL / 2] for x, y in around]
     faces = [[0, 1 + i, 1 + (i + 1) % 8] for i in range(8)]

@@ -69,16 +69,6 @@ def test_a_fifo_beside_a_mesh_is_refused(kind, tmp_path):
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nusemtl m\nf 1/1 2/2 3/3\n"
 
 
-@pytest.mark.parametrize("head", ["", "mtllib missing.mtl\n"])
-def test_an_obj_with_coordinates_and_no_material_is_grey(head, tmp_path):
-    (tmp_path / "a.obj").write_text(head + TRIANGLE)
-    mesh = load_mesh(tmp_path / "a.obj")
-    assert not mesh.has_colors
-    np.testing.assert_array_equal(surface_colors(mesh, np.array([0]), np.full((1, 3), 1 / 3)), HALF)
-    cloud = PointCloudPrior({"path": str(tmp_path / "a.obj")})("a fox")
-    np.testing.assert_array_equal(cloud.colors, HALF)
-
-
 GREY = "map_Kd grey.png\n"
 
 

@@ -63,7 +63,7 @@ def test_renders_of_the_baked_mesh_are_those_it_was_baked_from(unwrapped):
     assert again.volume == pytest.approx(BALL.volume)  # and their orientation
 
 
-def test_what_is_hidden_takes_nothing():
+def test_what_is_hidden_takes_the_colour_of_the_nearest_face():
     """A wall behind another one: only the one in front is seen, so only it gets its colour."""
     wall = np.array([[0, -1, -1], [0, 1, -1], [0, 1, 1], [0, -1, 1]], float)
     vertices = np.concatenate([wall + [0.5, 0, 0], wall - [0.5, 0, 0]])
@@ -75,19 +75,6 @@ def test_what_is_hidden_takes_nothing():
     assert (texture[4:-4, 4:12] == [200, 40, 10]).all()
     _, face, _ = MeshCaster(mesh).visible(front()[0], FOVY, 64, 64)
     assert set(np.unique(face)) <= {-1, 0, 1}
-
-
-def test_gaps_take_the_mean_of_their_surroundings():
-    colors, known = np.zeros((7, 9, 3)), np.zeros((7, 9), bool)
-    colors[0, 0], colors[6, 8] = 10, 30
-    known[0, 0] = known[6, 8] = True
-    found = filled(colors, known)
-    assert (found[0, 0] == 10).all() and (found[6, 8] == 30).all()
-    assert (found[1, 1] == 10).all() and 10 <= found.min() and found.max() <= 30
-    np.testing.assert_array_equal(filled(colors, np.zeros((7, 9), bool)), colors)
-
-
-def test_a_hidden_face_takes_the_colour_of_the_nearest_one():
     mesh = on_ball(in_grid(BALL.vertices, BALL.faces, 120))
     painted = mesh._replace(vertex_colors=np.where(mesh.vertices[:, :1] > 0, [1, 0, 0], [0, 0, 1]))
     images = MeshCaster(painted).render_views([(front()[0], FOVY)], 96, 96, supersample=1)
@@ -96,6 +83,23 @@ def test_a_hidden_face_takes_the_colour_of_the_nearest_one():
     behind = np.flatnonzero(mesh.vertices[mesh.faces].mean(axis=1)[:, 0] < 0)
     colors = surface_colors(baked, behind, np.full((len(behind), 3), 1 / 3))
     assert (colors[:, 0] > 0.9).all() and (colors[:, 2] < 0.1).all()
+
+
+def test_gaps_take_the_mean_of_their_surroundings_and_triangles_share_no_texel():
+    colors, known = np.zeros((7, 9, 3)), np.zeros((7, 9), bool)
+    colors[0, 0], colors[6, 8] = 10, 30
+    known[0, 0] = known[6, 8] = True
+    found = filled(colors, known)
+    assert (found[0, 0] == 10).all() and (found[6, 8] == 30).all()
+    assert (found[1, 1] == 10).all() and 10 <= found.min() and found.max() <= 30
+    np.testing.assert_array_equal(filled(colors, np.zeros((7, 9), bool)), colors)
+    size = 2 * SMALLEST_CELL * 7
+    found = in_grid(BALL.vertices, BALL.faces[:90], size)
+    owners = {}
+    for face, corners in enumerate(found.uv[found.faces]):
+        for texel in texels_of(corners, size):
+            assert owners.setdefault(texel, face) == face
+    assert {0 <= x < size and 0 <= y < size for x, y in owners} == {True}
 
 
 def texels_of(corners, size):
@@ -107,16 +111,6 @@ def texels_of(corners, size):
     columns, rows = first.T
     pairs = [(x, y) for x in (columns, right) for y in (rows, down)]
     return {texel for x, y in pairs for texel in zip(x, y, strict=True)}
-
-
-def test_triangles_of_the_grid_share_no_texel():
-    size = 2 * SMALLEST_CELL * 7
-    found = in_grid(BALL.vertices, BALL.faces[:90], size)
-    owners = {}
-    for face, corners in enumerate(found.uv[found.faces]):
-        for texel in texels_of(corners, size):
-            assert owners.setdefault(texel, face) == face
-    assert {0 <= x < size and 0 <= y < size for x, y in owners} == {True}
 
 
 def test_as_many_faces_fit_as_it_says_and_go_to_the_grid(size=512):

@@ -35,7 +35,7 @@ def two_boxes(offset):
     return welded(*joined((box.vertices, box.faces), (box.vertices + offset, box.faces)))
 
 
-def test_small_parts_and_cavities_are_dropped():
+def test_small_parts_and_folds_are_dropped_and_what_cant_be_closed_is_refused():
     vertices, faces = ball(subdivisions=2)
     cavity = ball(0.5, 2)[0], ball(0.5, 2)[1][:, ::-1]
     kept = without_small_parts(*joined(ball(0.05, 1, (2, 0, 0)), cavity, (vertices, faces)), 0.01)
@@ -47,6 +47,18 @@ def test_small_parts_and_cavities_are_dropped():
         two = joined(ball(), ball(radius, 2, (2, 0, 0)))
         _, faces, count = without_small_parts(*two, 0.01)
         assert count == dropped and (len(faces) == len(two[1])) == (not dropped)
+    _, faces = ball(subdivisions=1)
+    kept = without_folds(np.concatenate([faces, [[90, 91, 92], [92, 91, 90], [3, 3, 4]]]))
+    np.testing.assert_array_equal(kept, faces)
+    vertices, faces = ball(subdivisions=1)
+    again = simplified(vertices, faces, 5000)
+    assert len(again[1]) == len(faces) and is_closed(again[1])
+    np.testing.assert_allclose(np.sort(again[0], axis=0), np.sort(vertices, axis=0))
+    parts = joined(*(ball(subdivisions=1, place=(3 * k, 0, 0)) for k in range(60)))
+    with pytest.raises(UserError, match="can't be closed with 100 faces"):
+        simplified(*parts, 100)
+    with pytest.raises(UserError, match="closed with 5000 faces"):
+        simplified(vertices, faces[1:], 5000)  # with a hole
 
 
 @pytest.mark.parametrize("factor", [2.0**-20, 2.0**20])
@@ -61,18 +73,6 @@ def test_simplified_meshes_stay_closed_and_keep_their_size_at_any_scale(factor):
         assert found.volume == pytest.approx(4.12, rel=0.08)
 
 
-def test_a_mesh_of_few_faces_is_left_as_it_is_and_what_cant_be_closed_is_refused():
-    vertices, faces = ball(subdivisions=1)
-    again = simplified(vertices, faces, 5000)
-    assert len(again[1]) == len(faces) and is_closed(again[1])
-    np.testing.assert_allclose(np.sort(again[0], axis=0), np.sort(vertices, axis=0))
-    parts = joined(*(ball(subdivisions=1, place=(3 * k, 0, 0)) for k in range(60)))
-    with pytest.raises(UserError, match="can't be closed with 100 faces"):
-        simplified(*parts, 100)
-    with pytest.raises(UserError, match="closed with 5000 faces"):
-        simplified(vertices, faces[1:], 5000)  # with a hole
-
-
 def test_boxes_that_share_an_edge_or_a_corner_are_separated():
     vertices, faces = two_boxes([1, 1, 0])
     assert not is_closed(faces)
@@ -83,12 +83,6 @@ def test_boxes_that_share_an_edge_or_a_corner_are_separated():
     assert all(part.volume == pytest.approx(1, abs=0.1) for part in parts)
     moved, apart = separated(*two_boxes(1))
     assert len(moved) == 16 and len(np.unique(moved, axis=0)) == 16 and is_closed(apart)
-
-
-def test_a_fold_is_dropped():
-    _, faces = ball(subdivisions=1)
-    kept = without_folds(np.concatenate([faces, [[90, 91, 92], [92, 91, 90], [3, 3, 4]]]))
-    np.testing.assert_array_equal(kept, faces)
 
 
 def cells_to_mesh(cells):
@@ -108,7 +102,7 @@ def cells_to_mesh(cells):
     return welded(np.array(corners, float), np.array(faces))
 
 
-def test_a_surface_that_passes_an_edge_twice_gets_another_vertex():
+def test_cells_that_touch_at_an_edge_and_random_ones_are_closed():
     """A ring of cells whose ends touch at one edge only, so that its ends have one fan each."""
     cells = np.zeros((3, 3, 1), bool)
     cells[[0, 0, 0, 1, 2, 2], [0, 1, 2, 2, 2, 1]] = True
@@ -119,9 +113,6 @@ def test_a_surface_that_passes_an_edge_twice_gets_another_vertex():
     assert is_closed(welded(moved, apart)[1])
     volume = trimesh.Trimesh(moved, apart, process=False).volume
     assert volume == pytest.approx(cells.sum(), rel=0.05)
-
-
-def test_random_cells_are_closed():
     for seed in range(3):
         cells = np.random.default_rng(seed).random((5, 5, 5)) < 0.4
         moved, apart = separated(*cells_to_mesh(cells))

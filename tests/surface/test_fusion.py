@@ -12,21 +12,25 @@ from threestudio_gaussiandreamer.surface.fusion import DepthFusion
 SIZE, RADIUS = 96, 0.7
 
 
+def traced(c2w, fovy, size, radius):
+    """Return the exact depth (B, size, size) and opacity of a ball around the origin."""
+    rays = ray_directions(c2w, fovy, size, size, normalize=False)
+    origin = c2w[:, None, None, :3, 3]
+    a, b = rays.square().sum(-1), (rays * origin).sum(-1)
+    root = b.square() - a * (origin.square().sum(-1) - radius**2)
+    alpha = (root > 0).float()
+    return alpha * (-b - root.clamp_min(0).sqrt()) / a, alpha
+
+
 def views_of_a_ball(elevations):
     """Yield cameras with the exact depth and opacity of a ball around the origin."""
     count = len(elevations)
     fovy = torch.full((count,), math.radians(50))
     azimuth = torch.arange(count) * 137.5
-    orbit = Orbit(torch.tensor(elevations), azimuth, torch.full((count,), 2.5), fovy)
-    c2w = orbit.c2w
-    rays = ray_directions(c2w, fovy, SIZE, SIZE, normalize=False)
-    origin = c2w[:, None, None, :3, 3]
-    a, b = rays.square().sum(-1), (rays * origin).sum(-1)
-    inside = b.square() - a * (origin.square().sum(-1) - RADIUS**2)
-    depth = (-b - inside.clamp_min(0).sqrt()) / a
-    alpha = (inside > 0).float()
+    c2w = Orbit(torch.tensor(elevations), azimuth, torch.full((count,), 2.5), fovy).c2w
+    depth, alpha = traced(c2w, fovy, SIZE, RADIUS)
     viewmats, Ks = to_opencv(c2w, fovy, SIZE, SIZE)
-    yield from zip(viewmats, Ks, depth * alpha, torch.zeros_like(depth), alpha, strict=True)
+    yield from zip(viewmats, Ks, depth, torch.zeros_like(depth), alpha, strict=True)
 
 
 def fused(views, resolution=32):
@@ -41,26 +45,18 @@ def radii(fusion):
     return np.linalg.norm(index * fusion.cell + fusion.origin.numpy(), axis=-1)
 
 
-def test_the_distance_is_zero_at_the_surface():
+def test_the_distance_is_zero_at_the_surface_and_what_no_view_sees_is_inside():
     fusion = fused(views_of_a_ball([-60.0, -30, 0, 15, 30, 60, -15, 45, 75, -75, 5, -45]))
     field, distance = fusion.field(), radii(fusion) - RADIUS
     assert (field[distance > fusion.cell] > 0).all()
     assert (field[distance < -fusion.cell] < 0).all()
     across = field[:, field.shape[1] // 2, field.shape[2] // 2]
     assert (np.diff(across[: len(across) // 2]) <= 1e-3).all()  # falls towards the middle
-
-
-def test_what_no_view_sees_is_inside_and_the_border_outside():
-    field = fused(
-        views_of_a_ball([60.0, 70, 80])
-    ).field()  # from above: the underside is never seen
+    field = fused(views_of_a_ball([60.0, 70, 80])).field()  # the underside is never seen
     x, y, z = (n // 2 for n in field.shape)
     assert field[x, y, z] < 0 and field[x, y, 4] < 0
     for axis in range(3):
         assert (np.take(field, [0, -1], axis=axis) == 1).all()
-
-
-def test_an_uncertain_depth_counts_less():
     views = list(views_of_a_ball([0.0, 20, 40, -20, -40]))
     wrong = [
         (viewmat, K, depth - 0.2 * alpha, torch.full_like(depth, 1.0), alpha)

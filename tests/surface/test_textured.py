@@ -92,13 +92,19 @@ def test_tips_that_simplification_cuts_off_are_dropped(caplog):
     assert "loose parts below" in caplog.text
 
 
-def test_a_cloud_without_visible_gaussians_is_refused_before_rendering(monkeypatch):
+def test_a_cloud_without_visible_gaussians_and_a_missing_library_are_refused(monkeypatch):
     with pytest.raises(UserError, match="no view is covered to more than half"):  # fog
         mesh_from_gaussians(painted_ball(30, opacity=0.05), SMALL)
     monkeypatch.setattr(textured, "render", None)
     for gaussians in (painted_ball(300).rows(slice(0)), painted_ball(300, opacity=0.01)):
         with pytest.raises(UserError, match="form no surface"):
             mesh_from_gaussians(gaussians, SMALL)
+    monkeypatch.setattr(textured, "finite", None)
+    for library in ("xatlas", "fast_simplification", "skimage"):  # the first of many is named
+        monkeypatch.setitem(sys.modules, library, None)
+        said = rf"needs {library} .*threestudio-gaussiandreamer\[mesh\]"
+        with pytest.raises(UserError, match=said):
+            mesh_from_gaussians(painted_ball(20))
 
 
 def test_a_part_as_thin_as_a_cell_stays(caplog):
@@ -133,12 +139,3 @@ def test_wrong_options_are_refused_before_any_work(options, message, monkeypatch
     monkeypatch.setattr(textured, "finite", None)
     with pytest.raises(UserError, match=message):
         mesh_from_gaussians(painted_ball(20), MeshOptions(**options), "--")
-
-
-def test_a_missing_library_is_named_with_its_extra(monkeypatch):
-    monkeypatch.setattr(textured, "finite", None)
-    for library in ("xatlas", "fast_simplification", "skimage"):  # the first of many is named
-        monkeypatch.setitem(sys.modules, library, None)
-        said = rf"needs {library} .*threestudio-gaussiandreamer\[mesh\]"
-        with pytest.raises(UserError, match=said):
-            mesh_from_gaussians(painted_ball(20))
