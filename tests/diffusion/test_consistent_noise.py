@@ -6,6 +6,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
+from tests.surface.test_fusion import traced
 from threestudio_gaussiandreamer.cameras import focal_length, orbit_c2w, surface_points
 from threestudio_gaussiandreamer.diffusion.consistent_noise import (
     LATTICES,
@@ -17,25 +18,12 @@ from threestudio_gaussiandreamer.diffusion.consistent_noise import (
     surface_cells,
 )
 
-FOVY = math.radians(50)
 
-
-def ball(azimuths, size, distance=3.0):
+def ball(azimuths, size):
     """Return depth and opacity of a unit ball at the origin, ray traced, and its cameras."""
-    count = len(azimuths)
-    values = torch.full((count,), 15.0), torch.tensor(azimuths), torch.full((count,), distance)
-    c2w = orbit_c2w(*values)
-    half = math.tan(FOVY / 2)
-    grid = (torch.arange(size) + 0.5) / size * 2 - 1
-    y, x = torch.meshgrid(-grid * half, grid * half, indexing="ij")
-    rays = torch.stack([x, y, torch.full_like(x, -1.0)], -1)
-    # |position + s ray| = 1 with the ball's centre at distance along the view direction
-    a, b = rays.square().sum(-1), -distance * torch.ones_like(x)
-    root = b**2 - a * (distance**2 - 1)
-    hit = root > 0
-    s = torch.where(hit, (-b - root.clamp_min(0).sqrt()) / a, torch.zeros_like(a))
-    images = [image[None, ..., None].expand(count, -1, -1, -1) for image in (s, hit.float())]
-    return *images, c2w, torch.full((count,), FOVY)
+    elevation, distance, fovy = torch.tensor([15.0, 3, math.radians(50)]).repeat(len(azimuths), 1).T
+    c2w = orbit_c2w(elevation, torch.tensor(azimuths), distance)
+    return *(image[..., None] for image in traced(c2w, fovy, size, 1.0)), c2w, fovy
 
 
 def table(seed=0, channels=4):
@@ -45,17 +33,6 @@ def table(seed=0, channels=4):
 def noise_of(size, table, view, draw=0, first=0):
     """Return the noise of latents of size x size pixels."""
     return attached_noise((size, size), table, draw, first, *view)
-
-
-def test_a_model_that_gets_renders_squeezed_sees_the_noise_of_the_same_points():
-    """A pixel of latents as wide as high is in the middle of three square ones."""
-    depth, opacity, *cameras = ball([20.0], 96)
-    wide = [F.pad(image[..., 0], (96, 96))[..., None] for image in (depth, opacity)]
-    squeezed = attached_noise((32, 32), table(), 0, 0, *wide, *cameras)
-    whole = attached_noise((32, 96), table(), 0, 0, *wide, *cameras)
-    inside = wide[1][0, 1::3, 4::9, 0] > 0
-    assert inside.sum() > 50
-    assert torch.equal(squeezed[..., inside], whole[..., 1::3][..., inside])
 
 
 def test_pixels_are_standard_normal_and_hardly_correlated():
@@ -72,16 +49,13 @@ def test_pixels_are_standard_normal_and_hardly_correlated():
     assert abs(float(neighbours.mean())) < 0.25
 
 
-def test_near_views_see_the_same_noise_and_far_views_do_not():
+def test_near_views_see_the_same_noise_but_on_the_background():
     size, view = 32, ball([0.0, 0.0, 0.5, 90.0], 128)
     noise = noise_of(size, table(), view)
     centre = noise[:, :, 12:20, 12:20].flatten(1)
     correlation = torch.corrcoef(centre)
     assert torch.equal(centre[0], centre[1])
     assert correlation[0, 2] > 0.5 and abs(correlation[0, 3]) < 0.2
-
-
-def test_the_background_has_noise_of_its_own_in_each_view_and_draw():
     size, view = 32, ball([0.0, 0.0], 128)
     noise, again = noise_of(size, table(), view), noise_of(size, table(), view, draw=7)
     assert torch.equal(noise_of(size, table(), [x[1:] for x in view], first=1)[0], noise[1])
@@ -93,7 +67,7 @@ def test_the_background_has_noise_of_its_own_in_each_view_and_draw():
     assert len(noise[0][corner].unique()) == 4 * 6 * 6
 
 
-def test_cells_are_cubes_of_each_lattice():
+def test_cells_are_cubes_of_each_lattice_also_of_renders_that_are_squeezed():
     """The hash by Python's integers; a pixel is the sum of its cells in all lattices."""
     depth, opacity, c2w, fovy = view = ball([30.0, 200.0], 16)
     focal = focal_length(fovy, 16)
@@ -109,3 +83,10 @@ def test_cells_are_cubes_of_each_lattice():
     expected = sum(values[:, row.long()] for row in rows).transpose(0, 1)
     inside = opacity[:, None, :, :, 0] > 0
     torch.testing.assert_close(noise_of(16, values, view) * inside, expected * inside)
+    depth, opacity, *cameras = ball([20.0], 96)
+    wide = [F.pad(image[..., 0], (96, 96))[..., None] for image in (depth, opacity)]
+    squeezed = attached_noise((32, 32), table(), 0, 0, *wide, *cameras)
+    whole = attached_noise((32, 96), table(), 0, 0, *wide, *cameras)
+    inside = wide[1][0, 1::3, 4::9, 0] > 0
+    assert inside.sum() > 50
+    assert torch.equal(squeezed[..., inside], whole[..., 1::3][..., inside])

@@ -51,15 +51,12 @@ def test_eps_is_the_score_of_the_density(modes, dims, t, seed):
     assert (perplexity >= 1 - 1e-9).all() and (perplexity <= modes + 1e-9).all()
 
 
-def test_the_perplexity_counts_the_modes_that_share_z():
+def test_the_perplexity_counts_the_modes_and_items_are_independent():
     z, bank, abar = 1e4 * randn(3, 6), randn(7, 6, seed=1), ABAR[torch.tensor([0, 400, 999])]
     assert torch.isfinite(denoised(z, abar, bank)[0]).all()
     corners = torch.eye(4, dtype=torch.float64)
     for z, t, modes in ((torch.zeros_like(corners[:1]), 500, 4), (1e3 * corners[:1], 0, 1)):
         assert math.isclose(denoised(z, ABAR[t : t + 1], corners)[1], modes, abs_tol=1e-12)
-
-
-def test_items_are_independent_with_shared_and_with_separate_banks():
     z, abar, own = randn(3, 12), ABAR[torch.tensor([5, 400, 950])], randn(3, 4, 12, seed=1)
     log_prior = randn(3, 4, seed=2)
     for bank in (own, own[0]):
@@ -75,14 +72,7 @@ def test_items_are_independent_with_shared_and_with_separate_banks():
     torch.testing.assert_close(denoised(z, abar, own, excluded)[0], expected, rtol=0, atol=1e-12)
 
 
-def test_distances_in_chunks_are_the_distances(monkeypatch):
-    z, bank, abar = randn(2, 30), randn(11, 30, seed=1), ABAR[torch.tensor([50, 700])]
-    whole = squared_distances(z, bank, abar)
-    monkeypatch.setattr("threestudio_gaussiandreamer.diffusion.exact_score.CPU_CHUNK_ELEMENTS", 150)
-    torch.testing.assert_close(squared_distances(z, bank, abar), whole, rtol=1e-15, atol=0)
-
-
-def test_logits_in_float32_at_512_are_stable():
+def test_logits_in_float32_at_512_are_stable_and_those_of_chunks_the_same(monkeypatch):
     """Nearly equal, so that they cancel: within 0.01 nat of those of differences."""
     size, abar = 3 * 512 * 512, ABAR[20:21]
     bank = torch.rand(2, size, generator=torch.Generator().manual_seed(0)) * 2 - 1
@@ -92,6 +82,10 @@ def test_logits_in_float32_at_512_are_stable():
     found = squared_distances(z, bank, abar)[0]
     gaps = [float(values[0] - values[1]) / float(2 * (1 - abar)) for values in (found, exact)]
     assert abs(gaps[0] - gaps[1]) < 0.01
+    z, bank, abar = randn(2, 30), randn(11, 30, seed=1), ABAR[torch.tensor([50, 700])]
+    whole = squared_distances(z, bank, abar)
+    monkeypatch.setattr("threestudio_gaussiandreamer.diffusion.exact_score.CPU_CHUNK_ELEMENTS", 150)
+    torch.testing.assert_close(squared_distances(z, bank, abar), whole, rtol=1e-15, atol=0)
 
 
 @pytest.mark.parametrize("matrix", [None, COLOR_MATRIX], ids=["pixels", "colours"])

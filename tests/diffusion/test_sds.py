@@ -10,7 +10,7 @@ from threestudio_gaussiandreamer.diffusion import sds
 ABAR = sds.sd_alphas_cumprod()
 
 
-def test_the_schedule_is_stable_diffusions():
+def test_the_schedule_is_stable_diffusions_and_predictions_are_converted_to_the_noise():
     assert ABAR.dtype == torch.float64 and len(ABAR) == 1000
     # Published figures of the scaled-linear schedule: sigma_0 = .029, sqrt(abar/(1-abar)) = 7.2 at
     # t = 20 and .077 at 980.
@@ -19,24 +19,36 @@ def test_the_schedule_is_stable_diffusions():
     assert math.isclose(ratio[20], 7.2, abs_tol=0.05) and math.isclose(
         ratio[980], 0.077, abs_tol=5e-4
     )
+    x, eps = torch.randn(2, 3, 5, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    abar = ABAR[torch.tensor([20, 500, 980])]
+    a, sigma = abar.sqrt()[:, None], (1 - abar).sqrt()[:, None]
+    outputs = {"epsilon": eps, "v_prediction": a * eps - sigma * x, "sample": x}
+    outputs["velocity"] = eps - x
+    assert outputs.keys() == sds.PREDICTIONS.keys()
+    for name, output in outputs.items():
+        found = sds.PREDICTIONS[name](output, a * x + sigma * eps, abar)
+        torch.testing.assert_close(found, eps, rtol=0, atol=1e-12)
 
 
-def test_step_range_is_clamped_to_the_valid_timesteps():
+def test_timesteps_cover_the_valid_range_and_stratified_ones_lie_one_in_each_part():
     cases = [(0.02, 0.98, 20, 980), (0.0, 1.0, 1, 999), (1.0, 1.0, 999, 999), (0.02, 0.55, 20, 550)]
     for low, high, first, last in cases:
         assert sds.step_range(low, high) == (first, last)
     with pytest.raises(UserError, match="min_step_percent: 0.5 is above"):
         sds.step_range(0.5, 0.4)
-
-
-def test_timesteps_cover_the_range_with_both_ends():
     for low, high, last in ((20, 27, 27), (0, 10, 4)):
         options = {"seed": 0, "num_train": 1000 if low else 5}
         draws = torch.cat([sds.timesteps(8, low, high, step=step, **options) for step in range(99)])
         assert set(draws.tolist()) == set(range(max(low, 1), last + 1))
+    rng, batch = torch.Generator().manual_seed(3), 7
+    draws = torch.stack([sds.stratified_timesteps(batch, 1000, rng) for _ in range(200)])
+    low, high = torch.arange(batch) * 1000 // batch, (torch.arange(batch) + 1) * 1000 / batch
+    ordered = draws.sort(1).values
+    assert (ordered >= low).all() and (ordered <= high).all()
+    assert draws.min() < 20 and draws.max() > 980 and (draws[:, 0] != draws[0, 0]).any()
 
 
-def test_weights_guidance_and_loss_by_their_formulas():
+def test_weights_guidance_loss_and_ddim_by_their_formulas():
     quarter = torch.tensor([0.25], dtype=torch.float64)
     for name, value in {"sds": 0.75, "uniform": 1.0, "fantasia3d": 0.375}.items():
         assert sds.WEIGHTS[name](quarter).item() == value
@@ -48,9 +60,6 @@ def test_weights_guidance_and_loss_by_their_formulas():
     (found,) = torch.autograd.grad(loss, x)
     torch.testing.assert_close(found, grad / 4)
     torch.testing.assert_close(loss.detach(), 0.5 * grad.square().sum() / 4)
-
-
-def test_ddim_with_the_true_noise_of_a_point_lands_on_it():
     point = torch.randn(1, 5, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
 
     def predict(z, t):
@@ -63,27 +72,6 @@ def test_ddim_with_the_true_noise_of_a_point_lands_on_it():
         torch.testing.assert_close(out, point.expand(3, 5), rtol=0, atol=1e-11)
 
 
-def test_stratified_timesteps_lie_one_in_each_range():
-    rng, batch = torch.Generator().manual_seed(3), 7
-    draws = torch.stack([sds.stratified_timesteps(batch, 1000, rng) for _ in range(200)])
-    low, high = torch.arange(batch) * 1000 // batch, (torch.arange(batch) + 1) * 1000 / batch
-    ordered = draws.sort(1).values
-    assert (ordered >= low).all() and (ordered <= high).all()
-    assert draws.min() < 20 and draws.max() > 980 and (draws[:, 0] != draws[0, 0]).any()
-
-
-def test_every_prediction_type_is_converted_to_the_noise():
-    x, eps = torch.randn(2, 3, 5, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    abar = ABAR[torch.tensor([20, 500, 980])]
-    a, sigma = abar.sqrt()[:, None], (1 - abar).sqrt()[:, None]
-    outputs = {"epsilon": eps, "v_prediction": a * eps - sigma * x, "sample": x}
-    outputs["velocity"] = eps - x
-    assert outputs.keys() == sds.PREDICTIONS.keys()
-    for name, output in outputs.items():
-        found = sds.PREDICTIONS[name](output, a * x + sigma * eps, abar)
-        torch.testing.assert_close(found, eps, rtol=0, atol=1e-12)
-
-
 SIGMA = torch.tensor([0.002, 0.3, 0.6, 0.95, 0.999], dtype=torch.float64)
 
 
@@ -91,7 +79,7 @@ def randn(*shape, seed=0):
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
-def test_a_noisy_latent_lies_on_the_straight_path():
+def test_a_noisy_latent_lies_on_the_straight_path_of_diffusers_sigmas():
     x, eps = randn(2, 5, 7)
     abar = sds.abar_of_sigma(SIGMA)
     torch.testing.assert_close(sds.sigma_of_abar(abar), SIGMA)
@@ -103,9 +91,12 @@ def test_a_noisy_latent_lies_on_the_straight_path():
     path = (1 - SIGMA)[:, None] * x + SIGMA[:, None] * eps
     torch.testing.assert_close(sds.on_path(z, abar), path)
     torch.testing.assert_close(sds.noise_of_velocity(eps - x, z, abar), eps)
-
-
-def test_the_scheduler_of_diffusers_has_the_same_sigmas():
+    x, eps, guess = randn(3, 5, 7)
+    abar = sds.abar_of_sigma(SIGMA)
+    z = sds.diffuse(x, eps, abar)
+    torch.testing.assert_close(sds.predict_x0(z, eps, abar), x)
+    grad = sds.per_item(sds.WEIGHTS["x0"](abar), eps) * (guess - eps)
+    torch.testing.assert_close(grad, x - sds.predict_x0(z, guess, abar), rtol=1e-9, atol=1e-9)
     scheduler = pytest.importorskip("diffusers").FlowMatchEulerDiscreteScheduler(shift=3.0)
     sigmas = sds.shifted_sigmas(1000, 3.0)
     # theirs are in decreasing order and end at timestep 1
@@ -128,12 +119,3 @@ def test_a_mixtures_velocity_is_its_score(sigma):
     x0 = torch.softmax(shares.log() - gaps / (2 * sigma**2), 0) @ centers
     found = sds.noise_of_velocity((on_path - x0) / sigma, z, abar)  # E[eps - x | z]
     torch.testing.assert_close(found, eps, rtol=1e-9, atol=1e-9)
-
-
-def test_the_weight_of_x0_gives_the_distance_to_the_denoised_picture():
-    x, eps, guess = randn(3, 5, 7)
-    abar = sds.abar_of_sigma(SIGMA)
-    z = sds.diffuse(x, eps, abar)
-    torch.testing.assert_close(sds.predict_x0(z, eps, abar), x)
-    grad = sds.per_item(sds.WEIGHTS["x0"](abar), eps) * (guess - eps)
-    torch.testing.assert_close(grad, x - sds.predict_x0(z, guess, abar), rtol=1e-9, atol=1e-9)

@@ -72,18 +72,8 @@ def guidance(mesh_path, **options):
 
 
 def batch(*azimuths, elevation=10.0, height=16, width=16):
-    values = (
-        torch.full((len(azimuths),), elevation),
-        torch.tensor(azimuths),
-        torch.full((len(azimuths),), 2.7),
-    )
-    fovy = torch.full((len(azimuths),), math.radians(50))
-    return {
-        "c2w": cameras.orbit_c2w(*values),
-        "fovy": fovy,
-        "elevation": values[0],
-        "azimuth": values[1],
-        "camera_distances": values[2],
-        "height": height,
-        "width": width,
-    }
+    same = torch.ones(len(azimuths))
+    angles = {"elevation": elevation * same, "azimuth": torch.tensor(azimuths)}
+    angles["camera_distances"] = 2.7 * same
+    c2w, fovy = cameras.orbit_c2w(*angles.values()), math.radians(50) * same
+    return angles | {"c2w": c2w, "fovy": fovy, "height": height, "width": width}

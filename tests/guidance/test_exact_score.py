@@ -48,7 +48,7 @@ def test_planned_pictures_are_cast_with_the_first_one_and_not_again(mesh_path, m
         cast.clear()
 
 
-def test_the_target_is_the_mesh_on_the_renders_background(mesh_path):
+def test_the_target_is_the_mesh_on_the_renders_background_also_in_evaluation(mesh_path):
     truth, views = guidance(mesh_path).truth, batch(*VIEWS)
     target = truth.render(views, BACKGROUNDS)
     assert target.shape == (3, 16, 16, 3)
@@ -58,6 +58,11 @@ def test_the_target_is_the_mesh_on_the_renders_background(mesh_path):
     torch.testing.assert_close(truth.render(views, BACKGROUNDS.expand(3, 16, 16, 3)), target)
     assert truth.render(views, size=(8, 12)).shape == (3, 8, 12, 3)
     assert torch.equal(truth.render(views)[:, 0, 0], torch.zeros(3, 3))
+    exact, views = guidance(mesh_path), batch(*VIEWS) | {"comp_rgb_bg": BACKGROUNDS}
+    out = exact(uniform(3, 16, 16, 3), None, guidance_eval=True, **views)["eval"]
+    target = exact.truth.render(views, BACKGROUNDS)
+    for name in ("imgs_1step", "imgs_1orig", "imgs_final"):  # float32 noise times sigma/a
+        torch.testing.assert_close(out[name], target, rtol=0, atol=1e-4)
 
 
 def test_view_exact_is_a_weighted_squared_error(mesh_path, monkeypatch):
@@ -165,14 +170,6 @@ def test_the_cameras_own_view_is_one_of_the_modes(mesh_path, mode, modes):
     torch.testing.assert_close((mixture.own.movedim(0, -1) + 1) / 2, truth)
 
 
-def test_evaluation_shows_the_truth(mesh_path):
-    exact, views = guidance(mesh_path), batch(*VIEWS) | {"comp_rgb_bg": BACKGROUNDS}
-    out = exact(uniform(3, 16, 16, 3), None, guidance_eval=True, **views)["eval"]
-    target = exact.truth.render(views, BACKGROUNDS)
-    for name in ("imgs_1step", "imgs_1orig", "imgs_final"):  # float32 noise times sigma/a
-        torch.testing.assert_close(out[name], target, rtol=0, atol=1e-4)
-
-
 def test_sizes_that_do_not_fit_are_named(mesh_path):
     with pytest.raises(UserError, match="pictures of 64x64 can't be pooled to a latent 33 high"):
         ExactScoreGuidance(
@@ -185,7 +182,7 @@ def test_sizes_that_do_not_fit_are_named(mesh_path):
             step(exact, uniform(1, size, size, 3), **batch(0.0))
 
 
-def test_a_view_without_its_direction_in_the_bank_beside_others_with_guidance(mesh_path):
+def test_a_view_without_its_direction_in_the_bank_and_the_count_of_evaluations(mesh_path):
     """The bank has no view from above: such a view's guided score is the conditional one."""
     guide = guidance(mesh_path, mode="direction-bins", guidance_scale=7.5)
     views = batch(0.0, 0.0)
@@ -195,9 +192,6 @@ def test_a_view_without_its_direction_in_the_bank_beside_others_with_guidance(me
     assert [bool(mixture.log_prior.any()) for mixture in condition] == [True, False]
     cond, uncond = guide.predict(z, torch.tensor([400, 400]), condition)
     assert torch.equal(cond[1], uncond[1]) and not torch.equal(cond[0], uncond[0])
-
-
-def test_one_of_the_two_predictions_counts_as_one_evaluation(mesh_path):
     guide = guidance(mesh_path, mode="direction-bins", guidance_scale=7.5)
     z, t = guide.encode(uniform(2, 3, 16, 16)) + 0.1, torch.tensor([400, 400])
     condition = guide.condition(None, **batch(0.0, 90.0))

@@ -114,7 +114,7 @@ def test_content_that_no_run_can_use_is_named(returned, message):
         call_guidance(*inputs)
 
 
-def test_what_a_guidance_learnt_is_put_back():
+def test_what_a_guidance_learnt_is_put_back_and_its_draws_are_functions_of_the_step():
     guidance, other = LearningDouble(), LearningDouble()
     assert trainable_groups(ImageDouble(), 1e-3) == []
     (group,) = trainable_groups(guidance, 1e-3)
@@ -129,8 +129,6 @@ def test_what_a_guidance_learnt_is_put_back():
     with pytest.raises(UserError, match="had learnt 1 tensors, and ImageDouble learns 0"):
         restore_learnt(ImageDouble(), weights)
 
-
-def test_global_draws_are_functions_of_the_step_and_leave_no_trace():
     def draw(step):
         with own_randomness(step):
             return torch.rand(3)

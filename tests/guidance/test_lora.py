@@ -57,7 +57,7 @@ def merged(guide, particles):
     return unet
 
 
-def test_the_lora_is_in_every_attention_and_starts_as_the_unet(models, prompts):
+def test_the_lora_is_in_every_attention_starts_as_the_unet_and_is_restored(models, prompts):
     guide, particles = vsd(models)
     attentions = [m for m in guide.unet.modules() if type(m).__name__ == "Attention"]
     layers = {id(x) for m in attentions for x in (m.to_q, m.to_k, m.to_v, m.to_out[0])}
@@ -66,6 +66,22 @@ def test_the_lora_is_in_every_attention_and_starts_as_the_unet(models, prompts):
     with torch.no_grad():
         own = particles.predict(guide, noised, condition, cameras())
         assert torch.equal(own, guide.conditional(noised.z, noised.t, condition))
+    guide, particles = vsd(models, lr=1e-3)
+    latents, _, condition = inputs(guide, prompts)
+    learn(guide, latents, condition)
+    saved = {name: value.clone() for name, value in guide.variant.state().items()}
+    other, restored = vsd(models, lr=1e-3)
+    other.variant.restore(other, saved)
+    for guidance in (guide, other):
+        guidance.update_step(0, 1)
+        learn(guidance, latents, condition)
+    ours, theirs = particles.state(), restored.state()
+    assert ours.keys() == theirs.keys() == saved.keys()
+    assert all(torch.equal(ours[name], theirs[name]) for name in ours)
+    assert any(not torch.equal(ours[name], saved[name]) for name in ours)
+    smaller, _ = vsd(models, rank=2)
+    with pytest.raises(UserError, match="had learnt .* resume with the configuration"):
+        smaller.variant.restore(smaller, saved)
 
 
 @pytest.mark.parametrize("prediction", tiny.PREDICTIONS)
@@ -115,7 +131,7 @@ def test_the_lora_follows_the_gradient_of_the_mean_squared_error(models, prompts
         torch.testing.assert_close(down.grad, up.T @ whole, rtol=1e-3, atol=1e-6)
 
 
-def test_the_lora_learns_the_renders_and_leaves_the_unet_alone(models, prompts):
+def test_the_lora_alone_learns_and_not_in_evaluations_or_from_bad_items(models, prompts):
     guide, particles = vsd(models, lr=1e-2)
     before = {name: value.clone() for name, value in guide.unet.state_dict().items()}
     latents, noised, condition = inputs(guide, prompts)
@@ -132,9 +148,6 @@ def test_the_lora_learns_the_renders_and_leaves_the_unet_alone(models, prompts):
     after = guide.unet.state_dict()
     assert all(torch.equal(after[name], value) for name, value in before.items())
     assert not any(layer._forward_hooks for layer in guide.unet.modules())
-
-
-def test_an_evaluation_does_not_train_and_bad_items_are_not_learnt(models, prompts):
     guide, particles = vsd(models)
     before = {name: value.clone() for name, value in particles.state().items()}
     rgb, views = tiny.renders(2), tiny.first(2) | cameras(2)
@@ -148,22 +161,3 @@ def test_an_evaluation_does_not_train_and_bad_items_are_not_learnt(models, promp
     assert learn(guide, latents, condition, good)["lora_error"] > 0
     assert all(value.isfinite().all() for value in particles.state().values())
     assert learn(guide, latents, condition, ~GOOD) == {}
-
-
-def test_a_restored_lora_continues_bit_for_bit(models, prompts):
-    guide, particles = vsd(models, lr=1e-3)
-    latents, _, condition = inputs(guide, prompts)
-    learn(guide, latents, condition)
-    saved = {name: value.clone() for name, value in guide.variant.state().items()}
-    other, restored = vsd(models, lr=1e-3)
-    other.variant.restore(other, saved)
-    for guidance in (guide, other):
-        guidance.update_step(0, 1)
-        learn(guidance, latents, condition)
-    ours, theirs = particles.state(), restored.state()
-    assert ours.keys() == theirs.keys() == saved.keys()
-    assert all(torch.equal(ours[name], theirs[name]) for name in ours)
-    assert any(not torch.equal(ours[name], saved[name]) for name in ours)
-    smaller, _ = vsd(models, rank=2)
-    with pytest.raises(UserError, match="had learnt .* resume with the configuration"):
-        smaller.variant.restore(smaller, saved)

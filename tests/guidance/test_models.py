@@ -208,7 +208,7 @@ def test_a_vae_that_overflows_stays_in_float32(
     assert relative(mine, reference_gradient(XL, folder, prompts, rgb, scale=100.0)) < 0.5
 
 
-def test_the_unet_of_xl_gets_the_pooled_embedding_and_the_sizes(large):
+def test_what_the_unets_of_xl_and_if_get_and_give(large):
     model, prompts = large(XL)
     guide = guidance(XL, model, image_size=128)
     guide.unet = recorder = Recorder(guide.unet)
@@ -217,6 +217,19 @@ def test_the_unet_of_xl_gets_the_pooled_embedding_and_the_sizes(large):
     added = options["added_cond_kwargs"]
     assert added["time_ids"].tolist() == [[128, 128, 0, 0, 128, 128]] * 8
     assert torch.equal(added["text_embeds"][4:], prompts.uncond_text_embeddings_vd[:4, -1, :POOLED])
+    model, _ = large(IF)
+    guide, rgb = guidance(IF, model), renders(size=16)
+    prompts = large_tiny.prompts(IF, model, use_perp_neg=True)
+    before, _ = gradient(guide, prompts, rgb)
+    with torch.no_grad():
+        guide.unet.conv_out.weight[3:] += 1.0
+    assert torch.equal(before, gradient(guide, prompts, rgb)[0])
+    # its cosine schedule ends at 2.4e-9, below the value that replaces a signal of exactly 0
+    from diffusers import DDPMScheduler
+
+    expected = DDPMScheduler.from_pretrained(model, subfolder="scheduler").alphas_cumprod.double()
+    torch.testing.assert_close(guide.alphas_cumprod, expected, rtol=1e-3, atol=0)
+    assert guide.alphas_cumprod[-1] < 1e-8 and guide.text_width == tiny_models.TEXT_WIDTH  # of T5
 
 
 @pytest.mark.parametrize("shift", [None, 1.0])
@@ -235,22 +248,6 @@ def test_the_gradient_of_a_flow_towards_one_known_latent_is_the_closed_form(larg
     sigma = sigma_of(guide.draw_timesteps(latents)[0].double(), shift or 3.0)
     expected = (latents.detach().double() - target.movedim(1, -1)) / sigma[:, None, None, None] / 4
     assert relative(mine, expected) < 1e-5
-
-
-def test_the_variance_that_the_unet_of_if_also_predicts_is_left_out(large):
-    model, _ = large(IF)
-    guide, rgb = guidance(IF, model), renders(size=16)
-    prompts = large_tiny.prompts(IF, model, use_perp_neg=True)
-    before, _ = gradient(guide, prompts, rgb)
-    with torch.no_grad():
-        guide.unet.conv_out.weight[3:] += 1.0
-    assert torch.equal(before, gradient(guide, prompts, rgb)[0])
-    # its cosine schedule ends at 2.4e-9, below the value that replaces a signal of exactly 0
-    from diffusers import DDPMScheduler
-
-    expected = DDPMScheduler.from_pretrained(model, subfolder="scheduler").alphas_cumprod.double()
-    torch.testing.assert_close(guide.alphas_cumprod, expected, rtol=1e-3, atol=0)
-    assert guide.alphas_cumprod[-1] < 1e-8 and guide.text_width == tiny_models.TEXT_WIDTH  # of T5
 
 
 @pytest.mark.parametrize(
@@ -275,16 +272,13 @@ def test_the_size_is_the_models_unless_given(large, caplog, kind, trained, other
         guidance(kind, model, image_size=wrong)
 
 
-def test_a_shift_that_depends_on_the_picture_is_asked_for(tmp_path):
+def test_other_models_and_shifts_that_depend_on_the_picture_are_refused(tmp_path, large):
     folder = tiny_models.stable_diffusion_3(tmp_path / "dynamic")
     file = folder / "scheduler" / "scheduler_config.json"
     file.write_text(json.dumps(json.loads(file.read_text()) | {"use_dynamic_shifting": True}))
     with pytest.raises(UserError, match="set system.guidance.flow_shift"):
         guidance(SD3, folder)
     assert guidance(SD3, folder, flow_shift=3.0).image_size == 64
-
-
-def test_other_models_are_refused_by_name(large):
     (model, prompts), (other, _) = large(XL), large(SD)
     said = "isn't Stable Diffusion XL, but Stable Diffusion 1.x.*--config gaussiandreamer.yaml"
     for build in (guidance, large_tiny.prompts):

@@ -97,9 +97,7 @@ def test_the_gradient_towards_known_views_is_the_closed_form(model, prompts, sha
     assert relative(mine, expected[[2, 0, 3, 1]]) > 0.1, "views could be exchanged"
 
 
-def test_a_single_view_is_evaluated_alone_and_parts_of_a_group_are_refused(
-    model, prompts, monkeypatch
-):
+def test_a_single_view_is_alone_and_parts_of_a_group_are_refused(model, prompts, monkeypatch):
     """With one view per group the network is that of the view alone."""
     monkeypatch.setattr(base, "EVAL_STEPS", 2)
     guides = [tiny.guidance(KIND, model, n_view=count) for count in (4, 1)]
@@ -112,10 +110,6 @@ def test_a_single_view_is_evaluated_alone_and_parts_of_a_group_are_refused(
     said = "sees 4 views .*together, and a batch has 3: set data.n_view=4"
     with pytest.raises(UserError, match=said):
         guides[0](renders(3), prompts, **first(ring(), 3))
-
-
-def test_memory_savers_keep_the_views_together(model, prompts):
-    """In float64, in which sums in another order are the same on any processor."""
     pytest.importorskip("accelerate")
     found, saving = [], ("enable_attention_slicing", "enable_sequential_cpu_offload")
     for options in ({}, dict.fromkeys(saving, True)):

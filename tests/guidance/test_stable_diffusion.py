@@ -11,24 +11,35 @@ from tests.helpers import tiny_models
 from tests.helpers.tiny_guidance import Recorder, gradient, guidance, relative, renders
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.diffusion.sds import perp_neg
-from threestudio_gaussiandreamer.guidance import stable_diffusion
 from threestudio_gaussiandreamer.guidance.text_to_image import resized
 from threestudio_gaussiandreamer.guidance.types import view_of_row
-from threestudio_gaussiandreamer.host import NAME, find
 
 pytest.importorskip("diffusers")
 
 
-def test_one_forward_pass_and_no_decoding_per_step(models, prompts):
+def test_one_forward_pass_per_step_which_draws_the_same_again(models, prompts):
     for options, perp, rows in (({}, False, 8), ({}, True, 16), ({"guidance_scale": 1}, False, 4)):
         guide = tiny.guidance(models, **options)
         guide.unet = recorder = tiny.Recorder(guide.unet)
         guide.vae.decode = lambda *args: pytest.fail("decoded in a training step")
         tiny.gradient(guide, prompts[perp], tiny.renders())
         assert [len(args[0]) for args, _ in recorder.calls] == [rows]
+    guide, rgb = tiny.guidance(models), tiny.renders()
+    guide.update_step(0, 7)
+    before, _ = tiny.gradient(guide, prompts[False], rgb)
+    _, out = tiny.gradient(guide, prompts[True], rgb, guidance_eval=True)
+    picture = out["eval"]["imgs_final"]
+    assert picture.shape == (4, 64, 64, 3) and 0 <= picture.min() <= picture.max() <= 1
+    guide.update_step(0, 8)
+    other, _ = tiny.gradient(guide, prompts[False], rgb)
+    resumed = tiny.guidance(models)
+    resumed.update_step(0, 7)
+    again, _ = tiny.gradient(resumed, prompts[False], rgb)
+    assert torch.equal(before, again)
+    assert not torch.equal(before, other)
 
 
-def test_perp_neg_of_four_views_is_that_of_each_alone(models, prompts):
+def test_perp_neg_is_that_of_each_view_and_takes_away_what_is_perpendicular(models, prompts):
     guide = tiny.guidance(models, recon_std_rescale=0.7)
     z, t = torch.randn(4, 4, 8, 8, generator=torch.Generator().manual_seed(0)), tiny.TIMESTEPS
     together = guide.predict_noise(z, t, guide.condition(prompts[True], **tiny.BATCH))
@@ -40,9 +51,6 @@ def test_perp_neg_of_four_views_is_that_of_each_alone(models, prompts):
         assert tiny.relative(together[i : i + 1], alone.double()) < 1e-5
     assert view_of_row(3, 12).tolist() == [0, 1, 2, 0, 1, 2, 0, 0, 1, 1, 2, 2]
     assert view_of_row(3, 6).tolist() == [0, 1, 2, 0, 1, 2]
-
-
-def test_perp_neg_takes_away_only_what_is_perpendicular():
     draw = torch.Generator().manual_seed(0)
     cond, uncond = torch.randn(2, 1, 4, 4, 4, generator=draw).double()
     direction = cond - uncond
@@ -55,25 +63,7 @@ def test_perp_neg_takes_away_only_what_is_perpendicular():
     assert float((change * (negative - uncond[:, None]).sum(1)).sum()) < 0
 
 
-def test_the_same_step_draws_the_same_and_looking_changes_nothing(models, prompts):
-    guide, rgb = tiny.guidance(models), tiny.renders()
-    guide.update_step(0, 7)
-    before, _ = tiny.gradient(guide, prompts[False], rgb)
-    _, out = tiny.gradient(guide, prompts[True], rgb, guidance_eval=True)
-    assert out["eval"]["bs"] == 4 and len(out["eval"]["texts"]) == 4
-    for name in ("imgs_noisy", "imgs_1step", "imgs_1orig", "imgs_final"):
-        picture = out["eval"][name]
-        assert picture.shape == (4, 64, 64, 3) and 0 <= picture.min() <= picture.max() <= 1
-    guide.update_step(0, 8)
-    other, _ = tiny.gradient(guide, prompts[False], rgb)
-    resumed = tiny.guidance(models)
-    resumed.update_step(0, 7)
-    again, _ = tiny.gradient(resumed, prompts[False], rgb)
-    assert torch.equal(before, again)
-    assert not torch.equal(before, other)
-
-
-def test_the_models_own_schedule_is_used(models, tmp_path):
+def test_the_models_own_schedule_is_used_and_other_models_are_refused(models, tmp_path):
     from diffusers import DDPMScheduler
 
     folder = tiny_models.stable_diffusion(tmp_path / "linear")
@@ -86,6 +76,27 @@ def test_the_models_own_schedule_is_used(models, tmp_path):
     roots = torch.linspace(0.00085**0.5, 0.012**0.5, 1000, dtype=torch.float64)
     expected, found = torch.cumprod(1 - roots**2, 0), tiny.guidance(models).alphas_cumprod
     torch.testing.assert_close(found, expected, rtol=1e-5, atol=0)  # diffusers' are float32
+    from diffusers import FlowMatchEulerDiscreteScheduler, UNet2DConditionModel
+
+    folder = tiny_models.stable_diffusion(tmp_path / "other", prediction="flow_prediction")
+    with pytest.raises(UserError, match="prediction_type.*did you mean 'v_prediction'"):
+        guidance({"epsilon": folder})
+    FlowMatchEulerDiscreteScheduler().save_pretrained(folder / "scheduler")
+    with pytest.raises(UserError, match="no beta_schedule"):
+        guidance({"epsilon": folder})
+    folder = tiny_models.stable_diffusion(tmp_path / "model")
+    config = UNet2DConditionModel.load_config(folder / "unet")
+    for trained in (None, [8, 8]):
+        text = json.dumps(dict(config) | {"sample_size": trained})
+        (folder / "unet" / "config.json").write_text(text)
+        with pytest.raises(UserError, match="set system.guidance.image_size"):
+            guidance({"epsilon": folder})
+    assert guidance({"epsilon": folder}, image_size=64).image_size == 64
+    for other in ({"in_channels": 9}, {"class_embed_type": "timestep"}):
+        UNet2DConditionModel.from_config(config | other).save_pretrained(folder / "unet")
+        said = "needs other inputs than text .*" + " ".join(map(str, *other.items()))
+        with pytest.raises(UserError, match=said):
+            guidance({"epsilon": folder})
 
 
 @pytest.mark.parametrize(
@@ -127,36 +138,6 @@ def test_an_unusual_guidance_scale_is_told_and_compiling_asked_for_once(
         assert ("guidance_scale" in caplog.text) == warned
         if scale == -5:
             assert asked == [guide.unet]
-
-
-def test_models_that_cannot_be_used_are_refused(tmp_path):
-    from diffusers import FlowMatchEulerDiscreteScheduler, UNet2DConditionModel
-
-    folder = tiny_models.stable_diffusion(tmp_path / "other", prediction="flow_prediction")
-    with pytest.raises(UserError, match="prediction_type.*did you mean 'v_prediction'"):
-        guidance({"epsilon": folder})
-    FlowMatchEulerDiscreteScheduler().save_pretrained(folder / "scheduler")
-    with pytest.raises(UserError, match="no beta_schedule"):
-        guidance({"epsilon": folder})
-    folder = tiny_models.stable_diffusion(tmp_path / "model")
-    config = UNet2DConditionModel.load_config(folder / "unet")
-    for trained in (None, [8, 8]):
-        text = json.dumps(dict(config) | {"sample_size": trained})
-        (folder / "unet" / "config.json").write_text(text)
-        with pytest.raises(UserError, match="set system.guidance.image_size"):
-            guidance({"epsilon": folder})
-    assert guidance({"epsilon": folder}, image_size=64).image_size == 64
-    for other in ({"in_channels": 9}, {"class_embed_type": "timestep"}):
-        UNet2DConditionModel.from_config(config | other).save_pretrained(folder / "unet")
-        said = "needs other inputs than text .*" + " ".join(map(str, *other.items()))
-        with pytest.raises(UserError, match=said):
-            guidance({"epsilon": folder})
-
-
-def test_the_name_of_threestudio_is_this_part_where_it_is_not_the_host():
-    if NAME == "builtin":
-        part = stable_diffusion.StableDiffusionGuidance
-        assert find("stable-diffusion-guidance") is part
 
 
 def test_halving_is_the_mean_of_four_pixels_and_more_loses_none():

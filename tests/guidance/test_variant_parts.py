@@ -36,11 +36,20 @@ def test_bad_options_are_named_before_anything_is_built(mesh_path, options, mess
         check_part("system.guidance", "exact-score-guidance", {"mesh": mesh_path, **options})
 
 
-def test_a_checkpoint_of_another_variant_is_refused():
+def test_other_checkpoints_conditions_and_residuals_are_refused():
     guide = mixture_guidance()
     guide.variant.restore(guide, {})
     with pytest.raises(UserError, match="had learnt 1 tensors that aren't those"):
         guide.variant.restore(guide, {"mean": torch.zeros(3)})
+    guide, x = mixture_guidance(guidance_interval=[0.3, 0.7]), latents(12)
+    noised = guide.add_noise(x)
+    with pytest.raises(UserError, match="MixtureGuidance has conditions of type dict: define its"):
+        guide.predict_noise(noised.z, noised.t, {"azimuth": x})
+    two, one, guide = torch.zeros(2, 3, 4, 5), torch.zeros(1, 3, 4, 5), mixture_guidance()
+    for returned in (two, (one, torch.ones(2)), (two, torch.ones(1)), (two, 1), None):
+        guide.variant.residual = lambda *_, returned=returned: returned
+        with pytest.raises(UserError, match="SDS.residual returned .*; expected the residual"):
+            guide(torch.zeros(2, 4, 5, 3))
 
 
 class OneOfBoth(MixtureGuidance):
@@ -65,7 +74,7 @@ def test_the_unconditional_score_is_skipped_outside_of_the_interval():
     assert torch.equal(eps[~inside], plain.predict_noise(*arguments)[~inside])
 
 
-def test_the_conditions_of_a_diffusion_model_are_selected_by_view(models, prompts):
+def test_conditions_are_selected_by_view_and_an_empty_negative_prompt_is_no_other(models, prompts):
     """The noise of two of four views, selected, is that of all four at these views."""
     pytest.importorskip("diffusers")
     guide = tiny.guidance(models, guidance_scale=7.5)
@@ -77,10 +86,6 @@ def test_the_conditions_of_a_diffusion_model_are_selected_by_view(models, prompt
         whole = guide.predict_noise(z, tiny.TIMESTEPS, condition)
         # other batch sizes round differently, and the scale magnifies it
         torch.testing.assert_close(selected, whole[rows], rtol=0, atol=1e-4)
-
-
-def test_an_empty_negative_prompt_is_the_empty_prompt(models):
-    """It isn't evaluated a second time."""
     pytest.importorskip("diffusers")
     options = {"pretrained_model_name_or_path": str(models["epsilon"]), "prompt": "a fox"}
     guide = tiny.guidance(models, variant_type="nfsd-variant")
@@ -102,22 +107,6 @@ def test_without_guidance_the_last_prediction_is_of_one_prompt(models, prompts, 
     assert found[1.5] - found[1.0] == 4
 
 
-def test_a_guidance_with_its_own_conditions_must_say_how_to_select_them():
-    guide, x = mixture_guidance(guidance_interval=[0.3, 0.7]), latents(12)
-    noised = guide.add_noise(x)
-    with pytest.raises(UserError, match="MixtureGuidance has conditions of type dict: define its"):
-        guide.predict_noise(noised.z, noised.t, {"azimuth": x})
-
-
-def test_what_a_variant_returns_has_the_latents_shape():
-    """Broadcast, an error of one item would train all others with it."""
-    latents, one, guide = torch.zeros(2, 3, 4, 5), torch.zeros(1, 3, 4, 5), mixture_guidance()
-    for returned in (latents, (one, torch.ones(2)), (latents, torch.ones(1)), (latents, 1), None):
-        guide.variant.residual = lambda *_, returned=returned: returned
-        with pytest.raises(UserError, match="SDS.residual returned .*; expected the residual"):
-            guide(torch.zeros(2, 4, 5, 3))
-
-
 @register("test-none-variant")
 class NoResidual(Variant):
     pass
@@ -129,15 +118,13 @@ class OtherResidual(Variant):
         return latents
 
 
-def test_a_variant_without_the_method_residual_is_refused_before_the_run(mesh_path):
+def test_a_variant_without_the_method_residual_is_refused_and_its_old_name_works(mesh_path, caplog):
     called = r".*\(guidance, latents, condition, batch\)"
     with pytest.raises(UserError, match=f"NoResidual has no residual{called}"):
         guidance(mesh_path, variant_type="test-none-variant")
     with pytest.raises(UserError, match=f"OtherResidual has residual.*called as{called}"):
         guidance(mesh_path, variant_type="test-other-variant")
 
-
-def test_a_variant_with_the_old_name_of_the_method_is_told_and_works(caplog):
     class Named(Variant):
         def error(self, guidance, latents, condition, batch):
             return 0.25 * latents, torch.ones(len(latents))

@@ -106,7 +106,7 @@ def test_vsd_subtracts_the_optimal_denoiser_of_the_renders_gaussian(monkeypatch)
     assert_close(error_of(guidance, x), uncond + 7.5 * (cond - uncond) - own)
 
 
-def test_sdi_with_fresh_noise_follows_the_formulas_step_by_step():
+def test_sdi_and_ism_follow_their_formulas_step_by_step():
     """By threestudio's formulas on our timesteps; tests/host/test_real_variants.py runs its own."""
     options = {"guidance_scale": 8.5, "weighting_strategy": "x0"}
     guidance, x = mixture_guidance("sdi-variant", step=11, **options), latents(1)
@@ -129,10 +129,6 @@ def test_sdi_with_fresh_noise_follows_the_formulas_step_by_step():
     denoised = (z - (1 - abars[t]) ** 0.5 * predicted(z, int(t), 7.5)) / abars[t] ** 0.5
     weight = ((1 - abars[t]) / abars[t]) ** 0.5
     assert_close(weight * error_of(guidance, x), x - denoised)
-
-
-def test_ism_inverts_with_the_unconditional_score_and_subtracts_it():
-    """Step by step, where the conditional score is another."""
     guidance, x = mixture_guidance("ism-variant", guidance_scale=7.5), latents(7)
     abars, expected = guidance.alphas_cumprod, []
 

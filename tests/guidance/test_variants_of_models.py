@@ -7,6 +7,7 @@ from pkgutil import iter_modules
 import pytest
 import torch
 
+from tests.guidance import test_mvdream
 from tests.helpers import tiny_large_guidance as tiny
 from tests.helpers.tiny_guidance import relative, renders
 from threestudio_gaussiandreamer.core.errors import UserError
@@ -20,12 +21,7 @@ NO_LORA = {"stable-diffusion-3": "is a transformer", "mvdream": "predicts severa
 def ring():
     """Return four views around the object, and what the renderer gives of them."""
     depth, opacity = torch.full((4, 16, 16, 1), 2.0), torch.ones(4, 16, 16, 1)
-    angles = {
-        "elevation": torch.full((4,), 10.0),
-        "azimuth": torch.tensor([0.0, 90.0, 180.0, 270.0]),
-        "camera_distances": torch.full((4,), 2.0),
-    }
-    return tiny.views(**angles) | {"depth": depth, "opacity": opacity, "fovy": torch.ones(4)}
+    return test_mvdream.ring() | {"depth": depth, "opacity": opacity, "fovy": torch.ones(4)}
 
 
 VARIANTS = [module.name for module in iter_modules(variants.__path__) if module.name != "base"]

@@ -42,10 +42,6 @@ def test_the_conditional_prediction_moves_away_from_the_opposite_views(models, v
     torch.testing.assert_close(same, uncond)
     assert guide.evaluations == 8 + 3
     assert all(tiny.relative(*pair) > 1e-3 for pair in zip(cond[1:], plain[1:], strict=True))
-
-
-def test_each_view_keeps_its_opposite_in_a_guidance_interval(models, views, z):
-    """Views inside of the interval are those above timestep 500."""
     options = {"guidance_scale": 4.0, "view_contrast": CONTRAST}
     guide = tiny.guidance(models, **options, guidance_interval=(0.5, 1.0))
     condition = guide.condition(views, **BATCH)

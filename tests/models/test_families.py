@@ -47,16 +47,13 @@ def test_every_family_is_taken_by_its_own_parts_alone(family, tmp_path):
                 families.require_names(other, names)
 
 
-def test_models_that_no_guidance_takes(tmp_path):
+def test_models_that_no_guidance_takes_and_settings_that_are_left_to_the_loader(tmp_path):
     image = SETTINGS[families.MULTI_VIEW] | {"ip_dim": 16}
     for settings in ({"_class_name": "FluxTransformer2DModel"}, image):
         folder = model(tmp_path / settings["_class_name"], settings)
         said = f"{settings['_class_name']}, which no guidance takes; those that are taken: Stable"
         with pytest.raises(UserError, match=said):
             families.require_family(families.MULTI_VIEW, folder)
-
-
-def test_missing_and_damaged_settings_are_left_to_the_loader(tmp_path):
     families.require_family(families.STABLE_DIFFUSION, tmp_path)
     (tmp_path / "unet").mkdir()
     for content in ("not json", "[1]"):

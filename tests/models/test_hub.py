@@ -93,11 +93,8 @@ class FakeHub(BaseHTTPRequestHandler):
 def online(model, tmp_path, monkeypatch):
     """Start a hub with the tiny model and files that must not be downloaded; return its handler."""
     published = copied(model, tmp_path / "published")
-    for name in (
-        "unet/diffusion_pytorch_model.bin",
-        "unet/diffusion_pytorch_model.non_ema.safetensors",
-        "v2-1_512.safetensors",
-    ):
+    unet = "unet/diffusion_pytorch_model"
+    for name in (f"{unet}.bin", f"{unet}.non_ema.safetensors", "v2-1_512.safetensors"):
         (published / name).write_bytes(b"not wanted")
     for component in ("unet", "vae"):
         weights = published / component / "diffusion_pytorch_model.safetensors"
@@ -119,14 +116,7 @@ def connect_to(monkeypatch, cache, address):
     monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_DISABLE_XET", True)
 
 
-def test_a_local_folder_needs_no_network(model, monkeypatch):
-    monkeypatch.setattr(
-        socket, "getaddrinfo", lambda *args, **kwargs: pytest.fail("asked the network")
-    )
-    assert hub.find_model(str(model), (*TEXT, *IMAGE)) == model
-
-
-def test_a_missing_folder_names_the_near_ones(model, monkeypatch, tmp_path):
+def test_a_folder_needs_no_network_and_near_ones_are_named(model, monkeypatch, tmp_path):
     with pytest.raises(UserError, match="no such folder.*near.*tiny"):
         hub.find_model(str(model.parent / "tini"), TEXT)
     for name in ("./models/none", "no-owner", "../a/b", "a/b/c", "a\0b", "x" * 5000, "a/b.git"):
@@ -138,6 +128,10 @@ def test_a_missing_folder_names_the_near_ones(model, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(UserError, match=r"The folder 'models' has no 'tini' \(near: models/tiny\)"):
         hub.find_model("models/tini", IMAGE)
+    monkeypatch.setattr(
+        socket, "getaddrinfo", lambda *args, **kwargs: pytest.fail("asked the network")
+    )
+    assert hub.find_model(str(model), (*TEXT, *IMAGE)) == model
 
 
 def test_folders_without_usable_weights_are_named(model, tmp_path):
@@ -171,7 +165,7 @@ def test_the_wanted_precision_is_preferred_and_the_other_one_will_do(variant):
         pick(shards[:-1], "unet")
 
 
-def test_the_fingerprint_is_of_the_content_not_of_the_place(model, tmp_path):
+def test_the_fingerprint_is_of_the_content_and_missing_weights_are_not_made_up(model, tmp_path):
     moved = copied(model, tmp_path / "moved")
     assert model_files.fingerprint(moved, TEXT) == model_files.fingerprint(model, TEXT)
     assert model_files.fingerprint(moved, IMAGE) != model_files.fingerprint(moved, TEXT)
@@ -179,9 +173,6 @@ def test_the_fingerprint_is_of_the_content_not_of_the_place(model, tmp_path):
     *others, last = weights.read_bytes()
     weights.write_bytes(bytes([*others, last ^ 1]))
     assert model_files.fingerprint(moved, TEXT) != model_files.fingerprint(model, TEXT)
-
-
-def test_weights_that_are_missing_are_not_made_up(model, tmp_path):
     from diffusers import UNet2DConditionModel
     from safetensors.torch import load_file, save_file
 
@@ -238,7 +229,7 @@ def test_a_hub_model_without_safe_weights(online):
         hub.find_model("people/tiny", IMAGE)
 
 
-def test_no_network_is_one_clear_message(monkeypatch, tmp_path):
+def test_no_network_and_no_libraries_are_one_clear_message(monkeypatch, tmp_path):
     connect_to(monkeypatch, tmp_path, "http://hub.invalid")
 
     def blocked(*args, **kwargs):
@@ -248,9 +239,6 @@ def test_no_network_is_one_clear_message(monkeypatch, tmp_path):
     said = "could not be reached.*--local-dir models/tiny.*HF_ENDPOINT"
     with pytest.raises(UserError, match=said):
         hub.find_model("people/tiny", IMAGE)
-
-
-def test_without_the_libraries_the_extra_is_named(monkeypatch):
     require_extra("diffusion", "json")
     monkeypatch.setitem(sys.modules, "diffusers", None)
     said = r"needs diffusers .*pip install 'threestudio-gaussiandreamer\[diffusion\]'"

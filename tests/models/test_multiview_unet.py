@@ -49,7 +49,7 @@ def test_the_published_names_give_the_same_network(folder):
     assert load(folder, torch.float16).dtype == torch.float16
 
 
-def test_equal_views_give_what_one_view_gives(folder):
+def test_views_see_those_of_their_own_object_and_equal_ones_give_what_one_gives(folder):
     """Attention to four copies of each token has the weights of attention to one."""
     unet = load(folder)
     z, text, cameras = (values.repeat_interleave(VIEWS, 0) for values in inputs(2))
@@ -60,9 +60,6 @@ def test_equal_views_give_what_one_view_gives(folder):
     with views_attended_together(unet, 1):
         assert torch.equal(predict(unet, z, text, cameras), alone)
     assert not torch.allclose(predict(unet, z, text, cameras + 1), alone, atol=1e-3)
-
-
-def test_views_see_those_of_their_own_object_alone_in_any_order(folder):
     unet = load(folder)
     attend_across_views(unet, VIEWS)
     z, text, cameras = inputs(2 * VIEWS)
