@@ -8,7 +8,6 @@ from hypothesis.extra import numpy as np_strategies
 
 from threestudio_gaussiandreamer.gaussians import neighbours
 from threestudio_gaussiandreamer.gaussians.grow import grow, longest_side, nearest_distance_scales
-from threestudio_gaussiandreamer.gaussians.neighbours import NeighbourSearch
 from threestudio_gaussiandreamer.gaussians.point_cloud import PointCloud
 
 FINITE = st.floats(width=32, allow_nan=False, allow_infinity=False)
@@ -17,10 +16,6 @@ POINTS = st.tuples(st.integers(1, 12), st.just(3))
 
 def rng(seed=0):
     return np.random.default_rng(seed)
-
-
-def grey(points):
-    return PointCloud(points, np.full((len(points), 3), 0.5, np.float32))
 
 
 def sphere(count=2000, seed=1):
@@ -49,7 +44,8 @@ def algorithm_1(points, colors, num_candidates, radius, generator):
     return np.array(found), colors[near] + 0.2 * generator.uniform(0, 1, size=(len(near), 3))
 
 
-def test_equals_the_pseudocode_of_the_paper():
+def test_equals_the_pseudocode_of_the_paper(monkeypatch):
+    monkeypatch.setattr(neighbours, "QUERIES_AT_ONCE", 50)
     cloud = sphere(300)
     radius = 0.1 * longest_side(cloud.points)
     points, colors = algorithm_1(cloud.points.astype(float), cloud.colors, 2000, radius, rng(3))
@@ -62,7 +58,7 @@ def test_equals_the_pseudocode_of_the_paper():
     assert not np.array_equal(found.points[:10], other.points[:10])
 
 
-def test_originals_come_first_and_unchanged():
+def test_originals_come_first_and_the_cap_keeps_a_uniform_choice():
     cloud = sphere()._replace(faces=np.array([[0, 1, 2]]))
     found = grow(cloud, num_candidates=5000, radius=0.05, generator=rng())
     for name in ("points", "colors", "normals"):
@@ -71,11 +67,6 @@ def test_originals_come_first_and_unchanged():
     assert len(found.normals) == len(found.points) > 2000
     assert found.points.dtype == found.colors.dtype == np.float32
     assert len(grown(cloud, 0, 0.1).points) == 0
-    corners = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1]), np.float32).reshape(3, -1).T
-    assert len(grown(grey(corners), 10_000, 0.005).points) == 0
-
-
-def test_the_cap_is_exact_and_keeps_a_uniform_choice():
     everything, kept = grown(sphere(), 50_000, 0.05), grown(sphere(), 50_000, 0.05, max_points=1000)
     assert len(kept.points) == 1000 < len(everything.points)
     # Three standard errors of the mean of 1000 draws: no side of the cloud is preferred.
@@ -84,9 +75,13 @@ def test_the_cap_is_exact_and_keeps_a_uniform_choice():
     assert len(grown(sphere(), 50_000, 0.05, max_points=0).points) == 0
 
 
+@pytest.mark.parametrize("dimensions", [3, 2, 1])
 @pytest.mark.parametrize("rule, count", [("nearest", 1), ("rms3", 3)])
-def test_scales_equal_brute_force(rule, count):
+def test_scales_equal_brute_force(rule, count, dimensions, monkeypatch):
+    """Also of points in a plane and on a line, in several parts."""
+    monkeypatch.setattr(neighbours, "QUERIES_AT_ONCE", 50)
     points = rng().uniform(-1, 1, (200, 3))
+    points[:, dimensions:] = 0.25
     distances = np.linalg.norm(points[:, None] - points[None], axis=2)
     nearest = np.sort(distances, axis=1)[:, 1 : count + 1]
     scales = nearest_distance_scales(points, rule)
@@ -98,11 +93,6 @@ def test_scales_equal_brute_force(rule, count):
 
 def test_copies_get_the_median_of_the_distinct_points():
     points = rng().uniform(-1, 1, (200, 3))
-    alone = nearest_distance_scales(points)
-    scales = nearest_distance_scales(np.concatenate([points, points[:100]]))
-    np.testing.assert_allclose(scales[:100], np.median(alone), rtol=1e-6)
-    np.testing.assert_array_equal(scales[200:], scales[:100])
-    np.testing.assert_array_equal(scales[100:200], alone[100:])
     rounded = nearest_distance_scales(np.concatenate([points, points + 1e-15]))
     assert rounded.min() >= 0.9e-4 * np.median(rounded)  # no specks
     points[0], points[1] = 0.0, -0.0
@@ -120,41 +110,3 @@ def test_copies_get_the_median_of_the_distinct_points():
 def test_scales_are_always_positive_and_finite(points, rule):
     scales = nearest_distance_scales(points, rule)
     assert scales.shape == (len(points),) and np.isfinite(scales).all() and (scales > 0).all()
-
-
-def random_points(count, dimensions=3, seed=0):
-    """Return random points; those of fewer dimensions lie in a plane or on a line."""
-    points = rng(seed).standard_normal((count, 3))
-    points[:, dimensions:] = 0.25
-    return points
-
-
-def distances(queries, points):
-    return np.linalg.norm(queries[:, None] - points, axis=2)
-
-
-@pytest.mark.parametrize("dimensions", [3, 2, 1])
-@pytest.mark.parametrize("count", [1, 4])
-def test_the_neighbours_of_points_are_the_nearest(monkeypatch, dimensions, count):
-    monkeypatch.setattr(neighbours, "QUERIES_AT_ONCE", 50)
-    points = random_points(170, dimensions)
-    apart = distances(points, points)
-    rows = []
-    for some, found, nearest in NeighbourSearch(points).of_points(count):
-        rows += some.tolist()
-        assert np.allclose(found, np.sort(apart[some])[:, :count], atol=1e-15)
-        assert np.allclose(apart[some[:, None], nearest], found, atol=1e-15)
-    assert sorted(rows) == list(range(170))
-
-
-def test_queries_beyond_the_reach_have_no_neighbour(monkeypatch):
-    monkeypatch.setattr(neighbours, "QUERIES_AT_ONCE", 50)
-    points, queries = random_points(60), random_points(120, seed=1)
-    apart = distances(queries, points)
-    found, rows = NeighbourSearch(points).nearest(queries, 0.5)
-    near = apart.min(axis=1) < 0.5
-    assert 20 < near.sum() < 100
-    assert np.array_equal(rows[near], apart.argmin(axis=1)[near])
-    assert np.allclose(found[near], apart.min(axis=1)[near])
-    assert np.isinf(found[~near]).all() and (rows[~near] == -1).all()
-    assert len(NeighbourSearch(points).nearest(queries[:0], 0.5)[0]) == 0

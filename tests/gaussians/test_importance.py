@@ -146,13 +146,6 @@ def test_sampling_leaves_the_gradients_of_the_loss_alone(backend):
     assert all(torch.equal(plain, sampled) for plain, sampled in zip(*left, strict=True))
 
 
-def test_samples_are_taken_where_a_round_will_ask_for_them():
-    schedule = {"start": 100, "stop": 900, "every": 50}
-    control = DensityControl(cloud(10, budget=5, prune=schedule))
-    due = [step for step in (48, 51, 52, 848, 849, 852) if control.samples_removal(step)]
-    assert due == [52, 848]
-
-
 @pytest.mark.parametrize(("saved", "count"), [(0.0, 80), (0.5, 80), (0.95, 95), (1.5, 100)])
 def test_a_round_of_auto_drops_fewer_the_more_it_costs(saved, count):
     """``saved``: the cost of a whole round, in units of that where rounds end."""
@@ -163,13 +156,17 @@ def test_a_round_of_auto_drops_fewer_the_more_it_costs(saved, count):
     assert need.gain == pytest.approx(0.5 * saved**importance.POWER, rel=1e-3)
 
 
-def test_auto_drops_idle_gaussians_also_where_a_round_costs_too_much():
+def test_auto_drops_idle_gaussians_and_samples_where_a_round_will_ask_for_them():
     """Those that save less than a hundredth of their part of the error."""
     removal = torch.ones(100)
     removal[:10] = 1e-4
     assert importance.needed_count(torch.arange(100.0), removal, 7.0, 0.5, 0.8).count == 90
     removal[:50] = 1e-4
     assert importance.needed_count(torch.arange(100.0), removal, 7.0, 0.5, 0.8).count == 80
+    schedule = {"start": 100, "stop": 900, "every": 50}
+    control = DensityControl(cloud(10, budget=5, prune=schedule))
+    due = [step for step in (48, 51, 52, 848, 849, 852) if control.samples_removal(step)]
+    assert due == [52, 848]
 
 
 @pytest.mark.parametrize(("count", "keep"), [(1, 0.8), (2, 0.99), (3, 1e-6)])

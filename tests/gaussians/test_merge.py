@@ -48,7 +48,7 @@ def picture(params):
     return render_all(cloud, views_around(around, 6, 48))
 
 
-def test_a_merged_pair_keeps_its_peak_and_its_integral():
+def test_a_merged_pair_keeps_its_peak_and_integral_and_small_ones_stay():
     a, b, pair = 0.6, 0.8, repeated(2)
     log_size = pair["log_scales"][0].mean()
     pair["logit_opacities"] = torch.tensor([a, b]).logit()
@@ -60,6 +60,14 @@ def test_a_merged_pair_keeps_its_peak_and_its_integral():
     light = torch.trapezoid((1 - (1 - a * g) * (1 - b * g)) * r, r).item()
     assert peak == pytest.approx(1 - (1 - a) * (1 - b), abs=1e-6)
     assert peak * size**2 == pytest.approx(light, rel=1e-4)
+    rng = torch.Generator().manual_seed(0)
+    many = repeated(2000)
+    many["means"] = torch.rand(2000, 3, generator=rng)
+    many["log_scales"] = torch.full((2000, 3), -9.0)
+    many["log_scales"][0] = -1.0
+    merged = merge_duplicates(many)
+    assert len(merged["means"]) > 1900
+    assert merged["log_scales"].max() < -0.9  # e^354 before
 
 
 @pytest.mark.parametrize("times", [2, 5])
@@ -77,37 +85,22 @@ def test_copies_in_one_place_become_one(times):
     assert len(merge_duplicates(repeated(400))["means"]) <= 4
 
 
-def test_other_gaussians_are_unchanged_bit_for_bit():
+def test_another_colour_size_or_place_and_a_chain_of_neighbours_are_no_duplicates():
     params = shell()
     merged = merge_duplicates(params)
     assert all(torch.equal(merged[name], params[name]) for name in params)
-
-
-def test_another_colour_size_or_place_is_no_duplicate():
     assert len(merge_duplicates(repeated(2))["means"]) == 1
     for name, offset in (("sh0", 1.5), ("log_scales", [0, 1.0, 0]), ("means", [0.1, 0, 0.1])):
         params = repeated(2)
         params[name][1] += torch.tensor(offset)
         assert len(merge_duplicates(params)["means"]) == 2
-
-
-def test_the_floor_holds_and_the_least_important_are_pruned_first():
-    params = copies(shell(), 2)
-    params["sh0"][60:90] += 0.2  # duplicates still, but dearer ones
-    assert len(merge_duplicates(params, at_least=200)["means"]) == 120
-    merged = merge_duplicates(params, at_least=90)
-    assert len(merged["means"]) == 90 and torch.equal(merged["sh0"][60:], params["sh0"][60:90])
-
-
-def test_a_chain_of_neighbours_does_not_become_one():
-    """Each is similar to the next, but the first isn't similar to the last."""
     one = repeated(40)
     one["quats"], one["log_scales"][:] = torch.tensor([[1.0, 0, 0, 0]]).repeat(40, 1), -2.0
     one["means"] = torch.arange(40)[:, None] * torch.tensor([[0.05, 0.0, 0.0]])
     assert 10 <= len(merge_duplicates(one)["means"]) <= 20
 
 
-def test_few_and_unusable_gaussians():
+def test_few_and_unusable_gaussians_and_the_floor():
     params = shell(2)
     for count in (1, 0):
         few = {name: value[:count] for name, value in params.items()}
@@ -116,18 +109,11 @@ def test_few_and_unusable_gaussians():
     same["means"][0] = same["quats"][4] = float("nan")
     same["log_scales"][2] = torch.tensor([-30.0, -30, 3])
     assert len(merge_duplicates(same)["means"]) == 6
-
-
-def test_a_large_gaussian_does_not_absorb_the_small_ones_near_it():
-    """Their share of the weight is small, and so is the cost of each."""
-    rng = torch.Generator().manual_seed(0)
-    many = repeated(2000)
-    many["means"] = torch.rand(2000, 3, generator=rng)
-    many["log_scales"] = torch.full((2000, 3), -9.0)
-    many["log_scales"][0] = -1.0
-    merged = merge_duplicates(many)
-    assert len(merged["means"]) > 1900
-    assert merged["log_scales"].max() < -0.9  # e^354 before
+    params = copies(shell(), 2)
+    params["sh0"][60:90] += 0.2  # duplicates still, but dearer ones
+    assert len(merge_duplicates(params, at_least=200)["means"]) == 120
+    merged = merge_duplicates(params, at_least=90)
+    assert len(merged["means"]) == 90 and torch.equal(merged["sh0"][60:], params["sh0"][60:90])
 
 
 @pytest.mark.parametrize(("opacity", "larger"), [(0.005, 0.6), (0.0001, 1.5)])

@@ -45,15 +45,12 @@ def test_basis_and_colors_equal_scipys_of_one_or_several_views(degree):
     assert torch.autograd.gradcheck(sh.sh_to_colors, (few, directions(5).requires_grad_()))
 
 
-def test_rgb_round_trip_and_constant_color():
+def test_rgb_round_trip_and_gradients_of_bounded_colors():
     rgb = torch.rand(20, 3, generator=torch.Generator().manual_seed(3))
     assert torch.allclose(sh.sh0_to_rgb(sh.rgb_to_sh0(rgb)), rgb, atol=1e-6)
     constant = sh.sh_to_colors(sh.rgb_to_sh0(rgb)[:, None], directions(20).float())
     assert torch.allclose(constant, rgb, atol=1e-6)
     assert sh.C0 == pytest.approx(0.28209479177387814, rel=1e-15)
-
-
-def test_bounded_colors_pass_gradients_that_lead_into_the_range():
     colors = torch.tensor([-0.5, 0.0, 0.5, 1.0, 2.2]).repeat(2).requires_grad_()
     bounded = sh.bounded_colors(colors)
     assert bounded.tolist() == [0, 0, 0.5, 1, 1] * 2
@@ -63,21 +60,15 @@ def test_bounded_colors_pass_gradients_that_lead_into_the_range():
     assert torch.equal(colors.grad, expected)
 
 
-def test_a_zero_direction_gives_finite_colours():
+def test_zero_directions_autocast_and_numbers_of_coefficients_that_are_no_square():
     dirs = torch.zeros(2, 3, requires_grad=True)
     colors = sh.sh_to_colors(torch.ones(2, 16, 3), dirs)
     colors.sum().backward()
     assert colors.isfinite().all() and (dirs.grad == 0).all()
-
-
-def test_autocast_changes_nothing():
     coefficients = torch.randn(20, 16, 3, generator=torch.Generator().manual_seed(4))
     dirs = directions(20).float()
     with torch.autocast("cpu", dtype=torch.bfloat16):
         cast = sh.sh_to_colors(coefficients, dirs)
     assert cast.dtype == torch.float32 and torch.equal(cast, sh.sh_to_colors(coefficients, dirs))
-
-
-def test_a_number_of_coefficients_that_is_no_square_is_refused():
     with pytest.raises(UserError, match="1, 4, 9 or 16"):
         sh.sh_to_colors(torch.zeros(3, 5, 3), torch.ones(3, 3))

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from tests.helpers.painted_ball import opaque_cloud
 from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
 from threestudio_gaussiandreamer.gaussians.surface import gaussian_surface, surface_nets
 
@@ -10,19 +11,13 @@ trimesh = pytest.importorskip("trimesh")
 CENTER = np.array([0.3, 0.0, -0.2])
 
 
-def ball(count=4000, radius=0.5, scale=0.02, opacity=4.0, hollow=True):
+def ball(count=4000, scale=0.02, hollow=True):
     """Return Gaussians on, or in, a sphere, coloured by position."""
     rng = np.random.default_rng(0)
     points = rng.normal(size=(count, 3))
     share = 1 if hollow else rng.random((count, 1)) ** (1 / 3)
-    points *= radius * share / np.linalg.norm(points, axis=1, keepdims=True)
-    return Gaussians(
-        means=np.float32(points + CENTER),
-        sh=np.float32((points.clip(-0.5, 0.5)) / 0.28209479)[:, None],
-        logit_opacities=np.full(count, opacity, np.float32),
-        log_scales=np.full((count, 3), np.log(scale), np.float32),
-        quats=np.tile(np.float32([1, 0, 0, 0]), (count, 1)),
-    )
+    points *= 0.5 * share / np.linalg.norm(points, axis=1, keepdims=True)
+    return opaque_cloud(points + CENTER, points.clip(-0.5, 0.5) + 0.5, scale, 0.98)
 
 
 def as_mesh(surface):
@@ -33,7 +28,7 @@ def distances(surface):
     return np.linalg.norm(surface.vertices - CENTER, axis=1)
 
 
-def test_surface_nets_of_a_sphere():
+def test_surface_nets_of_a_sphere_and_of_a_turned_disc():
     """Linear interpolation of a distance is exact to second order in the cell size."""
     axes = np.meshgrid(*[np.linspace(-1, 1, 33)] * 3, indexing="ij")
     vertices, faces = surface_nets(0.7 - np.sqrt(sum(axis**2 for axis in axes)), 0.0)
@@ -41,38 +36,6 @@ def test_surface_nets_of_a_sphere():
     assert mesh.is_watertight and mesh.is_winding_consistent and mesh.euler_number == 2
     assert mesh.volume == pytest.approx(4 / 3 * np.pi * 0.7**3, rel=0.02)
     np.testing.assert_allclose(np.linalg.norm(mesh.vertices, axis=1), 0.7, atol=0.01)
-
-
-def test_a_solid_ball_is_one_closed_surface():
-    surface = gaussian_surface(ball(count=4000, scale=0.04, hollow=False), resolution=32)
-    mesh = as_mesh(surface)
-    assert mesh.is_watertight and mesh.is_winding_consistent and mesh.volume > 0
-    # half of the density at the middle is at the ball's own radius, blurred by the Gaussians' size
-    assert distances(surface).mean() == pytest.approx(0.5, abs=0.03)
-
-
-@pytest.mark.parametrize(("count", "scale"), [(4000, 0.02), (16000, 0.002)])
-def test_the_surface_is_at_the_gaussians_for_any_overlap(count, scale):
-    """Within 1.2 standard deviations of the Gaussians and a cell."""
-    surface = gaussian_surface(ball(count, scale=scale), resolution=64)
-    spread = np.hypot(scale, 1 / 64)
-    away = np.abs(distances(surface) - 0.5)
-    assert 0.5 * spread < np.median(away) < 1.5 * spread and away.max() < 3 * spread
-    wanted = (surface.vertices - CENTER + 0.5).clip(0, 1)
-    np.testing.assert_allclose(surface.colors, wanted, atol=0.08)
-
-
-def test_faint_gaussians_have_no_surface():
-    arrays = ball()
-    far = arrays._replace(means=arrays.means + 5, logit_opacities=arrays.logit_opacities - 10)
-    both = Gaussians(*(np.concatenate(pair) for pair in zip(arrays, far, strict=True)))
-    found, wanted = (gaussian_surface(each, resolution=24).vertices for each in (both, arrays))
-    np.testing.assert_array_equal(found, wanted)
-    assert len(gaussian_surface(far).faces) == 0
-
-
-def test_turned_and_flat_gaussians_lie_along_their_axes():
-    """One disc in the plane x = z, rotated by 45 degrees about y."""
     half = np.deg2rad(45 / 2)
     disc = Gaussians(
         means=np.zeros((1, 3), np.float32),
@@ -88,3 +51,28 @@ def test_turned_and_flat_gaussians_lie_along_their_axes():
     along, across = (np.sqrt(0.5) * np.array([1, 0, sign]) for sign in (1, -1))
     assert np.abs(vertices @ along).max() == pytest.approx(reach[0], abs=0.02)
     assert np.abs(vertices @ across).max() == pytest.approx(reach[1], abs=0.01)
+
+
+def test_a_solid_ball_is_one_closed_surface():
+    surface = gaussian_surface(ball(count=4000, scale=0.04, hollow=False), resolution=32)
+    mesh = as_mesh(surface)
+    assert mesh.is_watertight and mesh.is_winding_consistent and mesh.volume > 0
+    # half of the density at the middle is at the ball's own radius, blurred by the Gaussians' size
+    assert distances(surface).mean() == pytest.approx(0.5, abs=0.03)
+    arrays = ball()
+    far = arrays._replace(means=arrays.means + 5, logit_opacities=arrays.logit_opacities - 10)
+    both = Gaussians(*(np.concatenate(pair) for pair in zip(arrays, far, strict=True)))
+    found, wanted = (gaussian_surface(each, resolution=24).vertices for each in (both, arrays))
+    np.testing.assert_array_equal(found, wanted)
+    assert len(gaussian_surface(far).faces) == 0
+
+
+@pytest.mark.parametrize(("count", "scale"), [(4000, 0.02), (16000, 0.002)])
+def test_the_surface_is_at_the_gaussians_for_any_overlap(count, scale):
+    """Within 1.2 standard deviations of the Gaussians and a cell."""
+    surface = gaussian_surface(ball(count, scale=scale), resolution=64)
+    spread = np.hypot(scale, 1 / 64)
+    away = np.abs(distances(surface) - 0.5)
+    assert 0.5 * spread < np.median(away) < 1.5 * spread and away.max() < 3 * spread
+    wanted = (surface.vertices - CENTER + 0.5).clip(0, 1)
+    np.testing.assert_allclose(surface.colors, wanted, atol=0.08)

@@ -25,12 +25,18 @@ def batches(data, count, start=0):
     return list(itertools.islice(iter(data.train_dataloader()), count))
 
 
-def test_a_training_batch_has_the_hosts_keys_shapes_and_units():
+def test_batches_have_the_hosts_keys_shapes_and_units():
     (batch,) = batches(module(), 1)
     assert {k: tuple(v.shape) for k, v in batch.items() if torch.is_tensor(v)} == KEYS
     assert batch["height"] == 32 and batch["width"] == 48
     assert batch["fovy"].max() < math.pi and batch["azimuth"].abs().max() > 10  # radians, degrees
     assert torch.equal(batch["camera_positions"], batch["c2w"][:, :3, 3])
+    data = module(n_val_views=4, n_test_views=5, eval_height=20, eval_width=30)
+    val, test = list(data.val_dataloader()), list(data.test_dataloader())
+    assert [b["azimuth"].item() for b in val] == [0, 90, 180, 270]
+    assert [b["azimuth"].item() for b in test] == pytest.approx([0, 72, 144, 216, 288])
+    assert val[2]["index"].tolist() == [2] and val[2]["height"] == 20
+    assert val[2]["c2w"].shape == (1, 4, 4)
 
 
 def test_groups_of_views_share_all_but_their_evenly_spaced_azimuths():
@@ -47,34 +53,29 @@ def test_groups_of_views_share_all_but_their_evenly_spaced_azimuths():
         assert batch["elevation"][0] != batch["elevation"][4]
 
 
-def test_validation_and_test_batches_hold_one_view_and_its_index():
-    data = module(n_val_views=4, n_test_views=5, eval_height=20, eval_width=30)
-    val, test = list(data.val_dataloader()), list(data.test_dataloader())
-    assert [b["azimuth"].item() for b in val] == [0, 90, 180, 270]
-    assert [b["azimuth"].item() for b in test] == pytest.approx([0, 72, 144, 216, 288])
-    assert val[2]["index"].tolist() == [2] and val[2]["height"] == 20
-    assert val[2]["c2w"].shape == (1, 4, 4)
-
-
-def test_each_epoch_continues_the_stream_that_never_stopped():
+def test_each_epoch_continues_the_stream_and_a_milestone_takes_effect_at_its_step():
     whole, data = batches(module(), 5), module()
     loader, steps = data.train_dataloader(), iter([0, 3])
     data.train_dataset.next_step = lambda: next(steps)
     first, later = ([*itertools.islice(iter(loader), 2)] for _ in range(2))
     for a, b in zip([*whole[:2], *whole[3:]], [*first, *later], strict=True):
         assert torch.equal(a["c2w"], b["c2w"]) and torch.equal(a["fovy"], b["fovy"])
-
-
-def test_a_resolution_milestone_takes_effect_at_its_step():
     data = module(height=[16, 32], width=[16, 32], batch_size=[4, 2], resolution_milestones=[3])
     assert [(b["height"], len(b["c2w"])) for b in batches(data, 5)] == [(16, 4)] * 3 + [(32, 2)] * 2
 
 
-def test_a_pool_repeats_its_cameras_and_still_covers_the_circle():
+def test_a_pool_repeats_its_cameras_to_the_bit_and_covers_the_circle():
     data = module(train_views=8)
     seen = torch.cat([b["c2w"].flatten(1) for b in batches(data, 20)])
     assert len(seen.unique(dim=0)) == 8
     assert all(sorted((b["azimuth"] // 90).tolist()) == [-2, -1, 0, 1] for b in batches(data, 5))
+    data = module(train_views=50, batch_size=3)
+    for row in batches(data, 5):
+        shown = [data.train_dataset.pool.azimuth.tolist().index(a) for a in row["azimuth"].tolist()]
+        batch = orbit_batch(data.train_dataset.pool.rows(torch.tensor(shown)), 32, 48)
+        assert batch.keys() == row.keys()
+        for name in batch.keys() - {"light_positions", "height", "width"}:
+            assert torch.equal(row[name], batch[name]), name
 
 
 @pytest.mark.parametrize(
@@ -93,14 +94,3 @@ def test_a_pool_repeats_its_cameras_and_still_covers_the_circle():
 def test_a_wrong_value_is_named(wrong, named):
     with pytest.raises(UserError, match=named):
         module(**wrong)
-
-
-def test_a_batch_of_a_pool_is_that_of_its_cameras_to_the_bit():
-    """The tensors of all its views are computed once, and each step takes rows of them."""
-    data = module(train_views=50, batch_size=3)
-    for row in batches(data, 5):
-        shown = [data.train_dataset.pool.azimuth.tolist().index(a) for a in row["azimuth"].tolist()]
-        batch = orbit_batch(data.train_dataset.pool.rows(torch.tensor(shown)), 32, 48)
-        assert batch.keys() == row.keys()
-        for name in batch.keys() - {"light_positions", "height", "width"}:
-            assert torch.equal(row[name], batch[name]), name

@@ -30,7 +30,7 @@ def after_step(density, step=0):
     return density.after_step(torch.optim.Adam(density.cloud.parameter_groups()), step)
 
 
-def test_a_round_says_how_many_it_left_and_another_step_leaves_the_cloud():
+def test_a_round_says_how_many_it_left_and_opacities_decay_between_those_of_auto():
     density = control(budget=None)
     means = density.cloud.means
     assert after_step(density) is None and density.cloud.means is means
@@ -39,6 +39,16 @@ def test_a_round_says_how_many_it_left_and_another_step_leaves_the_cloud():
     assert after_step(density) is None and len(density.cloud) == 8
     assert density.summary() == "8 of 1,200 Gaussians: the budget is 5"
     assert control().summary() == "10 Gaussians: no budget"  # of a checkpoint without the number
+    for budget, step, decays in (("auto", 5, True), ("auto", 10, False), (5, 5, False)):
+        density = control(budget=budget, lr_opacities=0.02)
+        adam = torch.optim.Adam(density.cloud.parameter_groups())
+        density.cloud.set_learning_rates(adam, 0, 0)
+        before = density.cloud.logit_opacities.detach().clone()
+        density.cloud.cfg.prune.keep = 0.999  # nothing is dropped
+        density.after_step(adam, step)
+        fallen = before[: len(density.cloud)] - density.cloud.logit_opacities.detach()
+        rate = 0.02 if decays else 0.0
+        assert torch.allclose(fallen, torch.full_like(fallen, DECAY * rate))
 
 
 def sampled(density, removal, error):
@@ -69,19 +79,6 @@ def test_auto_drops_nothing_without_a_sample_or_with_nan_among_the_views(error):
     density = sampled(control(budget="auto"), torch.zeros(10), error)
     after_step(density)
     assert len(density.cloud) == 10
-
-
-def test_opacities_decay_only_between_the_rounds_of_auto():
-    for budget, step, decays in (("auto", 5, True), ("auto", 10, False), (5, 5, False)):
-        density = control(budget=budget, lr_opacities=0.02)
-        adam = torch.optim.Adam(density.cloud.parameter_groups())
-        density.cloud.set_learning_rates(adam, 0, 0)
-        before = density.cloud.logit_opacities.detach().clone()
-        density.cloud.cfg.prune.keep = 0.999  # nothing is dropped
-        density.after_step(adam, step)
-        fallen = before[: len(density.cloud)] - density.cloud.logit_opacities.detach()
-        rate = 0.02 if decays else 0.0
-        assert torch.allclose(fallen, torch.full_like(fallen, DECAY * rate))
 
 
 @pytest.mark.parametrize("known", [True, False])

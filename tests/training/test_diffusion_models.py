@@ -1,7 +1,6 @@
 """The shipped configurations trained with tiny random models in the real ones' files."""
 
 import csv
-from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -139,17 +138,12 @@ def configs_of(name):
     return ["gaussiandreamer.yaml", *(f"gaussiandreamer{x}.yaml" for x in RUNS[name][0].split())]
 
 
-def require_module(name):
-    if find_spec(name) is None:
-        pytest.skip(f"{name} isn't installed")
-
-
 @pytest.mark.parametrize("name", RUNS)
 def test_a_configuration_trains(name, models, seen, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     used = RUNS[name][1].split()
     if "avatar" in name:
-        require_module("anny" if "anny" in used else "smplx")
+        pytest.importorskip("anny" if "anny" in used else "smplx")
     options = {key: value for part in used for key, value in models[part].items()}
     folder = train(configs_of(name), options)
     # four views with and without the prompt, in one forward pass a step; what validation draws has

@@ -49,9 +49,6 @@ def test_numbers_that_arrive_late_are_logged_at_their_own_step(trainer, monkeypa
     log.reads.poll(wait=True)
     assert logged(trainer) == [(9, {"loss": 1, "epoch": 0}), (10, {"loss": 2, "epoch": 1})]
     assert trainer.progress_bar_metrics == {"loss": 1.0}
-
-
-def test_a_number_that_is_monitored_is_waited_for(trainer, monkeypatch):
     monkeypatch.setattr(HostCopy, "ready", lambda copy: False)
     trainer.checkpoint_callbacks = [object(), SimpleNamespace(monitor="loss")]
     StepLog().write(trainer, {"loss": torch.tensor(1.0)})

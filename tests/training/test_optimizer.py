@@ -105,7 +105,7 @@ def test_another_optimiser_forgets_the_arguments_that_it_lacks(name):
     check_optimizer(nothing.system.optimizer)
 
 
-def test_only_optimisers_that_can_train_are_named():
+def test_only_optimisers_that_can_train_are_named_and_no_parameter_is_left_untrained():
     with pytest.raises(UserError) as error:
         check_optimizer({"name": "zz"})
     named = str(error.value).partition("choose from ")[2].rstrip(".").split(", ")
@@ -114,8 +114,6 @@ def test_only_optimisers_that_can_train_are_named():
         check_optimizer({"name": name})
     assert not {"Optimizer", "LBFGS", "SparseAdam", "Muon"} & set(named)
 
-
-def test_a_parameter_of_an_own_geometry_is_not_left_untrained():
     class Own(GaussianCloud):
         def configure(self):
             super().configure()

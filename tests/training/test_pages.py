@@ -1,7 +1,6 @@
 """What a run leaves to look at: a page that is the run's, with the first cloud, and pictures."""
 
 import json
-import re
 import sys
 from types import SimpleNamespace
 
@@ -13,16 +12,13 @@ from benchmarks.viewers.browser import chromium
 from benchmarks.viewers.devtools import open_page
 from tests.helpers.painted_ball import painted_ball
 from tests.training.runs import launch, length, run_folder
+from tests.view.clouds import meta
 from threestudio_gaussiandreamer.core.images import read
 from threestudio_gaussiandreamer.exporters import files
 from threestudio_gaussiandreamer.training.export import discard_turntable
 
 SHORT = [*length(2)]
 MESH = "{faces: 200, texture: 64, views: 8, view_size: 64, resolution: 16}"
-
-
-def meta(path) -> dict:
-    return json.loads(re.search(r'id="meta">(.*?)</script>', path.read_text())[1])
 
 
 @pytest.fixture(scope="module")
@@ -43,28 +39,15 @@ def meshes():
 def save(tmp_path_factory, painted_box, meshes):
     """The results of a run of two steps."""
     folder = tmp_path_factory.mktemp("pages")
-    options = [
-        "system.prompt_processor.prompt=a <painted> box",
-        "system.renderer.eps2d=0.2",
-        "system.renderer.antialias=true",
-        "system.exporter.formats=[ply,mesh]",
-        f"system.exporter.options={{mesh: {MESH}}}",
-    ]
+    options = ["system.prompt_processor.prompt=a <painted> box", "system.renderer.eps2d=0.2"]
+    options += ["system.renderer.antialias=true", "system.exporter.formats=[ply,mesh]"]
+    options += [f"system.exporter.options={{mesh: {MESH}}}"]
     assert launch(folder, painted_box, *options, *SHORT) == 0
     return run_folder(folder) / "save"
 
 
-def test_a_mesh_is_exported_beside_the_cloud_as_the_run_draws(save, meshes):
-    export = save / "it2-export"
-    written = {"gaussians.ply", "mesh.glb", "mesh.obj", "mesh.mtl", "mesh.png"}
-    assert written <= {path.name for path in export.iterdir()}
-    assert (meshes[0].eps2d, meshes[0].antialias, meshes[0].faces) == (0.2, True, 200)
-    name = (export / "mesh.obj").read_text("utf-8").splitlines()[1].removeprefix("o ")
-    assert f'"name":"{name}"' in (export / "mesh.glb").read_bytes().decode(errors="ignore")
-
-
-def test_a_run_ends_with_a_page_of_its_cloud(save):
-    found = meta(save / "it2-export" / "view.html")
+def test_a_run_ends_with_a_page_and_a_mesh_of_its_cloud(save, meshes):
+    found = meta((save / "it2-export" / "view.html").read_text())
     assert found["title"] == "a <painted> box" and found["background"] == "#ffffff"
     assert found["settings"]["eps2d"] == 0.2 and found["settings"]["alphaMin"] == 1 / 255
     scores = json.loads((save / "metrics.json").read_text())
@@ -80,6 +63,12 @@ def test_a_run_ends_with_a_page_of_its_cloud(save):
     assert turntable.n_frames == len(list((save / "it2-test").glob("*.png"))) == 3
     expected = read(save / "it2-test" / "0.png").astype(float)
     assert np.abs(np.asarray(turntable.convert("RGB")) - expected).mean() < 8
+    export = save / "it2-export"
+    written = {"gaussians.ply", "mesh.glb", "mesh.obj", "mesh.mtl", "mesh.png"}
+    assert written <= {path.name for path in export.iterdir()}
+    assert (meshes[0].eps2d, meshes[0].antialias, meshes[0].faces) == (0.2, True, 200)
+    name = (export / "mesh.obj").read_text("utf-8").splitlines()[1].removeprefix("o ")
+    assert f'"name":"{name}"' in (export / "mesh.glb").read_bytes().decode(errors="ignore")
 
 
 def test_a_run_without_ffmpeg_or_a_page_exports_its_cloud_all_the_same(
@@ -131,6 +120,6 @@ def test_export_writes_the_page_again_and_the_next_test_discards_earlier_picture
     resume = [f"resume={save.parent / 'ckpts/last.ckpt'}", "system.exporter.save_video=false"]
     assert launch(save.parents[2], painted_box, *resume, stage="--export") == 0
     assert pictures and sorted((save / "it2-test").glob("*.png")) == pictures
-    assert [shown["label"] for shown in meta(page)["clouds"]] == ["result", "prior"]
+    assert [shown["label"] for shown in meta(page.read_text())["clouds"]] == ["result", "prior"]
     discard_turntable(SimpleNamespace(get_save_dir=lambda: str(save), true_global_step=2))
     assert not any(path.exists() for path in pictures)

@@ -22,7 +22,7 @@ def plane(height: int, width: int) -> tuple[torch.Tensor, ...]:
     return -c2w[:, None, None, 2:3, 3] / rays[..., 2:], c2w, fovy
 
 
-def test_normals_are_those_of_the_depth_surface_in_world_space():
+def test_normals_are_those_of_the_depth_surface_and_have_gradients():
     depth, c2w, fovy = plane(24, 32)
     alpha = torch.ones_like(depth)
     alpha[:, :10] = 0.5
@@ -31,10 +31,6 @@ def test_normals_are_those_of_the_depth_surface_in_world_space():
     up = torch.tensor([0.5, 0.5, 1.0]).expand_as(drawn)
     torch.testing.assert_close(drawn, up, rtol=0, atol=1e-4)
     assert (nothing == 0.5).all()
-
-
-def test_normals_have_gradients_where_the_surface_is_degenerate_too():
-    """Where the depth is zero all points are the camera's, and have no normal."""
     depth, c2w, fovy = plane(8, 8)
     depth[:, :4] = 0
     depth.requires_grad_()
@@ -87,14 +83,7 @@ def test_a_background_of_another_shape_or_type_is_named(background, message):
         SplattingRenderer._composite(SimpleNamespace(background=background), out, c2w, fovy)
 
 
-def test_fixed_is_the_colour_in_training_and_evaluation():
-    background = FlatBackground({"color": [0.2, 0.4, 0.6]})
-    assert torch.allclose(background.color(3), torch.tensor([0.2, 0.4, 0.6]).expand(3, 3))
-    assert background(torch.zeros(2, 5, 7, 3)).shape == (2, 5, 7, 3)
-    assert not list(background.parameters())
-
-
-def test_random_depends_on_the_step_alone_and_rests_in_evaluation():
+def test_fixed_and_random_backgrounds():
     background = FlatBackground({"mode": "random", "color": [1.0, 1.0, 1.0]})
     background.update_step(0, 7)
     first = background.color(4)
@@ -103,6 +92,10 @@ def test_random_depends_on_the_step_alone_and_rests_in_evaluation():
     background.update_step(0, 8)
     assert not torch.equal(background.color(4), first)
     assert torch.equal(background.eval().color(4), torch.ones(4, 3))
+    background = FlatBackground({"color": [0.2, 0.4, 0.6]})
+    assert torch.allclose(background.color(3), torch.tensor([0.2, 0.4, 0.6]).expand(3, 3))
+    assert background(torch.zeros(2, 5, 7, 3)).shape == (2, 5, 7, 3)
+    assert not list(background.parameters())
 
 
 def test_learned_starts_at_the_colour_stays_in_range_and_learns():

@@ -53,10 +53,8 @@ def test_looking_at_pictures_is_no_training_time_and_pages_can_be_switched_off(
     def taking(hours, body):
         return lambda *args: (clock.__iadd__(hours), body(*args))[1]
 
-    for owner, name, hours in (
-        (GaussianDreamerSystem, "training_step", 1),
-        (events, "save_pictures", 100),
-    ):
+    slow = (GaussianDreamerSystem, "training_step", 1), (events, "save_pictures", 100)
+    for owner, name, hours in slow:
         monkeypatch.setattr(owner, name, taking(hours, getattr(owner, name)))
     options = ["trainer.max_steps=2", "trainer.val_check_interval=1", "system.pages=false"]
     assert launch(tmp_path, painted_box, *options, "system.exporter.save_video=false") == 0
