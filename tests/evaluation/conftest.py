@@ -1,5 +1,7 @@
 """Clouds of the evaluation tests."""
 
+import json
+
 import numpy as np
 import pytest
 
@@ -18,6 +20,13 @@ def save(path, arrays):
     path.parent.mkdir(parents=True, exist_ok=True)
     write_cloud(str(path), StoredCloud(arrays))
     return path
+
+
+def run_of(folder, system, seed=0):
+    """Write a run with this section of its configuration; return its file of Gaussians."""
+    (folder / "configs").mkdir(parents=True)
+    (folder / "configs/parsed.yaml").write_text(json.dumps({"system": system}))
+    return save(folder / "save/it5-export/gaussians.ply", blob(seed=seed))
 
 
 @pytest.fixture

@@ -13,7 +13,7 @@ import pytest
 import torch
 from PIL import Image
 
-from tests.evaluation.conftest import blob, save
+from tests.evaluation.conftest import blob, run_of, save
 from tests.helpers import tiny_3d_models as tiny
 from threestudio_gaussiandreamer import register_parts
 from threestudio_gaussiandreamer.core.checkpoint_file import save_file
@@ -71,7 +71,7 @@ def scored(clip, tmp_path_factory):
     return plys, folder / "out", said.getvalue()
 
 
-def test_the_score_is_transformers_cosine_of_the_drawn_views(clip, scored):
+def test_the_score_is_transformers_cosine_over_the_seeds(clip, scored):
     """Repeats the computation: render the drawn views, use transformers' features, average."""
     from transformers import CLIPModel, CLIPTokenizer
 
@@ -94,9 +94,6 @@ def test_the_score_is_transformers_cosine_of_the_drawn_views(clip, scored):
     each = [result["per_seed"][1] for result in found["results"]]
     assert each == pytest.approx(means, abs=1e-4)
     assert found["per_seed"][1] == pytest.approx(sum(means) / 2, abs=1e-4)
-
-
-def test_mean_and_spread_are_over_the_seeds(scored):
     _, out, said = scored
     found = written(out)
     each = np.array([result["per_seed"] for result in found["results"]])
@@ -150,13 +147,6 @@ def test_a_runs_folder_brings_its_prompt_and_background(clip, tmp_path, monkeypa
     assert found["results"][0]["prompt"] == prompt and found["std"] is None
 
 
-def run_of(folder, system):
-    """Write a run with this section of its configuration; return its file of Gaussians."""
-    (folder / "configs").mkdir()
-    (folder / "configs/parsed.yaml").write_text(json.dumps({"system": system}))
-    return save(folder / "save/it1-export/gaussians.ply", blob())
-
-
 @pytest.mark.parametrize(
     ("kind", "options", "state", "color"),
     [
@@ -187,12 +177,18 @@ def test_a_prompt_of_a_library_is_compared_as_its_text(tmp_path, monkeypatch):
         module.prompts_for([results.find_result(str(tmp_path))], None, None)
 
 
-def test_of_the_last_export_the_ply_is_taken(tmp_path):
+def test_of_the_last_export_the_ply_is_taken_and_one_line_of_the_list(tmp_path, plys):
     for name in ("it200-export/a.ply", "it1200-export/a.spz", "it1200-export/a.ply"):
         save(tmp_path / "save" / name, blob())
     assert results.find_result(str(tmp_path)).file == tmp_path / "save/it1200-export/a.ply"
     save(tmp_path / "save/it1201-export/a.spz", blob())
     assert results.find_result(str(tmp_path)).file.name == "a.spz"
+    found = [results.find_result(ply) for ply in plys]
+    file = tmp_path / "prompts.txt"
+    file.write_text("a fox\n\n  a cat \n", encoding="utf-8")
+    assert module.prompts_for(found, None, str(file)) == ["a fox", "a cat"]
+    with pytest.raises(UserError, match="2 prompts for 1 results"):
+        module.prompts_for(found[:1], None, str(file))
 
 
 @pytest.mark.parametrize("antialiased", [False, True])
@@ -208,15 +204,6 @@ def test_clouds_are_drawn_with_the_antialiasing_of_their_training(tmp_path, anti
         for flag in (True, False)
     )
     assert drawn < other
-
-
-def test_one_line_of_the_list_for_each_result(plys, tmp_path):
-    found = [results.find_result(ply) for ply in plys]
-    file = tmp_path / "prompts.txt"
-    file.write_text("a fox\n\n  a cat \n", encoding="utf-8")
-    assert module.prompts_for(found, None, str(file)) == ["a fox", "a cat"]
-    with pytest.raises(UserError, match="2 prompts for 1 results"):
-        module.prompts_for(found[:1], None, str(file))
 
 
 @pytest.mark.parametrize(

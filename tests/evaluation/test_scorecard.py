@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.evaluation.conftest import blob, save
+from tests.evaluation.conftest import run_of
 from tests.helpers import tiny_3d_models as tiny
 from tests.helpers import tiny_image_reward
 from threestudio_gaussiandreamer.evaluation import t3bench
@@ -23,10 +23,7 @@ def finished(folder, prompts):
     """Folders of finished runs with one cloud each."""
     for number, prompt in enumerate(prompts):
         run = folder / "gaussiandreamer" / f"run{number}"
-        save(run / "save/it5-export/gaussians.ply", blob(seed=number))
-        (run / "configs").mkdir()
-        config = {"system": {"prompt_processor": {"prompt": prompt}}}
-        (run / "configs/parsed.yaml").write_text(json.dumps(config))
+        run_of(run, {"prompt_processor": {"prompt": prompt}}, number)
     return folder
 
 
@@ -136,21 +133,15 @@ def test_wrong_input_is_named(tmp_path, judge, capsys, arguments, message):
     assert message in capsys.readouterr().err
 
 
-def test_the_interval_of_many_values_is_that_of_the_normal_distribution():
+def test_intervals_of_many_undefined_and_paired_values():
     values = np.random.default_rng(0).normal(3.0, 2.0, 400)
     found, error = bootstrap(values), values.std() / math.sqrt(len(values))
     assert found.mean == pytest.approx(values.mean())
     assert found.low == pytest.approx(values.mean() - 1.96 * error, abs=0.15 * error)
     assert found.high == pytest.approx(values.mean() + 1.96 * error, abs=0.15 * error)
-
-
-def test_undefined_values_are_left_out():
     assert bootstrap(np.array([1.0, np.nan, 1.0])) == (1.0, 1.0, 1.0, 2)
     empty = bootstrap(np.array([np.nan]))
     assert math.isnan(empty.mean) and empty.count == 0
-
-
-def test_seeds_of_a_prompt_count_once_and_differences_are_of_common_prompts():
     means = per_prompt(["a", "a", "b", "c"], np.array([0.0, 1.0, 3.0, np.nan]))
     assert means["a"] == 0.5 and means["b"] == 3.0 and math.isnan(means["c"])
     first, second = {"a": 2.0, "b": 5.0, "c": 9.0}, {"b": 4.0, "a": 1.0, "d": 0.0}

@@ -22,7 +22,7 @@ def t3bench_pose(v):
     return pose
 
 
-def test_the_cameras_are_t3benchs(monkeypatch):
+def test_the_cameras_are_t3benchs_and_the_object_is_centred_and_scaled(monkeypatch):
     monkeypatch.setattr(t3bench, "SIZE", 8)
     drawn = []
     monkeypatch.setattr(t3bench, "render_views", lambda _, *views, **how: drawn.extend(views))
@@ -34,9 +34,6 @@ def test_the_cameras_are_t3benchs(monkeypatch):
     poses = np.repeat([t3bench_pose(v) for v in positions], 5, 0)
     np.testing.assert_allclose(drawn[0], poses, atol=2e-6)
     np.testing.assert_allclose(drawn[1][:10].reshape(2, 5), [t3bench.FOVY] * 2)
-
-
-def test_the_object_is_centred_and_scaled_without_what_is_invisible():
     arrays = blob(center=(3.0, -1.0, 0.5))
     arrays.means[0], arrays.logit_opacities[0] = 100.0, -8.0
     found = t3bench.normalized(arrays)

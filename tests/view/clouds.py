@@ -1,5 +1,8 @@
 """Clouds that test the page's renderer: thin Gaussians, view-dependent colours, many layers."""
 
+import json
+import re
+
 import numpy as np
 
 from threestudio_gaussiandreamer.formats.gaussian_files import StoredCloud
@@ -31,6 +34,11 @@ def cloud(
         sh=harmonics,
     )
     return StoredCloud(arrays.map(lambda values: values.astype(np.float32)), up)
+
+
+def meta(page: str) -> dict:
+    """Return what a page says of itself."""
+    return json.loads(re.search(r'id="meta">(.*?)</script>', page)[1])
 
 
 def options(**settings) -> PageOptions:

@@ -1,7 +1,6 @@
 """The command ``view``: any cloud becomes a page, rendered like its run."""
 
 import html
-import json
 import re
 from pathlib import Path
 
@@ -11,7 +10,7 @@ import torch
 from benchmarks.viewers.browser import chromium
 from benchmarks.viewers.devtools import open_page
 from tests.helpers.pruning import ball
-from tests.view.clouds import cloud
+from tests.view.clouds import cloud, meta
 from threestudio_gaussiandreamer.convert import command as convert
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.formats.gaussian_files import write_cloud
@@ -28,15 +27,11 @@ def source(tmp_path) -> Path:
     return path
 
 
-def meta(path: Path) -> dict:
-    return json.loads(re.search(r'id="meta">(.*?)</script>', path.read_text())[1])
-
-
 def test_options_say_how_a_cloud_is_drawn(source, tmp_path):
     out = tmp_path / "out.html"
     given = "--eps2d 0.1 --preset accurate --antialias --no-bound-colors --background 0080ff"
     assert main([str(source), "--html", str(out), "--title", "a box \udcff", *given.split()]) == 0
-    found = meta(out)
+    found = meta(out.read_text())
     settings = found["settings"]
     assert settings["eps2d"] == 0.1 and settings["alphaMin"] == 1 / 65536
     assert settings["antialias"] and not settings["boundColors"]
@@ -47,7 +42,7 @@ def test_options_say_how_a_cloud_is_drawn(source, tmp_path):
 def test_a_cloud_of_a_run_is_drawn_as_the_run_has_drawn_it(run_folder):
     export = run_folder / "save" / "it7-export" / "gaussians.spz"
     assert main([str(export), "--html"]) == 0
-    found = meta(export.with_suffix(".html"))
+    found = meta(export.with_suffix(".html").read_text())
     settings = found["settings"]
     assert settings["eps2d"] == pytest.approx(0.1) and settings["alphaMin"] == 1 / 255
     assert settings["antialias"] and not settings["boundColors"]
@@ -56,7 +51,7 @@ def test_a_cloud_of_a_run_is_drawn_as_the_run_has_drawn_it(run_folder):
     other = run_folder / "save" / "it3-export"
     export.parent.rename(other)  # a step of which the scores aren't
     assert main([str(other / "gaussians.spz"), "--html"]) == 0
-    assert meta(other / "gaussians.html")["clouds"][0]["quality"] == ""
+    assert meta((other / "gaussians.html").read_text())["clouds"][0]["quality"] == ""
 
 
 def message(capsys, *argv: object) -> str:
@@ -95,19 +90,16 @@ def test_what_is_wrong_is_named(source, tmp_path, run_folder, capsys, monkeypatc
     assert "has 30 Gaussians" in said and "prune" in said and "--count" in said
 
 
-def test_an_axis_that_begins_with_a_hyphen_is_a_value():
-    assert parse(["a.ply", "--up", "-y", "--html"]).up == "-y"
-    converted = convert.parse(["a.ply", "b.ply", "--up=-y", "--up-out", "-y"])
-    assert (converted.up, converted.up_out) == ("-y", "-y")
-
-
-def test_a_cloud_of_any_unit_has_no_far_plane(tmp_path):
+def test_a_cloud_of_any_unit_has_no_far_plane_and_an_axis_may_begin_with_a_hyphen(tmp_path):
     large = cloud(30)
     large.gaussians.means[:] *= 1e13
     large.gaussians.log_scales[:] += 30
     write_cloud(str(tmp_path / "large.ply"), large)
     _, options = page.cloud_page(tmp_path / "large.ply")
     assert options.settings.far > 1e30 and options.settings.near > 1e10
+    assert parse(["a.ply", "--up", "-y", "--html"]).up == "-y"
+    converted = convert.parse(["a.ply", "b.ply", "--up=-y", "--up-out", "-y"])
+    assert (converted.up, converted.up_out) == ("-y", "-y")
 
 
 def test_a_run_gets_the_page_of_any_export_but_of_a_ply_first(run_folder):
@@ -123,7 +115,7 @@ def test_a_run_gets_the_page_of_any_export_but_of_a_ply_first(run_folder):
 
 def test_a_run_gets_an_index_and_a_page_and_a_folder_of_runs_a_gallery(run_folder, capsys):
     assert main([str(run_folder), "--html"]) == 0
-    assert meta(run_folder / "save" / "it7-export" / "view.html")["title"] == "a box"
+    assert meta((run_folder / "save" / "it7-export" / "view.html").read_text())["title"] == "a box"
     assert capsys.readouterr().out.strip().endswith(str(run_folder / "index.html"))
     assert "it7-export/view.html" in (run_folder / "index.html").read_text()
     assert main([str(run_folder.parent), "--html"]) == 0
@@ -142,16 +134,13 @@ def embedded(shown) -> str:
     return html.unescape(re.search(r'srcdoc="([^"]*)"', shown._repr_html_())[1])
 
 
-def test_the_output_is_the_page_in_a_frame(ply):
+def test_the_output_is_the_page_in_a_frame_and_of_a_run_its_own(ply, run_folder):
     shown = show(ply, height=300, title="a <b> & “c”", background="ff0000")
     assert embedded(shown) == shown.content and "a &lt;b&gt; &amp; “c”" in shown.content
     text = shown._repr_html_()
     assert text.isascii() and 'height="300"' in text and "allow-same-origin" not in text
     assert '"background": "#ff0000"' in shown.content
     assert len(repr(shown)) < 100
-
-
-def test_of_a_run_its_own_page_is_shown(run_folder):
     (export,) = run_folder.glob("save/it*-export")
     assert ">a box<" in show(run_folder).content
     (export / "view.html").write_text("with the prior")

@@ -33,7 +33,7 @@ def taken():
         yield server.getsockname()[1]
 
 
-def test_viser_gets_covariances_colours_and_opacities():
+def test_what_viser_gets_and_the_buttons_of_a_training():
     quarter_turn = np.float32([[np.sqrt(0.5), 0, 0, np.sqrt(0.5)]])  # about z: x becomes y
     one = Gaussians(
         means=np.float32([[1, 2, 3]]),
@@ -46,10 +46,6 @@ def test_viser_gets_covariances_colours_and_opacities():
     np.testing.assert_allclose(got["covariances"][0], np.diag([4, 1, 9]), atol=1e-6)
     np.testing.assert_allclose(got["rgbs"], [[0.5, 1, 0]])
     assert got["opacities"].shape == (1, 1) and got["opacities"][0, 0] == 0.5
-
-
-def test_the_buttons_of_a_training():
-    """The cameras are switched off and go after it; a pause allows one step for a press."""
     actions, removed = {}, []
 
     def add(label, value=None):
@@ -94,7 +90,7 @@ def handshake(port, **headers):
         return int(connection.recv(4096).split()[1])
 
 
-def test_only_the_servers_own_page_is_answered(view):
+def test_only_the_servers_own_page_is_answered_and_updates_replace_the_cloud(view):
     port = view.server.get_port()
     assert view.address == f"http://127.0.0.1:{port}"
     own, local = f"127.0.0.1:{port}", f"localhost:{port}"
@@ -109,25 +105,6 @@ def test_only_the_servers_own_page_is_answered(view):
     assert handshake(port, Host=rebound) == 403
     assert handshake(port, Host=f"127.0.0.1.evil.example:{port}") == 403
     assert handshake(port, Host=f"evil.example@127.0.0.1:{port}", Origin="http://a") == 403
-
-
-def test_the_name_that_is_listened_on_is_known():
-    assert live.is_own_page("gpu7.lab:80", "http://gpu7.lab:80", "gpu7.lab")
-    assert live.is_own_page("192.168.0.7:80", "https://192.168.0.7:80", "0.0.0.0")
-    assert not live.is_own_page("gpu8.lab:80", "http://gpu8.lab:80", "gpu7.lab")
-    assert not live.is_own_page(None, None, "0.0.0.0")
-
-
-def test_a_server_that_cannot_be_guarded_is_not_used(monkeypatch):
-    stopped = []
-    server = SimpleNamespace(stop=lambda: stopped.append(1))
-    monkeypatch.setattr(pytest.importorskip("viser"), "ViserServer", lambda **_: server)
-    with pytest.raises(UserError, match="this version of viser"):
-        live.LiveView("127.0.0.1", 0, "cloud")
-    assert stopped
-
-
-def test_updates_replace_the_cloud_and_the_cameras(view):
     for count in (5, 5, 7):
         view.show(cloud(count).gaussians, f"{count} Gaussians")
         assert len(view._splats.centers) == count
@@ -139,6 +116,19 @@ def test_updates_replace_the_cloud_and_the_cameras(view):
         assert view._frustums[0].fov == 0.5 and view._frustums[0].aspect == 1.5
     view.remove_cameras()
     assert not view._frustums and not view.watched
+
+
+def test_a_server_that_cannot_be_guarded_is_not_used(monkeypatch):
+    stopped = []
+    server = SimpleNamespace(stop=lambda: stopped.append(1))
+    monkeypatch.setattr(pytest.importorskip("viser"), "ViserServer", lambda **_: server)
+    with pytest.raises(UserError, match="this version of viser"):
+        live.LiveView("127.0.0.1", 0, "cloud")
+    assert stopped
+    assert live.is_own_page("gpu7.lab:80", "http://gpu7.lab:80", "gpu7.lab")
+    assert live.is_own_page("192.168.0.7:80", "https://192.168.0.7:80", "0.0.0.0")
+    assert not live.is_own_page("gpu8.lab:80", "http://gpu8.lab:80", "gpu7.lab")
+    assert not live.is_own_page(None, None, "0.0.0.0")
 
 
 def test_without_viser_the_extra_is_named(monkeypatch, port):

@@ -3,7 +3,6 @@
 import base64
 import html
 import io
-import json
 import re
 import zlib
 
@@ -11,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.view.clouds import PROMPT, cloud, options
+from tests.view.clouds import PROMPT, cloud, meta, options
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.formats.gaussian_files import StoredCloud
 from threestudio_gaussiandreamer.formats.ply import gaussian_columns
@@ -21,19 +20,12 @@ from threestudio_gaussiandreamer.view.page import COARSE_MEANS, Shown, coarse, p
 from threestudio_gaussiandreamer.view.render import RenderSettings, first_pose, render
 
 
-def meta(text: str) -> dict:
-    return json.loads(re.search(r'id="meta">(.*?)</script>', text)[1])
-
-
-def test_a_prompt_is_text_wherever_it_stands():
+def test_a_prompt_is_text_and_no_control_needs_javascript_or_a_request():
     text = page(Shown(cloud(3), "result"), options())
     title = re.search(r"<title>(.*?)</title>", text, re.S)[1]
     assert html.unescape(title) == PROMPT and "<" not in title and PROMPT not in text
     assert meta(text)["title"] == PROMPT
     assert text.count("<script") == text.count("</script>") == 8  # four shaders, meta, data x 2
-
-
-def test_no_control_without_javascript_no_request_and_no_foreign_script():
     text = page(Shown(cloud(3), "result"), options())
     shown, footer = re.split("<footer hidden>|</footer>", text)[::2], text.partition("<footer")[2]
     control = re.compile("<(?:button|select|input|textarea)")
@@ -94,16 +86,13 @@ def unpacked(data: bytes, count: int) -> np.ndarray:
     return np.ascontiguousarray(planes.transpose(0, 2, 1)).view("<f4")[..., 0]
 
 
-def test_packing_keeps_every_bit():
+def test_packing_keeps_every_bit_and_a_coarse_cloud_is_a_fraction_of_the_size():
     gaussians = cloud(50, degree=2).gaussians
     columns = gaussian_columns(gaussians)
     found = unpacked(packed(gaussians), 50)
     assert np.array_equal(found[:3].T, columns[:, :3])
     assert np.array_equal(found[3:].T, columns[:, 6:])
     assert not columns[:, 3:6].any()  # the normals, which aren't stored
-
-
-def test_a_coarse_cloud_is_a_fraction_of_the_size_and_hardly_moves():
     gaussians = cloud(4000, degree=1).gaussians
     rounded = coarse(gaussians)
     side = np.ptp(gaussians.means, axis=0).max()

@@ -127,7 +127,7 @@ def test_the_pose_is_in_the_address_and_read_from_it(opened):
     assert page.problems == []
 
 
-def test_dragging_turns_and_the_wheel_zooms(opened):
+def test_dragging_turns_the_wheel_zooms_and_every_control_works(opened):
     page, _ = opened
     before = Pose(**page.evaluate("viewer.then(v => v.pose)"))
     for kind, x in (("mousePressed", 400), ("mouseMoved", 300), ("mouseReleased", 300)):
@@ -138,9 +138,6 @@ def test_dragging_turns_and_the_wheel_zooms(opened):
     after = Pose(**page.evaluate("viewer.then(v => v.pose)"))
     assert math.isclose((after.azimuth - before.azimuth) % 360, 35, abs_tol=0.01)
     assert after.distance < 0.95 * before.distance
-
-
-def test_every_control_works(opened):
     page, _ = opened
 
     def press(name, action="click()"):

@@ -117,7 +117,7 @@ def test_names_that_are_not_utf_8_are_linked(full_run):
     assert "save/it7-%FF.png" in write_index(full_run).read_text()
 
 
-def test_the_changes_of_the_configuration_are_listed(full_run):
+def test_changes_of_the_configuration_are_listed_and_a_damaged_file_loses_its_part(full_run):
     text = write_index(full_run).read_text()
     rows = re.findall(r"<tr><td>([\w.]+)</td><td>([^<]*)</td><td>([^<]*)</td></tr>", text)
     changed = {key: (base, run) for key, base, run in rows}
@@ -125,9 +125,6 @@ def test_the_changes_of_the_configuration_are_listed(full_run):
     assert changed["trainer.max_steps"] == ("–", "7")
     # neither what is equal, nor what is computed, nor what the base file refers to elsewhere
     assert not changed.keys() & {"seed", "exp_dir", "tag", "system.renderer.preset"}
-
-
-def test_a_damaged_file_only_loses_its_part(full_run):
     names = "save/metrics.json times.json configs/raw.yaml csv_logs/version_0/metrics.csv".split()
     for damage in (b"", b"{", b"[1]", b"\xff\xfe", b'{"result": {"psnr": "x"}}'):
         for name in names:
@@ -156,14 +153,11 @@ def test_the_gallery_shows_prompt_poster_and_scores_and_is_replaced(full_run):
     assert "run" in Tags(write_gallery(full_run.parent)).files
 
 
-def test_a_gallery_needs_runs_and_an_empty_folder_has_an_index(tmp_path):
+def test_a_gallery_needs_runs_and_curves_are_those_of_the_resumed_run(tmp_path):
     assert Tags(write_index(tmp_path)).tags.count("h1") == 1
     (tmp_path / "index.html").unlink()
     with pytest.raises(UserError, match="holds no run.*configs/parsed.yaml"):
         write_gallery(tmp_path)
-
-
-def test_a_resumed_run_replaces_the_steps_that_it_repeats(tmp_path):
     logs = {2: "loss,alone,step\n1,1,1\n2,inf,2\n3,nan,3\n", 10: "loss,step\n30,3\n40,4\n"}
     for version, text in logs.items():
         path = tmp_path / f"csv_logs/version_{version}/metrics.csv"
@@ -171,9 +165,6 @@ def test_a_resumed_run_replaces_the_steps_that_it_repeats(tmp_path):
         path.write_text(text)
     curves = read_curves(tmp_path, ["loss", "absent", "alone"])
     assert curves == {"loss": [(1, 1), (2, 2), (3, 30), (4, 40)]}
-
-
-def test_curves_fill_their_axes():
     assert drawn([(0, 1.0), (10, 3.0)], "loss")["points"] == "0.0000,0.0000 1.0000,1.0000"
     powers = drawn([(0, 1.0), (1, 100.0), (2, 10_000.0)], "loss")
     assert powers["points"].split()[1] == "0.5000,0.5000"
