@@ -5,7 +5,8 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 import torch
 
-from threestudio_gaussiandreamer.core import memory, options
+from threestudio_gaussiandreamer.core import options
+from threestudio_gaussiandreamer.core import options as memory
 from threestudio_gaussiandreamer.core.devices import get_device, torch_threads, without_autocast
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.core.logs import get_rank

@@ -9,8 +9,8 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from threestudio_gaussiandreamer.core import streams
+from threestudio_gaussiandreamer.core.devices import DelayedReads, HostCopy, flush_reads
 from threestudio_gaussiandreamer.core.given_gradient import given_gradient
-from threestudio_gaussiandreamer.core.host_copies import DelayedReads, HostCopy, flush_reads
 from threestudio_gaussiandreamer.core.lazy_mapping import LazyMapping
 from threestudio_gaussiandreamer.core.quaternions import rotation_rows
 

@@ -18,8 +18,8 @@ import torch
 from tests.helpers import tiny_parts
 from tests.helpers.gallery import assert_same_training, files, only_run
 from threestudio_gaussiandreamer.core.checkpoint_file import load_file
+from threestudio_gaussiandreamer.core.devices import DelayedReads, HostCopy
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.core.host_copies import DelayedReads, HostCopy
 from threestudio_gaussiandreamer.launch import callbacks
 from threestudio_gaussiandreamer.launch.config import load_config
 from threestudio_gaussiandreamer.launch.experiment import main

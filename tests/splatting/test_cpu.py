@@ -27,7 +27,7 @@ from tests.helpers.splatting_scenes import (
     random_cloud,
     rasterize,
 )
-from threestudio_gaussiandreamer.core import memory
+from threestudio_gaussiandreamer.core import options as memory
 from threestudio_gaussiandreamer.core.devices import torch_threads
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.splatting import validation

@@ -15,8 +15,8 @@ from tests.stability.scenes import CorruptedScore, orbit, score_gradient, seeded
 from tests.stability.small_runs import EVERY_STEP, Ended, launch, refused, require_equal_ends
 from threestudio_gaussiandreamer import cameras
 from threestudio_gaussiandreamer.cameras import Orbit
+from threestudio_gaussiandreamer.core.devices import HostCopy
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.core.host_copies import HostCopy
 from threestudio_gaussiandreamer.diffusion import sds
 from threestudio_gaussiandreamer.host import C, find
 from threestudio_gaussiandreamer.launch import run

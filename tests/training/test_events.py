@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from tests.training.runs import launch, length, run_folder
-from threestudio_gaussiandreamer.core.host_copies import HostCopy
+from threestudio_gaussiandreamer.core.devices import HostCopy
 from threestudio_gaussiandreamer.metrics import psnr
 from threestudio_gaussiandreamer.splatting.cpu import backend as cpu
 from threestudio_gaussiandreamer.training import events

@@ -12,8 +12,7 @@ from typing import Optional
 from ..core.command import joined_values, run_command
 from ..core.errors import UserError
 from ..core.files import existing_file, require_other_file, require_writable, through_link
-from ..core.memory import size_text
-from ..core.options import RULE, check_options, in_range
+from ..core.options import RULE, check_options, in_range, size_text
 from ..formats.gaussian_files import (
     FORMATS,
     WRITTEN,

@@ -21,7 +21,7 @@ from typing import Any, Optional
 import torch
 
 from .errors import UserError
-from .files import atomic_file
+from .files import atomic_file, output_folder
 from .logs import warn
 
 _MARK = b"sha256:"
@@ -36,15 +36,10 @@ def save_file(path: str | os.PathLike, content: Any) -> None:
     """
     path, buffer = Path(path), io.BytesIO()
     torch.save(content, buffer)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        # of processes that were killed while saving
-        for stale in path.parent.glob(f".{glob.escape(path.name)}.*.tmp"):
-            stale.unlink(missing_ok=True)
-    except OSError as error:
-        raise UserError(
-            f"the folder of the checkpoint {path} can't be written: {error.strerror or error}"
-        ) from error
+    output_folder(path.absolute().parent, f"the checkpoint {path}")
+    # of processes that were killed while saving
+    for stale in path.parent.glob(f".{glob.escape(path.name)}.*.tmp"):
+        stale.unlink(missing_ok=True)
     with atomic_file(path) as file:
         # the last two bytes of an archive without a comment are the length of the comment
         length = (len(_MARK) + _DIGITS).to_bytes(2, "little")
@@ -86,9 +81,7 @@ def load_file(path: str | os.PathLike, map_location: Any = "cpu") -> Any:
 
 
 def _verify(path: Path) -> None:
-    """Raise an exception unless the checksum of a file holds; in one of plain ``torch.save``, those
-    of its records, which ``torch.load`` doesn't check.
-    """
+    """Raise an exception unless the checksum of a file, or of torch.save's records, holds."""
     with open(path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
         covered = len(content) - _DIGITS
         if content[max(covered - len(_MARK), 0) : max(covered, 0)] != _MARK:
@@ -135,8 +128,8 @@ def newest_readable(folder: str | os.PathLike) -> Optional[tuple[Path, int]]:
 
 
 def _claimed_order(path: Path) -> tuple[float, bool]:
-    """Read the step of a checkpoint without its tensors and without verifying the checksum;
-    infinity if it can't be read, so that it is loaded and reported first. Then ``last.ckpt``.
+    """Read the step of a checkpoint without its tensors and the checksum; infinity if it can't be
+    read, so that it is reported first. Then ``last.ckpt``.
     """
     try:
         content = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
@@ -146,19 +139,11 @@ def _claimed_order(path: Path) -> tuple[float, bool]:
 
 
 def load_module_weights(path: str, module_name: Optional[str] = None) -> tuple[dict, int, int]:
-    """Read the parameters of one module (its prefix removed), or all.
-
-    Returns:
-        parameters, epoch and step of the checkpoint.
-
-    Raises:
-        UserError: the file is missing, damaged or no checkpoint, or has no parameters of that
-            module.
+    """Return the parameters of one module (its prefix removed), or all, and the checkpoint's epoch
+    and step; raise UserError as :func:`load_checkpoint`, or if it has no parameters of that module.
     """
     checkpoint = load_checkpoint(path)
-    state = checkpoint["state_dict"]
-    if module_name:
-        state = entries_below(state, f"{module_name}.")
+    state = entries_below(checkpoint["state_dict"], f"{module_name}." if module_name else "")
     if not state:
         raise UserError(
             f"the checkpoint {path} has no parameters of {module_name!r}; it has "
@@ -169,9 +154,7 @@ def load_module_weights(path: str, module_name: Optional[str] = None) -> tuple[d
 
 def entries_below(state: Mapping[str, Any], prefix: str) -> dict[str, Any]:
     """Return the entries whose names begin with ``prefix``, without it."""
-    return {
-        name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)
-    }
+    return {name[len(prefix) :]: x for name, x in state.items() if name.startswith(prefix)}
 
 
 def load_checkpoint(path: str | os.PathLike, map_location: Any = "cpu") -> dict:

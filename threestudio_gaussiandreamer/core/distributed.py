@@ -1,9 +1,6 @@
-"""Data-parallel training: the views of a step are shared equally by the processes; gradients and
-statistics are reduced over all of them.
-
-Random numbers belong to a view, not to the process that renders it, so a step with several
-processes is the same as with one but for the order of floating-point sums.
-"""
+"""Data-parallel training: the processes share the views of a step equally, and gradients and
+statistics are reduced over all of them. Random numbers belong to a view, not to the process that
+renders it, so a step is the same as with one process but for the order of floating-point sums."""
 
 from collections.abc import Callable, Iterable
 from typing import Any, Optional
@@ -40,8 +37,8 @@ def own_rows(total: int) -> slice:
 
 
 def draw_shared(count: int, draw: Callable[[int], Tensor]) -> Tensor:
-    """Draw numbers for the views of all processes, ``count`` each, by a function of their number
-    that returns the same in all, and return the rows of this one's.
+    """Call ``draw``, which returns the same numbers in all processes, with the number of all views,
+    ``count`` for each process, and return the rows of this one's.
     """
     total = count * world_size()
     return draw(total)[own_rows(total)]
@@ -89,12 +86,7 @@ def all_max(tensor: Tensor) -> Tensor:
 
 
 def average_gradients(parameters: Iterable[torch.nn.Parameter]) -> None:
-    """Replace gradients by their mean over all processes, so that the parameters stay identical.
-
-    A gradient that is None counts as zero.
-    """
-    if not is_active():
-        return
-    for parameter in parameters:
+    """Replace gradients, of which None counts as zero, by their mean over all processes."""
+    for parameter in parameters if is_active() else ():
         gradient = torch.zeros_like(parameter) if parameter.grad is None else parameter.grad
         parameter.grad = all_sum(gradient) / dist.get_world_size()

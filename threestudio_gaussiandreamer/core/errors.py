@@ -1,6 +1,4 @@
-"""Errors in the user's input. Commands print their message, show a traceback only with
-``--verbose``, and exit with code 2.
-"""
+"""Errors in the user's input."""
 
 import difflib
 import traceback

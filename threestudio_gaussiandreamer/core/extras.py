@@ -1,4 +1,4 @@
-"""Optional dependencies: the check that they are installed."""
+"""Optional dependencies."""
 
 import re
 from importlib import import_module, metadata

@@ -26,9 +26,7 @@ PLACEHOLDERS = {
 
 
 def usable_path(path: str | os.PathLike, what: str, *, home: bool = False) -> Path:
-    """Return a path, with ``~`` expanded if ``home``; raise UserError, which names it by ``what``,
-    if it contains NUL or is too long.
-    """
+    """Return a path, with ``~`` expanded if ``home``; raise UserError for NUL or a long name."""
     try:
         path = Path(os.path.expanduser(path) if home else path)
         with suppress(FileNotFoundError, NotADirectoryError):
@@ -46,8 +44,8 @@ def existing_file(path: str | os.PathLike, kind: str, bundled: Collection[str] =
         bundled: bare names of packaged files, for the message only.
 
     Raises:
-        UserError: the path doesn't exist or is no regular file; the message lists the files of its
-            folder with similar names. Or it is one of ``PLACEHOLDERS``.
+        UserError: there is no such regular file, and the message lists similar names; or it is one
+            of ``PLACEHOLDERS``.
     """
     path = usable_path(path, kind, home=True)
     reason = "is no regular file"
@@ -64,9 +62,7 @@ def existing_file(path: str | os.PathLike, kind: str, bundled: Collection[str] =
 
 
 def require_content(path: Path, name: str) -> None:
-    """Raise UserError if a file is one of ``PLACEHOLDERS``; ``name`` is for the message. One that
-    can't be read is left to its reader.
-    """
+    """Raise UserError, which names it by ``name``, if a file is one of ``PLACEHOLDERS``."""
     with suppress(OSError), open(path, "rb") as file:
         start = file.read(64).lstrip().lower()
         for placeholder, what in PLACEHOLDERS.items():
@@ -75,9 +71,7 @@ def require_content(path: Path, name: str) -> None:
 
 
 def near_names(path: Path, bundled: Collection[str] = ()) -> str:
-    """Return the end of the message for a missing file: a bundled file and files in its folder with
-    similar names, or files with the same extension.
-    """
+    """Return the end of the message for a missing file: similar names, or those of a kind."""
     folder, hint = path.parent, f"there is no folder {str(path.parent)!r} either."
     if folder.is_dir():
         names = sorted(entry.name for entry in folder.iterdir() if entry.is_file())
@@ -143,12 +137,8 @@ def through_link(path: str | os.PathLike) -> Path:
 
 
 def require_writable(path: str | os.PathLike, what: str) -> None:
-    """Check that a file, which ``what`` names in messages, can be written, before the work that
-    makes its content.
-
-    Raises:
-        UserError: the name contains NUL or is too long, its folder is missing or can't be written,
-            or the path is a folder.
+    """Raise UserError, which names the file by ``what``, if it can't be written, before the work
+    that makes its content.
     """
     path = usable_path(path, f"{what}:")
     if not path.parent.is_dir():
@@ -161,9 +151,7 @@ def require_writable(path: str | os.PathLike, what: str) -> None:
 def require_other_file(
     path: str | os.PathLike, source: str | os.PathLike, what: str = "OUT is IN"
 ) -> None:
-    """Raise UserError, with a message that begins with ``what``, if a file to be written is the
-    existing one that it is made from.
-    """
+    """Raise UserError if a file to be written is the existing one that it is made from."""
     if os.path.exists(source) and os.path.exists(path) and os.path.samefile(source, path):
         raise UserError(f"{what}: give it another name, so that {_quoted(source)} is kept")
 
@@ -176,14 +164,8 @@ def is_folder(path: str | os.PathLike) -> bool:
 
 
 def output_folder(path: str | os.PathLike, option: str, files: Collection[str] = ()) -> Path:
-    """Make a folder for results, before the work that makes them.
-
-    Args:
-        option: names the folder in messages.
-        files: names of what will be written into it.
-
-    Raises:
-        UserError: it can't be made or written into.
+    """Make a folder for results, before the work that makes them; raise UserError, which names it
+    by ``option``, unless it and the ``files`` of these names can be written.
     """
     folder = usable_path(path, f"{option}: the folder", home=True)
     try:

@@ -1,7 +1,6 @@
 """Stateless random numbers: every draw comes from a generator that is a function of (seed, stream,
-step, item), so a resumed run draws the same numbers as an uninterrupted one, and additional draws
-in one place don't change those elsewhere. Numbers are drawn on the CPU, so they don't depend on the
-device."""
+step, item), so a resumed run draws the same numbers, and draws in one place don't change those
+elsewhere. Numbers are drawn on the CPU, so they don't depend on the device."""
 
 import hashlib
 from typing import Any
@@ -10,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .host_copies import to_device
+from .devices import to_device
 
 
 def derive_seed(seed: int, stream: str, step: int = 0, item: int = 0) -> int:

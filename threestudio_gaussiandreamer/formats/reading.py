@@ -11,7 +11,7 @@ import numpy as np
 
 from ..core.errors import UserError
 from ..core.files import existing_file
-from ..core.memory import size_text
+from ..core.options import size_text
 
 FIXED_BYTES = 24 << 20
 BYTES_PER_FILE_BYTE = 64

@@ -43,10 +43,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ..core import streams
-from ..core.devices import without_autocast
+from ..core.devices import DelayedReads, to_device, without_autocast
 from ..core.distributed import first_item
 from ..core.errors import UserError, unknown
-from ..core.host_copies import DelayedReads, to_device
 from ..core.methods import require_method
 from ..core.options import in_range, interval, one_of, schedule
 from ..diffusion import sds

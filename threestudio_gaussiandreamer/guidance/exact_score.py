@@ -46,8 +46,7 @@ from torch import Tensor
 from ..cameras import OrbitRanges, camera_pool
 from ..core.errors import UserError
 from ..core.given_gradient import given_gradient
-from ..core.memory import count_of, require_memory
-from ..core.options import at_least, in_range, interval, one_of, required
+from ..core.options import at_least, count_of, in_range, interval, one_of, require_memory, required
 from ..diffusion import sds
 from ..diffusion.exact_score import (
     COLOR_MATRIX,

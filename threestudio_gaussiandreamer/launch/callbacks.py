@@ -13,8 +13,8 @@ from typing import Any, Optional
 
 from ..core.checkpoint_file import load_file, save_file
 from ..core.command import interrupt, restore_handlers, set_handlers
+from ..core.devices import flush_reads
 from ..core.files import atomic_file
-from ..core.host_copies import flush_reads
 from ..host import info, pl, warn
 from .config import dump_config
 from .run_folder import PARSED

@@ -22,9 +22,17 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..core.errors import UserError
-from ..core.memory import count_of
 from ..core.methods import require_method
-from ..core.options import Rule, is_numbers, one_of, positive, require_defaults, required, satisfies
+from ..core.options import (
+    Rule,
+    count_of,
+    is_numbers,
+    one_of,
+    positive,
+    require_defaults,
+    required,
+    satisfies,
+)
 from ..core.streams import numpy_generator
 from ..formats.producers import PRODUCERS, producer_axes
 from ..gaussians.point_cloud import PointCloud

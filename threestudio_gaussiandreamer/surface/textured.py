@@ -22,8 +22,7 @@ import numpy as np
 from ..core.errors import UserError
 from ..core.extras import require_extra
 from ..core.logs import warn
-from ..core.memory import require_memory
-from ..core.options import at_least, check_options, in_range, one_of
+from ..core.options import at_least, check_options, in_range, one_of, require_memory
 from ..gaussians.gaussians import Gaussians, finite, opaque
 from ..gaussians.surface import MIN_OPACITY, gaussian_surface
 from ..gaussians.views import EPS2D, views_around

@@ -17,8 +17,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from ..core.devices import to_device
 from ..core.distributed import first_item
-from ..core.host_copies import to_device
 from ..core.options import each, in_range, one_of, schedule
 from ..core.streams import generator
 from ..host import BaseBackground, register, run_seed

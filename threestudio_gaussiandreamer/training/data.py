@@ -39,8 +39,16 @@ from .. import cameras
 from ..cameras import Orbit, OrbitRanges
 from ..core.distributed import own_rows, require_shareable
 from ..core.errors import UserError
-from ..core.memory import count_of, require_memory
-from ..core.options import Rule, in_range, interval, is_list, is_whole, satisfies
+from ..core.options import (
+    Rule,
+    count_of,
+    in_range,
+    interval,
+    is_list,
+    is_whole,
+    require_memory,
+    satisfies,
+)
 from ..core.streams import generator
 from ..host import Updateable, parse_structured, pl, register, register_builtin, run_seed
 

@@ -26,9 +26,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ..core.devices import to_device
 from ..core.distributed import all_max, all_sum, draw_shared
 from ..core.errors import UserError
-from ..core.host_copies import to_device
 from ..core.methods import require_method
 from ..core.options import at_least, between, in_range, positive
 from ..core.streams import generator

@@ -11,7 +11,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from ..core.host_copies import DelayedReads
+from ..core.devices import DelayedReads
 from ..core.images import read as read_image
 from ..guidance.base import ScoreDistillation
 from ..guidance.external import truth_of

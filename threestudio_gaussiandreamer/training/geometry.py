@@ -55,11 +55,11 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from ..core.errors import UserError
-from ..core.memory import count_of
 from ..core.methods import require_method
 from ..core.options import (
     at_least,
     between,
+    count_of,
     in_range,
     interval,
     is_whole,

@@ -23,8 +23,7 @@ from ..core.errors import UserError
 from ..core.files import atomic_file, json_text
 from ..core.images import read as read_image
 from ..core.images import write as write_image
-from ..core.memory import require_memory
-from ..core.options import at_least, in_range
+from ..core.options import at_least, in_range, require_memory
 from ..meshes.mesh import SurfaceDistance
 from ..meshes.raycast import over_background
 from ..view.run_files import read_json

@@ -36,9 +36,9 @@ from typing import Any, ClassVar, Optional
 import torch
 from torch import Tensor
 
+from ..core.devices import flush_reads
 from ..core.distributed import average_gradients, from_first, rank
 from ..core.errors import UserError
-from ..core.host_copies import flush_reads
 from ..core.methods import require_class_method
 from ..core.schedule import parse_schedule, validate_schedule
 from ..gaussians.gaussians import SHAPES, require_cloud

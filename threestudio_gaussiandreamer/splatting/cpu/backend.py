@@ -17,7 +17,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from ...core.errors import UserError
-from ...core.memory import main_memory
+from ...core.options import main_memory
 from .. import autograd
 from ..autograd import Drawn, SceneGradients, Upstream
 from ..scene import Rasterized, RasterizeOptions, Scene, SceneStruct, Settings, pointers

@@ -23,8 +23,8 @@ from typing import Any, NamedTuple, Optional, TypeVar
 import torch
 from torch import Tensor
 
+from ...core.devices import HostCopy
 from ...core.errors import UserError
-from ...core.host_copies import HostCopy
 from .. import autograd, torch_backend
 from ..autograd import Drawn, SceneGradients, Upstream
 from ..scene import Rasterized, RasterizeOptions, Scene, SceneStruct, Settings, pointers

@@ -14,8 +14,8 @@ from typing import Any, Optional
 import torch
 from torch import Tensor
 
+from ...core.devices import HostCopy
 from ...core.errors import UserError
-from ...core.host_copies import HostCopy
 from . import nvrtc
 from .nvrtc import release
 
