@@ -40,17 +40,6 @@ class Orbit(NamedTuple):
         return Orbit(*(values[index] for values in self))
 
 
-def orbit_positions(
-    elevation_deg: Float[Tensor, " B"],
-    azimuth_deg: Float[Tensor, " B"],
-    distance: Float[Tensor, " B"],
-) -> Float[Tensor, "B 3"]:
-    """Convert spherical to Cartesian coordinates, both in world units."""
-    elevation, azimuth = torch.deg2rad(elevation_deg), torch.deg2rad(azimuth_deg)
-    along, z = distance * torch.cos(elevation), distance * torch.sin(elevation)
-    return torch.stack([along * torch.cos(azimuth), along * torch.sin(azimuth), z], -1)
-
-
 def look_at(
     position: Float[Tensor, "B 3"], center: Float[Tensor, "B 3"], up: Float[Tensor, "B 3"]
 ) -> Float[Tensor, "B 4 4"]:
@@ -89,7 +78,9 @@ def orbit_c2w(
         center: the points that the cameras look at; by default the origin.
         up: by default +z.
     """
-    position = orbit_positions(elevation_deg, azimuth_deg, distance)
+    elevation, azimuth = torch.deg2rad(elevation_deg), torch.deg2rad(azimuth_deg)
+    along, z = distance * torch.cos(elevation), distance * torch.sin(elevation)
+    position = torch.stack([along * torch.cos(azimuth), along * torch.sin(azimuth), z], -1)
     center = torch.zeros_like(position) if center is None else center
     up = position.new_tensor([0.0, 0.0, 1.0]).expand_as(position) if up is None else up
     return look_at(position, center, up)
@@ -119,11 +110,7 @@ def to_opencv(
 
 
 def world_to_camera(c2w: Float[Tensor, "B 4 4"]) -> Float[Tensor, "B 4 4"]:
-    """Invert rigid motions by transposing their rotations.
-
-    A matrix that isn't a rigid motion gets a wrong inverse, but raises no error and leaves the
-    other items of the batch correct.
-    """
+    """Invert rigid motions by transposing their rotations; for others the result is wrong."""
     rotation = c2w[:, :3, :3].transpose(1, 2)
     translation = -torch.bmm(rotation, c2w[:, :3, 3:])
     last = _constant(((0.0, 0.0, 0.0, 1.0),), c2w.dtype, c2w.device).expand(len(c2w), 1, 4)
@@ -212,9 +199,7 @@ def projection(
 
 
 class OrbitRanges(NamedTuple):
-    """Ranges from which training views are drawn, in degrees and world units; the defaults are the
-    paper's.
-    """
+    """Of training views, in degrees and world units; the defaults are the paper's."""
 
     elevation: tuple[float, float] = (-10.0, 60.0)
     azimuth: tuple[float, float] = (-180.0, 180.0)

@@ -14,9 +14,8 @@ SMALLEST_SIDE = SSIM_WINDOW // 2 + 1
 
 
 def psnr(image: Float[Tensor, "*shape"], truth: Float[Tensor, "*shape"]) -> Float[Tensor, ""]:
-    """Compute -10 log10 of the mean squared error over all elements, for images in [0, 1], in dB.
-
-    The result is clamped to [-100, 100] dB; an error that isn't finite gives -100 dB.
+    """Compute -10 log10 of the mean squared error over all elements, for images in [0, 1], in dB,
+    clamped to [-100, 100]; an error that isn't finite gives -100 dB.
     """
     return psnr_of_error((image - truth).square().mean())
 
@@ -71,8 +70,7 @@ def multi_face_rate(
     ``threshold`` degrees away.
 
     Similarity is the squared error at ``size`` x ``size`` pixels, so both sets of images need the
-    same background. The rate is most reliable where the bank has the elevations and distances of
-    the views: images from other ones may match by their outline alone.
+    same background, and for a reliable rate the same elevations and distances.
 
     Args:
         renders: images of the Gaussians, in [0, 1].
@@ -80,13 +78,10 @@ def multi_face_rate(
         view_azimuths: of the renders, degrees.
         bank_azimuths: of the bank images, degrees.
     """
-    views, bank = (
-        _shrunk(images, size).flatten(1) for images in (renders, bank_images.to(renders))
-    )
-    nearest = torch.cdist(views, bank).argmin(dim=1)
-    apart = azimuth_difference(
-        view_azimuths, bank_azimuths.to(view_azimuths)[nearest.to(view_azimuths.device)]
-    )
+    sets = (images.movedim(-1, 1) for images in (renders, bank_images.to(renders)))
+    views, bank = (F.adaptive_avg_pool2d(images, (size, size)).flatten(1) for images in sets)
+    nearest = torch.cdist(views, bank).argmin(dim=1).to(view_azimuths.device)
+    apart = azimuth_difference(view_azimuths, bank_azimuths.to(view_azimuths)[nearest])
     return (apart > threshold).double().mean().item()
 
 
@@ -115,10 +110,7 @@ def floater_mass(
 
 
 def out_of_gamut(images: Float[Tensor, "*batch 3"]) -> float:
-    """Compute the fraction of pixels with a channel more than half a grey level outside [0, 1].
-
-    A display clips such colours; large guidance scales produce them.
-    """
+    """Compute the fraction of pixels with a channel more than half a grey level outside [0, 1]."""
     beyond = 0.5 / 255
     return ((images < -beyond) | (images > 1 + beyond)).any(-1).double().mean().item()
 
@@ -144,8 +136,3 @@ def _window_mean(images: Float[Tensor, "*batch H W C"]) -> Float[Tensor, "*batch
             mean.add_(padded.narrow(dim, start, size), alpha=weight)
         images = mean
     return images
-
-
-def _shrunk(images: Float[Tensor, "n H W C"], size: int) -> Float[Tensor, "n s s C"]:
-    """Resize images to ``size`` x ``size`` by averaging."""
-    return F.adaptive_avg_pool2d(images.movedim(-1, 1), (size, size)).movedim(1, -1)

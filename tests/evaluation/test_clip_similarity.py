@@ -215,7 +215,6 @@ def test_clouds_are_drawn_with_the_antialiasing_of_their_training(tmp_path, anti
         (["{ply}", "--clip", "{folder}", "--prompt", "a"], "config.json"),
         (["{ply}", "--clip", "x"], "what was"),
         (["{ply}", "--prompt", "a"], "--clip"),
-        (["{ply}", "--clip", "x", "--prompt", "a", "--prompts-file", "b"], "give one of them"),
         (["{ply}", "--clip", "x", "--prompt", "a", "--size", "0"], "--size"),
         (["{ply}", "--clip", "x", "--prompt", "a", "--fovy", "180"], "--fovy"),
         (["{ply}", "--clip", "toybox", "--prompt", "a", "--fovy", "60"], "--fovy has no effect"),

@@ -120,7 +120,7 @@ def test_a_folder_that_a_dying_process_still_holds_is_waited_for(place, monkeypa
 
 
 def test_a_machine_with_another_version_or_without_the_folder_is_named(place):
-    other = f"has threestudio-gaussiandreamer {__version__}; the farm is of 9.9"
+    other = f"has {__version__}; the farm is of 9.9"
     for wrong, value, said in (("version", "9.9", other), ("start", "/nowhere", "no folder /no")):
         outcome = Worker().make(JOB, 0, setting(place)._replace(**{wrong: value}))
         assert outcome["state"] == FAILED and said in outcome["error"]

@@ -12,7 +12,7 @@ import torch
 from threestudio_gaussiandreamer import host
 from threestudio_gaussiandreamer.core.checkpoint_file import save_file
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.host.builtin import registry
+from threestudio_gaussiandreamer.host.builtin import base as registry
 from threestudio_gaussiandreamer.host.builtin.base import (
     BaseModule,
     BaseObject,

@@ -159,12 +159,8 @@ class Janus(Recognized):
 
 
 METRICS: dict[str, type[Metric]] = {
-    "clip": Clip,
-    "directions": Directions,
-    "imagereward": Reward,
-    "quality": Quality,
-    "judge": Recognized,
-    "janus": Janus,
+    **{"clip": Clip, "directions": Directions, "imagereward": Reward, "quality": Quality},
+    **{"judge": Recognized, "janus": Janus},
 }
 
 

@@ -110,7 +110,6 @@ def score(
 
 
 def _mean_and_spread(per_seed: Float[np.ndarray, " S"]) -> dict[str, Any]:
-    """Return mean and standard deviation over the seeds; the latter is None for a single seed."""
     spread = float(per_seed.std(ddof=1)) if len(per_seed) > 1 else None
     return {"mean": float(per_seed.mean()), "std": spread, "per_seed": per_seed.tolist()}
 
@@ -128,8 +127,6 @@ def prompts_for(
     """Return the prompt of each result: ``prompt``, the file's non-empty lines in the order of the
     results, such as T3Bench's ``data/prompt_single.txt``, or the prompts of their runs.
     """
-    if prompt is not None and prompts_file is not None:
-        raise UserError("both --prompt and --prompts-file: give one of them")
     if prompts_file is not None:
         file = existing_file(prompts_file, "list of prompts")
         try:
@@ -138,17 +135,13 @@ def prompts_for(
             raise UserError(f"--prompts-file {prompts_file} is no UTF-8 text: {error}") from error
         lines = [line.strip() for line in text.splitlines() if line.strip()]
         if len(lines) != len(results):
-            raise UserError(
-                f"--prompts-file {prompts_file} has {len(lines)} prompts for {len(results)} "
-                "results: one line for each is needed"
-            )
+            said = f"has {len(lines)} prompts for {len(results)} results: give a line for each"
+            raise UserError(f"--prompts-file {prompts_file} {said}")
         return lines
     prompts = [prompt if prompt is not None else result.prompt for result in results]
     if None in prompts:
-        raise UserError(
-            f"what was {str(results[prompts.index(None)].file)!r} made from? Give --prompt or "
-            "--prompts-file"
-        )
+        file = str(results[prompts.index(None)].file)
+        raise UserError(f"what was {file!r} made from? Give --prompt or --prompts-file")
     return prompts
 
 
@@ -161,8 +154,9 @@ def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
     add = parser.add_argument
     add("results", nargs="+", help="a run's folder, or a PLY of Gaussians")
     add("--clip", help="CLIP folder in transformers' format, or toybox (bundled)")
-    add("--prompt", help="the text of all results; default: what each run was asked for")
-    add("--prompts-file", help="one prompt for each result, a line each")
+    texts = parser.add_mutually_exclusive_group()
+    texts.add_argument("--prompt", help="the text of all; default: what each run was asked for")
+    texts.add_argument("--prompts-file", help="one prompt for each result, a line each")
     add("--output", default="evaluation", help="folder for clip.json and clip.png")
     add("--seeds", type=int, nargs="+", default=list(paper.seeds))
     add("--size", type=int, help=f"width and height, pixels (default: {paper.size})")

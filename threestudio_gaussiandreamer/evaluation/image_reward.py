@@ -87,9 +87,8 @@ class ImageReward:
         place = Path(folder).expanduser()
         for name, command in SOURCES.items():
             if not (place / name).is_file():
-                raise UserError(
-                    f"--imagereward {folder}: {name} is missing: `{command} --local-dir {folder}`"
-                )
+                get = f"`{command} --local-dir {folder}`"
+                raise UserError(f"--imagereward {folder}: {name} is missing: {get}")
         self.network = load_network(place / WEIGHTS).to(device)
         self.tokenizer, self.device = open_tokenizer(place / VOCABULARY), device
         self.size = self.network.vision.config.image_size
@@ -132,10 +131,8 @@ def load_network(path: Path) -> RewardNetwork:
     try:
         network = RewardNetwork(*configurations(state))
     except (KeyError, IndexError, ValueError, RuntimeError, ZeroDivisionError) as error:
-        raise UserError(
-            f"{kind} {str(path)!r}: it has no tensors, or misshapen ones, of a BLIP with a reward "
-            f"head ({error})"
-        ) from error
+        said = f"no tensors, or misshapen ones, of a BLIP with a reward head ({error})"
+        raise UserError(f"{kind} {str(path)!r}: it has {said}") from error
     load_exactly(network, state, f"{kind} {str(path)!r}")
     return network.float().eval()
 

@@ -48,17 +48,13 @@ def find_result(place: str) -> Result:
     if not folder.is_dir():
         file = existing_file(place, "result (a run's folder or a PLY of Gaussians)")
         if not is_gaussian_ply(file):
-            raise UserError(
-                f"{str(file)!r} is no PLY of Gaussians: a run writes one to "
-                "save/it*-export/gaussians.ply"
-            )
+            where = "a run writes one to save/it*-export/gaussians.ply"
+            raise UserError(f"{str(file)!r} is no PLY of Gaussians: {where}")
         return Result(file, None, BLACK, is_antialiased(file))
     run = RunFiles(folder)
     if not run.cloud:
-        raise UserError(
-            f"{place!r} is no run's folder with Gaussians in save/it*-export: export it first, "
-            "with --export and system.exporter.formats=[ply], or name a PLY file"
-        )
+        said = "export it first (--export system.exporter.formats=[ply]), or name a PLY file"
+        raise UserError(f"{place!r} is no run's folder with Gaussians in save/it*-export: {said}")
     prompt, color, parsed = None, BLACK, folder / "configs" / "parsed.yaml"
     if parsed.is_file():
         system = load_config(parsed).system

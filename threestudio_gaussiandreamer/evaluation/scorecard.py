@@ -33,13 +33,12 @@ Rows = list[dict[str, Any]]
 
 
 class Estimate(NamedTuple):
-    """A mean with its interval; NaN where there are no values."""
+    """A mean with its interval, NaN where there are no values, and the number of prompts."""
 
     mean: float
     low: float
     high: float
     count: int
-    """Number of prompts."""
 
 
 def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
@@ -106,9 +105,7 @@ def find_results(folders: Sequence[str], failed: list[str]) -> list[Result]:
     for folder in folders:
         runs = list(run_folders(Path(folder).expanduser()))
         if not runs:
-            raise UserError(
-                f"{folder!r} is no folder that holds finished runs, which have a save/it*-export"
-            )
+            raise UserError(f"{folder!r} holds no finished runs, which have a save/it*-export")
         for run in runs:
             places.setdefault(run.resolve(), str(run))
     results = []
@@ -155,10 +152,8 @@ def scored(
 
 
 def bootstrap(values: Float[np.ndarray, " N"], *, seed: int = 0) -> Estimate:
-    """Return the mean and its percentile bootstrap interval (Efron 1979) of level LEVEL.
-
-    Args:
-        values: one for each prompt; NaN where the metric isn't defined, which is left out.
+    """Return the mean and its percentile bootstrap interval (Efron 1979) of level LEVEL of values,
+    one for each prompt, without NaN, where the metric isn't defined.
     """
     values = values[~np.isnan(values)]
     if not len(values):

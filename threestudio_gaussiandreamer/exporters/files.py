@@ -38,7 +38,7 @@ import numpy as np
 
 from ..core.errors import UserError
 from ..core.methods import find_method, require_dataclass, require_method
-from ..core.options import Rule, each, in_range, one_of, rule
+from ..core.options import Rule, each, in_range, one_of, require_mapping, rule, shown, wrong
 from ..formats.gaussian_files import FORMATS, StoredCloud, suffix_of
 from ..formats.glb import GLB_UP
 from ..formats.spz import VERSION, VERSIONS, require_version
@@ -72,15 +72,11 @@ def require_file_name(option: str, name: str) -> None:
     folders = not name or name != os.path.basename(name) or name in (os.curdir, os.pardir)
     long = "\0" in name or len(name.encode(errors="surrogateescape")) > NAME_BYTES
     if folders or long or name.casefold() in RESERVED:
-        said = f"{option}: expected the name of a file, without folders, of at most {NAME_BYTES}"
-        others = ", ".join(RESERVED)
-        raise UserError(f"{said} bytes and no NUL, other than {others}, got {name[:80]!r}")
+        said = f"the name of a file, without folders, of at most {NAME_BYTES} bytes and no NUL"
+        raise wrong(option, f"{said}, other than {', '.join(RESERVED)}", name)
 
 
-SAVE_NAME = rule(require_file_name)
-UP = one_of(AXES)
-
-
+SAVE_NAME, UP = rule(require_file_name), one_of(AXES)
 DRAWING = {"eps2d": EPS2D, "antialias": False}
 """Of a run's renderer: the dilation in square pixels of the image, and whether it antialiases."""
 
@@ -119,19 +115,12 @@ def require_export(exporter: type) -> None:
 
 
 def outputs_of(exporter: Exporter) -> list[ExporterOutput]:
-    """Call an exporter.
-
-    Raises:
-        UserError: it returns something else than a list of ExporterOutput.
-    """
+    """Call an exporter; raise UserError if it returns no list of ExporterOutput."""
     found = exporter()
     is_list = isinstance(found, (list, tuple))
-    kinds = {type(entry) for entry in found} if is_list else {type(found)}
-    if not is_list or not all(issubclass(kind, ExporterOutput) for kind in kinds):
-        what = ("entries of type " if is_list else "") + ", ".join(kind.__name__ for kind in kinds)
-        raise UserError(
-            f"{type(exporter).__name__} returned {what}; expected a list of ExporterOutput"
-        )
+    if not is_list or not all(isinstance(entry, ExporterOutput) for entry in found):
+        said = f"{type(exporter).__name__} returned {shown(found)}"
+        raise UserError(f"{said}; expected a list of ExporterOutput")
     return list(found)
 
 
@@ -143,8 +132,8 @@ Params = Callable[[Gaussians, Any], dict[str, Any]]
 
 
 def stored(suffix: str, *variants: str) -> Params:
-    """Return a function for a format, a key of ``formats.gaussian_files.FORMATS``, or for one of
-    ``variants`` that the extension of ``save_name`` selects instead.
+    """Return a function for a format of ``formats.gaussian_files.FORMATS``, or one of ``variants``
+    that the extension of ``save_name`` selects.
     """
 
     def params(gaussians: Gaussians, cfg: Any) -> dict[str, Any]:
@@ -189,12 +178,8 @@ def add(
     options: Sequence[tuple[str, Any, Any, Rule]] = (),
     check: Callable[[Any], None] = lambda cfg: None,
 ) -> None:
-    """Register the exporter of a format.
-
-    Args:
-        save_name: default of the option.
-        options: name, type, default and rule of those beside ``save_name`` and ``save_video``.
-        check: raises UserError for options that can't be had.
+    """Register the exporter of a format, whose further ``options`` each have name, type, default
+    and rule; ``check`` raises UserError for those that can't be had.
     """
 
     def call(self: FileExporter) -> List[ExporterOutput]:
@@ -318,8 +303,7 @@ class BundleExporter(Exporter):
 def options_of(name: str, cfg: Any) -> Any:
     """Parse and check the options of one format; the bundle's ``up`` is the default of its own."""
     options, exporter = cfg.options.get(name, {}), find(name + SUFFIX)
-    if not isinstance(options, Mapping):
-        raise UserError(f"options.{name}: expected keys and values, got {options!r}")
+    require_mapping(f"options.{name}", options)
     require_export(exporter)
     require_dataclass(exporter)
     if cfg.up is not None and "up" in exporter.Config.__dataclass_fields__:

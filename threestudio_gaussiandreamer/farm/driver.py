@@ -1,5 +1,6 @@
 """Ray's cluster: workers, which asset each makes, what became of it, and those that hang."""
 
+import contextlib
 import os
 import socket
 import sys
@@ -7,6 +8,7 @@ import tempfile
 import time
 from collections import Counter, deque
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from typing import Any, Optional
 
 from tqdm import tqdm
@@ -109,27 +111,19 @@ def start_workers(ray: Any, count: int, gpus: int, setting: Setting) -> list[Any
     return workers
 
 
+@dataclass
 class Driver:
-    """Gives the assets that are left, ``jobs``, to idle workers.
+    """Gives the assets that are left, ``jobs``, to idle workers."""
 
-    Args:
-        ray: the module, connected to a cluster.
-        hang: seconds without a finished step after which a worker is restarted.
-        total: number of assets of the farm, ``done`` of which were finished before.
-    """
+    ray: Any  # the module, connected to a cluster
+    workers: list[Any]
+    setting: Setting
+    jobs: Iterator[Job]
+    hang: float  # seconds without a finished step after which a worker is restarted
+    total: int  # number of assets of the farm, ``done`` of which were finished before
+    done: int
 
-    def __init__(
-        self,
-        ray: Any,
-        workers: list[Any],
-        setting: Setting,
-        jobs: Iterator[Job],
-        hang: float,
-        total: int,
-        done: int,
-    ) -> None:
-        self.ray, self.workers, self.setting, self.jobs = ray, workers, setting, jobs
-        self.hang, self.total, self.done = hang, total, done
+    def __post_init__(self) -> None:
         self.idle = deque(range(len(self.workers)))
         self.running: dict[Any, tuple[int, Job]] = {}
         self.again: deque[Job] = deque()
@@ -264,7 +258,6 @@ class Driver:
                 self.ray.kill(self.workers[number], no_restart=False)
 
     def tell_board_to_stop(self) -> None:
-        try:
+        # while it is being restarted, the workers are stopped without checkpoints
+        with contextlib.suppress(self.ray.exceptions.RayError):
             self.ray.get(self.setting.board.stop.remote(), timeout=5)
-        except self.ray.exceptions.RayError:
-            pass  # it is being restarted; the workers are stopped without checkpoints

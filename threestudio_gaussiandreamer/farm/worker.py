@@ -15,7 +15,7 @@ import time
 import traceback
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple, Optional
+from typing import Any, NamedTuple
 
 from .. import __version__, register_parts
 from ..core.command import foreign_exit
@@ -67,17 +67,13 @@ class Worker:
         """Prepare this process; raises UserError for another version, or a missing folder."""
         if self.is_ready:
             return
-        name, host = "threestudio-gaussiandreamer", socket.gethostname()
-        if (version := setting.version) != __version__:
-            raise UserError(
-                f"{host} has {name} {__version__}; the farm is of {version}: "
-                f"pip install {name}=={version} there"
-            )
+        host, version = socket.gethostname(), setting.version
+        if version != __version__:
+            install = f"pip install threestudio-gaussiandreamer=={version} there"
+            raise UserError(f"{host} has {__version__}; the farm is of {version}: {install}")
         if not os.path.isdir(setting.start):
-            raise UserError(
-                f"{host} has no folder {setting.start}: start the farm in a folder that all "
-                "machines share"
-            )
+            shared = "start the farm in a folder that all machines share"
+            raise UserError(f"{host} has no folder {setting.start}: {shared}")
         os.chdir(setting.start)
         train_alone()  # before Lightning is imported, which reads the variables
         import torch
@@ -219,28 +215,24 @@ class Heartbeat(pl.Callback):
 
     def beat(self, stage: str, step: int, steps: int = 0) -> bool:
         """Tell the board, unless it is being restarted; return whether the farm is stopping."""
-        if time.monotonic() < self.due:
-            return False
-        stopping = self.report(Beat(self.job.row.name, self.attempt, stage, step, steps))
-        self.due = time.monotonic() + SECONDS_BETWEEN
-        return stopping
-
-    def report(self, beat: Beat) -> bool:
         import ray
 
+        if time.monotonic() < self.due:
+            return False
+        beat = Beat(self.job.row.name, self.attempt, stage, step, steps)
         try:
             return ray.get(self.setting.board.report.remote(self.number, beat), timeout=1)
         except ray.exceptions.RayError:
             return False
+        finally:
+            self.due = time.monotonic() + SECONDS_BETWEEN
 
 
 def outcome_of(error: Exception) -> dict[str, Any]:
     """Return the outcome of an asset that ended with an error."""
-    causes: list[BaseException] = []
-    cause: Optional[BaseException] = error
-    while cause is not None:
+    causes: list[BaseException] = [error]
+    while (cause := causes[-1].__cause__ or causes[-1].__context__) is not None:
         causes.append(cause)
-        cause = cause.__cause__ or cause.__context__
     torch = sys.modules.get("torch")
     no_memory = (MemoryError, torch.OutOfMemoryError) if torch else MemoryError
     state = REFUSED if isinstance(error, AnotherRow) else FAILED

@@ -139,7 +139,15 @@ else:
 
     from ..core.devices import get_device
     from ..core.logs import debug, info, warn
-    from .builtin.base import BaseModule, BaseObject, Updateable, run_seed
+    from .builtin.base import (
+        BaseModule,
+        BaseObject,
+        Updateable,
+        find,
+        names,
+        register,
+        run_seed,
+    )
     from .builtin.models import (
         BaseBackground,
         BaseGeometry,
@@ -148,7 +156,6 @@ else:
         ExporterOutput,
         Rasterizer,
     )
-    from .builtin.registry import find, names, register
     from .builtin.system import BaseLift3DSystem, BaseSystem
 
     NAME = "builtin"

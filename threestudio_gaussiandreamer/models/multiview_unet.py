@@ -77,12 +77,10 @@ def unet_options(settings: dict[str, Any]) -> dict[str, Any]:
 @contextlib.contextmanager
 def views_attended_together(unet: nn.Module, views: int) -> Iterator[None]:
     """Do as :func:`attend_across_views` within a ``with`` block; nothing for one view."""
-    hooks = attend_across_views(unet, views) if views > 1 else []
-    try:
+    with contextlib.ExitStack() as stack:
+        for hook in attend_across_views(unet, views) if views > 1 else ():
+            stack.enter_context(hook)
         yield
-    finally:
-        for hook in hooks:
-            hook.remove()
 
 
 def attend_across_views(unet: nn.Module, views: int) -> list[RemovableHandle]:

@@ -30,6 +30,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from ..core.errors import UserError
+from ..core.extras import require_extra
 from ..core.options import one_of, positive
 from ..formats.reading import Unreadable, reading, require
 from ..gaussians.point_cloud import PointCloud
@@ -207,6 +208,7 @@ def read_state_dict(path: str, kind: str) -> dict[str, Tensor]:
     """
     with reading(path, kind) as file:
         if file.suffix == ".safetensors":
+            require_extra("diffusion", "safetensors")
             from safetensors.torch import load_file
 
             content = load_file(file)

@@ -1,6 +1,8 @@
-"""Base classes of parts: a typed ``Config``, a device, and ``update_step`` on everything below."""
+"""Base classes of parts: a typed ``Config``, a device, and ``update_step`` on everything below; and
+the registry, in which a decorator enters parts under a name."""
 
 import os
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Optional
 
@@ -8,8 +10,45 @@ from torch import nn
 
 from ...core.checkpoint_file import load_module_weights
 from ...core.devices import get_device
-from ...core.errors import UserError
+from ...core.errors import UserError, unknown
 from ...core.options import parse_structured
+
+_parts: dict[str, type] = {}
+
+
+def register(name: str) -> Callable[[type], type]:
+    """Return a decorator that enters a class, or of a regulariser the function, under ``name``;
+    it raises UserError if another one has that name already.
+    """
+
+    def enter(cls: type) -> type:
+        taken = _parts.get(name)
+        if taken is not None and _identity(taken) != _identity(cls):
+            raise UserError(
+                f"the name {name!r} is taken by {_identity(taken)}: register {_identity(cls)} "
+                "under another name"
+            )
+        _parts[name] = cls
+        return cls
+
+    return enter
+
+
+def find(name: str) -> type:
+    """Return the class registered as ``name``; raise UserError, with the near ones, if none is."""
+    if name not in _parts:
+        raise unknown("part", name, _parts)
+    return _parts[name]
+
+
+def names() -> list[str]:
+    """Return all registered names, sorted."""
+    return sorted(_parts)
+
+
+def _identity(cls: type) -> str:
+    # a module that is executed again makes new class objects of the same name: still the same part
+    return f"{cls.__module__}.{cls.__qualname__}"
 
 
 class Updateable:

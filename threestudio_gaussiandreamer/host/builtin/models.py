@@ -2,13 +2,12 @@
 
 from abc import abstractmethod
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Optional, Tuple
+from typing import Any, Tuple
 
 import torch
 from torch import Tensor, nn
 
-from .base import BaseModule, BaseObject
-from .registry import register
+from .base import BaseModule, BaseObject, register
 
 
 class BaseGeometry(BaseModule):
@@ -72,33 +71,17 @@ class SolidColorBackground(BaseBackground):
         return self.env_color.to(dirs).expand(*dirs.shape[:-1], self.cfg.n_output_dims)
 
 
-class SubModules(NamedTuple):
-    """References to parts that belong to the system, kept out of ``nn.Module``'s registration."""
-
-    geometry: BaseGeometry
-    material: Optional[BaseMaterial]
-    background: Optional[BaseBackground]
-
-
 class HasSubModules:
-    """Refers to the system's parts, under the names that threestudio gives them."""
+    """Refers to the system's parts by threestudio's names; in a tuple they aren't registered."""
 
     def configure(
         self, geometry: BaseGeometry, material: BaseMaterial, background: BaseBackground
     ) -> None:
-        self.sub_modules = SubModules(geometry, material, background)
+        self.sub_modules = geometry, material, background
 
-    @property
-    def geometry(self) -> BaseGeometry:
-        return self.sub_modules.geometry
-
-    @property
-    def material(self) -> Optional[BaseMaterial]:
-        return self.sub_modules.material
-
-    @property
-    def background(self) -> Optional[BaseBackground]:
-        return self.sub_modules.background
+    geometry = property(lambda self: self.sub_modules[0])
+    material = property(lambda self: self.sub_modules[1])
+    background = property(lambda self: self.sub_modules[2])
 
 
 class Rasterizer(HasSubModules, BaseModule):
@@ -112,13 +95,10 @@ class Rasterizer(HasSubModules, BaseModule):
 
     cfg: Config
 
-    def configure(
-        self, geometry: BaseGeometry, material: BaseMaterial, background: BaseBackground
-    ) -> None:
-        super().configure(geometry, material, background)
-        self.register_buffer(
-            "bbox", self.cfg.radius * torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
-        )
+    def configure(self, *parts: Any, **named: Any) -> None:
+        super().configure(*parts, **named)
+        corners = torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
+        self.register_buffer("bbox", self.cfg.radius * corners)
 
 
 @dataclass

@@ -56,16 +56,10 @@ class SaverMixin:
     def create_loggers(self, loggers: Any) -> None:
         """Make the Weights & Biases logger if ``loggers.wandb.enable``; needs the package wandb."""
         if loggers.wandb.enable:
-            try:
-                from lightning.pytorch.loggers import WandbLogger
+            from lightning.pytorch.loggers import WandbLogger
 
-                options = loggers.wandb
-                self._wandb_logger = WandbLogger(project=options.project, name=options.name)
-            except ModuleNotFoundError as error:
-                raise UserError(
-                    "system.loggers.wandb.enable is true, but wandb isn't installed: pip install "
-                    "wandb"
-                ) from error
+            options = loggers.wandb
+            self._wandb_logger = WandbLogger(project=options.project, name=options.name)
 
     def get_loggers(self) -> list:
         return [self._wandb_logger] if self._wandb_logger else []
@@ -119,15 +113,6 @@ class SaverMixin:
             raise FileNotFoundError(f"no picture in {folder} matches {matcher}")
         pictures.write_video(path, [picture for _, picture in frames], fps=fps)
         self._log_file("Video", path, name, step)
-        return path
-
-    def save_data(self, filename: str, data: Any) -> str:
-        """Save a dict of arrays as npz, anything else as npy."""
-        data = self.convert_data(data)
-        extension = ".npz" if isinstance(data, dict) else ".npy"
-        path = self.get_save_path(filename.removesuffix(extension) + extension)
-        with atomic_file(path) as file:
-            np.savez(file, **data) if isinstance(data, dict) else np.save(file, data)
         return path
 
     def save_obj(

@@ -11,9 +11,8 @@ from ...core.checkpoint_file import load_module_weights
 from ...core.errors import UserError
 from ...core.options import parse_structured
 from ...core.schedule import C
-from .base import Updateable, load_parameters
+from .base import Updateable, find, load_parameters
 from .models import Exporter
-from .registry import find
 from .savers import LoggerOptions, SaverMixin
 
 
@@ -42,7 +41,7 @@ class BaseSystem(pl.LightningModule, Updateable, SaverMixin):
         super().__init__()
         self.cfg = parse_structured(self.Config, cfg, "system.")
         self._save_dir = None
-        self._resumed = resumed
+        self.resumed = resumed  # whether a checkpoint will be loaded after construction
         self._resumed_eval: Optional[tuple[int, int]] = None
         self.create_loggers(self.cfg.loggers)
         self.configure()
@@ -65,11 +64,6 @@ class BaseSystem(pl.LightningModule, Updateable, SaverMixin):
     def set_resume_status(self, current_epoch: int, global_step: int) -> None:
         """Set the epoch and step of the checkpoint that is evaluated, for which Lightning has 0."""
         self._resumed_eval = current_epoch, global_step
-
-    @property
-    def resumed(self) -> bool:
-        """Whether a checkpoint will be loaded after construction."""
-        return self._resumed
 
     @property
     def true_current_epoch(self) -> int:
@@ -145,20 +139,15 @@ class BaseLift3DSystem(BaseSystem):
         self.geometry = find(self.cfg.geometry_type)(self.cfg.geometry)
         self.material = find(self.cfg.material_type)(self.cfg.material)
         self.background = find(self.cfg.background_type)(self.cfg.background)
-        self.renderer = find(self.cfg.renderer_type)(
-            self.cfg.renderer,
-            geometry=self.geometry,
-            material=self.material,
-            background=self.background,
-        )
+        self.renderer = self._drawing("renderer")
+
+    def _drawing(self, kind: str) -> Any:
+        """Build a part that is given the others: the renderer or the exporter."""
+        others = {name: getattr(self, name) for name in ("geometry", "material", "background")}
+        return find(getattr(self.cfg, f"{kind}_type"))(getattr(self.cfg, kind), **others)
 
     def on_predict_start(self) -> None:
-        self.exporter: Exporter = find(self.cfg.exporter_type)(
-            self.cfg.exporter,
-            geometry=self.geometry,
-            material=self.material,
-            background=self.background,
-        )
+        self.exporter: Exporter = self._drawing("exporter")
 
     def predict_step(self, batch: dict, batch_idx: int) -> None:
         if self.exporter.cfg.save_video:
