@@ -215,17 +215,19 @@ class Heartbeat(pl.Callback):
 
     def beat(self, stage: str, step: int, steps: int = 0) -> bool:
         """Tell the board, unless it is being restarted; return whether the farm is stopping."""
-        import ray
-
         if time.monotonic() < self.due:
             return False
-        beat = Beat(self.job.row.name, self.attempt, stage, step, steps)
+        stopping = self.report(Beat(self.job.row.name, self.attempt, stage, step, steps))
+        self.due = time.monotonic() + SECONDS_BETWEEN
+        return stopping
+
+    def report(self, beat: Beat) -> bool:
+        import ray
+
         try:
             return ray.get(self.setting.board.report.remote(self.number, beat), timeout=1)
         except ray.exceptions.RayError:
             return False
-        finally:
-            self.due = time.monotonic() + SECONDS_BETWEEN
 
 
 def outcome_of(error: Exception) -> dict[str, Any]:
