@@ -1,6 +1,5 @@
-"""Run a command-line program: exit codes, errors in the user's input as one message without a
-traceback, and the signals that stop it: Ctrl-C, SIGTERM, and SIGHUP, which a closed terminal or a
-lost SSH connection sends."""
+"""Run a command-line program: exit codes, errors in the user's input as one message, and signals
+that stop it: Ctrl-C, SIGTERM, and SIGHUP, which a closed terminal or a lost connection sends."""
 
 import contextlib
 import errno
@@ -23,15 +22,12 @@ def run_command(
     run: Callable[[Any], Any],
     argv: Optional[Sequence[str]] = None,
 ) -> int:
-    """Parse a command line and run it.
-
-    Args:
-        parse: parses the arguments; None means those of this process.
-        run: does the work; its argument is what ``parse`` returned. It may return an exit code.
+    """Parse a command line (None: that of this process), and call ``run`` with the arguments.
 
     Returns:
-        the exit code: 0 for success, 2 for wrong input, 141 for a closed pipe, 128 and the number
-        of a stop signal, even if other code has caught or replaced the exception that it raised.
+        the exit code: that of ``run``, if it returns one, 0 for success, 2 for wrong input, 141 for
+        a closed pipe, 128 and the number of a stop signal, even if other code has caught or
+        replaced the exception that it raised.
     """
     try:
         args = parse(argv)
@@ -45,12 +41,9 @@ def run_command(
                 sys.stdout.flush()
                 if not received:
                     return code if isinstance(code, int) else 0
+        except (KeyboardInterrupt, Terminated) as stop:  # also of handlers of a caller's
+            received = received or [getattr(stop, "code", 128 + signal.SIGINT) - 128]
         except BaseException as error:
-            # these two are also raised by handlers that a caller has installed
-            if isinstance(error, KeyboardInterrupt):
-                received = received or [signal.SIGINT]
-            elif isinstance(error, Terminated):
-                received = received or [error.code - 128]
             if not received:
                 return exit_code(error, getattr(args, "verbose", False))
         print("stopped", file=sys.stderr)
@@ -58,9 +51,7 @@ def run_command(
 
 
 def run_main(module: str) -> int:
-    """Import a module, which may take seconds and be stopped, and return the exit code of its
-    ``main()``.
-    """
+    """Import a module, which may be stopped, and return the exit code of its ``main()``."""
     mains: list[Callable[[], int]] = []
 
     def load(_: Any) -> None:
@@ -71,11 +62,8 @@ def run_main(module: str) -> int:
 
 
 def exit_code(error: BaseException, verbose: bool = False) -> int:
-    """Print one message about the error that ended a command, and return the exit code.
-
-    Raises:
-        BaseException: ``error`` itself, unless it is a UserError, a BrokenPipeError, a
-            ``sys.exit()``, or about a missing module of an extra.
+    """Print one message about the error that ended a command, and return the exit code; raise it if
+    it is no UserError, BrokenPipeError, ``sys.exit()``, or about a missing module of an extra.
     """
     if isinstance(error, SystemExit):
         error = foreign_exit(error)
@@ -89,10 +77,9 @@ def exit_code(error: BaseException, verbose: bool = False) -> int:
         return 2
     # The reader has closed the pipe, as `| head` does; without this, Python's flush at exit fails.
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+    said = f"stopped: the reader of the output has closed it ({error.strerror})"
     with contextlib.suppress(BrokenPipeError):  # after `2>&1 |` it has no reader either
-        print(
-            f"stopped: the reader of the output has closed it ({error.strerror})", file=sys.stderr
-        )
+        print(said, file=sys.stderr)
     return 128 + 13  # SIGPIPE, which Windows doesn't have
 
 
@@ -105,8 +92,8 @@ def foreign_exit(stop: SystemExit) -> UserError:
 def joined_values(
     argv: Optional[Sequence[str]], options: Sequence[str], values: Collection[str]
 ) -> list[str]:
-    """Join each of these options to the value behind it by ``=``, where argparse would take a value
-    that begins with a hyphen for an option; ``argv`` None means the arguments of this process.
+    """Join each of these options by ``=`` to the value behind it, which argparse would take for an
+    option if it begins with a hyphen; ``argv`` None means the arguments of this process.
     """
     joined: list[str] = []
     for word in sys.argv[1:] if argv is None else argv:
@@ -167,9 +154,8 @@ def raised_signals() -> Iterator[list[int]]:
 
 
 class Tolerant:
-    """A text stream that escapes characters which its encoding doesn't have, and whose descriptor
-    becomes the null device after the first write error: the terminal was closed, or the disk is
-    full. A closed pipe still raises BrokenPipeError, which ends the command as usual.
+    """A text stream that escapes characters which its encoding doesn't have, and becomes the null
+    device after a write error, but that of a closed pipe: no terminal, or a full disk.
     """
 
     def __init__(self, stream: Any) -> None:
@@ -201,9 +187,7 @@ class Tolerant:
 
 @contextlib.contextmanager
 def tolerant_output() -> Iterator[None]:
-    """Let ``sys.stdout`` and ``sys.stderr`` ignore write errors. Streams that Python couldn't open,
-    since their descriptors were closed (``>&-``), are replaced by the null device.
-    """
+    """Let ``sys.stdout`` and ``sys.stderr`` ignore write errors, also where they are closed."""
     earlier = sys.stdout, sys.stderr
     with open(os.devnull, "w", encoding="utf-8") as null:
         sys.stdout, sys.stderr = (Tolerant(null if s is None else s) for s in earlier)

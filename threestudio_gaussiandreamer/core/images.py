@@ -92,11 +92,7 @@ def with_texts(image: np.ndarray, texts: list) -> np.ndarray:
 
 
 def read(path: str | os.PathLike) -> np.ndarray:
-    """Read an image as uint8 (H,W,3).
-
-    Raises:
-        UserError: there is no such file, or it is damaged.
-    """
+    """Read an image as uint8 (H,W,3); raise UserError if it is missing or damaged."""
     from PIL import Image
 
     path = existing_file(path, "image")
@@ -107,21 +103,15 @@ def read(path: str | os.PathLike) -> np.ndarray:
 
 
 def write(path: str | os.PathLike, image: np.ndarray) -> None:
-    """Write an image in the format of the extension.
-
-    Raises:
-        UserError: the disk is full or the folder can't be written.
-    """
+    """Write an image in the format of the extension; raise UserError if it can't be written."""
     from PIL import Image
 
     _save(path, Image.fromarray(image), **_PNG_OPTIONS)
 
 
 def write_video(path: str, frames: list[Path], *, fps: int) -> None:
-    """Write the images as an mp4 (H.264, yuv420p, index first; scaled to an even size) or gif.
-
-    Raises:
-        UserError: the disk is full, or there is no ffmpeg.
+    """Write the images as an mp4 (H.264, yuv420p, index first; scaled to an even size) or gif;
+    raise UserError if the disk is full, or there is no ffmpeg.
     """
     if path.endswith(".gif"):
         write_animation(path, frames, None, len(frames) / fps)
@@ -147,14 +137,11 @@ def write_video(path: str, frames: list[Path], *, fps: int) -> None:
 def write_animation(
     path: str | os.PathLike, frames: list[Path], size: Optional[int], seconds: float
 ) -> None:
-    """Write pictures as an animated WebP or GIF that repeats.
+    """Write pictures as an animated WebP or GIF that repeats, or raise UserError.
 
     Args:
         size: the largest width and height, pixels, to which larger pictures are shrunk.
         seconds: of one round.
-
-    Raises:
-        UserError: the disk is full or the folder can't be written.
     """
     from PIL import Image
 

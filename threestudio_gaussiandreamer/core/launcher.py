@@ -17,9 +17,7 @@ SLURM = ("SLURM_PROCID", "SLURM_LOCALID", "SLURM_NODEID")
 
 
 def require_numbers(environment: Mapping[str, str] = os.environ) -> None:
-    """Raise UserError if a variable isn't a whole number, before Lightning is imported, which reads
-    some of them at once.
-    """
+    """Raise UserError if a variable isn't a whole number, before Lightning's import reads some."""
     for name in (*INDICES, *SIZES):
         text, lowest = environment.get(name, "1"), int(name in SIZES)
         if not re.fullmatch("[0-9]{1,19}", text) or int(text) < lowest:
@@ -30,11 +28,8 @@ def require_numbers(environment: Mapping[str, str] = os.environ) -> None:
 
 
 def require_launcher(environment: Mapping[str, str] = os.environ) -> None:
-    """Check the variables of a run, which may be one of several processes.
-
-    Raises:
-        UserError: one isn't a whole number, some of those that belong together are missing, or the
-            machines have different numbers of processes.
+    """Raise UserError if a variable of a run isn't a whole number, some that belong together are
+    missing, or the machines have different numbers of processes.
     """
     require_numbers(environment)
     by_torchrun = "TORCHELASTIC_RUN_ID" in environment

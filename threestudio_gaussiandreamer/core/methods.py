@@ -44,18 +44,15 @@ def require_class_method(owner: type, name: str) -> None:
 
 
 def require_dataclass(owner: Any) -> None:
-    """Raise UserError if the options of a part, ``Config``, have what would be ignored: options
-    without the decorator or without a type.
-    """
+    """Raise UserError for options in ``Config`` that would be ignored: no decorator, no type."""
     config, types = owner.Config, inspect.get_annotations(owner.Config)
+    known = types if "__dataclass_fields__" in vars(config) else ()
     names = [
         name
         for name, value in {**dict.fromkeys(types), **vars(config)}.items()
-        if not (name.startswith("_") or name.isupper() or callable(value))
-        and not hasattr(value, "__get__")
+        if not (name in known or name.startswith("_") or name.isupper())
+        and not (callable(value) or hasattr(value, "__get__"))
     ]
-    if "__dataclass_fields__" in vars(config):
-        names = [name for name in names if name not in types]
     if names or not hasattr(config, "__dataclass_fields__"):
         option = names[0] if names else "color"
         raise UserError(

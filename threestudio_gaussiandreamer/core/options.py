@@ -192,9 +192,7 @@ def wrong(path: str, expected: str, value: Any) -> UserError:
 
 
 def require_representable(path: str, value: Any) -> None:
-    """Raise UserError for an int beyond 64 bits, or a float that isn't finite in float32, also
-    inside of mappings and lists.
-    """
+    """Raise UserError for ints beyond 64 bits and floats beyond float32, also nested ones."""
     if isinstance(value, Mapping):
         for key in value:
             require_representable(f"{path}.{key}", value[key])
@@ -231,17 +229,13 @@ def main_memory() -> int:
 
 
 def require_memory(options: str, needed: float, what: str) -> None:
-    """Raise UserError if about ``needed`` bytes exceed :func:`memory_bytes`.
-
-    Args:
-        options: the names of the options that determine the size, for the message.
-        what: names the data in the message, such as "24 pictures of 256 x 256 pixels".
+    """Raise UserError, which names the ``options`` and ``what`` ("24 pictures of 64 x 64 pixels"),
+    if about ``needed`` bytes exceed :func:`memory_bytes`.
     """
     if needed > memory_bytes():
-        raise UserError(
-            f"{options}: {what} take about {size_text(needed)} of memory, and this machine has "
-            f"{size_text(memory_bytes())}; take less"
-        )
+        has = f"this machine has {size_text(memory_bytes())}"
+        said = f"{what} take about {size_text(needed)} of memory, and {has}; take less"
+        raise UserError(f"{options}: {said}")
 
 
 def size_text(count: float) -> str:
@@ -257,15 +251,14 @@ def size_text(count: float) -> str:
 
 
 def parse_structured(config_class: Any, values: Any = None, prefix: str = "") -> Any:
-    """Make the options ``config_class`` from values, and check names, types and ranges.
+    """Make the options ``config_class`` from a mapping, or options that have been made already, and
+    check names, types and ranges.
 
     Args:
-        values: a mapping, or options that have been made already.
         prefix: prepended to the names of options in messages, such as "system.geometry.".
 
     Raises:
-        UserError: an unknown key, a value of the wrong type or out of range, or a missing one; the
-            message names the option.
+        UserError: an unknown key, a value of the wrong type or out of range, or a missing one.
     """
     cfg = _filled(config_class, {} if values is None else _plain(values), prefix)
     check_options(config_class, cfg, prefix)
@@ -349,10 +342,8 @@ def require_mapping(path: str, values: Any) -> None:
 
 def drop_removed(config_class: Any, values: MutableMapping, prefix: str = "") -> None:
     """Drop the options that a part had in earlier versions from its section, in place, with a line
-    for each, a warning if it did something.
-
-    ``Config.REMOVED`` has their names, each with the value that did nothing, or a function that
-    says whether a value did, and with what is the case now.
+    for each, a warning if it did something. ``Config.REMOVED`` maps their names to the value that
+    did nothing, or a function that says whether one did nothing, and to what is the case now.
     """
     options = {option.name: option for option in dataclasses.fields(config_class)}
     removed = getattr(config_class, "REMOVED", {})
@@ -376,13 +367,8 @@ def _plain(value: Any) -> Any:
 
 
 def check_options(config_class: type, cfg: Any, prefix: str = "") -> None:
-    """Check options against the rules that the fields of their dataclass declare.
-
-    Args:
-        prefix: prepended to the names of options in messages, such as "system.geometry." or "--".
-
-    Raises:
-        UserError: the first value out of range; the message begins with its path.
+    """Raise UserError for the first option out of the range that its field declares; the message
+    begins with ``prefix``, such as "system.geometry." or "--", and its name.
     """
     for option in dataclasses.fields(config_class):
         # as users write it: on a command line with hyphens
@@ -412,11 +398,8 @@ def require_defaults(
     prefix: str = "",
     neutral: Mapping[str, Any] = MappingProxyType({}),
 ) -> None:
-    """Raise UserError unless the options ``names``, which have no effect, are at their defaults.
-
-    Args:
-        reason: when that is so, such as "with pose=A".
-        neutral: values by name that do nothing, where the default does something.
+    """Raise UserError unless the options ``names``, which have no effect (``reason``: "with a=1"),
+    are at their defaults, or at the ``neutral`` values, by name, which do nothing.
     """
     for name in names:
         default = getattr(config_class, name, None)

@@ -62,11 +62,7 @@ def C_max(value: Any) -> float:
 
 
 def validate_schedule(value: Any, name: str = "the schedule") -> Any:
-    """Return ``value`` after checking that it is a schedule.
-
-    Raises:
-        UserError: it isn't; the message begins with ``name``.
-    """
+    """Return ``value`` if it is a schedule; else raise UserError, which begins with ``name``."""
     schedule = parse_schedule(value, name)
     # once for the part and the launcher, which call the option by its name and by its path
     if schedule.in_epochs and (key := (name.rpartition(".")[2], str(value))) not in _warned:
@@ -79,8 +75,7 @@ def validate_schedule(value: Any, name: str = "the schedule") -> Any:
 
 
 def parse_schedule(value: Any, name: str = "the schedule") -> Schedule:
-    """Convert a number, list, tuple or ListConfig to the knots of a schedule; return a parsed
-    schedule as it is.
+    """Convert a number, list, tuple or ListConfig to the knots of a schedule; a parsed one is kept.
 
     Raises:
         UserError: wrong length, something that isn't a finite number, or steps that don't increase.
