@@ -122,7 +122,7 @@ def test_rewards_of_views(tmp_path, monkeypatch):
         (["{}", "--metrics", "judge", "--judge", "none.safetensors"], "none.safetensors"),
         (["{}", "--metrics", "judge", "--size", "0", "--judge", "{judge}"], "--size: exp"),
         (["{}", "--metrics", "judge", "--size", "64", "--judge", "{judge}"], "--size has no"),
-        (["{}/configs", "--metrics", "judge", "--judge", "{judge}"], "no folder that holds"),
+        (["{}/configs", "--metrics", "judge", "--judge", "{judge}"], "holds no finished runs"),
         (["{}", "--metrics", "judge", "--judge", "{judge}", "--output", "{judge}"], "--output"),
     ],
 )

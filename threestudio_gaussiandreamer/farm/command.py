@@ -31,8 +31,8 @@ RULES = {
 
 
 def main(argv: Optional[Sequence[str]] = None) -> int:
-    """Run one command line and return the exit code: 0 if all assets are finished, 1 if some aren't
-    (with ``--report``: have failed), 2 for invalid input, 130 for Ctrl-C.
+    """Return the exit code: 0 if all assets are finished, 1 if some aren't (with ``--report``: have
+    failed), 2 for invalid input, 130 for Ctrl-C.
     """
     return run_command(parse_arguments, run_farm, argv)
 
@@ -106,11 +106,8 @@ def make_assets(args: argparse.Namespace, place: Place, recipe: Recipe, total: i
         count, gpus = driver.plan_workers(there, args.gpus, args.cores, args.workers)
         count, recipe = min(count, total - finished), recipe._replace(cpu=not gpus)
         require_same_farm(place, recipe)
-        print(
-            f"{total} assets, {finished} finished; {count} workers with "
-            f"{'1 GPU' if gpus else f'{args.cores} cores'} each; results in {place}",
-            flush=True,
-        )
+        each = f"{count} workers with {'1 GPU' if gpus else f'{args.cores} cores'} each"
+        print(f"{total} assets, {finished} finished; {each}; results in {place}", flush=True)
         board = ray.remote(num_cpus=0, max_restarts=-1)(Board).remote()
         session = datetime.now().isoformat()
         setting = Setting(recipe, place, board, os.getcwd(), session, args.retries)

@@ -75,7 +75,7 @@ def plan_workers(
     resources: Mapping[str, float], gpus: Optional[int], cores: int, workers: Optional[int]
 ) -> tuple[int, int]:
     """Return how many workers of so many cores fit into the cluster, or are asked for, and the GPUs
-    of each: 1 where the cluster has some, else 0. ``gpus=None`` asks for all.
+    of each, 0 or 1; ``gpus=None`` asks for all.
     """
     there, cpus = int(resources.get("GPU", 0)), int(resources.get("CPU", 0))
     if gpus is not None and gpus > there:

@@ -202,7 +202,5 @@ def require_same_farm(place: Place, recipe: Recipe, *, before_ray: bool = False)
     for name, here in ours.items():
         there = theirs.get(name)
         if there != here and not (before_ray and name in OF_MACHINES):
-            raise UserError(
-                f"{place} belongs to another farm: its {name} is {json.dumps(there)[:1000]}, here "
-                f"{json.dumps(here)[:1000]}; choose another --out"
-            )
+            said = f"its {name} is {json.dumps(there)[:1000]}, here {json.dumps(here)[:1000]}"
+            raise UserError(f"{place} belongs to another farm: {said}; choose another --out")

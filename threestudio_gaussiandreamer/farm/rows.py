@@ -72,11 +72,9 @@ def check_rows(path: Path) -> int:
         digest = hashlib.blake2b(row.name.casefold().encode(), digest_size=8).digest()
         earlier = lines.setdefault(digest, row.line)
         if earlier != row.line:
-            raise UserError(
-                f"{path}: lines {earlier} and {row.line} have the same name {row.name!r} (upper "
-                "and lower case are one folder on some machines); remove one, or give names in a "
-                "CSV or JSONL list (columns prompt, name, seed)"
-            )
+            said = f"{path}: lines {earlier} and {row.line} have the same name {row.name!r} (upper "
+            said += "and lower case are one folder on some machines); remove one, or give names in "
+            raise UserError(f"{said}a CSV or JSONL list (columns prompt, name, seed)")
     if not lines:
         raise UserError(f"{path} has no prompts: expected one per line, such as 'a fox'")
     return len(lines)
@@ -104,10 +102,8 @@ def make_row(values: Mapping[str, Any], line: int = 0) -> Row:
         words = "_".join(prompt.split())
         name = safe_name(words if seed is None else f"{words}-seed{seed}")
     elif not isinstance(name, str) or safe_name(name) != name:
-        raise UserError(
-            f"the name {str(name)[:80]!r} can't be a folder's: expected for instance "
-            f"{safe_name(str(name))!r}"
-        )
+        instead = f"expected for instance {safe_name(str(name))!r}"
+        raise UserError(f"the name {str(name)[:80]!r} can't be a folder's: {instead}")
     config, overrides = _texts("config", values.get("config")), _overrides(values.get("overrides"))
     return Row(name, prompt, seed, tuple(config), tuple(overrides), line)
 
@@ -162,10 +158,8 @@ def _from_csv(texts: Iterator[str]) -> Iterator[dict[str, Any]]:
         )
     for values in reader:
         if None in values:
-            raise UserError(
-                f"{len(header) + len(values[None])} cells for {len(header)} columns; put a text "
-                "with commas in double quotes"
-            )
+            count = f"{len(header) + len(values[None])} cells for {len(header)} columns"
+            raise UserError(f"{count}; put a text with commas in double quotes")
         yield values
 
 

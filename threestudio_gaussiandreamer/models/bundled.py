@@ -1,8 +1,6 @@
-"""The models that the package contains: the name ``toybox``, wherever a model is named.
-
-The folder of a training's export (``toybox/export.py``) can be named in its place. Of either, each
-option takes its part. Digests of the files detect damage before anything is loaded.
-"""
+"""The models that the package contains: the name ``toybox``, wherever a model is named, or in its
+place the folder of a training's export (``toybox/export.py``). Of either, each option takes its
+part. Digests of the files detect damage before anything is loaded."""
 
 import contextlib
 import functools
@@ -33,9 +31,8 @@ EXPORT_AGAIN = (
 
 
 def model_part(name: str, part: str) -> str:
-    """Return the path of a part, DIFFUSION, CLIP, POINTS or JUDGE, of the bundled models or of an
-    export if ``name`` is theirs, and any other ``name`` unchanged. Raise UserError if a file is
-    missing or damaged.
+    """Return the path of a part, DIFFUSION, CLIP, POINTS or JUDGE, if ``name`` is the bundled
+    models or an export, else ``name``. Raise UserError if a file is missing or damaged.
     """
     if name == NAME:
         require_intact(FOLDER, part)

@@ -1,9 +1,5 @@
-"""CLIP in transformers' format: text features, which condition Point-E and Shap-E, and the
-similarity of pictures and texts.
-
-``hub.py`` resolves folders and model ids. The published 3D models were trained with OpenAI's
-ViT-L/14 (``openai/clip-vit-large-patch14``); similarities can be computed with any CLIP.
-"""
+"""CLIP in transformers' format: text features, which condition Point-E and Shap-E, trained with
+``openai/clip-vit-large-patch14``, and the similarity of pictures and texts, by any CLIP."""
 
 from functools import partial
 from pathlib import Path

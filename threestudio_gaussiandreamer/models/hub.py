@@ -1,7 +1,6 @@
 """Locate a model in a local folder, in the hub's cache on this disk, or on the Hugging Face hub,
-and tell which family of text-to-image models it belongs to: by the settings of its network, since
-``model_index.json`` is missing or names another class in many fine-tuned models; of one on the hub
-by the names of its files, until it is downloaded.
+and tell its family by the settings of its network, since ``model_index.json`` is missing or names
+another class in many fine-tuned models; on the hub by the names of its files.
 
 No request is made if the disk has the needed files, which ``model_files.py`` selects; only these
 are downloaded. If a model isn't available, UserError says within seconds what to do."""
@@ -51,12 +50,10 @@ class Family(NamedTuple):
     """Name of the prompt processor, where it isn't ``parts``."""
 
     def __str__(self) -> str:
-        processor = f"{self.processor or self.parts}-prompt-processor"
-        return (
-            f"{self.title}, which --config {self.config} uses "
-            f"(system.guidance_type=gaussiandreamer-{self.parts}-guidance and "
-            f"system.prompt_processor_type=gaussiandreamer-{processor})"
-        )
+        guidance = f"system.guidance_type=gaussiandreamer-{self.parts}-guidance"
+        name = f"gaussiandreamer-{self.processor or self.parts}-prompt-processor"
+        types = f"({guidance} and system.prompt_processor_type={name})"
+        return f"{self.title}, which --config {self.config} uses {types}"
 
 
 STABLE_DIFFUSION = Family("Stable Diffusion 1.x or 2.x", "stable-diffusion", "gaussiandreamer.yaml")
@@ -74,9 +71,7 @@ SAME_FILES = (STABLE_DIFFUSION, MULTI_VIEW)
 
 
 def require_family(family: Optional[Family], folder: Path) -> None:
-    """Raise UserError if ``folder`` holds a model of another family than this; None accepts any.
-    Folders without the settings of a network pass: what loads them reports it.
-    """
+    """Raise UserError if ``folder`` holds a network of another family than this; None is any."""
     settings: Any = {}
     for component in ("unet", "transformer"):
         with contextlib.suppress(OSError, ValueError):
@@ -161,8 +156,7 @@ def find_model(
 
 def locate(source: Source, *, download: bool = True) -> Optional[Path]:
     """Return the folder with the needed files of a model, which are downloaded if necessary; with
-    ``download=False`` return None then. Raise UserError if there is no such model, its files are
-    missing or gated, or the hub can't be reached; the message says what to do.
+    ``download=False`` return None then. Raise UserError, which says what to do, if it can't be had.
     """
     folder = Path(source.name).expanduser()
     if is_folder(folder):
@@ -227,9 +221,7 @@ def _near_folders(folder: Path) -> str:
 
 
 def _with_timeout(ask: Callable[[], Any]) -> Any:
-    """Return ``ask()``, or raise TimeoutError after ``TIMEOUT``: the library's own doesn't cover
-    the DNS lookup, which can take a minute.
-    """
+    """Return ``ask()``, or raise TimeoutError: the library's own doesn't cover the DNS lookup."""
     answers: Future = Future()
 
     def work() -> None:
@@ -247,11 +239,9 @@ def explain(source: Source, error: Exception) -> str:
     from huggingface_hub import errors
 
     if isinstance(error, errors.GatedRepoError):
-        return (
-            f"{source} is gated: accept its licence on https://huggingface.co/{source.name} while "
-            "logged in, then run `hf auth login` here with a token of that account and start again."
-        )
-    if isinstance(error, errors.RevisionNotFoundError):
+        what = f"is gated: accept its licence on https://huggingface.co/{source.name} while logged "
+        what += "in, then run `hf auth login` here with a token of that account and start again."
+    elif isinstance(error, errors.RevisionNotFoundError):
         what = f"has no revision {source.revision!r}: leave `revision` out for its main branch."
     elif isinstance(error, errors.RepositoryNotFoundError):
         what = "is not on the hub, or is private and needs `hf auth login`." + _how_to_get(source)

@@ -131,9 +131,7 @@ def pipeline_settings(folder: Path) -> dict[str, Any]:
 
 
 def fingerprint(folder: Path, components: Iterable[str]) -> str:
-    """Return a digest of the content of these components: of files above 1 MiB of their size and
-    sixteen samples, which distinguish differently trained weights.
-    """
+    """Return a digest of the components; of files above 1 MiB, of size and 16 samples."""
     digest = hashlib.sha256()
     for component in sorted(components):
         for path in sorted(path for path in (folder / component).rglob("*") if path.is_file()):
@@ -149,12 +147,9 @@ def fingerprint(folder: Path, components: Iterable[str]) -> str:
 def load_network(
     loader: Any, folder: Path, component: str = "", *, half=False, allow_bin=None, **options: Any
 ) -> Any:
-    """Return a network on the CPU, in evaluation mode, loaded with ``from_pretrained`` of diffusers
-    or transformers from local files. Raise UserError if these are damaged or lack weights.
-
-    Args:
-        half, allow_bin: see :func:`component_weights`.
-        options: further arguments of ``from_pretrained``, such as ``dtype``.
+    """Return a network on the CPU, in evaluation mode, loaded from local files with diffusers' or
+    transformers' ``from_pretrained``, which gets ``options``; for the others see
+    :func:`component_weights`. Raise UserError if files are damaged or lack weights.
     """
     from transformers.utils import logging
 
@@ -169,10 +164,9 @@ def load_network(
         logging.set_verbosity(level)
     # if weights are missing, both libraries only warn and initialise them at random
     if missing := sorted(report["missing_keys"]):
-        raise UserError(
-            f"{component or loader.__name__} of the model in {str(folder)!r} lacks weights: "
-            f"{', '.join(missing[:3])}{', ...' if missing[3:] else ''}"
-        )
+        some = f"{', '.join(missing[:3])}{', ...' if missing[3:] else ''}"
+        name = f"{component or loader.__name__} of the model in {str(folder)!r}"
+        raise UserError(f"{name} lacks weights: {some}")
     return network.eval()
 
 
@@ -197,10 +191,6 @@ def loading_errors(name: str) -> Iterator[None]:
         ) from error
 
 
-# Networks that a process keeps
-# --------------------------------------------------------------------------------------------------
-
-
 _kept: Optional[dict[Hashable, Any]] = None
 """By key; None where networks aren't kept."""
 _counts: Counter = Counter()
@@ -214,11 +204,8 @@ def keep_loaded(keep: bool = True) -> None:
 
 
 def loaded(key: tuple[Hashable, ...], load: Callable[[], Any]) -> Any:
-    """Return ``load()``, or what it returned for the same key earlier, if networks are kept.
-
-    Args:
-        key: the network's name for :func:`load_counts`, then all that ``load`` depends on, which
-            also changes the network: folder, number type, device and options.
+    """Return ``load()``, or what it returned earlier for the same key, if networks are kept, which
+    is the network's name for :func:`load_counts`, and all that ``load`` depends on.
     """
     kept = {} if _kept is None else _kept
     if key not in kept:

@@ -1,13 +1,9 @@
 """Load the UNet of MVDream (Shi et al. 2023) from the folders of its conversions to diffusers'
-format, such as ``ashawkey/mvdream-sd2.1-diffusers``.
-
-Those folders hold a ``MultiViewUNetModel`` with its code, which isn't run. It is Stable Diffusion's
-UNet in the naming of CompVis's latent-diffusion, with two additions; diffusers' UNet computes it:
+format, such as ``ashawkey/mvdream-sd2.1-diffusers``, whose code isn't run. It is Stable Diffusion's
+in the naming of CompVis's latent-diffusion, with two additions; diffusers' UNet computes it:
 
 * an embedding of the camera, added to that of the timestep: a "projection" class embedding;
-* self-attention over all views of an object together: the tokens of its views are joined before
-  every self-attention and parted after it.
-"""
+* self-attention over all views of an object together."""
 
 import contextlib
 import json

@@ -191,17 +191,10 @@ def _freed(run: Callable[[torch.device], Any]) -> Any:
     try:
         return run(device)
     except torch.OutOfMemoryError:
-        warn(
-            "the text encoder doesn't fit into the GPU's memory and runs on the CPU, once: "
-            "this can take minutes"
-        )
+        warn("the text encoder is too large for the GPU, and runs on the CPU, once, for minutes")
         return run(torch.device("cpu"))
     finally:
         free_memory()
-
-
-# Embeddings on the disk
-# --------------------------------------------------------------------------------------------------
 
 
 def require_cache_folder(folder: str) -> Path:
@@ -210,11 +203,8 @@ def require_cache_folder(folder: str) -> Path:
 
 
 class EmbeddingCache:
-    """The embeddings of one model's text encoder in ``folder``, a safetensors file per text.
-
-    Args:
-        folder: contains the files; created on the first write.
-        model: ``model_files.fingerprint`` of the tokenizer and the text encoder.
+    """The embeddings of one text encoder in ``folder``, a safetensors file per text; ``model`` is
+    the ``model_files.fingerprint`` of it and its tokenizer.
     """
 
     def __init__(self, folder: str, model: str) -> None:

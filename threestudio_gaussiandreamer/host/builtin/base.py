@@ -24,10 +24,8 @@ def register(name: str) -> Callable[[type], type]:
     def enter(cls: type) -> type:
         taken = _parts.get(name)
         if taken is not None and _identity(taken) != _identity(cls):
-            raise UserError(
-                f"the name {name!r} is taken by {_identity(taken)}: register {_identity(cls)} "
-                "under another name"
-            )
+            said = f"taken by {_identity(taken)}: register {_identity(cls)} under another name"
+            raise UserError(f"the name {name!r} is {said}")
         _parts[name] = cls
         return cls
 
@@ -52,9 +50,7 @@ def _identity(cls: type) -> str:
 
 
 class Updateable:
-    """Something that changes with the step: it and all its public attributes are updated before and
-    after each batch.
-    """
+    """Something that is updated, with all its public attributes, before and after each batch."""
 
     def do_update_step(self, epoch: int, global_step: int, on_load_weights: bool = False) -> None:
         for part in self._updateables():
@@ -92,9 +88,7 @@ def run_seed() -> int:
 def load_parameters(
     module: nn.Module, state: dict[str, Any], source: str, *, strict: bool = True
 ) -> None:
-    """Load parameters into a module; raise UserError, which names the checkpoint ``source``, if one
-    has another shape here, or names differ with ``strict``.
-    """
+    """Load parameters; raise UserError if shapes differ or, with ``strict``, names."""
     try:
         module.load_state_dict(state, strict=strict)
     except RuntimeError as error:
@@ -146,10 +140,8 @@ class BaseModule(Part, nn.Module):
         if (source := self.cfg.weights) is not None:
             path, _, module_name = source.rpartition(":")
             if not path:
-                raise UserError(
-                    "weights: expected <checkpoint>:<module>, such as last.ckpt:geometry, got "
-                    f"{source!r}"
-                )
+                form = "<checkpoint>:<module>, such as last.ckpt:geometry"
+                raise UserError(f"weights: expected {form}, got {source!r}")
             state_dict, epoch, global_step = load_module_weights(path, module_name)
             load_parameters(self, state_dict, source)
             self.do_update_step(epoch, global_step, on_load_weights=True)
