@@ -38,10 +38,8 @@ def ssim(
         UserError: a side has fewer pixels than SMALLEST_SIDE.
     """
     if min(image.shape[-3:-1]) < SMALLEST_SIDE:
-        raise UserError(
-            f"SSIM needs images of at least {SMALLEST_SIDE} pixels a side, not "
-            f"{tuple(image.shape[-3:-1])}"
-        )
+        found = tuple(image.shape[-3:-1])
+        raise UserError(f"SSIM needs images of at least {SMALLEST_SIDE} pixels a side, not {found}")
     mean_x, mean_y = _window_mean(image), _window_mean(truth)
     var_x = _window_mean(image**2) - mean_x**2
     var_y = _window_mean(truth**2) - mean_y**2

@@ -69,15 +69,11 @@ def load_file(path: str | os.PathLike, map_location: Any = "cpu") -> Any:
     except pickle.UnpicklingError as error:
         # the first line of torch's message advises to load the file with weights_only=False
         found = re.search(r"GLOBAL (\S+)", str(error))
-        name = f": {found[1]}" if found else ""
-        raise UserError(
-            f"{path} holds Python objects that could run code when read, so it isn't read{name}"
-        ) from error
+        said = f"it isn't read{f': {found[1]}' if found else ''}"
+        raise UserError(f"{path} holds Python objects that could run code, so {said}") from error
     except Exception as error:  # of many types for a damaged file
-        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
-        raise UserError(
-            f"{path} isn't a checkpoint, or is damaged: {reason}{_siblings(path)}"
-        ) from error
+        said = (str(error).strip() or type(error).__name__).splitlines()[0] + _siblings(path)
+        raise UserError(f"{path} isn't a checkpoint, or is damaged: {said}") from error
 
 
 def _verify(path: Path) -> None:
@@ -145,10 +141,8 @@ def load_module_weights(path: str, module_name: Optional[str] = None) -> tuple[d
     checkpoint = load_checkpoint(path)
     state = entries_below(checkpoint["state_dict"], f"{module_name}." if module_name else "")
     if not state:
-        raise UserError(
-            f"the checkpoint {path} has no parameters of {module_name!r}; it has "
-            f"{sorted(checkpoint['state_dict'])}"
-        )
+        there = sorted(checkpoint["state_dict"])
+        raise UserError(f"{path} has no parameters of {module_name!r}; it has {there}")
     return state, checkpoint["epoch"], checkpoint["global_step"]
 
 

@@ -55,13 +55,11 @@ def require_shareable(
     """
     size = processes or world_size()
     if views % (size * together):
-        relation = "fewer than" if views < size * together else "no multiple of"
-        groups = f" in groups of {together}" if together > 1 else ""
-        raise UserError(
-            f"{option} is {views}, {relation} the {size} processes that share the views of a step"
-            f"{groups}: set {option} to {size * together} or a multiple, or use as many processes "
-            f"as divide {views // together}"
-        )
+        said = "fewer than" if views < size * together else "no multiple of"
+        said += f" the {size} processes that share the views of a step"
+        said += f" in groups of {together}" if together > 1 else ""
+        fits = f"{size * together} or a multiple, or use as many processes as divide"
+        raise UserError(f"{option} is {views}, {said}: set {option} to {fits} {views // together}")
 
 
 def from_first(make: Callable[[], Any]) -> Any:

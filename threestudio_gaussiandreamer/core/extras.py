@@ -44,9 +44,8 @@ def require_extra(extra: str, *modules: str) -> None:
 
 def missing_extra(extra: str, module: str, problem: str) -> UserError:
     """Make the error for a missing module, with the command that installs ``extra``."""
-    return UserError(
-        f"this part needs {module} ({problem}): pip install 'threestudio-gaussiandreamer[{extra}]'"
-    )
+    install = f"pip install 'threestudio-gaussiandreamer[{extra}]'"
+    return UserError(f"this part needs {module} ({problem}): {install}")
 
 
 def error_of_extra(error: BaseException) -> Optional[UserError]:

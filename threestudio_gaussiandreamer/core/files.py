@@ -106,10 +106,8 @@ def atomic_file(path: str | os.PathLike, *, durable: bool = True) -> Iterator[Bi
         if durable:
             _sync_folder(path.parent)
     except OSError as error:
-        raise UserError(
-            f"cannot write {str(path)!r}: {error.strerror or error}. An earlier file of this "
-            "name is untouched."
-        ) from error
+        why = f"{error.strerror or error}. An earlier file of this name is untouched."
+        raise UserError(f"cannot write {str(path)!r}: {why}") from error
     finally:
         temporary.unlink(missing_ok=True)
 

@@ -79,15 +79,13 @@ def grid(cells: list) -> np.ndarray:
     return np.concatenate([_resize(image, height, width) for image in images], axis=1)
 
 
-def with_texts(image: np.ndarray, texts: list) -> np.ndarray:
-    """Draw one line of text at the top of each of ``len(texts)`` equal bands of the image."""
+def with_text(image: np.ndarray, text: str) -> np.ndarray:
+    """Draw one line of text at the top of an image."""
     from PIL import Image, ImageDraw
 
     canvas = Image.fromarray(image)
-    draw, band = ImageDraw.Draw(canvas), image.shape[0] // max(len(texts), 1)
     black_on_white = {"fill": (0, 0, 0), "stroke_width": 1, "stroke_fill": (255, 255, 255)}
-    for row, text in enumerate(texts):
-        draw.text((2, row * band), str(text), **black_on_white)
+    ImageDraw.Draw(canvas).text((2, 0), text, **black_on_white)
     return np.asarray(canvas)
 
 

@@ -21,10 +21,8 @@ def require_numbers(environment: Mapping[str, str] = os.environ) -> None:
     for name in (*INDICES, *SIZES):
         text, lowest = environment.get(name, "1"), int(name in SIZES)
         if not re.fullmatch("[0-9]{1,19}", text) or int(text) < lowest:
-            raise UserError(
-                f"the environment variable {name} is {text!r}; expected a whole number from "
-                f"{lowest} on, as torchrun or SLURM sets it: `unset {name}` for a single process"
-            )
+            expected = f"a whole number from {lowest} on, as torchrun or SLURM sets it"
+            raise _wrong(name, f"is {text!r}; expected {expected}", name)
 
 
 def require_launcher(environment: Mapping[str, str] = os.environ) -> None:
@@ -39,25 +37,24 @@ def require_launcher(environment: Mapping[str, str] = os.environ) -> None:
         first, names, program, sizes = "TORCHELASTIC_RUN_ID", TORCHRUN, "torchrun", SIZES[:2]
     missing = [name for name in names if name not in environment]
     if missing and by_one:
-        raise UserError(
-            f"the environment variable {first} is set, but not {', '.join(missing)}: start the "
-            f"command with {program}, or `unset {first}` for a single process"
-        )
+        said = f"is set, but not {', '.join(missing)}: start the command with {program}"
+        raise _wrong(first, said, first)
     size, step = (int(environment.get(name, 1)) for name in sizes)
     if size % step and by_one:
-        raise UserError(
-            f"the environment variable {sizes[0]} is {size}, no multiple of {sizes[1]}, which is "
-            f"{step}: give each machine as many processes"
-        )
+        said = f"is {size}, no multiple of {sizes[1]}, which is {step}"
+        raise _wrong(sizes[0], f"{said}: give each machine as many processes", first)
     for name, started, hint in (
         ("RANK", by_torchrun, "start the command with torchrun"),
         ("SLURM_PROCID", by_one, "give srun --job-name and --ntasks-per-node"),
     ):
         if not started and int(environment.get(name, 0)):
-            raise UserError(
-                f"the environment variable {name} is {environment[name]}, but nothing says how "
-                f"many processes there are: {hint}, or `unset {name}` for a single process"
-            )
+            said = "but nothing says how many processes there are"
+            raise _wrong(name, f"is {environment[name]}, {said}: {hint}", name)
+
+
+def _wrong(name: str, said: str, unset: str) -> UserError:
+    advice = f", or `unset {unset}` for a single process"
+    return UserError(f"the environment variable {name} {said}{advice}")
 
 
 def many_tasks(environment: Mapping[str, str] = os.environ) -> bool:

@@ -32,9 +32,8 @@ def require_method(owner: type, name: str, *parameters: str, more: bool = False)
         bind = signature.bind_partial if more else signature.bind
         bind(*["self"] * binds, *parameters)
     except TypeError as error:
-        raise UserError(
-            f"{owner.__name__} has {name}{signature}, which is called as {call}: {error}"
-        ) from error
+        said = f"{name}{signature}, which is called as {call}: {error}"
+        raise UserError(f"{owner.__name__} has {said}") from error
 
 
 def require_class_method(owner: type, name: str) -> None:
@@ -54,8 +53,6 @@ def require_dataclass(owner: Any) -> None:
         and not (callable(value) or hasattr(value, "__get__"))
     ]
     if names or not hasattr(config, "__dataclass_fields__"):
-        option = names[0] if names else "color"
-        raise UserError(
-            f"{owner.__name__}.Config is no dataclass with typed options: write @dataclass above "
-            f"its class line, and {option}: float = ..., for instance"
-        )
+        write = f"@dataclass above its class line, and {[*names, 'color'][0]}: float = ..."
+        said = f"is no dataclass with typed options: write {write}, for instance"
+        raise UserError(f"{owner.__name__}.Config {said}")

@@ -82,10 +82,8 @@ def protocol_for(clip: Optional[str], **options: Any) -> Protocol:
 def open_clip(folder: str) -> PictureText:
     """Load the CLIP in a local folder in transformers' format, or the bundled one."""
     if folder != NAME and not Path(folder).expanduser().is_dir():
-        raise UserError(
-            f"--clip {folder}: expected a folder, for instance after `hf download "
-            "openai/clip-vit-large-patch14 --local-dir clip`"
-        )
+        command = "`hf download openai/clip-vit-large-patch14 --local-dir clip`"
+        raise UserError(f"--clip {folder}: expected a folder, for instance after {command}")
     source = clip_source(folder, option="--clip", allow_bin=True)
     return PictureText(source, get_device(), allow_bin=True)
 
@@ -214,7 +212,7 @@ def evaluate(
         scores.append(per_seed)
         numbers = _mean_and_spread(per_seed)
         text = f"{numbers['mean']:.2f}  {prompt}"
-        rows.append(picture_files.with_texts(np.concatenate(views, axis=1), [text]))
+        rows.append(picture_files.with_text(np.concatenate(views, axis=1), text))
         each.append({"result": str(result.file), "prompt": prompt, **numbers})
         print(f"{numbers['mean']:6.2f}  {prompt}  {result.file}", flush=True)
     total = _mean_and_spread(np.mean(scores, axis=0))

@@ -70,10 +70,8 @@ class Place:
         try:
             self.system = fsspec.core.url_to_fs(self.url, use_listings_cache=False)[0]
         except Exception as error:  # each file system has its own
-            raise UserError(
-                f"{self.url} can't be used: {error}; s3:// needs pip install "
-                "'threestudio-gaussiandreamer[cluster]'"
-            ) from error
+            install = "pip install 'threestudio-gaussiandreamer[cluster]'"
+            raise UserError(f"{self.url} can't be used: {error}; s3:// needs {install}") from error
 
     def __str__(self) -> str:
         return self.url
@@ -118,9 +116,8 @@ class Place:
                 scores = (record.get("scores") or {}).values()
                 sum([*(record.get(key, 0) for key in NUMBERS), *filter(None, scores)])
             except (ValueError, TypeError, AttributeError, RecursionError) as error:
-                raise UserError(
-                    f"{self}/{name} is damaged ({error}): delete it, or choose another --out"
-                ) from error
+                advice = "delete it, or choose another --out"
+                raise UserError(f"{self}/{name} is damaged ({error}): {advice}") from error
         return found
 
     def write(self, name: str, content: Mapping[str, Any]) -> None:

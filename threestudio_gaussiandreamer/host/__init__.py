@@ -22,9 +22,8 @@ def _threestudio_is_importable() -> bool:
     except Exception as error:
         if isinstance(error, ModuleNotFoundError) and error.name == "threestudio":
             return False
-        raise UserError(
-            f"threestudio is on the Python path but can't be imported: {error}; fix it or remove it"
-        ) from error
+        said = f"can't be imported: {error}; fix it or remove it"
+        raise UserError(f"threestudio is on the Python path but {said}") from error
     return hasattr(threestudio, "register")
 
 

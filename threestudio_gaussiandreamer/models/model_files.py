@@ -185,10 +185,9 @@ def loading_errors(name: str) -> Iterator[None]:
     except UserError:
         raise
     except Exception as error:  # OSError, ValueError, RuntimeError, SafetensorError, ImportError
-        raise UserError(
-            f"{name} can't be loaded: {type(error).__name__}: {str(error).strip()[:500]}. "
-            "If a file is damaged, delete it and download it again."
-        ) from error
+        said = f"{type(error).__name__}: {str(error).strip()[:500]}"
+        advice = "If a file is damaged, delete it and download it again."
+        raise UserError(f"{name} can't be loaded: {said}. {advice}") from error
 
 
 _kept: Optional[dict[Hashable, Any]] = None
@@ -204,8 +203,8 @@ def keep_loaded(keep: bool = True) -> None:
 
 
 def loaded(key: tuple[Hashable, ...], load: Callable[[], Any]) -> Any:
-    """Return ``load()``, or what it returned earlier for the same key, if networks are kept, which
-    is the network's name for :func:`load_counts`, and all that ``load`` depends on.
+    """Return ``load()``, or what it returned earlier for ``key``, if networks are kept: the name
+    for :func:`load_counts`, and all that ``load`` depends on.
     """
     kept = {} if _kept is None else _kept
     if key not in kept:

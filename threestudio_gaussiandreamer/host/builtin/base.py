@@ -93,10 +93,8 @@ def load_parameters(
         module.load_state_dict(state, strict=strict)
     except RuntimeError as error:
         reasons = "; ".join(line.strip() for line in str(error).splitlines()[1:])
-        raise UserError(
-            f"the weights of {source} don't fit these options ({reasons}): use those of the run "
-            "that wrote the file, such as its sh_degree"
-        ) from error
+        said = f"({reasons}): use those of the run that wrote the file, such as its sh_degree"
+        raise UserError(f"the weights of {source} don't fit these options {said}") from error
 
 
 class Part(Updateable):

@@ -159,8 +159,6 @@ class BaseLift3DSystem(BaseSystem):
         for output in self.exporter():
             save = getattr(self, f"save_{output.save_type}", None)
             if save is None:
-                raise UserError(
-                    f"{type(self).__name__} has no save_{output.save_type}, which "
-                    f"{type(self.exporter).__name__} asks for"
-                )
+                who = f"{type(self).__name__} has no save_{output.save_type}"
+                raise UserError(f"{who}, which {type(self.exporter).__name__} asks for")
             save(f"it{self.true_global_step}-export/{output.save_name}", **output.params)
