@@ -38,7 +38,7 @@ import numpy as np
 
 from ..core.errors import UserError
 from ..core.methods import find_method, require_dataclass, require_method
-from ..core.options import Rule, each, in_range, one_of, require_mapping, rule, shown, wrong
+from ..core.options import Rule, each, in_range, one_of, require_mapping, rule, wrong
 from ..formats.gaussian_files import FORMATS, StoredCloud, suffix_of
 from ..formats.glb import GLB_UP
 from ..formats.spz import VERSION, VERSIONS, require_version
@@ -119,7 +119,7 @@ def outputs_of(exporter: Exporter) -> list[ExporterOutput]:
     found = exporter()
     is_list = isinstance(found, (list, tuple))
     if not is_list or not all(isinstance(entry, ExporterOutput) for entry in found):
-        said = f"{type(exporter).__name__} returned {shown(found)}"
+        said = f"{type(exporter).__name__} returned {type(found).__name__}"
         raise UserError(f"{said}; expected a list of ExporterOutput")
     return list(found)
 
