@@ -10,9 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from threestudio_gaussiandreamer.core import streams
 from threestudio_gaussiandreamer.core.devices import DelayedReads, HostCopy, flush_reads
-from threestudio_gaussiandreamer.core.given_gradient import given_gradient
-from threestudio_gaussiandreamer.core.lazy_mapping import LazyMapping
-from threestudio_gaussiandreamer.core.quaternions import rotation_rows
+from threestudio_gaussiandreamer.core.tensors import LazyMapping, given_gradient, rotation_rows
 
 
 def test_a_draw_is_a_function_of_its_key_only():

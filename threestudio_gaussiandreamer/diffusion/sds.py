@@ -24,7 +24,7 @@ from torch import Tensor
 
 from ..core import streams
 from ..core.errors import UserError
-from ..core.given_gradient import given_gradient
+from ..core.tensors import given_gradient
 
 WEIGHTS: dict[str, Callable[[Tensor], Tensor]] = {
     "sds": lambda abar: 1 - abar,

@@ -26,7 +26,7 @@ from torch import Tensor
 
 from ..core.devices import to_device
 from ..core.distributed import all_sum, draw_shared
-from ..core.given_gradient import given_gradient
+from ..core.tensors import given_gradient
 
 SAMPLES = 12
 """Approximate number of samples of the removal error per round; each costs a backward pass."""

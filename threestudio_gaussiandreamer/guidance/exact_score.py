@@ -45,8 +45,8 @@ from torch import Tensor
 
 from ..cameras import OrbitRanges, camera_pool
 from ..core.errors import UserError
-from ..core.given_gradient import given_gradient
 from ..core.options import at_least, count_of, in_range, interval, one_of, require_memory, required
+from ..core.tensors import given_gradient
 from ..diffusion import sds
 from ..diffusion.exact_score import (
     COLOR_MATRIX,

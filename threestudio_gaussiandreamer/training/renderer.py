@@ -27,8 +27,8 @@ from torch import Tensor
 from .. import cameras
 from ..core.devices import get_device, without_autocast
 from ..core.errors import UserError
-from ..core.lazy_mapping import LazyMapping
 from ..core.options import at_least, in_range, one_of, positive, rule
+from ..core.tensors import LazyMapping
 from ..gaussians.gaussians import require_attributes
 from ..host import Rasterizer, register
 from ..splatting import PRESETS, Rasterized, rasterize

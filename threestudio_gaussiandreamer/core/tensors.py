@@ -1,5 +1,7 @@
-"""A number whose gradient is given."""
+"""A number whose gradient is given, and values that are computed when they are read."""
 
+from collections import UserDict
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
@@ -26,3 +28,19 @@ class _GivenGradient(torch.autograd.Function):
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, None, None]:
         (gradient,) = ctx.saved_tensors
         return upstream * gradient, None, None
+
+
+class LazyMapping(UserDict):
+    """Values by name; ``later`` are functions of no argument, each called at most once."""
+
+    def __init__(self, values: Mapping[str, Any], later: Mapping[str, Callable[[], Any]]) -> None:
+        self.data, self.later = {**values, **later}, {*later}
+
+    def __getitem__(self, name: str) -> Any:
+        if name in self.later:
+            self[name] = self.data[name]()
+        return self.data[name]
+
+    def __setitem__(self, name: str, value: Any) -> None:
+        self.later.discard(name)
+        self.data[name] = value
