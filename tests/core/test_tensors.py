@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from threestudio_gaussiandreamer.core import streams
 from threestudio_gaussiandreamer.core.devices import DelayedReads, HostCopy, flush_reads
-from threestudio_gaussiandreamer.core.tensors import LazyMapping, given_gradient, rotation_rows
+from threestudio_gaussiandreamer.core.quaternions import rotation_rows
+from threestudio_gaussiandreamer.core.tensors import LazyMapping, given_gradient
 
 
 def test_a_draw_is_a_function_of_its_key_only():
