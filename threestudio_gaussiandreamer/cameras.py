@@ -102,9 +102,7 @@ def intrinsics(fovy: Float[Tensor, " B"], height: int, width: int) -> Float[Tens
 def to_opencv(
     c2w: Float[Tensor, "B 4 4"], fovy: Float[Tensor, " B"], height: int, width: int
 ) -> tuple[Float[Tensor, "B 4 4"], Float[Tensor, "B 3 3"]]:
-    """Convert the host's OpenGL cameras to ``(viewmats, Ks)``: invert the rigid motion, and flip
-    the camera's y and z axes.
-    """
+    """Convert the host's OpenGL cameras to ``(viewmats, Ks)``: y and z axes are flipped."""
     flip = _constant(((1.0,), (-1.0,), (-1.0,), (1.0,)), c2w.dtype, c2w.device)
     return world_to_camera(c2w) * flip, intrinsics(fovy, height, width)
 
@@ -177,9 +175,7 @@ def surface_points(
 
 @functools.lru_cache(maxsize=8)
 def _image_plane(height: int, width: int, device: torch.device) -> Float[Tensor, "3 hw"]:
-    """Return the rays through the pixel centres of an OpenGL camera of focal length 1, with -1
-    along the optical axis.
-    """
+    """Return the rays through the pixel centres at focal length 1, -1 along the optical axis."""
     with torch.inference_mode(False):  # else it couldn't serve training later
         rows, columns = (torch.arange(n, device=device) + 0.5 - n / 2 for n in (height, width))
         y, x = torch.meshgrid(-rows, columns, indexing="ij")

@@ -93,9 +93,7 @@ def _verify(path: Path) -> None:
 
 
 def _require_stored(content: Any, size: int) -> None:
-    """Raise ValueError if a tensor is larger than the file: one with stride 0 announces any size
-    with a few stored numbers.
-    """
+    """Raise ValueError if a tensor, of stride 0 for instance, is larger than its file."""
     if isinstance(content, torch.Tensor):
         if content.numel() * content.element_size() > size:
             shape = tuple(content.shape)
@@ -124,9 +122,7 @@ def newest_readable(folder: str | os.PathLike) -> Optional[tuple[Path, int]]:
 
 
 def _claimed_order(path: Path) -> tuple[float, bool]:
-    """Read the step of a checkpoint without its tensors and the checksum; infinity if it can't be
-    read, so that it is reported first. Then ``last.ckpt``.
-    """
+    """Read a checkpoint's step without its checksum; infinity if it can't be read."""
     try:
         content = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
         return int(content["global_step"]), path.stem == "last"

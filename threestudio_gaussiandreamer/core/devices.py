@@ -21,9 +21,7 @@ def get_device() -> torch.device:
 
 @contextmanager
 def torch_threads(count: int) -> Iterator[None]:
-    """Let torch use ``count`` threads in this context: thousands of tiny operations take many times
-    longer with more than one.
-    """
+    """Let torch use ``count`` threads: one is much faster for thousands of tiny operations."""
     threads = torch.get_num_threads()
     torch.set_num_threads(count)
     try:

@@ -6,15 +6,11 @@ from collections.abc import Iterable
 
 
 class UserError(ValueError):
-    """Report invalid input; the message names it, what was expected, and what to do. Commands print
-    the message alone and exit with code 2.
-    """
+    """Invalid input; the message names it, what was expected, and what to do."""
 
 
 class Terminated(SystemExit):
-    """Raised when a signal asks the process to end; distinct from a ``sys.exit()`` in an extension,
-    which is an error.
-    """
+    """Raised when a signal ends the process; a ``sys.exit()`` in an extension is an error."""
 
 
 def unknown(kind: str, name: str, choices: Iterable[str], prefix: str = "") -> UserError:

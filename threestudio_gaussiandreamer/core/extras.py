@@ -32,9 +32,7 @@ def extras() -> dict[str, list[str]]:
 
 
 def require_extra(extra: str, *modules: str) -> None:
-    """Raise UserError, with the command that installs ``extra``, unless all of its ``modules`` can
-    be imported.
-    """
+    """Raise UserError, which says how to install ``extra``, unless ``modules`` can be imported."""
     for module in modules:
         try:
             import_module(module)

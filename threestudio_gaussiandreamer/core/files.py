@@ -135,9 +135,7 @@ def through_link(path: str | os.PathLike) -> Path:
 
 
 def require_writable(path: str | os.PathLike, what: str) -> None:
-    """Raise UserError, which names the file by ``what``, if it can't be written, before the work
-    that makes its content.
-    """
+    """Raise UserError, which names the file by ``what``, if it can't be written."""
     path = usable_path(path, f"{what}:")
     if not path.parent.is_dir():
         raise UserError(f"{what}: there is no folder {_quoted(path.parent)}")

@@ -66,9 +66,7 @@ def grayscale(
 
 
 def grid(cells: list) -> np.ndarray:
-    """Compose a row of ``{"type", "img", "kwargs"}``, or a list of rows, into one image; all cells
-    of a row get the size of the largest.
-    """
+    """Compose a row of ``{"type", "img", "kwargs"}``, or a list of rows, into one image."""
     if isinstance(cells[0], list):
         rows = [grid(row) for row in cells]
         width = max(row.shape[1] for row in rows)

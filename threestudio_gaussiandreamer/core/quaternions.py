@@ -7,9 +7,7 @@ Row = tuple[T, T, T]
 
 
 def rotation_rows(w: T, x: T, y: T, z: T) -> tuple[Row, Row, Row]:
-    """Return the rows of the rotation matrix of a unit quaternion, element by element: each entry
-    has the type and shape of the arguments.
-    """
+    """Return the rows of a unit quaternion's rotation matrix, of the arguments' type and shape."""
     return (
         (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
         (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),

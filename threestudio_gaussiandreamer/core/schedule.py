@@ -27,9 +27,7 @@ FORMS = "a number, [v0, v1, end], [s0, v0, v1, s1] or [s0, v0, v1, s1, v2, s2, .
 
 
 class Schedule(NamedTuple):
-    """Knots of a piecewise linear function; ``steps`` strictly increasing, counted in epochs or in
-    optimiser steps.
-    """
+    """Knots of a piecewise linear function; ``steps`` strictly increasing."""
 
     steps: list[float]
     values: list[float]

@@ -61,9 +61,7 @@ class RewardNetwork(nn.Module):
     def forward(
         self, pixels: Float[Tensor, "B 3 S S"], ids: Tensor, mask: Tensor
     ) -> Float[Tensor, " B"]:
-        """Return the rewards of pictures, normalised as for CLIP, for one prompt: (1, L) tokens,
-        and which of them aren't padding.
-        """
+        """Return the rewards of pictures, normalised as for CLIP, for one prompt: (1, L) tokens."""
         features = self.vision(pixels).last_hidden_state
         count = len(features)
         found = self.text(
@@ -78,9 +76,7 @@ class RewardNetwork(nn.Module):
 
 
 class ImageReward:
-    """ImageReward from a folder with ``ImageReward.pt`` and BERT's ``vocab.txt``; raises UserError
-    for files that are missing, damaged or others.
-    """
+    """ImageReward from a folder with ``ImageReward.pt`` and BERT's ``vocab.txt``."""
 
     def __init__(self, folder: str, device: torch.device) -> None:
         require_extra("diffusion", "transformers")

@@ -285,9 +285,7 @@ class BundleExporter(Exporter):
         return [output for outputs in self.by_format().values() for output in outputs()]
 
     def by_format(self) -> Dict[str, Callable[[], List[ExporterOutput]]]:
-        """Return a function for each format that calls its exporter, so that one that fails leaves
-        the others. The Gaussians are read once.
-        """
+        """Return for each format what calls its exporter; the Gaussians are read once."""
         shared = functools.cache(lambda: read_gaussians(self.geometry))
         parts = {name: getattr(self, name) for name in ("geometry", "material", "background")}
 

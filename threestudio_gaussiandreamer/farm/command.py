@@ -31,9 +31,7 @@ RULES = {
 
 
 def main(argv: Optional[Sequence[str]] = None) -> int:
-    """Return the exit code: 0 if all assets are finished, 1 if some aren't (with ``--report``: have
-    failed), 2 for invalid input, 130 for Ctrl-C.
-    """
+    """Return the exit code: 0, or 1 if some aren't finished (``--report``: have failed)."""
     return run_command(parse_arguments, run_farm, argv)
 
 

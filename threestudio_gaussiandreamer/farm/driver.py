@@ -74,9 +74,7 @@ def first_line(error: Exception) -> str:
 def plan_workers(
     resources: Mapping[str, float], gpus: Optional[int], cores: int, workers: Optional[int]
 ) -> tuple[int, int]:
-    """Return how many workers of so many cores fit into the cluster, or are asked for, and the GPUs
-    of each, 0 or 1; ``gpus=None`` asks for all.
-    """
+    """Return how many workers are asked for, or fit into the cluster, and the GPUs of each."""
     there, cpus = int(resources.get("GPU", 0)), int(resources.get("CPU", 0))
     if gpus is not None and gpus > there:
         most = f"has {there} GPUs; give at most that" if there else "has no GPU; give none"

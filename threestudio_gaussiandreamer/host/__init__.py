@@ -47,9 +47,7 @@ if _threestudio_is_importable():
     IDENTITY = ("__module__", "__qualname__")
 
     class Checked:
-        """Puts checked options, an instance of ``Config``, in the place of those that threestudio's
-        base class parses.
-        """
+        """Puts the checked options in the place of those that threestudio parses."""
 
         SECTION = ""
 

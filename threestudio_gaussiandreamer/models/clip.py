@@ -30,9 +30,7 @@ def clip_source(
 
 
 def load_text_encoder(folder: Path, component: str = "", *, allow_bin=None) -> Any:
-    """Load transformers' ``CLIPTextModelWithProjection``, float32, also from the files of a CLIP
-    with both encoders.
-    """
+    """Load ``CLIPTextModelWithProjection``, float32, also from a CLIP with both encoders."""
     from transformers import CLIPTextModelWithProjection
 
     return load_network(CLIPTextModelWithProjection, folder, component, allow_bin=allow_bin).float()

@@ -25,9 +25,7 @@ LDM_PREFIX = "model.diffusion_model."
 def load_multiview_unet(
     unet_class: Any, folder: Path, component: str, *, half: bool, torch_dtype: torch.dtype
 ) -> nn.Module:
-    """Load the network as diffusers' UNet; its cameras are ``class_labels`` (B, 16). See
-    :func:`.model_files.load_network`.
-    """
+    """Load the network as diffusers' UNet; its cameras are ``class_labels`` (B, 16)."""
     from diffusers.loaders.single_file_utils import convert_ldm_unet_checkpoint
     from safetensors.torch import load_file
 

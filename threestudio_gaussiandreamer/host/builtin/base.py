@@ -17,9 +17,7 @@ _parts: dict[str, type] = {}
 
 
 def register(name: str) -> Callable[[type], type]:
-    """Return a decorator that enters a class, or of a regulariser the function, under ``name``;
-    it raises UserError if another one has that name already.
-    """
+    """Return a decorator that enters a class or function under ``name``, which must be free."""
 
     def enter(cls: type) -> type:
         taken = _parts.get(name)
@@ -63,9 +61,7 @@ class Updateable:
         self.update_step_end(epoch, global_step)
 
     def update_step(self, epoch: int, global_step: int, on_load_weights: bool = False) -> None:
-        """Prepare for the next batch; must be idempotent, since a part may be an attribute of
-        several others.
-        """
+        """Prepare for the next batch; must be idempotent: several parts may share one."""
 
     def update_step_end(self, epoch: int, global_step: int) -> None:
         """Hook that is called after a batch."""

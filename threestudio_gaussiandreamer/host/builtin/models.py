@@ -85,9 +85,7 @@ class HasSubModules:
 
 
 class Rasterizer(HasSubModules, BaseModule):
-    """Base class of renderers: ``renderer(**batch)`` returns a dict with ``comp_rgb`` (B,H,W,3),
-    ``opacity`` (B,H,W,1), ...
-    """
+    """Renderers return ``comp_rgb`` (B,H,W,3), ``opacity`` (B,H,W,1), ... in a dict."""
 
     @dataclass
     class Config(BaseModule.Config):

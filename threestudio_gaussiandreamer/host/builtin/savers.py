@@ -28,9 +28,7 @@ class LoggerOptions:
 
 
 class SaverMixin:
-    """``save_*`` methods: each takes a file name relative to the save folder, and returns the full
-    path of the file that it has written.
-    """
+    """``save_*`` methods take a name relative to the save folder, and return the full path."""
 
     _save_dir: Optional[str] = None
     _wandb_logger: Any = None
@@ -44,9 +42,7 @@ class SaverMixin:
         return self._save_dir
 
     def get_save_path(self, filename: str) -> str:
-        """Return the full path of a file below the save folder, and create its folder; raise
-        UserError if it is outside of it.
-        """
+        """Return the full path of a file below the save folder, and make its folder."""
         path = os.path.join(self.get_save_dir(), filename)
         if os.path.relpath(path, self.get_save_dir()).startswith(os.pardir):
             raise UserError(f"the file name {filename!r} is outside of {self.get_save_dir()}")
@@ -118,9 +114,7 @@ class SaverMixin:
     def save_obj(
         self, filename: str, mesh: Any, save_vertex_color: bool = False, **unused: Any
     ) -> list[str]:
-        """Save ``mesh.v_pos`` (V,3), ``mesh.t_pos_idx`` (F,3) and, if asked, ``mesh.v_rgb`` (V,3)
-        as a Wavefront OBJ without material.
-        """
+        """Save ``v_pos`` (V,3), ``t_pos_idx`` (F,3) and, if asked, ``v_rgb`` (V,3) as an OBJ."""
         path = self.get_save_path(f"{filename.removesuffix('.obj')}.obj")
         vertices, faces = self.convert_data(mesh.v_pos), self.convert_data(mesh.t_pos_idx)
         if save_vertex_color:

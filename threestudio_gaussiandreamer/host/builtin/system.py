@@ -17,9 +17,7 @@ from .savers import LoggerOptions, SaverMixin
 
 
 class BaseSystem(pl.LightningModule, Updateable, SaverMixin):
-    """Parses its configuration, calls ``configure``, and updates the loader's ``dataset`` and the
-    parts before and after every batch.
-    """
+    """Parses its options, calls ``configure``, and updates dataset and parts around every batch."""
 
     @dataclass
     class Config:
@@ -80,9 +78,7 @@ class BaseSystem(pl.LightningModule, Updateable, SaverMixin):
         return C(value, self.true_current_epoch, self.true_global_step)
 
     def preprocess_data(self, batch: dict, stage: str) -> None:
-        """Change a batch in place before it is used; ``stage`` is "train", "validation", "test" or
-        "predict".
-        """
+        """Change a batch of "train", "validation", "test" or "predict" in place."""
 
     def on_train_batch_start(self, batch: dict, *rest: Any) -> None:
         self._before_batch(batch, "train", self.trainer.train_dataloader)
@@ -112,9 +108,7 @@ class BaseSystem(pl.LightningModule, Updateable, SaverMixin):
 
 
 class BaseLift3DSystem(BaseSystem):
-    """Builds geometry, material, background and renderer by their names in the registry; exports
-    through an exporter.
-    """
+    """Builds the parts by their names in the registry, and exports through an exporter."""
 
     @dataclass
     class Config(BaseSystem.Config):
