@@ -7,7 +7,6 @@ import torch
 
 from tests.guidance.conftest import step, uniform
 from threestudio_gaussiandreamer.core import streams
-from threestudio_gaussiandreamer.core.devices import HostCopy, flush_reads
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.diffusion import sds
 from threestudio_gaussiandreamer.guidance.base import ScoreDistillation
