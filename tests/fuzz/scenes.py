@@ -7,9 +7,8 @@ from typing import Any, NamedTuple, Optional
 import torch
 from torch import Tensor
 
-from tests.helpers.splatting_scenes import NAMES, Cloud, cotangents, rasterize
+from tests.helpers.splatting_scenes import NAMES, Cloud, Run, cotangents, rasterize
 from threestudio_gaussiandreamer.gaussians.sh import sh_to_colors
-from threestudio_gaussiandreamer.splatting import Rasterized
 from threestudio_gaussiandreamer.splatting.projection import quats_to_rotations
 
 MAX = 3.4028235e38
@@ -19,13 +18,9 @@ PIXELS_TIMES_GAUSSIANS = 2_000_000
 ROUNDING = 2e-5
 """Smallest distance of depths whose order float32 resolves, for means up to 50."""
 FLIPS = 4 / 1024
-"""Tolerance of pixels: float32 rounding may put the faintest contribution (1/1024) of a few
-Gaussians on either side of the threshold.
-"""
+"""Of pixels: a few Gaussians' faintest contribution (1/1024) may fall beyond the threshold."""
 GRADIENTS = 1e-2
-"""Tolerance of gradients, relative, without the worst hundredth of the Gaussians: those at a
-threshold (alpha_min, the cap).
-"""
+"""Of gradients, relative, without the worst hundredth of the Gaussians, those at a threshold."""
 
 SIZES = (0.0, DENORMAL, 1e-30, 1e-8, 1e-4, 0.05, 1.0, 1e2, 1e4, 1e10, 1e30, MAX)
 PLACES = (0.0, -0.0, DENORMAL, 0.01, -0.01, 0.3, 1.0, -1.0, 10.0, -1e4, 1e8, 1e20, -1e30, MAX)
@@ -33,9 +28,7 @@ LENGTHS = (0.0, DENORMAL, 1e-30, 1e-13, 1e-12, 1e-3, 1.0, 5.0, 1e10, 1e20, 1e30,
 OPACITIES = (0.0, -0.0, DENORMAL, 1 / 1024, 1 / 255, 0.5, 1 - 2**-10, 1.0, 1.5, -1.0, 100.0)
 HARMONICS = (0.0, -0.0, DENORMAL, -1.0, 1.0, 1e4, -1e10)
 BRIGHT = (1e30, -1e30, MAX, -MAX)
-"""SH coefficients whose pixels are finite in float32, but not their gradients, which grow with
-colour times focal length / depth.
-"""
+"""SH coefficients whose pixels are finite, but not their gradients (by focal length / depth)."""
 NOT_FINITE = (math.nan, math.inf, -math.inf)
 NEAR = (0.01, 0.01, 1e-6, 0.5)
 FOVS_DEG = (1e-3, 0.1, 1.0, 30.0, 60.0, 120.0, 179.0, 179.999)
@@ -54,13 +47,6 @@ class Scene(NamedTuple):
     options: dict[str, Any]
 
 
-class Drawn(NamedTuple):
-    """A render, and the gradients by argument name."""
-
-    out: Rasterized
-    grads: dict[str, Tensor]
-
-
 def extreme_scene(seed: int, most: int = 4000) -> Scene:
     """Draw a scene of up to ``most`` Gaussians; a tenth of the scenes contains NaN and infinity."""
     g = torch.Generator().manual_seed(seed)
@@ -75,10 +61,8 @@ def extreme_scene(seed: int, most: int = 4000) -> Scene:
 
 def well_posed(scene: Scene) -> Scene:
     """Select the Gaussians on which float32 backends must agree: finite, of moderate size and
-    position, clear of the near plane.
-
-    Under a field of view of less than a degree or more than 150, neither rounding nor the clamped
-    Jacobian is moderate."""
+    position, clear of the near plane; none under a field of view of less than a degree or more than
+    150, where neither rounding nor the clamped Jacobian is moderate."""
     cloud, near = scene.cloud, scene.options["near"]
     lengths = torch.linalg.vector_norm(cloud.quats, dim=1)
     keep = (cloud.means.abs() <= 50).all(1) & (lengths >= 1e-3) & (lengths <= 1e3)
@@ -188,7 +172,7 @@ def _options(g: torch.Generator, size: tuple[int, int]) -> dict[str, Any]:
     return options
 
 
-def draw(scene: Scene, backend: str, dtype: torch.dtype = torch.float32) -> Drawn:
+def draw(scene: Scene, backend: str, dtype: torch.dtype = torch.float32) -> Run:
     """Render forward and backward with fixed cotangents."""
     leaves = scene.cloud.to(dtype).leaves()
     viewmats = scene.viewmats.to(dtype, copy=True).requires_grad_()
@@ -203,15 +187,13 @@ def draw(scene: Scene, backend: str, dtype: torch.dtype = torch.float32) -> Draw
     torch.autograd.backward([out.image, out.alpha, out.depth], cotangents(out))
     inputs = zip((*NAMES, "viewmats", "means2d"), (*leaves, viewmats, out.means2d), strict=True)
     grads = {name: leaf.grad for name, leaf in inputs}
-    return Drawn(out, grads if background is None else grads | {"background": background.grad})
+    return Run(out, grads if background is None else grads | {"background": background.grad})
 
 
-def fault(scene: Scene, drawn: Drawn) -> Optional[str]:
-    """Return the first problem of a render: a value or gradient that isn't finite, or alpha outside
-    [0, 1].
-
-    Two exceptions: radii may be infinite for a Gaussian larger than float32, and the gradient of SH
-    coefficients may be NaN where the mean is, since it has no viewing direction.
+def fault(scene: Scene, drawn: Run) -> Optional[str]:
+    """Return the first value or gradient that isn't finite, or alpha outside [0, 1]; but radii may
+    be infinite for a Gaussian larger than float32, and the gradient of SH coefficients NaN where
+    the mean is, since it has no viewing direction.
     """
     for name in ("image", "alpha", "depth", "means2d", "contribution"):
         if not getattr(drawn.out, name).isfinite().all():
@@ -229,7 +211,7 @@ def fault(scene: Scene, drawn: Drawn) -> Optional[str]:
     return None
 
 
-def disagreement(pictures: dict[str, Drawn]) -> Optional[str]:
+def disagreement(pictures: dict[str, Run]) -> Optional[str]:
     """Return which render of a well-posed scene differs from the last one by more than rounding."""
     *others, (first, one) = pictures.items()
     for name, other in others:

@@ -8,10 +8,8 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
-import torch
 
 from tests.fuzz.scenes import (
-    Drawn,
     disagreement,
     disagreement_on,
     draw,
@@ -106,9 +104,9 @@ def test_wrong_renders_and_backends_that_differ_are_detected():
     part = well_posed(scene(ORDINARY))
     one, other = draw(part, "reference"), draw(part, "torch")
     assert disagreement({"one": one, "other": other}) is None
-    shifted = Drawn(other.out._replace(image=1.1 * other.out.image), other.grads)
+    shifted = other._replace(out=other.out._replace(image=1.1 * other.out.image))
     assert "image" in disagreement({"one": one, "other": shifted})
-    wrong = Drawn(other.out, other.grads | {"means": torch.flip(other.grads["means"], [1])})
+    wrong = other._replace(grads=other.grads | {"means": other.grads["means"].flip(1)})
     assert "means" in disagreement({"one": one, "other": wrong})
 
 

@@ -46,15 +46,12 @@ def shap_e(folder: Path, seed: int = 0) -> Path:
 
     torch.manual_seed(seed)
     clip_tokenizer(folder / "vocabulary")
-    scheduler = HeunDiscreteScheduler(
-        beta_schedule="exp", num_train_timesteps=1024, prediction_type="sample",
-        use_karras_sigmas=True, clip_sample=True,
-    )  # fmt: skip
+    options = {"beta_schedule": "exp", "num_train_timesteps": 1024, "prediction_type": "sample"}
     ShapEPipeline(
         prior=shap_e_prior(),
         text_encoder=CLIPTextModelWithProjection(clip_text_config(32, FEATURES)),
         tokenizer=CLIPTokenizer.from_pretrained(folder / "vocabulary"),
-        scheduler=scheduler,
+        scheduler=HeunDiscreteScheduler(**options, use_karras_sigmas=True, clip_sample=True),
         shap_e_renderer=_shap_e_renderer(),
     ).save_pretrained(folder)
     return folder
@@ -158,9 +155,9 @@ def body_arrays(seed: int = 0) -> dict[str, np.ndarray]:
         faces.append(tube_faces + sum(map(len, vertices)))
         vertices.append(tube)
         owners.append(np.full(len(tube), PARENTS[joint]))
-    vertices, owners = np.concatenate(vertices), np.concatenate(owners)
-    weights = np.eye(24)[owners]
-    regressor = _regressor(vertices)
+    vertices, weights = np.concatenate(vertices), np.eye(24)[np.concatenate(owners)]
+    # each joint is the mean of its own vertices
+    own = np.linalg.norm(vertices - JOINTS[:, None], axis=-1) < 1e-9
     shape = np.zeros((len(vertices), 3, 10))
     shape[:, 1, 0], shape[:, 0, 1] = 0.05 * vertices[:, 1], 0.05 * vertices[:, 0]
     rng = np.random.default_rng(seed)
@@ -168,7 +165,7 @@ def body_arrays(seed: int = 0) -> dict[str, np.ndarray]:
         "v_template": vertices,
         "shapedirs": shape,
         "posedirs": rng.normal(scale=1e-4, size=(len(vertices), 3, 207)),
-        "J_regressor": regressor,
+        "J_regressor": own / own.sum(axis=1, keepdims=True),
         "weights": weights,
         "kintree_table": np.array([[2**32 - 1, *PARENTS[1:]], range(24)], np.uint32),
         "f": np.concatenate(faces).astype(np.uint32),
@@ -180,23 +177,21 @@ def body_model(path: Path) -> Path:
     return path
 
 
+def rings(start: np.ndarray, end: np.ndarray, radius: float, sides: int) -> list[np.ndarray]:
+    """Return two rings (sides, 3) around a bone's ends."""
+    along = (end - start) / np.linalg.norm(end - start)
+    side = np.cross(along, np.eye(3)[np.abs(along).argmin()])
+    side /= np.linalg.norm(side)
+    angles = 2 * np.pi * np.arange(sides)[:, None] / sides
+    ring = radius * (np.cos(angles) * side + np.sin(angles) * np.cross(along, side))
+    return [start + ring, end + ring]
+
+
 def _tube(start: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return a closed tube of 4 cm radius: two rings around the bone's ends, and these."""
-    along = (end - start) / np.linalg.norm(end - start)
-    side = np.cross(along, [0.0, 0.0, 1.0] if abs(along[2]) < 0.9 else [1.0, 0.0, 0.0])
-    side /= np.linalg.norm(side)
-    angles = 2 * np.pi * np.arange(RING) / RING
-    ring = 0.04 * (np.cos(angles)[:, None] * side + np.sin(angles)[:, None] * np.cross(along, side))
     faces = []
     for i in range(RING):
         j = (i + 1) % RING
         faces += [(i, j, RING + i), (j, RING + j, RING + i)]
         faces += [(2 * RING, j, i), (2 * RING + 1, RING + i, RING + j)]
-    return np.concatenate([start + ring, end + ring, [start, end]]), np.array(faces)
-
-
-def _regressor(vertices: np.ndarray) -> np.ndarray:
-    """Return the regressor in which each joint is the mean of its own vertices."""
-    distance = np.linalg.norm(vertices[None] - JOINTS[:, None], axis=-1)
-    regressor = (distance < 1e-9).astype(np.float64)
-    return regressor / regressor.sum(axis=1, keepdims=True)
+    return np.concatenate([*rings(start, end, 0.04, RING), [start, end]]), np.array(faces)

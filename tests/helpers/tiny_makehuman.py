@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.helpers.tiny_3d_models import JOINTS
+from tests.helpers.tiny_3d_models import JOINTS, rings
 from threestudio_gaussiandreamer.priors.anny import BONES, METRES, Person, target_weights
 from threestudio_gaussiandreamer.priors.body_pose import BODY_JOINTS, PARENTS
 from threestudio_gaussiandreamer.priors.body_pose import JOINTS as NAMES
@@ -37,22 +37,14 @@ def tiny_makehuman(folder: Path, *persons: Person) -> Path:
 def tubes() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return vertices, quads, and owners: a tube, with the joints as means, for each bone."""
     vertices, quads, owners = [], [], []
-    angles = 2 * np.pi * np.arange(SIDES) / SIDES
+    here = np.arange(SIDES)
+    there = (here + 1) % SIDES
     for joint in range(1, BODY_JOINTS):
-        start, end = HEADS[PARENTS[joint]], HEADS[joint]
-        along = (end - start) / np.linalg.norm(end - start)
-        side = np.cross(along, np.eye(3)[np.abs(along).argmin()])
-        side /= np.linalg.norm(side)
-        up = np.cross(along, side)
-        ring = RADIUS * (np.cos(angles)[:, None] * side + np.sin(angles)[:, None] * up)
         first = 2 * SIDES * (joint - 1)
-        quads += [
-            [first + i, first + (i + 1) % SIDES, first + SIDES + (i + 1) % SIDES, first + SIDES + i]
-            for i in range(SIDES)
-        ]
-        vertices += [start + ring, end + ring]
+        quads.append(first + np.stack([here, there, SIDES + there, SIDES + here], 1))
+        vertices += rings(HEADS[PARENTS[joint]], HEADS[joint], RADIUS, SIDES)
         owners += [PARENTS[joint]] * 2 * SIDES
-    return np.concatenate(vertices), np.array(quads), np.array(owners)
+    return np.concatenate(vertices), np.concatenate(quads), np.array(owners)
 
 
 def obj_text(vertices: np.ndarray, quads: np.ndarray) -> str:
