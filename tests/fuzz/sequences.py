@@ -23,12 +23,12 @@ from threestudio_gaussiandreamer.splatting import Rasterized
 from threestudio_gaussiandreamer.training.density import DECAY, DensityControl
 from threestudio_gaussiandreamer.training.geometry import STATISTICS, GaussianCloud
 
-EXTREMES = {
-    "means": [0.0, 1e4, -1e30, 3e38],
-    "log_scales": [-1e30, -1000.0, -104.0, 0.0, 88.7, 1000.0, 3e38],
-    "quats": [0.0, 1e-42, 1e30, -3e38],
-    "logit_opacities": [-3e38, -1000.0, -15.0, 15.0, 1000.0, 3e38],
-}
+EXTREMES = [
+    *(("means", value) for value in (0.0, 1e4, -1e30, 3e38)),
+    *(("log_scales", value) for value in (-1e30, -1000.0, -104.0, 0.0, 88.7, 1000.0, 3e38)),
+    *(("quats", value) for value in (0.0, 1e-42, 1e30, -3e38)),
+    *(("logit_opacities", value) for value in (-3e38, -1000.0, -15.0, 15.0, 1000.0, 3e38)),
+]
 FLOORS, CAPS = (1, 2, 64), (64, 65, 90, 500)
 SEEDS = st.integers(0, 2**31 - 1)
 
@@ -40,12 +40,9 @@ class CloudSequence(RuleBasedStateMachine):
     """Operations that were run, in all sequences."""
 
     @initialize(
-        count=st.integers(1, 90),
-        floor=st.sampled_from(FLOORS),
-        cap=st.sampled_from(CAPS),
-        seed=SEEDS,
-        stepped=st.booleans(),
-    )
+        count=st.integers(1, 90), floor=st.sampled_from(FLOORS), cap=st.sampled_from(CAPS),
+        seed=SEEDS, stepped=st.booleans(),
+    )  # fmt: skip
     def start(self, count: int, floor: int, cap: int, seed: int, stepped: bool) -> None:
         self.g = torch.Generator().manual_seed(seed)
         densify = {"enabled": True, "start": 0, "stop": 10}
@@ -117,19 +114,13 @@ class CloudSequence(RuleBasedStateMachine):
         self.see(seed, bad=False, views=2)
         self._round(budget=budget, densify={"grad_threshold": 0.0, "every": 1}, prune={"keep": 0.5})
 
-    @rule(
-        name=st.sampled_from(sorted(EXTREMES)),
-        which=st.integers(0, 10),
-        share=st.floats(0, 1),
-        seed=SEEDS,
-    )
-    def set_extreme(self, name: str, which: int, share: float, seed: int) -> None:
+    @rule(extreme=st.sampled_from(EXTREMES), share=st.floats(0, 1), seed=SEEDS)
+    def set_extreme(self, extreme: tuple[str, float], share: float, seed: int) -> None:
         """Set parameters to extreme finite values."""
         CloudSequence.steps += 1
-        values, g = getattr(self.cloud, name), torch.Generator().manual_seed(seed)
-        extreme = EXTREMES[name][which % len(EXTREMES[name])]
+        values, g = getattr(self.cloud, extreme[0]), torch.Generator().manual_seed(seed)
         with torch.no_grad():
-            values[torch.rand(values.shape, generator=g) < share] = extreme
+            values[torch.rand(values.shape, generator=g) < share] = extreme[1]
 
     @rule()
     def resume(self) -> None:

@@ -27,13 +27,10 @@ def assert_same_training(a: Path, b: Path) -> None:
 
 def training_state(checkpoint: dict[str, Any]) -> dict[str, torch.Tensor]:
     """Return parameters, statistics, moments and the step."""
-    moments = checkpoint["optimizer_states"][0]["state"]
-    found = {
-        f"{i}.{name}": torch.as_tensor(value)
-        for i, state in moments.items()
-        for name, value in state.items()
-    }
-    return {**checkpoint["state_dict"], **found, "step": torch.tensor(checkpoint["global_step"])}
+    found = {"step": torch.tensor(checkpoint["global_step"]), **checkpoint["state_dict"]}
+    for i, state in checkpoint["optimizer_states"][0]["state"].items():
+        found |= {f"{i}.{name}": torch.as_tensor(value) for name, value in state.items()}
+    return found
 
 
 def differences(a: dict[str, Any], b: dict[str, Any]) -> int:

@@ -14,13 +14,8 @@ def ball(count: int = 600, degree: int = 0, seed: int = 0) -> Gaussians:
     colors = 0.5 + 0.4 * np.sin(4 * directions + [0, 1, 2])
     sh = rng.normal(size=(count, (degree + 1) ** 2, 3)) * 0.08
     sh[:, 0] = (colors - 0.5) / 0.28209479
-    values = [
-        means,
-        rng.normal(size=(count, 4)),
-        np.log(0.02 + 0.05 * rng.random((count, 3))),
-        rng.normal(size=count) + 2,
-        sh,
-    ]
+    quats, log_scales = rng.normal(size=(count, 4)), np.log(0.02 + 0.05 * rng.random((count, 3)))
+    values = means, quats, log_scales, rng.normal(size=count) + 2, sh
     return Gaussians(*(np.asarray(value, np.float32) for value in values))
 
 

@@ -38,10 +38,7 @@ STD = 0.4
 
 def noise_of(z, abar, modes, std=STD):
     """Return -sigma grad log p_t(z), by autograd, of an equal mixture of N(mode, std^2) after
-    noising.
-
-    Args:
-        z: (B, 1, 1, 3); abar: (B,).
+    noising, for z (B, 1, 1, 3) and abar (B,).
     """
     with torch.enable_grad():
         z = z.detach().requires_grad_()

@@ -1,7 +1,5 @@
-"""A real, unmodified threestudio on this machine, for the tests that run in it.
-
-Needs ``THREESTUDIO_SRC`` (a checkout of threestudio v0.2.3), ``HOST3_DIR`` (where the harness has
-put the environment that it starts in) and the harness itself, in ``GAUSSIANDREAMER_SHARED`` or
+"""A real threestudio on this machine: ``THREESTUDIO_SRC`` (a checkout of v0.2.3), ``HOST3_DIR``
+(where the harness has put its environment), and the harness, in ``GAUSSIANDREAMER_SHARED`` or
 ``../shared``."""
 
 import os
@@ -28,14 +26,10 @@ NEEDED = [
 def output_of(module: str, *arguments: str | Path) -> str:
     """Run a module of the tests beside threestudio, in its environment; return what it printed."""
     places = [HARNESS.parent / "stubs", REPOSITORY, SOURCE, os.environ.get("EXTRA_PYTHONPATH", "")]
-    environment = {
-        **os.environ,
-        "HOST3_PATCH": "1",
-        "PYTHONDONTWRITEBYTECODE": "1",
-        "PYTHONPATH": os.pathsep.join(str(place) for place in places if str(place)),
-    }
-    command = [str(HOST / "venv" / "bin" / "python"), "-W", "ignore", "-m", module]
-    command += map(str, arguments)
+    path = os.pathsep.join(str(place) for place in places if str(place))
+    options = {"HOST3_PATCH": "1", "PYTHONDONTWRITEBYTECODE": "1", "PYTHONPATH": path}
+    command = [HOST / "venv" / "bin" / "python", "-W", "ignore", "-m", module, *arguments]
+    environment = {**os.environ, **options}
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout

@@ -125,12 +125,9 @@ class KernelContract:
     @repeatable
     @given(seed=st.integers(0, 10**6), n=st.integers(1, 60), antialias=st.booleans())
     def test_extreme_clouds(self, backend, seed, n, antialias):
-        """Needles, discs, behind the camera, NaN, infinite, coincident, transparent, opaque:
-        finite, and the image is correct.
-
-        Some opacities are alpha_min itself, so whole images depend on one rounding; either outcome
-        is correct. One alpha on the other side of alpha_min = 1/1024 moves a pixel by that times
-        the range of colours, 3.
+        """Some opacities are alpha_min itself, so whole images depend on one rounding; either
+        outcome is correct. One alpha on the other side of alpha_min = 1/1024 moves a pixel by that
+        times the range of colours, 3.
         """
         cloud, view = extreme_cloud(seed, n), (cameras(2, 37, 13), 37, 13)
         ours = draw(backend, cloud, *view, antialias=antialias, camera_gradient=True)
@@ -146,13 +143,9 @@ class KernelContract:
 
     @repeatable
     @given(
-        seed=st.integers(0, 10**6),
-        n=st.integers(0, 80),
-        size=st.floats(1e-3, 2.0),
-        stretch=st.floats(0, 3),
-        width=st.integers(1, 70),
-        height=st.integers(1, 40),
-    )
+        seed=st.integers(0, 10**6), n=st.integers(0, 80), size=st.floats(1e-3, 2.0),
+        stretch=st.floats(0, 3), width=st.integers(1, 70), height=st.integers(1, 40),
+    )  # fmt: skip
     def test_random_clouds(self, backend, seed, n, size, stretch, width, height):
         """Any size and shape; the median, since a few pixels may fall beyond a threshold."""
         cloud = random_cloud(n, seed, size=size, stretch=stretch)
@@ -215,13 +208,11 @@ class KernelContract:
 
     def test_several_forwards_before_their_backwards(self, backend):
         """Each graph owns what its backward pass needs, for any order of calls."""
-        clouds = [random_cloud(n, seed=n).to(torch.float32) for n in (300, 40, 900)]
-        *camera, width, height = single(70, 40, views=2)
-        alone = [draw(backend, cloud, camera, width, height) for cloud in clouds]
-        leaves = [cloud.leaves() for cloud in clouds]
-        outs = [rasterize(*cloud, *camera, width, height, backend=backend) for cloud in leaves]
-        for i in (1, 2, 0):
-            out = outs[i]
+        clouds, view = [random_cloud(n, seed=n) for n in (300, 40, 900)], single(70, 40, views=2)
+        alone = [draw(backend, cloud, view[:2], 70, 40) for cloud in clouds]
+        leaves = [cloud.to(torch.float32).leaves() for cloud in clouds]
+        outs = [rasterize(*cloud, *view, backend=backend) for cloud in leaves]
+        for out in (outs[1], outs[2], outs[0]):
             torch.autograd.backward([out.image, out.alpha, out.depth], cotangents(out))
         for cloud, expected in zip(leaves, alone, strict=True):
             for name, leaf in zip(NAMES, cloud, strict=True):

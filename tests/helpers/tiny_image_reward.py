@@ -65,14 +65,11 @@ def rewards(state: dict, pixels: torch.Tensor, ids: list[int]) -> torch.Tensor:
     return (found[:, 0] - 0.16717362830052426) / 1.0333394966054072
 
 
-class Tensors:
-    """The tensors whose names begin with a prefix."""
+class Tensors(dict):
+    """The tensors, those whose names begin with a prefix without it."""
 
     def __init__(self, state: dict, prefix: str) -> None:
-        self.state, self.prefix = state, prefix
-
-    def __getitem__(self, name: str) -> torch.Tensor:
-        return self.state[self.prefix + name]
+        super().__init__((name.removeprefix(prefix), value) for name, value in state.items())
 
     def linear(self, name: str, x: torch.Tensor) -> torch.Tensor:
         return F.linear(x, self[f"{name}.weight"], self[f"{name}.bias"])
@@ -82,9 +79,8 @@ class Tensors:
 
 
 def picture_features(t: Tensors, pixels: torch.Tensor) -> torch.Tensor:
-    patches = F.conv2d(
-        pixels, t["patch_embed.proj.weight"], t["patch_embed.proj.bias"], stride=PATCH
-    )
+    weights = (t[f"patch_embed.proj.{name}"] for name in ("weight", "bias"))
+    patches = F.conv2d(pixels, *weights, stride=PATCH)
     x = torch.cat([t["cls_token"].expand(len(pixels), -1, -1), patches.flatten(2).mT], 1)
     x = x + t["pos_embed"]
     for i in range(LAYERS):

@@ -38,6 +38,9 @@ class Ended(NamedTuple):
     def last(self) -> Path:
         return self.folder / "ckpts" / "last.ckpt"
 
+    def at_step(self, step: int) -> Path:
+        return self.folder / f"ckpts/epoch=0-step={step}.ckpt"
+
     def checkpoint(self, path: Path | None = None) -> dict[str, Any]:
         return torch.load(path or self.last, weights_only=True, map_location="cpu")
 

@@ -1,7 +1,7 @@
 """A3: densification at its limits, and its state over resumes."""
 
 import math
-from pathlib import Path
+from collections.abc import Iterator
 from types import SimpleNamespace
 from unittest import mock
 
@@ -190,6 +190,10 @@ def test_moments_follow_their_gaussian(sequences, measured, monkeypatch):
     measured("to the bit")
 
 
+def parameters_of(runs: list[Training]) -> Iterator[tuple[torch.nn.Parameter, ...]]:
+    return zip(*(run.geometry.parameters_by_name().values() for run in runs), strict=True)
+
+
 @row("A3", "Lost step")
 def test_a_round_that_selects_no_gaussian_changes_nothing(measured):
     """Five rounds between three prunings, whose scores must not count them."""
@@ -197,11 +201,10 @@ def test_a_round_that_selects_no_gaussian_changes_nothing(measured):
     pruned = {"budget": 100, "prune": {"start": 0, "stop": 99, "every": 3}}
     runs = [Training(started(**pruned)), Training(started(**pruned, densify=none_selected))]
     assert [training.run(10)[-1] for training in runs] == [102, 102]
-    pairs = list(zip(*(run.geometry.parameters_by_name().values() for run in runs), strict=True))
-    for pair in pairs:
+    for pair in parameters_of(runs):
         one, other = (run.optimizer.state.get(p, {}) for run, p in zip(runs, pair, strict=True))
         assert one.keys() == other.keys() and all(torch.equal(one[key], other[key]) for key in one)
-    moved = sum((plain != idle).sum() for plain, idle in pairs)
+    moved = sum((plain != idle).sum() for plain, idle in parameters_of(runs))
     measured(moved, "numbers that differ", at_most=0)
 
 
@@ -212,8 +215,7 @@ def test_a_round_takes_no_step_from_those_that_stay(measured):
     runs = [Training(started()), Training(started(densify=everybody))]
     counts = [training.run(3) for training in runs]
     assert counts[1][-1] > 350
-    pairs = zip(*(run.geometry.parameters_by_name().values() for run in runs), strict=True)
-    moved = sum((plain != cloned[:200]).sum() for plain, cloned in pairs)
+    moved = sum((plain != cloned[:200]).sum() for plain, cloned in parameters_of(runs))
     measured(moved, "numbers that differ", at_most=0)
 
 
@@ -224,13 +226,9 @@ def whole(tmp_path_factory) -> Ended:
     return launch(tmp_path_factory.mktemp("whole"), *SCHEDULES, *steps)
 
 
-def at_step(run: Ended, step: int) -> Path:
-    return run.folder / f"ckpts/epoch=0-step={step}.ckpt"
-
-
 def counts_at(run: Ended, step: int) -> tuple[int, int]:
     """Count the Gaussians, and those without moments, which were created at this step."""
-    state = run.checkpoint(at_step(run, step))["optimizer_states"][0]["state"][0]["exp_avg_sq"]
+    state = run.checkpoint(run.at_step(step))["optimizer_states"][0]["state"][0]["exp_avg_sq"]
     return len(state), int((state == 0).all(1).sum())
 
 
@@ -238,15 +236,12 @@ def counts_at(run: Ended, step: int) -> tuple[int, int]:
 @row("A3", "Densify x resume")
 @pytest.mark.parametrize("k", [29, 30, 31, 35, 90])
 def test_resumed_anywhere_the_cloud_is_the_same(k, whole, tmp_path, measured):
-    """A tenth of the row's steps: stops before, at and after a round that densifies and prunes,
-    between rounds, and at the last.
-
-    The checkpoints are those of the uninterrupted run, which shows that writing them changes
-    nothing.
+    """Before, at and after a round that densifies and prunes, between rounds, and at the last; the
+    checkpoints are those of the uninterrupted run, so writing them changes nothing.
     """
     counts, new = zip(*(counts_at(whole, step) for step in (29, 30, 31, 89, 90)), strict=True)
     assert counts[0] > counts[1] == counts[2] and new[1] > new[0] and new[4] > new[3]
-    resumed = launch(tmp_path, *SCHEDULES, "trainer.max_steps=100", f"resume={at_step(whole, k)}")
+    resumed = launch(tmp_path, *SCHEDULES, "trainer.max_steps=100", f"resume={whole.at_step(k)}")
     differing = differences(whole.checkpoint(), resumed.checkpoint())
     measured(differing, "tensors that differ, moments too", at_most=0)
 

@@ -35,7 +35,6 @@ from tests.stability.scenes import (
     drawn,
     finite,
     joined,
-    pixels,
     seeded,
     stack,
     started,
@@ -94,16 +93,11 @@ def test_near_plane(backend, measured):
 def test_spill_of_the_clamped_jacobian(backend, measured):
     """No pixel outside the ellipse of the clamped formula is covered."""
     width, focal, z, spilt = 32, 20.0, 2.0, 0
-    limit = 0.5 * width / focal
+    camera = front_camera(width, width, focal)
     for limits, scale in AROUND_THE_CLAMP:
-        x = limits * limit * z
-        slope = min(x / z, 1.3 * limit)
-        J = torch.tensor([[focal / z, 0, -focal / z * slope], [0, focal / z, 0]]).double()
-        inverse = (scale**2 * J @ J.T + 0.3 * torch.eye(2)).inverse()
-        offsets = pixels(width, width) - torch.tensor([focal * x / z, 0.0]).double() - 0.5 * width
-        alpha = 0.9 * torch.exp(-0.5 * (offsets @ inverse * offsets).sum(-1))
+        cloud = one_gaussian((limits * 0.5 * width / focal * z, 0.0, z), scale, 0.9)
+        alpha = clamped_alpha(cloud.means[0], cloud.scales[0], width, focal, 0.9)
         inside = alpha >= 1 / 1024 - 1e-6  # rounding
-        cloud, camera = one_gaussian((x, 0.0, z), scale, 0.9), front_camera(width, width, focal)
         covered = draw(backend, cloud, camera, width, width).out.alpha[0, ..., 0] > 0
         spilt += int((covered & ~inside).sum())
     measured(spilt, "pixels", what="spill", at_most=0)
@@ -121,9 +115,7 @@ def test_gradients_at_the_clamp(backend, measured):
     width, focal, z = 16, 20.0, 1.5
     camera = front_camera(width, width, focal)
     weights = torch.randn(width, width, generator=seeded()).double()
-    what, bound, dtype = (
-        ("float64", 1e-6, torch.float64) if backend in EXACT else ("float32", 1e-4, torch.float32)
-    )
+    dtype, bound = (torch.float64, 1e-6) if backend in EXACT else (torch.float32, 1e-4)
     for limits, scale in AROUND_THE_CLAMP:
         x = limits * 0.5 * width / focal * z
         # long enough to reach back into the image from anywhere
@@ -137,7 +129,7 @@ def test_gradients_at_the_clamp(backend, measured):
         assert all(grad.isfinite().all() for grad in grads)
         if limits != 1.3 and mean.grad.abs().max() > 1e-6:
             worst = max(error(grads[0], mean.grad), error(grads[1], spread.grad))
-            measured(worst, what=what, at_most=bound)
+            measured(worst, what=str(dtype).removeprefix("torch."), at_most=bound)
 
 
 @row("A1", "det <= 0, float32 cancellation ac-b^2")

@@ -26,14 +26,7 @@ from tests.helpers.ply_files import ply_bytes
 from tests.promises.commands import full_disk
 from tests.stability.backends import slow
 from tests.stability.report import row
-from tests.stability.small_runs import (
-    DEMO,
-    EVERY_STEP,
-    Ended,
-    launch,
-    refused,
-    require_equal_ends,
-)
+from tests.stability.small_runs import DEMO, EVERY_STEP, Ended, launch, refused, require_equal_ends
 from threestudio_gaussiandreamer import host
 from threestudio_gaussiandreamer.core import images as pictures
 from threestudio_gaussiandreamer.core.checkpoint_file import (

@@ -210,7 +210,7 @@ DENSIFYING = [
 
 def require_same_when_resumed(measured, folder, run: Ended, step: int, *options) -> None:
     """Resume, in another folder, from the checkpoint that the run wrote at ``step``."""
-    ended = launch(folder, *options, f"resume={run.folder}/ckpts/epoch=0-step={step}.ckpt")
+    ended = launch(folder, *options, f"resume={run.at_step(step)}")
     require_equal_ends(measured, run, ended, "different")
 
 
