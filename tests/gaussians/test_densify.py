@@ -65,6 +65,15 @@ def test_which_gaussians_are_dropped_and_their_room_is_used_in_the_same_round(ca
     assert sorted(change.parents.tolist()) == [3, 4, 5, 6, 7, 7, 8, 8, 9, 9]
 
 
+def test_the_threshold_means_the_same_at_any_resolution_batch_and_loss_scale():
+    """Of a view's loss; its gradient in pixels is averaged and scaled."""
+    device_units = torch.rand(1, 20, 2)
+    pixels = device_units / torch.tensor([512 / 2, 256 / 2]) / 4 * 65536.0
+    norms = densify.screen_gradients(pixels.repeat(4, 1, 1), 512, 256, 65536.0)
+    assert torch.allclose(norms, device_units.norm(dim=-1).expand(4, -1), rtol=1e-5)
+    assert (densify.screen_gradients(torch.full((1, 2, 2), float("nan")), 8, 8) == 0).all()
+
+
 def test_state_with_one_number_a_gaussian_follows_it():
     params = {"means": nn.Parameter(torch.rand(5, 3))}
     optimizer = torch.optim.Adam([{"params": [params["means"]], "name": "means"}])

@@ -34,7 +34,7 @@ class Stub(ScoreDistillation):
         return noise + x, None
 
 
-def test_the_gradient_is_w_times_the_residual_and_evaluation_has_what_the_host_reads():
+def test_the_gradient_is_w_times_the_residual_and_evaluation_has_what_the_host_reads(monkeypatch):
     guidance, rgb = Stub({"guidance_scale": 1.0}), uniform(4, 6, 5, 3)
     out, grad = step(guidance, rgb)
     t = sds.timesteps(4, 20, 980, seed=0, step=0)
@@ -43,6 +43,8 @@ def test_the_gradient_is_w_times_the_residual_and_evaluation_has_what_the_host_r
     torch.testing.assert_close(grad, 2 * weight * (2 * rgb - 1) / 4, rtol=0, atol=1e-5)
     assert (out["min_step"], out["max_step"], out["bad_items"]) == (20, 980, 0)
     torch.testing.assert_close(out["grad_norm"], (weight * (2 * rgb - 1)).norm(), rtol=1e-4, atol=0)
+    monkeypatch.setenv("PL_GLOBAL_SEED", "5")
+    assert not torch.equal(step(Stub({"guidance_scale": 1.0}), rgb)[1], grad)
     angles = {"elevation": torch.zeros(6), "azimuth": torch.tensor([0.0, 90, 180, -90, 0, 0])}
     batch = angles | {"camera_distances": torch.full((6,), 2.5)}
     out = Stub({})(uniform(6, 8, 6, 3), None, guidance_eval=True, **batch)["eval"]

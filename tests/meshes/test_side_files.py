@@ -136,10 +136,10 @@ def test_texts_with_a_byte_order_mark_are_read(encoding, tmp_path):
     """As editors on Windows save them."""
     (tmp_path / "a.mtl").write_text(f"newmtl m\n{GREY}", encoding)
     (tmp_path / "grey.png").write_bytes(png(np.uint8([[0x80]])))
-    for head in ("mtllib a.mtl\n", ""):
+    for head in ("mtllib a.mtl\n", "mtllib missing.mtl\n", ""):
         (tmp_path / "a.obj").write_text(head + TRIANGLE, encoding)
         mesh = load_mesh(tmp_path / "a.obj")
-        assert len(mesh.vertices) == 3 and (mesh.texture is not None) == bool(head)
+        assert len(mesh.vertices) == 3 and mesh.has_colors == ("a.mtl" in head)
 
 
 @pytest.mark.parametrize("name", ["p.png", "p.exr", "P.PNG "])
