@@ -7,7 +7,6 @@ import logging
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Optional
 
 import pytest
 
@@ -20,15 +19,7 @@ register_parts()
 REPORT: list[dict] = []
 
 
-def measure(
-    record: Callable[[Any], None],
-    value: Any,
-    unit: str = "",
-    *,
-    what: str = "",
-    at_most: Optional[float] = None,
-    at_least: Optional[float] = None,
-) -> None:
+def measure(record, value, unit="", *, what="", at_most=None, at_least=None) -> None:
     """Record a number (quantity ``what``, in ``unit``) and assert its bound, or record a text.
 
     Of several values of the same ``what`` the report shows the worst: the smallest if ``at_least``
@@ -62,23 +53,15 @@ def said(caplog) -> pytest.LogCaptureFixture:
 
 @pytest.fixture
 def fault(measured, record_property) -> Callable[..., None]:
-    """``fault(deviation, ours, emulation, at_most)``: assert that our implementation holds the bar
-    and that the emulated fault does not.
+    """``fault(deviation, ours, emulation, at_most)``: assert that ``deviation(ours)`` holds the bar
+    and that of the emulated fault does not.
 
-    ``deviation`` is a function of an implementation; use ``at_least`` instead of ``at_most`` if
-    more is better; ``raises`` names the exception of an emulation that crashes instead of returning
-    a wrong number.
+    Use ``at_least`` if more is better; ``raises`` is what an emulation raises that crashes instead
+    of returning a wrong number.
     """
 
     def hold(
-        deviation: Callable[[Any], float],
-        ours: Any,
-        emulation: Any,
-        at_most: float = 0.0,
-        unit: str = "",
-        *,
-        at_least: Optional[float] = None,
-        raises: type[Exception] = AssertionError,
+        deviation, ours, emulation, at_most=0.0, unit="", *, at_least=None, raises=AssertionError
     ) -> None:
         bound = {"at_most": at_most} if at_least is None else {"at_least": at_least}
         measured(deviation(ours), unit, **bound)

@@ -53,10 +53,10 @@ def row(group: str, name: str, *, bar: Optional[str] = None) -> pytest.MarkDecor
 
 def main(source: str) -> None:
     """Summarise the tests in the JSON ``source``, and write the page."""
-    results = json.loads(Path(source).read_text())
-    rows = [
-        summary_of(key, [test for test in results if tuple(test["row"]) == key]) for key in ROWS
-    ]
+    found: dict[tuple, list] = {key: [] for key in ROWS}
+    for test in json.loads(Path(source).read_text()):
+        found[tuple(test["row"])].append(test)
+    rows = [summary_of(key, tests) for key, tests in found.items()]
     RESULTS.write_text(json.dumps(rows, indent=1, ensure_ascii=False) + "\n")
     PAGE.write_text(page())
 
@@ -92,15 +92,13 @@ def worst_of(tests: list[dict], kind: str) -> str:
 
 
 def page() -> str:
-    """Return the text of reports/stability.md: how many rows hold, and a table for each group."""
+    """Return the text of reports/stability.md."""
     entries = {(entry["group"], entry["name"]): entry for entry in json.loads(RESULTS.read_text())}
     entries = {key: entries.get(key) or summary_of(key, []) for key in ROWS}
-    run = [entry for entry in entries.values() if entry["tests"]]
-    held = f"{len(ROWS)} rows, {sum(not entry['failed'] for entry in run)} hold"
+    hold = sum(bool(entry["tests"]) and not entry["failed"] for entry in entries.values())
     absent = [" ".join(key) for key, entry in entries.items() if not entry["tests"]]
-    held += f"; not run: {', '.join(absent)}" if absent else ""
-    groups = (section(group, entries) for group in TABLE)
-    return "\n".join([INTRO, f"{held}.\n", *groups])
+    held = f"{len(ROWS)} rows, {hold} hold" + f"; not run: {', '.join(absent)}" * bool(absent)
+    return "\n".join([INTRO, f"{held}.\n", *(section(group, entries) for group in TABLE)])
 
 
 def section(group: str, entries: dict[tuple[str, str], dict]) -> str:
