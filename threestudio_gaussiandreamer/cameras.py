@@ -43,10 +43,8 @@ class Orbit(NamedTuple):
 def look_at(
     position: Float[Tensor, "B 3"], center: Float[Tensor, "B 3"], up: Float[Tensor, "B 3"]
 ) -> Float[Tensor, "B 4 4"]:
-    """Return the OpenGL ``c2w`` of cameras at ``position`` that look at ``center``.
-
-    A camera that looks along ``up`` has +x as the top of its image. One at ``center`` itself looks
-    along -x.
+    """Return the OpenGL ``c2w`` of cameras at ``position`` that look at ``center``, or along -x if
+    they are there; +x is the top of the image if they look along ``up``.
     """
     offset = center - position
     x_axis = torch.tensor([1.0, 0, 0], dtype=up.dtype, device=up.device).expand_as(up)
@@ -69,14 +67,9 @@ def orbit_c2w(
     center: Float[Tensor, "B 3"] | None = None,
     up: Float[Tensor, "B 3"] | None = None,
 ) -> Float[Tensor, "B 4 4"]:
-    """Return the OpenGL ``c2w`` of cameras on spheres around the origin.
-
-    Args:
-        elevation_deg: degrees above the horizon.
-        azimuth_deg: degrees from +x towards +y.
-        distance: from the origin, world units.
-        center: the points that the cameras look at; by default the origin.
-        up: by default +z.
+    """Return the OpenGL ``c2w`` of cameras on spheres around the origin: degrees above the horizon
+    and from +x towards +y, and world units. ``center`` are the points that they look at, by default
+    the origin; ``up`` is +z by default.
     """
     elevation, azimuth = torch.deg2rad(elevation_deg), torch.deg2rad(azimuth_deg)
     along, z = distance * torch.cos(elevation), distance * torch.sin(elevation)
@@ -131,10 +124,8 @@ def ray_directions(
     width: int,
     normalize: bool = True,
 ) -> Float[Tensor, "B H W 3"]:
-    """Return the directions of the rays through the pixel centres, in world coordinates.
-
-    Args:
-        normalize: scale to unit length; otherwise the component along the view axis is 1.
+    """Return the directions of the rays through the pixel centres, in world coordinates, of unit
+    length, or without ``normalize`` with 1 along the view axis.
     """
     like = {"dtype": c2w.dtype, "device": c2w.device}
     rows, columns = (torch.arange(n, **like) + 0.5 - 0.5 * n for n in (height, width))
@@ -152,13 +143,9 @@ def surface_points(
     focal: Float[Tensor, " B"],
     aspect: float = 1.0,
 ) -> Float[Tensor, "B 3 h w"]:
-    """Return the world coordinates of the points on the rendered surface.
-
-    Args:
-        depth: along the optical axis, at the centres of h x w pixels.
-        c2w: OpenGL cameras; the fourth row isn't needed.
-        focal: :func:`focal_length` for this height.
-        aspect: width of a pixel over its height.
+    """Return the world coordinates of the points on the rendered surface, from ``depth`` along the
+    optical axis at the centres of h x w pixels, OpenGL cameras, whose fourth row isn't needed, the
+    :func:`focal_length` for this height, and ``aspect``, the width of a pixel over its height.
     """
     height, width = depth.shape[1:]
     plane = _image_plane(height, width, depth.device).type_as(depth)
@@ -252,10 +239,8 @@ def _lerp(ends: Sequence[float], u: Tensor) -> Tensor:
 
 
 def held_out_orbit(count: int = 24) -> Orbit:
-    """Return the fixed views that a run is evaluated on; they are never used for training.
-
-    Their azimuths are evenly spaced over 360 degrees, at four elevations and three distances, with
-    a vertical field of view of 50 degrees.
+    """Return the fixed views that a run is evaluated on and never trained with: azimuths evenly
+    spaced over 360 degrees, four elevations, three distances, a vertical field of view of 50.
     """
     index = torch.arange(count)
     elevation = torch.tensor([0.0, 15.0, 30.0, 45.0])[index % 4]

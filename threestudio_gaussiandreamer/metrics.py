@@ -32,10 +32,8 @@ def ssim(
     """Compute the structural similarity of pairs of images in [0, 1] (Wang et al. 2004, eq. 13).
 
     The window is an 11 x 11 Gaussian with sigma 1.5, images are padded by reflection, K1 is 0.01
-    and K2 0.03, and the mean is over pixels and channels, as in torchmetrics' defaults.
-
-    Raises:
-        UserError: a side has fewer pixels than SMALLEST_SIDE.
+    and K2 0.03, and the mean is over pixels and channels, as in torchmetrics' defaults. Raises
+    UserError for a side of fewer pixels than SMALLEST_SIDE.
     """
     if min(image.shape[-3:-1]) < SMALLEST_SIDE:
         found = tuple(image.shape[-3:-1])
@@ -71,10 +69,8 @@ def multi_face_rate(
     same background, and for a reliable rate the same elevations and distances.
 
     Args:
-        renders: images of the Gaussians, in [0, 1].
-        bank_images: images of the known object, of any size.
-        view_azimuths: of the renders, degrees.
-        bank_azimuths: of the bank images, degrees.
+        renders, view_azimuths: images of the Gaussians, in [0, 1], and their azimuths, degrees.
+        bank_images, bank_azimuths: those of the known object, of any size.
     """
     sets = (images.movedim(-1, 1) for images in (renders, bank_images.to(renders)))
     views, bank = (F.adaptive_avg_pool2d(images, (size, size)).flatten(1) for images in sets)
@@ -95,13 +91,8 @@ def floater_mass(
     extent: float,
     share: float = 0.02,
 ) -> float:
-    """Compute the opacity-weighted fraction of Gaussians that are far from the surface.
-
-    Args:
-        distances: from the surface, world units.
-        opacities: in [0, 1].
-        extent: longest side of the object's box, world units.
-        share: a Gaussian is far beyond this fraction of ``extent``.
+    """Compute the fraction of Gaussians, weighted by opacities in [0, 1], whose distances from the
+    surface exceed ``share`` of ``extent``, the longest side of the object's box, in world units.
     """
     total = opacities.sum()
     return (opacities[distances > share * extent].sum() / total).item() if total > 0 else 0.0

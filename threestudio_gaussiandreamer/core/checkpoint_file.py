@@ -49,10 +49,8 @@ def save_file(path: str | os.PathLike, content: Any) -> None:
 
 
 def load_file(path: str | os.PathLike, map_location: Any = "cpu") -> Any:
-    """Read what :func:`save_file` or ``torch.save`` wrote, without executing code from the file.
-
-    Raises:
-        UserError: there is no such file, or it is damaged or no checkpoint.
+    """Read what :func:`save_file` or ``torch.save`` wrote, without executing code from the file;
+    raise UserError if it is missing, damaged or no checkpoint.
     """
     path = Path(os.path.expanduser(path))
     if os.path.isdir(path):
@@ -148,10 +146,8 @@ def entries_below(state: Mapping[str, Any], prefix: str) -> dict[str, Any]:
 
 
 def load_checkpoint(path: str | os.PathLike, map_location: Any = "cpu") -> dict:
-    """Read a training checkpoint: a dict with ``state_dict``, ``epoch``, ``global_step`` and more.
-
-    Raises:
-        UserError: as in :func:`load_file`, or one of these keys is missing or of a wrong type.
+    """Read a training checkpoint by :func:`load_file`: a dict with ``state_dict``, ``epoch``,
+    ``global_step`` and more; raise UserError if one of these is missing or of a wrong type.
     """
     found = load_file(path, map_location)
     known = found if isinstance(found, dict) else {}

@@ -48,10 +48,8 @@ def require_shareable(
     views: int, option: str, *, together: int = 1, processes: Optional[int] = None
 ) -> None:
     """Raise UserError, which names ``option``, unless the processes can share the views of a step
-    equally, of which ``together`` consecutive ones stay in one process.
-
-    Args:
-        processes: how many there will be; by default those that there are.
+    equally, of which ``together`` consecutive ones stay in one process. ``processes`` is how many
+    there will be, by default those that there are.
     """
     size = processes or world_size()
     if views % (size * together):

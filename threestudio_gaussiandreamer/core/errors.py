@@ -14,11 +14,8 @@ class Terminated(SystemExit):
 
 
 def unknown(kind: str, name: str, choices: Iterable[str], prefix: str = "") -> UserError:
-    """Make the error for a name that isn't among ``choices``; its message lists the most similar
-    choices, or all of them if none is similar.
-
-    Args:
-        prefix: what the message puts in front of name and similar choices, such as a section.
+    """Make the error for a name that isn't among ``choices``; its message lists similar choices, or
+    all, and puts ``prefix``, such as a section, in front of the names.
     """
     choices = sorted(set(map(str, choices)))
     near = difflib.get_close_matches(str(name), choices, n=3, cutoff=0.6)

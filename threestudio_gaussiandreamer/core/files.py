@@ -37,15 +37,11 @@ def usable_path(path: str | os.PathLike, what: str, *, home: bool = False) -> Pa
 
 
 def existing_file(path: str | os.PathLike, kind: str, bundled: Collection[str] = ()) -> Path:
-    """Return ``path`` as a :class:`Path` after checking that it is an existing file.
-
-    Args:
-        kind: what the file is, for the message ("mesh", "PLY file").
-        bundled: bare names of packaged files, for the message only.
+    """Return ``path`` as a :class:`Path` if it is an existing file, a ``kind`` ("PLY file").
 
     Raises:
-        UserError: there is no such regular file, and the message lists similar names; or it is one
-            of ``PLACEHOLDERS``.
+        UserError: there is no such regular file, and the message lists similar names, also those of
+            ``bundled`` files; or it is one of ``PLACEHOLDERS``.
     """
     path = usable_path(path, kind, home=True)
     reason = "is no regular file"
@@ -85,10 +81,8 @@ def near_names(path: Path, bundled: Collection[str] = ()) -> str:
 @contextmanager
 def atomic_file(path: str | os.PathLike, *, durable: bool = True) -> Iterator[BinaryIO]:
     """Open a binary file for writing that replaces ``path`` only if the block succeeds: a temporary
-    file ``.<name>.<process>-<thread>.tmp`` in the same folder, which is renamed at the end.
-
-    Args:
-        durable: also flush it to the disk, so that it is complete even after a power failure.
+    file ``.<name>.<process>-<thread>.tmp`` in the same folder, which is renamed at the end, and if
+    ``durable`` flushed to the disk, so that it is complete even after a power failure.
 
     Raises:
         UserError: the folder is missing or can't be written, or the disk is full.

@@ -50,10 +50,8 @@ def grayscale(
     data_range: Optional[tuple[float, float]] = None,
     cmap: Optional[str] = "jet",
 ) -> np.ndarray:
-    """Convert (H,W) to uint8 (H,W,3) by a colour map, "jet" or "magma", or to grey without one.
-
-    Args:
-        data_range: values of the first and the last colour; by default the smallest and largest.
+    """Convert (H,W) to uint8 (H,W,3) by a colour map, "jet" or "magma", or to grey without one;
+    ``data_range`` are the values of its ends, by default the smallest and largest.
     """
     image = np.nan_to_num(image)
     values = _normalize(image, data_range or (image.min(), image.max()))
@@ -133,11 +131,8 @@ def write_video(path: str, frames: list[Path], *, fps: int) -> None:
 def write_animation(
     path: str | os.PathLike, frames: list[Path], size: Optional[int], seconds: float
 ) -> None:
-    """Write pictures as an animated WebP or GIF that repeats, or raise UserError.
-
-    Args:
-        size: the largest width and height, pixels, to which larger pictures are shrunk.
-        seconds: of one round.
+    """Write pictures as an animated WebP or GIF that repeats after ``seconds``, or raise UserError;
+    larger ones are shrunk to ``size`` pixels.
     """
     from PIL import Image
 

@@ -137,9 +137,7 @@ def required(purpose: str) -> Rule:
 
 
 def count_of(things: str, low: int, bytes_each: int) -> Rule:
-    """Return a rule for counts of ``things``: whole numbers of at least ``low``, limited by the
-    memory, of which each takes ``bytes_each``.
-    """
+    """Return a rule for counts from ``low`` on, limited by memory: each takes ``bytes_each``."""
 
     def check(path: str, value: Any) -> None:
         if not is_whole(value) or value < low:

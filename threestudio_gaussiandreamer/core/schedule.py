@@ -1,12 +1,10 @@
-"""Values that change during training: ``C(value, epoch, global_step)``, and checks of schedules in
-configurations.
+"""Values that change during training: ``C(value, epoch, global_step)``.
 
 ==========================================  ========================================================
 ``5`` or ``0.5``                            constant
 ``[v0, v1, end]``                           the same as ``[0, v0, v1, end]``
 ``[s0, v0, v1, s1]``                        v0 until s0, linear to v1 at s1, then v1
-``[s0, v0, v1, s1, v2, s2, ...]``           piecewise linear through (s0, v0), (s1, v1), (s2, v2),
-                                            ...
+``[s0, v0, v1, s1, v2, s2, ...]``           piecewise linear through (s0, v0), (s1, v1), ...
 ==========================================  ========================================================
 
 Integer end steps count optimiser steps, those written as ``10.0`` epochs. Random cameras are one
@@ -35,13 +33,8 @@ class Schedule(NamedTuple):
 
 
 def C(value: Any, epoch: int, global_step: int) -> float:
-    """Evaluate a schedule at a step of training.
-
-    Args:
-        value: a number, a schedule in one of the forms above, or a parsed one, which is faster.
-
-    Raises:
-        UserError: ``value`` is no schedule.
+    """Evaluate a schedule, in one of the forms above or parsed, which is faster, at a step of
+    training; raise UserError if it is none.
     """
     steps, values, in_epochs = parse_schedule(value)
     now = epoch if in_epochs else global_step
@@ -74,9 +67,7 @@ def validate_schedule(value: Any, name: str = "the schedule") -> Any:
 
 def parse_schedule(value: Any, name: str = "the schedule") -> Schedule:
     """Convert a number, list, tuple or ListConfig to the knots of a schedule; a parsed one is kept.
-
-    Raises:
-        UserError: wrong length, something that isn't a finite number, or steps that don't increase.
+    Raise UserError for a wrong length, what isn't a finite number, or steps that don't increase.
     """
     if isinstance(value, Schedule):
         return value

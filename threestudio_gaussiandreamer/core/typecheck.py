@@ -1,9 +1,6 @@
 """``--typecheck``: every call of this package is checked against the array shapes and types in its
-annotations.
-
-jaxtyping's import hook decorates each function with :func:`check` and binds the names of
-dimensions. Only arrays are checked: configurations hold OmegaConf's lists and mappings where an
-annotation says ``list``, and an int may be given for a float."""
+annotations. jaxtyping's import hook decorates each function with :func:`check` and binds the names
+of dimensions. Only arrays are checked: an int may be given for a float, for instance."""
 
 import functools
 import inspect

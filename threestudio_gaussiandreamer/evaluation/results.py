@@ -96,11 +96,7 @@ def render_views(
     chunk: int = 4,
 ) -> Iterator[Float[np.ndarray, "B H W 3"]]:
     """Yield renders in [0, 1] with this package's rasteriser and its default options, ``chunk``
-    views at a time, ``size`` pixels each way.
-
-    Args:
-        fovy: vertical, radians.
-        antialias: whether the cloud was trained with antialiasing.
+    views at a time, ``size`` pixels each way; ``fovy`` is vertical, radians.
     """
     geometry = find("gaussiandreamer-cloud")({"sh_degree": math.isqrt(arrays.sh.shape[1]) - 1})
     geometry.set_arrays(**arrays._asdict())

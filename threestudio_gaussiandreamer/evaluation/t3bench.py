@@ -1,10 +1,8 @@
 """T3Bench: its quality of Gaussians, and meshes where its scripts look for them, which is
-``outputs_mesh_t3/<method>_<group>/<prompt with _ for spaces>*/save/it*-export/model.obj``.
-
-The cameras for quality are at the 162 vertices of an icosphere of radius 2.2, with five fields of
-view each. Pictures have 512 pixels each way and a black background. The object is centred at the
-mean of the centres of its Gaussians with an opacity of at least ``MIN_OPACITY`` and scaled to
-[-1, 1]. A mesh is the surface of the Gaussians."""
+``outputs_mesh_t3/<method>_<group>/<prompt with _ for spaces>*/save/it*-export/model.obj``. The
+cameras for quality are at the 162 vertices of an icosphere, with five fields of view each, and the
+background is black. The object is centred at the mean of the centres of its Gaussians of at least
+``MIN_OPACITY`` and scaled to [-1, 1]. A mesh is the surface of the Gaussians."""
 
 import math
 import os

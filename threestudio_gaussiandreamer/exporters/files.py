@@ -132,9 +132,7 @@ Params = Callable[[Gaussians, Any], dict[str, Any]]
 
 
 def stored(suffix: str, *variants: str) -> Params:
-    """Return a function for a format of ``formats.gaussian_files.FORMATS``, or one of ``variants``
-    that the extension of ``save_name`` selects.
-    """
+    """Return a function for a key of ``FORMATS``, or of ``variants`` that ``save_name`` ends in."""
 
     def params(gaussians: Gaussians, cfg: Any) -> dict[str, Any]:
         named = suffix_of(cfg.save_name)

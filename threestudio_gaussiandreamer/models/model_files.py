@@ -1,9 +1,7 @@
 """Select the needed files of a model in diffusers' or transformers' format, load them, and keep
-networks for processes with several runs.
-
-A model of several components has a sub-folder for each (``unet``, ``vae``, ``text_encoder``, ...);
-the component of a single network is "". Weights are read from safetensors, since a pickle could run
-code; if a caller allows ``.bin`` files, they are read with ``weights_only``."""
+networks for processes with several runs. A model of several components has a sub-folder for each
+(``unet``, ``vae``, ``text_encoder``, ...); the component of a single network is "". Weights are
+read from safetensors; if a caller allows ``.bin`` files, they are read with ``weights_only``."""
 
 import gc
 import hashlib
@@ -81,11 +79,8 @@ def component_weights(
     names: Collection[str], component: str, *, half: bool = False, allow_bin: Optional[bool] = None
 ) -> Weights:
     """Select the weight files of one component: in half precision if that is preferred and the set
-    is complete, else in the other one. Raise UserError if there is no complete set.
-
-    Args:
-        allow_bin: accept ``.bin`` files if there is no safetensors. None is False for callers
-            without such an option, which messages don't suggest.
+    is complete, else in the other one; with ``allow_bin`` also ``.bin`` files (None: there is no
+    such option, which messages could suggest). Raise UserError if there is no complete set.
     """
     prefix, own = _own(names, component)
     for variant in (*HALF_VARIANTS, None) if half else (None, *HALF_VARIANTS):

@@ -1,10 +1,8 @@
 """Encode texts with a model's text encoders: CLIP for Stable Diffusion, T5 for DeepFloyd IF, two or
 three encoders for Stable Diffusion XL and 3. An encoder is loaded for one call and freed; CLIP's,
-which are small, are kept where ``model_files.py`` keeps networks.
-
-As in diffusers' pipelines, texts are padded to the model's length, and longer ones truncated with a
-warning. The result is float32 on the CPU, without gradients. The pooled embedding of Stable
-Diffusion XL and 3 is a last token (:func:`pack`)."""
+which are small, are kept where ``model_files.py`` keeps networks. As in diffusers, texts are
+padded to the model's length, and longer ones truncated with a warning. The result is float32 on the
+CPU; the pooled embedding of Stable Diffusion XL and 3 is a last token (:func:`pack`)."""
 
 import hashlib
 import json

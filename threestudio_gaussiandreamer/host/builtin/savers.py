@@ -71,11 +71,8 @@ class SaverMixin:
     def save_image_grid(
         self, filename: str, imgs: list, name: Optional[str] = None, step: Optional[int] = None
     ) -> str:
-        """Save a grid of images.
-
-        Args:
-            imgs: a row of ``{"type": "rgb"|"grayscale", "img": ..., "kwargs": {...}}``, or a list
-                of rows; ``kwargs`` as for ``core.images.rgb`` and ``core.images.grayscale``.
+        """Save a row of ``{"type": "rgb"|"grayscale", "img": ..., "kwargs": {...}}``, or a list of
+        rows, as an image; ``kwargs`` as for the functions of this name in ``core.images``.
         """
         path = self.get_save_path(filename)
         pictures.write(path, pictures.grid(self.convert_data(imgs)))
@@ -92,11 +89,8 @@ class SaverMixin:
         name: Optional[str] = None,
         step: Optional[int] = None,
     ) -> str:
-        """Save a video of the pictures in ``img_dir``, a folder below the save folder.
-
-        Args:
-            matcher: regular expression for the file names to include; its first group is the
-                number by which they are sorted.
+        """Save a video of the pictures in ``img_dir``, a folder below the save folder, whose names
+        match the regular expression ``matcher``, sorted by the number in its first group.
         """
         if save_format not in ("mp4", "gif"):
             raise UserError(f"unknown video format {save_format!r}: expected 'mp4' or 'gif'")

@@ -1,6 +1,4 @@
-"""The base systems: LightningModules that build the registered parts of a run (geometry, renderer,
-...), update them at every step, and export the result.
-"""
+"""The base systems: LightningModules that build, update and export the parts of a run."""
 
 from dataclasses import dataclass, field
 from typing import Any, Optional
