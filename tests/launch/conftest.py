@@ -1,11 +1,14 @@
 """Runs of the tiny system and of a tiny demo, in this process."""
 
+from datetime import datetime
+
 import pytest
 
 import threestudio_gaussiandreamer
 from tests.helpers import tiny_parts
 from tests.helpers.gallery import only_run
 from tests.launch.cases import DEMO, SMALL
+from threestudio_gaussiandreamer.launch import run_folder
 from threestudio_gaussiandreamer.launch.experiment import main
 
 
@@ -25,6 +28,18 @@ def launch(tmp_path, monkeypatch, capsys):
         return code, captured.out, captured.err
 
     return run
+
+
+@pytest.fixture
+def noon(monkeypatch):
+    """Let every run begin in the same second."""
+
+    class Noon(datetime):
+        @classmethod
+        def now(cls, tz=None):
+            return cls(2026, 1, 31, 12)
+
+    monkeypatch.setattr(run_folder, "datetime", Noon)
 
 
 @pytest.fixture

@@ -3,41 +3,21 @@
 import json
 from pathlib import Path
 
-import pytest
 import torch
 
 from tests.launch.cases import assert_refused
-from threestudio_gaussiandreamer import host, register_parts
+from threestudio_gaussiandreamer import register_parts
 from threestudio_gaussiandreamer.core.checkpoint_file import load_checkpoint
-from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.core.images import read as read_image
 from threestudio_gaussiandreamer.training import held_out as evaluate
 
 register_parts()
 TRIAL = Path("outputs/demo/t")
-PLY = (
-    b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty "
-    b"float z\nend_header\n"
-)
 
 
 def test_an_invalid_mesh_is_refused(launch_demo):
     Path("text.glb").write_bytes(b"hello there, this is no mesh")
     assert_refused(*launch_demo("system.guidance.mesh=text.glb"), "text.glb")
-
-
-def test_a_file_that_no_prior_can_read_is_refused(tmp_path):
-    """Others are in ``tests/priors``."""
-    path = tmp_path / "start.ply"
-    for content in (
-        PLY + b"nan nan nan\n",
-        PLY + b"a b c\n",
-        PLY.replace(b" 1\n", b" 9999999999\n"),
-    ):
-        path.write_bytes(content)
-        for prior in ("gaussians-prior", "point-cloud-prior", "mesh-prior", "body-prior"):
-            with pytest.raises(UserError, match="start.ply|PointCloudPrior"):
-                host.find(prior)({"path": str(path)})("a fox")
 
 
 def test_damaged_results_of_an_earlier_run_are_made_again(tmp_path):

@@ -91,10 +91,8 @@ def test_a_shell_of_slurm_trains_with_one_process_and_says_so(environment, caplo
     assert found == Processes(1, 1) and plugins(found) is None
     assert "SLURM has 4 tasks, which a shell (SLURM_JOB_NAME=interactive) doesn't" in caplog.text
     assert "the number of processes that train is 1; for all: srun --job-name" in caplog.text
-
-
-def test_a_batch_job_with_one_task_needs_none_of_sruns_variables(environment):
-    environment(SLURM | {"SLURM_NTASKS": "1", "SLURM_NNODES": "1"})
+    # a batch job with one task needs none of srun's variables
+    environment({"SLURM_JOB_NAME": "train", "SLURM_NTASKS": "1", "SLURM_NNODES": "1"})
     require_launcher()
     assert plugins(planned_processes(0, {}))
     environment(dict.fromkeys(launcher.SLURM, "0"))
@@ -125,18 +123,16 @@ TASK = dict.fromkeys(launcher.SLURM, "1")
         ({"RANK": "1", "WORLD_SIZE": "2"}, "RANK is 1, but nothing says how many .* torchrun"),
         (TASK | SLURM | {"SLURM_JOB_NAME": "bash"}, "SLURM_PROCID is 1, but nothing says"),
         ({"SLURM_NTASKS": "0"}, "SLURM_NTASKS is '0'; expected a whole number from 1 on"),
+        *((variables, None) for variables in ({}, TORCHRUN | RANKS, SLURM | TASK)),
+        # as Lightning starts its second process
+        ({"LOCAL_RANK": "1", "NODE_RANK": "0", "WORLD_SIZE": "2"}, None),
     ],
 )
 def test_what_is_missing_beside_a_variable_is_named(variables, said):
+    if said is None:
+        return require_launcher(variables)
     with pytest.raises(UserError, match=said):
         require_launcher(variables)
-
-
-def test_variables_of_launchers_are_fine():
-    for variables in ({}, TORCHRUN | RANKS, SLURM | TASK):
-        require_launcher(variables)
-    # as Lightning starts its second process
-    require_launcher({"LOCAL_RANK": "1", "NODE_RANK": "0", "WORLD_SIZE": "2"})
 
 
 def test_a_broken_variable_is_one_line_before_a_command_is_imported(monkeypatch, capsys):
@@ -148,13 +144,11 @@ def test_a_broken_variable_is_one_line_before_a_command_is_imported(monkeypatch,
         assert said.startswith("error: the environment variable LOCAL_") and said.count("\n") == 1
 
 
-def test_a_single_process_needs_no_strategy(environment):
+def test_strategy_and_plugins_of_the_trainer(environment):
+    """Lightning starts the processes in a job with one task; a single one needs no strategy."""
     assert trainer_options(Processes(1, 1)) == {"devices": 1, "num_nodes": 1}
     strategy = trainer_options(Processes(2, 2))["strategy"]
     assert isinstance(strategy, ReplicatedStrategy) and strategy._timeout == LONGEST_WAIT
-
-
-def test_lightning_starts_the_processes_in_a_job_with_one_task(environment):
     assert plugins(Processes(2, 1)) is None
     environment(SLURM | {"SLURM_NTASKS": "1"} | dict.fromkeys(launcher.SLURM, "0"))
     (plugin,) = plugins(planned_processes(2, {}))

@@ -80,19 +80,11 @@ def test_parts_are_told_every_step(launch, monkeypatch):
 # -- mistakes --------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["system.fail_in=configure"], "failed in configure, as asked"),
-        (["system.fail_in=on_fit_start"], "failed in on_fit_start, as asked"),
-        (["system.fail_in=step 0"], "failed in step 0, as asked"),
-        (["resume=tiny.yaml"], "tiny.yaml isn't a checkpoint"),
-        (["--gpu", "0"], "--gpu 0: torch"),
-    ],
-)
-def test_a_mistake_is_one_message_and_leaves_nothing(launch, arguments, message):
-    code, out, err = launch("--train", *arguments)
-    assert code == 2 and out == "" and message in err and "Traceback" not in err
+@pytest.mark.parametrize("place", ["configure", "on_fit_start", "step 0"])
+def test_a_mistake_is_one_message_and_leaves_nothing(launch, place):
+    code, out, err = launch("--train", f"system.fail_in={place}")
+    assert code == 2 and out == "" and f"failed in {place}, as asked" in err
+    assert "Traceback" not in err
     assert os.listdir() == ["tiny.yaml"]
 
 

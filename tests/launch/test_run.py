@@ -1,6 +1,5 @@
 """What a run writes beside its results, and concurrent runs in one folder."""
 
-import datetime
 import os
 from pathlib import Path
 
@@ -8,7 +7,7 @@ from tests.helpers import tiny_parts
 from tests.helpers.gallery import files, only_run
 from threestudio_gaussiandreamer.core.checkpoint_file import load_checkpoint
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.launch import callbacks, experiment, run, run_folder
+from threestudio_gaussiandreamer.launch import callbacks, experiment, run
 from threestudio_gaussiandreamer.launch.config import load_config
 from threestudio_gaussiandreamer.launch.ddp import ReplicatedStrategy
 from threestudio_gaussiandreamer.launch.run_folder import claim
@@ -162,13 +161,7 @@ def test_a_folder_in_use_is_refused_before_the_parts_are_built(launch, monkeypat
     assert code == 2 and "another run is training in outputs/tiny/run" in err
 
 
-def test_runs_of_one_second_have_a_folder_each(launch, monkeypatch):
-    class Noon(datetime.datetime):
-        @classmethod
-        def now(cls):
-            return cls(2026, 1, 31, 12, 0, 0)
-
-    monkeypatch.setattr(run_folder, "datetime", Noon)
+def test_runs_of_one_second_have_a_folder_each(launch, noon):
     for _ in range(2):
         assert launch("--train", "trainer.max_steps=1", "trainer.limit_val_batches=0")[0] == 0
     folders = sorted(Path("outputs/tiny").iterdir())

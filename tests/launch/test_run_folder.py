@@ -10,7 +10,6 @@ import shutil
 import signal
 import socket
 import time
-from datetime import datetime
 from pathlib import Path
 
 import pytest
@@ -48,10 +47,13 @@ def copied(folder):
     return shutil.copytree(run, folder / "outputs/tiny/b")
 
 
-@pytest.mark.parametrize("resume", ["auto", "outputs/tiny/b/ckpts/last.ckpt"])
-def test_a_copy_of_a_run_continues_in_its_own_folder(folder, copied, resume):
+def test_a_copy_of_a_run_continues_in_its_own_folder_or_is_left_for_others(folder, copied):
     parsed = "outputs/tiny/b/configs/parsed.yaml"
-    for _ in range(2):
+    others = {"resume=outputs/tiny/a/ckpts/last.ckpt": "a", "tag=c": "c", "seed=1": "a"}
+    for option, name in others.items():
+        more = ["resume=auto"] if name == "c" else []
+        assert load_config(parsed, cli_args=[option, *more]).trial_dir == f"outputs/tiny/{name}"
+    for resume in 2 * ["auto", "outputs/tiny/b/ckpts/last.ckpt"]:
         cfg = load_config(parsed, cli_args=[f"resume={resume}"])
         assert cfg.trial_dir == str(copied) and cfg.trial_name == "b" and not cfg.new_folder
         assert Path(cfg.resume).resolve() == copied / "ckpts/last.ckpt"
@@ -70,16 +72,6 @@ def test_of_another_part_only_its_type_is_named(folder):
     assert run_folder.changes_since(cfg, run_folder.SIZES) == [mode]
 
 
-@pytest.mark.parametrize(
-    "options",
-    [["resume=outputs/tiny/a/ckpts/last.ckpt"], ["resume=auto", "tag=c"], []],
-    ids=["another run's checkpoint", "another tag", "not resumed"],
-)
-def test_a_copy_of_a_run_is_left_for_other_folders(folder, copied, options):
-    cfg = load_config("outputs/tiny/b/configs/parsed.yaml", cli_args=options)
-    assert cfg.trial_dir == f"outputs/tiny/{'c' if 'tag=c' in options else 'a'}"
-
-
 def test_a_run_of_the_same_name_elsewhere_is_left_with_a_warning(folder, caplog):
     cfg = load("tag=a", "use_timestamp=false", "resume=other/outputs/tiny/a/ckpts/last.ckpt")
     here, other = folder / "outputs/tiny/a", folder / "other/outputs/tiny/a"
@@ -87,13 +79,7 @@ def test_a_run_of_the_same_name_elsewhere_is_left_with_a_warning(folder, caplog)
     assert Path(cfg.trial_dir).absolute() == here and said in caplog.text
 
 
-def test_a_run_of_the_same_second_is_resumed_in_its_folder(folder, monkeypatch):
-    class Noon(datetime):
-        @classmethod
-        def now(cls, tz=None):
-            return cls(2026, 1, 1, 12)
-
-    monkeypatch.setattr(run_folder, "datetime", Noon)
+def test_a_run_of_the_same_second_is_resumed_in_its_folder(folder, noon):
     first = load("tag=a")
     save_file(Path(first.trial_dir, "ckpts/last.ckpt"), CHECKPOINT)
     again = load("tag=a", "resume=auto")
@@ -144,14 +130,10 @@ def go_on(child: int) -> int:
     return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
 
 
-def claim_and_discard(path: Path) -> None:
-    claim(path).discard()
-
-
 def test_the_creator_without_the_lock_does_not_remove_the_folder(place, monkeypatch):
     with monkeypatch.context() as patch:
         stop_before(patch, fcntl, "flock")
-        loser = stopped_child(lambda: claim_and_discard(place))
+        loser = stopped_child(lambda: claim(place).discard())
     winner = claim(place)
     (place / "ckpts").mkdir()
     assert go_on(loser) == 3 and (place / "ckpts").is_dir()
@@ -161,7 +143,7 @@ def test_the_creator_without_the_lock_does_not_remove_the_folder(place, monkeypa
 def test_a_folder_that_is_about_to_be_removed_is_made_again(place, monkeypatch):
     with monkeypatch.context() as patch:
         stop_before(patch, run_folder.shutil, "rmtree")
-        maker = stopped_child(lambda: claim_and_discard(place))
+        maker = stopped_child(lambda: claim(place).discard())
     other = claim(place)
     assert other.first_made == place and go_on(maker) == 0 and place.is_dir()
     other.discard()
@@ -259,10 +241,7 @@ def test_a_folder_that_can_not_be_renamed_is_removed_in_place(place, monkeypatch
     monkeypatch.setattr(Path, "rename", lambda path, target: os.rename("nothing", target))
     claim(place).discard()
     assert not Path("outputs").exists()
-
-
-def test_a_folder_that_was_there_is_never_removed(place):
-    place.mkdir(parents=True)
+    place.mkdir(parents=True)  # one that was there is never removed
     claim(place).discard()
     assert place.is_dir()
 

@@ -147,6 +147,10 @@ def test_few_bad_rows_are_dropped_also_when_normalized(tmp_path):
     assert (cloud.colors == 0.5).all()
 
 
+PLY = b"ply\nformat ascii 1.0\nelement vertex 1\n"
+PLY += b"".join(b"property float %c\n" % axis for axis in b"xyz") + b"end_header\n"
+
+
 @pytest.mark.parametrize(
     "name, content, problem",
     [
@@ -155,6 +159,9 @@ def test_few_bad_rows_are_dropped_also_when_normalized(tmp_path):
         ("a.npz", b"PK\3\4 broken", "truncated, damaged"),
         ("a.glb", b"glTF broken", "it is truncated or damaged"),
         ("a.ply", b"plyx", "not a PLY"),
+        ("a.ply", PLY + b"nan nan nan\n", "PointCloudPrior"),
+        ("a.ply", PLY + b"a b c\n", "a.ply"),
+        ("a.ply", PLY.replace(b" 1\n", b" 9999999999\n"), "a.ply"),
         ("a.npz", {"xyz": POINTS}, "has no array"),
         ("a.npz", {"points": POINTS, "colors": BYTES[:2]}, "has shape"),
         ("a.npz", {"points": np.array([{}], object)}, "could run code"),
