@@ -9,7 +9,6 @@ os.environ.setdefault("HF_HUB_OFFLINE", "1")
 os.environ["CUDA_VISIBLE_DEVICES"] = ""
 
 import signal
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -49,14 +48,3 @@ def sphere_points() -> PointCloud:
     points = rng.normal(size=(400, 3))
     points *= 0.7 / np.linalg.norm(points, axis=1, keepdims=True)
     return PointCloud(points.astype(np.float32), (points / 1.4 + 0.5).astype(np.float32))
-
-
-@pytest.fixture
-def shared_folder() -> Path:
-    """Return a folder with real meshes beside the repository; tests that use it are skipped without
-    it.
-    """
-    folder = Path(os.environ.get("GAUSSIANDREAMER_SHARED", Path(__file__).parents[2] / "shared"))
-    if not (folder / "assets").is_dir():
-        pytest.skip("set GAUSSIANDREAMER_SHARED to a folder with assets/*.glb")
-    return folder

@@ -7,11 +7,7 @@ from tests.helpers.object_clouds import assert_close, ball
 from tests.helpers.painted_ball import painted_ball
 from tests.helpers.pruning import FAST
 from threestudio_gaussiandreamer.convert.command import main
-from threestudio_gaussiandreamer.formats.gaussian_files import (
-    StoredCloud,
-    read_cloud,
-    write_cloud,
-)
+from threestudio_gaussiandreamer.formats.gaussian_files import StoredCloud, read_cloud, write_cloud
 from threestudio_gaussiandreamer.meshes.load import load_mesh
 from threestudio_gaussiandreamer.meshes.mesh import vertex_surface_colors
 from threestudio_gaussiandreamer.prune import command as prune

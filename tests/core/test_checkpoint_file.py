@@ -3,11 +3,11 @@
 import os
 import pickle
 import random
-import resource
 
 import pytest
 import torch
 
+from tests.promises.commands import full_disk
 from threestudio_gaussiandreamer.core.checkpoint_file import (
     load_checkpoint,
     load_file,
@@ -134,13 +134,8 @@ def test_a_missing_file_lists_what_is_there(tmp_path):
 
 def test_a_full_disk_leaves_the_earlier_file_and_no_temporary_one(tmp_path):
     save_file(tmp_path / "last.ckpt", content(1))
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, hard))
-    try:
-        with pytest.raises(UserError, match="cannot write .*untouched"):
-            save_file(tmp_path / "last.ckpt", content(2, size=200_000))
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    with full_disk(100_000), pytest.raises(UserError, match="cannot write .*untouched"):
+        save_file(tmp_path / "last.ckpt", content(2, size=200_000))
     assert os.listdir(tmp_path) == ["last.ckpt"]
     assert load_file(tmp_path / "last.ckpt")["global_step"] == 1
 

@@ -45,8 +45,5 @@ def test_what_a_download_left_in_a_files_place_is_named(tmp_path, content, said)
     (tmp_path / "base_40m_textvec.pt").write_bytes(content)
     with pytest.raises(UserError, match=f"^checkpoint '[^']*' is a.*{said}"):
         existing_file(tmp_path / "base_40m_textvec.pt", "checkpoint")
-
-
-def test_what_is_no_regular_file_is_called_so():
     with pytest.raises(UserError, match="mesh '/dev/null' is no regular file$"):
         existing_file("/dev/null", "mesh")

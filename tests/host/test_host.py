@@ -13,10 +13,7 @@ from threestudio_gaussiandreamer import host
 from threestudio_gaussiandreamer.core.checkpoint_file import save_file
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.host.builtin import base as registry
-from threestudio_gaussiandreamer.host.builtin.base import (
-    BaseModule,
-    BaseObject,
-)
+from threestudio_gaussiandreamer.host.builtin.base import BaseModule, BaseObject
 from threestudio_gaussiandreamer.host.builtin.models import (
     BaseGeometry,
     NoMaterial,
@@ -146,26 +143,19 @@ def test_an_output_that_the_system_cannot_write_is_named():
 # -- which host ------------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def path_with_threestudio(tmp_path, monkeypatch):
-    def make(content: str | None) -> None:
-        (tmp_path / "threestudio").mkdir()
-        if content is not None:
-            (tmp_path / "threestudio" / "__init__.py").write_text(content)
-        monkeypatch.syspath_prepend(tmp_path)
-
-    monkeypatch.delitem(sys.modules, "threestudio", raising=False)
-    yield make
-    sys.modules.pop("threestudio", None)
-
-
 @pytest.mark.parametrize(
     ("content", "is_host"),
     [(None, False), ("def register(name): ...", True), ("import none", None)],
 )
-def test_threestudio_is_the_host_if_it_imports(path_with_threestudio, content, is_host):
+def test_threestudio_is_the_host_if_it_imports(tmp_path, monkeypatch, content, is_host):
     """Not a folder of its name; a broken one is an error with its cause."""
-    path_with_threestudio(content)
+    # set, so that what the import leaves there is removed afterwards
+    monkeypatch.setitem(sys.modules, "threestudio", None)
+    del sys.modules["threestudio"]
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "threestudio").mkdir()
+    if content is not None:
+        (tmp_path / "threestudio/__init__.py").write_text(content)
     if is_host is None:
         with pytest.raises(UserError, match="can't be imported: No module named 'none'"):
             host._threestudio_is_importable()

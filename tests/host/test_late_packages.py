@@ -51,11 +51,7 @@ print(type(torchmetrics).__name__, lightning.pytorch.Trainer.__name__)
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "code, printed",
-    [
-        (TRAINING, "[True, True]\nset()"),
-        (USED, "used"),
-        (INCOMPATIBLE, "module Trainer"),
-    ],
+    [(TRAINING, "[True, True]\nset()"), (USED, "used"), (INCOMPATIBLE, "module Trainer")],
 )
 def test_lightning_and_the_optimisers_run_none_until_they_are_used(code, printed):
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)

@@ -24,11 +24,6 @@ def saver(tmp_path):
     return saver
 
 
-def test_saving_without_a_folder_is_an_internal_error():
-    with pytest.raises(ValueError, match="set_save_dir"):
-        SaverMixin().get_save_path("a.png")
-
-
 def save_rgb(saver, name, image, **kwargs):
     return saver.save_image_grid(name, [{"type": "rgb", "img": image, "kwargs": kwargs}])
 

@@ -12,21 +12,23 @@ from threestudio_gaussiandreamer.priors.base import Prior
 
 register_parts()
 ROOT = Path(__file__).parents[2]
+POLISH = (ROOT / "configs/polish.yaml").read_text()
 CONFIGS = sorted(path.name for path in (ROOT / "configs").glob("*.yaml"))
 
 
-def loaded(name, tmp_path):
-    paths = [ROOT / "configs" / word for word in stack(name) if word != "--config"]
-    overrides = [PROMPT, f"exp_root_dir={tmp_path}", *FILES.get(name, [])]
-    cfg = load_config(*paths, cli_args=overrides)
+def loaded(*names, overrides=()):
+    """Load and check a configuration with others laid over it."""
+    paths = [ROOT / "configs" / name for name in names]
+    cfg = load_config(*paths, cli_args=[PROMPT, *overrides])
     check_config(cfg)
     return cfg
 
 
 @pytest.mark.parametrize("name", CONFIGS)
-def test_a_shipped_configuration_is_valid_and_its_parts_can_be_built(name, tmp_path):
+def test_a_shipped_configuration_is_valid_and_its_parts_can_be_built(name):
     """Built, not run: the prior looks for its files only on preflight."""
-    cfg = loaded(name, tmp_path)
+    names = [word for word in stack(name) if word != "--config"]
+    cfg = loaded(*names, overrides=FILES.get(name, []))
     data = host.find(cfg.data_type)(cfg.data)
     system = host.find(cfg.system_type)(cfg.system)
     assert data.cfg.batch_size == (2 if name == "toybox-draft.yaml" else 4)
@@ -37,10 +39,7 @@ def test_a_shipped_configuration_is_valid_and_its_parts_can_be_built(name, tmp_p
 
 def stacked(*names, overrides=()):
     """Load and check overlays of the paper's configuration."""
-    paths = [ROOT / "configs" / f"gaussiandreamer{name}.yaml" for name in ("", *names)]
-    cfg = load_config(*paths, cli_args=[PROMPT, *overrides])
-    check_config(cfg)
-    return cfg
+    return loaded(*(f"gaussiandreamer{name}.yaml" for name in ("", *names)), overrides=overrides)
 
 
 def test_a_body_may_be_chosen_among_meshes_instead():
@@ -63,9 +62,9 @@ def test_the_lowmem_overlay_combines_with_others_in_either_order(other):
         assert cfg.system.guidance.enable_vae_slicing
 
 
-def test_the_papers_numbers_are_the_papers(tmp_path):
+def test_the_papers_numbers_are_the_papers():
     """Section 4.1 (implementation details) and 3.3 of the paper."""
-    cfg = loaded("gaussiandreamer.yaml", tmp_path)
+    cfg = loaded("gaussiandreamer.yaml")
     system = host.find(cfg.system_type)(cfg.system)
     geometry, data = system.geometry.cfg, cfg.data
     names = ("means", "opacities", "sh", "scales", "quats")
@@ -83,8 +82,8 @@ def test_the_papers_numbers_are_the_papers(tmp_path):
     assert cfg.system.guidance.guidance_scale == 101  # the host's 100
 
 
-def test_the_released_codes_numbers_are_the_codes(tmp_path):
-    cfg = loaded("gaussiandreamer-official.yaml", tmp_path)
+def test_the_released_codes_numbers_are_the_codes():
+    cfg = loaded("gaussiandreamer-official.yaml")
     geometry = host.find(cfg.system_type)(cfg.system).geometry.cfg
     rates = host.C(geometry.lr_means, 0, 0), geometry.lr_scales, geometry.lr_quats
     assert rates == (2e-4, 5e-3, 1e-3) and geometry.scale_rule == "rms3"
@@ -99,32 +98,23 @@ def test_the_released_codes_numbers_are_the_codes(tmp_path):
 @pytest.mark.parametrize(
     "overlay, overrides, prompt",
     [
-        (None, [], "a painted toy"),
-        (None, ["system.guidance.mesh=models/my fox.obj"], "my fox"),
-        (None, ["system.guidance.mesh=a.obj", "system.prompt_processor.prompt=a fox"], "a fox"),
-        ("polish.yaml", ["system.geometry.prior.path=fox.ply"], "fox"),
+        ("{}", [], "a painted toy"),
+        ("{}", ["system.guidance.mesh=models/my fox.obj"], "my fox"),
+        ("{}", ["system.guidance.mesh=a.obj", "system.prompt_processor.prompt=a fox"], "a fox"),
+        (POLISH, ["system.geometry.prior.path=fox.ply"], "fox"),
         ("system: {guidance: {mesh: b.glb}}", ["seed=3"], "b"),
         ("system: {guidance: {mesh: b.glb}, prompt_processor: {prompt: a bee}}", [], "a bee"),
     ],
 )
 def test_the_prompt_of_an_own_object_is_its_files_name(overlay, overrides, prompt, tmp_path):
-    paths = [ROOT / "configs" / "demo.yaml"]
-    if overlay:
-        paths.append(
-            ROOT / "configs" / overlay if overlay.endswith(".yaml") else tmp_path / "o.yaml"
-        )
-        if overlay.startswith("system"):
-            paths[-1].write_text(overlay)
-    cfg = load_config(*paths, cli_args=overrides)
+    (tmp_path / "overlay.yaml").write_text(overlay)
+    cfg = load_config(ROOT / "configs/demo.yaml", tmp_path / "overlay.yaml", cli_args=overrides)
     assert cfg.system.prompt_processor.prompt == prompt
     assert cfg.tag == prompt.replace(" ", "_")
 
 
 def test_a_removed_option_of_a_section_within_is_named_and_dropped(caplog):
-    cfg = load_config(
-        ROOT / "configs" / "demo.yaml", cli_args=["system.geometry.prune.quality=0.3"]
-    )
-    check_config(cfg)
+    cfg = loaded("demo.yaml", overrides=["system.geometry.prune.quality=0.3"])
     said = "system.geometry.prune.quality is no option any more: budget=auto goes by prune.gain"
     assert said in caplog.text
     assert "quality" not in cfg.system.geometry.prune

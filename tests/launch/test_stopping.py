@@ -77,20 +77,15 @@ def test_before_training_a_signal_ends_it_at_once(launch, monkeypatch):
 
 
 def test_a_resumed_run_keeps_its_first_configuration_and_adds_its_command(launch, trained):
-    code, _, _ = launch(
-        "--train",
-        f"resume={trained}/ckpts/last.ckpt",
-        "trainer.max_steps=8",
-        config=f"{trained}/configs/parsed.yaml",
-    )
+    again = [f"resume={trained}/ckpts/last.ckpt", "trainer.max_steps=8"]
+    code, _, _ = launch("--train", *again, config=f"{trained}/configs/parsed.yaml")
     assert code == 0 and only_run() == trained
     assert (trained / "configs/raw.yaml").read_text() == tiny_parts.CONFIG
     assert load_config(trained / "configs/parsed.yaml").trainer.max_steps == 8
     assert len((trained / "cmd.txt").read_text().splitlines()) == 2
     # every_n_train_steps is still 6 there, but the last step is always kept
-    assert load_file(trained / "ckpts/last.ckpt")["global_step"] == 8 and not list(
-        trained.glob("ckpts/last-v*")
-    )
+    assert load_file(trained / "ckpts/last.ckpt")["global_step"] == 8
+    assert not list(trained.glob("ckpts/last-v*"))
 
 
 @pytest.mark.parametrize("error", [ValueError, UserError])

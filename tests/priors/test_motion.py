@@ -243,8 +243,6 @@ def test_the_body_of_a_frame(options, monkeypatch, tmp_path):
         ({"candidates": ["a.obj"]}, "both"),
         ({"body_model": ""}, "body_model.*smpl.is.tue.mpg.de"),
         ({"frame": "best"}, "frame"),
-        ({"frame": -1}, "frame"),
-        ({"sample": -1}, "sample"),
         ({"color": "pink"}, "color"),
     ],
 )

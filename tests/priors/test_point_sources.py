@@ -102,18 +102,15 @@ def written(path, colors=BYTES, as_bytes=True):
     return path
 
 
-@pytest.mark.parametrize("name", ["a.npz", "a.npy", "a.xyz", "a.txt", "a.csv", "a.pts", "a.ply"])
-def test_formats(tmp_path, name):
-    cloud = read(written(tmp_path / name))
-    np.testing.assert_allclose(cloud.points, POINTS, atol=1e-6)
-    np.testing.assert_allclose(cloud.colors, BYTES / 255, atol=1e-6)
-
-
-def test_axes_and_scale(assets, tmp_path):
+def test_formats_axes_and_scale(assets, tmp_path):
+    for suffix in ("npz", "npy", "xyz", "txt", "csv", "pts", "ply"):
+        cloud = read(written(tmp_path / f"a.{suffix}"))
+        np.testing.assert_allclose(cloud.points, POINTS, atol=1e-6)
+        np.testing.assert_allclose(cloud.colors, BYTES / 255, atol=1e-6)
     cloud = read(written(tmp_path / "a.glb"))  # y up, z to the front
     np.testing.assert_allclose(cloud.points, POINTS[:, [2, 0, 1]], atol=1e-6)
     np.testing.assert_allclose(cloud.colors, BYTES / 255, atol=1e-6)
-    turned = read(written(tmp_path / "a.xyz"), up="+y", front="+z").points
+    turned = read(tmp_path / "a.xyz", up="+y", front="+z").points
     np.testing.assert_allclose(turned, POINTS[:, [2, 0, 1]], atol=1e-6)
     with pytest.raises(UserError, match="up axis"):
         read(tmp_path / "a.xyz", up="y")

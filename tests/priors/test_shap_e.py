@@ -16,11 +16,7 @@ from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.priors import point_e
 from threestudio_gaussiandreamer.priors import shap_e as module
 from threestudio_gaussiandreamer.priors.point_e import PointTransformer
-from threestudio_gaussiandreamer.priors.shap_e import (
-    SIGMA_MAX,
-    ShapEPrior,
-    load_original_prior,
-)
+from threestudio_gaussiandreamer.priors.shap_e import SIGMA_MAX, ShapEPrior, load_original_prior
 
 PARTS = ("text_encoder", "tokenizer")
 QKV = "wrapped.backbone.resblocks.0.attn.c_qkv"

@@ -23,9 +23,7 @@ def test_a_prompt_is_text_and_a_file_all_of_it_but_its_last_line_end(tmp_path, t
         (tmp_path / "prompt.txt").write_bytes((text + end).encode())
         found = processed(prompt_file=str(tmp_path / "prompt.txt")).prompt
         assert found == text + ("\n" if end == "\n\n" else "")
-
-
-def test_view_dependent_prompts_are_in_the_order_of_the_host():
+    # view-dependent ones are in the order of the host
     expected = ["a fox, side view", "a fox, front view", "a fox, back view", "a fox, overhead view"]
     assert processed(prompt="a fox").prompts_vd == expected
 

@@ -1,11 +1,12 @@
 """Fixtures of the toybox tests: a small world, and a folder with trained stages."""
 
 import contextlib
+import shutil
 from collections.abc import Iterator
 
 import pytest
 
-from tests.toybox.helpers import copied, training
+from tests.toybox.helpers import training
 from threestudio_gaussiandreamer.toybox import loop, models, views
 from threestudio_gaussiandreamer.toybox.export import main as export
 
@@ -14,17 +15,15 @@ from threestudio_gaussiandreamer.toybox.export import main as export
 def small_sizes() -> Iterator[None]:
     """Make images few and networks small meanwhile, so that a step takes milliseconds."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(models, "UNET_CHANNELS", (16, 32))
-        patch.setattr(models, "VAE_CHANNELS", (8, 8, 8, 8))
-        patch.setattr(models, "TEXT_LAYERS", 1)
-        patch.setattr(models, "VISION_LAYERS", 1)
-        patch.setattr(models, "POINTS_LAYERS", 1)
-        patch.setattr(models.Judge, "CHANNELS", (8, 8, 8, 8))
-        patch.setattr(views, "POINTS", 300)
-        patch.setattr(views, "OBJECTS", 4)
-        patch.setattr(views, "HELD_OUT_OBJECTS", 4)
-        patch.setattr(loop, "LOG_EVERY", 1)
-        patch.setattr(loop, "WARMUP", 1)
+        for owner, sizes in (
+            (models, {"UNET_CHANNELS": (16, 32), "VAE_CHANNELS": (8, 8, 8, 8), "TEXT_LAYERS": 1}),
+            (models, {"VISION_LAYERS": 1, "POINTS_LAYERS": 1}),
+            (models.Judge, {"CHANNELS": (8, 8, 8, 8)}),
+            (views, {"POINTS": 300, "OBJECTS": 4, "HELD_OUT_OBJECTS": 4}),
+            (loop, {"LOG_EVERY": 1, "WARMUP": 1}),
+        ):
+            for name, value in sizes.items():
+                patch.setattr(owner, name, value)
         yield
 
 
@@ -49,7 +48,7 @@ def folder(tmp_path_factory):
 @pytest.fixture(scope="session")
 def trained(folder, tmp_path_factory):
     """A folder in which every stage is trained for a step."""
-    place = copied(folder, tmp_path_factory.mktemp("trained") / "toybox")
+    place = shutil.copytree(folder, tmp_path_factory.mktemp("trained") / "toybox")
     with small_sizes():
         for name in ("unet", "points", "judge"):
             training(place, name).run(4)

@@ -1,9 +1,5 @@
 """Trainings of a few steps on a few pictures."""
 
-import contextlib
-import resource
-import shutil
-from collections.abc import Iterator
 from pathlib import Path
 
 from threestudio_gaussiandreamer.toybox import loop
@@ -19,20 +15,3 @@ def training(folder: Path, name: str, **more) -> loop.Training:
     result = loop.Training(STAGES[name](options(folder, **more)))
     result.stage.evaluate = lambda model: {}
     return result
-
-
-def copied(source: Path, target: Path) -> Path:
-    """Copy a folder of checkpoints, tokenizer and pictures."""
-    shutil.copytree(source, target)
-    return target
-
-
-@contextlib.contextmanager
-def largest_file(size: int) -> Iterator[None]:
-    """Let writing beyond ``size`` bytes fail, as it does where the disk is full."""
-    earlier = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, earlier[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, earlier)

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from tests.toybox.helpers import largest_file, options, training
+from tests.promises.commands import full_disk
+from tests.toybox.helpers import options, training
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.guidance import stable_diffusion  # noqa: F401
 from threestudio_gaussiandreamer.host import find
@@ -131,7 +132,7 @@ def test_a_full_disk_is_one_message_and_the_call_can_be_repeated(
 ):
     target = tmp_path / "models"
     for size in (100, 8000):  # in weights or vocabulary, and in a configuration
-        with largest_file(size):
+        with full_disk(size):
             assert main([str(trained), str(target)]) == 2
         assert "cannot write" in capsys.readouterr().err
     assert main([str(trained), str(target)]) == 0
@@ -139,7 +140,7 @@ def test_a_full_disk_is_one_message_and_the_call_can_be_repeated(
     assert set(read_digests(target)) == files - {DIGESTS}
     monkeypatch.setattr(train, "STAGES", {"text": STAGES["text"]})
     for size in (3000, 20000):  # in the vocabulary, and in a checkpoint
-        with largest_file(size), pytest.raises(UserError, match="cannot write"):
+        with full_disk(size), pytest.raises(UserError, match="cannot write"):
             train.start_from(exported, options(tmp_path))
     train.start_from(exported, options(tmp_path))
     assert is_trained(tmp_path, "text") and open_tokenizer(tmp_path)

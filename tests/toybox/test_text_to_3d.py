@@ -5,6 +5,7 @@ scorecard of its runs, wrong input; and the demo: sheet, table, going on after a
 import csv
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -15,7 +16,6 @@ import pytest
 import yaml
 from PIL import Image
 
-from tests.toybox.helpers import copied
 from tests.training.runs import CONFIGS
 from threestudio_gaussiandreamer.evaluation.scorecard import main as evaluate
 from threestudio_gaussiandreamer.launch.experiment import main as launch
@@ -167,7 +167,7 @@ def test_an_error_of_a_run_ends_the_demo(exported, tmp_path, in_process, capsys)
 def test_ctrl_c_writes_a_checkpoint_and_tells_how_to_continue(exported, tmp_path, monkeypatch):
     # the other process builds a judge of full size; the other networks' sizes are in their files
     monkeypatch.setattr(models.Judge, "CHANNELS", FULL_SIZE)
-    folder = copied(exported, tmp_path / "models")
+    folder = shutil.copytree(exported, tmp_path / "models")
     write_weights(folder / JUDGE, models.Judge().state_dict())
     write_digests(folder)
     options = [*arguments(folder, tmp_path, PROMPT), "trainer.max_steps=500"]

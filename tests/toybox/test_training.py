@@ -1,13 +1,14 @@
 """Every stage of the toybox's training learns, resumes exactly, and reports errors."""
 
 import itertools
+import shutil
 import signal
 
 import numpy as np
 import pytest
 import torch
 
-from tests.toybox.helpers import copied, options, training
+from tests.toybox.helpers import options, training
 from threestudio_gaussiandreamer.core.checkpoint_file import load_file, save_file
 from threestudio_gaussiandreamer.core.devices import torch_threads
 from threestudio_gaussiandreamer.core.errors import UserError
@@ -37,7 +38,10 @@ def stop_after(run: loop.Training, steps: int) -> None:
 
 @pytest.mark.parametrize("name", STAGES)
 def test_resuming_gives_what_an_uninterrupted_training_gives(folder, name, tmp_path):
-    whole, parts = copied(folder, tmp_path / "whole"), copied(folder, tmp_path / "parts")
+    whole, parts = (
+        shutil.copytree(folder, tmp_path / "whole"),
+        shutil.copytree(folder, tmp_path / "parts"),
+    )
     torch.seed()  # random weights are a function of the seed, whatever the process drew before
     uninterrupted = training(whole, name)
     uninterrupted.run(uninterrupted.progress.images + 8)
@@ -87,7 +91,7 @@ def test_a_stop_signal_saves_and_stops_and_no_other_stage_begins(tmp_path, monke
 
 
 def test_a_gradient_that_is_not_finite_stops_before_it_is_saved(folder, tmp_path):
-    run = training(copied(folder, tmp_path / "run"), "judge")
+    run = training(shutil.copytree(folder, tmp_path / "run"), "judge")
     run.run(4)
     before = run.path.read_bytes()
     loss = run.stage.loss
@@ -103,7 +107,7 @@ def test_a_gradient_that_is_not_finite_stops_before_it_is_saved(folder, tmp_path
 
 
 def test_a_time_limit_ends_a_stage_and_lowers_the_rate_before(folder, tmp_path):
-    run = training(copied(folder, tmp_path / "run"), "judge")
+    run = training(shutil.copytree(folder, tmp_path / "run"), "judge")
     rates = []
 
     def step(batch):
@@ -179,7 +183,7 @@ def test_the_judge_has_data_of_its_own(tmp_path):
     ],
 )
 def test_networks_that_others_depend_on_are_frozen(folder, tmp_path, name, user, prefix, free):
-    place = copied(folder, tmp_path / "run")
+    place = shutil.copytree(folder, tmp_path / "run")
     training(place, user).run(4)
     before = averaged_weights(place, name)
     run = training(place, name)
@@ -191,7 +195,7 @@ def test_networks_that_others_depend_on_are_frozen(folder, tmp_path, name, user,
 
 
 def test_damaged_and_other_files_and_a_full_disk_are_messages(folder, tmp_path, monkeypatch):
-    run = training(copied(folder, tmp_path / "run"), "judge")
+    run = training(shutil.copytree(folder, tmp_path / "run"), "judge")
     run.run(4)
     before = run.path.read_bytes()
 
