@@ -14,6 +14,7 @@ import sys
 import time
 import tracemalloc
 from dataclasses import fields, is_dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -123,8 +124,8 @@ def permissions_count_for_root():
 
 def left_in(ended: Ended, *parts: str) -> list[str]:
     """Return the names of temporary files, and of those with one of these words."""
-    names = [path.name for path in ended.folder.rglob("*")]
-    return [name for name in names if any(part in name for part in (".tmp", ".part", *parts))]
+    parts, names = (".tmp", ".part", *parts), (path.name for path in ended.folder.rglob("*"))
+    return [name for name in names if any(part in name for part in parts)]
 
 
 @pytest.mark.slow
@@ -407,7 +408,8 @@ def config_classes():
 
 def names_that_are_read():
     """Return attributes, words of strings and parameters in the package's code."""
-    read = {f"prompt_{direction}" for direction in ("front", "side", "back", "overhead")}  # getattr
+    directions = ("front", "side", "back", "overhead")
+    read = {"renderer_type", *(f"prompt_{direction}" for direction in directions)}  # by getattr
     for path in PACKAGE.rglob("*.py"):
         tree = ast.parse(path.read_text())
         docstrings = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
@@ -448,7 +450,6 @@ MISSPELT = "misspelt {} accepted, or without a correct suggestion"
 @pytest.mark.slow
 @row("A5", "Wrong config keys")
 def test_every_key_misspelt_by_one_letter_is_refused_with_the_right_one(measured):
-    """Every key of the shipped files, at every depth; the message contains the right word."""
     tried, failed = set(), []
     for name in ("demo", "gaussiandreamer", "gaussiandreamer-official"):
         path = DEMO.with_stem(name)
@@ -517,9 +518,8 @@ ALIKE = "x" * 4095, "🦊" * 999, "a_.._.._x", "two_lines", "a?b", "a*b", "con",
 @row("A5", "Prompt as path / YAML")
 @pytest.mark.parametrize("source", [*slow("command line"), "prompt file"])
 def test_a_prompt_stays_text_and_its_folder_below_the_root(source, tmp_path, measured):
-    """The prompt is stored verbatim, also after parsed.yaml was read back; a folder of its name can
-    be created. Different prompts have different ones, also those that share their first 64 bytes,
-    or become equal when forbidden characters are replaced.
+    """Also after parsed.yaml was read back; prompts that share their first 64 bytes, or are equal
+    when forbidden characters are replaced, have different folders.
     """
     names, prompts = set(), PROMPTS[::4] if source == "prompt file" else [*PROMPTS, *ALIKE]
     for number, prompt in enumerate(prompts):
@@ -660,22 +660,19 @@ def open_prior_cache(path: Path) -> None:
     assert read_cache(path, "key") is None
 
 
-def launched(option: str, stage: str = "--train"):
-    def reader(path: Path) -> None:
-        options = option.format(path), "trainer.max_steps=1"
-        refused(path.parent / "out", *options, stage=stage, words=["could run code"])
-
-    return reader
+def start(option: str, path: Path, stage: str = "--train") -> None:
+    options = option.format(path), "trainer.max_steps=1"
+    refused(path.parent / "out", *options, stage=stage, words=["could run code"])
 
 
 shape_weights = refuses(lambda path: read_state_dict(path, "Shap-E"))
 points, motions = refuses(lambda path: load_points(Path(path))), refuses(read_motions)
 body = refuses(load_body_model)
 READERS = {
-    "resume": ("bomb.ckpt", launched("resume={}")),
-    "resume to export": ("bomb.ckpt", launched("resume={}", "--export")),
-    "system.weights": ("bomb.ckpt", launched("system.weights={}")),
-    "system.geometry.weights": ("bomb.ckpt", launched("system.geometry.weights={}:geometry")),
+    "resume": ("bomb.ckpt", partial(start, "resume={}")),
+    "resume to export": ("bomb.ckpt", partial(start, "resume={}", stage="--export")),
+    "system.weights": ("bomb.ckpt", partial(start, "system.weights={}")),
+    "system.geometry.weights": ("bomb.ckpt", partial(start, "system.geometry.weights={}:geometry")),
     "weights of Shap-E, Point-E": ("checkpoint.pt", shape_weights),
     "a bare pickle as .pt": ("a.pt", shape_weights),
     "pytorch_model.bin": ("pytorch_model.bin", open_bin),
@@ -717,7 +714,6 @@ NEVER = set(
 
 @row("A5", "Untrusted pickle")
 def test_every_load_in_the_package_is_the_safe_one(measured):
-    """Benchmarks and launcher included."""
     unsafe, found, root = [], 0, PACKAGE.parent
     hidden = r"from (torch|numpy|numpy\.lib\.format) import .*(load|read_array)\b"
     for path in [*PACKAGE.rglob("*.py"), *(root / "benchmarks").glob("*.py"), root / "launch.py"]:
