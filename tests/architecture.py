@@ -39,13 +39,13 @@ class Step(NamedTuple):
 
 STEPS = (
     Step("launch/experiment.py", "main", "parse arguments, load and check the configuration"),
-    Step("launch/run.py", "Run", "build data module, system and trainer, hold the run folder"),
+    Step("launch/run.py", "Run", "build data module, system, trainer; fit, test, export"),
     Step("training/data.py", "GaussianDreamerDataModule", "draw the cameras of step k"),
     Step("training/system.py", "training_step", "render, score, sum the losses, backward"),
     Step("training/renderer.py", "forward", "convert host cameras to OpenCV, composite"),
     Step("splatting/backends.py", "rasterize", "validate, choose a backend, splat"),
-    Step("guidance/base.py", "ScoreDistillation", "encode, add noise, predict, weigh, clip"),
-    Step("diffusion/sds.py", "diffuse", "the formulas of score distillation"),
+    Step("guidance/base.py", "ScoreDistillation", "encode; variant: add noise, predict; weigh, clip"),
+    Step("diffusion/sds.py", "diffuse", "add noise to the latents"),
     Step("training/density.py", "DensityControl", "clone, split and drop Gaussians after the step"),
     Step("core/checkpoint_file.py", "save_file", "write a checkpoint atomically"),
 )

@@ -1,4 +1,4 @@
-"""Exporters, which write the cloud of a run to files.
+"""Exporters, which prepare the files of a run's cloud.
 
 An exporter is a subclass of the host's ``Exporter``, registered as ``<format>-exporter``. A call
 returns a list of ``ExporterOutput(save_name, save_type, params)``, and the system writes each with

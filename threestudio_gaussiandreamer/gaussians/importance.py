@@ -1,8 +1,8 @@
 """Importance of Gaussians, and gradual pruning by it inside the training loop.
 
-Each round keeps a fraction of the Gaussians, those with the highest importance, until a budget is
-reached. Training continues between rounds, so that the remaining Gaussians compensate for the
-removed ones. Two quantities are collected between rounds:
+Each round keeps a fraction of the Gaussians (``kept_share`` of ``training/density.py``), those with
+the highest importance, until a budget is reached; training goes on between rounds, so that they
+compensate for the others. Two quantities are collected between rounds:
 
 - the *contribution*, the largest weight sigma_i T_i over the pixels of all views, a by-product of
   rendering (RadSplat, Niemeyer et al. 2024);

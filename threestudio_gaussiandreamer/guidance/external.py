@@ -1,4 +1,4 @@
-"""Guidances of this and other packages as threestudio's systems use them."""
+"""How the system calls guidances, its own and other packages'."""
 
 import inspect
 from collections.abc import Iterator
