@@ -44,7 +44,7 @@ STEPS = (
     Step("training/system.py", "training_step", "render, score, sum the losses, backward"),
     Step("training/renderer.py", "forward", "convert host cameras to OpenCV, composite"),
     Step("splatting/backends.py", "rasterize", "validate, choose a backend, splat"),
-    Step("guidance/base.py", "ScoreDistillation", "encode; variant: add noise, predict; weigh, clip"),
+    Step("guidance/base.py", "ScoreDistillation", "encode; variant: noise, predict; weigh, clip"),
     Step("diffusion/sds.py", "diffuse", "add noise to the latents"),
     Step("training/density.py", "DensityControl", "clone, split and drop Gaussians after the step"),
     Step("core/checkpoint_file.py", "save_file", "write a checkpoint atomically"),

@@ -4,6 +4,7 @@ import os
 import re
 import shutil
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Optional
 
@@ -54,6 +55,8 @@ class SaverMixin:
         if loggers.wandb.enable:
             from lightning.pytorch.loggers import WandbLogger
 
+            if find_spec("wandb") is None:
+                raise UserError("system.loggers.wandb.enable: install wandb (pip install wandb)")
             options = loggers.wandb
             self._wandb_logger = WandbLogger(project=options.project, name=options.name)
 
