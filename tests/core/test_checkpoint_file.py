@@ -53,6 +53,9 @@ def test_the_file_that_is_replaced_is_kept(tmp_path):
     save_file(path, content(4))
     left = [".of another.ckpt.1-2.tmp", "last-prev.ckpt", "last.ckpt"]
     assert sorted(os.listdir(tmp_path)) == left
+    (tmp_path / f".{100 * 'a'}.1-2.tmp").touch()  # names of temporary files are cut
+    save_file(tmp_path / f"{120 * 'a'}.ckpt", content(4))
+    assert not (tmp_path / f".{100 * 'a'}.1-2.tmp").exists()
     assert [load_file(p)["global_step"] for p in (path, previous_of(path))] == [4, 3]
 
 

@@ -42,6 +42,7 @@ class Options:
     free: Any = None
     inner: Inner = field(default_factory=Inner)
     text: str = ""
+    table: dict = field(default_factory=lambda: {"on": True, "size": 1.0})
     later: int = 3
 
     @staticmethod
@@ -84,6 +85,7 @@ WRONG = [
     ({"color": [["a"]]}, "a.color[0]: expected a number, got ['a']"),
     ({"pair": [1]}, "a.pair: expected a list of 2, got [1]"),
     ({"pair": [1, float("inf")]}, "a.pair[1]: expected a finite number"),
+    ({"table": {"of": 1}}, "unknown key 'a.table.of'"),
     ({"text": "???"}, "a.text: no value is given"),
 ]
 

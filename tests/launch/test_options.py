@@ -70,6 +70,8 @@ def test_a_configuration_is_found_by_path_or_name(tmp_path, monkeypatch):
     for name, said in (("mien.yaml", ": did you mean 'mine.yaml'"), ("there/mine.yaml", "")):
         with pytest.raises(UserError, match=f"unknown configuration '{name}'{said}"):
             find_config(name)
+    with pytest.raises(UserError, match="configuration 'a{200}': File name too long"):
+        find_config(300 * "a")
     # an installed package brings its configurations
     (tmp_path / "package/configs").mkdir(parents=True)
     (tmp_path / "package/configs/demo.yaml").touch()
@@ -103,7 +105,7 @@ def test_what_cuda_reports(monkeypatch, environment, gpu, overrides, visible):
     assert os.environ["CUDA_VISIBLE_DEVICES"] == visible
 
 
-def test_gpus_that_are_none_or_not_there(monkeypatch):
+def test_gpus_that_are_none_or_not_there(monkeypatch, caplog):
     import torch
 
     for gpu in ("", "gpu", "0,", "-1", "0 1"):
@@ -115,6 +117,9 @@ def test_gpus_that_are_none_or_not_there(monkeypatch):
     with pytest.raises(UserError, match="--gpu 0,1: torch .* can use 1 of these GPUs"):
         announce_device("0,1")
     assert announce_device(None) == 1
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "5")
+    assert announce_device("0") == 1
+    assert "--gpu 0 is ignored: CUDA_VISIBLE_DEVICES=5 is set" in caplog.text
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(UserError, match="--gpu 0: torch .* can use 0 .* run with --gpu cpu"):
         announce_device("0")

@@ -289,6 +289,9 @@ def test_a_checkpoint_may_be_protected_or_a_broken_link(place, monkeypatch):
     require_writable(place)
     (place / "ckpts/step=2.ckpt").touch(mode=0o444)
     require_writable(place)
-    (place / "cmd.txt").touch(mode=0o444)
-    with pytest.raises(UserError, match="cmd.txt is no writable file"):
-        require_writable(place)
+    for name, make in (("cmd.txt", Path.touch), ("save", Path.mkdir), ("ckpts", Path.mkdir)):
+        make(place / name, mode=0o444, exist_ok=True)
+        (place / name).chmod(0o444)
+        with pytest.raises(UserError, match=f"{name} is no writable f"):
+            require_writable(place)
+        (place / name).chmod(0o755)

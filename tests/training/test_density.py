@@ -107,7 +107,7 @@ def test_the_error_of_a_round_is_that_of_its_views_or_of_the_likeness(known):
         ({"budget": None}, 0, 5, None),
         ({"budget": 5}, 0, 5, "4 of the 10 rounds of pruning would come after step 5"),
         ({"budget": 5}, 0, -1, None),
-        ({"budget": 5}, 9, 10, "0 rounds of pruning must reduce 10 Gaussians to 5"),
+        ({"budget": 5}, 9, 10, "0 rounds of pruning must reduce 10 Gaussians to 5; use more"),
         ({"budget": 2}, 0, 10, None),
         ({"budget": 1}, 7, 10, "2 rounds of pruning must reduce 10 Gaussians to 1"),
         ({"budget": 20}, 9, 10, None),

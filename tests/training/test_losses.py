@@ -71,6 +71,9 @@ def test_logged_numbers_of_a_guidance_and_weights_of_zero_alone():
     with pytest.raises(UserError, match="system.loss: every weight is 0"):
         check_losses(SimpleNamespace(LOSSES=("sds",)), {"lambda_sds": 0, "lambda_tv": None})
     check_losses(SimpleNamespace(LOSSES=("sds",)), {"lambda_sds": 0, "lambda_tv": 1.0})
+    own(torch.nn.Identity)
+    with pytest.raises(UserError, match="own-regulariser is a class; register a function"):
+        check_losses(SimpleNamespace(LOSSES=("sds",)), {"lambda_sds": 1, "lambda_own": 1.0})
 
 
 @pytest.mark.parametrize(

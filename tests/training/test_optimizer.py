@@ -71,9 +71,12 @@ def groups(geometry, params=(), **parts):
     return PartRates({"params": dict(params)}).groups(SimpleNamespace(**parts))
 
 
-@pytest.mark.parametrize(("name", "part"), [("background", FlatBackground({})), ("material", None)])
-def test_a_rate_without_parameters_is_refused(name, part):
-    with pytest.raises(UserError, match=f"params.{name}: .* has no parameters that need this rate"):
+@pytest.mark.parametrize(
+    ("name", "part", "said"),
+    [("background", FlatBackground({}), ": its rate is system.back"), ("material", None, "$")],
+)
+def test_a_rate_without_parameters_is_refused(name, part, said):
+    with pytest.raises(UserError, match=f"params.{name}: .* that need this rate{said}"):
         groups(GaussianCloud({}), {name: {"lr": 0.1}}, **{name: part})
 
 
@@ -82,7 +85,7 @@ def test_a_rate_without_parameters_is_refused(name, part):
     [
         (3, "optimizer.params: expected parts and their lr, got 3"),
         ({"backgroud": {"lr": 1}}, "did you mean 'background'"),
-        ({"geometry": {"lr": 1}}, "'geometry': choose from background, material, renderer"),
+        ({"geometry": {"lr": 1}}, "its rates are system.geometry.lr_\*"),
         ({"background": 0.1}, r"params.background: expected \{lr: ...\}, got 0.1"),
         ({"background": {"lr": -1}}, "params.background.lr: expected values of 0 or more"),
         ({"background": {"lr": 1, "eps": 1}}, r"expected \{lr: ...\}"),

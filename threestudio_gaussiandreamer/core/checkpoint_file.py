@@ -21,7 +21,7 @@ from typing import Any, Optional
 import torch
 
 from .errors import UserError
-from .files import atomic_file, output_folder
+from .files import atomic_file, output_folder, temporary_start
 from .logs import warn
 
 _MARK = b"sha256:"
@@ -38,7 +38,7 @@ def save_file(path: str | os.PathLike, content: Any) -> None:
     torch.save(content, buffer)
     output_folder(path.absolute().parent, f"the checkpoint {path}")
     # of processes that were killed while saving
-    for stale in path.parent.glob(f".{glob.escape(path.name)}.*.tmp"):
+    for stale in path.parent.glob(f"{glob.escape(temporary_start(path))}*.tmp"):
         stale.unlink(missing_ok=True)
     with atomic_file(path) as file:
         # the last two bytes of an archive without a comment are the length of the comment

@@ -28,10 +28,10 @@ PLACEHOLDERS = {
 def usable_path(path: str | os.PathLike, what: str, *, home: bool = False) -> Path:
     """Return a path, with ``~`` expanded if ``home``; raise UserError for NUL or a long name."""
     try:
-        path = Path(os.path.expanduser(path) if home else path)
+        path = Path(path).expanduser() if home else Path(path)
         with suppress(FileNotFoundError, NotADirectoryError):
-            path.lstat()
-    except (OSError, ValueError) as error:
+            path.stat()
+    except (OSError, ValueError, RuntimeError) as error:
         raise UserError(f"{what} {_quoted(path)}: not a usable file name ({error})") from error
     return path
 
@@ -78,6 +78,11 @@ def near_names(path: Path, bundled: Collection[str] = ()) -> str:
     return f"did you mean the bundled {meant[0]!r}? {hint}" if meant else hint
 
 
+def temporary_start(path: Path) -> str:
+    """Return how the names of temporary files of a path begin: names have at most 255 bytes."""
+    return f".{os.fsencode(path.name)[:100].decode(errors='ignore')}."
+
+
 @contextmanager
 def atomic_file(path: str | os.PathLike, *, durable: bool = True) -> Iterator[BinaryIO]:
     """Open a binary file for writing that replaces ``path`` only if the block succeeds: a temporary
@@ -88,8 +93,7 @@ def atomic_file(path: str | os.PathLike, *, durable: bool = True) -> Iterator[Bi
         UserError: the folder is missing or can't be written, or the disk is full.
     """
     path = Path(path)
-    start = os.fsencode(path.name)[:100].decode(errors="ignore")  # names have at most 255 bytes
-    temporary = path.with_name(f".{start}.{os.getpid()}-{get_ident()}.tmp")
+    temporary = path.with_name(f"{temporary_start(path)}{os.getpid()}-{get_ident()}.tmp")
     try:
         with open(temporary, "wb") as file:
             yield file

@@ -37,7 +37,7 @@ def rgb(
 
     Channels lie side by side, three by three; missing ones are black.
     """
-    image = image.transpose(1, 2, 0) if data_format == "CHW" else image
+    image = {"HWC": image, "CHW": np.moveaxis(image, 0, -1)}[data_format]
     image = image if image.dtype == np.uint8 else _to_bytes(_normalize(image, data_range))
     missing = -image.shape[-1] % 3
     image = np.pad(image, ((0, 0), (0, 0), (0, missing)))
@@ -115,15 +115,16 @@ def write_video(path: str, frames: list[Path], *, fps: int) -> None:
         from imageio_ffmpeg import get_ffmpeg_exe
 
         command = [get_ffmpeg_exe(), "-v", "error", "-xerror", "-y", "-framerate", str(fps)]
-        command += ["-i", "-", *_MP4_OPTIONS, str(part)]
+        command += ["-i", "-", *_MP4_OPTIONS, str(part.absolute())]
         pictures = b"".join(frame.read_bytes() for frame in frames)
         subprocess.run(command, input=pictures, capture_output=True, check=True)
         os.replace(part, path)
     except ImportError as error:
         raise UserError(f"the video {path} needs ffmpeg: pip install imageio-ffmpeg") from error
     except (OSError, RuntimeError, subprocess.CalledProcessError) as error:
-        said = getattr(error, "stderr", b"").decode(errors="replace").strip()
-        raise UserError(f"the video {path} could not be written: {said or error}") from error
+        said = getattr(error, "stderr", b"").decode(errors="replace").strip() or str(error)
+        why = said.splitlines()[0]
+        raise UserError(f"the video {path} could not be written: {why}") from error
     finally:
         part.unlink(missing_ok=True)
 

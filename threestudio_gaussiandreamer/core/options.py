@@ -268,16 +268,20 @@ def _filled(config_class: Any, values: Any, prefix: str) -> Any:
         return values
     require_mapping(prefix.rstrip("."), values)
     drop_removed(config_class, values, prefix)
-    names = [option.name for option in dataclasses.fields(config_class)]
+    options = {option.name: option for option in dataclasses.fields(config_class)}
     hints, given = typing.get_type_hints(config_class), {}
     for key, value in values.items():
-        if key not in names:
-            raise unknown("key", key, names, prefix=prefix)
+        if key not in options:
+            raise unknown("key", key, options, prefix=prefix)
+        known = make() if callable(make := options[key].default_factory) else None
+        for name in value if isinstance(known, dict) and isinstance(value, Mapping) else ():
+            if known and name not in known:
+                raise unknown("key", name, known, prefix=f"{prefix}{key}.")
         given[key] = _converted(prefix + key, value, hints[key])
     try:
         return config_class(**given)
     except (TypeError, ValueError) as error:  # of __post_init__, or a value is missing
-        raise UserError(_located(str(error), prefix, names)) from error
+        raise UserError(_located(str(error), prefix, options)) from error
 
 
 def _converted(path: str, value: Any, annotation: Any) -> Any:

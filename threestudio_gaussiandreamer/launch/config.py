@@ -18,7 +18,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from ..core.errors import UserError
 from ..core.files import atomic_file
-from ..core.options import escape, in_range, parse_structured, require_mapping
+from ..core.options import escape, parse_structured, require_mapping, satisfies
 from ..core.schedule import C_max
 from ..host import find, info, names
 from ..prompts.prompts import read_prompt
@@ -38,6 +38,7 @@ NO_TEXT = re.compile(r"^\?\?\?$|(?<!\\)(\\\\)*\$\{")
 """A missing value, or the beginning of an interpolation, unless it is escaped."""
 MOST_DEPTH = 32
 MOST_NODES = 10_000
+SEEDS = "a whole number from 0 to 4294967295"
 SECTIONS = ("data", "system", "trainer", "checkpoint", "viewer")
 
 
@@ -48,7 +49,7 @@ class ExperimentConfig:
     name: str = "default"
     description: str = ""
     tag: str = ""
-    seed: int = field(default=0, metadata=in_range(0, 2**32 - 1))
+    seed: int = field(default=0, metadata=satisfies(SEEDS, lambda n: 0 <= n < 2**32))
     use_timestamp: bool = True
     timestamp: Optional[str] = None
     exp_root_dir: str = "outputs"
@@ -182,7 +183,8 @@ def _yaml_errors(what: str) -> Iterator[None]:
         mark = getattr(error, "problem_mark", None)
         place = f"line {mark.line + 1}, column {mark.column + 1}: " if mark else ""
         problem = getattr(error, "problem", None) or str(error).splitlines()[0]
-        raise UserError(f"{what} isn't valid YAML: {place}{problem}") from error
+        kind = "UTF-8" if isinstance(error, UnicodeError) else "valid YAML"
+        raise UserError(f"{what} isn't {kind}: {place}{problem}") from error
 
 
 def _bounded(what: str, source: str) -> Any:
@@ -199,8 +201,10 @@ def _bounded(what: str, source: str) -> Any:
         if isinstance(node, yaml.MappingNode):
             inner = itertools.chain(*inner)
             for key, _ in node.value:
-                if key.tag.rpartition(":")[2] not in ("str", "merge"):
-                    raise UserError(f"{what} has a key that isn't a word, {key.value}: quote it")
+                text = key.value if isinstance(key, yaml.ScalarNode) else f"a {key.id}"
+                is_float = re.fullmatch(r"[-+]?[\d.]+[eE][-+]?\d+", text) and not key.style
+                if key.tag.rpartition(":")[2] not in ("str", "merge") or is_float:
+                    raise UserError(f"{what} has a key that isn't a word, {text}: quote it")
         for item in inner:
             yield from nodes(item, depth + 1)
 

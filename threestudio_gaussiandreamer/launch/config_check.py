@@ -7,6 +7,7 @@ import inspect
 import os
 from collections.abc import Mapping
 from dataclasses import field, make_dataclass
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -93,9 +94,15 @@ def check_config(cfg: Any) -> None:
         logged = system.logged(parse_structured(system.Config, cfg.system, "system."))
         if logged is not None and monitor not in logged | {"epoch", "step"}:
             raise unknown("checkpoint.monitor", monitor, logged)
+        if monitor not in ("epoch", "step") and not cfg.trainer.get("log_every_n_steps", 1):
+            raise UserError("checkpoint.monitor: trainer.log_every_n_steps=0 logs nothing")
     checkpointing = build("checkpoint", pl.callbacks.ModelCheckpoint, plain(cfg.checkpoint))
     numbers = dict.fromkeys(("epoch", "step"), torch.tensor(0))  # files are named in the end
-    build("checkpoint.filename", checkpointing.format_checkpoint_name, {"metrics": numbers})
+    made = build("checkpoint.filename", checkpointing.format_checkpoint_name, {"metrics": numbers})
+    parts = Path(made).parts
+    longest = max(len(os.fsencode(part)) for part in parts)
+    if os.path.isabs(made) or ".." in parts or "\0" in made or longest > 200:
+        raise UserError("checkpoint.filename: expected a name of at most 200 bytes below ckpts/")
     options = {key: v for key, v in plain(cfg.trainer).items() if key not in NEEDS_PROCESSES}
     build("trainer", pl.Trainer, {**options, "devices": 1, "logger": False})
 

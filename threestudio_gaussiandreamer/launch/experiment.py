@@ -73,16 +73,18 @@ def prepare(args: argparse.Namespace, argv: Sequence[str], **options: Any) -> An
     is_first = gc.isenabled() and "torch" not in sys.modules
     if is_first:
         gc.disable()
-    from .. import register_parts
-    from .config import load_config, read_source
-    from .config_check import check_config
-    from .parts import load_extensions
-    from .run import Run
+    try:
+        from .. import register_parts
+        from .config import load_config, read_source
+        from .config_check import check_config
+        from .parts import load_extensions
+        from .run import Run
 
-    register_parts()
-    if is_first:
-        gc.freeze()
-        gc.enable()
+        register_parts()
+    finally:
+        if is_first:
+            gc.freeze()
+            gc.enable()
     configure_logging(args.verbose)
     # read only once, since the file may change while the parts are built
     sources = [(path, read_source(path)) for path in config_paths]

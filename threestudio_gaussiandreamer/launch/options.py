@@ -1,7 +1,6 @@
 """Arguments of the launcher, and the choice of GPUs and files, before torch is imported."""
 
 import argparse
-import contextlib
 import os
 import re
 import sys
@@ -111,8 +110,10 @@ def announce_device(gpu: Optional[str]) -> int:
     count = torch.cuda.device_count() if torch.cuda.is_available() else 0
     if gpu is None and not count:
         info("no GPU found: running on the CPU")
-    asked = os.environ["CUDA_VISIBLE_DEVICES"].split(",")
-    if gpu not in (None, "cpu") and count < len(asked):
+    visible = os.environ["CUDA_VISIBLE_DEVICES"]
+    if gpu not in (None, "cpu", visible):
+        info(f"--gpu {gpu} is ignored: CUDA_VISIBLE_DEVICES={visible} is set")
+    if gpu not in (None, "cpu") and count < len(visible.split(",")):
         found = f"torch {torch.__version__} can use {count} of these GPUs"
         raise UserError(f"--gpu {gpu}: {found}; run with --gpu cpu")
     return count
@@ -122,12 +123,15 @@ def find_config(name: str) -> Path:
     """Find the YAML file for ``--config name``: a path, or a bare name in :func:`config_folders`.
     Raise UserError, which lists similar names, if there is no such file.
     """
-    with contextlib.suppress(OSError, ValueError, RuntimeError):  # too long; NUL; "~user"
+    try:
         path = Path(name).expanduser()
         folders = config_folders() if path.name == name else []
         places = [folder / file for folder in folders for file in (name, f"{name}.yaml")]
         if found := next((place for place in (path, *places) if place.is_file()), None):
             return found
+    except (OSError, ValueError, RuntimeError) as error:  # NUL; "~user"
+        why = getattr(error, "strerror", None) or error
+        raise UserError(f"configuration {name[:200]!r}: {why}") from error
     known = sorted({file.name for folder in config_folders() for file in folder.glob("*.yaml")})
     raise unknown("configuration", name[:200], known)
 

@@ -150,7 +150,7 @@ def _load(entry: Path, file: Path) -> str:
             raise
         frames, root = traceback.extract_tb(error.__traceback__), str(entry.resolve())
         places = [f"{f.filename}:{f.lineno}: " for f in frames if f.filename.startswith(root)]
-        if getattr(error, "lineno", None):  # of a SyntaxError
+        if isinstance(error, SyntaxError) and error.lineno:
             places.append(f"{error.filename}:{error.lineno}: ")
         raise UserError(
             f"the extension {entry} can't be imported: {''.join(places[-1:])}"

@@ -63,6 +63,7 @@ SLUG_BYTES = 64
 HASH = r"-[0-9a-f]{8}$"
 SLUG_SOURCE = 1024  # characters that are read: normalising takes quadratic time
 SLUG_CHARACTERS = "-_.,+=()'! "
+DEVICE = r"(?i)(con|prn|aux|nul|(com|lpt)[1-9\u00b9\u00b2\u00b3]) *(\.|$)"  # a name in Windows
 SUBFOLDERS = ("ckpts", "configs", "code", "save", "tb_logs", "csv_logs")
 FILES = ("ckpts/last.ckpt", "configs/parsed.yaml", "cmd.txt")  # the last one is appended to
 LOCK_FILE = ".lock"
@@ -192,7 +193,8 @@ def _slug(text: str, most_bytes: int) -> str:
         c if c.isalnum() or c in SLUG_CHARACTERS else "_"
         for c in unicodedata.normalize("NFC", text[:SLUG_SOURCE])
     )
-    return slug.encode()[:most_bytes].decode(errors="ignore").lstrip("-. ").rstrip(". ")
+    slug = slug.encode()[:most_bytes].decode(errors="ignore").lstrip("-. ").rstrip(". ")
+    return f"_{slug}"[:most_bytes] if re.match(DEVICE, slug) else slug
 
 
 def _set_trial(cfg: Any, trial_name: str) -> None:
@@ -322,7 +324,8 @@ def require_writable(folder: Path, option: str = "exp_root_dir") -> None:
         for name in (*SUBFOLDERS, *FILES):
             path = folder / name
             fits = path.is_dir() if name in SUBFOLDERS else path.is_file()  # no FIFO
-            if path.exists() and not (fits and (name != FILES[-1] or os.access(path, os.W_OK))):
+            is_replaced = name in FILES[:2]
+            if path.exists() and not (fits and (is_replaced or os.access(path, os.W_OK))):
                 wanted = "folder" if name in SUBFOLDERS else "file"
                 raise OSError(errno.EEXIST, f"{path} is no writable {wanted}")
     except (OSError, ValueError) as error:
@@ -356,6 +359,10 @@ def _lock(path: Path) -> tuple[Callable[[], None], bool]:
             except Timeout as error:
                 only = f". If none is, here or on another machine, remove {file}"
                 raise FolderInUse(only) from error
+            except FileNotFoundError:
+                raise
+            except OSError as error:
+                raise unwritable(path, error) from error
             return lock.release, True
         if not os.path.samestat(os.fstat(descriptor), os.stat(path)):
             raise FileNotFoundError(errno.ENOENT, "replaced by another folder", str(path))

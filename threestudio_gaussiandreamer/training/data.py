@@ -105,7 +105,7 @@ class CameraConfig:
             lambda pair: is_list(pair) and tuple(pair) == LIGHT_DISTANCES,
             "it is 0.8 to 1.5",
         ),
-        "rays": (False, "the renderer computes them"),
+        "rays": (False, "cameras.ray_directions(c2w, fovy, height, width) computes them"),
         "rays_d_normalize": (True, "rays have unit length"),
         "camera_perturb": (0, "cameras look at the origin from where they are drawn"),
         "center_perturb": (0, "cameras look at the origin"),

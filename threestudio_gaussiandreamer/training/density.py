@@ -219,10 +219,10 @@ class DensityControl(DensityRule):
         # equal in the two decimals of the message
         if share >= keep - 0.005:
             return None
+        each = f": each keeps {share:.2f} instead of {keep:g}, which loses quality" if left else ""
         return (
-            f"{len(left)} rounds of pruning must reduce {count} Gaussians to {budget}: each keeps "
-            f"{share:.2f} instead of {keep:g}, which loses more quality; use more rounds "
-            "(system.geometry.prune.start, stop and every) or start with fewer"
+            f"{len(left)} rounds of pruning must reduce {count} Gaussians to {budget}{each}; use "
+            "more rounds (system.geometry.prune.start, stop and every) or start with fewer"
         )
 
     # -- statistics --------------------------------------------------------------------------------

@@ -139,6 +139,8 @@ class GaussianCloud(BaseGeometry):
         def __post_init__(self) -> None:
             if isinstance(self.budget, str):
                 self.budget = None if self.budget.lower() == "none" else self.budget.lower()
+                with contextlib.suppress(TypeError, ValueError):
+                    self.budget = float(self.budget)
             if isinstance(self.budget, float) and self.budget.is_integer():
                 self.budget = int(self.budget)  # 5e3
 

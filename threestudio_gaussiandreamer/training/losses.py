@@ -116,6 +116,9 @@ def check_losses(guidance: type, options: Mapping[str, Any]) -> None:
             "system.loss: every weight is 0, so that nothing would be trained: give one, such as "
             "system.loss.lambda_sds=1"
         )
+    for name, call in regularisers().items():
+        if options.get(f"lambda_{name}") and isinstance(call, type):
+            raise UserError(f"{name}{SUFFIX} is a class; register a function of the outputs")
     known = getattr(guidance, "LOSSES", None)  # also of guidances that aren't ScoreDistillation
     if known is not None:
         check_weights({key.removeprefix("lambda_"): value for key, value in options.items()}, known)

@@ -106,6 +106,8 @@ def _check_rates(params: Any) -> None:
     if not isinstance(params, Mapping):
         raise UserError(f"optimizer.params: expected parts and their lr, got {params!r}")
     for name, options in params.items():
+        if name == "geometry":
+            raise UserError("optimizer.params.geometry: its rates are system.geometry.lr_*")
         if name not in PARTS:
             raise unknown("key system.optimizer.params.", name, PARTS)
         if not isinstance(options, Mapping) or set(options) != {"lr"}:
@@ -148,7 +150,8 @@ class PartRates:
             )
         if own in self.rates and not trained:
             found = f"{type(part).__name__} has no parameters that need this rate"
-            raise UserError(f"system.optimizer.params.{name}: {found}")
+            hint = ": its rate is system.background.lr" if ours else ""
+            raise UserError(f"system.optimizer.params.{name}: {found}{hint}")
         return [*groups, {"params": trained, "name": own, "lr": 0.0}] if trained else groups
 
     def set(self, optimizer: torch.optim.Optimizer, epoch: int, step: int) -> None:
