@@ -82,6 +82,7 @@ def test_draws_are_standard_normal_and_depend_on_seed_stream_step_and_part_alone
     first = table.draw("a", 1, 0, 3)
     table.draw("b", 7, 1, 1)
     assert torch.equal(table.draw("a", 1, 2, 1)[0], first[2])
+    assert first.untyped_storage().data_ptr() == table._values.untyped_storage().data_ptr()
     assert torch.equal(NoiseTable(0, (100, 100)).draw("a", 1, 2, 1)[0], first[2])
     keys = ("b", 1, 0, 1), ("a", 2, 0, 1), ("a", 1, 1, 1), ("a", 1, 0, 1, 1)  # the last of part 1
     others = [table.draw(*key) for key in keys] + [NoiseTable(1, (100, 100)).draw("a", 1, 0, 1)]

@@ -115,6 +115,8 @@ def test_one_pass_over_the_pixels_gives_the_bits_of_the_general_path(
 def test_what_one_pass_cannot_compute_takes_the_general_path(mesh_path):
     rgb, views = uniform(3, 16, 16, 3), batch(*VIEWS)
     assert guidance(mesh_path, grad_clip=0.1)._in_one_pass(rgb, **views) is None
+    with pytest.raises(UserError, match="can't take rgb_as_latents"):
+        guidance(mesh_path)(rgb, **views, rgb_as_latents=True)
     rgb[1, 0, 0, 0] = torch.inf
     out, grad = step(guidance(mesh_path), rgb, **views)
     assert out["bad_items"] == 1 and grad.isfinite().all() and grad[0].abs().max() > 0

@@ -98,8 +98,11 @@ def test_each_signature_gets_what_it_takes():
     "returned, message",
     [
         (torch.zeros(3), "returned Tensor"),
-        ({"loss_sds": torch.zeros(4)}, r"returned loss_sds = tensor.* expected one finite"),
-        ({"loss_sds": torch.tensor(torch.nan)}, "returned loss_sds = .*nan.*: expected one finite"),
+        ({"loss_sds": torch.zeros(4)}, r"returned loss_sds of .*\(\[4\]\): expected one number"),
+        ({"loss_x": None}, "returned loss_x of NoneType: expected one"),
+        ({"loss_x": {"a": 1}}, "returned loss_x of dict: expected one"),
+        ({"loss_x": [torch.zeros(2)]}, "returned loss_x of list: expected one"),
+        ({"loss_sds": torch.tensor(torch.nan)}, "returned loss_sds = nan: expected a finite"),
         ({"loss_sds": torch.inf}, "returned loss_sds = inf"),
         ({"loss_sds": torch.ones(()), "loss_off": 0.0, "note": 1.5}, None),
     ],

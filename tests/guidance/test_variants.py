@@ -12,6 +12,7 @@ from tests.helpers.pixel_guidance import (
     noise_of,
 )
 from threestudio_gaussiandreamer.core import streams
+from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.diffusion.consistent_noise import (
     TABLE,
     attached_noise,
@@ -169,5 +170,7 @@ def test_cfd_uses_the_surfaces_noise():
     z = a * x + sigma * noise
     cond, uncond = both_scores(guidance, z, t)
     assert_close(error_of(guidance, x, batch), uncond + 7.5 * (cond - uncond) - noise)
+    with pytest.raises(UserError, match="cfd-variant needs the renderer's depth and opacity"):
+        error_of(guidance, x)
     assert torch.equal(noise[0], noise[1])  # two views from the same place
     assert not torch.equal(noise, guidance.normal(x, "noise"))

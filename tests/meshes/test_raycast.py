@@ -3,6 +3,7 @@
 import logging
 import math
 import sys
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -225,11 +226,14 @@ def soup(seed, count=150):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_triangles_through_the_camera_plane_are_what_single_rays_see(seed):
+def test_triangles_through_the_camera_plane_are_what_single_rays_see(seed, monkeypatch):
     vertices, faces = soup(seed)
     depth = vertices[faces][..., 2]
     assert ((depth.min(axis=1) < 0) & (depth.max(axis=1) > 0)).sum() > 10
+    monkeypatch.setattr(raycast, "_pairs", Mock(wraps=raycast._pairs))
     found, expected = draw(vertices, faces), cast(vertices, faces)
+    first, end, left, right = raycast._pairs.call_args[0][0].T
+    assert ((end - first) * (right - left)).mean() < 0.4 * len(PLACES) ** 2  # clipped
     assert len(np.unique(found[0])) > 8
     np.testing.assert_array_equal(found[0], expected[0])
     np.testing.assert_allclose(found[1], expected[1], atol=1e-9)  # of a few units, in float64

@@ -36,6 +36,12 @@ def test_pictures_and_buffers_are_found_and_a_missing_one_is_named(tmp_path, cap
     np.testing.assert_allclose(color_at(path, 0.2, 0.8), HALF)
     assert "names the file 'picture one.png', which does not exist" in caplog.text
     np.testing.assert_allclose(PointCloudPrior({"path": str(path)})("a fox").colors, HALF)
+    document = json.loads(path.read_text())
+    for uri, said in (("no.bin", "is missing: a file"), ("data:,a", "is shorter .* truncated")):
+        document["buffers"][0]["uri"] = uri
+        path.write_text(json.dumps(document))
+        with pytest.raises(UserError, match=f"buffer 0 {said}"):
+            load_mesh(path)
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="FIFOs are of Unix")

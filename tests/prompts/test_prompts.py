@@ -31,7 +31,7 @@ def test_a_prompt_is_text_and_a_file_all_of_it_but_its_last_line_end(tmp_path, t
 @pytest.mark.parametrize(
     "options, match",
     [
-        ({"prompt_file": "prompt.txt"}, "prompt.txt': .*codec.* position 3"),
+        ({"prompt_file": "prompt.txt"}, "prompt.txt': it isn't UTF-8 text .*position 3"),
         ({"prompt_file": "promt.txt"}, "does not exist; near names.*prompt.txt"),
         ({"prompt_file": "prompt.txt", "prompt": "a fox"}, "both prompt and prompt_file"),
     ],

@@ -1,5 +1,7 @@
 """The toybox's objects, prompts, pictures and tokenizer, as functions of (seed, index)."""
 
+import os
+
 import numpy as np
 import pytest
 import torch
@@ -174,7 +176,11 @@ def shards(tmp_path_factory):
 
 
 def test_a_shard_is_a_function_of_seed_and_index(shards):
+    left, fresh = (shards.folder / f".{shards.path(0).name}.{i}-7.tmp" for i in (1, 2))
+    left.touch(), fresh.touch(), os.utime(left, (0, 0))
     shard, again = shards.get(0), shards.make(0)
+    assert not left.exists() and fresh.exists()  # of a killed process, and of one that writes
+    fresh.unlink()
     for first, second in zip(shard, again, strict=True):
         assert np.array_equal(first, second)
     assert not np.array_equal(shard.rgba, shards.make(1).rgba)

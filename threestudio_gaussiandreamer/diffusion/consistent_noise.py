@@ -50,10 +50,10 @@ def surface_cells(
     """
     lattice = _counted(0, LATTICES, points.device)[:, None, None, None]
     shifts, per_unit = lattice[..., None] / LATTICES, size.reciprocal()[:, None, None, None]
-    cells = torch.addcmul(shifts, points, per_unit).floor_().int()
-    primes = torch.tensor(PRIMES, dtype=torch.int32, device=points.device)[:, None, None]
+    x, y, z = torch.addcmul(shifts, points, per_unit).floor_().int().unbind(2)
     # the last term makes the rows of one lattice differ from those of the others
-    return cells.mul_(primes).sum(2, dtype=torch.int32).add_(lattice * (TABLE // LATTICES))
+    last = lattice * (TABLE // LATTICES)
+    return last.add(x, alpha=PRIMES[0]).add_(y, alpha=PRIMES[1]).add_(z, alpha=PRIMES[2])
 
 
 def background_cells(

@@ -60,15 +60,18 @@ def invert(
     ends, rows = t.cpu().sort(stable=True)
     left = rows = rows.to(x.device)
     abar, z, ended = alphas_cumprod.cpu(), x.index_select(0, rows), []
-    for index, start in enumerate(range(0, int(ends[-1]), stride)):
+    starts = torch.arange(0, int(ends[-1]), stride)[:, None]
+    now, later = abar[starts], abar[torch.minimum(ends, starts + stride)]
+    variance = (1 - now) / (1 - later) * (1 - later / now)
+    deviation = eta * variance.clamp_min(0).sqrt()
+    # one copy for all steps and items: one in each step would wait for a GPU
+    factors = torch.stack([*ddim_factors(now, later), deviation], dim=1).to(x)
+    for index, of_step in enumerate(factors):
+        start = index * stride
         gone = int((ends <= start).sum())
         ended.append(z[:gone])
         ends, left, z = ends[gone:], left[gone:], z[gone:]
-        now, later = abar[start], abar[ends.clamp(max=start + stride)]
-        variance = (1 - now) / (1 - later) * (1 - later / now)
-        deviation = eta * variance.clamp_min(0).sqrt()
-        factors = torch.stack([*ddim_factors(now, later), deviation]).to(x.device)
-        ratio, slope, deviation = (per_item(values, x) for values in factors)
+        ratio, slope, deviation = (per_item(values, x) for values in of_step[:, -len(z) :])
         predicted = predict(Step(index, left, z, torch.full_like(left, start)))
         z = (z * ratio).addcmul_(predicted, slope)
         if eta and fresh is not None:
@@ -78,7 +81,7 @@ def invert(
 
 class NoiseTable:
     """A table of standard normal numbers, a function of the run's seed, of which a draw is a slice
-    (Salimans et al. 2017, arXiv:1703.03864, section 2.1): drawing costs nothing.
+    (Salimans et al. 2017, arXiv:1703.03864, section 2.1): a draw is mostly a view.
 
     Numbers of one draw are independent. Slices of different draws overlap by chance, shifted
     against each other, so each pair of numbers is uncorrelated.
@@ -102,5 +105,7 @@ class NoiseTable:
         numel = self.shape.numel()
         places = len(self._values) - numel
         begin = streams.derive_seed(self.seed, stream, step) + part * int(SPREAD * places)
-        begins = ((begin + item * numel) % places for item in range(first, first + count))
+        begins = [(begin + item * numel) % places for item in range(first, first + count)]
+        if begins[-1] - begins[0] == (count - 1) * numel:
+            return self._values[begins[0] : begins[-1] + numel].view(count, *self.shape)
         return torch.stack([self._values[i : i + numel].view(self.shape) for i in begins])

@@ -207,7 +207,8 @@ def read_gaussians(path: str | os.PathLike) -> Gaussians:
             names = ", ".join(unknown[:5])
             logger.warning("%s: unknown properties are left out: %s%s", file, names, more)
         arrays = Gaussians(table[MEANS], table[QUATS], *_read_sizes(table), _read_sh(table))
-    filled = np.column_stack([*arrays[:4], arrays.sh[:, 0]]).any(axis=1)
+    parts = (*arrays[:4], arrays.sh[:, 0])
+    filled = np.logical_or.reduce([p.any(axis=(*range(1, p.ndim),)) for p in parts])
     if filled.all():
         return arrays
     said = "%s: %d of %d rows hold nothing but zeros: left out"

@@ -116,8 +116,10 @@ def spz_bytes(
     Raises:
         UserError: values aren't finite, harmonics are above degree 3, or Zstandard is missing.
     """
-    if not usable(gaussians).all() or gaussians.sh_degree > 3:
-        raise UserError("an SPZ file can't hold NaN, infinity, or harmonics above degree 3")
+    if not usable(gaussians).all():
+        raise UserError("an SPZ file can't hold NaN or infinity")
+    if gaussians.sh_degree > 3:
+        raise UserError(f"an SPZ file holds harmonics up to degree 3, not {gaussians.sh_degree}")
     gaussians = gaussians.rows(packing.morton_order(gaussians.means))
     fractional = _fractional_bits(gaussians)
     fixed = np.rint(gaussians.means.astype(np.float64) * 2.0**fractional)

@@ -383,6 +383,8 @@ class ExactScoreGuidance(ScoreDistillation):
         the render's pixels, and nothing but its weight is applied to it; else, or if values aren't
         finite, None.
         """
+        if rgb_as_latents:
+            raise UserError("exact-score compares pictures: it can't take rgb_as_latents")
         cfg, size = self.cfg, tuple(rgb.shape[1:3])
         background = background_of(comp_rgb_bg, len(rgb), rgb.device)
         is_one_picture = (
@@ -390,7 +392,7 @@ class ExactScoreGuidance(ScoreDistillation):
             and self._picture_size(*size) == size
             and background.shape[1:3] == (1, 1)
             and self.grad_clip is None
-            and not (self.needs_unconditional or rgb_as_latents or guidance_eval)
+            and not (self.needs_unconditional or guidance_eval)
         )
         if not is_one_picture or rgb.device.type != "cpu" or cpu_kernel.unavailable():
             return None

@@ -47,11 +47,14 @@ def call_guidance(
 
 def _loss(value: Any, what: str, rgb: Tensor) -> Float[Tensor, ""]:
     """Return a loss as a tensor, since some guidances return plain numbers for disabled ones."""
-    loss = torch.as_tensor(value, device=rgb.device)
-    # on a GPU, looking at the number would wait for it
-    if loss.numel() != 1 or (loss.device.type == "cpu" and not loss.isfinite()):
-        raise UserError(f"{what} = {value}: expected one finite number, as from .mean()")
-    return loss.reshape(())
+    try:
+        loss = torch.as_tensor(value, device=rgb.device).reshape(())
+    except (TypeError, ValueError, RuntimeError) as error:
+        kind = getattr(value, "shape", None) or type(value).__name__
+        raise UserError(f"{what} of {kind}: expected one number, as from .mean()") from error
+    if loss.device.type == "cpu" and not loss.isfinite():  # on a GPU, looking would wait for it
+        raise UserError(f"{what} = {loss.item()}: expected a finite number")
+    return loss
 
 
 @contextmanager

@@ -179,8 +179,9 @@ class Document:
             content = self._chunk if index == 0 else None
             if "uri" in entry:
                 content = self.resource(entry["uri"], f"buffer {index}")
-            whole = content is not None and len(content) >= whole_number(entry, "byteLength")
-            require(whole, f"buffer {index} is missing, or shorter than it should be")
+            require(content is not None, f"buffer {index} is missing: a file, or a GLB's BIN chunk")
+            whole = len(content) >= whole_number(entry, "byteLength")
+            require(whole, f"buffer {index} is shorter than it should be: it is truncated")
             self._buffers[index] = memoryview(content)
         return self._buffers[index]
 

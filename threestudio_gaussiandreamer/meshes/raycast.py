@@ -319,17 +319,22 @@ def _pairs(
 def _boxes(
     corners: Float[np.ndarray, "F 3 3"], focal: float, rows: np.ndarray, columns: np.ndarray
 ) -> Int[np.ndarray, "F 4"]:
-    """Return the box of samples around each triangle (first row, end, first column, end): empty for
-    triangles behind the camera, all samples for those that cross the near plane.
+    """Return the box of samples around the part of each triangle in front of the near plane (first
+    row, end, first column, end), empty where there is none.
     """
-    x, y, z = np.moveaxis(corners, 2, 0)
+    depth, points = -corners[..., 2] - NEAR, [corners]
     with np.errstate(invalid="ignore", divide="ignore"):
+        if (depth < 0).any():  # move corners behind the plane to it, along both edges; else NaN
+            points = []
+            for turn in (1, 2):
+                other = np.roll(depth, turn, axis=1)
+                along = np.where(other < 0, np.nan, depth / (depth - other))
+                along = np.where(depth < 0, along, 0)[..., None]
+                points.append(corners + along * (np.roll(corners, turn, axis=1) - corners))
+        x, y, z = np.moveaxis(np.concatenate(points, axis=1), 2, 0)
         places = (rows, focal * y / z), (columns, focal * x / -z)
     ends = []
     for samples, values in places:
-        ends.append(np.searchsorted(samples, values.min(axis=1) - SLACK))
-        ends.append(np.searchsorted(samples, values.max(axis=1) + SLACK, "right"))
-    box, ahead = np.stack(ends, axis=1), -z >= NEAR
-    box[~ahead.all(axis=1)] = 0, len(rows), 0, len(columns)
-    box[~ahead.any(axis=1)] = 0
-    return box
+        ends.append(np.searchsorted(samples, np.fmin.reduce(values, axis=1) - SLACK))
+        ends.append(np.searchsorted(samples, np.fmax.reduce(values, axis=1) + SLACK, "right"))
+    return np.stack(ends, axis=1)

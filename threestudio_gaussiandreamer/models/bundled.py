@@ -19,6 +19,8 @@ RECORD, DIGESTS = "training.json", "SHA256SUMS"
 LINE = re.compile(rb"([0-9a-f]{64})  (.+)")
 DIFFUSION, CLIP = "stable-diffusion", "clip"
 POINTS, JUDGE = "points.safetensors", "judge.safetensors"
+WORDS_FILE = "tokenizer/words.txt"
+"""Where a model may list the words that it was trained on; published models have no such file."""
 REINSTALL = (
     "install the package again (pip install --force-reinstall --no-deps "
     "threestudio-gaussiandreamer; in a clone: git checkout -- "

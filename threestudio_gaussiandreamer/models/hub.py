@@ -11,7 +11,7 @@ import json
 import os
 import threading
 from collections.abc import Callable, Collection
-from concurrent.futures import Future
+from concurrent.futures import Future, wait
 from difflib import get_close_matches
 from functools import partial
 from pathlib import Path
@@ -231,7 +231,9 @@ def _with_timeout(ask: Callable[[], Any]) -> Any:
             answers.set_exception(error)
 
     threading.Thread(target=work, daemon=True).start()
-    return answers.result(TIMEOUT)
+    if not wait([answers], TIMEOUT).done:
+        raise TimeoutError(f"no answer within {TIMEOUT:g} seconds")
+    return answers.result()
 
 
 def explain(source: Source, error: Exception) -> str:

@@ -111,10 +111,10 @@ class ShapEPrior(SampledPrior):
         schedule = load_settings(HeunDiscreteScheduler, folder, "scheduler")
         shape = (1, prior.config.num_embeddings, prior.config.embedding_dim)
         noise = torch.randn(shape, generator=rng).to(self.device)
-        conditions = self.with_unconditional(condition)
+        conditions, half = self.with_unconditional(condition), noise.is_cuda
 
         def network(z: Tensor, timesteps: Tensor) -> Tensor:
-            with torch.autocast(z.device.type, torch.float16, enabled=z.is_cuda):
+            with torch.autocast(z.device.type, torch.float16, enabled=half):
                 output = prior(z, timesteps, conditions).predicted_image_embedding
             return output[..., : z.shape[-1]]  # the rest is the variance, which isn't used
 
@@ -125,7 +125,12 @@ class ShapEPrior(SampledPrior):
             prediction=schedule.config.prediction_type,
         )
         sigmas = karras.karras_sigmas(STEPS, SIGMA_MAX)
-        return karras.sample_heun(denoise, noise, sigmas, generator=rng, progress="Shap-E")
+        options = {"generator": rng, "progress": "Shap-E"}
+        latents = karras.sample_heun(denoise, noise, sigmas, **options)
+        if half and not latents.isfinite().all():  # some weights overflow float16
+            half = False
+            latents = karras.sample_heun(denoise, noise, sigmas, **options)
+        return latents
 
     def _part(self, folder: Path, part: str) -> Any:
         """Return one network, always in float32: in half precision the renderer's encoding of

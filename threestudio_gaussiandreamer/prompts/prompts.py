@@ -19,8 +19,9 @@ from pathlib import Path
 from typing import Any, List, Optional
 
 from ..core.errors import UserError
-from ..formats.reading import reading
+from ..formats.reading import Unreadable, reading
 from ..host import BaseObject, register, warn
+from ..models.bundled import WORDS_FILE
 
 DIRECTIONS = ("side", "front", "back", "overhead")
 """The view directions in the order of threestudio's view-dependent prompts."""
@@ -70,14 +71,15 @@ def read_prompt(path: str) -> str:
     missing or isn't UTF-8.
     """
     with reading(path, "prompt file (system.prompt_processor.prompt_file)") as file:
-        text = file.read_bytes().decode("utf-8-sig")
+        try:
+            text = file.read_bytes().decode("utf-8-sig")
+        except UnicodeDecodeError as error:
+            raise Unreadable(f"it isn't UTF-8 text ({error})") from error
     return text.removesuffix("\n").removesuffix("\r")
 
 
 # Words that a model wasn't trained on -------------------------------------------------------------
 
-WORDS_FILE = "tokenizer/words.txt"
-"""Where a model may list the words that it was trained on; published models have no such file."""
 SHOWN = 8
 """Largest number of words that the warning names."""
 

@@ -19,8 +19,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..cameras import Orbit
-from ..models.bundled import JUDGE, model_part
-from ..priors.karras import load_exactly, read_state_dict
+from ..models.bundled import JUDGE, NAME, model_part
 from .kinds import ALIKE_FROM_ALL_SIDES
 from .models import Judge
 from .views import DISTANCE, FOVY_DEG, LABELS
@@ -44,8 +43,11 @@ def load_judge(name: str) -> Judge:
     Raises:
         UserError: there is no such file, or it doesn't hold a judge.
     """
+    from ..priors.karras import load_exactly, read_state_dict  # imports Lightning
+
     path, judge = model_part(name, JUDGE), Judge()
-    load_exactly(judge, read_state_dict(path, "judge of the toybox"), f"judge {path!r}")
+    kind = f"judge ({NAME}, or the export of a training that has one: make train-toybox)"
+    load_exactly(judge, read_state_dict(path, kind), f"judge {path!r}")
     return judge.eval()
 
 

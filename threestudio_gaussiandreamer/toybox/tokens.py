@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ..core.errors import UserError
 from ..core.files import atomic_file, existing_file, output_folder
-from ..prompts.prompts import WORDS_FILE
+from ..models.bundled import WORDS_FILE
 from . import words
 from .views import Shard, attributes_of
 

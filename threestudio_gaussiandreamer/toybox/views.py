@@ -3,7 +3,9 @@ views of each object, which are composited over backgrounds when a shard is read
 """
 
 import math
+import time
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -89,6 +91,10 @@ class Shards:
         path = self.path(index)
         if not path.is_file():
             self.folder.mkdir(parents=True, exist_ok=True)
+            for left in self.folder.glob(f".{path.name}.*.tmp"):  # of a training that was killed
+                with suppress(OSError):
+                    if time.time() - left.stat().st_mtime > 3600:
+                        left.unlink()
             shard = self.make(index)
             with atomic_file(path) as file:
                 np.savez(file, **shard._asdict())

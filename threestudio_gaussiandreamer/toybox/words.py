@@ -7,9 +7,8 @@ from collections.abc import Iterable, Mapping
 from typing import Optional
 
 import numpy as np
-import torch
 
-from ..prompts.view_prompts import direction_indices, view_directions
+from ..prompts.view_prompts import THRESHOLDS
 from .world import COLORS, Attributes
 
 NOUNS: dict[str, tuple[str, ...]] = {
@@ -77,7 +76,6 @@ OPPOSITE = {
     "overhead": "overhead",
 }
 """The directions of views, each with the opposite one."""
-DIRECTIONS = view_directions(left_and_right=True)
 UNNAMED_SIDE_SHARE = 0.1
 """Fraction of the side views whose prompts say "side view", as threestudio's do."""
 EMPTY_SHARE, PLAIN_SHARE, PREFIX_SHARE = 0.1, 0.2, 0.04
@@ -88,8 +86,15 @@ def direction(elevation: float, azimuth: float) -> str:
     """Return the direction of a view (degrees), as the prompt processors name it with
     ``view_dependent_left_and_right``.
     """
-    view = torch.tensor([[elevation], [azimuth], [1.0]], dtype=torch.float64)
-    return DIRECTIONS[int(direction_indices(DIRECTIONS, *view))].name
+    front, back, overhead = THRESHOLDS.values()
+    shifted = (float(azimuth) + 180) % 360 - 180
+    if elevation > overhead:
+        return "overhead"
+    if abs(shifted) < front:
+        return "front"
+    if abs(shifted) > 180 - back:
+        return "back"
+    return "left side" if shifted >= 0 else "right side"
 
 
 def describe(attributes: Attributes, rng: np.random.Generator) -> str:

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from ...core import streams
 from ...core.distributed import first_item
+from ...core.errors import UserError
 from ...diffusion.consistent_noise import TABLE, attached_noise, cell_values
 from ...host import register, run_seed
 from ..types import Batch, Latents, Residual
@@ -35,6 +36,8 @@ class CFD(Variant):
         self._table: Optional[Float[Tensor, "c TABLE"]] = None
 
     def residual(self, guidance: Any, latents: Latents, condition: Any, batch: Batch) -> Residual:
+        if missing := [name for name in self.RENDERS if name not in batch]:
+            raise UserError(f"cfd-variant needs the renderer's {' and '.join(missing)}")
         if self._table is None:  # the same in all processes of a run
             generator = streams.generator(run_seed(), "surface noise")
             self._table = cell_values(latents.shape[1], generator).to(latents.device)
