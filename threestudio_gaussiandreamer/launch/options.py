@@ -105,14 +105,14 @@ def announce_device(gpu: Optional[str]) -> int:
     """Return the number of visible GPUs, of which ``--gpu`` may ask for more: a UserError."""
     import torch
 
-    from ..host import info
+    from ..host import info, warn
 
     count = torch.cuda.device_count() if torch.cuda.is_available() else 0
     if gpu is None and not count:
         info("no GPU found: running on the CPU")
     visible = os.environ["CUDA_VISIBLE_DEVICES"]
     if gpu not in (None, "cpu", visible):
-        info(f"--gpu {gpu} is ignored: CUDA_VISIBLE_DEVICES={visible} is set")
+        warn(f"--gpu {gpu} is ignored: CUDA_VISIBLE_DEVICES={visible} is set")
     if gpu not in (None, "cpu") and count < len(visible.split(",")):
         found = f"torch {torch.__version__} can use {count} of these GPUs"
         raise UserError(f"--gpu {gpu}: {found}; run with --gpu cpu")
