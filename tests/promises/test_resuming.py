@@ -47,6 +47,21 @@ def test_a_resumed_run_is_the_same_bit_for_bit(trained):
         assert same[0] == same[1]
 
 
+def test_the_automatic_count_is_the_same_after_resuming_between_its_rounds():
+    rounds = [f"system.geometry.prune.{x}" for x in ("start=2", "stop=8", "every=2", "keep=0.8")]
+    auto = [*SMOKE, "system.geometry.budget=auto", "system.geometry.prune.gain=5", *rounds]
+    auto += ["system.geometry.densify.enabled=false", "use_timestamp=false"]
+    kept = ["checkpoint.save_top_k=-1", "checkpoint.every_n_train_steps=3"]
+    assert launch(*auto, *kept, "tag=whole").code == 0
+    ckpts = Path("outputs/smoke/whole/ckpts")
+    assert launch(*auto, f"resume={ckpts}/epoch=0-step=3.ckpt", "tag=again").code == 0
+    states = [load(ckpts / "epoch=0-step=3.ckpt"), load(ckpts / "last.ckpt")]
+    states.append(load(Path("outputs/smoke/again/ckpts/last.ckpt")))
+    middle, end = (len(state["state_dict"]["geometry.means"]) for state in states[:2])
+    assert middle > end  # rounds before and after it have dropped some
+    assert [d for key in TRAINED for d in differences(states[1][key], states[2][key], key)] == []
+
+
 def test_the_seed_decides(trained):
     """The same seed repeats a run, also from its ``parsed.yaml``; another one doesn't."""
     found = []

@@ -62,6 +62,7 @@ def test_a_round_of_auto_says_what_more_would_gain_and_so_does_the_end():
     """Those that a round drops save a fortieth of the error: at this cost it keeps all."""
     density = sampled(control(budget="auto"), torch.full((10,), 0.0125), 1.0)
     density.cloud.started_with.fill_(10)
+    assert density.summary() == "10 of 10 Gaussians: no round has dropped any"
     needed = after_step(density)
     cost = 10 * math.log10(1.025) / math.log2(10 / 8)
     assert needed.gain == pytest.approx(0.5 * (cost / 0.12) ** 2) and len(density.cloud) == 10

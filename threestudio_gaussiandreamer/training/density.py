@@ -39,6 +39,8 @@ from ..host import find, parse_structured, register, run_seed
 from ..splatting import Rasterized
 
 AUTO = "auto"
+LOSSY = -2.0
+"""What the buffer ``gain`` holds where a round would have lost too much, before any dropped some."""
 DECAY = 0.1
 """How much the logits of the opacities fall in each step while ``budget: auto`` prunes, in units of
 their learning rate: a Gaussian that the loss doesn't hold up fades until it can go (after natural
@@ -324,14 +326,14 @@ class DensityControl(DensityRule):
             error = float(cloud.error)
             needed = importance.needed_count(scores, removal, error, cfg.gain, cfg.keep)
             count = max(count, needed.count)
-            if needed.gain >= 0 and not needed.enough:
-                cloud.gain.fill_(needed.gain)
+            if needed.gain >= 0 and (not needed.enough or cloud.gain < 0):
+                cloud.gain.fill_(LOSSY if needed.enough else needed.gain)
         return densify.select(change, densify.highest(scores, count)), needed
 
     def summary(self) -> str:
         budget, gain = self.cloud.cfg.budget, float(self.cloud.gain)
-        needed = Need(len(self.cloud), gain) if gain >= 0 else "a round would have lost too much"
-        why = {None: "no budget", AUTO: needed}
+        none = "a round would have lost too much" if gain == LOSSY else "no round has dropped any"
+        why = {None: "no budget", AUTO: Need(len(self.cloud), gain) if gain >= 0 else none}
         return f"{super().summary()}: {why.get(budget, f'the budget is {budget}')}"
 
 

@@ -262,7 +262,9 @@ class GaussianDreamerSystem(export.GaussianSavers, BaseLift3DSystem):
         if truth_of(self.guidance) is None:
             return None
         rgb = out["comp_rgb"].detach()
-        return lambda: (rgb - events.true_views(self.guidance, batch, out)).square().mean()
+        return lambda: (
+            (rgb - events.true_views(self.guidance, batch, out)).square().mean((2, 3)).mean()
+        )
 
     def set_learning_rates(self, optimizer: torch.optim.Optimizer) -> None:
         now = self.true_current_epoch, self.true_global_step
