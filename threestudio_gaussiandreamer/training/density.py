@@ -40,7 +40,7 @@ from ..splatting import Rasterized
 
 AUTO = "auto"
 LOSSY = -2.0
-"""What the buffer ``gain`` holds where a round would have lost too much, before any dropped some."""
+"""The buffer ``gain`` where a round would have lost too much, before any dropped some."""
 DECAY = 0.1
 """How much the logits of the opacities fall in each step while ``budget: auto`` prunes, in units of
 their learning rate: a Gaussian that the loss doesn't hold up fades until it can go (after natural
