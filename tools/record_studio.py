@@ -32,8 +32,6 @@ def main(path: Path) -> None:
         frames.append((picture.resize((WIDTH, height), Image.Resampling.LANCZOS), milliseconds))
 
     with tempfile.TemporaryDirectory() as folder, opened(Path(folder), SIZE) as tab:
-        hidden = "'[class*=mantine-Notification] { display: none !important; }'"
-        tab.js(f"$('scene').contentDocument.head.append(make('style', {{}}, {hidden}))")
         for end in range(4, len(PROMPT) + 4, 4):
             tab.type("prompt", PROMPT[:end])
             take(tab, 120)

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import resource
 import signal
 import socket
@@ -11,7 +12,10 @@ import urllib.request
 import pytest
 
 from tests.view.test_live import handshake
+from threestudio_gaussiandreamer.launch.config import load_config
 from threestudio_gaussiandreamer.launch.experiment import main
+from threestudio_gaussiandreamer.launch.options import find_config
+from threestudio_gaussiandreamer.studio.server import WEB
 
 HOSTILE = (
     '<img src=x onerror="window.hurt=1"> & <script>window.hurt=1</script> **лиса** 狐 ' + "x" * 4000
@@ -122,6 +126,37 @@ def test_stop_writes_a_checkpoint_from_which_the_run_goes_on(studio):
     resumed = studio.until_ended()
     assert resumed["id"] == stopped["id"] and resumed["ended"]
     assert any("it400" in file["path"] for file in resumed["files"])
+
+
+def test_every_choice_of_the_page_is_a_whole_configuration():
+    choices = re.findall(r'option value="([^"]+)"', (WEB / "studio.html").read_text())
+    assert len(choices) == 8
+    prompt = ["system.prompt_processor.prompt=a fox"]
+    for choice in choices:
+        cfg = load_config(*map(find_config, choice.split()), cli_args=prompt)
+        assert cfg.system_type and cfg.data_type and cfg.trainer["max_steps"] > 0, choice
+
+
+def test_wrong_requests_and_damaged_runs_leave_the_page_alive(studio):
+    damaged = studio.root / "smoke" / "damaged"
+    for name in ("configs", "save/it5-export"):
+        (damaged / name).mkdir(parents=True)
+    (damaged / "configs/parsed.yaml").write_text("system: [")
+    (damaged / "save/metrics.json").write_text('{"result": {"psnr": "none"}}')
+    (damaged / "save/it5-export/lost.ply").symlink_to("nowhere")
+    (damaged / os.fsdecode(b"save/it5-export/\xff.spz")).touch()
+    studio.js("ask({do: 'refresh'})")
+    studio.until("$('cards').innerText.includes('damaged')")
+    studio.js("choose(shelf.find(run => run.id === 'smoke/damaged'))")
+    for wrong in ([], 5, {}, {"do": "root"}, {"do": "start", "words": 5, "label": ""}, {"do": "x"}):
+        studio.js(f"ask({json.dumps(wrong)})")
+        studio.until("$('message').textContent !== ''")
+    assert studio.js("$('steps').placeholder") == "150"
+    studio.start("a first ball", more="trainer.max_stepz=3")
+    studio.js("ask({do: 'start', words: [5, {}, '\\u0000'], label: {a: 1}})")
+    studio.until("$('message').textContent.includes('null byte')")
+    studio.js(f"ask({{do: 'delete', run: {json.dumps('smoke/damaged')}}})")
+    studio.until("!$('cards').innerText.includes('damaged')")
 
 
 def test_errors_are_those_of_the_command_line(studio, capfd):

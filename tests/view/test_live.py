@@ -74,7 +74,7 @@ def test_what_viser_gets_and_the_buttons_of_a_training():
 def view():
     """A view at any free port."""
     pytest.importorskip("viser")
-    view = live.LiveView("127.0.0.1", 0, "cloud")
+    view = live.LiveView("127.0.0.1", 0, "<img src=x onerror=hurt()>\n# [a](b) **cloud**")
     yield view
     view.close()
 
@@ -108,6 +108,9 @@ def test_only_the_servers_own_page_is_answered_and_updates_replace_the_cloud(vie
     for count in (5, 5, 7):
         view.show(cloud(count).gaussians, f"{count} Gaussians")
         assert len(view._splats.centers) == count
+        title, _, status = view._status.content.partition("\n\n")
+        assert title == r"**\<img src\=x onerror\=hurt\(\)\> \# \[a\]\(b\) \*\*cloud\*\***"
+        assert status == f"{count} Gaussians"
     for views in (2, 2, 3):
         poses = np.tile(np.eye(4, dtype=np.float32), (views, 1, 1))
         poses[:, 0, 3] = views

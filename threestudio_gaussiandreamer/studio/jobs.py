@@ -1,5 +1,6 @@
 """Commands that the studio starts, in processes of their own, one at a time."""
 
+import contextlib
 import os
 import signal
 import subprocess
@@ -64,8 +65,10 @@ class Job:
 
     def shown(self) -> dict[str, Any]:
         """Return what a page shows: the end of its output, the exit code, the worker's notes."""
-        output, code = self.live / "output", self.process and self.process.poll()
-        text = output.read_bytes()[-TAIL:].decode(errors="replace") if output.is_file() else ""
+        output, code, text = self.live / "output", self.process and self.process.poll(), ""
+        with contextlib.suppress(OSError), open(output, "rb") as file:
+            file.seek(max(file.seek(0, os.SEEK_END) - TAIL, 0))
+            text = file.read().decode(errors="replace")
         if self.future.done() and self.future.exception():  # a full disk; a NUL in a prompt
             text, code = f"error: {self.future.exception()}", code or 2
         shown = {"id": self.number, "label": self.label[:LABEL], "text": text, "code": code}

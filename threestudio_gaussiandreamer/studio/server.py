@@ -27,13 +27,13 @@ from ..formats.ply import is_gaussian_ply
 from ..gaussians.axes import WORLD_UP
 from ..gaussians.gaussians import Gaussians
 from ..gaussians.sh import rgb_to_sh0
-from ..launch.options import find_config
+from ..launch.options import config_folders
 from ..launch.run_folder import PARSED, claim, resume_command, safe_name
-from ..models.hub import FAMILIES
+from ..models.hub import FAMILIES, OPTION
 from ..view import live
 from ..view.render import camera_of, first_pose
 from ..view.run_files import RunFiles, cloud_file, is_run, read_any, read_text, read_yaml, section
-from ..view.run_index import MAX_DEPTH, config_changes, read_curves
+from ..view.run_index import MAX_DEPTH, config_changes, leaves, read_curves
 from .jobs import LABEL, Job, Lane
 
 WEB = Path(__file__).with_name("web")
@@ -43,9 +43,7 @@ THEIRS = "sandbox allow-scripts allow-downloads"
 """The policies of our page, and of files of runs, whose pages can't act as ours."""
 LARGEST_UPLOAD = 256 * 2**20  # bytes
 POLL = 0.15  # seconds between two looks for something new
-MODEL = "pretrained_model_name_or_path"
-TAKES = {"gaussians.glb": ["--gaussians"]}
-"""Options of the command that converts, for files that need some."""
+HUB = Path(os.environ.get("HF_HOME", "~/.cache/huggingface")).expanduser() / "hub"
 
 
 def parse(argv: Optional[Sequence[str]]) -> argparse.Namespace:
@@ -72,15 +70,15 @@ class Studio:
     """The queue, the shelf of runs below ``root``, and the view of them."""
 
     def __init__(self, root: Path, host: str, port: int) -> None:
-        self.root, self.entries, self.version = root.resolve(), [], 0
+        self.root, self.entries = root.resolve(), None
         self.read: dict[Path, tuple[list[int], dict[str, Any]]] = {}
         self.trainings, self.tools = Lane(), Lane()
         self.do_remove = self.trainings.remove
         # a folder or file below the root; the main one may be none, for the run that grows
         self.shown: dict[str, Optional[str]] = {"main": None, "beside": None}
-        self.stamp = (0, 0)
-        self.missing = [family.config for family in FAMILIES if not has_weights(family.config)]
-        self.do_refresh()
+        self.stamp, self.grown = (0, 0), ""
+        files = (file for folder in config_folders()[::-1] for file in folder.glob("*.yaml"))
+        self.configs = {file.name: dict(leaves(read_yaml(file))) for file in files}
         self.counts, self.handles, self.camera, self.half = {}, {}, None, 1.0
         live.require_server(host, port)
         import viser.transforms
@@ -169,15 +167,19 @@ class Studio:
             telling.cancel()
 
     async def tell(self, connection: Any) -> None:
-        about = {"missing": self.missing, "limit": LARGEST_UPLOAD, "root": str(self.root)}
-        sent = ("", -1)
+        models = {x.config: str(self.configs[x.config].get(OPTION)) for x in FAMILIES}
+        found = {path.name.removeprefix("models--") for path in HUB.glob("models--*")}
+        missing = [name for name, model in models.items() if model.replace("/", "--") not in found]
+        about = {"missing": missing, "limit": LARGEST_UPLOAD, "root": str(self.root)}
+        await connection.send(json_text({**about, "configs": self.configs}))
+        sent = ("", None)
         while True:
-            state, version = json_text(self.state()), self.version
-            if version != sent[1]:
-                await connection.send(json_text({"shelf": self.entries, **about}))
+            state, entries = json_text(self.state()), self.entries
+            if entries is not sent[1]:
+                await connection.send(json_text({"shelf": entries}))
             if state != sent[0]:
                 await connection.send(state)
-            sent = state, version
+            sent = state, entries
             await asyncio.sleep(POLL)
 
     def state(self) -> dict[str, Any]:
@@ -185,7 +187,7 @@ class Studio:
         jobs = {"job": self.trainings.current, "tool": self.tools.current}
         jobs |= {"last": self.trainings.last, "last_tool": self.tools.last}
         queue = [{"id": job.number, "label": job.label[:LABEL]} for job in self.trainings.waiting]
-        state = {"queue": queue, "shown": self.shown, "counts": self.counts}
+        state = {"queue": queue, "shown": self.shown, "counts": self.counts, "grown": self.grown}
         return state | {name: job and job.shown() for name, job in jobs.items()}
 
     def do_upload(self, file: bytes) -> dict[str, Any]:
@@ -203,7 +205,7 @@ class Studio:
 
     def do_start(self, words: list[str], label: str) -> None:
         """Queue a run of the launcher with these arguments."""
-        self.trainings.add(Job(label, words, done=self.do_refresh))
+        self.trainings.add(Job(str(label), [*map(str, words)], done=self.do_refresh))
 
     def do_control(self, stop: bool = False, paused: bool = False) -> None:
         """Stop the current run, let it pause, or let it go on."""
@@ -213,7 +215,8 @@ class Studio:
     def do_take(self, run: str, name: str) -> None:
         """Make a file of a run that isn't there yet."""
         cloud = cloud_file(self.path_of(run))
-        words = [str(cloud), str(cloud.with_name(Path(name).name)), *TAKES.get(name, ())]
+        option = ["--gaussians"] if name == "gaussians.glb" else []
+        words = [str(cloud), str(cloud.with_name(Path(name).name)), *option]
         self.tools.add(Job(name, words, "convert", self.do_refresh))
 
     def do_prune(self, run: str, budget: str, value: str) -> None:
@@ -236,11 +239,9 @@ class Studio:
         folder = self.path_of(run)
         if not is_run(folder):
             raise UserError(f"{run[:LABEL]!r} is no run")
-        claimed = claim(folder, advice="")
-        try:
+        with contextlib.ExitStack() as stack:
+            stack.callback(claim(folder, advice="").release)
             shutil.rmtree(folder)
-        finally:
-            claimed.release()
         self.do_refresh()
 
     def do_show(self, main: Optional[str] = None, beside: Optional[str] = None) -> None:
@@ -249,7 +250,7 @@ class Studio:
             if name is not None:
                 cloud = read_any(cloud_file(self.path_of(name))).in_axes(WORLD_UP)
                 self.draw(place, cloud.gaussians)
-            elif place == "beside":
+            else:
                 self.draw(place, None)
             self.shown[place] = name
         self.stamp = (0, 0)
@@ -260,11 +261,12 @@ class Studio:
         for depth in range(1, MAX_DEPTH + 1):
             for folder in filter(is_run, self.root.glob("/".join("*" * depth))):
                 watched = (folder, *folder.glob("*/"), *folder.glob("save/it*-export/"))
-                stamp = [path.stat().st_mtime_ns for path in watched]
                 known = self.read.get(folder, ([], {}))
-                read[folder] = known if known[0] == stamp else (stamp, self.entry_of(folder))
+                with contextlib.suppress(OSError, ValueError):  # it is being deleted, or damaged
+                    stamp = [path.stat().st_mtime_ns for path in watched]
+                    read[folder] = known if known[0] == stamp else (stamp, self.entry_of(folder))
         entries = sorted((entry for _, entry in read.values()), key=lambda x: x["when"])
-        self.read, self.entries, self.version = read, entries[::-1], self.version + 1
+        self.read, self.entries = read, entries[::-1]
 
     def path_of(self, name: str) -> Path:
         """Return a file or folder below the root; raises UserError for any other."""
@@ -277,7 +279,7 @@ class Studio:
         """Return what the page shows of a run, with names of files relative to the root."""
         name = functools.partial(os.path.relpath, start=self.root)
         run, command = RunFiles(folder), read_text(folder / "cmd.txt").partition("\n")[0]
-        files = sorted(path for path in (run.export or folder / "-").rglob("*.*"))
+        files = sorted(filter(Path.is_file, (run.export or folder / "-").rglob("*.*")))
         files += [*sorted(run.save.glob("it*-test.mp4"))[-1:], folder / PARSED]
         curve = read_curves(folder, ["gaussians"]).get("gaussians") or [(0, 0)]
         last = run.export is None and (folder / "ckpts/last.ckpt").is_file()
@@ -337,11 +339,12 @@ class Studio:
             handle.wxyz = self.rotation.exp(sign * angle * down).wxyz
 
     async def look(self) -> None:
-        """Show the current run whenever it has changed and a browser is connected."""
+        """Read the runs, then show the current one whenever it has changed and is watched."""
+        await asyncio.to_thread(self.do_refresh)
         while True:
             job = self.trainings.current or self.trainings.last
             if job and self.shown["main"] is None and self.server.get_clients():
-                with contextlib.suppress(OSError, ValueError, KeyError):  # it has just ended
+                with contextlib.suppress(Exception):  # it has just ended
                     await asyncio.to_thread(self.grow, job)
             await asyncio.sleep(POLL)
 
@@ -363,10 +366,4 @@ class Studio:
                 sizes = np.full_like(points, math.log(0.012))
                 gaussians = Gaussians(points, quats, sizes, 0 * sizes[:, 0] + 5, sh)
         self.draw("main", gaussians)
-
-
-def has_weights(config: str) -> bool:
-    """Return whether a configuration's model is in the hub's cache; no request is made."""
-    model = section(read_yaml(find_config(config)), "system", "guidance").get(MODEL, "")
-    home = Path(os.environ.get("HF_HOME", "~/.cache/huggingface")).expanduser()
-    return (home / "hub" / f"models--{model.replace('/', '--')}").is_dir()
+        self.grown = job.label[:LABEL]

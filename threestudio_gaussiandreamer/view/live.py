@@ -4,6 +4,7 @@ with a dilation of 0.3 square pixels and colours of degree 0."""
 import contextlib
 import http
 import ipaddress
+import re
 import socket
 import threading
 from collections.abc import Callable, Iterator
@@ -58,8 +59,10 @@ class LiveView:
         self.server.scene.set_up_direction("+z")
         name = "localhost" if host == "0.0.0.0" else host
         self.address = f"http://{name}:{self.server.get_port()}"
-        self._status = self.server.gui.add_markdown(title)
-        self._title, self._splats, self._frustums = title, None, []
+        # viser draws Markdown with HTML: a prompt or a file's name must be neither
+        self._title = re.sub(r"([!-/:-@\[-`{-~])", r"\\\1", " ".join(title.split()))
+        self._status = self.server.gui.add_markdown(self._title)
+        self._splats, self._frustums = None, []
 
     @property
     def watched(self) -> bool:
