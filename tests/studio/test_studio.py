@@ -115,7 +115,7 @@ def test_a_long_run_survives_reloads_and_tabs_and_its_death_leaves_the_studio(st
 
 
 def test_stop_writes_a_checkpoint_from_which_the_run_goes_on(studio):
-    studio.start("a cube", more="trainer.max_steps=400 data.n_test_views=1")
+    studio.start("a cube", more="trainer.max_steps=200 data.n_test_views=1")
     studio.until("state.job && state.job.status.step > 0")
     studio.press("stop")
     stopped = studio.until_ended()
@@ -125,7 +125,7 @@ def test_stop_writes_a_checkpoint_from_which_the_run_goes_on(studio):
     studio.until("state.job")
     resumed = studio.until_ended()
     assert resumed["id"] == stopped["id"] and resumed["ended"]
-    assert any("it400" in file["path"] for file in resumed["files"])
+    assert any("it200" in file["path"] for file in resumed["files"])
 
 
 def test_every_choice_of_the_page_is_a_whole_configuration():
