@@ -58,6 +58,7 @@ def test_resolvers_of_threestudio(folder):
         ("=3", "isn't an override"),
         ("~system", "isn't an override"),
         ("data.views=[1", "the value of data.views isn't valid YAML"),
+        ("seed=-1", "seed: expected a number from 0 to 4294967295, got -1"),
         ("seed=x", "seed: expected a whole number, got 'x'"),
         ("system=3", "system is 3; expected keys and values"),
         ("system=???", "no value for system"),

@@ -52,6 +52,7 @@ def demo():
         ("system.geometry.prior.color=3", "color: expected null, 'grey', 'random' or [red, green,"),
         ("data.resolution_milestones=[5]", "data.resolution_milestones: give height, width or"),
         ("system.geometry.prior.up=+w", "unknown up axis '+w'"),
+        ("system.geometry.budget='12'", "a number from min_gaussians (64) on, got 12"),
         ("system.guidance.up=w", "unknown system.guidance.up 'w'"),
         ("system.guidance.min_step_percent=[0,0.02,0.9,100]", "0.9 is above max_step_percent"),
         ("system.optimizer.args.eps=-1", "Adam doesn't accept this: Invalid epsilon value"),

@@ -70,7 +70,7 @@ def test_a_configuration_is_found_by_path_or_name(tmp_path, monkeypatch):
     for name, said in (("mien.yaml", ": did you mean 'mine.yaml'"), ("there/mine.yaml", "")):
         with pytest.raises(UserError, match=f"unknown configuration '{name}'{said}"):
             find_config(name)
-    with pytest.raises(UserError, match="configuration 'a{200}': File name too long"):
+    with pytest.raises(UserError, match="configuration 'a{200}': .*File name too long"):
         find_config(300 * "a")
     # an installed package brings its configurations
     (tmp_path / "package/configs").mkdir(parents=True)

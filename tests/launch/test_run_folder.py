@@ -235,6 +235,9 @@ def test_without_flock_a_file_keeps_a_second_run_away(place, monkeypatch):
     assert os.listdir(other.path) == [".lock"]
     first.release()
     assert list(place.iterdir()) == []
+    monkeypatch.setattr(os, "open", unsupported)
+    with pytest.raises(UserError, match="can't be written: Operation not supported"):
+        claim(place)
 
 
 def test_a_folder_that_can_not_be_renamed_is_removed_in_place(place, monkeypatch):

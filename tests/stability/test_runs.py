@@ -314,6 +314,7 @@ TAKEN = "from threestudio_gaussiandreamer.host import register\n@register('mesh-
 MODULES = {
     "ImportError": ("import nothing_of_this_name", "custom/part.py:1: ModuleNotFoundError"),
     "syntax": ("def f(:", "custom/part.py:1: "),
+    "a damaged file": ("import json\njson.loads('{')", "custom/part.py:2: JSONDecodeError"),
     "an exception": ("\n\nraise RuntimeError('broken')", "custom/part.py:3: RuntimeError: broken"),
     "sys.exit(0)": ("import sys\nsys.exit(0)", "custom/part.py:2: SystemExit: 0"),
     "a name that is taken": (TAKEN, "custom/part.py:2"),

@@ -73,7 +73,7 @@ def at_least(low: float, unit: str = "") -> Rule:
 
 def in_range(low: float, high: float, unit: str = "") -> Rule:
     """Accept numbers from ``low`` to ``high``, both included."""
-    return _numbers(f"a number from {low:g} to {high:g}", unit, lambda v: low <= v <= high)
+    return _numbers(f"a number from {low:.10g} to {high:.10g}", unit, lambda v: low <= v <= high)
 
 
 def between(low: float, high: float, unit: str = "") -> Rule:

@@ -18,7 +18,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from ..core.errors import UserError
 from ..core.files import atomic_file
-from ..core.options import escape, parse_structured, require_mapping, satisfies
+from ..core.options import escape, in_range, parse_structured, require_mapping
 from ..core.schedule import C_max
 from ..host import find, info, names
 from ..prompts.prompts import read_prompt
@@ -38,7 +38,6 @@ NO_TEXT = re.compile(r"^\?\?\?$|(?<!\\)(\\\\)*\$\{")
 """A missing value, or the beginning of an interpolation, unless it is escaped."""
 MOST_DEPTH = 32
 MOST_NODES = 10_000
-SEEDS = "a whole number from 0 to 4294967295"
 SECTIONS = ("data", "system", "trainer", "checkpoint", "viewer")
 
 
@@ -49,7 +48,7 @@ class ExperimentConfig:
     name: str = "default"
     description: str = ""
     tag: str = ""
-    seed: int = field(default=0, metadata=satisfies(SEEDS, lambda n: 0 <= n < 2**32))
+    seed: int = field(default=0, metadata=in_range(0, 2**32 - 1))
     use_timestamp: bool = True
     timestamp: Optional[str] = None
     exp_root_dir: str = "outputs"

@@ -130,8 +130,7 @@ def find_config(name: str) -> Path:
         if found := next((place for place in (path, *places) if place.is_file()), None):
             return found
     except (OSError, ValueError, RuntimeError) as error:  # NUL; "~user"
-        why = getattr(error, "strerror", None) or error
-        raise UserError(f"configuration {name[:200]!r}: {why}") from error
+        raise UserError(f"configuration {name[:200]!r}: {str(error)[:200]}") from error
     known = sorted({file.name for folder in config_folders() for file in folder.glob("*.yaml")})
     raise unknown("configuration", name[:200], known)
 

@@ -65,7 +65,7 @@ SLUG_SOURCE = 1024  # characters that are read: normalising takes quadratic time
 SLUG_CHARACTERS = "-_.,+=()'! "
 DEVICE = r"(?i)(con|prn|aux|nul|(com|lpt)[1-9\u00b9\u00b2\u00b3]) *(\.|$)"  # a name in Windows
 SUBFOLDERS = ("ckpts", "configs", "code", "save", "tb_logs", "csv_logs")
-FILES = ("ckpts/last.ckpt", "configs/parsed.yaml", "cmd.txt")  # the last one is appended to
+FILES = ("ckpts/last.ckpt", "configs/parsed.yaml", "cmd.txt")  # the first two are replaced
 LOCK_FILE = ".lock"
 
 
@@ -324,8 +324,7 @@ def require_writable(folder: Path, option: str = "exp_root_dir") -> None:
         for name in (*SUBFOLDERS, *FILES):
             path = folder / name
             fits = path.is_dir() if name in SUBFOLDERS else path.is_file()  # no FIFO
-            is_replaced = name in FILES[:2]
-            if path.exists() and not (fits and (is_replaced or os.access(path, os.W_OK))):
+            if path.exists() and not (fits and (name in FILES[:2] or os.access(path, os.W_OK))):
                 wanted = "folder" if name in SUBFOLDERS else "file"
                 raise OSError(errno.EEXIST, f"{path} is no writable {wanted}")
     except (OSError, ValueError) as error:
