@@ -52,16 +52,14 @@ from ..core.options import (
 from ..core.streams import generator
 from ..host import Updateable, parse_structured, pl, register, register_builtin, run_seed
 
-MAX_SIDE = 16_384
-"""Pixels of a picture each way."""
+MAX_SIDE = 16_384  # pixels of a picture each way
 FAR = 1e6
 """Distances of cameras and lights, world units: float32 keeps places to some digits in it."""
 TRAIN_BYTES, EVAL_BYTES, CAMERA_BYTES = 64, 32, 256
 """What a pixel of a training view, a pixel of an evaluated view, and a camera take at least."""
 FOVY = 1e-3, 179.999, "degrees"
 DISTANCE = 1e-6, FAR, "world units"
-LIGHT_DISTANCES = (0.8, 1.5)
-"""World units."""
+LIGHT_DISTANCES = (0.8, 1.5)  # world units
 PIXELS = in_range(1, MAX_SIDE, "pixels")
 Range = Tuple[float, float]
 

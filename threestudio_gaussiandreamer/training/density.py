@@ -42,10 +42,8 @@ AUTO = "auto"
 LOSSY = -2.0
 """The buffer ``gain`` where a round would have lost too much, before any dropped some."""
 DECAY = 0.1
-"""How much the logits of the opacities fall in each step while ``budget: auto`` prunes, in units of
-their learning rate: a Gaussian that the loss doesn't hold up fades until it can go (after natural
-selection, Deng et al. 2025, arXiv 2511.16980).
-"""
+"""Fall of logits of opacities in a step of ``budget: auto``, in units of their learning rate, so
+that what no loss holds up fades (after natural selection, Deng et al. 2025, arXiv 2511.16980)."""
 LEAST_ERROR = 2.5e-4
 """Smallest mean squared error to the ground truth that ``auto`` reckons with, 36 dB: clouds that
 exceed it at the rates of the rounds end above 41 dB, where more Gaussians don't pay."""
@@ -172,9 +170,7 @@ class DensityControl(DensityRule):
     # -- schedules ---------------------------------------------------------------------------------
 
     def kept_share(self, count: int, step: int) -> float:
-        """Return the fraction of ``count`` Gaussians that the round at ``step`` keeps:
-        ``prune.keep``, or less if the remaining rounds couldn't meet the budget otherwise.
-        """
+        """Return the share that a round keeps: ``prune.keep``, or less if the budget needs it."""
         left = sum(later >= step for later in rounds_of(self.cloud.cfg.prune))
         if self.cloud.cfg.budget in (None, AUTO) or not left:
             return self.cloud.cfg.prune.keep
@@ -232,10 +228,7 @@ class DensityControl(DensityRule):
     def before_backward(
         self, pictures: dict[str, Any], step: int, error: Optional[MeanError] = None
     ) -> None:
-        """Add a sample of the removal error in these renders to the statistics, if the next round
-        of pruning uses it, and the ``error`` with which ``auto`` compares it, or that of
-        ``prune.likeness``.
-        """
+        """Sample the removal error if the next round uses it, and the error that ``auto`` needs."""
         if not self.samples_removal(step):
             return
         if self.cloud.cfg.budget == AUTO:
@@ -312,9 +305,7 @@ class DensityControl(DensityRule):
         return densify.densify_and_prune(cloud.parameters_by_name(), *statistics, cfg, *counts, rng)
 
     def _prune(self, step: int, first: Optional[Change]) -> tuple[Change, Optional[Need]]:
-        """Prune once, after the change ``first`` by densification at the same step; return the
-        combined change, and what ``auto`` has found.
-        """
+        """Prune once, after densification ``first`` of this step; return both, and the need."""
         cloud, cfg = self.cloud, self.cloud.cfg.prune
         change = densify.unchanged(cloud.parameters_by_name()) if first is None else first
         removal = cloud.removal[change.parents]

@@ -68,9 +68,7 @@ def log_scores(
 
 
 def save_pictures(system: Any, batch: dict[str, Any]) -> None:
-    """Save a row of pictures: the render, its depth and normals, the ground truth if there is one,
-    and the score model's noisy and denoised images.
-    """
+    """Save a row of pictures: render, depth, normals, ground truth, noisy and denoised images."""
     out = system(batch)
     images, truth = _render_panels(out), true_views(system.guidance, batch, out)
     if truth is not None:

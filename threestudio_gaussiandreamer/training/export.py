@@ -21,13 +21,7 @@ from typing import Any, Optional
 from ..core.errors import UserError
 from ..core.files import atomic_file
 from ..core.images import write_animation
-from ..exporters.files import (
-    RESERVED,
-    BundleExporter,
-    FileExporter,
-    outputs_of,
-    read_gaussians,
-)
+from ..exporters.files import RESERVED, BundleExporter, FileExporter, outputs_of, read_gaussians
 from ..formats.gaussian_files import StoredCloud, read_cloud, write_cloud
 from ..formats.ply import write_points
 from ..formats.spz import VERSION
@@ -45,8 +39,7 @@ from .background import FlatBackground
 
 FIRST_CLOUD = "prior/gaussians.spz"
 PAGE, POSTER = "view.html", "poster.png"
-POSTER_SIZE = 512
-"""Pixels each way."""
+POSTER_SIZE = 512  # pixels each way
 TURNTABLE_FRAMES, TURNTABLE_SIZE, TURNTABLE_SECONDS = 40, 256, 4.0
 """Of the animated picture: largest number of frames, longest side in pixels, seconds."""
 SUMMARY = ("held_out/compare.png", "it*-test.*", "it*-export/*.*", "it*-export/pruned/*.*")
@@ -100,9 +93,7 @@ def prompt_of(system: Any) -> str:
 
 
 def export(system: Any) -> None:
-    """Write the files of the exporter, the page, and the pruned cloud. Raises the first error of
-    one of these, after all others are written.
-    """
+    """Write exports, page and pruned cloud; raise the first error after all others are written."""
     folder = f"it{system.true_global_step}-export"
     calls = writers(system, system.geometry, folder)
     calls |= {"the page": lambda: write_pages(system, folder)}
@@ -128,9 +119,7 @@ def _call_each(calls: Mapping[str, Callable[[], Any]]) -> None:
 def writers(
     system: Any, geometry: Any, folder: str, pruned_to: Optional[float] = None
 ) -> dict[str, Callable[[], None]]:
-    """Return a function for each format of the exporter that writes its files of a geometry into
-    ``folder``; ``pruned_to``, dB, is noted in files of Gaussians.
-    """
+    """Map the exporter's formats to what writes them to ``folder``; ``pruned_to`` (dB) is noted."""
     parts = {"geometry": geometry, "material": system.material, "background": system.background}
     exporter = find(system.cfg.exporter_type)(system.cfg.exporter, **parts)
     if isinstance(exporter, (FileExporter, BundleExporter)):
@@ -157,9 +146,7 @@ def writers(
 
 
 def export_pruned(system: Any, folder: str) -> None:
-    """Write the same files of the cloud pruned to ``system.prune``, if it is given, and the prune
-    command's report. Dilation and antialiasing are the renderer's unless given.
-    """
+    """Write the exports and the report of the cloud pruned to ``system.prune``, if it is given."""
     options, drawn = PruneOptions(**vars(system.cfg.prune)), settings_of(system)
     if not options.asked_for:
         return

@@ -16,10 +16,8 @@ from ..host import warn
 
 CHECK_EVERY = 25
 """Optimiser steps between two checks, each of which synchronises with the device once."""
-
 LIMITS = {"means": 1e9, "log_scales": 30.0, "sh0": 1e9, "sh_rest": 1e9}
-"""Magnitudes from which on a cloud is lost, although its numbers are finite: no camera sees that
-far, and scales of e^30 are far beyond the e^10 that is drawn at most."""
+"""Magnitudes of a lost cloud: no camera sees so far, and scales of e^10 at most are drawn."""
 
 
 def optimizer_tensors(optimizer: torch.optim.Optimizer) -> Iterator[tuple[str, Tensor]]:
@@ -101,8 +99,6 @@ def warn_if_invisible(opacity: Float[Tensor, "B H W 1"], step: int) -> None:
 
 
 def loss_scale(trainer: Any) -> float:
-    """Return the factor of automatic mixed precision on all gradients, 1 without it. If it makes
-    them infinite, it is halved and the step is skipped.
-    """
+    """Return the factor of mixed precision on gradients, else 1; if they overflow, it is halved."""
     scaler = getattr(trainer.precision_plugin, "scaler", None)
     return 1.0 if scaler is None else float(scaler.get_scale())

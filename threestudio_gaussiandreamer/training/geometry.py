@@ -246,9 +246,7 @@ class GaussianCloud(BaseGeometry):
 
     @torch.no_grad()
     def clamp_colors(self) -> None:
-        """Clamp the constant band to colours in [0, 1], unless ``bound_colors`` is off: after each
-        step of the optimiser, so that what is stored and exported is in the range too.
-        """
+        """Clamp the constant band to colours in [0, 1], unless ``bound_colors`` is off."""
         if self.cfg.bound_colors:
             self.sh0.clamp_(*(sh.rgb_to_sh0(bound) for bound in (0.0, 1.0)))
 
@@ -376,11 +374,8 @@ class GaussianCloud(BaseGeometry):
 
 
 def grow_points(cloud: PointCloud, cfg: GrowConfig, ground: int = 0) -> PointCloud:
-    """Grow points and perturb their colours (the paper's Algorithm 1), within ``max_points``.
-
-    Args:
-        ground: how many points at the end of ``cloud`` are a prior's ground: they neither grow
-            nor count for the box, and stay at the end.
+    """Grow points and perturb their colours (the paper's Algorithm 1), within ``max_points``;
+    the last ``ground`` points, a prior's ground, neither grow nor count for the box, and stay last.
     """
     if not cfg.enabled:
         return cloud

@@ -174,16 +174,14 @@ class Measurements:
 
     @torch.no_grad()
     def begin(self, renderer: Any) -> None:
-        """Drop the scores of an earlier run. Render the prior's cloud now, and score it in
-        :meth:`score_postponed`, since rendering the truth takes seconds.
-        """
+        """Drop an earlier run's scores; render the prior's cloud for :meth:`score_postponed`."""
         self.values, self.seconds = {}, np.zeros(len(CLOCKS))
         with self.paused_clock():
             self._prior = self._snapshot(renderer, 0)
 
     @torch.no_grad()
     def score_postponed(self) -> dict[str, dict[str, Any]]:
-        """Score the prior's cloud, if it was postponed; return the scores by key."""
+        """Score the prior's cloud, if postponed (the truth takes seconds); return scores by key."""
         prior, self._prior = self._prior, None
         with self.paused_clock():
             return {"prior": self._score("prior", prior)} if prior else {}

@@ -69,9 +69,7 @@ def total(losses: Mapping[str, Tensor]) -> Float[Tensor, ""]:
 
 
 def require_gradients(geometry: torch.nn.Module, losses: Mapping[str, Tensor]) -> None:
-    """Raise UserError if no gradient of the losses has reached the cloud, as from a loss of copies
-    of the renders, or of a guidance's own parameters alone.
-    """
+    """Raise UserError if no gradient of the losses has reached the cloud."""
     gradients = [parameter.grad for parameter in geometry.parameters()]
     if gradients and all(gradient is None for gradient in gradients):
         names = ", ".join(f"loss_{name}" for name in losses)
@@ -104,9 +102,7 @@ def logged_names(guidance: type, options: Iterable[str]) -> Optional[set[str]]:
 
 
 def check_losses(guidance: type, options: Mapping[str, Any]) -> None:
-    """Raise UserError for wrong keys of ``system.loss``, also if the class of the guidance declares
-    its losses.
-    """
+    """Raise UserError for wrong keys of ``system.loss``, also by the guidance's ``LOSSES``."""
     for name in options:
         if not name.startswith("lambda_"):
             called = "weights of losses are called lambda_<loss>, such as lambda_sds"

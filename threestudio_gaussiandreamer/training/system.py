@@ -52,14 +52,7 @@ from ..prune import PruneOptions
 from . import events, export, finite
 from .density import MeanError, density_rule
 from .held_out import EvaluationConfig, HeldOut, Measurements
-from .losses import (
-    check_losses,
-    loggable,
-    logged_names,
-    require_gradients,
-    total,
-    weighted_losses,
-)
+from .losses import check_losses, loggable, logged_names, require_gradients, total, weighted_losses
 from .optimizer import PartRates, check_optimizer, make_optimizer, restore_arguments
 
 Outputs, Batch, Losses = Mapping[str, Any], dict[str, Any], dict[str, Tensor]
@@ -289,9 +282,7 @@ class GaussianDreamerSystem(export.GaussianSavers, BaseLift3DSystem):
             return external.call_guidance(*inputs, **options)
 
     def report(self, out: Outputs, batch: Batch, guided: dict[str, Any], losses: Losses) -> None:
-        """Log what the guidance returned, the losses, the number of Gaussians and, if there is a
-        ground truth, the PSNR.
-        """
+        """Log the guidance's numbers, losses, number of Gaussians, and PSNR to a ground truth."""
         every = self.trainer.log_every_n_steps
         if not every or self.global_step % every:
             return
