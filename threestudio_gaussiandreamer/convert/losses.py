@@ -67,11 +67,7 @@ def dropped(whole: StoredCloud, kept: StoredCloud) -> Iterator[str]:
 
 
 def _counted(rows: np.ndarray, what: str) -> Iterator[str]:
-    """Yield "n of N Gaussians ``what``" if n > 0.
-
-    Args:
-        rows: Booleans, N rows of any shape; a Gaussian counts if any of its row is true.
-    """
+    """Yield "n of N Gaussians ``what``" if n > 0; a Gaussian counts if any of its row is true."""
     count = int(rows.reshape(len(rows), -1).any(axis=1).sum())
     if count:
         yield f"{count:,} of {len(rows):,} Gaussians {what}"

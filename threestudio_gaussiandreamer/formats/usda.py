@@ -256,9 +256,7 @@ def _of_prim(prim: Any, now: Any, path: Path) -> Gaussians:
 def _built(
     degree: str, arrays: dict[str, Float[np.ndarray, "N width"]], linear: bool, name: str
 ) -> Gaussians:
-    """Return the Gaussians of a prim, whose colours may be of ``linear`` light, after checking the
-    numbers of its values; ``name`` is for the message.
-    """
+    """Check a prim's values and return its Gaussians; ``name`` is for the message."""
     count, colors = len(arrays["positions"]), arrays.pop(COLORS)
     for attribute, value in DEFAULTS.items():
         if not len(arrays[attribute]):

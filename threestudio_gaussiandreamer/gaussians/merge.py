@@ -139,9 +139,7 @@ def _cheap_pairs(shapes: _Shapes) -> tuple[Int[Tensor, "P 2"], Float[Tensor, " P
 def _neighbours(
     points: Float[np.ndarray, "N 3"],
 ) -> Iterator[tuple[Int[np.ndarray, " P"], Int[np.ndarray, " P"]]]:
-    """Yield pairs of each point with its nearest ones, most of them twice, and of neighbours in
-    sorted order, since many copies of one point all have the same few nearest ones.
-    """
+    """Yield pairs of near points, and of sorted neighbours, as many copies share nearest ones."""
     if len(points) < 2:
         return
     count = min(NEIGHBOURS + 1, len(points))
@@ -154,9 +152,7 @@ def _neighbours(
 def _moments(
     shapes: _Shapes, pairs: Int[Tensor, "P 2"], least: float = 0.0
 ) -> tuple[Float[Tensor, " P"], Float[Tensor, "P 3"], Float[Tensor, "P 3 3"]]:
-    """Return f, the first one's share of the weight of each pair, at least ``least`` for both, and
-    the mean and the covariance of the pair.
-    """
+    """Return each pair's f, at least ``least`` for both, and its mean and covariance."""
     i, j = pairs.unbind(1)
     f = (shapes.weights[i] / (shapes.weights[i] + shapes.weights[j])).clamp(least, 1 - least)
     apart = shapes.means[i] - shapes.means[j]

@@ -204,9 +204,7 @@ def _crossings(
 def _quads(
     inside: np.ndarray, number: Int[np.ndarray, "x y z"], axis: int
 ) -> Int[np.ndarray, "Q 4"]:
-    """Return the four cells around each edge along ``axis`` that is crossed, counterclockwise seen
-    from outside.
-    """
+    """Return the cells around each crossed edge along ``axis``, counterclockwise from outside."""
     u, v = (axis + 1) % 3, (axis + 2) % 3
     along = np.moveaxis(inside, (axis, u, v), (0, 1, 2))[:, 1:-1, 1:-1]
     cells = np.moveaxis(number, (axis, u, v), (0, 1, 2))

@@ -276,9 +276,7 @@ def _local_matrix(document: Document, node: dict[str, Any]) -> World:
 
 
 class _Scene:
-    """The meshes of a document, transformed by the nodes of its default scene, and their materials;
-    each image is decoded once.
-    """
+    """The transformed meshes of a document's default scene, and materials; decodes images once."""
 
     def __init__(self, document: Document) -> None:
         self.document, self.worlds = document, world_matrices(document)
@@ -427,9 +425,7 @@ class _Scene:
     def _skinned(
         self, skin: Any, attributes: dict[str, Any], positions: Float[np.ndarray, "V 3"]
     ) -> Float[np.ndarray, "V 3"]:
-        """Return the vertices moved by the weighted mean of their joints' matrices; the mesh's own
-        node doesn't move them (glTF 2.0, 3.7.3.3).
-        """
+        """Return vertices moved by their weighted joints, not by the node (glTF 2.0, 3.7.3.3)."""
         entry, count = self.document.entry("skins", skin), len(positions)
         matrices = np.stack([self.worlds[joint] for joint in entry["joints"]])
         if "inverseBindMatrices" in entry:

@@ -233,9 +233,7 @@ def _textured(
     numbers: Float[np.ndarray, " T"],
     budget: Budget,
 ) -> list[Mesh]:
-    """Return a part for each texture, with vertices divided where their coordinates differ; the
-    triangles without a texture keep their colours.
-    """
+    """Return a part per texture, divided at seams; triangles without one keep their colours."""
     path, files = table.path, SideFiles(table.path, budget)
     said = [text for text in table.comments if text.lower().startswith(TEXTURE_FILE.lower())]
     names = [text[len(TEXTURE_FILE) :].strip() for text in said]
@@ -372,9 +370,7 @@ def _off_colors(text: str, path: Path) -> Optional[np.ndarray]:
 
 
 class _Resolver:
-    """Reads the files that a mesh references for trimesh, which catches what is raised here, so the
-    first Unreadable is kept in ``refused``.
-    """
+    """Reads a mesh's files for trimesh, which catches what is raised; the first is ``refused``."""
 
     def __init__(self, path: Path, budget: Budget) -> None:
         self.budget, self.file_name = budget, path.name

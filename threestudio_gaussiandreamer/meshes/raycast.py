@@ -119,9 +119,7 @@ class MeshCaster:
     def _bounds(
         self, c2w: np.ndarray, focal: float, height: int, width: int
     ) -> tuple[int, int, int, int]:
-        """Return the bounding rectangle (top, bottom, left, right) of the projected vertices, in
-        pixels; the whole image if some are behind the camera.
-        """
+        """Return top, bottom, left, right of the vertices, pixels; the image if any is behind."""
         x, y, z = ((self._vertices - c2w[:3, 3]) @ c2w[:3, :3]).T
         if (-z).min() < NEAR:
             return 0, height, 0, width
@@ -302,9 +300,7 @@ def zbuffer_hits(
 def _pairs(
     box: Int[np.ndarray, "T 4"], width: int
 ) -> Iterator[tuple[Int[np.ndarray, " P"], Int[np.ndarray, " P"]]]:
-    """Yield all pairs (triangle, sample) with the sample in the triangle's box, in the order of the
-    triangles, up to ``PAIRS_PER_STEP`` at a time.
-    """
+    """Yield pairs (triangle, sample in its box) by triangle, up to ``PAIRS_PER_STEP`` at a time."""
     across = box[:, 3] - box[:, 2]
     ends = np.cumsum((box[:, 1] - box[:, 0]) * across)
     starts = np.concatenate([[0], ends[:-1]])

@@ -69,9 +69,7 @@ def rasterize(kernel: Any, scene: Scene, options: RasterizeOptions) -> Rasterize
 
 
 class _Rasterize(torch.autograd.Function):
-    """Runs a kernel on up to three channels. ``means2d`` is an input that is filled in place, so
-    that its gradient is stored in the caller's tensor.
-    """
+    """Runs a kernel on up to three channels; fills ``means2d``, the caller's, for its gradient."""
 
     @staticmethod
     def forward(ctx, kernel: Any, downsample: int, size, means2d: Tensor, *tensors: Tensor):

@@ -53,9 +53,7 @@ def rasterize(scene: Scene, options: RasterizeOptions) -> Rasterized:
 
 
 def _project(scene: Scene, options: RasterizeOptions) -> Splats:
-    """Call `project`, for many Gaussians in parts that are recomputed in backward, since autograd
-    stores about a hundred numbers per Gaussian and view.
-    """
+    """Call `project`, for many Gaussians in parts that backward recomputes, to save memory."""
     size = max(1, PROJECTED_AT_ONCE // len(scene.viewmats))
     if len(scene.means) <= size:
         return project(scene, options)

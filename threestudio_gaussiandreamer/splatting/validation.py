@@ -61,9 +61,7 @@ def checked_scene(
 
 
 def _check_tensors(tensors: dict[str, Tensor]) -> None:
-    """Check types, devices and shapes, with N from the means, B from the viewmats and C from the
-    colours.
-    """
+    """Check types, devices and shapes; N is of the means, B of the viewmats, C of the colours."""
     device = getattr(tensors["means"], "device", None)
     for name, tensor in tensors.items():
         _require(isinstance(tensor, Tensor), name, "a torch.Tensor", type(tensor).__name__)

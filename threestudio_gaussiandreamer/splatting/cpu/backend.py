@@ -190,12 +190,7 @@ def _path(build: str) -> pathlib.Path:
 
 
 def _load(build: str) -> ctypes.CDLL:
-    """Load one build and declare its functions.
-
-    Raises:
-        OSError: there is no such file, it needs another system library, or it is of an earlier
-            version.
-    """
+    """Load one build and declare its functions; OSError if it is missing or unfit."""
     path, struct = _path(build), ctypes.c_void_p
     library, scene, settings = ctypes.CDLL(str(path)), *map(ctypes.POINTER, (SceneStruct, Settings))
     known = hasattr(library, "splat_gradients_to_pictures")  # added last

@@ -319,12 +319,7 @@ def _report_short_memory() -> None:
 def _sums_of_rows(
     batch: Batch, splats: Splats, lists: Lists, ends: Tensor, upstream: Images, absolute: bool
 ) -> Tensor:
-    """Run `blend_backward` on all views, or on fewer at a time if memory is short; lists that are
-    incomplete are made again.
-
-    Raises:
-        UserError: there is no memory for a single view.
-    """
+    """Run `blend_backward` on the views, fewer at a time if memory is short; complete the lists."""
 
     def sums(part: Batch, splats: Splats, upstream: Images) -> Tensor:
         whole = part is batch
@@ -353,12 +348,7 @@ def _sums_of_rows(
 def _halve_on_oom(
     work: Callable[[Batch, Splats, Images], Result], batch: Batch, splats: Splats, images: Images
 ) -> list[Result]:
-    """Call ``work`` with these; if memory is short, call it for each half of the views instead,
-    recursively. Return the results in order.
-
-    Raises:
-        torch.cuda.OutOfMemoryError: a single view doesn't fit.
-    """
+    """Call ``work`` with these, or for each half if memory is short; return results in order."""
     try:
         return [work(batch, splats, images)]
     except torch.cuda.OutOfMemoryError:

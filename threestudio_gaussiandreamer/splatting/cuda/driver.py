@@ -156,11 +156,7 @@ def _driver() -> ctypes.CDLL:
 
 
 def _call(doing: str, name: str, *arguments: Any) -> None:
-    """Call a function of the driver.
-
-    Raises:
-        UserError: it failed at ``doing``.
-    """
+    """Call a function of the driver; UserError if it fails at ``doing``."""
     status = getattr(_driver(), name)(*arguments)
     if status:
         text = ctypes.c_char_p()
