@@ -135,14 +135,13 @@ class Studio:
 
     def answer(self, path: str) -> Optional[tuple[bytes, dict[str, str]]]:
         """Answer the request for our page, a file of a run, or the picture of the current one."""
+        file, policy = self.root / path.removeprefix("/files/"), THEIRS  # any other is absolute
         if path in OURS:
             file, policy = WEB / OURS[path], POLICY
         elif path == "/picture" and (job := self.trainings.current):
-            file, policy = job.live / "picture.png", THEIRS
-        else:
-            file, policy = self.root / path.removeprefix("/files/"), THEIRS
-            if not path.startswith("/files/") or not file.resolve().is_relative_to(self.root):
-                return None
+            file = job.live / "picture.png"
+        elif not (os.path.isfile(file) and file.resolve().is_relative_to(self.root)):
+            return None
         if not file.is_file():
             return None
         kind = mimetypes.guess_type(file.name)[0] or "application/octet-stream"
