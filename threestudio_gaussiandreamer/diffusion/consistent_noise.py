@@ -120,9 +120,7 @@ def attached_noise(
 
 
 def _sampled(images: Float[Tensor, "B H W 1"], size: tuple[int, int]) -> Float[Tensor, "B h w"]:
-    """Return the pixels nearest to the centres of h x w pixels; between an edge and what is behind
-    it there is no surface.
-    """
+    """Return the pixels nearest to the centres of h x w ones; edges aren't interpolated."""
     height, width = size
     if images.shape[1] % height == 0 == images.shape[2] % width:  # as below, but a view
         rows, columns = images.shape[1] // height, images.shape[2] // width

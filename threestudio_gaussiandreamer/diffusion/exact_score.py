@@ -62,9 +62,7 @@ def expanded_distances(
     norms: Float[Tensor, "*batch K"],
     products: Float[Tensor, "B K"],
 ) -> Float[Tensor, "B K"]:
-    """Compute |z - sqrt(abar) x_k|^2 from |x_k|^2 and the scalar products of z and x_k; all but
-    abar are float64.
-    """
+    """Compute |z - sqrt(abar) x_k|^2 from |x_k|^2 and z x_k; all but abar are float64."""
     a = abar.double().sqrt().to(z.device)[:, None]
     distances = a * (a * norms - 2 * products) + z.square().sum(1, keepdim=True)
     return distances.clamp_min_(0)
@@ -151,9 +149,7 @@ class LinearLatent(NamedTuple):
         )
 
     def normalised(self, rgb: Float[Tensor, "K 3 h w"]) -> "LinearLatent":
-        """Return a latent scaled to unit variance on pooled images in [0, 1]; raise UserError if
-        they are all of one colour.
-        """
+        """Return it with unit variance on images in [0, 1]; raise UserError if of one colour."""
         std = self._replace(scale=1.0).encode_pooled(rgb).std()
         if not std > 0:
             raise UserError("a latent can't be normalised on images that are all of one colour")

@@ -116,9 +116,7 @@ def diffuse(
 def predict_x0(
     z: Float[Tensor, "B *d"], eps: Float[Tensor, "B *d"], abar: Float[Tensor, " B"]
 ) -> Float[Tensor, "B *d"]:
-    """Compute the denoised x0 = (z - sqrt(1 - abar) eps) / sqrt(abar), the inverse of
-    :func:`diffuse`.
-    """
+    """Compute x0 = (z - sqrt(1 - abar) eps) / sqrt(abar), the inverse of :func:`diffuse`."""
     return (z - per_item((1 - abar).sqrt(), z) * eps) / per_item(abar.sqrt(), z)
 
 
@@ -148,9 +146,7 @@ def ddim_step(
     abar: Float[Tensor, " B"],
     abar_next: Float[Tensor, " B"],
 ) -> Float[Tensor, "B *d"]:
-    """Take one deterministic DDIM step to the noise level ``abar_next``, lower or higher (Song et
-    al. 2021 eq. 12 with eta 0).
-    """
+    """Take a DDIM step to ``abar_next``, lower or higher (Song et al. 2021 eq. 12 with eta 0)."""
     ratio, slope = ddim_factors(abar, abar_next)
     return per_item(ratio, z) * z + per_item(slope, z) * eps
 
@@ -199,9 +195,7 @@ def sigma_of_abar(abar: Float[Tensor, " B"]) -> Float[Tensor, " B"]:
 
 
 def on_path(z: Float[Tensor, "B *d"], abar: Float[Tensor, " B"]) -> Float[Tensor, "B *d"]:
-    """Scale the noisy latent of a diffusion to that of the flow: z_sigma = z / (sqrt(abar) +
-    sqrt(1 - abar)).
-    """
+    """Return the flow's latent of a diffusion's: z_sigma = z / (sqrt(abar) + sqrt(1 - abar))."""
     return z / per_item(abar.sqrt() + (1 - abar).sqrt(), z)
 
 

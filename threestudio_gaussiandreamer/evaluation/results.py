@@ -41,9 +41,7 @@ class Result(NamedTuple):
 
 
 def find_result(place: str) -> Result:
-    """Find the result of the last export in a run's folder; a PLY file is a result itself. Raises
-    UserError if there is no such file or folder, or it has no Gaussians.
-    """
+    """Find a run's last export, or take a PLY; raise UserError if missing or without Gaussians."""
     folder = Path(place).expanduser()
     if not folder.is_dir():
         file = existing_file(place, "result (a run's folder or a PLY of Gaussians)")

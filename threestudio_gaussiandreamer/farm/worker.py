@@ -192,8 +192,7 @@ def count_attempts(folder: Path, session: str, job: Job) -> tuple[int, int]:
 
 
 class Heartbeat(pl.Callback):
-    """Report the steps of a run, at most one a second, and stop it as SIGTERM does, with a
-    checkpoint, when the farm is stopping."""
+    """Report a run's steps, at most one a second; when the farm stops, end it with a checkpoint."""
 
     def __init__(self, job: Job, attempt: int, number: int, setting: Setting) -> None:
         self.job, self.attempt, self.number, self.setting = job, attempt, number, setting

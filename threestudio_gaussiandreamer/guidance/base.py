@@ -276,9 +276,7 @@ class ScoreDistillation(BaseObject, ABC):
         return out | (self.report() or {}) | (self.variant.report() or {})
 
     def _gradient(self, found: Any, latents: Latents) -> tuple[Latents, Bool[Tensor, " B"]]:
-        """Weight and clip the residual that the variant found; also return which items aren't
-        finite, which are set to zero.
-        """
+        """Weight and clip the residual; also return which items aren't finite, set to zero."""
         shapes, name = (tuple(latents.shape), (len(latents),)), type(self.variant).__name__
         said = f"the residual and abar, tensors of the shapes {shapes}"
         residual, abar = require_pair(f"{name}.residual", found, [shapes], said)

@@ -61,9 +61,7 @@ class StableDiffusionGuidance(TextToImageDistillation):
         return self.dtype
 
     def encode(self, rgb: Float[Tensor, "B 3 H W"], **batch: Any) -> Latents:
-        """Draw latents from the VAE's posterior, scaled to unit variance, float32. The draw is a
-        function of (seed, step, item).
-        """
+        """Draw float32 latents of unit variance from the VAE, a function of (seed, step, item)."""
         images = resized(rgb, self.image_size) * 2 - 1
         if self.vae_dtype == torch.float32:
             return self._encode(images)

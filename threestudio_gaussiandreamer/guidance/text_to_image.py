@@ -344,9 +344,7 @@ class TextToImageDistillation(ScoreDistillation):
     def _contrasted(
         self, eps: Latents, z: Latents, t: Timesteps, condition: Condition, scale: float = 1.0
     ) -> Latents:
-        """Return the conditional predictions ``eps``, which have guidance of this scale, with view
-        contrast, if the condition has it.
-        """
+        """Add view contrast, if any, to conditional predictions with this guidance scale."""
         if condition.opposite is None:
             return eps
         rows = (t >= CONTRAST_FROM * len(self.alphas_cumprod)).nonzero()[:, 0]
@@ -390,9 +388,7 @@ class TextToImageDistillation(ScoreDistillation):
 
 
 def resized(images: Float[Tensor, "B 3 H W"], size: int) -> Float[Tensor, "B 3 s s"]:
-    """Resize images to the model's size, with antialiasing if they shrink by more than a factor of
-    2, since bilinear sampling would skip pixels.
-    """
+    """Resize to the model's size, with antialiasing if images shrink by more than a factor of 2."""
     if images.shape[-2:] == (size, size):
         return images
     antialias = max(images.shape[-2:]) > 2 * size

@@ -201,9 +201,7 @@ def load_body(person: Person) -> Body:
 
 
 def target_weights(person: Person) -> dict[str, float]:
-    """Return the weights of all targets that a person needs, by file name without extension: the
-    products of the interpolation weights of their parameters.
-    """
+    """Return the weight of each target, the product of its parameters' weights, by file stem."""
     parts = {name: shares(v, *PARAMETERS[name].split()) for name, v in person._asdict().items()}
     grown = {name: share for name, share in parts["age"].items() if name != "baby"}
     parts |= {"race": RACES, "grown": grown}
@@ -261,9 +259,7 @@ def joint_positions(
 
 
 def joint_weights(bones: dict, skin: dict[str, list], count: int) -> Float[np.ndarray, "V 22"]:
-    """Sum the weights, rows of a vertex index and a weight by bone, of the bones that move with
-    each joint.
-    """
+    """Sum the weights by bone, rows (vertex, weight), of the bones that move with each joint."""
     of_bone = {bone: INDEX[joint] for joint, names in BONES.items() for bone in names}
     weights = np.zeros((count, len(INDEX)))
     for bone, rows in skin.items():

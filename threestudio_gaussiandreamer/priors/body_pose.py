@@ -151,9 +151,7 @@ def pose_of_positions(
 
 
 def part_frame(positions: dict[str, Float[np.ndarray, "3"]], part: str) -> Float[np.ndarray, "3 3"]:
-    """Return the directions to the left, up and to the front, as columns, of the hips ("hip") or
-    of the chest ("shoulder").
-    """
+    """Return the columns left, up and front of the hips ("hip") or of the chest ("shoulder")."""
     left, right = positions[f"left {part}"], positions[f"right {part}"]
     low, chest = (
         (positions[f"left {name}"] + positions[f"right {name}"]) / 2 for name in ("hip", "shoulder")
@@ -176,9 +174,7 @@ def part_frame(positions: dict[str, Float[np.ndarray, "3"]], part: str) -> Float
 def swing(
     source: Float[np.ndarray, "3"], target: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "3 3"]:
-    """Return the smallest rotation of the direction of ``source`` to that of ``target``; the
-    identity where one of them has no length.
-    """
+    """Return the smallest rotation from ``source`` to ``target``; the identity if one is zero."""
     from scipy.spatial.transform import Rotation
 
     if not (np.linalg.norm(source) > 1e-9 and np.linalg.norm(target) > 1e-9):

@@ -49,9 +49,7 @@ def cached_cloud(prior: Any, prompt: str, save_dir: Optional[str]) -> PointCloud
 
 
 def cache_key(prior: Any, prompt: str) -> str:
-    """Return a digest of what the prior's output depends on: also of the files that its options
-    name and of the code of its class.
-    """
+    """Return a digest of what the output depends on, with the named files and the class's code."""
     options = dict(prior.cfg) if isinstance(prior.cfg, Mapping) else vars(prior.cfg)
     content = [type(prior).__module__, type(prior).__qualname__, options, prompt, run_seed()]
     content += [__version__, *_files(options), *_code(type(prior))]
@@ -84,9 +82,7 @@ def _code(kind: type) -> Iterator[tuple[str, str]]:
 
 
 def read_cache(path: Path, key: str) -> Optional[PointCloud]:
-    """Return the cached cloud; None if there is none, its key or a file beside the mesh differs, or
-    the file is damaged.
-    """
+    """Return the cached cloud; None if missing or damaged, or if the key or the files changed."""
     names = ["key", "beside", "points", "colors"]
     try:  # a missing file is a UserError too
         data = read_arrays(path, "cache", names, ["normals", "faces"])

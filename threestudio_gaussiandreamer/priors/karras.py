@@ -115,9 +115,7 @@ def linear_alphas_cumprod(steps: int = 1024) -> Float[np.ndarray, "T"]:
 
 
 def timestep_of(sigma: float, alphas_cumprod: Float[np.ndarray, "T"]) -> int:
-    """Return the largest timestep whose noise level is at most ``sigma``, or 0: interpolated
-    linearly in abar and truncated.
-    """
+    """Return the last timestep with noise of at most ``sigma``, or 0; abar is interpolated."""
     levels = -alphas_cumprod  # np.interp requires increasing values
     return int(np.interp(-1 / (sigma**2 + 1), levels, np.arange(len(levels))))
 
@@ -229,9 +227,7 @@ def read_state_dict(path: str, kind: str) -> dict[str, Tensor]:
 
 
 def load_exactly(module: nn.Module, state: Mapping[str, Tensor], what: str) -> None:
-    """Load ``state`` into ``module``, converted to its dtype; raise UserError if names or shapes
-    differ.
-    """
+    """Load ``state``, converted to its dtype; raise UserError if names or shapes differ."""
     try:
         module.load_state_dict(state)
     except RuntimeError as error:

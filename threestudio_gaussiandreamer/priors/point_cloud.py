@@ -108,9 +108,7 @@ def rotated(cloud: PointCloud, rotation: Float[np.ndarray, "3 3"]) -> PointCloud
 
 
 def normalized(cloud: PointCloud, scale: float) -> PointCloud:
-    """Centre the box of the cloud's finite rows at the origin, with half its longest side
-    ``scale``.
-    """
+    """Centre the box of the finite rows at the origin, with half its longest side ``scale``."""
     points = np.asarray(cloud.points, np.float64)
     finite = points[np.isfinite(points).all(axis=1)]
     if not len(finite):

@@ -148,9 +148,7 @@ class Mlp(nn.Module):
 
 
 class Attention(nn.Module):
-    """Self-attention whose packed projection is ordered head by head: first the query, key and
-    value of the first head.
-    """
+    """Self-attention whose packed projection has query, key and value of each head together."""
 
     def __init__(self, width: int, heads: int) -> None:
         super().__init__()

@@ -133,9 +133,7 @@ class ShapEPrior(SampledPrior):
         return latents
 
     def _part(self, folder: Path, part: str) -> Any:
-        """Return one network, always in float32: in half precision the renderer's encoding of
-        positions loses all detail. ``checkpoint`` replaces the weights of the prior.
-        """
+        """Return one network in float32, since half precision loses the detail of positions."""
         from diffusers import PriorTransformer
         from diffusers.pipelines.shap_e.renderer import ShapERenderer
 
@@ -154,9 +152,7 @@ class ShapEPrior(SampledPrior):
 
 @torch.no_grad()
 def decoded(renderer: Any, latents: Float[Tensor, "1 N D"], colors: str) -> PointCloud:
-    """Return the mesh of ``latents`` by marching cubes, with the texture field's colours at its
-    vertices.
-    """
+    """Return the mesh of ``latents`` by marching cubes, with the texture field's colours."""
     if not torch.isfinite(latents).all():
         raise UserError("Shap-E's latents are not finite: check its weights")
     hook = renderer.mesh_decoder.register_forward_hook(_refuse_empty)

@@ -67,9 +67,7 @@ def given_prompt(cfg: Any) -> str:
 
 
 def read_prompt(path: str) -> str:
-    """Read a prompt file verbatim, except for one line break at its end; raise UserError if it is
-    missing or isn't UTF-8.
-    """
+    """Read a file verbatim but for a last line break; UserError if missing or not UTF-8."""
     with reading(path, "prompt file (system.prompt_processor.prompt_file)") as file:
         try:
             text = file.read_bytes().decode("utf-8-sig")

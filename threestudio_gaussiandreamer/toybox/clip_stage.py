@@ -106,9 +106,7 @@ def text_features(
 
 
 def trained_clip(folder: Path, vocabulary_size: int, stage: str) -> Any:
-    """Return a CLIPModel with a stage's averaged weights, without gradients; after "text" its image
-    encoder is random.
-    """
+    """Return a frozen CLIPModel of averaged weights; after "text" its image encoder is random."""
     clip, weights = models.clip_model(vocabulary_size), averaged_weights(folder, stage)
     whole = stage == ClipStage.name
     clip.load_state_dict(entries_below(weights, "clip.") if whole else weights, strict=whole)

@@ -70,9 +70,7 @@ def imperfect_gaussians(mesh: Mesh, rng: np.random.Generator) -> tuple[np.ndarra
 def smooth_field(
     points: Float[np.ndarray, "P 3"], deviation: float, rng: np.random.Generator
 ) -> Float[np.ndarray, "P 3"]:
-    """Evaluate a random smooth vector field, a sum of plane waves, at these points; each component
-    has this standard deviation.
-    """
+    """Return a random sum of plane waves at these points, whose components have this deviation."""
     directions = rng.normal(size=(3, WAVES))
     lengths = rng.uniform(*WAVELENGTH, WAVES)
     waves = 2 * np.pi * directions / (np.linalg.norm(directions, axis=0) * lengths)
@@ -101,9 +99,7 @@ def judge_batch(
 
 
 class JudgeStage(Stage):
-    """Minimise the cross entropy of every attribute on renders of Gaussians and, in one step of
-    CAST_EVERY, on ray-cast pictures.
-    """
+    """Classify renders of Gaussians and, in one step of CAST_EVERY, ray-cast pictures."""
 
     name = "judge"
     batch_size = 64

@@ -367,7 +367,5 @@ def _average(averages: list[Tensor], current: list[Tensor], count: Any) -> None:
 
 
 def rate_factor(step: int, done: float) -> float:
-    """Return the multiplier of the learning rate: linear warm-up to 1, constant, then a linear
-    decrease to zero, by the fraction of the training that is ``done``.
-    """
+    """Return the rate's factor: linear warm-up to 1, constant, linear decrease to 0 by ``done``."""
     return min(1.0, (step + 1) / WARMUP) * min(1.0, max(0.0, 1 - done) / DECAY_SHARE)

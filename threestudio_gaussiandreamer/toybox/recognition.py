@@ -70,9 +70,7 @@ def probabilities(judge: Judge, pictures: Float[Tensor, "V 3 s s"]) -> dict[str,
 
 
 def recognized(found: dict[str, Tensor], wanted: Attributes) -> dict[str, bool]:
-    """Return for each attribute whether the pictures show it as the prompt, or none if that names
-    none.
-    """
+    """Return whether the pictures show each attribute as the prompt does, which may name none."""
     right = {}
     for name in ("kind", "part", "accessory", "accessory_color"):
         most_probable = LABELS[name][int(found[name].mean(dim=0).argmax())]
@@ -111,9 +109,7 @@ def _possible() -> Bool[Tensor, "pattern color second"]:
 
 
 def multi_face(found: dict[str, Tensor], wanted: Attributes) -> float:
-    """Return the share of :func:`views` recognised as views from another quadrant; NaN for kinds
-    without a front.
-    """
+    """Return the share of :func:`views` that look like another quadrant's; NaN without a front."""
     if wanted.kind in ALIKE_FROM_ALL_SIDES:
         return math.nan
     sides = torch.arange(4).repeat_interleave(len(OFFSETS_DEG))

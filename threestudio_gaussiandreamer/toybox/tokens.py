@@ -26,9 +26,7 @@ LENGTH = 32
 
 
 def write_tokenizer(folder: Path, words: Sequence[str]) -> None:
-    """Write the vocabulary, merges and configuration of a CLIPTokenizer into ``folder``, and the
-    list of ``words`` that prompts/prompts.py reads.
-    """
+    """Write a CLIPTokenizer's files, and the list of ``words`` that prompts/prompts.py reads."""
     from tokenizers.pre_tokenizers import ByteLevel
 
     output_folder(folder, "the tokenizer")

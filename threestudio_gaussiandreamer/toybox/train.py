@@ -162,9 +162,7 @@ def start_from(weights: Path, options: Options) -> None:
 
 
 def read_weights(weights: Path, name: str) -> dict[str, Tensor]:
-    """Read an export's weights of a stage's network, float32; of "clip" all but the text encoder,
-    which the stage has from the one before.
-    """
+    """Read an export's weights of a stage, float32; of "clip" all but the text encoder."""
     from safetensors.torch import load_file
     from transformers import CLIPModel
 

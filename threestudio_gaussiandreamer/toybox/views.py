@@ -173,9 +173,7 @@ def attributes_of(row: Int[np.ndarray, " L"]) -> Attributes:
 def with_backgrounds(
     rgba: UInt8[np.ndarray, "N H W 4"], rng: np.random.Generator, *, random_share: float
 ) -> Float[torch.Tensor, "N 3 H W"]:
-    """Composite pictures over BACKGROUND, and a share of them over a random colour or a gradient
-    between two; return pictures in [0, 1].
-    """
+    """Return pictures in [0, 1] over BACKGROUND, or a share over random colours or gradients."""
     count, height = rgba.shape[:2]
     top, bottom = (rng.uniform(0, 1, (count, 3, 1, 1)) for _ in range(2))
     bottom = np.where(rng.uniform(size=(count, 1, 1, 1)) < 0.5, top, bottom)
@@ -191,9 +189,7 @@ def with_backgrounds(
 def render_gaussians(
     gaussians: Sequence[np.ndarray], orbit: Orbit, *, eps2d: float
 ) -> Float[np.ndarray, "N s s 4"]:
-    """Render Gaussians, given as the first arguments of ``rasterize``, from these cameras; return
-    premultiplied RGBA in [0, 1].
-    """
+    """Return premultiplied RGBA in [0, 1] of Gaussians, the first arguments of ``rasterize``."""
     viewmats, Ks = to_opencv(orbit.c2w, orbit.fovy, SIZE, SIZE)
     gaussians = [torch.from_numpy(np.float32(values)) for values in gaussians]
     drawn = rasterize(*gaussians, viewmats, Ks, SIZE, SIZE, preset="fast", eps2d=eps2d)

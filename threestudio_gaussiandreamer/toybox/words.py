@@ -83,9 +83,7 @@ EMPTY_SHARE, PLAIN_SHARE, PREFIX_SHARE = 0.1, 0.2, 0.04
 
 
 def direction(elevation: float, azimuth: float) -> str:
-    """Return the direction of a view (degrees), as the prompt processors name it with
-    ``view_dependent_left_and_right``.
-    """
+    """Name the direction of a view (degrees), as with ``view_dependent_left_and_right``."""
     front, back, overhead = THRESHOLDS.values()
     shifted = (float(azimuth) + 180) % 360 - 180
     if elevation > overhead:
@@ -124,9 +122,7 @@ def describe(attributes: Attributes, rng: np.random.Generator) -> str:
 def prompt_of(
     attributes: Attributes, elevation: float, azimuth: float, rng: np.random.Generator
 ) -> str:
-    """Write a training prompt of one view: empty, without a direction, or with it as the prompt
-    processors write it.
-    """
+    """Write a view's prompt: empty, without a direction, or with it as prompt processors do."""
     share = rng.random()
     if share < EMPTY_SHARE:
         return ""

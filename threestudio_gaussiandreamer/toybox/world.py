@@ -167,9 +167,7 @@ def _pattern_mask(pattern: str) -> np.ndarray:
 def _texture_coordinates(
     pattern: str, shape: Shape, roles: np.ndarray, like_body: np.ndarray, stretch: float
 ) -> Float[np.ndarray, "V 2"]:
-    """Return uv of each vertex: in the pattern for the body, and for parts ``like_body``; in their
-    colour's cell for others.
-    """
+    """Return each vertex's uv: in the pattern (body, ``like_body``), or in its colour's cell."""
     period = PERIOD.get(pattern, 1.0) * stretch
     body = roles == "body"
     height = shape.vertices[:, 2] - shape.vertices[body, 2].min()
@@ -184,10 +182,7 @@ def _texture_coordinates(
 
 
 def _inside(periods: Float[np.ndarray, " V"]) -> Float[np.ndarray, " V"]:
-    """Convert numbers of periods to shares of the texture, half a texel from its borders.
-
-    Negative ones are moved up by whole periods.
-    """
+    """Convert numbers of periods, also negative, to shares of the texture, half a texel inside."""
     periods = periods - min(0.0, np.floor(periods.min()))
     margin = 0.5 / SIZE
     return (periods / PERIODS).clip(margin, 1 - margin)

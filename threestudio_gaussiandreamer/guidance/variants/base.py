@@ -74,9 +74,7 @@ class Variant(BaseObject, ABC):
     def learn(
         self, guidance: Any, latents: Latents, condition: Any, batch: Batch, good: Good
     ) -> None:
-        """Train what the variant trains, after the residual of a training step has been computed;
-        ``good`` are the items whose residual is finite.
-        """
+        """Train the variant after a step's residual; ``good`` are the items with a finite one."""
 
     def report(self) -> dict[str, float]:
         """Return further numbers about the last step, to be logged."""
