@@ -108,6 +108,15 @@ class SaverMixin:
         self._log_file("Video", path, name, step)
         return path
 
+    def save_data(self, filename: str, data: Any) -> str:
+        """Save a dict of arrays as npz, anything else as npy."""
+        data = self.convert_data(data)
+        extension, save = (".npz", np.savez) if isinstance(data, dict) else (".npy", np.save)
+        path = self.get_save_path(filename.removesuffix(extension) + extension)
+        with atomic_file(path) as file:
+            save(file, **data) if isinstance(data, dict) else save(file, data)
+        return path
+
     def save_obj(
         self, filename: str, mesh: Any, save_vertex_color: bool = False, **unused: Any
     ) -> list[str]:
