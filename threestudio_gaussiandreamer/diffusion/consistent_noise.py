@@ -31,8 +31,6 @@ one, shifted.
 """
 OPAQUE = 0.5
 """Alpha below which a pixel belongs to the background."""
-EXPONENT = 0x7F800000
-"""Bits of the exponent of a float32: without the others, it is rounded down to a power of two."""
 
 
 def cell_values(channels: int, generator: torch.Generator) -> Float[Tensor, "c TABLE"]:
@@ -83,7 +81,7 @@ def cell_size(c2w: Float[Tensor, "B 4 4"], focal: Float[Tensor, " B"]) -> Float[
     """
     footprint = torch.linalg.vector_norm(c2w[:, :3, 3], dim=1) / focal
     bits = footprint.clamp_min_(1e-6).view(torch.int32)
-    return bits.bitwise_and_(EXPONENT).view(torch.float32)
+    return bits.bitwise_and_(0x7F800000).view(torch.float32)  # only the exponent
 
 
 def attached_noise(

@@ -48,9 +48,7 @@ def per_item(values: Float[Tensor, " B"], like: Tensor) -> Tensor:
 def sd_alphas_cumprod(
     num_train: int = 1000, *, beta_start: float = 0.00085, beta_end: float = 0.012
 ) -> Float[Tensor, " T"]:
-    """Compute abar of Stable Diffusion's "scaled linear" schedule, in which sqrt(beta) is linear in
-    t; float64.
-    """
+    """Return Stable Diffusion's abar, float64: sqrt(beta) is linear in t ("scaled linear")."""
     betas = torch.linspace(beta_start**0.5, beta_end**0.5, num_train, dtype=torch.float64) ** 2
     return torch.cumprod(1 - betas, dim=0)
 
@@ -99,9 +97,7 @@ def timesteps(
 
 
 def stratified_timesteps(batch: int, num_train: int, rng: torch.Generator) -> Int[Tensor, " B"]:
-    """Draw one timestep in each of ``batch`` equal ranges of [0, num_train - 1], in random order:
-    the loss of a batch varies less than with independent timesteps.
-    """
+    """Draw a timestep in each of ``batch`` equal ranges of [0, num_train - 1], in random order."""
     fractions = (torch.randperm(batch, generator=rng) + torch.rand(batch, generator=rng)) / batch
     return (fractions * num_train).long().clamp(max=num_train - 1)
 

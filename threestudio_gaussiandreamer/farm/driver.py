@@ -21,16 +21,10 @@ from .place import ASSETS, FAILED, FAILURE, FINISHED, STOPPED
 from .recipe import Job, repeat_command
 from .worker import BLOCKED, NO_MEMORY, REFUSED, Setting, Worker
 
-OBJECT_STORE_BYTES = 100 << 20
-"""Memory for what workers send each other: little."""
 LONGEST_FOLDER = 36
 """Characters of a temporary folder; the names of Ray's sockets then fit into the system's 107."""
-SECONDS_TO_ANSWER = 120
-"""How long workers may take to start."""
 POLL = 0.5
 """Seconds between two reads of the board, and longest wait for an outcome."""
-SECONDS_TO_STOP = 60
-"""How long workers may take to write their checkpoints when the farm is stopped."""
 SAME_ERRORS = 3
 """The farm ends if its first assets, this many, all fail with the same message."""
 
@@ -47,7 +41,7 @@ def connect(address: Optional[str]) -> Any:
     address = address or os.environ.get("RAY_ADDRESS") or "local"
     options: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
     if address == "local":
-        options |= {"include_dashboard": False, "object_store_memory": OBJECT_STORE_BYTES}
+        options |= {"include_dashboard": False, "object_store_memory": 100 << 20}
         if len(tempfile.gettempdir()) > LONGEST_FOLDER and os.path.isdir("/tmp"):
             os.environ.setdefault("RAY_TMPDIR", "/tmp")
     try:
@@ -101,7 +95,7 @@ def start_workers(ray: Any, count: int, gpus: int, setting: Setting) -> list[Any
     actor = ray.remote(**resources, **endless)(Worker)
     workers = [actor.remote() for _ in range(count)]
     try:
-        ray.get([worker.hello.remote(setting) for worker in workers], timeout=SECONDS_TO_ANSWER)
+        ray.get([worker.hello.remote(setting) for worker in workers], timeout=120)
     except ray.exceptions.RayError as error:
         needed = f"each machine needs threestudio-gaussiandreamer {__version__}: {error}"
         said = getattr(error, "cause", None) or needed
@@ -148,7 +142,7 @@ class Driver:
         except (KeyboardInterrupt, SystemExit):
             print("\nstopping: the workers write checkpoints; once more to stop at once")
             self.tell_board_to_stop()
-            deadline = time.monotonic() + SECONDS_TO_STOP
+            deadline = time.monotonic() + 60  # to write the checkpoints
             while self.running and time.monotonic() < deadline:
                 self.collect_ready()
             raise

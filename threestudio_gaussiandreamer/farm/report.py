@@ -20,8 +20,6 @@ from .rows import Row
 FOLDER, CSV, PARQUET = "report", "table.csv", "table.parquet"
 PER_PAGE = 200
 """Assets on one page of the gallery."""
-MOST_FAILURES = 1000
-"""Failures that the first page lists; the table has all."""
 BATCH = 5000
 """Rows of the table that are held in memory."""
 COLUMNS = (
@@ -54,7 +52,7 @@ def write_report(
             states.update(line["state"] for line in batch)
             seconds += sum(line["worker_seconds"] or 0.0 for line in batch)
             failures += [line for line in batch if line["state"] == FAILED]
-            del failures[MOST_FAILURES:]
+            del failures[1000:]  # the table has all
             finished += [line for line in batch if line["state"] == FINISHED]
             while len(finished) >= PER_PAGE or finished and not batch:
                 pages.append(f"page-{len(pages) + 1}.html")

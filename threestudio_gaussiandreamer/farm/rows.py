@@ -18,8 +18,6 @@ from ..launch.run_folder import safe_name
 COLUMNS = ("prompt", "name", "seed", "config", "overrides")
 MOST_LINE_BYTES = 32_768
 MOST_SEED = 2**32 - 1
-NOT_TEXT = ("Cc", "Cs", "Zl", "Zp")
-"""Unicode's categories of control characters, surrogates and line breaks."""
 
 
 class Row(NamedTuple):
@@ -88,7 +86,7 @@ def make_row(values: Mapping[str, Any], line: int = 0) -> Row:
     prompt, seed, name = (values.get(column) for column in ("prompt", "seed", "name"))
     if not isinstance(prompt, str) or not prompt.strip():
         raise UserError(f"the prompt is {prompt!r}; expected a text, such as 'a fox'")
-    if any(unicodedata.category(character) in NOT_TEXT for character in prompt):
+    if any(unicodedata.category(character) in ("Cc", "Cs", "Zl", "Zp") for character in prompt):
         raise UserError(f"the prompt {prompt[:80]!r} has a line break or a control character")
     verbatim(prompt := prompt.strip())  # refuses "???", which means that a value is missing
     if seed in (None, ""):

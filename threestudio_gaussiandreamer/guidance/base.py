@@ -185,8 +185,7 @@ class ScoreDistillation(BaseObject, ABC):
         """Return further numbers about the last step, to be logged."""
         return {}
 
-    # A step
-    # ----------------------------------------------------------------------------------------------
+    # A step ---------------------------------------------------------------------------------------
 
     def configure(self) -> None:
         self.alphas_cumprod = sds.sd_alphas_cumprod()
@@ -312,8 +311,7 @@ class ScoreDistillation(BaseObject, ABC):
         kept = {name: value for name, value in state.items() if not name.startswith("kept.")}
         self.variant.restore(self, kept)
 
-    # Predictions
-    # ----------------------------------------------------------------------------------------------
+    # Predictions ----------------------------------------------------------------------------------
 
     def predict_noise(self, z: Latents, t: Timesteps, condition: Any) -> Latents:
         """Predict the noise with guidance: that of ``guidance_scale`` for items inside of
@@ -387,8 +385,7 @@ class ScoreDistillation(BaseObject, ABC):
         cond, uncond = require_pair(f"{type(self).__name__}.predict", found, accepted, said)
         return cond.to(z), None if uncond is None else uncond.to(z)
 
-    # The noise of a step
-    # ----------------------------------------------------------------------------------------------
+    # The noise of a step --------------------------------------------------------------------------
 
     def abar_of(self, t: Int[Tensor, "*b"]) -> Float[Tensor, "*b"]:
         """Return abar of timesteps, on their device."""

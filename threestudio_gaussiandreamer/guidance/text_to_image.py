@@ -72,8 +72,6 @@ CONTRAST_FROM = 0.4
 """Smallest timestep, as a share of all, at which view contrast is applied."""
 TAKEN_SCALES = (1, 20)
 """Those that a network which takes the scale may know; latent consistency models' are 3 to 15."""
-SCALE_UNIT = 1000.0
-"""Factor of the scale in its embedding."""
 HALF_TYPES = {"float16": torch.float16, "bfloat16": torch.bfloat16}
 
 
@@ -382,7 +380,7 @@ class TextToImageDistillation(ScoreDistillation):
             return {}
         from diffusers.models.embeddings import get_timestep_embedding
 
-        w = SCALE_UNIT * torch.full((count,), scale - 1.0)
+        w = 1000.0 * torch.full((count,), scale - 1.0)
         embedding = get_timestep_embedding(w, self.scale_width, downscale_freq_shift=1)
         return {"timestep_cond": embedding.to(self.device, self.dtype)}
 

@@ -51,8 +51,6 @@ from .karras import SampledPrior, load_exactly, read_state_dict
 UPSAMPLED = 3072
 """Number of points that the upsampler adds."""
 HEAD_CHANNELS = 64
-IMAGE_CELLS = 256
-"""16 x 16 patches of the ViT-L/14 that the upsampler was trained with."""
 CHANNELS = 6
 """x, y, z, red, green, blue of a point; the networks give these and as many for the variance."""
 SCALES = torch.tensor([2.0] * 3 + [2 / 255] * 3)[:, None]
@@ -249,7 +247,7 @@ class Upsampler(PointTransformer):
         scaled = coarse * self.channel_scales[:, None] + self.channel_biases[:, None]
         tokens = [
             self.time_token(timesteps),
-            no_image.expand(-1, IMAGE_CELLS, -1),
+            no_image.expand(-1, 256, -1),  # 16 x 16 patches of ViT-L/14
             self.cond_point_proj(scaled.transpose(1, 2)),
         ]
         return self.transform(points, tokens)
@@ -267,9 +265,7 @@ def timestep_embedding(timesteps: Real[Tensor, " B"], width: int) -> Float[Tenso
 
 
 def load_network(kind: type[PointTransformer], path: str) -> Any:
-    """Load a network of this kind in evaluation mode; its sizes are those of the weights. Raise
-    UserError if the file can't be read, or is of another model.
-    """
+    """Load a frozen network of the weights' sizes; raise UserError if unreadable or another."""
     state = read_state_dict(path, kind.title)
     layers = len({name.split(".")[2] for name in state if name.startswith("backbone.resblocks.")})
     width, projection = len(state.get("ln_pre.weight", ())), state.get(kind.projection)

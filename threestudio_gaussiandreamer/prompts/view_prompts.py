@@ -33,9 +33,7 @@ THRESHOLDS = {"front_threshold": 45.0, "back_threshold": 45.0, "overhead_thresho
 
 
 class Direction(NamedTuple):
-    """One view direction. If a view satisfies the conditions of several directions, the last one in
-    :func:`view_directions` applies.
-    """
+    """A view direction; a view takes the last one in :func:`view_directions` that it satisfies."""
 
     name: str
     condition: Condition

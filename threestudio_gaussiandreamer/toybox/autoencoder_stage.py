@@ -18,8 +18,6 @@ from .loop import Stage, StepData, is_trained, normal
 from .views import DISTANCE, FOVY_DEG, Shard, Shards, render_gaussians, with_backgrounds
 
 RANDOM_BACKGROUNDS = 0.15
-SPLAT_SHARE = 0.2
-"""Fraction of the pictures that are renders of rough Gaussians."""
 FULL_EVERY = 4
 """One step in four trains on pictures of the full size, a quarter as many; the others on pictures
 of half the size. On crops, colours were learnt much more slowly.
@@ -41,7 +39,7 @@ def autoencoder_batch(
     rows = rows[: max(1, len(rows) // 4)] if full else rows
     shard = shards.get(index)
     rgba = shard.rgba[rows]
-    for place in np.flatnonzero(rng.uniform(size=len(rows)) < SPLAT_SHARE):
+    for place in np.flatnonzero(rng.uniform(size=len(rows)) < 0.2):
         rgba[place] = rough_render(shard, int(rows[place]), rng)
     images = with_backgrounds(rgba, rng, random_share=RANDOM_BACKGROUNDS)
     images = images if full else F.avg_pool2d(images, 2)

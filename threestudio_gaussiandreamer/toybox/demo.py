@@ -53,8 +53,6 @@ RECORD, SHEET, TABLE = "demo.json", "sheet.png", "table.md"
 STAGES = ("prior", "result", "2D model")
 LINE = 11
 """Pixels from line to line of the sheet's texts."""
-NAME_LENGTH, TABLE_LENGTH = 40, 60
-"""Of a prompt in the name of its folder and in the table, characters."""
 Stages = dict[str, tuple[Float[Tensor, "V 3 s s"], dict[str, float]]]
 """Pictures and scores of one prompt, by stage."""
 
@@ -88,7 +86,7 @@ def run(args: argparse.Namespace) -> int:
     root = output_folder(args.output, "--output")
     recognition.load_judge(args.models)  # a missing file is reported before the training
     claimed = open_folder(root, {key: vars(args)[key] for key in ("prompts", "options", "models")})
-    names = (re.sub(r"[^a-z0-9]+", "_", p.lower())[:NAME_LENGTH] for p in args.prompts)
+    names = (re.sub(r"[^a-z0-9]+", "_", p.lower())[:40] for p in args.prompts)
     try:
         runs = [claimed.path / "runs" / f"prompt{i}_{name}" for i, name in enumerate(names, 1)]
         for index in range(len(runs)):
@@ -264,7 +262,7 @@ def table(prompts: Sequence[str], runs: Sequence[Path], stages: Sequence[Stages]
             cells = ["" if math.isnan(value) else "yes" if value else "no" for value in found]
             rate = scores.get("multi_face", math.nan)
             took = f"{seconds:.0f}" if name == "result" else ""
-            text = textwrap.shorten(prompt, TABLE_LENGTH, placeholder=" ...").replace("|", "\\|")
+            text = textwrap.shorten(prompt, 60, placeholder=" ...").replace("|", "\\|")
             lines.append((text, name, *cells, "" if math.isnan(rate) else f"{rate:.0%}", took))
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 

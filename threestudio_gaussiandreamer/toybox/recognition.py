@@ -30,8 +30,6 @@ VERSION = 2
 ELEVATION_DEG = 15.0
 OFFSETS_DEG = (-22.5, 22.5)
 """Azimuths of a quadrant's two views, relative to its middle."""
-EXCHANGEABLE = ("striped", "checkered")
-"""Patterns that look alike with their two colours exchanged."""
 
 
 def load_judge(name: str) -> Judge:
@@ -77,7 +75,7 @@ def recognized(found: dict[str, Tensor], wanted: Attributes) -> dict[str, bool]:
         right[name] = most_probable == (getattr(wanted, name) or "none")
     pattern, *colors = most_probable_pattern(found)
     asked = [wanted.color, wanted.second or "none"]
-    exchanged = wanted.pattern in EXCHANGEABLE and colors == asked[::-1]
+    exchanged = wanted.pattern in ("striped", "checkered") and colors == asked[::-1]
     return {
         "kind": right["kind"],
         "colors": colors == asked or exchanged,
