@@ -421,7 +421,7 @@ def posed_vertices(model: BodyModel, fit: BodyFit) -> Float[np.ndarray, "F V 3"]
 
 
 def _placed(model: BodyModel, wanted: Float[Tensor, "F K 3"]) -> tuple[Tensor, Tensor]:
-    """Return rotations (axis-angle) and translations (F, 3) to the nearest trunk (Kabsch 1976)."""
+    """Return the axis-angles and translations (F, 3) to the nearest trunk (Kabsch 1976)."""
     from scipy.spatial.transform import Rotation
 
     joints = model.joint_regressor @ model.template
