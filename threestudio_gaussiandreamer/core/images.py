@@ -37,7 +37,7 @@ def rgb(
 
     Channels lie side by side, three by three; missing ones are black.
     """
-    image = {"HWC": image, "CHW": np.moveaxis(image, 0, -1)}[data_format]
+    image = np.moveaxis(np.asarray(image), {"HWC": -1, "CHW": 0}[data_format], -1)
     image = image if image.dtype == np.uint8 else _to_bytes(_normalize(image, data_range))
     missing = -image.shape[-1] % 3
     image = np.pad(image, ((0, 0), (0, 0), (0, missing)))

@@ -88,7 +88,7 @@ class Snapshots(pl.Callback):
         guided = guidance.predict_noise(z, t, condition)
         drawn = guidance.decode(sds.predict_x0(z, guided, abar).float()).float().clamp(0, 1)
         drawn = F.interpolate(drawn, render.shape[-2:], mode="bilinear", align_corners=False)
-        pair = [rgb_panel(image[0].movedim(0, -1)) for image in (render, drawn)]
+        pair = [rgb_panel(image[0].movedim(0, -1).cpu()) for image in (render, drawn)]
         images.write(self.folder / "picture.png", images.grid(pair))
         self.write(likeness=float(psnr(render, drawn)), pictures=self.status["pictures"] + 1)
 

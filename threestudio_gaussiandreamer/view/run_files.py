@@ -188,7 +188,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
         # a ``parsed.yaml`` has no aliases, which can expand without limit
         if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text, LOADER)):
             return {}
-        content = yaml.load(text, LOADER)
+        content = LOADER(text).get_single_data()
     except (ValueError, RecursionError, yaml.YAMLError):
         return {}
     return content if isinstance(content, dict) else {}
