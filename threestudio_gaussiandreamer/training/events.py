@@ -102,7 +102,7 @@ def score_panels(evaluated: Mapping[str, Any], size: tuple[int, int]) -> list[Pa
     """
     images = [evaluated[name][:1].movedim(-1, 1) for name in SCORE_PICTURES]
     images = [F.interpolate(x, size, mode="bilinear", align_corners=False) for x in images]
-    return [rgb_panel(image[0].movedim(0, -1).clamp(0, 1)) for image in images]
+    return [rgb_panel(image[0].movedim(0, -1).clamp(0, 1).cpu()) for image in images]
 
 
 def rgb_panel(image: Float[Tensor, "H W 3"]) -> Panel:
