@@ -7,7 +7,7 @@ details, which tell the front from the back. Sizes are arbitrary, since ``world.
 object to the same bounding sphere.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -26,6 +26,8 @@ class Anchors(NamedTuple):
     neck_radii: tuple[float, float]
     """Half axes of the scarf's ring."""
     neck_axis: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    cape: tuple[Shape, ...] = ()
+    """What a person wears as "cape"."""
 
 
 Model = tuple[list[Shape], Anchors]
@@ -44,6 +46,10 @@ class Proportions:
     def chance(self, share: float) -> bool:
         """Draw true with probability ``share``."""
         return bool(self._rng.random() < share)
+
+    def choice(self, names: Sequence[str]) -> str:
+        """Draw one of these."""
+        return names[int(self._rng.random() * len(names))]
 
 
 def eyes(x: float, y: float, z: float, radius: float) -> list[Shape]:
@@ -455,5 +461,6 @@ ACCESSORIES: dict[str, Callable[[Anchors, Proportions], list[Shape]]] = {
     "scarf": _scarf,
     "flag": _flag,
     "balloon": _balloon,
+    "cape": lambda anchors, p: list(anchors.cape),
 }
 """Each returns shapes, at its place on an object, of the role "accessory"."""

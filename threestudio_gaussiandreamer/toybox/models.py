@@ -19,6 +19,8 @@ UNET_CHANNELS = (96, 160)
 """At 16^2 and 8^2."""
 LATENT_CHANNELS = 4
 POINTS_WIDTH, POINTS_LAYERS = 128, 5
+MOTION_WIDTH, MOTION_LAYERS, MOTION_HIDDEN = 128, 4, 1024
+"""The last is that of every published MDM."""
 SCHEDULE = {
     "num_train_timesteps": 1000,
     "beta_start": 0.00085,

@@ -33,11 +33,12 @@ from .autoencoder_stage import AutoencoderStage
 from .clip_stage import TEXT_PARTS, ClipStage, TextStage
 from .judge_stage import SEED_OFFSET, JudgeStage, judge_shards
 from .loop import Options, Progress, Stage, Training, is_trained
+from .motion_stage import MotionStage
 from .points_stage import PointsStage
 from .unet_stage import LATENT_SCALE, UNetStage
 from .views import Shards
 
-IN_ORDER = TextStage, ClipStage, AutoencoderStage, UNetStage, PointsStage, JudgeStage
+IN_ORDER = TextStage, ClipStage, AutoencoderStage, UNetStage, PointsStage, MotionStage, JudgeStage
 STAGES: dict[str, type[Stage]] = {stage.name: stage for stage in IN_ORDER}
 """In the order of training: later ones need earlier ones."""
 RANGES = {
@@ -119,9 +120,10 @@ def train(
             interrupt(training.signum)
 
 
-def start_from(weights: Path, options: Options) -> None:
-    """Write a checkpoint for every stage of ``weights``, a folder that ``toybox.export`` wrote, of
-    which the training folder has none. Optimisers start without state, attribute classifiers at
+def start_from(weights: Path, options: Options, stages: Sequence[str]) -> None:
+    """Write a checkpoint for each of these stages of ``weights``, a folder that ``toybox.export``
+    wrote, of which the training folder has none. Optimisers start without state; the attribute
+    classifiers, which aren't published, and words and classes that the weights don't have, start at
     random.
 
     Raises:
@@ -130,17 +132,16 @@ def start_from(weights: Path, options: Options) -> None:
     with reading(weights / RECORD, "record of the toybox's weights") as path:
         record = {name: dict(seen) for name, seen in json.loads(path.read_bytes()).items()}
         require(bool(record), "it names no network")
-    if not (options.folder / "tokenizer" / tokens.SETTINGS).is_file():
-        source = weights / "stable-diffusion" / "tokenizer"
-        existing_file(source / tokens.SETTINGS, "tokenizer")
-        tokens.copy_tokenizer(source, options.folder / "tokenizer")
-    for name in (name for name in STAGES if name in record):
+    vocabulary = read_json(existing_file(weights / "clip/vocab.json", "vocabulary"), dict)
+    known = tokens.open_tokenizer(options.folder).get_vocab()
+    tokens_kept = [(known[token], row) for token, row in vocabulary.items() if token in known]
+    for name in (name for name in STAGES if name in record and name in stages):
         if is_trained(options.folder, name):
             continue
         training, seen = Training(STAGES[name](options)), record[name]
         try:
-            state, classified = read_weights(weights, name), name in ("text", "clip")
-            training.model.load_state_dict(state, strict=not classified)
+            state = grown(read_weights(weights, name), training.model.state_dict(), tokens_kept)
+            training.model.load_state_dict(state, strict=name in ("autoencoder", "unet", "points"))
             if name == "unet":
                 vae = read_json(weights / "stable-diffusion/vae/config.json", dict)
                 training.stage.constants[LATENT_SCALE] = float(vae["scaling_factor"])
@@ -159,6 +160,23 @@ def start_from(weights: Path, options: Options) -> None:
             earlier=seen["trainings"],
         )
         training.save()
+
+
+def grown(
+    state: dict[str, Tensor], own: dict[str, Tensor], tokens_kept: Sequence[tuple[int, int]]
+) -> dict[str, Tensor]:
+    """Return weights with the rows that a larger network has more, from its own weights: those of
+    new tokens, and of classes, which are appended.
+    """
+    found = dict(state)
+    for name, value in state.items():
+        target = own.get(name, value)
+        if target.shape[1:] == value.shape[1:] and len(target) > len(value):
+            found[name] = target.clone()
+            count = [(row, row) for row in range(len(value))]
+            to, of = zip(*(tokens_kept if "token_embedding" in name else count), strict=True)
+            found[name][list(to)] = value[list(of)]
+    return found
 
 
 def read_weights(weights: Path, name: str) -> dict[str, Tensor]:
@@ -186,7 +204,7 @@ def run(args: argparse.Namespace) -> None:
         workers = min(args.workers, os.cpu_count() or 1)
         render_shards([options.shards, *of_judge], options.pool, workers)
     if args.from_weights:
-        start_from(args.from_weights, options)
+        start_from(args.from_weights, options, args.stages)
     train(options, args.stages, args.images, 60 * args.minutes)
 
 

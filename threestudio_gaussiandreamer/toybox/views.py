@@ -21,8 +21,10 @@ from ..core.streams import numpy_generator
 from ..meshes.mesh import Mesh, sample_surface, surface_colors
 from ..meshes.raycast import MeshCaster
 from ..splatting import rasterize
-from .kinds import ACCESSORIES, KINDS
-from .world import COLORS, PATTERNS, VERSION, Attributes, draw_attributes, object_mesh
+from . import motions
+from .kinds import KINDS
+from .world import COLORS, PATTERNS, PERSON, THINGS_WORN, VERSION, Attributes
+from .world import draw_attributes, object_mesh
 
 SIZE = 128
 """Height and width of the pictures, pixels."""
@@ -39,13 +41,14 @@ HELD_OUT_OBJECTS = 64
 """Number of objects for evaluation, which are withheld from training."""
 
 LABELS: dict[str, tuple[str, ...]] = {
-    "kind": tuple(KINDS),
+    "kind": (*KINDS, PERSON),
     "color": tuple(COLORS),
     "pattern": PATTERNS,
     "second": (*COLORS, "none"),
     "part": (*COLORS, "none"),
-    "accessory": (*ACCESSORIES, "none"),
+    "accessory": (*THINGS_WORN, "none", "cape"),
     "accessory_color": (*COLORS, "none"),
+    "action": ("none", *motions.names()),
     "quadrant": ("front", "left", "back", "right"),
 }
 """The classes of what classifiers recognise: :class:`Attributes`, and the side that is shown."""

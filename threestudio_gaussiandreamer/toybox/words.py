@@ -9,6 +9,7 @@ from typing import Optional
 import numpy as np
 
 from ..prompts.view_prompts import THRESHOLDS
+from . import motions
 from .world import COLORS, Attributes
 
 NOUNS: dict[str, tuple[str, ...]] = {
@@ -28,6 +29,7 @@ NOUNS: dict[str, tuple[str, ...]] = {
     "chair": ("chair", "seat"),
     "mushroom": ("mushroom", "toadstool"),
     "robot": ("robot", "android"),
+    "person": ("person", "man", "woman"),
 }
 COLOR_WORDS: dict[str, tuple[str, ...]] = {
     "red": ("red", "scarlet", "crimson"),
@@ -57,6 +59,7 @@ PARTS: dict[str, str] = {
     "chair": "cushion",
     "mushroom": "stem",
     "robot": "head",
+    "person": "trousers",
 }
 """The word for the role "part" of each kind."""
 PLURALS = ("ears", "wings", "legs")
@@ -65,7 +68,10 @@ ACCESSORY_WORDS: dict[str, tuple[str, ...]] = {
     "scarf": ("scarf", "ribbon"),
     "flag": ("flag", "banner"),
     "balloon": ("balloon",),
+    "cape": ("cape", "cloak"),
 }
+CLOTHES = {"shirt": ("shirt", "jacket"), "trousers": ("trousers", "pants")}
+"""Words of a person's upper and lower half."""
 OPENINGS = *["a {}"] * 3, "a toy {}", "a small {}", "a photo of a {}", "a 3d model of a {}", "{}"
 """Templates for the object's description; "a {}" is drawn most often."""
 OPPOSITE = {
@@ -97,6 +103,8 @@ def direction(elevation: float, azimuth: float) -> str:
 
 def describe(attributes: Attributes, rng: np.random.Generator) -> str:
     """Write a prompt for the object, without a direction."""
+    if attributes.action:
+        return _describe_person(attributes, rng)
     noun = _pick(NOUNS[attributes.kind], rng)
     color = _color(attributes.color, rng)
     opening = _pick(OPENINGS, rng)
@@ -117,6 +125,53 @@ def describe(attributes: Attributes, rng: np.random.Generator) -> str:
         joint = " and" if " with " in text and verb == "with" else f" {verb}"
         text = f"{text}{joint} a {_color(attributes.accessory_color, rng)} {name}"
     return re.sub(r"\ba (?=[aeio])", "an ", text)
+
+
+def _describe_person(a: Attributes, rng: np.random.Generator) -> str:
+    """Write "a person in a red shirt and blue trousers kicks with the left leg"."""
+    upper, lower = (_pick(words, rng) for words in CLOTHES.values())
+    worn = [f"a {_color(a.color, rng)} {upper}", f"{_color(a.part, rng)} {lower}"]
+    if a.accessory:
+        name = _pick(ACCESSORY_WORDS[a.accessory], rng)
+        worn.insert(int(rng.integers(3)), f"a {_color(a.accessory_color, rng)} {name}")
+    dressed = f"{', '.join(worn[:-1])} and {worn[-1]}"
+    subject = f"{_pick(OPENINGS, rng).format(_pick(NOUNS[a.kind], rng))}"
+    does = motion_of(a.action, rng)
+    joint = _pick(("in", "in", "wearing"), rng)
+    if rng.random() < 0.25:
+        text = f"{subject} {does} {joint} {dressed}"
+    else:
+        text = f"{subject} {joint} {dressed} {does}"
+    return re.sub(r"\ba (?=[aeio])", "an ", text)
+
+
+def motion_of(action: str, rng: np.random.Generator) -> str:
+    """Write what a person does: "kicks with the left leg", "kicking the left leg"."""
+    name, side = motions.split(action)
+    phrase = _pick(motions.ACTIONS[name].phrases, rng).format(side)
+    verb, _, rest = phrase.partition(" ")
+    if rng.random() < 0.25:
+        verb = PROGRESSIVE[verb]
+    return f"{verb} {rest}".rstrip()
+
+
+PROGRESSIVE = {
+    "stands": "standing", "opens": "opening", "is": "standing", "holds": "holding",
+    "raises": "raising", "lifts": "lifting", "waves": "waving", "points": "pointing",
+    "punches": "punching", "kicks": "kicking", "walks": "walking", "runs": "running",
+    "sits": "sitting", "squats": "squatting", "crouches": "crouching", "jumps": "jumping",
+    "bows": "bowing", "takes": "taking",
+}  # fmt: skip
+
+
+ACTION_PHRASES: dict[str, str] = {}
+"""The action of each phrase, in both forms of its verb."""
+for _action in motions.names():
+    _name, _side = motions.split(_action)
+    for _phrase in motions.ACTIONS[_name].phrases:
+        _verb, _, _rest = _phrase.format(_side).partition(" ")
+        for _form in (_verb, PROGRESSIVE[_verb]):
+            ACTION_PHRASES[f"{_form} {_rest}".rstrip()] = _action
 
 
 def prompt_of(
@@ -141,6 +196,7 @@ def vocabulary() -> list[str]:
     named = [*NOUNS.values(), *COLOR_WORDS.values(), *ACCESSORY_WORDS.values()]
     phrases = [*COLORS, *PARTS.values(), *OPENINGS, *(word for n in named for word in n)]
     phrases += [*OPPOSITE, "backside view of , an with and wearing half below above bottom top"]
+    phrases += ["someone in", *CLOTHES["shirt"], *CLOTHES["trousers"], *ACTION_PHRASES]
     phrases += ["two tone striped stripes dotted dots spots polka spotted checkered checks"]
     return sorted(set(re.findall(r"[a-z]+|\d|,", " ".join(phrases))))
 
@@ -194,6 +250,13 @@ def attributes_in(prompt: str) -> Optional[Attributes]:
     kind = next((meaning for role, meaning in words if role == "kind"), None)
     part = _colored(words, "part", PARTS.get(kind, ""))
     accessory = _colored(words, "accessory")
+    action = next((meaning for role, meaning in words if role == "action"), None)
+    if action and kind == "person":
+        shirt = _colored(words, "shirt")[2]
+        return shirt and Attributes(
+            kind, shirt, part=part[2] or shirt, accessory=accessory[1],
+            accessory_color=accessory[2], action=action,
+        )  # fmt: skip
     rest = [word for i, word in enumerate(words) if i not in (part[0], accessory[0])]
     colors, patterns = ([m for role, m in rest if role == of] for of in ("color", "pattern"))
     if kind is None or not colors:
@@ -238,5 +301,8 @@ MEANINGS: dict[str, Word] = (
     | _synonyms("accessory", ACCESSORY_WORDS)
     | _synonyms("pattern", PATTERN_WORDS)
     | {part: ("part", part) for part in PARTS.values()}
+    | _synonyms("shirt", {"shirt": CLOTHES["shirt"]})
+    | _synonyms("part", {"trousers": CLOTHES["trousers"]})
+    | {phrase: ("action", action) for phrase, action in ACTION_PHRASES.items()}
 )
 PHRASES = sorted(MEANINGS, key=len, reverse=True)

@@ -15,10 +15,12 @@ from jaxtyping import Float
 
 from ..core.streams import numpy_generator
 from ..meshes.mesh import Mesh
+from . import motions
 from .kinds import ACCESSORIES, KINDS, Proportions
+from .people import posed_person
 from .shapes import Shape, joined
 
-VERSION = 2
+VERSION = 3
 """Changes with the objects of a (seed, index), so that no training reads pictures of others."""
 RADIUS = 0.8
 """Of the bounding sphere of all objects, world units: as large as Point-E's at a scale of 1.6."""
@@ -41,6 +43,9 @@ DETAILS: dict[str, tuple[float, float, float]] = {
     "pale": (0.93, 0.92, 0.88),
     "warm": (0.93, 0.47, 0.16),
     "glass": (0.63, 0.82, 0.94),
+    "skin": (0.93, 0.72, 0.58),
+    "tan": (0.62, 0.42, 0.29),
+    "hair": (0.36, 0.21, 0.12),
 }
 """Colours of details that prompts never mention."""
 PATTERNS = ("plain", "striped", "dotted", "checkered", "two-tone")
@@ -55,6 +60,10 @@ PERIODS = 16
 PERIOD = {"striped": 0.34, "dotted": 0.34, "checkered": 0.46}
 """Length of a pattern's period before objects are scaled to RADIUS."""
 WITHHELD_SHARE = 0.04
+THINGS_WORN = [name for name in ACCESSORIES if name != "cape"]
+"""Accessories of objects that are no persons."""
+PERSON, PERSON_SHARE = "person", 0.3
+"""The kind that has an action, and the share of all objects that are persons."""
 
 
 class Attributes(NamedTuple):
@@ -69,6 +78,8 @@ class Attributes(NamedTuple):
     """The colour of the kind's part (a roof, a handle, ...); None = the body's."""
     accessory: Optional[str] = None
     accessory_color: Optional[str] = None
+    action: Optional[str] = None
+    """What a person does: one of ``motions.names()``."""
 
 
 def draw_attributes(seed: int, index: int, *, held_out: bool = False) -> Attributes:
@@ -84,13 +95,24 @@ def _draw(rng: np.random.Generator) -> Attributes:
     colors = [list(COLORS)[i] for i in rng.permutation(len(COLORS))]
     pattern = "plain" if rng.random() < 0.4 else str(rng.choice(PATTERNS[1:]))
     extra = str(rng.choice(["none", "part", "accessory"], p=[0.35, 0.25, 0.4]))
+    kind = str(rng.choice(list(KINDS)))
+    accessory = str(rng.choice(THINGS_WORN)) if extra == "accessory" else None
+    if rng.random() < PERSON_SHARE:
+        return Attributes(
+            PERSON,
+            colors[0],
+            part=colors[1],
+            accessory=(worn := (None, None, "hat", "cape")[int(rng.integers(4))]),
+            accessory_color=colors[2] if worn else None,
+            action=str(rng.choice(motions.names())),
+        )
     return Attributes(
-        kind=str(rng.choice(list(KINDS))),
+        kind=kind,
         color=colors[0],
         pattern=pattern,
         second=colors[1] if pattern != "plain" else None,
         part=colors[2] if extra == "part" else None,
-        accessory=str(rng.choice(list(ACCESSORIES))) if extra == "accessory" else None,
+        accessory=accessory,
         accessory_color=colors[2] if extra == "accessory" else None,
     )
 
@@ -102,6 +124,8 @@ def withheld(attributes: Attributes) -> bool:
     are never withheld, since the words are learnt from them.
     """
     extra = attributes.accessory or ("part" if attributes.part else "none")
+    if attributes.action:
+        extra = f"{extra}/{attributes.part}/{attributes.action}"
     if attributes.pattern == "plain" and extra == "none":
         return False
     name = f"{attributes.kind}/{attributes.color}/{attributes.pattern}/{extra}"
@@ -112,7 +136,10 @@ def withheld(attributes: Attributes) -> bool:
 def object_mesh(attributes: Attributes, rng: np.random.Generator) -> Mesh:
     """Make an object's mesh with random proportions, a texture and baked light."""
     proportions = Proportions(rng)
-    shapes, anchors = KINDS[attributes.kind](proportions)
+    if attributes.action:
+        shapes, anchors = posed_person(proportions, attributes.action, rng)
+    else:
+        shapes, anchors = KINDS[attributes.kind](proportions)
     if attributes.accessory:
         shapes += ACCESSORIES[attributes.accessory](anchors, proportions)
     shape, names = joined(shapes)

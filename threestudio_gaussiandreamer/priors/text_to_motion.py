@@ -1,0 +1,205 @@
+"""Text to motion with MDM (Tevet et al. 2022, "Human Motion Diffusion Model"), from the files that
+its authors publish: ``model*.pt`` with ``args.json`` and the mean and deviation of HumanML3D's
+features beside it.
+
+The network is written from the architecture that the checkpoints fix: a transformer encoder whose
+first token is the sum of the timestep's and the text's embedding, and which predicts the clean
+features. Its text features are those of a CLIP, which isn't part of the file."""
+
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from ..core.errors import UserError
+from ..core.files import existing_file
+from ..formats.array_files import read_arrays
+from .karras import cosine_alphas_cumprod, load_exactly, read_state_dict
+
+FEATURES, HEADS, POSITIONS = 263, 4, 512
+KIND = "MDM checkpoint"
+STATISTICS = ("t2m_mean.npy", "t2m_std.npy"), ("Mean.npy", "Std.npy")
+"""Names of the files with the mean and the standard deviation, in MDM's folder or HumanML3D's."""
+SUPPORTED = {"dataset": "humanml", "arch": "trans_enc", "text_encoder_type": "clip",
+             "noise_schedule": "cosine"}  # fmt: skip
+"""What ``args.json`` must say where it says it."""
+GUIDANCE_SCALE, STEPS, FRAMES = 2.5, 50, 60
+"""MDM's guidance, at most so many steps of the sampler, and frames at 20 per second."""
+
+
+class MotionModel(nn.Module):
+    """Predict clean features from noisy ones; names are those of MDM's checkpoints."""
+
+    def __init__(self, width: int, layers: int, hidden: int, text: int) -> None:
+        super().__init__()
+        self.input_process = nn.ModuleDict({"poseEmbedding": nn.Linear(FEATURES, width)})
+        layer = nn.TransformerEncoderLayer(width, HEADS, hidden, dropout=0.1, activation="gelu")
+        self.seqTransEncoder = nn.TransformerEncoder(layer, layers, enable_nested_tensor=False)
+        embed = nn.Sequential(nn.Linear(width, width), nn.SiLU(), nn.Linear(width, width))
+        self.embed_timestep = nn.ModuleDict({"time_embed": embed})
+        self.embed_text = nn.Linear(text, width)
+        self.output_process = nn.ModuleDict({"poseFinal": nn.Linear(width, FEATURES)})
+        self.register_buffer("positions", sinusoids(POSITIONS, width), persistent=False)
+
+    def forward(
+        self, x: Float[Tensor, "B T 263"], t: Tensor, text: Float[Tensor, "B D"]
+    ) -> Float[Tensor, "B T 263"]:
+        """Return the clean features; zeros as ``text`` for no prompt."""
+        first = self.embed_timestep["time_embed"](self.positions[t]) + self.embed_text(text)
+        tokens = torch.cat([first[:, None], self.input_process["poseEmbedding"](x)], 1)
+        tokens = (tokens + self.positions[: tokens.shape[1]]).transpose(0, 1)
+        return self.output_process["poseFinal"](self.seqTransEncoder(tokens)[1:].transpose(0, 1))
+
+
+def sinusoids(count: int, width: int) -> Float[Tensor, "count width"]:
+    """Return sines and cosines in turn (Vaswani et al. 2017)."""
+    rates = torch.exp(torch.arange(0, width, 2) * (-math.log(10000.0) / width))
+    angles = torch.arange(count)[:, None] * rates
+    return torch.stack([angles.sin(), angles.cos()], -1).flatten(1)
+
+
+class TextToMotion(NamedTuple):
+    """A model with what it is sampled with."""
+
+    network: MotionModel
+    steps: int
+    """Timesteps of its training."""
+    mean: Float[np.ndarray, "263"]
+    std: Float[np.ndarray, "263"]
+
+
+def load_motion_model(path: str) -> TextToMotion:
+    """Load MDM's checkpoint with the files beside it.
+
+    Raises:
+        UserError: a file is missing or damaged, or the model is of another kind.
+    """
+    file = existing_file(path, KIND)
+    args = _arguments(file)
+    state = read_state_dict(path, KIND)
+    state = {name: v for name, v in state.items() if not name.endswith("sequence_pos_encoder.pe")}
+    layers = len({n.split(".")[2] for n in state if n.startswith("seqTransEncoder.layers.")})
+    first = state.get("input_process.poseEmbedding.weight", torch.zeros(0, 0))
+    text = state.get("embed_text.weight", torch.zeros(0, 0))
+    hidden = len(state.get("seqTransEncoder.layers.0.linear1.weight", ()))
+    width = len(first)
+    if first.shape[1:] != (FEATURES,) or not layers or len(text) != width or width % HEADS:
+        raise UserError(
+            f"{KIND} {path!r} holds another model: one of HumanML3D's {FEATURES} features with "
+            "CLIP's text was expected, such as humanml_trans_enc_512"
+        )
+    network = MotionModel(width, layers, hidden, text.shape[1])
+    load_exactly(network, state, f"{KIND} {path!r}")
+    mean, std = _statistics(file.parent)
+    return TextToMotion(network.eval().requires_grad_(False), args["diffusion_steps"], mean, std)
+
+
+def _arguments(file: Path) -> dict[str, Any]:
+    path = existing_file(file.parent / "args.json", "settings of the MDM checkpoint")
+    try:
+        args = json.loads(path.read_text(encoding="utf-8"))
+        args["diffusion_steps"] = steps = int(args.get("diffusion_steps", 1000))
+    except (ValueError, TypeError, AttributeError) as error:
+        raise UserError(f"settings of the MDM checkpoint {str(path)!r} are damaged") from error
+    for name, value in SUPPORTED.items():
+        if args.get(name, value) != value:
+            raise UserError(f"{str(path)!r}: {name} is {args[name]!r}; only {value!r} is supported")
+    if not 2 <= steps <= POSITIONS * 8:
+        raise UserError(f"{str(path)!r}: diffusion_steps is {steps}; expected 2 to {POSITIONS * 8}")
+    return args
+
+
+def _statistics(folder: Path) -> tuple[np.ndarray, np.ndarray]:
+    for pair in STATISTICS:
+        if all((folder / name).is_file() for name in pair):
+            found = [
+                read_arrays(folder / name, "statistics of motions", ["array"]) for name in pair
+            ]
+            mean, std = (f["array"].astype(np.float64) for f in found)
+            if mean.shape == std.shape == (FEATURES,) and np.isfinite([mean, std]).all():
+                return mean, np.maximum(std, 1e-8)
+            raise UserError(
+                f"{pair[0]} and {pair[1]} in {str(folder)!r}: expected {FEATURES} numbers each"
+            )
+    raise UserError(
+        f"{str(folder)!r} has no {' or '.join(pair[0] for pair in STATISTICS)} with its standard "
+        "deviation: copy t2m_mean.npy and t2m_std.npy from MDM's dataset folder to the checkpoint"
+    )
+
+
+@torch.no_grad()
+def sample_motions(
+    model: TextToMotion,
+    text: Float[Tensor, "1 D"],
+    count: int,
+    generator: torch.Generator,
+    *,
+    frames: int = FRAMES,
+) -> Float[np.ndarray, "S T 22 3"]:
+    """Draw ``count`` motions for a text: ancestral steps (Ho et al. 2020) over at most ``STEPS`` of
+    the timesteps, with classifier-free guidance. Metres, y up.
+    """
+    network, device = model.network, text.device
+    kept = np.unique(np.linspace(0, model.steps - 1, min(STEPS, model.steps)).round().astype(int))
+    abar = cosine_alphas_cumprod(model.steps)[kept]
+    shape = (count, frames, FEATURES)
+    x = torch.randn(shape, generator=generator).to(device)
+    both = torch.cat([text.expand(count, -1), torch.zeros(count, text.shape[1], device=device)])
+    for i in range(len(kept) - 1, -1, -1):
+        t = torch.full((2 * count,), int(kept[i]), device=device)
+        given, none = network(torch.cat([x, x]), t, both).chunk(2)
+        clean = none + GUIDANCE_SCALE * (given - none)
+        before = abar[i - 1] if i else 1.0
+        beta = 1 - abar[i] / before
+        # the mean and the variance of q(z before | z now, clean)
+        towards = math.sqrt(before) * beta / (1 - abar[i])
+        stay = math.sqrt(1 - beta) * (1 - before) / (1 - abar[i])
+        x = towards * clean + stay * x
+        if i:
+            fresh = torch.randn(shape, generator=generator).to(device)
+            x = x + math.sqrt(beta * (1 - before) / (1 - abar[i])) * fresh
+    return positions_of(x.double().cpu().numpy() * model.std + model.mean)
+
+
+def positions_of(features: Float[np.ndarray, "S T 263"]) -> Float[np.ndarray, "S T 22 3"]:
+    """Return the joints of HumanML3D's features (Guo et al. 2022): 0 is half the angle by which the
+    heading turns to the next frame, 1 and 2 the pelvis' velocity on the ground in the next frame's
+    heading, 3 its height, 4 to 66 the other joints relative to the pelvis' place on the ground.
+    """
+    turns = np.cumsum(features[..., :-1, 0], axis=-1)
+    half = np.concatenate([np.zeros_like(turns[..., :1]), turns], -1)
+    sine, cosine = np.sin(-2 * half), np.cos(-2 * half)  # from the heading's axes to the world's
+
+    def turned(x: np.ndarray, z: np.ndarray, s: np.ndarray, c: np.ndarray) -> tuple:
+        return c * x + s * z, c * z - s * x
+
+    steps = turned(features[..., :-1, 1], features[..., :-1, 2], sine[..., 1:], cosine[..., 1:])
+    x, z = (np.concatenate([np.zeros_like(s[..., :1]), np.cumsum(s, -1)], -1) for s in steps)
+    local = features[..., 4:67].reshape(*features.shape[:-1], 21, 3)
+    there = turned(local[..., 0], local[..., 2], sine[..., None], cosine[..., None])
+    found = np.stack([there[0] + x[..., None], local[..., 1], there[1] + z[..., None]], -1)
+    pelvis = np.stack([x, features[..., 3], z], -1)
+    return np.concatenate([pelvis[..., None, :], found], -2)
+
+
+def mdm_files(network: MotionModel, steps: int) -> tuple[Mapping[str, Tensor], dict[str, Any]]:
+    """Return the state dict and the settings as MDM's authors publish them."""
+    empty = torch.zeros(1, 1, network.embed_text.out_features)
+    places = ("sequence_pos_encoder.pe", "embed_timestep.sequence_pos_encoder.pe")
+    layer = network.seqTransEncoder.layers[0]
+    args = SUPPORTED | {
+        "latent_dim": network.embed_text.out_features,
+        "layers": len(network.seqTransEncoder.layers),
+        "ff_size": layer.linear1.out_features,
+        "diffusion_steps": steps,
+        "cond_mask_prob": 0.1,
+        "emb_trans_dec": False,
+        "sigma_small": True,
+    }
+    return network.state_dict() | dict.fromkeys(places, empty), args
