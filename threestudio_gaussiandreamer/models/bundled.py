@@ -19,6 +19,7 @@ RECORD, DIGESTS = "training.json", "SHA256SUMS"
 LINE = re.compile(rb"([0-9a-f]{64})  (.+)")
 DIFFUSION, CLIP = "stable-diffusion", "clip"
 POINTS, JUDGE = "points.safetensors", "judge.safetensors"
+MOTION, BODY = "motion/model.pt", "body.npz"
 WORDS_FILE = "tokenizer/words.txt"
 """Where a model may list the words that it was trained on; published models have no such file."""
 REINSTALL = (
@@ -33,8 +34,8 @@ EXPORT_AGAIN = (
 
 
 def model_part(name: str, part: str) -> str:
-    """Return the path of a part, DIFFUSION, CLIP, POINTS or JUDGE, if ``name`` is the bundled
-    models or an export, else ``name``. Raise UserError if a file is missing or damaged.
+    """Return the path of a part, DIFFUSION, CLIP, POINTS ..., if ``name`` is the bundled models or an
+    export, else ``name``. Raise UserError if a file is missing or damaged.
     """
     if name == NAME:
         require_intact(FOLDER, part)

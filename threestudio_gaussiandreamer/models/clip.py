@@ -55,6 +55,14 @@ def text_condition(tokenizer: Any, encoder: Any, text: str) -> Float[Tensor, "1 
     return features / features.norm(dim=-1, keepdim=True) * features.shape[-1] ** 0.5
 
 
+@torch.no_grad()
+def text_features(source: Source, text: str) -> Float[Tensor, "1 D"]:
+    """Return the text's features as the encoder gives them, of any length, on the CPU."""
+    folder = locate(source)
+    encoder = load_text_encoder(folder)
+    return encoder(token_ids(load_tokenizer(folder), text)).text_embeds.float()
+
+
 class PictureText:
     """Load a CLIP with both encoders and compute similarities of pictures and texts."""
 

@@ -43,6 +43,7 @@ the whole body is placed, then the pose is fitted under a strong prior, then und
 
 import math
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, ClassVar, List, NamedTuple, Optional
 
 import numpy as np
@@ -63,16 +64,21 @@ from ..host import info, register, warn
 from ..meshes.load import load_mesh
 from ..meshes.mesh import Mesh
 from ..meshes.raycast import MeshCaster, over_background
-from ..models.clip import clip_source, picture_similarities
-from ..models.hub import locate
+from ..models.bundled import BODY, MOTION, model_part
+from ..models.clip import clip_source, picture_similarities, text_features
+from ..models.hub import Source, locate
 from .base import COLOR, SCALE, Prior, points
 from .body_pose import BODY_JOINTS, JOINTS, require_frame, world_mesh
+from .karras import torch_generator
 from .mesh import centred, colored_cloud, face_normals
 from .motion_text import reduced_prompt
+from .text_to_motion import load_motion_model, sample_motions
 
 VIEW_AZIMUTHS = (-40.0, 0.0, 40.0)
 VIEW_ELEVATION, VIEW_DISTANCE, VIEW_FOVY = 10.0, 3.2, math.radians(40)
 PICTURE_SIZE = 224
+MDM_CLIP, SAMPLES = "openai/clip-vit-base-patch32", 3
+"""The CLIP that MDM was trained with, and how many motions are drawn."""
 NUM_FRAMES = 16
 """Frames of each motion that CLIP chooses from, evenly spaced."""
 ROUGH, FINE = 80, 300
@@ -182,8 +188,13 @@ class MotionPrior(Prior):
             for path in cfg.candidates:
                 existing_file(path, "body mesh")
         else:
-            read_motions(cfg.motion)
-            load_body_model(cfg.body_model)
+            if is_model(name := model_part(cfg.motion, MOTION)):
+                load_motion_model(name)
+                require_extra("diffusion", "transformers")
+                locate(motion_clip(cfg.motion, name), download=False)
+            else:
+                read_motions(cfg.motion)
+            load_body_model(model_part(cfg.body_model, BODY))
             require_extra("smpl", "smplx")
         if len(cfg.candidates) > 1 if cfg.candidates else cfg.frame == "clip":
             require_extra("diffusion", "transformers")
@@ -197,13 +208,29 @@ class MotionPrior(Prior):
             info(f"body: {paths[best]}")
             body = meshes[best]
         else:
-            body = self._body_of_motion(prompt)
+            body = self._body_of_motion(prompt, generator)
         return centred(colored_cloud(body, self.cfg, generator))
 
-    def _body_of_motion(self, prompt: str) -> Mesh:
+    def _motions(self, prompt: str, generator: np.random.Generator) -> Motions:
+        """Return the motions of the file, or those that its model draws for the prompt."""
+        name = model_part(self.cfg.motion, MOTION)
+        if not is_model(name):
+            return read_motions(name)
+        text = self.cfg.motion_text or reduced_prompt(prompt)
+        if text is None:
+            raise UserError(
+                f"no verb of motion was found in {prompt!r}: set motion_text, for instance to "
+                "'Someone stands with open arms'"
+            )
+        model = load_motion_model(name)
+        features = text_features(motion_clip(self.cfg.motion, name), text)
+        positions = sample_motions(model, features, SAMPLES, torch_generator(generator))
+        return Motions(positions, [text] * SAMPLES, [positions.shape[1]] * SAMPLES)
+
+    def _body_of_motion(self, prompt: str, generator: np.random.Generator) -> Mesh:
         """Return the body of the chosen frame, with z up, facing +x, centred and scaled."""
-        cfg, motions = self.cfg, read_motions(self.cfg.motion)
-        model = load_body_model(cfg.body_model)
+        cfg, motions = self.cfg, self._motions(prompt, generator)
+        model = load_body_model(model_part(cfg.body_model, BODY))
         choices = offered_frames(motions, cfg.sample, cfg.frame)
         targets = np.stack([motions.positions[choice] for choice in choices])
         names = [f"motion {sample}, frame {frame}" for sample, frame in choices]
@@ -244,6 +271,20 @@ class MotionPrior(Prior):
         found = (f"{name} {score:.4f}" for name, score in zip(names, scores, strict=True))
         info(f"CLIP for {text!r}: {', '.join(found)}")
         return int(scores.argmax())
+
+
+def is_model(motion: str) -> bool:
+    """Return whether a file is MDM's checkpoint, and not of motions."""
+    return Path(motion).suffix == ".pt"
+
+
+def motion_clip(motion: str, path: str) -> Source:
+    """Return the CLIP whose text features a motion model takes: that of the same export of the
+    toybox, or the published models' own.
+    """
+    return clip_source(
+        MDM_CLIP if path == motion else motion, option="system.geometry.prior.motion"
+    )
 
 
 def offered_frames(motions: Motions, sample: Optional[int], frame: Any) -> list[tuple[int, int]]:

@@ -6,6 +6,8 @@
 stable-diffusion/     diffusers' pipeline: tokenizer, text_encoder, vae, unet, scheduler
 clip/                 transformers' CLIPModel and tokenizer: both towers
 points.safetensors    Point-E's base checkpoint
+motion/               MDM's checkpoint, with the mean and the deviation of its features
+body.npz              the body of tools/toybox_body.py, in SMPL's format
 judge.safetensors     the judge, which has no published format
 training.json         what each network has seen: images, hours, numbers on withheld objects
 SHA256SUMS            digests of all other files
@@ -20,16 +22,20 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Optional
 
+import numpy as np
+import torch
 from torch import Tensor
 
 from ..core.checkpoint_file import load_file
 from ..core.command import run_command
 from ..core.errors import UserError
 from ..core.files import atomic_file, output_folder
-from ..models.bundled import write_digests
+from ..models.bundled import MOTION, write_digests
+from ..priors.text_to_motion import STATISTICS, mdm_files
 from . import models
 from .clip_stage import trained_clip
 from .loop import averaged_weights, checkpoint_path, is_trained
+from .motion_stage import TIMESTEPS, MotionStage
 from .tokens import copy_tokenizer, open_tokenizer
 from .train import STAGES
 from .unet_stage import LATENT_SCALE, frozen_autoencoder
@@ -50,6 +56,8 @@ def export(training: Path, target: Path) -> dict[str, Any]:
     for name in ("points", "judge"):
         if is_trained(training, name):
             write_weights(target / f"{name}.safetensors", averaged_weights(training, name))
+    if is_trained(training, "motion"):
+        write_motion_model(target / MOTION, training)
     record = training_record(training)
     with atomic_file(target / "training.json") as file:
         file.write(json.dumps(record, indent=2).encode())
@@ -95,6 +103,22 @@ def write_weights(path: Path, weights: dict[str, Tensor]) -> None:
 
     with atomic_file(path) as file:
         file.write(save({name: value.half().contiguous() for name, value in weights.items()}))
+
+
+def write_motion_model(path: Path, training: Path) -> None:
+    """Write a text-to-motion model as MDM's authors publish theirs, in float16."""
+    content = load_file(checkpoint_path(training, "motion"))
+    network = MotionStage.network()
+    network.load_state_dict(averaged_weights(training, "motion"))
+    state, args = mdm_files(network, TIMESTEPS)
+    output_folder(path.parent, "the motion model")
+    with atomic_file(path) as file:
+        torch.save({name: value.half() for name, value in state.items()}, file)
+    with atomic_file(path.parent / "args.json") as file:
+        file.write(json.dumps(args, indent=2).encode())
+    for name, key in zip(STATISTICS[0], ("mean", "std"), strict=True):
+        with atomic_file(path.parent / name) as file:
+            np.save(file, np.float32(content["constants"][key]))
 
 
 def training_record(training: Path) -> dict[str, Any]:

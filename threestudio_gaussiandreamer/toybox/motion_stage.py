@@ -97,6 +97,10 @@ class MotionStage(Stage):
         self.tokenizer = open_tokenizer(self.options.folder)
         self.clip = trained_clip(self.options.folder, len(self.tokenizer), "text").to(self.device)
         self.alphas_cumprod = torch.from_numpy(cosine_alphas_cumprod(TIMESTEPS)).to(self.device)
+        return self.network()
+
+    @staticmethod
+    def network() -> MotionModel:
         sizes = models.MOTION_WIDTH, models.MOTION_LAYERS, models.MOTION_HIDDEN, models.FEATURES
         return MotionModel(*sizes)
 
