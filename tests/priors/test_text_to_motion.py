@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.priors import text_to_motion as t2m
-from threestudio_gaussiandreamer.toybox import motions
 
 
 @pytest.fixture

@@ -34,8 +34,8 @@ EXPORT_AGAIN = (
 
 
 def model_part(name: str, part: str) -> str:
-    """Return the path of a part, DIFFUSION, CLIP, POINTS ..., if ``name`` is the bundled models or an
-    export, else ``name``. Raise UserError if a file is missing or damaged.
+    """Return the path of a part, DIFFUSION, CLIP, POINTS ..., if ``name`` is the bundled models or
+    an export, else ``name``. Raise UserError if a file is missing or damaged.
     """
     if name == NAME:
         require_intact(FOLDER, part)

@@ -419,7 +419,8 @@ ALIKE_FROM_ALL_SIDES = ("mug", "mushroom")
 
 
 def _hat(anchors: Anchors, p: Proportions) -> list[Shape]:
-    r, high = anchors.top_radius, 0.36 * p(0.2)
+    r = anchors.top_radius
+    high = min(0.36, 1.8 * r) * p(0.2)
     brim = [(0, -0.02), (1.45 * r, -0.02), (1.45 * r, 0.05), (0, 0.05)]
     round_crown = [(0.85 * r, 0.05), (0.8 * r, high), (0, high)]
     crown = round_crown if p.chance(0.5) else [(0.95 * r, 0.05), (0, 1.35 * high)]

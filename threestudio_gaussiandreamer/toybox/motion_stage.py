@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from torch.utils.data import Dataset
+from tqdm import tqdm
 
 from ..core.streams import numpy_generator
 from ..diffusion import sds
@@ -21,8 +22,8 @@ from .tokens import open_tokenizer, token_ids
 
 TIMESTEPS, EMPTY_SHARE = 50, 0.1
 SUBJECTS = "someone", "someone", "a person", "a man", "a woman"
-MEASURED = 40
-"""Motions of each action from which the features' mean and deviation are computed."""
+EACH = 300
+"""Motions of each action that a training sees, in random order with fresh sentences."""
 
 
 class MotionBatch(NamedTuple):
@@ -35,17 +36,21 @@ class MotionBatch(NamedTuple):
 
 
 @functools.cache
-def statistics(seed: int) -> tuple[Float[np.ndarray, "263"], Float[np.ndarray, "263"]]:
-    """Return mean and standard deviation of the features, the latter averaged over each kind of
-    feature, as HumanML3D's.
+def drawn_features(seed: int) -> Float[np.ndarray, "M 60 263"]:
+    """Draw :data:`EACH` motions of each action in turn, float32."""
+    rng = numpy_generator(seed, "toybox-motion-features")
+    drawn = tqdm(motions.names() * EACH, "motions", disable=None)
+    return np.stack([motions.features(motions.draw(n, rng, FRAMES + 1).positions) for n in drawn])
+
+
+def statistics(features: Float[np.ndarray, "M 60 263"]) -> tuple[np.ndarray, np.ndarray]:
+    """Return mean and standard deviation, the latter averaged over each kind of feature, as
+    HumanML3D's.
     """
-    rng = numpy_generator(seed, "toybox-motion-statistics")
-    drawn = [motions.draw(name, rng, FRAMES + 1) for name in motions.names() * MEASURED]
-    features = np.concatenate([motions.features(motion.positions) for motion in drawn])
-    std = features.std(axis=0)
+    std = features.std(axis=(0, 1), dtype=np.float64)
     for start, end in zip(KINDS, KINDS[1:], strict=False):
         std[start:end] = std[start:end].mean()
-    return features.mean(axis=0), std
+    return features.mean(axis=(0, 1), dtype=np.float64), std
 
 
 KINDS = (0, 1, 3, 4, 67, 193, 259, 263)
@@ -64,18 +69,20 @@ class MotionData(Dataset):
     seed: int
     batch: int
     tokenizer: Any
+    statistics: tuple[np.ndarray, np.ndarray]
 
     def __getitem__(self, step: int) -> MotionBatch:
         rng = numpy_generator(self.seed, "toybox-motions", step)
-        names = [str(name) for name in rng.choice(motions.names(), self.batch)]
-        found = [motions.features(motions.draw(n, rng, FRAMES + 1).positions) for n in names]
-        mean, std = statistics(self.seed)
-        features = torch.from_numpy(((np.stack(found) - mean) / std).astype(np.float32))
+        found = drawn_features(self.seed)
+        rows, names = rng.integers(len(found), size=self.batch), motions.names()
+        mean, std = self.statistics
+        features = torch.from_numpy(np.float32((found[rows] - mean) / std))
+        texts = [sentence(names[row % len(names)], rng) for row in rows]
         return MotionBatch(
             features,
             normal(rng, features.shape),
             sds.stratified_timesteps(self.batch, TIMESTEPS, torch_generator(rng)),
-            token_ids(self.tokenizer, [sentence(name, rng) for name in names]),
+            token_ids(self.tokenizer, texts),
             torch.from_numpy(rng.uniform(size=self.batch) < EMPTY_SHARE),
         )
 
@@ -90,7 +97,8 @@ class MotionStage(Stage):
 
     def __init__(self, options: Options) -> None:
         super().__init__(options)
-        mean, std = statistics(options.seed)
+        self.statistics = statistics(drawn_features(options.seed))
+        mean, std = self.statistics
         self.constants = {"mean": mean.tolist(), "std": std.tolist()}
 
     def build(self) -> nn.Module:
@@ -105,7 +113,7 @@ class MotionStage(Stage):
         return MotionModel(*sizes)
 
     def data(self) -> MotionData:
-        return MotionData(self.options.seed, self.batch, self.tokenizer)
+        return MotionData(self.options.seed, self.batch, self.tokenizer, self.statistics)
 
     def loss(self, model: nn.Module, batch: MotionBatch) -> tuple[Tensor, dict[str, Tensor]]:
         text = self.condition(batch.ids) * ~batch.empty[:, None]

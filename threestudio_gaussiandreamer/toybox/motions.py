@@ -249,13 +249,15 @@ class Action(NamedTuple):
 
 
 ACTIONS: dict[str, Action] = {
-    "open arms": Action(open_arms, ("stands with open arms", "opens the arms", "stands with the arms open"), 1.2),
+    "open arms": Action(open_arms, 
+        ("stands with open arms", "opens the arms", "stands with the arms open"), 1.2),
     "t pose": Action(t_pose, ("stands in a t pose", "is in a t pose", "holds a t pose"), 0.5),
     "raise": Action(raise_arms, ("raises both arms", "lifts both arms", "raises the arms"), 1.2),
     "wave": Action(wave, ("waves with the {} hand", "waves the {} hand", "waves the {} arm"), 1.2),
     "point": Action(point, ("points with the {} hand", "points ahead with the {} arm"), 1.2),
     "punch": Action(punch, ("punches with the {} hand", "punches with the {} fist"), 1.0),
-    "kick": Action(kick, ("kicks with the {} leg", "kicks the {} leg", "kicks with the {} foot"), 1.2),
+    "kick": Action(kick,
+        ("kicks with the {} leg", "kicks the {} leg", "kicks with the {} foot"), 1.2),
     "walk": Action(walk, ("walks", "walks forward", "walks ahead"), 0.5),
     "run": Action(run, ("runs", "runs forward", "runs ahead"), 0.5),
     "sit": Action(sit, ("sits", "sits down"), 1.4),

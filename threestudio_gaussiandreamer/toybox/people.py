@@ -37,7 +37,7 @@ def person(p: Proportions, joints: Float[np.ndarray, "22 3"]) -> Model:
     head, top = head_shapes(at, trunk, skin, p)
     neck = tuple(at["neck"] + 0.02 * trunk.up)
     cape = (cape_shape(chest, trunk, p),)
-    return [*shapes, *head], Anchors(tuple(top), 0.115, neck, (0.085, 0.085), cape=cape)
+    return [*shapes, *head], Anchors(tuple(top), 0.14, neck, (0.1, 0.1), cape=cape)
 
 
 def trunk_axes(at: dict[str, np.ndarray]) -> Trunk:
@@ -51,7 +51,7 @@ def trunk_axes(at: dict[str, np.ndarray]) -> Trunk:
 
 def upper_body(at: dict, chest: np.ndarray, trunk: Trunk, p: Proportions) -> list[Shape]:
     """Make the shirt without its sleeves, and buttons."""
-    wide, deep = 0.175 * p(0.08), 0.115 * p()
+    wide, deep = 0.21 * p(0.08), 0.15 * p()
     waist = (at["pelvis"] + at["lower spine"]) / 2
     long = np.linalg.norm(at["neck"] - waist)
     shapes = [
@@ -60,25 +60,25 @@ def upper_body(at: dict, chest: np.ndarray, trunk: Trunk, p: Proportions) -> lis
     ]
     middle = chest + 0.92 * deep * trunk.ahead
     for step in (-0.1, 0.0, 0.1):
-        shapes += [ellipsoid("pale", middle + step * trunk.up, (0.022, 0.022, 0.022), rings=6)]
+        shapes += [ellipsoid("pale", middle + step * trunk.up, (0.03, 0.03, 0.03), rings=6)]
     return shapes
 
 
 def lower_body(at: dict, trunk: Trunk, p: Proportions) -> list[Shape]:
     """Make trousers, belt and shoes."""
-    thigh = 0.085 * p(0.1)
+    thigh = 0.108 * p(0.1)
     hips = (at["left hip"] + at["right hip"]) / 2
-    shapes = [oriented("part", (hips + at["pelvis"]) / 2, (0.115, 0.16, 0.12), trunk)]
+    shapes = [oriented("part", (hips + at["pelvis"]) / 2, (0.14, 0.19, 0.13), trunk)]
     belt = (at["pelvis"] + at["lower spine"]) / 2
-    shapes += [oriented("dark", belt, (0.12, 0.155, 0.028), trunk)]
-    shapes += [ellipsoid("warm", belt + 0.118 * trunk.ahead, (0.025, 0.03, 0.025), rings=6)]
+    shapes += [oriented("dark", belt, (0.15, 0.195, 0.035), trunk)]
+    shapes += [ellipsoid("warm", belt + 0.145 * trunk.ahead, (0.03, 0.04, 0.035), rings=6)]
     for side in SIDES:
         hip, knee, ankle, toe = (at[f"{side} {n}"] for n in ("hip", "knee", "ankle", "foot"))
         shapes += [
             limb("part", hip, knee, thigh, 0.8 * thigh),
             ellipsoid("part", knee, (0.8 * thigh,) * 3, rings=8),
-            limb("part", knee, ankle, 0.8 * thigh, 0.055),
-            limb("dark", ankle + (ankle - toe) * 0.3, toe + (toe - ankle) * 0.3, 0.055, 0.045),
+            limb("part", knee, ankle, 0.8 * thigh, 0.075),
+            limb("dark", ankle + (ankle - toe) * 0.3, toe + (toe - ankle) * 0.3, 0.075, 0.062),
         ]
     return shapes
 
@@ -86,15 +86,15 @@ def lower_body(at: dict, trunk: Trunk, p: Proportions) -> list[Shape]:
 def arm(at: dict, side: str, sleeve: float, skin: str, p: Proportions) -> list[Shape]:
     """Make an arm with a sleeve over this share of its lower part, and a hand."""
     shoulder, elbow, wrist = (at[f"{side} {n}"] for n in ("shoulder", "elbow", "wrist"))
-    thick = 0.058 * p(0.1)
+    thick = 0.078 * p(0.1)
     end = elbow + sleeve * 0.92 * (wrist - elbow)
     return [
         ellipsoid("body", shoulder, (1.15 * thick,) * 3, rings=8),
         limb("body", shoulder, elbow, thick, 0.88 * thick),
         ellipsoid("body", elbow, (0.88 * thick,) * 3, rings=8),
         limb("body", elbow, end, 0.88 * thick, 0.8 * thick),
-        limb(skin, elbow, wrist, 0.045, 0.036),
-        ellipsoid(skin, wrist + 0.2 * (wrist - elbow), (0.055,) * 3, rings=8),
+        limb(skin, elbow, wrist, 0.062, 0.05),
+        ellipsoid(skin, wrist + 0.2 * (wrist - elbow), (0.08,) * 3, rings=8),
     ]
 
 
@@ -104,31 +104,31 @@ def head_shapes(
     """Make neck, head, face and hair; return them and the place of a hat."""
     up = at["head"] - at["neck"]
     up = 0.5 * trunk.up + 0.5 * up / np.linalg.norm(up)
-    r = 0.125 * p(0.08)
-    center = at["head"] + 0.06 * up
+    r = 0.16 * p(0.08)
+    center = at["head"] + 0.09 * up
     hair = p.choice(("hair", "dark", "warm", "pale"))
     shapes = [
-        limb(skin, at["neck"] - 0.03 * trunk.up, center, 0.05),
+        limb(skin, at["neck"] - 0.03 * trunk.up, center, 0.065),
         oriented(skin, center, (r, 0.9 * r, 1.12 * r), trunk),
         oriented(hair, center - 0.3 * r * trunk.ahead + 0.22 * r * up, (r, r, 1.1 * r), trunk),
-        ellipsoid(skin, center + 1.02 * r * trunk.ahead - 0.1 * r * up, (0.025,) * 3, rings=6),
+        ellipsoid(skin, center + 1.02 * r * trunk.ahead - 0.1 * r * up, (0.033,) * 3, rings=6),
     ]
     if p.chance(0.4):  # long hair
         low = center - 0.55 * r * trunk.ahead - 0.9 * r * up
         shapes += [oriented(hair, low, (0.45 * r, 0.8 * r, 1.2 * r), trunk)]
     for sign in (-1, 1):
         eye = center + 0.9 * r * trunk.ahead + sign * 0.4 * r * trunk.left + 0.12 * r * up
-        shapes += [ellipsoid("dark", eye, (0.022,) * 3, rings=6)]
+        shapes += [ellipsoid("dark", eye, (0.03,) * 3, rings=6)]
     return shapes, center + 1.05 * r * up - 0.1 * r * trunk.ahead
 
 
 def cape_shape(chest: np.ndarray, trunk: Trunk, p: Proportions) -> Shape:
     """Make a cape that hangs from the shoulders to the knees."""
-    top = chest + 0.16 * trunk.up - 0.13 * trunk.ahead
+    top = chest + 0.16 * trunk.up - 0.165 * trunk.ahead
     down = -0.65 * trunk.up + np.array([0.0, 0.0, -0.35]) - 0.12 * trunk.ahead
     down = down / np.linalg.norm(down)
     long = 0.36 * p(0.1)
-    half = (0.02, 0.26 * p(0.08), long)
+    half = (0.025, 0.3 * p(0.08), long)
     return oriented_box("accessory", top + long * down, half, (1.0, 0.68), trunk.left, -down)
 
 

@@ -23,8 +23,16 @@ from ..meshes.raycast import MeshCaster
 from ..splatting import rasterize
 from . import motions
 from .kinds import KINDS
-from .world import COLORS, PATTERNS, PERSON, THINGS_WORN, VERSION, Attributes
-from .world import draw_attributes, object_mesh
+from .world import (
+    COLORS,
+    PATTERNS,
+    PERSON,
+    THINGS_WORN,
+    VERSION,
+    Attributes,
+    draw_attributes,
+    object_mesh,
+)
 
 SIZE = 128
 """Height and width of the pictures, pixels."""

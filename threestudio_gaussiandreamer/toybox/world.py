@@ -62,7 +62,7 @@ PERIOD = {"striped": 0.34, "dotted": 0.34, "checkered": 0.46}
 WITHHELD_SHARE = 0.04
 THINGS_WORN = [name for name in ACCESSORIES if name != "cape"]
 """Accessories of objects that are no persons."""
-PERSON, PERSON_SHARE = "person", 0.3
+PERSON, PERSON_SHARE = "person", 0.4
 """The kind that has an action, and the share of all objects that are persons."""
 
 
