@@ -171,7 +171,7 @@ def grown(
     found = dict(state)
     for name, value in state.items():
         target = own.get(name, value)
-        if target.shape[1:] == value.shape[1:] and len(target) > len(value):
+        if value.ndim and target.shape[1:] == value.shape[1:] and len(target) > len(value):
             found[name] = target.clone()
             count = [(row, row) for row in range(len(value))]
             to, of = zip(*(tokens_kept if "token_embedding" in name else count), strict=True)
