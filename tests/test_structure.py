@@ -32,7 +32,7 @@ LIBRARIES = {  # of ring 0, beyond MATHS_MAY_USE
 }
 HOST = {"lightning", "pytorch_lightning", "omegaconf", "threestudio"}
 HEAVY = HOST | set(
-    "trimesh embreex diffusers transformers PIL smplx anny pxr zstandard skimage "
+    "trimesh embreex diffusers transformers PIL anny pxr zstandard skimage "
     "fast_simplification xatlas".split()
 )
 MODULES_AT_THE_TOP = 5

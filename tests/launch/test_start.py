@@ -10,7 +10,7 @@ from benchmarks.start.launched import run_with_probe
 from tests.training.runs import SMALL
 
 UNUSED = {
-    "trimesh", "networkx", "diffusers", "transformers", "viser", "imageio", "smplx", "matplotlib",
+    "trimesh", "networkx", "diffusers", "transformers", "viser", "imageio", "matplotlib",
     "tensorboard.backend", "accelerate", "scipy.stats", "scipy.signal", "torchmetrics.functional",
     "torch._dynamo.eval_frame", "sympy",
 }  # fmt: skip

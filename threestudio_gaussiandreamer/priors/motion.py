@@ -32,7 +32,7 @@ The motion itself comes from MDM, outside this package; ``motion_text.py`` print
 ask it for.
 
 The body model is the user's own file of SMPL, SMPL-H or SMPL-X, whose first 22 joints are the same,
-with smplx's kinematics. What is minimised over the rotations of all joints (axis-angle), a
+skinned as in SMPL's paper. What is minimised over the rotations of all joints (axis-angle), a
 translation and a few shape coefficients, summed over the frames, which share nothing:
 
     sum_j |joint_j - target_j|^2 / s^2 + pose |theta|^2 + shape |beta|^2
@@ -195,7 +195,6 @@ class MotionPrior(Prior):
             else:
                 read_motions(cfg.motion)
             load_body_model(model_part(cfg.body_model, BODY))
-            require_extra("smpl", "smplx")
         if len(cfg.candidates) > 1 if cfg.candidates else cfg.frame == "clip":
             require_extra("diffusion", "transformers")
             locate(clip_source(cfg.clip), download=False)
@@ -341,7 +340,7 @@ LIMITS = {
 
 
 class BodyModel(NamedTuple):
-    """A skinned body, float64 tensors in the layout of smplx's functions."""
+    """A skinned body, float64 tensors."""
 
     template: Float[Tensor, "V 3"]
     """Metres, y up, looking along +z."""
@@ -442,23 +441,51 @@ def posed_joints(
     translation: Float[Tensor, "F 3"],
 ) -> Float[Tensor, "F J 3"]:
     """Return the joint positions, which is cheaper than the whole body."""
-    from smplx.lbs import batch_rigid_transform, batch_rodrigues
-
-    frames, joints = pose.shape[:2]
     directions = torch.einsum("jv,vcb->jcb", model.joint_regressor, model.shape_directions)
     rest = model.joint_regressor @ model.template + torch.einsum("fb,jcb->fjc", shape, directions)
-    rotations = batch_rodrigues(pose.reshape(-1, 3)).reshape(frames, joints, 3, 3)
-    found, _ = batch_rigid_transform(rotations, rest, model.parents, dtype=pose.dtype)
-    return found + translation[:, None]
+    return joint_frames(model, rotation_matrices(pose), rest)[1] + translation[:, None]
 
 
 @torch.no_grad()
 def posed_vertices(model: BodyModel, fit: BodyFit) -> Float[np.ndarray, "F V 3"]:
-    """Return the surfaces of the fitted bodies: metres, y up."""
-    from smplx.lbs import lbs
+    """Return the surfaces of the fitted bodies, metres, y up: SMPL's linear blend skinning of the
+    template with the offsets of shape and pose (Loper et al. 2015, equations 2 to 10).
+    """
+    own = rotation_matrices(fit.pose)
+    shaped = model.template + torch.einsum("fb,vcb->fvc", fit.shape, model.shape_directions)
+    rest = model.joint_regressor @ shaped
+    turns, places = joint_frames(model, own, rest)
+    offsets = (own[:, 1:] - torch.eye(3, dtype=own.dtype)).flatten(1) @ model.pose_directions
+    bent = shaped + offsets.unflatten(1, (-1, 3))
+    blended = torch.einsum("vj,fjab->fvab", model.weights, turns)
+    moved = torch.einsum("fvab,fvb->fva", blended, bent)
+    shifts = places - torch.einsum("fjab,fjb->fja", turns, rest) + fit.translation[:, None]
+    return (moved + model.weights @ shifts).numpy()
 
-    vertices, _ = lbs(fit.shape, fit.pose.flatten(1), *model[:-1])  # in the order of lbs
-    return (vertices + fit.translation[:, None]).numpy()
+
+def joint_frames(
+    model: BodyModel, own: Float[Tensor, "F J 3 3"], rest: Float[Tensor, "F J 3"]
+) -> tuple[Float[Tensor, "F J 3 3"], Float[Tensor, "F J 3"]]:
+    """Return the joints' rotations and places; their own ones are relative to their parents'."""
+    first, *others = own.unbind(1)
+    parents, turns, places = model.parents[1:], [first], [rest[:, 0]]
+    for parent, rotation in zip(parents.tolist(), others, strict=True):
+        turns.append(turns[parent] @ rotation)
+    turned = torch.stack(turns, 1)
+    bones = turned[:, parents] @ (rest[:, 1:] - rest[:, parents])[..., None]
+    for parent, bone in zip(parents.tolist(), bones[..., 0].unbind(1), strict=True):
+        places.append(places[parent] + bone)
+    return turned, torch.stack(places, 1)
+
+
+def rotation_matrices(vectors: Float[Tensor, "... 3"]) -> Float[Tensor, "... 3 3"]:
+    """Return the matrices of axis-angles (Rodrigues' formula), differentiable at zero too."""
+    angle = (vectors.square().sum(-1, keepdim=True) + 1e-16).sqrt()
+    x, y, z = (vectors / angle).unbind(-1)
+    none, angle = torch.zeros_like(x), angle[..., None]
+    cross = torch.stack([none, -z, y, z, none, -x, -y, x, none], -1).unflatten(-1, (3, 3))
+    turn = angle.sin() * cross + (1 - angle.cos()) * (cross @ cross)
+    return torch.eye(3, dtype=vectors.dtype) + turn
 
 
 def _placed(model: BodyModel, wanted: Float[Tensor, "F K 3"]) -> tuple[Tensor, Tensor]:
