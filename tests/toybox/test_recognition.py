@@ -11,6 +11,7 @@ from threestudio_gaussiandreamer.toybox.views import LABELS, label_row
 from threestudio_gaussiandreamer.toybox.world import Attributes
 
 FOX = Attributes("fox", "red", "striped", "white", None, "hat", "blue")
+KICK = Attributes("person", "red", "plain", None, "blue", "cape", "lime", "kick left")
 
 
 def sure(attributes, sides=None):
@@ -23,6 +24,26 @@ def sure(attributes, sides=None):
         name: torch.nn.functional.one_hot(rows[:, column], len(classes)).float()
         for column, (name, classes) in enumerate(LABELS.items())
     }
+
+
+@pytest.mark.parametrize(
+    ("change", "missed"),
+    [
+        ({"action": "kick right"}, ["sides"]),
+        ({"action": "punch right"}, ["action"]),
+        ({"action": None}, ["action"]),
+        ({"part": "red"}, ["colors"]),
+        ({"color": "blue"}, ["colors"]),
+        ({"accessory": "hat"}, ["accessory"]),
+        ({"accessory_color": "red"}, ["accessory"]),
+    ],
+)
+def test_one_wrong_attribute_of_a_person_is_missed_alone(change, missed):
+    found = recognition.recognized(sure(KICK._replace(**change)), KICK)
+    assert [name for name, right in found.items() if right == 0] == missed
+    wanted = KICK._replace(action="sit")  # has no side
+    found = recognition.recognized(sure(wanted._replace(**change)), wanted)
+    assert math.isnan(found["sides"]) and found["action"] == ("action" not in change)
 
 
 @pytest.mark.parametrize(
@@ -46,7 +67,7 @@ def test_colours_may_be_exchanged_where_nobody_can_tell():
     for pattern, right in (("striped", True), ("checkered", True), ("dotted", False)):
         wanted = FOX._replace(pattern=pattern)
         exchanged = wanted._replace(color=wanted.second, second=wanted.color)
-        assert recognition.recognized(sure(exchanged), wanted)["colors"] is right
+        assert recognition.recognized(sure(exchanged), wanted)["colors"] == right
         plain = wanted._replace(pattern="plain", second=None)
         assert not recognition.recognized(sure(plain), wanted)["colors"]
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from threestudio_gaussiandreamer.meshes.load import AXES
-from threestudio_gaussiandreamer.toybox import views, words, world
+from threestudio_gaussiandreamer.toybox import motions, views, words, world
 from threestudio_gaussiandreamer.toybox.demo import contact_sheet
 from threestudio_gaussiandreamer.toybox.kinds import ACCESSORIES, KINDS
 from threestudio_gaussiandreamer.toybox.loop import StepData
@@ -27,7 +27,8 @@ def mesh_of(attributes, seed=0):
 
 def test_objects_are_functions_of_seed_and_index(drawn):
     assert len(KINDS) >= 16 and len(world.COLORS) == 12 and len(world.PATTERNS) == 5
-    assert {a.kind for a in drawn} == set(KINDS) == set(words.NOUNS) == set(words.PARTS)
+    assert {a.kind for a in drawn} == {*KINDS, "person"} == set(words.NOUNS) == set(words.PARTS)
+    assert {a.action for a in drawn} == {None, *motions.names()}
     assert {a.pattern for a in drawn} == set(world.PATTERNS)
     assert {a.accessory for a in drawn} == {None, *ACCESSORIES} and any(a.part for a in drawn)
     assert drawn[7] == world.draw_attributes(0, 7)
@@ -38,13 +39,14 @@ def test_objects_are_functions_of_seed_and_index(drawn):
         assert (a.second is None) == (a.pattern == "plain")
     assert not any(world.withheld(a) for a in drawn)
     assert all(world.withheld(world.draw_attributes(0, i, held_out=True)) for i in range(20))
+    assert all(views.attributes_of(views.label_row(a, 50)) == a for a in drawn)
     # every kind and colour is learnt from other objects
     assert not any(world.withheld(world.Attributes(k, c)) for k in KINDS for c in world.COLORS)
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_kind_has_a_mesh_inside_the_sphere_with_patterns_on_all_sides(kind):
-    for accessory in (None, *ACCESSORIES):
+    for accessory in (None, *world.THINGS_WORN):
         color = "red" if accessory else None
         mesh = mesh_of(world.Attributes(kind, "blue", "dotted", "white", None, accessory, color))
         assert np.linalg.norm(mesh.vertices, axis=1).max() == pytest.approx(world.RADIUS)
@@ -67,7 +69,7 @@ def test_every_kind_has_a_mesh_inside_the_sphere_with_patterns_on_all_sides(kind
 def test_accessories_patterns_and_parts_show_in_their_colors():
     """A part without a colour of its own has the pattern, but is darker."""
     for kind in ("fox", "house", "robot"):
-        for name in ACCESSORIES:
+        for name in world.THINGS_WORN:
             attributes = world.Attributes(kind, "blue", accessory=name, accessory_color="lime")
             assert share_of(attributes, "lime") > 0.01, name
             assert share_of(world.Attributes(kind, "blue"), "lime") == 0
@@ -92,6 +94,19 @@ def test_two_tone_has_the_second_color_above_and_the_front_is_plus_x():
     points = points_of(world.Attributes("duck", "blue"))
     beak = points[hue_matches(points[:, 3:], "orange")]
     assert (beak[beak[:, 2] > 0, :3] @ AXES["+x"]).min() > 0.1  # without the feet
+
+
+def test_a_person_wears_its_colors_has_the_cape_behind_and_kicks_ahead_with_its_own_leg():
+    for side, sign in (("left", 1), ("right", -1)):  # left is +y
+        clothes = {"part": "yellow", "accessory": "cape", "accessory_color": "lime"}
+        points = points_of(world.Attributes("person", "blue", **clothes, action=f"kick {side}"))
+        assert np.linalg.norm(points[:, :3], axis=1).max() <= world.RADIUS + 1e-3
+        shirt, trousers, cape = (
+            points[hue_matches(points[:, 3:], name), :3] for name in ("blue", "yellow", "lime")
+        )
+        assert min(map(len, (shirt, trousers, cape))) > 0.03 * len(points)
+        assert cape[:, 0].mean() < shirt[:, 0].mean() and shirt[:, 2].min() > trousers[:, 2].min()
+        assert sign * trousers[trousers[:, 0].argmax(), 1] > 0
 
 
 def points_of(attributes):
@@ -135,6 +150,14 @@ def test_prompts_name_what_there_is(drawn):
         ("a shiny light green lorry from above", world.Attributes("truck", "lime")),
         ("a blue teddy bear and a horse", world.Attributes("bear", "blue")),
         ("a carrot coloured blue car", world.Attributes("car", "blue")),
+        (
+            "a woman in a navy jacket and pink pants kicks with her left foot",
+            world.Attributes("person", "blue", part="pink", action="kick left"),
+        ),
+        (
+            "a person in a red shirt and blue trousers",
+            world.Attributes("person", "red", part="blue"),
+        ),
         *((prompt, None) for prompt in ("", "a fox", "something red", "狐狸", "a " * 2000)),
     ],
 )

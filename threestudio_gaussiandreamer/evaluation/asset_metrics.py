@@ -18,8 +18,7 @@ from ..gaussians.gaussians import Gaussians
 from ..gaussians.point_cloud import PointCloud
 from ..host import get_device
 from ..toybox import recognition
-from ..toybox.kinds import KINDS
-from ..toybox.views import BACKGROUND, SIZE
+from ..toybox.views import BACKGROUND, LABELS, SIZE
 from ..toybox.words import attributes_in
 from ..training.geometry import gaussians_on_points
 from . import t3bench
@@ -39,7 +38,9 @@ class Asset(NamedTuple):
 
 
 class Metric:
-    """A metric, made from the command's arguments; ``score`` returns the columns of an asset."""
+    """A metric, made from the command's arguments; ``score`` returns the columns of an asset, and
+    possibly some that others don't have.
+    """
 
     columns: ClassVar[tuple[str, ...]]
     undefined: ClassVar[str] = ""
@@ -122,12 +123,11 @@ class Quality(Metric):
 
 
 class Recognized(Metric):
-    """Which attributes of the prompt the toybox's judge recognises."""
+    """Which attributes of the prompt the toybox's judge recognises; of persons their action too."""
 
     columns = ("kind", "colors", "pattern", "accessory")
-    undefined = (
-        f"the prompt doesn't name a color and one of the judge's objects: {', '.join(KINDS)}"
-    )
+    objects = ", ".join(LABELS["kind"])
+    undefined = f"the prompt doesn't name a color and one of the judge's objects: {objects}"
 
     def __init__(self, args: Namespace) -> None:
         self.judge = shared_judge(args.judge)
@@ -144,8 +144,7 @@ class Recognized(Metric):
         return self.compared(recognition.probabilities(self.judge, views), wanted)
 
     def compared(self, found: dict[str, Tensor], wanted: Any) -> dict[str, float]:
-        right = recognition.recognized(found, wanted)
-        return {name: float(right[name]) for name in self.columns}
+        return recognition.recognized(found, wanted)
 
 
 class Janus(Recognized):

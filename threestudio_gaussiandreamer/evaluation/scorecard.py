@@ -69,7 +69,7 @@ def run(args: argparse.Namespace) -> None:
     output = output_folder(args.output, "--output", FILES)
     rows = [list(scored(results, metrics, failed)) for results in (first, second)]
     if rows[0]:
-        content = summary(metrics, *rows)
+        content = summary(*rows)
         write(output, rows[0] + rows[1], content)
         notes = [line for metric in metrics for line in without_value(metric, rows[0] + rows[1])]
         print("\n".join([*table(content), *notes, str(output / "scorecard.csv")]))
@@ -178,12 +178,19 @@ def paired(first: dict[str, float], second: dict[str, float], *, seed: int = 0) 
     return bootstrap(np.array([first[p] - second[p] for p in common], float), seed=seed)
 
 
-def summary(metrics: Sequence[Metric], first: Rows, second: Rows) -> dict[str, Any]:
+def columns_of(rows: Rows) -> list[str]:
+    """Return the columns of all rows: those of persons are in theirs only."""
+    return list(dict.fromkeys(name for row in rows for name in row))
+
+
+def summary(first: Rows, second: Rows) -> dict[str, Any]:
     """Return the content of ``scorecard.json``."""
     content: dict[str, Any] = {}
-    for column in (name for metric in metrics for name in metric.columns):
+    for column in columns_of(first + second)[2:]:  # after asset and prompt
         means = [
-            per_prompt([row["prompt"] for row in rows], np.array([row[column] for row in rows]))
+            per_prompt(
+                [row["prompt"] for row in rows], np.array([row.get(column, np.nan) for row in rows])
+            )
             for rows in (first, second)
         ]
         own, other = (bootstrap(np.array(list(mean.values()), float)) for mean in means)
@@ -197,7 +204,7 @@ def summary(metrics: Sequence[Metric], first: Rows, second: Rows) -> dict[str, A
 def write(output: Path, rows: Rows, content: dict[str, Any]) -> None:
     """Write ``scorecard.csv`` and ``scorecard.json``."""
     text = io.StringIO()
-    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
+    writer = csv.DictWriter(text, columns_of(rows), restval="nan", lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
     for name, body in zip(FILES, (text.getvalue(), json_text(content, indent=2)), strict=True):

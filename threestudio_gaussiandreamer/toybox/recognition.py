@@ -3,9 +3,14 @@
 ===========  ===================================================================================
 kind         whether the kind with the highest probability, averaged over the views, is the prompt's
 colors       whether the body's colour and the pattern's are the prompt's; for stripes and checks,
-             which look alike with their colours exchanged, in either order
+             which look alike with their colours exchanged, in either order; of a person, whether
+             those of shirt and trousers are
 pattern      whether the pattern is the prompt's
-accessory    whether the coloured part, the accessory and its colour all are the prompt's
+accessory    whether the coloured part, the accessory and its colour all are the prompt's; of a
+             person, the accessory and its colour
+action       of a person: whether what it does is the prompt's, with either side
+sides        of a person: whether the action isn't the prompt's with left and right swapped; NaN for
+             actions that have no side
 multi_face   share of the views that the judge takes for views from another quadrant; NaN for
              objects that look alike from all sides
 ===========  ===================================================================================
@@ -20,12 +25,13 @@ from torch import Tensor
 
 from ..cameras import Orbit
 from ..models.bundled import JUDGE, NAME, model_part
+from . import motions
 from .kinds import ALIKE_FROM_ALL_SIDES
 from .models import Judge
 from .views import DISTANCE, FOVY_DEG, LABELS
 from .world import Attributes
 
-VERSION = 2
+VERSION = 3
 """Changes with what is read from the same probabilities."""
 ELEVATION_DEG = 15.0
 OFFSETS_DEG = (-22.5, 22.5)
@@ -67,21 +73,33 @@ def probabilities(judge: Judge, pictures: Float[Tensor, "V 3 s s"]) -> dict[str,
     return {name: logits.softmax(dim=-1) for name, logits in judge(pictures).items()}
 
 
-def recognized(found: dict[str, Tensor], wanted: Attributes) -> dict[str, bool]:
-    """Return whether the pictures show each attribute as the prompt does, which may name none."""
-    right = {}
-    for name in ("kind", "part", "accessory", "accessory_color"):
-        most_probable = LABELS[name][int(found[name].mean(dim=0).argmax())]
-        right[name] = most_probable == (getattr(wanted, name) or "none")
+def recognized(found: dict[str, Tensor], wanted: Attributes) -> dict[str, float]:
+    """Return whether the pictures show each attribute as the prompt does, which may name none: 1,
+    0 or NaN.
+    """
+    names = ("kind", "color", "part", "accessory", "accessory_color", "action")
+    shown = {name: LABELS[name][int(found[name].mean(dim=0).argmax())] for name in names}
+    right = {name: shown[name] == (getattr(wanted, name) or "none") for name in names}
+    worn = right["accessory"] and right["accessory_color"]
     pattern, *colors = most_probable_pattern(found)
     asked = [wanted.color, wanted.second or "none"]
     exchanged = wanted.pattern in ("striped", "checkered") and colors == asked[::-1]
-    return {
+    rights = {
         "kind": right["kind"],
         "colors": colors == asked or exchanged,
         "pattern": pattern == wanted.pattern,
-        "accessory": right["part"] and right["accessory"] and right["accessory_color"],
+        "accessory": right["part"] and worn,
     }
+    if wanted.action:
+        (does, side), (action, wanted_side) = map(motions.split, (shown["action"], wanted.action))
+        swapped = does == action and side != wanted_side
+        rights |= {
+            "colors": right["color"] and right["part"],
+            "accessory": worn,
+            "action": does == action,
+            "sides": not swapped if wanted_side else math.nan,
+        }
+    return {name: float(value) for name, value in rights.items()}
 
 
 def most_probable_pattern(found: dict[str, Tensor]) -> tuple[str, str, str]:
