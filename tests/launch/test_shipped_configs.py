@@ -3,12 +3,14 @@
 from pathlib import Path
 
 import pytest
+import yaml
 
 from tests.promises.test_configurations import FILES, PROMPT, stack
 from threestudio_gaussiandreamer import host, register_parts
 from threestudio_gaussiandreamer.launch.config import load_config
 from threestudio_gaussiandreamer.launch.config_check import check_config
 from threestudio_gaussiandreamer.priors.base import Prior
+from threestudio_gaussiandreamer.view.run_index import leaves
 
 register_parts()
 ROOT = Path(__file__).parents[2]
@@ -60,6 +62,16 @@ def test_the_lowmem_overlay_combines_with_others_in_either_order(other):
         prior = host.find(cfg.system.geometry.prior_type)(cfg.system.geometry.prior).cfg
         assert prior.ground and prior.motion == "results.npz"
         assert cfg.system.guidance.enable_vae_slicing
+
+
+def test_avatars_of_the_toybox_differ_in_the_prior_only():
+    """It repeats the other's numbers, so that it works alone."""
+    names = [ROOT / f"configs/toybox{name}.yaml" for name in ("", "-avatar")]
+    objects, avatars = (dict(leaves(yaml.safe_load(path.read_text()))) for path in names)
+    differing = {key for key in objects | avatars if objects.get(key) != avatars.get(key)}
+    assert all(key.startswith("system.geometry.prior") for key in differing - {"name"}), differing
+    prior = loaded("toybox-avatar.yaml").system.geometry.prior
+    assert prior.motion == prior.body_model == prior.clip == "toybox"
 
 
 def test_the_papers_numbers_are_the_papers():

@@ -40,7 +40,8 @@ def cached_cloud(prior: Any, prompt: str, save_dir: Optional[str]) -> PointCloud
     consulted.clear()
     cloud = points_of(prior, prompt)
     path.parent.mkdir(parents=True, exist_ok=True)
-    content = {name: value for name, value in cloud._asdict().items() if value is not None}
+    saved = cloud._asdict() | {"joints": getattr(prior, "joints", None)}  # of a posed body
+    content = {name: value for name, value in saved.items() if value is not None}
     beside = np.array(json.dumps(list(consulted.items())))
     with atomic_file(path) as file:
         np.savez_compressed(file, key=np.array(key), beside=beside, **content)

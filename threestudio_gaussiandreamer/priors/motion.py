@@ -20,6 +20,8 @@ num_points         points uniform over the surface (the released code), or 0 for
                    paper)
 color              ``random`` (the paper), ``grey``, [r, g, b] in [0, 1], or null for the mesh's own
                    colours
+center             what is at the origin: the ``mean`` of the points (the released code), or the
+                   middle of the body's ``box``
 ground, ...        see ``priors/base.py``
 =================  =================================================================================
 
@@ -56,7 +58,7 @@ from ..core.devices import torch_threads
 from ..core.errors import UserError
 from ..core.extras import require_extra
 from ..core.files import existing_file
-from ..core.options import at_least, is_whole, satisfies
+from ..core.options import at_least, is_whole, one_of, satisfies
 from ..formats.array_files import read_arrays
 from ..formats.reading import reading, require
 from ..gaussians.point_cloud import PointCloud
@@ -154,6 +156,7 @@ class MotionPrior(Prior):
         scale: float = field(default=1.0, metadata=SCALE)
         num_points: int = field(default=50_000, metadata=points(0))
         color: Any = field(default="random", metadata=COLOR)
+        center: str = field(default="mean", metadata=one_of(("mean", "box")))
         REMOVED: ClassVar[dict[str, Any]] = {
             **Prior.Config.REMOVED,
             "num_frames": (NUM_FRAMES, f"it is {NUM_FRAMES}"),
@@ -181,6 +184,8 @@ class MotionPrior(Prior):
                 )
 
     cfg: Config
+    joints: Optional[Float[np.ndarray, "K 3"]] = None
+    """The chosen frame of the motion, metres, y up; saved beside the points."""
 
     def preflight(self) -> None:
         cfg = self.cfg
@@ -208,7 +213,8 @@ class MotionPrior(Prior):
             body = meshes[best]
         else:
             body = self._body_of_motion(prompt, generator)
-        return centred(colored_cloud(body, self.cfg, generator))
+        cloud = colored_cloud(body, self.cfg, generator)
+        return centred(cloud) if self.cfg.center == "mean" else cloud
 
     def _motions(self, prompt: str, generator: np.random.Generator) -> Motions:
         """Return the motions of the file, or those that its model draws for the prompt."""
@@ -259,6 +265,7 @@ class MotionPrior(Prior):
                 "positions in metres, y up and in SMPL's order? Choose another frame"
             )
         info(f"SMPL fitted to {names[best]}: {found}")
+        self.joints = targets[best]
         return mesh
 
     def _best(self, meshes: list[Mesh], text: str, names: list[str]) -> int:
