@@ -102,9 +102,9 @@ def in_process(monkeypatch):
     runs = []
     monkeypatch.setattr(demo, "SAMPLE_STEPS", 2)
 
-    def launched(options):
-        runs.append(options)
-        return launch(["--config", "toybox.yaml", "--train", "--gpu", "cpu", *options])
+    def launched(config, options):
+        runs.append(config)
+        return launch(["--config", config, "--train", "--gpu", "cpu", *options])
 
     monkeypatch.setattr(demo, "launch", launched)
     return runs
@@ -119,11 +119,11 @@ def test_an_interrupted_demo_continues_and_ends_with_a_sheet_and_a_table(
 ):
     words, launched = arguments(exported, tmp_path, PROMPT, "a zebra: 1=2"), demo.launch
 
-    def stopped(options):
+    def stopped(*arguments):
         monkeypatch.setattr(demo, "launch", interrupted)
-        return launched(options)
+        return launched(*arguments)
 
-    def interrupted(options):
+    def interrupted(*arguments):
         time.sleep(0.5)
         raise KeyboardInterrupt
 

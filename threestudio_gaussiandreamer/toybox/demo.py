@@ -1,7 +1,8 @@
 """From prompts to clouds with the bundled models, as a demonstration.
 
-``demo [PROMPT ...] [key=value ...]`` trains configs/toybox.yaml on each prompt. It writes a contact
-sheet (the prior, the result, what the 2D model itself draws) and a table of what the judge
+``demo [PROMPT ...] [key=value ...]`` trains configs/toybox.yaml on each prompt, or
+configs/toybox-avatar.yaml where a person does something. It writes a contact sheet (the prior, of a
+person pose and body; the result; what the 2D model itself draws) and a table of what the judge
 recognises into a new folder of ``outputs/demo``. After Ctrl-C the same command continues.
 """
 
@@ -32,19 +33,25 @@ from ..core.files import atomic_file, json_text, output_folder
 from ..core.streams import generator
 from ..diffusion import sds
 from ..evaluation.asset_metrics import ATTRIBUTES, Scores, prior_of, rendered, result_of
+from ..formats.array_files import read_arrays
 from ..host import find
 from ..launch.run_folder import RunFolder, claim, claim_new
 from ..models.bundled import NAME, is_export
+from ..priors.body_pose import JOINTS, PARENTS, Z_UP, facing
+from ..priors.motion_text import reduced_prompt
 from ..view.run_files import read_json
 from . import recognition
 from .views import BACKGROUND, SIZE
+from .words import NOUNS
 
 PROMPTS = (
     "a red fox with a green scarf",
     "a blue mug with white dots",
-    "a white and blue striped robot with a red scarf",
+    "a person in a blue shirt and red trousers kicks with the right leg",
 )
 """The last is of a combination that the models were not trained on."""
+OBJECT, AVATAR = "toybox.yaml", "toybox-avatar.yaml"
+PERSON = re.compile(rf"\b({'|'.join(NOUNS['person'])})\b", re.IGNORECASE)
 SHOWN = [1, 3, 5]
 """Which of the judge's views the sheet has: from the front, the left and the back."""
 GUIDANCE, SAMPLE_STEPS = 3.0, 25
@@ -126,7 +133,7 @@ def train(folder: Path, index: int, place: Path, args: argparse.Namespace) -> in
     place.parent.mkdir(exist_ok=True)
     start, code = time.monotonic(), None
     try:
-        code = launch([
+        code = launch(config_of(prompt), [
             f"exp_root_dir={folder}",
             "name=runs",
             f"tag={place.name}",
@@ -143,13 +150,18 @@ def train(folder: Path, index: int, place: Path, args: argparse.Namespace) -> in
     return code
 
 
-def launch(options: list[str]) -> int:
+def config_of(prompt: str) -> str:
+    """Return the configuration: that of avatars for a prompt with a person and a verb of motion."""
+    return AVATAR if PERSON.search(prompt) and reduced_prompt(prompt) else OBJECT
+
+
+def launch(config: str, options: list[str]) -> int:
     """Run the launcher in a process of its own, and wait for it even after Ctrl-C: it has received
     the signal too, and writes a checkpoint. Return its exit code.
     """
     program = [sys.executable, "-m", "threestudio_gaussiandreamer.launch.experiment"]
     with raised_signals() as received:
-        process = subprocess.Popen([*program, "--config", "toybox.yaml", "--train", *options])
+        process = subprocess.Popen([*program, "--config", config, "--train", *options])
         code = None
         while code is None:
             try:
@@ -175,7 +187,8 @@ def write_results(folder: Path, args: argparse.Namespace, runs: list[Path]) -> N
     with atomic_file(folder / TABLE) as file:
         file.write(f"{text}\n".encode())
     pictures = torch.cat([each[name][0] for each in stages for name in STAGES])
-    first = [f"{name}: {prompt}" for prompt in args.prompts for name in STAGES]
+    shown = {OBJECT: STAGES, AVATAR: ("pose, body", *STAGES[1:])}
+    first = [f"{name}: {prompt}" for prompt in args.prompts for name in shown[config_of(prompt)]]
     texts = [text for one in first for text in (one, *[""] * (len(SHOWN) - 1))]
     sheet = contact_sheet(pictures, texts, columns=len(STAGES) * len(SHOWN))
     images.write(folder / SHEET, sheet)
@@ -192,8 +205,28 @@ def stages_of(prompt: str, place: Path, models: str, scores: Scores) -> Stages:
     for name, asset in assets.items():
         pictures = rendered(asset, views.rows(SHOWN), SIZE, background=BACKGROUND)
         found[name] = torch.from_numpy(pictures).movedim(-1, 1), scores.of_asset(asset)
+    if config_of(prompt) == AVATAR:
+        joints = read_arrays(place / "save/prior/points.npz", "prior", ["joints"])["joints"]
+        pose, (body, rates) = stick_figure(joints, views.azimuth[SHOWN[0]]), found["prior"]
+        found["prior"] = torch.cat([pose[None], body[:-1]]), rates
     own = samples(models, prompt, views, guidance_scale=GUIDANCE)
     return found | {"2D model": (own[SHOWN], scores.of_pictures(own, prompt))}
+
+
+def stick_figure(joints: Float[np.ndarray, "K 3"], azimuth: float) -> Float[Tensor, "3 s s"]:
+    """Draw a pose (y up) as seen from this azimuth, degrees: its left blue, its right red."""
+    from PIL import Image, ImageDraw
+
+    places, angle = joints[:, Z_UP] @ facing(joints).T, math.radians(azimuth)
+    flat = places @ np.array([[-math.sin(angle), 0], [math.cos(angle), 0], [0, -1]])
+    low, high = flat.min(0), flat.max(0)
+    flat = SIZE * (0.5 + 0.8 * (flat - (low + high) / 2) / (high - low).max())
+    picture = Image.new("RGB", (SIZE, SIZE), tuple(round(255 * value) for value in BACKGROUND))
+    for joint, parent in enumerate(PARENTS[1:], 1):
+        color = {"left": "blue", "right": "red"}.get(JOINTS[joint].split()[0], "white")
+        ends = [tuple(flat[joint]), tuple(flat[parent])]
+        ImageDraw.Draw(picture).line(ends, fill=color, width=SIZE // 40)
+    return torch.from_numpy(np.asarray(picture) / np.float32(255)).movedim(-1, 0)
 
 
 @torch.no_grad()
@@ -252,13 +285,15 @@ def contact_sheet(
 
 def table(prompts: Sequence[str], runs: Sequence[Path], stages: Sequence[Stages]) -> str:
     """Return a Markdown table with a line for each prompt and stage."""
-    head = ("prompt", "", *ATTRIBUTES, "multi-face", "seconds")
+    known = {key for each in stages for _, scores in each.values() for key in scores}
+    names = [*ATTRIBUTES, *(name for name in ("action", "sides") if name in known)]
+    head = ("prompt", "", *names, "multi-face", "seconds")
     lines = [head, ("---",) * len(head)]
     for prompt, place, each in zip(prompts, runs, stages, strict=True):
         seconds = read_json(place.with_suffix(".json"), dict).get("seconds", math.nan)
         for name in STAGES:
             scores = each[name][1]
-            found = [scores.get(key, math.nan) for key in ATTRIBUTES]
+            found = [scores.get(key, math.nan) for key in names]
             cells = ["" if math.isnan(value) else "yes" if value else "no" for value in found]
             rate = scores.get("multi_face", math.nan)
             took = f"{seconds:.0f}" if name == "result" else ""

@@ -30,7 +30,7 @@ from ..core.checkpoint_file import load_file
 from ..core.command import run_command
 from ..core.errors import UserError
 from ..core.files import atomic_file, output_folder
-from ..models.bundled import MOTION, write_digests
+from ..models.bundled import BODY, FOLDER, MOTION, write_digests
 from ..priors.text_to_motion import STATISTICS, mdm_files
 from . import models
 from .clip_stage import trained_clip
@@ -58,6 +58,8 @@ def export(training: Path, target: Path) -> dict[str, Any]:
             write_weights(target / f"{name}.safetensors", averaged_weights(training, name))
     if is_trained(training, "motion"):
         write_motion_model(target / MOTION, training)
+        with atomic_file(target / BODY) as file:
+            file.write((FOLDER / BODY).read_bytes())
     record = training_record(training)
     with atomic_file(target / "training.json") as file:
         file.write(json.dumps(record, indent=2).encode())
