@@ -9,7 +9,7 @@ import re
 from collections.abc import Callable
 
 from benchmarks.markdown import markdown
-from benchmarks.quality import formats, large_prune
+from benchmarks.quality import avatars, formats, large_prune
 from benchmarks.quality import mesh as mesh_quality
 from benchmarks.quality import tables as quality
 from benchmarks.quality import toybox_tables as toybox
@@ -71,6 +71,7 @@ SECTIONS: dict[str, dict[str, Callable[[], str]]] = {
     "reports/exports.md": {"front": mesh_quality.front, "quality": viewers.page_quality},
     "reports/robustness.md": {"fuzz": robustness.fuzz, "long run": robustness.long_run},
     "reports/small_models.md": {
+        "avatars": avatars.table,
         "toybox": toybox.results,
         "seeds": toybox.seeds,
         "judges": toybox.judges,

@@ -116,7 +116,8 @@ class Task(NamedTuple):
         if self.variant.name == TRUTH:
             return WORLD
         is_run = self.variant.name != SAMPLES
-        return setup(self.models) if is_run else setup_of_samples(self.models)
+        of_run = setup(self.models, self.variant.config)
+        return of_run if is_run else setup_of_samples(self.models)
 
 
 # ---- in the processes ----------------------------------------------------------------------------
@@ -221,7 +222,7 @@ def run(task: Task, folder: Path) -> None:
     options |= dict.fromkeys(MODELS_BESIDE_GUIDANCE if exact else (MODELS,), task.models)
     arguments = [f"{key}={value}" for key, value in options.items()]
     with truth_known(task.prompt) if exact else contextlib.nullcontext():
-        code = launch(["--config", "toybox.yaml", "--train", "--gpu", task.gpu, *arguments])
+        code = launch(["--config", task.variant.config, "--train", "--gpu", task.gpu, *arguments])
     if code:
         raise RuntimeError(f"the launcher returned {code}")
 
@@ -250,8 +251,13 @@ def row_of(task: Task, found: dict[str, Any]) -> dict[str, Any]:
 
 def main() -> None:
     arguments = parse_arguments()
+    measure_missing(arguments, tasks(arguments))
+
+
+def measure_missing(arguments: argparse.Namespace, tasks: Iterator[Task]) -> None:
+    """Measure the tasks that ``arguments.chart`` lacks, whose columns are ``arguments.columns``."""
     arguments.out.mkdir(parents=True, exist_ok=True)
-    todo = missing(arguments)
+    todo = missing(arguments, tasks)
     if arguments.list:
         print("\n".join(" | ".join((*task.key, task.prompt.text)) for task in todo))
         return
@@ -284,13 +290,24 @@ def device(text: str) -> str:
 
 
 def parse_arguments() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argument_parser(__doc__)
     add = parser.add_argument
     add("--charts", nargs="*", choices=VARIANTS, help="in order of priority (default: all)")
     add("--variant", action="append", type=variant, default=[], help='"NAME X KEY=VALUE ..."')
     add("--prompts", nargs="+", choices=("seen", "withheld"), default=["withheld"])
     add("--count", type=int, default=20, help="of prompts of each sort (default: 20)")
     add("--seeds", type=int, nargs="+", default=[0])
+    arguments = parsed(parser, (CHART, GPU_CHART))
+    arguments.columns = COLUMNS
+    if arguments.charts is None:
+        arguments.charts = [] if arguments.variant else list(VARIANTS)
+    return arguments
+
+
+def argument_parser(doc: str) -> argparse.ArgumentParser:
+    """Return a parser with the options of all benchmarks of runs."""
+    parser = argparse.ArgumentParser(description=doc.splitlines()[0])
+    add = parser.add_argument
     add("--models", default="toybox", help="toybox, or the folder of an export")
     add("--gpu", type=device, default=CPU, help="its number; its runs have a CSV of their own")
     add("--keep", type=Path, help="folder for the runs; those that it has are only scored")
@@ -299,12 +316,15 @@ def parse_arguments() -> argparse.Namespace:
     add("--out", type=Path, default=CHARTS, help="folder of the CSV (default: docs/charts)")
     add("--list", action="store_true", help="only print what would run")
     add_jobs(parser)
+    return parser
+
+
+def parsed(parser: argparse.ArgumentParser, charts: tuple[str, str]) -> argparse.Namespace:
+    """Parse the command line; choose the chart of the CPU or that of a GPU."""
     arguments = parser.parse_args()
-    arguments.chart = CHART if arguments.gpu == CPU else GPU_CHART
+    arguments.chart = charts[arguments.gpu != CPU]
     if arguments.only_score and not arguments.keep:
         parser.error("--only-score: give the runs' folder as --keep")
-    if arguments.charts is None:
-        arguments.charts = [] if arguments.variant else list(VARIANTS)
     return arguments
 
 
@@ -340,14 +360,14 @@ def unique(items: Iterator[Task]) -> list[Task]:
     return list(found.values())
 
 
-def missing(arguments: argparse.Namespace) -> list[Task]:
+def missing(arguments: argparse.Namespace, tasks: Iterator[Task]) -> list[Task]:
     """Return the tasks whose rows aren't in the CSV; with ``--only-score`` those without a run."""
     rows = rows_of(arguments.chart, arguments.out)
-    if rows and list(rows[0]) != COLUMNS:
+    if rows and list(rows[0]) != arguments.columns:
         path = arguments.out / f"{arguments.chart}.csv"
         sys.exit(f"{path} has other columns: give another folder as --out")
     done = {tuple(row[name] for name in KEY) for row in rows}
-    todo = [task for task in unique(tasks(arguments)) if task.key not in done]
+    todo = [task for task in unique(tasks) if task.key not in done]
     return [task for task in todo if not arguments.only_score or needs_no_run(task)]
 
 
@@ -393,7 +413,7 @@ def noted(done: Future, arguments: argparse.Namespace) -> bool:
     row = done.result()
     if not seconds_comparable(arguments.out):
         row = row | {"cpu_seconds": ""}
-    append_rows(arguments.chart, COLUMNS, [row], arguments.out)
+    append_rows(arguments.chart, arguments.columns, [row], arguments.out)
     return True
 
 

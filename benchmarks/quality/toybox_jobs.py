@@ -22,7 +22,7 @@ from threestudio_gaussiandreamer.models.bundled import (
 )
 from threestudio_gaussiandreamer.toybox import recognition
 from threestudio_gaussiandreamer.toybox.words import describe
-from threestudio_gaussiandreamer.toybox.world import VERSION, draw_attributes
+from threestudio_gaussiandreamer.toybox.world import VERSION, Attributes, draw_attributes
 
 CHART = "toybox"
 GPU_CHART = "toybox_gpu"
@@ -58,6 +58,7 @@ class Variant(NamedTuple):
     x: float = 0.0
     """The number that a chart varies; 0 if it varies none."""
     options: dict[str, Any] = {}
+    config: str = DEFAULT
 
     @property
     def key(self) -> tuple[str, str]:
@@ -68,16 +69,19 @@ class Prompt(NamedTuple):
     text: str
     index: int
     withheld: bool
+    attributes: Attributes
 
 
 @functools.cache
-def setup(models: str = NAME) -> str:
-    """Return a digest of what every run depends on: toybox.yaml and the networks but the judge.
+def setup(models: str = NAME, config: str = DEFAULT) -> str:
+    """Return a digest of what every run depends on: its configuration, and the networks but the
+    judge.
 
     Args:
         models: "toybox", or the folder of an export.
     """
-    return digest((CONFIG, networks(models)))
+    content = yaml.safe_load((ROOT / "configs" / config).read_text())
+    return digest((content, networks(models)))
 
 
 @functools.cache
@@ -111,13 +115,14 @@ def prompts(sort: str, count: int) -> list[Prompt]:
     """Write prompts for objects that no training saw.
 
     Args:
-        sort: "withheld": combinations of attributes that all trainings leave out; "seen": others,
-            on which settings are chosen.
+        sort: "withheld": combinations of attributes that all trainings leave out, but persons;
+            "persons": persons of such combinations; "seen": other objects, on which settings are
+            chosen.
     """
-    held_out = sort == "withheld"
+    held_out, share = sort != "seen", float(sort == "persons")
     found: list[Prompt] = []
     for index in range(count):
-        attributes = draw_attributes(PROMPT_SEED, index, held_out=held_out)
+        made = draw_attributes(PROMPT_SEED, index, held_out=held_out, person_share=share)
         rng = numpy_generator(PROMPT_SEED, "benchmark-prompt", int(held_out), index)
-        found.append(Prompt(describe(attributes, rng), index, held_out))
+        found.append(Prompt(describe(made, rng), index, held_out, made))
     return found

@@ -26,7 +26,7 @@ from threestudio_gaussiandreamer.meshes.mesh import Mesh
 from threestudio_gaussiandreamer.toybox import recognition
 from threestudio_gaussiandreamer.toybox.demo import samples
 from threestudio_gaussiandreamer.toybox.views import BACKGROUND, SIZE, render
-from threestudio_gaussiandreamer.toybox.world import RADIUS, draw_attributes, object_mesh
+from threestudio_gaussiandreamer.toybox.world import RADIUS, object_mesh
 
 FAINT = (0.03, 0.5)
 """Alpha of pixels that show neither object nor background."""
@@ -67,8 +67,8 @@ def at_limits(views: Float[Tensor, "V H W 3"]) -> float:
 
 def object_of(prompt: Prompt) -> Mesh:
     """Return an object with the prompt's attributes."""
-    attributes = draw_attributes(PROMPT_SEED, prompt.index, held_out=prompt.withheld)
-    return object_mesh(attributes, numpy_generator(PROMPT_SEED, "benchmark-mesh", prompt.index))
+    rng = numpy_generator(PROMPT_SEED, "benchmark-mesh", prompt.index)
+    return object_mesh(prompt.attributes, rng)
 
 
 def of_truth(prompt: Prompt, models: str) -> dict[str, float]:

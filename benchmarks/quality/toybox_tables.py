@@ -46,7 +46,8 @@ Row = dict[str, str]
 def asks_for(prompt: str, name: str) -> bool:
     """Return whether a prompt has what a column is about."""
     wanted = attributes_in(prompt)
-    has = {"pattern": wanted.pattern != "plain", "accessory": wanted.part or wanted.accessory}
+    extra = wanted.accessory if wanted.action else wanted.part or wanted.accessory
+    has = {"pattern": wanted.pattern != "plain", "accessory": extra}
     return bool(has.get(name, True))
 
 

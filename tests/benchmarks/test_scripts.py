@@ -2,12 +2,13 @@
 runs, each of which the launcher accepts.
 """
 
+import itertools
 import json
 import shutil
 
 import pytest
 
-from benchmarks.quality import jobs, runs, toybox, toybox_options
+from benchmarks.quality import avatars, jobs, runs, toybox, toybox_options
 from benchmarks.quality.toybox_jobs import SAMPLES, TRUTH
 from benchmarks.robustness import long_run
 from benchmarks.splatting import emulated
@@ -45,8 +46,8 @@ def test_the_options_of_every_chart_are_accepted():
         for job in make():
             check_config(load_config(*runs.configs_of(job.overlay), cli_args=words(job.options)))
     prompt = {"system.prompt_processor.prompt": "a red fox"}
-    for make in toybox_options.CHARTS.values():
-        for variant in make():
-            if variant.name not in (SAMPLES, TRUTH):
-                options = words(toybox.QUICK | variant.options | prompt)
-                check_config(load_config(runs.ROOT / "configs/toybox.yaml", cli_args=options))
+    charts = [list(make()) for make in toybox_options.CHARTS.values()]
+    for variant in itertools.chain(*charts, avatars.VARIANTS):
+        if variant.name not in (SAMPLES, TRUTH):
+            options = words(toybox.QUICK | variant.options | prompt)
+            check_config(load_config(runs.CONFIGS / variant.config, cli_args=options))

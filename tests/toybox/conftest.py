@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import pytest
 
 from tests.toybox.helpers import training
-from threestudio_gaussiandreamer.toybox import loop, models, views
+from threestudio_gaussiandreamer.toybox import loop, models, motion_stage, views
 from threestudio_gaussiandreamer.toybox.export import main as export
 
 
@@ -17,7 +17,8 @@ def small_sizes() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         for owner, sizes in (
             (models, {"UNET_CHANNELS": (16, 32), "VAE_CHANNELS": (8, 8, 8, 8), "TEXT_LAYERS": 1}),
-            (models, {"VISION_LAYERS": 1, "POINTS_LAYERS": 1}),
+            (models, {"VISION_LAYERS": 1, "POINTS_LAYERS": 1, "MOTION_LAYERS": 1}),
+            (motion_stage, {"EACH": 1}),
             (models.Judge, {"CHANNELS": (8, 8, 8, 8)}),
             (views, {"POINTS": 300, "OBJECTS": 4, "HELD_OUT_OBJECTS": 4}),
             (loop, {"LOG_EVERY": 1, "WARMUP": 1}),
@@ -50,7 +51,7 @@ def trained(folder, tmp_path_factory):
     """A folder in which every stage is trained for a step."""
     place = shutil.copytree(folder, tmp_path_factory.mktemp("trained") / "toybox")
     with small_sizes():
-        for name in ("unet", "points", "judge"):
+        for name in ("unet", "points", "motion", "judge"):
             training(place, name).run(4)
     return place
 

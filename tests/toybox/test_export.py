@@ -17,8 +17,9 @@ from threestudio_gaussiandreamer.host import find
 from threestudio_gaussiandreamer.models.bundled import DIGESTS, digest_of, read_digests
 from threestudio_gaussiandreamer.priors.point_e import PointEPrior
 from threestudio_gaussiandreamer.prompts import prompt_processors  # noqa: F401
-from threestudio_gaussiandreamer.toybox import models, train
+from threestudio_gaussiandreamer.toybox import models, train, views
 from threestudio_gaussiandreamer.toybox.export import main
+from threestudio_gaussiandreamer.toybox.kinds import KINDS
 from threestudio_gaussiandreamer.toybox.loop import averaged_weights, is_trained
 from threestudio_gaussiandreamer.toybox.tokens import open_tokenizer, token_ids
 from threestudio_gaussiandreamer.toybox.train import STAGES
@@ -104,7 +105,7 @@ def test_a_training_continues_from_the_weights_and_their_record(exported, traine
     shutil.copytree(exported, weights)
     (weights / "training.json").write_text(json.dumps(record))
     tokenizer_before = (trained / "tokenizer" / "vocab.json").read_bytes()
-    train.start_from(weights, there)
+    train.start_from(weights, there, STAGES)
     assert (tmp_path / "tokenizer" / "vocab.json").read_bytes() == tokenizer_before
     for name in STAGES:
         expected, found = averaged_weights(trained, name), averaged_weights(tmp_path, name)
@@ -116,15 +117,33 @@ def test_a_training_continues_from_the_weights_and_their_record(exported, traine
         assert run.progress.history == ([record[name]["last"]] if record[name]["last"] else [])
         before = run.progress.images
         assert before == training(trained, name).progress.images
-        if name in ("unet", "judge"):
+        if name in ("unet", "motion", "judge"):
             run.run(before + 4)
+
+
+def test_new_words_and_classes_are_added_to_weights():
+    words, kinds = torch.tensor([[1.0], [2], [3]]), torch.tensor([5.0, 6])
+    state = {"x.token_embedding.weight": words, "heads.kind.bias": kinds, "scale": torch.tensor(2)}
+    own = {"x.token_embedding.weight": torch.zeros(5, 1), "heads.kind.bias": torch.zeros(3)}
+    found = train.grown(state, own, [(0, 0), (3, 1), (4, 2)])
+    assert [value.flatten().tolist() for value in found.values()] == [
+        [1, 0, 0, 2, 3],
+        [5, 6, 0],
+        [2],
+    ]
+    state["x.token_embedding.weight"] = words[:, :0]  # of another width
+    with pytest.raises(RuntimeError):
+        train.grown(state, own, [(0, 0)])
+    # the classes of earlier judges keep their places
+    assert views.LABELS["accessory"][:5] == ("hat", "scarf", "flag", "balloon", "none")
+    assert views.LABELS["kind"][:16] == tuple(KINDS)
 
 
 def test_weights_of_another_size_are_refused(exported, tmp_path, monkeypatch):
     monkeypatch.setattr(models, "VISION_LAYERS", 2)
     monkeypatch.setattr(models, "FEATURES", 64)
     with pytest.raises(UserError, match="'text'.*of another model"):
-        train.start_from(exported, options(tmp_path))
+        train.start_from(exported, options(tmp_path), ["text"])
 
 
 def test_a_full_disk_is_one_message_and_the_call_can_be_repeated(
@@ -141,8 +160,8 @@ def test_a_full_disk_is_one_message_and_the_call_can_be_repeated(
     monkeypatch.setattr(train, "STAGES", {"text": STAGES["text"]})
     for size in (3000, 20000):  # in the vocabulary, and in a checkpoint
         with full_disk(size), pytest.raises(UserError, match="cannot write"):
-            train.start_from(exported, options(tmp_path))
-    train.start_from(exported, options(tmp_path))
+            train.start_from(exported, options(tmp_path), ["text"])
+    train.start_from(exported, options(tmp_path), ["text"])
     assert is_trained(tmp_path, "text") and open_tokenizer(tmp_path)
 
 
@@ -157,4 +176,4 @@ def test_other_folders_are_named(tmp_path, capsys):
             (tmp_path / "training.json").write_bytes(content)
         problem = "does not exist" if content is None else "training.json': it is .*damaged"
         with pytest.raises(UserError, match=problem):
-            train.start_from(tmp_path, options(tmp_path / "run"))
+            train.start_from(tmp_path, options(tmp_path / "run"), STAGES)

@@ -75,7 +75,7 @@ class TextStage(Stage):
 
     def frozen(self) -> tuple[str, ...]:
         """Freeze the encoder once other networks are trained on it."""
-        trained = is_trained(self.options.folder, "clip", "unet", "points")
+        trained = is_trained(self.options.folder, "clip", "unet", "points", "motion")
         return TEXT_PARTS if trained else ()
 
     def data(self) -> TextData:

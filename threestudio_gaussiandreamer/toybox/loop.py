@@ -281,6 +281,8 @@ class Training:
         factor = rate_factor(progress.step, self.done)
         for group in self.optimizer.param_groups:
             group["lr"] = self.stage.learning_rate * factor
+        rng = numpy_generator(self.stage.options.seed, f"{self.stage.name}-dropout", progress.step)
+        torch.manual_seed(int(rng.integers(2**63)))
         mixed = self.stage.options.precision == "bfloat16"
         with torch.autocast(device, dtype=torch.bfloat16, enabled=mixed):
             loss, metrics = self.stage.loss(self.model, batch)

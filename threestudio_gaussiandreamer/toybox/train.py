@@ -26,7 +26,8 @@ from ..core.files import existing_file, output_folder
 from ..core.options import shown
 from ..formats.reading import reading, require
 from ..launch.run_folder import claim
-from ..models.bundled import RECORD
+from ..models.bundled import MOTION, RECORD
+from ..priors.text_to_motion import load_motion_model
 from ..view.run_files import read_json
 from . import tokens
 from .autoencoder_stage import AutoencoderStage
@@ -121,10 +122,9 @@ def train(
 
 
 def start_from(weights: Path, options: Options, stages: Sequence[str]) -> None:
-    """Write a checkpoint for each of these stages of ``weights``, a folder that ``toybox.export``
-    wrote, of which the training folder has none. Optimisers start without state; the attribute
-    classifiers, which aren't published, and words and classes that the weights don't have, start at
-    random.
+    """Write checkpoints of ``weights``, a folder that ``toybox.export`` wrote, for the stages up to
+    the last of ``stages``, unless the training folder has them. Optimisers start without state;
+    attribute classifiers, which aren't published, and new words and classes start at random.
 
     Raises:
         UserError: a file is missing or damaged, or holds another model.
@@ -135,13 +135,16 @@ def start_from(weights: Path, options: Options, stages: Sequence[str]) -> None:
     vocabulary = read_json(existing_file(weights / "clip/vocab.json", "vocabulary"), dict)
     known = tokens.open_tokenizer(options.folder).get_vocab()
     tokens_kept = [(known[token], row) for token, row in vocabulary.items() if token in known]
-    for name in (name for name in STAGES if name in record and name in stages):
+    count = 1 + max(map(list(STAGES).index, stages))
+    for name in (name for name in list(STAGES)[:count] if name in record):
         if is_trained(options.folder, name):
             continue
         training, seen = Training(STAGES[name](options)), record[name]
         try:
-            state = grown(read_weights(weights, name), training.model.state_dict(), tokens_kept)
-            training.model.load_state_dict(state, strict=name in ("autoencoder", "unet", "points"))
+            own = training.model.state_dict()
+            unpublished = {k: v for k, v in own.items() if "heads." in k or "clip.text_" in k}
+            state = grown(read_weights(weights, name), own, tokens_kept)
+            training.model.load_state_dict(unpublished | state)
             if name == "unet":
                 vae = read_json(weights / "stable-diffusion/vae/config.json", dict)
                 training.stage.constants[LATENT_SCALE] = float(vae["scaling_factor"])
@@ -165,17 +168,19 @@ def start_from(weights: Path, options: Options, stages: Sequence[str]) -> None:
 def grown(
     state: dict[str, Tensor], own: dict[str, Tensor], tokens_kept: Sequence[tuple[int, int]]
 ) -> dict[str, Tensor]:
-    """Return weights with the rows that a larger network has more, from its own weights: those of
-    new tokens, and of classes, which are appended.
+    """Return weights with embeddings and classifiers of the sizes in ``own``, from which new tokens
+    and new classes, which are appended to the others, take their rows.
+
+    Args:
+        tokens_kept: the new row and the old one of each known token.
     """
     found = dict(state)
     for name, value in state.items():
-        target = own.get(name, value)
-        if value.ndim and target.shape[1:] == value.shape[1:] and len(target) > len(value):
-            found[name] = target.clone()
-            count = [(row, row) for row in range(len(value))]
-            to, of = zip(*(tokens_kept if "token_embedding" in name else count), strict=True)
-            found[name][list(to)] = value[list(of)]
+        embeds = "token_embedding" in name
+        if embeds or "heads." in name and len(own[name]) > len(value):
+            pairs = tokens_kept if embeds else [(row, row) for row in range(len(value))]
+            to, of = torch.tensor(pairs).T
+            found[name] = own[name].index_copy(0, to, value[of])
     return found
 
 
@@ -189,6 +194,8 @@ def read_weights(weights: Path, name: str) -> dict[str, Tensor]:
         prefix = "" if name == "text" else "clip."
         kept = (key for key in state if key.startswith(TEXT_PARTS) == (name == "text"))
         return {f"{prefix}{key}": state[key] for key in kept}
+    if name == "motion":
+        return load_motion_model(str(weights / MOTION)).network.state_dict()
     of_diffusion = "stable-diffusion/{}/diffusion_pytorch_model.safetensors"
     files = {"autoencoder": of_diffusion.format("vae"), "unet": of_diffusion.format("unet")}
     path = existing_file(weights / files.get(name, f"{name}.safetensors"), "weights")

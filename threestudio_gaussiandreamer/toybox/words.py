@@ -8,6 +8,7 @@ from typing import Optional
 
 import numpy as np
 
+from ..priors.motion_text import POSSESSIVES
 from ..prompts.view_prompts import THRESHOLDS
 from . import motions
 from .world import COLORS, Attributes
@@ -269,7 +270,7 @@ def attributes_in(prompt: str) -> Optional[Attributes]:
 def _meanings(prompt: str) -> list[Word]:
     """Return the known words in order; of those that begin at one place, the longest."""
     text, found = " ".join(re.findall(r"[^\W_]+", prompt.lower())) + " ", []
-    text = re.sub(r"\b(his|her|their)\b", "the", text)  # "kicks with his left leg"
+    text = POSSESSIVES.sub("the", text)  # "kicks with his left leg"
     while text:
         phrase = next((p for p in PHRASES if text.startswith(f"{p} ")), "")
         if phrase:

@@ -82,22 +82,25 @@ class Attributes(NamedTuple):
     """What a person does: one of ``motions.names()``."""
 
 
-def draw_attributes(seed: int, index: int, *, held_out: bool = False) -> Attributes:
+def draw_attributes(
+    seed: int, index: int, *, held_out: bool = False, person_share: float = PERSON_SHARE
+) -> Attributes:
     """Draw the attributes of object ``index``, either withheld from training or not."""
     for attempt in itertools.count():  # one in 25 combinations is withheld
-        attributes = _draw(numpy_generator(seed, "toybox-attributes", attempt, index))
+        rng = numpy_generator(seed, "toybox-attributes", attempt, index)
+        attributes = _draw(rng, person_share)
         if withheld(attributes) == held_out:
             break
     return attributes
 
 
-def _draw(rng: np.random.Generator) -> Attributes:
+def _draw(rng: np.random.Generator, person_share: float) -> Attributes:
     colors = [list(COLORS)[i] for i in rng.permutation(len(COLORS))]
     pattern = "plain" if rng.random() < 0.4 else str(rng.choice(PATTERNS[1:]))
     extra = str(rng.choice(["none", "part", "accessory"], p=[0.35, 0.25, 0.4]))
     kind = str(rng.choice(list(KINDS)))
     accessory = str(rng.choice(THINGS_WORN)) if extra == "accessory" else None
-    if rng.random() < PERSON_SHARE:
+    if rng.random() < person_share:
         return Attributes(
             PERSON,
             colors[0],
