@@ -1,6 +1,5 @@
 """Train the autoencoder on clean pictures and on renders of rough Gaussians, since score
-distillation encodes such renders in its first iterations.
-"""
+distillation encodes such renders in its first iterations."""
 
 import math
 from typing import NamedTuple
@@ -19,11 +18,9 @@ from .views import DISTANCE, FOVY_DEG, Shard, Shards, render_gaussians, with_bac
 
 RANDOM_BACKGROUNDS = 0.15
 FULL_EVERY = 4
-"""One step in four trains on pictures of the full size, a quarter as many; the others on pictures
-of half the size. On crops, colours were learnt much more slowly.
-"""
-KL_WEIGHT = 2e-4
-EDGE_WEIGHT, SQUARE_WEIGHT = 1.0, 2.0
+"""One step in four is of pictures of the full size, a quarter as many; the others of half the size.
+On crops, colours were learnt much more slowly."""
+KL_WEIGHT, EDGE_WEIGHT, SQUARE_WEIGHT = 2e-4, 1.0, 2.0
 
 
 class AutoencoderBatch(NamedTuple):
@@ -105,9 +102,8 @@ def rough_render(shard: Shard, row: int, rng: np.random.Generator) -> UInt8[np.n
 def rough_gaussians(
     points: Float[np.ndarray, "P 6"], rng: np.random.Generator
 ) -> tuple[np.ndarray, ...]:
-    """Make Gaussians of a random number, size, opacity and error of place and colour from places
-    on a surface and their colours; return them as the first arguments of ``rasterize``.
-    """
+    """Make Gaussians, the first arguments of ``rasterize``, of a random number, size, opacity and
+    error of place and colour from places on a surface and their colours."""
     points = points[: int(rng.integers(200, 1000))]
     count = len(points)
     grey = rng.uniform(0, 1)

@@ -1,8 +1,7 @@
 """Train CLIP: first the text encoder, to recognise an object's attributes in its prompt, then the
 image encoder, on the fixed features of the trained text encoder (after Zhai et al. 2022).
 
-Classifiers teach small encoders which colour belongs to which part, much earlier than contrast.
-"""
+Classifiers teach small encoders which colour belongs to which part, much earlier than contrast."""
 
 import re
 from dataclasses import dataclass
@@ -38,7 +37,7 @@ class TextBatch(NamedTuple):
 
 @dataclass(frozen=True)
 class TextData(Dataset):
-    """Prompts of random objects, each from a random view; a batch is a function of (seed, step)."""
+    """Prompts of random objects from random views; a batch is a function of (seed, step)."""
 
     seed: int
     batch: int
@@ -112,8 +111,6 @@ def trained_clip(folder: Path, vocabulary_size: int, stage: str) -> Any:
     clip.load_state_dict(entries_below(weights, "clip.") if whole else weights, strict=whole)
     return clip.eval().requires_grad_(False)
 
-
-# Pictures -------------------------------------------------------------------------------------
 
 RANDOM_BACKGROUNDS = 0.3
 LARGEST_SCALE = 100.0

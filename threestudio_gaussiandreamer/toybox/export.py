@@ -30,7 +30,7 @@ from ..core.checkpoint_file import load_file
 from ..core.command import run_command
 from ..core.errors import UserError
 from ..core.files import atomic_file, output_folder
-from ..models.bundled import BODY, FOLDER, MOTION, write_digests
+from ..models.bundled import BODY, FOLDER, MOTION, RECORD, write_digests
 from ..priors.text_to_motion import STATISTICS, mdm_files
 from . import models
 from .clip_stage import trained_clip
@@ -46,8 +46,7 @@ def export(training: Path, target: Path) -> dict[str, Any]:
     and judge those that it has. Return what ``training.json`` says.
 
     Raises:
-        UserError: a stage isn't trained yet, or the disk is full.
-    """
+        UserError: a stage isn't trained yet, or the disk is full."""
     tokenizer = open_tokenizer(training)
     clip = trained_clip(training, len(tokenizer), "clip")
     _save(clip, target / "clip")
@@ -61,8 +60,7 @@ def export(training: Path, target: Path) -> dict[str, Any]:
         with atomic_file(target / BODY) as file:
             file.write((FOLDER / BODY).read_bytes())
     record = training_record(training)
-    with atomic_file(target / "training.json") as file:
-        file.write(json.dumps(record, indent=2).encode())
+    _write_json(target / RECORD, record)
     write_digests(target)
     return record
 
@@ -82,8 +80,7 @@ def write_stable_diffusion(folder: Path, training: Path, clip: Any) -> None:
         _save(network, folder / name)
     copy_tokenizer(training / "tokenizer", folder / "tokenizer")
     models.scheduler().save_pretrained(folder / "scheduler")
-    with atomic_file(folder / "model_index.json", durable=False) as file:
-        file.write(json.dumps(MODEL_INDEX, indent=2).encode())
+    _write_json(folder / "model_index.json", MODEL_INDEX)
 
 
 MODEL_INDEX = {
@@ -116,8 +113,7 @@ def write_motion_model(path: Path, training: Path) -> None:
     output_folder(path.parent, "the motion model")
     with atomic_file(path) as file:
         torch.save({name: value.half() for name, value in state.items()}, file)
-    with atomic_file(path.parent / "args.json") as file:
-        file.write(json.dumps(args, indent=2).encode())
+    _write_json(path.parent / "args.json", args)
     for name, key in zip(STATISTICS[0], ("mean", "std"), strict=True):
         with atomic_file(path.parent / name) as file:
             np.save(file, np.float32(content["constants"][key]))
@@ -139,6 +135,11 @@ def training_record(training: Path) -> dict[str, Any]:
                 "withheld": content["measured"],
             }
     return record
+
+
+def _write_json(path: Path, content: dict[str, Any]) -> None:
+    with atomic_file(path) as file:
+        file.write(json.dumps(content, indent=2).encode())
 
 
 def _save(network: Any, folder: Path) -> None:

@@ -1,8 +1,7 @@
 """Train the judge, a classifier that evaluates the other networks, on data of a separate seed.
 
 Most of its pictures show objects as Gaussians with errors, as results of score distillation, whose
-blurred edges a classifier of ray-cast pictures alone takes for other colours.
-"""
+blurred edges a classifier of ray-cast pictures alone takes for other colours."""
 
 import dataclasses
 from typing import NamedTuple
@@ -26,16 +25,13 @@ CAST_EVERY = 3
 """One step in so many is of ray-cast pictures, the others of renders of Gaussians."""
 SPLATS_VERSION = 1
 """Changes with :func:`imperfect_gaussians`, so that no training reads earlier pictures."""
-COUNT = (800, 4000)
-"""Range of the number of Gaussians."""
+COUNT, BLENDED = (800, 4000), 12
+"""Range of the number of Gaussians, and of how many neighbours at most colours are averaged."""
 WAVES, WAVELENGTH = 6, (0.15, 0.8)
 """Number of plane waves of a smooth error, and the range of their lengths, world units."""
-COLOR_SHIFT, SHAPE_SHIFT = 0.06, 0.025
-"""Largest deviations of smooth displacements of the pattern and of the shape, world units."""
-BLENDED = 12
-"""Largest number of neighbouring points whose colours are averaged."""
-COLOR_ERROR, COLOR_NOISE = 0.08, 0.12
-"""Largest standard deviations of smooth errors of the colour, and of errors of each Gaussian's."""
+COLOR_SHIFT, SHAPE_SHIFT, COLOR_ERROR, COLOR_NOISE = 0.06, 0.025, 0.08, 0.12
+"""Largest deviations of smooth displacements of pattern and shape, world units; of smooth errors of
+the colour, and of errors of each Gaussian's."""
 
 
 class SplatShards(Shards):
@@ -50,9 +46,8 @@ class SplatShards(Shards):
 
 
 def imperfect_gaussians(mesh: Mesh, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
-    """Cover a surface with Gaussians whose pattern, shape and colours have errors, of random sizes
-    up to the constants above; return them as the first arguments of ``rasterize``.
-    """
+    """Cover a surface with Gaussians, the first arguments of ``rasterize``, whose pattern, shape
+    and colours have errors of random sizes up to the constants above."""
     count = int(rng.integers(*COUNT))
     points, faces, barycentric = sample_surface(mesh, count, rng)
     colors = surface_colors(mesh, faces, barycentric)

@@ -4,8 +4,7 @@ z is up and the front is +x.
 
 Roles: "body" and "part" take the prompt's colours; "dark", "pale", "warm" and "glass" are fixed
 details, which tell the front from the back. Sizes are arbitrary, since ``world.py`` scales every
-object to the same bounding sphere.
-"""
+object to the same bounding sphere."""
 
 from collections.abc import Callable, Sequence
 from typing import NamedTuple

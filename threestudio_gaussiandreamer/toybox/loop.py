@@ -33,16 +33,12 @@ CLIP_GRADIENT = 1.0
 LOG_EVERY, SAVE_SECONDS = 50, 300.0
 
 
-# Batches --------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class StepData(Dataset):
     """The batches of one stage, indexed by step. It is sent to worker processes.
 
     Each pass over a shard visits its rows (pictures, or objects) in random order; an incomplete
-    last batch is dropped.
-    """
+    last batch is dropped."""
 
     shards: Shards
     batch: int
@@ -51,9 +47,7 @@ class StepData(Dataset):
     stream: str
     """Name of the streams of random numbers."""
     make: Callable[[int, np.ndarray, np.random.Generator], Any]
-    """Makes the batch of these rows of a shard, given by its index: a named tuple of tensors and
-    numbers.
-    """
+    """Makes the batch of these rows of a shard, a named tuple of tensors and numbers."""
     per_object: bool = False
     """Whether rows are objects instead of pictures."""
 
@@ -88,16 +82,13 @@ def moved(batch: Any, device: torch.device) -> Any:
 
 
 def torch_generator(rng: np.random.Generator) -> torch.Generator:
-    """Return a torch generator that is seeded by the next number of ``rng``."""
+    """Return a torch generator with the next number of ``rng`` as its seed."""
     return torch.Generator().manual_seed(int(rng.integers(2**63)))
 
 
 def normal(rng: np.random.Generator, shape: Sequence[int]) -> torch.Tensor:
     """Draw standard normal numbers, float32."""
     return torch.from_numpy(rng.standard_normal(tuple(shape), dtype=np.float32))
-
-
-# Checkpoints ----------------------------------------------------------------------------------
 
 
 def checkpoint_path(folder: Path, name: str) -> Path:
@@ -118,25 +109,17 @@ def averaged_weights(folder: Path, name: str) -> dict[str, Tensor]:
     return entries_below(load_file(path)["ema"], "module.")
 
 
-# Training -------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class Options:
-    """The options of a training."""
+    """The options of a training, those of the command line in ``train.py``."""
 
     folder: Path
-    """The folder for shards, checkpoints and curves."""
     seed: int = 0
     device: str = "cpu"
     pool: int = 40
-    """Number of shards, which a stage visits in a cycle."""
     precision: str = "float32"
-    """Either "float32", or "bfloat16" for autocast on GPUs and on CPUs that multiply it."""
     batch: Optional[int] = None
-    """Batch size; None for the default of each stage."""
     workers: int = 0
-    """Number of processes that make batches in advance."""
 
     @property
     def shards(self) -> Shards:
@@ -150,7 +133,7 @@ class Stage(ABC):
     batch_size: ClassVar[int]
     learning_rate: ClassVar[float]
     images: ClassVar[int]
-    """Number of images in a full training."""
+    """Of a full training."""
 
     def __init__(self, options: Options) -> None:
         self.options = options
@@ -174,12 +157,10 @@ class Stage(ABC):
         self, make: Callable[..., Any], *given: Any, shards: Optional[Shards] = None, **more: Any
     ) -> StepData:
         """Return the batches ``make(shards, *given, index, rows, rng)`` of these shards, by default
-        the stage's own; ``more`` are further fields of :class:`StepData`.
-        """
-        shards, fields = shards or self.shards, {"stream": self.name, "batch": self.batch} | more
-        return StepData(
-            shards, pool=self.options.pool, make=partial(make, shards, *given), **fields
-        )
+        the stage's own; ``more`` are further fields of :class:`StepData`."""
+        shards = shards or self.shards
+        fields = {"stream": self.name, "batch": self.batch, "pool": self.options.pool} | more
+        return StepData(shards, make=partial(make, shards, *given), **fields)
 
     def batches(self, step: int) -> Iterator[Any]:
         """Yield the batches from ``step`` on, on the stage's device."""
@@ -248,8 +229,7 @@ class Training:
     def run(self, images: Optional[int] = None, seconds: float = math.inf) -> Progress:
         """Train until ``images`` (default: the stage's number) have been seen or ``seconds`` of
         training have passed, those before a resumption included. A stop signal, such as Ctrl-C,
-        ends it earlier: a checkpoint is saved, and ``signum`` is the signal's number.
-        """
+        ends it earlier: a checkpoint is saved, and ``signum`` is the signal's number."""
         self.target, self.limit = images or self.stage.images, seconds
         earlier = set_handlers(lambda number, frame: setattr(self, "signum", number))
         saved = logged = started = time.monotonic()

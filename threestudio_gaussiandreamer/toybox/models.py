@@ -21,12 +21,8 @@ LATENT_CHANNELS = 4
 POINTS_WIDTH, POINTS_LAYERS = 128, 5
 MOTION_WIDTH, MOTION_LAYERS, MOTION_HIDDEN = 128, 4, 1024
 """The last is that of every published MDM."""
-SCHEDULE = {
-    "num_train_timesteps": 1000,
-    "beta_start": 0.00085,
-    "beta_end": 0.012,
-    "beta_schedule": "scaled_linear",
-}
+SCHEDULE = {"num_train_timesteps": 1000, "beta_schedule": "scaled_linear"}
+SCHEDULE |= {"beta_start": 0.00085, "beta_end": 0.012}
 """Stable Diffusion's."""
 
 
@@ -35,26 +31,17 @@ def clip_model(vocabulary_size: int) -> Any:
     from transformers import CLIPConfig, CLIPModel
 
     start, end = vocabulary_size - 2, vocabulary_size - 1
-    both = {"num_attention_heads": HEADS, "hidden_act": "gelu", "projection_dim": FEATURES}
-    text = dict(
-        vocab_size=vocabulary_size,
-        hidden_size=TEXT_WIDTH,
-        intermediate_size=4 * TEXT_WIDTH,
-        num_hidden_layers=TEXT_LAYERS,
-        max_position_embeddings=LENGTH,
-        bos_token_id=start,
-        eos_token_id=end,
-        pad_token_id=end,
-    )
-    vision = dict(
-        hidden_size=VISION_WIDTH,
-        intermediate_size=4 * VISION_WIDTH,
-        num_hidden_layers=VISION_LAYERS,
-        image_size=SIZE,
-        patch_size=PATCH,
-    )
-    towers = {"text_config": text | both, "vision_config": vision | both}
+    text = {"vocab_size": vocabulary_size, "max_position_embeddings": LENGTH}
+    text |= {"bos_token_id": start, "eos_token_id": end, "pad_token_id": end}
+    text |= _transformer(TEXT_WIDTH, TEXT_LAYERS)
+    vision = _transformer(VISION_WIDTH, VISION_LAYERS) | {"image_size": SIZE, "patch_size": PATCH}
+    towers = {"text_config": text, "vision_config": vision}
     return CLIPModel(CLIPConfig(**towers, projection_dim=FEATURES))
+
+
+def _transformer(width: int, layers: int) -> dict[str, Any]:
+    sizes = {"hidden_size": width, "intermediate_size": 4 * width, "num_hidden_layers": layers}
+    return sizes | {"num_attention_heads": HEADS, "hidden_act": "gelu", "projection_dim": FEATURES}
 
 
 def autoencoder() -> Any:
@@ -107,8 +94,7 @@ def unet() -> Any:
 @torch.no_grad()
 def start_as_identity(network: nn.Module) -> None:
     """Initialise every block of a diffusers network to pass its input on unchanged, so that
-    training needs far fewer steps: residual branches start at zero, resampling as averages.
-    """
+    training needs far fewer steps: residual branches start at zero, resampling as averages."""
     for name, module in network.named_modules():
         if name.endswith(("conv2", "proj_out")):
             _start_at_zero(module)
@@ -143,9 +129,8 @@ class AttributeHeads(nn.Module):
 
     def __init__(self, width: int) -> None:
         super().__init__()
-        self.heads = nn.ModuleDict(
-            {name: nn.Linear(width, len(classes)) for name, classes in LABELS.items()}
-        )
+        sizes = {name: len(classes) for name, classes in LABELS.items()}
+        self.heads = nn.ModuleDict({name: nn.Linear(width, n) for name, n in sizes.items()})
 
     def forward(self, features: Float[Tensor, "B W"]) -> dict[str, Tensor]:
         return {name: head(features) for name, head in self.heads.items()}
@@ -154,8 +139,7 @@ class AttributeHeads(nn.Module):
 class Judge(nn.Module):
     """A convolutional classifier of pictures in [0, 1], (B, 3, 128, 128), into LABELS.
 
-    It shares neither architecture nor training data nor seed with the models that it evaluates.
-    """
+    It shares neither architecture nor training data nor seed with the models that it evaluates."""
 
     CHANNELS = (24, 48, 96, 128)
 
@@ -193,8 +177,7 @@ def classified(logits: dict[str, Tensor], labels: Int[Tensor, "B L"]) -> tuple[T
 
 def accuracies(logits: dict[str, Tensor], labels: Int[Tensor, "B L"]) -> dict[str, float]:
     """Return the share recognised of each attribute."""
-    out = {}
-    for (name, value), label in zip(logits.items(), labels.unbind(1), strict=True):
-        known = label != IGNORED
-        out[name] = float((value.argmax(-1)[known] == label[known]).float().mean())
-    return out
+    return {
+        name: float((value.argmax(-1) == label)[label != IGNORED].float().mean())
+        for (name, value), label in zip(logits.items(), labels.unbind(1), strict=True)
+    }

@@ -69,8 +69,7 @@ class PointsStage(Stage):
     def loss(self, model: nn.Module, batch: PointsBatch) -> tuple[Tensor, dict[str, Tensor]]:
         condition = self.condition(batch.ids) * ~batch.empty[:, None]
         z = sds.diffuse(batch.points, batch.noise, self.alphas_cumprod[batch.t])
-        predicted = mean_of(model, condition)(z, batch.t).float()
-        errors = (predicted - batch.noise).square()
+        errors = (mean_of(model, condition)(z, batch.t).float() - batch.noise).square()
         parts = {"mse_points": errors[:, :3].mean(), "mse_colors": errors[:, 3:].mean()}
         return errors.mean(), parts
 
@@ -83,8 +82,7 @@ class PointsStage(Stage):
 
 def network_units(points: Float[Tensor, "B N 6"]) -> Float[Tensor, "B 6 N"]:
     """Convert points of the world to the units of Point-E's networks: their front is -y and their
-    unit 2 RADIUS; then follow the published scales and biases.
-    """
+    unit 2 RADIUS; then follow the published scales and biases."""
     x, y, z = (points[..., i] / (2 * RADIUS) for i in range(3))
     turned = torch.stack([y, -x, z, *(255 * points[..., i] for i in (3, 4, 5))], dim=1)
     return turned * SCALES + BIASES

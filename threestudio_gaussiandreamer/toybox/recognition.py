@@ -45,8 +45,7 @@ def load_judge(name: str) -> Judge:
         name: ``toybox``, the folder of an export, or the file.
 
     Raises:
-        UserError: there is no such file, or it doesn't hold a judge.
-    """
+        UserError: there is no such file, or it doesn't hold a judge."""
     from ..priors.karras import load_exactly, read_state_dict  # imports Lightning
 
     path, judge = model_part(name, JUDGE), Judge()
@@ -58,13 +57,9 @@ def load_judge(name: str) -> Judge:
 def views() -> Orbit:
     """Return the eight views that the judge sees, two of each quadrant in the order of LABELS."""
     azimuth = torch.tensor([90.0 * side + offset for side in range(4) for offset in OFFSETS_DEG])
-    ones = torch.ones_like(azimuth)
-    return Orbit(
-        ELEVATION_DEG * ones,
-        (azimuth + 180) % 360 - 180,
-        sum(DISTANCE) / 2 * ones,
-        math.radians(FOVY_DEG) * ones,
-    )
+    ones, distance, fovy = torch.ones_like(azimuth), sum(DISTANCE) / 2, math.radians(FOVY_DEG)
+    around = (azimuth + 180) % 360 - 180
+    return Orbit(ELEVATION_DEG * ones, around, distance * ones, fovy * ones)
 
 
 @torch.no_grad()
@@ -75,8 +70,7 @@ def probabilities(judge: Judge, pictures: Float[Tensor, "V 3 s s"]) -> dict[str,
 
 def recognized(found: dict[str, Tensor], wanted: Attributes) -> dict[str, float]:
     """Return whether the pictures show each attribute as the prompt does, which may name none: 1,
-    0 or NaN.
-    """
+    0 or NaN."""
     names = ("kind", "color", "part", "accessory", "accessory_color", "action")
     shown = {name: LABELS[name][int(found[name].mean(dim=0).argmax())] for name in names}
     right = {name: shown[name] == (getattr(wanted, name) or "none") for name in names}
@@ -106,8 +100,7 @@ def most_probable_pattern(found: dict[str, Tensor]) -> tuple[str, str, str]:
     """Return the most probable pattern, and the most probable two colours with it, among the
     combinations that objects have: two different colours, or plain with "none" as the second one.
 
-    The probability of a combination is the product of the three, averaged over the views.
-    """
+    The probability of a combination is the product of the three, averaged over the views."""
     pattern, color, second = (found[name].mean(dim=0) for name in ("pattern", "color", "second"))
     joint = pattern[:, None, None] * color[:, None] * second * _possible()
     chosen = int(joint.sum(dim=(1, 2)).argmax())

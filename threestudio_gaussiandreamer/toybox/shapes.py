@@ -2,8 +2,7 @@
 
 A role says which colour a part gets ("body", "part", "accessory", or a fixed detail as "dark"). The
 pattern coordinates of a vertex are (around, along) in world units of the object before it is
-scaled; ``world.py`` divides them by the pattern's period.
-"""
+scaled; ``world.py`` divides them by the pattern's period."""
 
 from typing import NamedTuple
 
@@ -27,11 +26,14 @@ class Shape(NamedTuple):
 
 
 def lathe(role: str, profile, center=(0, 0, 0), axis=(0, 0, 1), segments: int = SEGMENTS) -> Shape:
-    """Revolve a polyline of (radius, height) pairs around ``axis`` through ``center``.
-
-    Each piece of the polyline gets its own vertices and normal, so that its corners are sharp.
-    """
-    return _revolve(role, *_sharp(np.asarray(profile, float)), center, axis, segments)
+    """Revolve a polyline of (radius, height) pairs around ``axis`` through ``center``. Each piece
+    has its own vertices and normal, so that corners are sharp."""
+    profile = np.asarray(profile, float)
+    step = np.diff(profile, axis=0)
+    normal = np.stack([step[:, 1], -step[:, 0]], 1)
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
+    rows = np.stack([profile[:-1], profile[1:]], 1).reshape(-1, 2)
+    return _revolve(role, rows, np.repeat(normal, 2, axis=0), center, axis, segments)
 
 
 def ellipsoid(role: str, center, radii, axis=(0, 0, 1), rings: int = 10) -> Shape:
@@ -139,15 +141,6 @@ def _placed(vertices, faces, normals, uv, center, axis, role: str) -> Shape:
     """Turn the z axis to ``axis``, then move the origin to ``center``."""
     turn = frame(axis)
     return Shape(vertices @ turn + np.asarray(center), faces, normals @ turn, uv, role)
-
-
-def _sharp(profile: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return two rows of points and normals for each piece of a polyline."""
-    step = np.diff(profile, axis=0)
-    normal = np.stack([step[:, 1], -step[:, 0]], 1)
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
-    rows = np.stack([profile[:-1], profile[1:]], 1).reshape(-1, 2)
-    return rows, np.repeat(normal, 2, axis=0)
 
 
 def _grid_faces(rows: int, columns: int) -> Int[np.ndarray, "F 3"]:

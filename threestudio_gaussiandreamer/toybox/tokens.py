@@ -1,6 +1,5 @@
 """Prompts of pictures as token ids, the same for every stage that reads text, and their CLIP
-tokenizer: it has one token for every word of the toybox, and makes bytes and pieces of others.
-"""
+tokenizer: it has one token for every word of the toybox, and makes bytes and pieces of others."""
 
 import json
 from collections.abc import Sequence
@@ -85,8 +84,6 @@ def _merged(pieces: list[str], pair: tuple[str, str]) -> list[str]:
     return out
 
 
-# Prompts --------------------------------------------------------------------------------------
-
 JOINED_PLAIN_SHARE = 0.03
 """Fraction of objects with joined views whose prompts name no direction."""
 
@@ -95,8 +92,7 @@ def open_tokenizer(folder: Path) -> Any:
     """Load the training's tokenizer, which is written on first use.
 
     Raises:
-        UserError: it is of an earlier version of the toybox, and lacks words.
-    """
+        UserError: it is of an earlier version of the toybox, and lacks words."""
     from transformers import CLIPTokenizer
 
     place = Path(folder) / "tokenizer"
@@ -127,8 +123,7 @@ def joined_prompts(
     shard: Shard, objects: np.ndarray, views: int, rng: np.random.Generator
 ) -> list[str]:
     """Write prompts for all views of these objects: the same words, and each view's direction; or
-    of some only empty prompts, or prompts without a direction.
-    """
+    of some only empty prompts, or prompts without a direction."""
     texts: list[str] = []
     for row in objects:
         share = rng.random()
@@ -158,8 +153,7 @@ def view_prompts(
     """Write a prompt with its direction for each picture, as the prompt processors write it.
 
     Args:
-        opposite: name the opposite direction instead.
-    """
+        opposite: name the opposite direction instead."""
     texts, names = object_prompts(shard.labels[rows], rng), _directions(shard, rows)
     names = [words.OPPOSITE[name] for name in names] if opposite else names
     return [f"{text}, {name} view" for text, name in zip(texts, names, strict=True)]

@@ -1,8 +1,7 @@
 """Train the toybox's models: ``python -m threestudio_gaussiandreamer.toybox.train FOLDER``.
 
 Stages run in order, each up to its number of images, and go on from their checkpoints, so the same
-command continues a training that was stopped anywhere.
-"""
+command continues a training that was stopped anywhere."""
 
 import argparse
 import dataclasses
@@ -104,8 +103,7 @@ def train(
 
     Raises:
         UserError: another process trains one of them in this folder.
-        Terminated, KeyboardInterrupt: a signal stopped one, after it wrote its checkpoint.
-    """
+        Terminated, KeyboardInterrupt: a signal stopped one, after it wrote its checkpoint."""
     for name in (name for name in STAGES if name in stages):
         # another process's checkpoints would replace these
         busy = f"another process trains the stage {name!r}"
@@ -127,8 +125,7 @@ def start_from(weights: Path, options: Options, stages: Sequence[str]) -> None:
     attribute classifiers, which aren't published, and new words and classes start at random.
 
     Raises:
-        UserError: a file is missing or damaged, or holds another model.
-    """
+        UserError: a file is missing or damaged, or holds another model."""
     with reading(weights / RECORD, "record of the toybox's weights") as path:
         record = {name: dict(seen) for name, seen in json.loads(path.read_bytes()).items()}
         require(bool(record), "it names no network")
@@ -172,8 +169,7 @@ def grown(
     and new classes, which are appended to the others, take their rows.
 
     Args:
-        tokens_kept: the new row and the old one of each known token.
-    """
+        tokens_kept: the new row and the old one of each known token."""
     found = dict(state)
     for name, value in state.items():
         embeds = "token_embedding" in name

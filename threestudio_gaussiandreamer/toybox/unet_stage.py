@@ -57,11 +57,7 @@ def unet_batch(
     rng: np.random.Generator,
 ) -> UNetBatch:
     """Draw a prompt, latents and noise for each of these pictures, and a timestep; with ``views``
-    above 1, rows are objects, whose views have one timestep.
-
-    Args:
-        moments: the files of the shards' posteriors.
-    """
+    above 1, rows are objects, whose views have one timestep. ``moments``: the shards' files."""
     if views == 1:
         texts = training_prompts(shards.get(index), rows, rng)
     else:
@@ -82,9 +78,8 @@ def kept_moments(path: Path) -> Float[Tensor, "2 N 4 s s"]:
 
 class UNetStage(Stage):
     """Train v-prediction with the weights SNR + 1 of Salimans and Ho (2022), truncated as in Hang
-    et al. (2023). In most steps the self-attention joins the views of an object, as in MVDream (Shi
-    et al. 2023), so that their prompts have to tell the directions apart.
-    """
+    et al. (2023). Most steps join the self-attention of an object's views, as in MVDream (Shi et
+    al. 2023), so that their prompts have to tell the directions apart."""
 
     name = "unet"
     batch_size = 64
@@ -97,10 +92,9 @@ class UNetStage(Stage):
         clip = trained_clip(folder, len(self.tokenizer), "text")
         self.text_model = clip.text_model.to(self.device)
         self.vae = frozen_autoencoder(folder).to(self.device)
-        digest = hashlib.sha256()
-        for name, value in sorted(self.vae.encoder.state_dict().items()):
-            digest.update(name.encode() + value.cpu().contiguous().numpy().tobytes())
-        self.encoder_digest = digest.hexdigest()
+        encoder = sorted(self.vae.encoder.state_dict().items())
+        content = (name.encode() + v.cpu().contiguous().numpy().tobytes() for name, v in encoder)
+        self.encoder_digest = hashlib.sha256(b"".join(content)).hexdigest()
         betas = models.scheduler().betas.double()
         self.alphas_cumprod = torch.cumprod(1 - betas, dim=0).to(self.device)
         self.constants[LATENT_SCALE] = latent_scale(kept_moments(self._moments(0)))
@@ -112,7 +106,7 @@ class UNetStage(Stage):
         given = self.tokenizer, [self._moments(index) for index in pool]
         singles, views = self.steps(unet_batch, *given, 1), self.shards.views
         objects = {"batch": self.batch // views, "stream": "unet-joined", "per_object": True}
-        if not objects["batch"]:
+        if self.batch < views:
             return singles
         return MixedData(singles, self.steps(unet_batch, *given, views, **objects), SINGLE_EVERY)
 
@@ -125,11 +119,8 @@ class UNetStage(Stage):
 
     def _errors(self, model: nn.Module, batch: UNetBatch) -> Float[Tensor, " B"]:
         """Return the squared errors of v."""
-        abar, noise, x = (
-            self.alphas_cumprod[batch.t],
-            batch.noise,
-            batch.latents * self.constants[LATENT_SCALE],
-        )
+        abar, noise = self.alphas_cumprod[batch.t], batch.noise
+        x = batch.latents * self.constants[LATENT_SCALE]
         z = sds.diffuse(x, noise, abar).contiguous(memory_format=torch.channels_last)
         v = sds.per_item(abar.sqrt(), x) * noise - sds.per_item((1 - abar).sqrt(), x) * x
         with torch.no_grad():
@@ -186,9 +177,8 @@ class UNetStage(Stage):
 
 
 def truncated_weight(abar: Float[Tensor, " B"]) -> Float[Tensor, " B"]:
-    """Return the weight of v's squared error, (min(SNR, gamma) + 1) / (SNR + 1). Only at the high
-    noise levels, which keep it, does the prompt decide between left and right.
-    """
+    """Return the weight of v's squared error, (min(SNR, gamma) + 1) / (SNR + 1): whole at high
+    noise, where the prompt decides between left and right."""
     snr = abar / (1 - abar)
     return (snr.clamp(max=SNR_GAMMA) + 1) / (snr + 1)
 

@@ -21,18 +21,9 @@ from ..core.streams import numpy_generator
 from ..meshes.mesh import Mesh, sample_surface, surface_colors
 from ..meshes.raycast import MeshCaster
 from ..splatting import rasterize
-from . import motions
+from . import motions, world
 from .kinds import KINDS
-from .world import (
-    COLORS,
-    PATTERNS,
-    PERSON,
-    THINGS_WORN,
-    VERSION,
-    Attributes,
-    draw_attributes,
-    object_mesh,
-)
+from .world import COLORS, Attributes
 
 SIZE = 128
 """Height and width of the pictures, pixels."""
@@ -49,12 +40,12 @@ HELD_OUT_OBJECTS = 64
 """Number of objects for evaluation, which are withheld from training."""
 
 LABELS: dict[str, tuple[str, ...]] = {
-    "kind": (*KINDS, PERSON),
+    "kind": (*KINDS, world.PERSON),
     "color": tuple(COLORS),
-    "pattern": PATTERNS,
+    "pattern": world.PATTERNS,
     "second": (*COLORS, "none"),
     "part": (*COLORS, "none"),
-    "accessory": (*THINGS_WORN, "none", "cape"),
+    "accessory": (*world.THINGS_WORN, "none", "cape"),
     "accessory_color": (*COLORS, "none"),
     "action": ("none", *motions.names()),
     "quadrant": ("front", "left", "back", "right"),
@@ -95,7 +86,7 @@ class Shards:
     def path(self, index: int) -> Path:
         """Return the file of shard ``index``."""
         sort, size = self.file_names[self.held_out], f"{self.objects}x{self.views}"
-        return self.folder / f"{sort}-world{VERSION}-{self.seed}-{size}-{index:05d}.npz"
+        return self.folder / f"{sort}-world{world.VERSION}-{self.seed}-{size}-{index:05d}.npz"
 
     def ensure(self, index: int) -> None:
         """Render shard ``index`` into its file, unless that exists."""
@@ -127,9 +118,9 @@ class Shards:
         return Shard(*map(np.concatenate, zip(*rows, strict=True)))
 
     def _object(self, index: int) -> Shard:
-        attributes = draw_attributes(self.seed, index, held_out=self.held_out)
+        attributes = world.draw_attributes(self.seed, index, held_out=self.held_out)
         rng = numpy_generator(self.seed, "toybox-object", int(self.held_out), index)
-        mesh = object_mesh(attributes, rng)
+        mesh = world.object_mesh(attributes, rng)
         orbit = draw_orbit(self.views, rng)
         rgba = (self.pictures(mesh, orbit, rng) * 255).round().astype(np.uint8)
         labels = np.stack([label_row(attributes, float(a)) for a in orbit.azimuth])

@@ -1,6 +1,5 @@
 """Prompts for the toybox's objects: synonyms, templates, and view directions in the form of the
-prompt processors; and the inverse, the attributes that a prompt asks for.
-"""
+prompt processors; and the inverse, the attributes that a prompt asks for."""
 
 import re
 from collections.abc import Iterable, Mapping
@@ -14,79 +13,43 @@ from . import motions
 from .world import COLORS, Attributes
 
 NOUNS: dict[str, tuple[str, ...]] = {
-    "fox": ("fox", "vixen"),
-    "rabbit": ("rabbit", "bunny", "hare"),
-    "bear": ("bear", "teddy bear", "teddy"),
-    "duck": ("duck", "duckling"),
-    "elephant": ("elephant",),
-    "penguin": ("penguin",),
-    "turtle": ("turtle", "tortoise"),
-    "car": ("car", "automobile"),
-    "truck": ("truck", "lorry"),
-    "boat": ("boat", "sailing boat", "ship"),
-    "plane": ("plane", "airplane", "aeroplane"),
-    "house": ("house", "cottage", "hut"),
-    "mug": ("mug", "cup"),
-    "chair": ("chair", "seat"),
-    "mushroom": ("mushroom", "toadstool"),
-    "robot": ("robot", "android"),
+    "fox": ("fox", "vixen"), "rabbit": ("rabbit", "bunny", "hare"),
+    "bear": ("bear", "teddy bear", "teddy"), "duck": ("duck", "duckling"),
+    "elephant": ("elephant",), "penguin": ("penguin",), "turtle": ("turtle", "tortoise"),
+    "car": ("car", "automobile"), "truck": ("truck", "lorry"),
+    "boat": ("boat", "sailing boat", "ship"), "plane": ("plane", "airplane", "aeroplane"),
+    "house": ("house", "cottage", "hut"), "mug": ("mug", "cup"), "chair": ("chair", "seat"),
+    "mushroom": ("mushroom", "toadstool"), "robot": ("robot", "android"),
     "person": ("person", "man", "woman"),
-}
+}  # fmt: skip
 COLOR_WORDS: dict[str, tuple[str, ...]] = {
-    "red": ("red", "scarlet", "crimson"),
-    "lime": ("lime", "light green"),
-    "green": ("green", "dark green"),
-    "teal": ("teal", "turquoise", "cyan"),
-    "blue": ("blue", "navy"),
-    "purple": ("purple", "violet"),
-    "pink": ("pink", "rose"),
+    "red": ("red", "scarlet", "crimson"), "lime": ("lime", "light green"),
+    "green": ("green", "dark green"), "teal": ("teal", "turquoise", "cyan"),
+    "blue": ("blue", "navy"), "purple": ("purple", "violet"), "pink": ("pink", "rose"),
     "yellow": ("yellow", "golden"),
-}
+}  # fmt: skip
 """Synonyms of colours; colours that aren't listed have none."""
 PARTS: dict[str, str] = {
-    "fox": "ears and tail",
-    "rabbit": "ears",
-    "bear": "belly",
-    "duck": "wings",
-    "elephant": "ears",
-    "penguin": "belly",
-    "turtle": "legs",
-    "car": "roof",
-    "truck": "trailer",
-    "boat": "sail",
-    "plane": "wings",
-    "house": "roof",
-    "mug": "handle",
-    "chair": "cushion",
-    "mushroom": "stem",
-    "robot": "head",
-    "person": "trousers",
-}
+    "fox": "ears and tail", "rabbit": "ears", "bear": "belly", "duck": "wings", "elephant": "ears",
+    "penguin": "belly", "turtle": "legs", "car": "roof", "truck": "trailer", "boat": "sail",
+    "plane": "wings", "house": "roof", "mug": "handle", "chair": "cushion", "mushroom": "stem",
+    "robot": "head", "person": "trousers",
+}  # fmt: skip
 """The word for the role "part" of each kind."""
-PLURALS = ("ears", "wings", "legs")
 ACCESSORY_WORDS: dict[str, tuple[str, ...]] = {
-    "hat": ("hat", "cap"),
-    "scarf": ("scarf", "ribbon"),
-    "flag": ("flag", "banner"),
-    "balloon": ("balloon",),
-    "cape": ("cape", "cloak"),
-}
+    "hat": ("hat", "cap"), "scarf": ("scarf", "ribbon"), "flag": ("flag", "banner"),
+    "balloon": ("balloon",), "cape": ("cape", "cloak"),
+}  # fmt: skip
 CLOTHES = {"shirt": ("shirt", "jacket"), "trousers": ("trousers", "pants")}
 """Words of a person's upper and lower half."""
 OPENINGS = *["a {}"] * 3, "a toy {}", "a small {}", "a photo of a {}", "a 3d model of a {}", "{}"
 """Templates for the object's description; "a {}" is drawn most often."""
-OPPOSITE = {
-    "front": "back",
-    "back": "front",
-    "left side": "right side",
-    "right side": "left side",
-    "overhead": "overhead",
-}
+OPPOSITE = {"front": "back", "back": "front", "overhead": "overhead"}
+OPPOSITE |= {"left side": "right side", "right side": "left side"}
 """The directions of views, each with the opposite one."""
-UNNAMED_SIDE_SHARE = 0.1
-"""Fraction of the side views whose prompts say "side view", as threestudio's do."""
-EMPTY_SHARE, PLAIN_SHARE, PREFIX_SHARE = 0.1, 0.2, 0.04
-"""Shares of prompts that are empty, that name no direction, and that begin with it."""
+EMPTY_SHARE, PLAIN_SHARE, PREFIX_SHARE, UNNAMED_SIDE_SHARE = 0.1, 0.2, 0.04, 0.1
+"""Shares of prompts that are empty, that name no direction, and that begin with it; and of the side
+views, of prompts that say "side view", as threestudio's do."""
 
 
 def direction(elevation: float, azimuth: float) -> str:
@@ -117,7 +80,7 @@ def describe(attributes: Attributes, rng: np.random.Generator) -> str:
         text = opening.format(f"{color} {noun}")
     if attributes.part:
         name = PARTS[attributes.kind]
-        article = "" if name.startswith(PLURALS) else "a "
+        article = "" if name.startswith(("ears", "wings", "legs")) else "a "
         joint = "and" if " with " in text else "with"
         text = f"{text} {joint} {article}{_color(attributes.part, rng)} {name}"
     if attributes.accessory:
@@ -136,24 +99,27 @@ def _describe_person(a: Attributes, rng: np.random.Generator) -> str:
         name = _pick(ACCESSORY_WORDS[a.accessory], rng)
         worn.insert(int(rng.integers(3)), f"a {_color(a.accessory_color, rng)} {name}")
     dressed = f"{', '.join(worn[:-1])} and {worn[-1]}"
-    subject = f"{_pick(OPENINGS, rng).format(_pick(NOUNS[a.kind], rng))}"
+    subject = _pick(OPENINGS, rng).format(_pick(NOUNS[a.kind], rng))
     does = motion_of(a.action, rng)
-    joint = _pick(("in", "in", "wearing"), rng)
-    if rng.random() < 0.25:
-        text = f"{subject} {does} {joint} {dressed}"
-    else:
-        text = f"{subject} {joint} {dressed} {does}"
-    return re.sub(r"\ba (?=[aeio])", "an ", text)
+    clothes = f"{_pick(('in', 'in', 'wearing'), rng)} {dressed}"
+    first, last = (does, clothes) if rng.random() < 0.25 else (clothes, does)
+    return re.sub(r"\ba (?=[aeio])", "an ", f"{subject} {first} {last}")
 
 
 def motion_of(action: str, rng: np.random.Generator) -> str:
     """Write what a person does: "kicks with the left leg", "kicking the left leg"."""
+    phrase = _pick(_phrases(action), rng)
+    return _progressive(phrase) if rng.random() < 0.25 else phrase
+
+
+def _phrases(action: str) -> tuple[str, ...]:
     name, side = motions.split(action)
-    phrase = _pick(motions.ACTIONS[name].phrases, rng).format(side)
-    verb, _, rest = phrase.partition(" ")
-    if rng.random() < 0.25:
-        verb = PROGRESSIVE[verb]
-    return f"{verb} {rest}".rstrip()
+    return tuple(phrase.format(side) for phrase in motions.ACTIONS[name].phrases)
+
+
+def _progressive(phrase: str) -> str:
+    verb, space, rest = phrase.partition(" ")
+    return f"{PROGRESSIVE[verb]}{space}{rest}"
 
 
 PROGRESSIVE = {
@@ -163,16 +129,13 @@ PROGRESSIVE = {
     "sits": "sitting", "squats": "squatting", "crouches": "crouching", "jumps": "jumping",
     "bows": "bowing", "takes": "taking",
 }  # fmt: skip
-
-
-ACTION_PHRASES: dict[str, str] = {}
+ACTION_PHRASES: dict[str, str] = {
+    form: action
+    for action in motions.names()
+    for phrase in _phrases(action)
+    for form in (phrase, _progressive(phrase))
+}
 """The action of each phrase, in both forms of its verb."""
-for _action in motions.names():
-    _name, _side = motions.split(_action)
-    for _phrase in motions.ACTIONS[_name].phrases:
-        _verb, _, _rest = _phrase.format(_side).partition(" ")
-        for _form in (_verb, PROGRESSIVE[_verb]):
-            ACTION_PHRASES[f"{_form} {_rest}".rstrip()] = _action
 
 
 def prompt_of(
@@ -202,19 +165,14 @@ def vocabulary() -> list[str]:
     return sorted(set(re.findall(r"[a-z]+|\d|,", " ".join(phrases))))
 
 
+DOTS = "{c} {n} with {s} dots", "{c} {n} with {s} spots", "{c} {n} with {s} polka dots"
 PATTERN_PHRASES: dict[str, tuple[str, ...]] = {
     "striped": ("{c} {n} with {s} stripes", "{c} and {s} striped {n}", "striped {c} and {s} {n}"),
-    "dotted": (
-        *(f"{{c}} {{n}} with {{s}} {dots}" for dots in ("dots", "spots", "polka dots")),
-        "{c} {n} dotted with {s}",
-    ),
-    "checkered": (
-        "{c} and {s} checkered {n}",
-        "{c} {n} with {s} checks",
-        "checkered {c} and {s} {n}",
-    ),
+    "dotted": (*DOTS, "{c} {n} dotted with {s}"),
+    "checkered": ("{c} and {s} checkered {n}", "{c} {n} with {s} checks",
+                  "checkered {c} and {s} {n}"),
     "two-tone": ("two tone {n}, {c} below and {s} above", "{n} with {c} bottom and {s} top"),
-}
+}  # fmt: skip
 
 
 def _color(color: str, rng: np.random.Generator) -> str:
@@ -228,17 +186,13 @@ def _pick(choices: tuple[str, ...], rng: np.random.Generator) -> str:
 # Reading prompts
 
 PATTERN_WORDS: dict[str, tuple[str, ...]] = {
-    "striped": ("striped", "stripes"),
-    "dotted": ("dotted", "dots", "spotted", "spots"),
-    "checkered": ("checkered", "checks"),
-    "two-tone": ("two tone", "top", "above"),
-}
+    "striped": ("striped", "stripes"), "dotted": ("dotted", "dots", "spotted", "spots"),
+    "checkered": ("checkered", "checks"), "two-tone": ("two tone", "top", "above"),
+}  # fmt: skip
 
 
 Word = tuple[str, str]
-"""The role (kind, color, pattern, part or accessory) and the meaning of a word, or of a phrase such
-as "light green".
-"""
+"""The role (kind, color, part, ...) and the meaning of a word, or of a phrase as "light green"."""
 
 
 def attributes_in(prompt: str) -> Optional[Attributes]:
@@ -248,16 +202,13 @@ def attributes_in(prompt: str) -> Optional[Attributes]:
     first is the body's and the second the pattern's. A pattern without a second colour is ignored.
     """
     words = _meanings(prompt)
-    kind = next((meaning for role, meaning in words if role == "kind"), None)
+    kind, action = (next((m for role, m in words if role == of), None) for of in ("kind", "action"))
     part = _colored(words, "part", PARTS.get(kind, ""))
     accessory = _colored(words, "accessory")
-    action = next((meaning for role, meaning in words if role == "action"), None)
     if action and kind == "person":
         shirt = _colored(words, "shirt")[2]
-        return shirt and Attributes(
-            kind, shirt, part=part[2] or shirt, accessory=accessory[1],
-            accessory_color=accessory[2], action=action,
-        )  # fmt: skip
+        clothes = part[2] or shirt, *accessory[1:]
+        return shirt and Attributes(kind, shirt, "plain", None, *clothes, action)
     rest = [word for i, word in enumerate(words) if i not in (part[0], accessory[0])]
     colors, patterns = ([m for role, m in rest if role == of] for of in ("color", "pattern"))
     if kind is None or not colors:
@@ -283,8 +234,7 @@ def _colored(
     words: list[Word], role: str, meaning: str = ""
 ) -> tuple[Optional[int], Optional[str], Optional[str]]:
     """Find the first word of a role, and of this meaning if one is given, with a colour before it;
-    return the colour's index in ``words``, the word's meaning and its colour, or three None.
-    """
+    return the colour's index in ``words``, the word's meaning and its colour, or three None."""
     pairs = enumerate(zip(words, words[1:], strict=False))
     for place, ((before, color), (word, found)) in pairs:
         if word == role and before == "color" and meaning in ("", found):
@@ -303,8 +253,8 @@ MEANINGS: dict[str, Word] = (
     | _synonyms("accessory", ACCESSORY_WORDS)
     | _synonyms("pattern", PATTERN_WORDS)
     | {part: ("part", part) for part in PARTS.values()}
-    | _synonyms("shirt", {"shirt": CLOTHES["shirt"]})
-    | _synonyms("part", {"trousers": CLOTHES["trousers"]})
+    | dict.fromkeys(CLOTHES["shirt"], ("shirt", "shirt"))
+    | dict.fromkeys(CLOTHES["trousers"], ("part", "trousers"))
     | {phrase: ("action", action) for phrase, action in ACTION_PHRASES.items()}
 )
 PHRASES = sorted(MEANINGS, key=len, reverse=True)

@@ -3,8 +3,7 @@
 An object has a kind, a colour, a pattern in a second colour, and at most one extra: a part in a
 different colour, or an accessory. Meshes are in world axes (z up, front +x), centred, and inside a
 sphere of radius :data:`RADIUS`; shading is baked into the vertex colours. Some combinations are
-withheld from all training (:func:`withheld`), to measure generalisation.
-"""
+withheld from all training (:func:`withheld`), to measure generalisation."""
 
 import hashlib
 import itertools
@@ -25,28 +24,16 @@ VERSION = 3
 RADIUS = 0.8
 """Of the bounding sphere of all objects, world units: as large as Point-E's at a scale of 1.6."""
 COLORS: dict[str, tuple[float, float, float]] = {
-    "red": (0.86, 0.11, 0.12),
-    "orange": (0.97, 0.52, 0.08),
-    "yellow": (0.98, 0.86, 0.14),
-    "lime": (0.60, 0.88, 0.18),
-    "green": (0.10, 0.52, 0.17),
-    "teal": (0.10, 0.72, 0.70),
-    "blue": (0.13, 0.29, 0.85),
-    "purple": (0.50, 0.17, 0.72),
-    "pink": (0.98, 0.55, 0.74),
-    "brown": (0.44, 0.25, 0.11),
-    "black": (0.08, 0.08, 0.09),
-    "white": (0.97, 0.97, 0.96),
-}
+    "red": (0.86, 0.11, 0.12), "orange": (0.97, 0.52, 0.08), "yellow": (0.98, 0.86, 0.14),
+    "lime": (0.60, 0.88, 0.18), "green": (0.10, 0.52, 0.17), "teal": (0.10, 0.72, 0.70),
+    "blue": (0.13, 0.29, 0.85), "purple": (0.50, 0.17, 0.72), "pink": (0.98, 0.55, 0.74),
+    "brown": (0.44, 0.25, 0.11), "black": (0.08, 0.08, 0.09), "white": (0.97, 0.97, 0.96),
+}  # fmt: skip
 DETAILS: dict[str, tuple[float, float, float]] = {
-    "dark": (0.14, 0.14, 0.16),
-    "pale": (0.93, 0.92, 0.88),
-    "warm": (0.93, 0.47, 0.16),
-    "glass": (0.63, 0.82, 0.94),
-    "skin": (0.93, 0.72, 0.58),
-    "tan": (0.62, 0.42, 0.29),
+    "dark": (0.14, 0.14, 0.16), "pale": (0.93, 0.92, 0.88), "warm": (0.93, 0.47, 0.16),
+    "glass": (0.63, 0.82, 0.94), "skin": (0.93, 0.72, 0.58), "tan": (0.62, 0.42, 0.29),
     "hair": (0.36, 0.21, 0.12),
-}
+}  # fmt: skip
 """Colours of details that prompts never mention."""
 PATTERNS = ("plain", "striped", "dotted", "checkered", "two-tone")
 PART_SHADE = 0.82
@@ -59,11 +46,11 @@ PERIODS = 16
 """Periods of the pattern in the texture, more than any surface has."""
 PERIOD = {"striped": 0.34, "dotted": 0.34, "checkered": 0.46}
 """Length of a pattern's period before objects are scaled to RADIUS."""
-WITHHELD_SHARE = 0.04
+WITHHELD_SHARE, PERSON_SHARE = 0.04, 0.4
+"""Shares of combinations that are withheld, and of objects that are persons."""
+PERSON = "person"
 THINGS_WORN = [name for name in ACCESSORIES if name != "cape"]
 """Accessories of objects that are no persons."""
-PERSON, PERSON_SHARE = "person", 0.4
-"""The kind that has an action, and the share of all objects that are persons."""
 
 
 class Attributes(NamedTuple):
@@ -121,11 +108,9 @@ def _draw(rng: np.random.Generator, person_share: float) -> Attributes:
 
 
 def withheld(attributes: Attributes) -> bool:
-    """Return whether this combination of kind, colour, pattern and extra is withheld from training.
-
-    The colours of pattern, part and accessory aren't considered. Objects without pattern and extra
-    are never withheld, since the words are learnt from them.
-    """
+    """Return whether this combination of kind, colour, pattern and extra is withheld from training;
+    of a person, of both colours, accessory and action. Other colours aren't considered. Objects
+    without pattern and extra are never withheld, since the words are learnt from them."""
     extra = attributes.accessory or ("part" if attributes.part else "none")
     if attributes.action:
         extra = f"{extra}/{attributes.part}/{attributes.action}"
@@ -163,13 +148,12 @@ def object_mesh(attributes: Attributes, rng: np.random.Generator) -> Mesh:
     )
 
 
-# Texture: the pattern's PERIODS^2 periods, and to the right of them a column of cells, each plain
-
 SIZE = CELL * PERIODS
 
 
 def texture(attributes: Attributes) -> Float[np.ndarray, "H W 3"]:
-    """Draw the object's colours: float32 (256, 272, 3), row 0 on top."""
+    """Draw the object's colours, float32, row 0 on top: the pattern's PERIODS^2 periods, and to the
+    right of them a column of cells, each plain."""
     a = attributes
     names = (a.color, a.second, a.part, a.accessory_color)
     color, second, *others = (np.float32(COLORS[name or a.color]) for name in names)
