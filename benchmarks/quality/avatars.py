@@ -56,6 +56,8 @@ MISSED = {
     "colors": "colours",
     "accessory": "accessory",
 }
+CELLS = {"prior": ("pose", "body"), "result": ("result: {}", ""), "2D model": ("2D model",)}
+"""The pictures of each of ``demo.STAGES`` on the sheet, by their texts."""
 SHEET, PROMPTS_PER_ROW = 20, 2
 
 
@@ -90,13 +92,12 @@ def draw_sheet(arguments: argparse.Namespace) -> None:
     for prompt in prompts("persons", SHEET):
         task = toybox.Task(VARIANTS[2], prompt, 0, arguments.models, arguments.keep)
         stages = stages_of(prompt.text, toybox.kept(task) / toybox.RUN, arguments.models, scores)
-        for name, (views, found) in stages.items():
-            shown = views[:2] if name == "result" else views[:1]
+        for name, labels in CELLS.items():
+            views, found = stages[name]
             missed = [text for key, text in MISSED.items() if found.get(key) == 0]
-            failures = f" MISSED: {', '.join(missed)}" if missed else ""
-            label = f"{name}: {prompt.text}" if name == "result" else name
-            pictures += shown
-            texts += [label + failures, *[""] * (len(shown) - 1)]
+            ending = f"; missed: {', '.join(missed)}" if missed and name != "prior" else ""
+            pictures += views[: len(labels)]
+            texts += [f"{labels[0].format(prompt.text)}{ending}", *labels[1:]]
     columns = PROMPTS_PER_ROW * len(pictures) // SHEET
     images.write(arguments.sheet, contact_sheet(torch.stack(pictures), texts, columns=columns))
     print(arguments.sheet)
