@@ -52,9 +52,7 @@ class Proportions:
 
 
 def eyes(x: float, y: float, z: float, radius: float) -> list[Shape]:
-    return [
-        ellipsoid("dark", (x, side * y, z), (radius, radius, radius), rings=6) for side in (-1, 1)
-    ]
+    return [ellipsoid("dark", (x, s * y, z), (radius,) * 3, rings=6) for s in (-1, 1)]
 
 
 def legs(x: float, y: float, top: float, radius: float, role: str = "body") -> list[Shape]:
@@ -72,9 +70,6 @@ def wheels(x: float, y: float, radius: float) -> list[Shape]:
             wheels += [limb("dark", inner, outer, radius)]
             wheels += [limb("pale", outer, outer + [0, j * 0.02, 0], 0.5 * radius)]
     return wheels
-
-
-# Animals --------------------------------------------------------------------------------------
 
 
 def fox(p: Proportions) -> Model:
@@ -242,9 +237,6 @@ def turtle(p: Proportions) -> Model:
     return shapes, Anchors(hat, 0.24, neck, (0.2, 0.2), (1, 0, 0.5))
 
 
-# Vehicles, buildings and other things ---------------------------------------------------------
-
-
 def car(p: Proportions) -> Model:
     long, high = 0.86 * p(), 0.2 * p()
     base = 0.26
@@ -410,9 +402,7 @@ def robot(p: Proportions) -> Model:
 
 ANIMALS = fox, rabbit, bear, duck, elephant, penguin, turtle
 THINGS = car, truck, boat, plane, house, mug, chair, mushroom, robot
-KINDS: dict[str, Callable[[Proportions], Model]] = {
-    make.__name__: make for make in (*ANIMALS, *THINGS)
-}
+KINDS: dict[str, Callable[[Proportions], Model]] = {f.__name__: f for f in (*ANIMALS, *THINGS)}
 ALIKE_FROM_ALL_SIDES = ("mug", "mushroom")
 """Kinds whose front and back don't differ."""
 

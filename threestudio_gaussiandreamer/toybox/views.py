@@ -34,10 +34,8 @@ ELEVATION, OVERHEAD_ELEVATION, OVERHEAD_SHARE = (-10.0, 60.0), (60.0, 80.0), 0.0
 """Elevations in degrees: the paper's range, and that of a share of views from above."""
 BACKGROUND = (0.5, 0.5, 0.5)
 """Background of nearly all pictures; no object has this colour."""
-OBJECTS, VIEWS, POINTS = 256, 4, 1024
-"""Objects per shard, views per object, and points per object."""
-HELD_OUT_OBJECTS = 64
-"""Number of objects for evaluation, which are withheld from training."""
+OBJECTS, VIEWS, POINTS, HELD_OUT_OBJECTS = 256, 4, 1024, 64
+"""Objects per shard, views and points per object, and objects for evaluation, all withheld ones."""
 
 LABELS: dict[str, tuple[str, ...]] = {
     "kind": (*KINDS, world.PERSON),

@@ -183,8 +183,6 @@ def _pick(choices: tuple[str, ...], rng: np.random.Generator) -> str:
     return choices[int(rng.integers(len(choices)))]
 
 
-# Reading prompts
-
 PATTERN_WORDS: dict[str, tuple[str, ...]] = {
     "striped": ("striped", "stripes"), "dotted": ("dotted", "dots", "spotted", "spots"),
     "checkered": ("checkered", "checks"), "two-tone": ("two tone", "top", "above"),

@@ -40,10 +40,8 @@ PART_SHADE = 0.82
 """Factor on the body's colours for a part that has no own colour."""
 LIGHT = np.array([0.25, -0.35, 0.9]) / np.linalg.norm([0.25, -0.35, 0.9])
 AMBIENT = 0.70
-CELL = 16
-"""Texels per period of a pattern."""
-PERIODS = 16
-"""Periods of the pattern in the texture, more than any surface has."""
+CELL, PERIODS = 16, 16
+"""Texels per period of a pattern, and periods in the texture, more than any surface has."""
 PERIOD = {"striped": 0.34, "dotted": 0.34, "checkered": 0.46}
 """Length of a pattern's period before objects are scaled to RADIUS."""
 WITHHELD_SHARE, PERSON_SHARE = 0.04, 0.4
