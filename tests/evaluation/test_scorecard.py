@@ -17,6 +17,7 @@ from threestudio_gaussiandreamer.formats.gaussian_files import read_cloud, write
 from threestudio_gaussiandreamer.toybox import export, models
 
 PROMPTS = ("a red fox", "a red fox", "a blue mug with white dots", "a zebra")
+PERSON = "a man in a red shirt and blue trousers jumps"
 
 
 def finished(folder, prompts):
@@ -40,14 +41,17 @@ def judge(tmp_path):
 
 
 def test_rows_and_intervals_over_prompts(tmp_path, judge, capsys):
-    runs = finished(tmp_path / "runs", PROMPTS)
+    runs = finished(tmp_path / "runs", (*PROMPTS, PERSON))
     arguments = ["--metrics", "judge,janus", "--judge", judge, "--output", str(tmp_path / "out")]
     assert main([str(runs), *arguments]) == 0
-    assert table(tmp_path / "out") == list(PROMPTS)
+    assert table(tmp_path / "out") == [*PROMPTS, PERSON]
+    *others, of_person = table(tmp_path / "out", "action")  # a column of persons only
+    assert others == ["nan"] * 4 and of_person in ("0.0", "1.0")
     assert table(tmp_path / "out", "kind")[3] == table(tmp_path / "out", "multi_face")[2] == "nan"
     content = json.loads((tmp_path / "out/scorecard.json").read_text())
-    assert content["kind"]["mean"]["count"] == 2  # two prompts have known words
-    assert content["multi_face"]["mean"]["count"] == 1  # and a mug has no front
+    assert content["kind"]["mean"]["count"] == 3  # three prompts have known words
+    assert content["multi_face"]["mean"]["count"] == 2  # and a mug has no front
+    assert content["action"]["mean"]["count"] == 1
     printed = capsys.readouterr().out
     assert "kind, colors, pattern, accessory: no value for 1 of the prompts ('a zebra')" in printed
     assert "multi_face: no value for 2 of the prompts ('a blue mug with white dots'; 'a" in printed
@@ -64,6 +68,7 @@ def test_a_run_in_several_folders_is_scored_once(tmp_path, judge, monkeypatch):
     monkeypatch.chdir(tmp_path)
     again = ["runs/gaussiandreamer/run1", str(runs), "runs", "links"]
     assert main([*again, "--metrics", "judge", "--judge", judge, "--output", "out"]) == 0
+    assert "pattern,accessory\n" in (tmp_path / "out/scorecard.csv").read_text()
     assert sorted(table(tmp_path / "out")) == sorted(PROMPTS[:2])
 
 
