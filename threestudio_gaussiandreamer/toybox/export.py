@@ -42,8 +42,8 @@ from .unet_stage import LATENT_SCALE, frozen_autoencoder
 
 
 def export(training: Path, target: Path) -> dict[str, Any]:
-    """Write the models of a training that has all of text, clip, autoencoder and unet; of points
-    and judge those that it has. Return what ``training.json`` says.
+    """Write the models of a training that has all of text, clip, autoencoder and unet; of points,
+    motion and judge those that it has. Return what ``training.json`` says.
 
     Raises:
         UserError: a stage isn't trained yet, or the disk is full."""
