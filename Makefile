@@ -16,7 +16,7 @@ MODELS = toybox
 # both as they are written, without expansion by make or the shell; an empty prompt is reported
 demo: export TEXT = $(value PROMPT)
 demo: export FOLDER = $(value MODELS)
-demo: $(VENV)/ready-for-models     ## text to 3D with small models, offline, on the CPU; make demo MODELS=folder PROMPT="a red fox with a green scarf"
+demo: $(VENV)/ready-for-models     ## text to 3D with small models, offline, on the CPU; make demo MODELS=folder PROMPT="a man in a green jacket and white pants bows"
 	$(BIN)/python -m threestudio_gaussiandreamer.toybox.demo $(if $(filter command,$(origin PROMPT)),"$$TEXT") --models "$$FOLDER"
 
 demo-exact: $(VENV)/ready          ## train the bundled toy from a coarse prior with the exact score, offline, on the CPU

@@ -130,7 +130,7 @@ def test_stop_writes_a_checkpoint_from_which_the_run_goes_on(studio):
 
 def test_every_choice_of_the_page_is_a_whole_configuration():
     choices = re.findall(r'option value="([^"]+)"', (WEB / "studio.html").read_text())
-    assert len(choices) == 8
+    assert len(choices) == 9
     prompt = ["system.prompt_processor.prompt=a fox"]
     for choice in choices:
         cfg = load_config(*map(find_config, choice.split()), cli_args=prompt)
