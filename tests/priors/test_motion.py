@@ -157,12 +157,12 @@ def test_offered_frames(monkeypatch):
     monkeypatch.setattr(module, "NUM_FRAMES", 3)
     motions = Motions(np.zeros((2, 9, 22, 3)), [9, 4])
     every = [(0, 0), (0, 4), (0, 8), (1, 0), (1, 2), (1, 3)]
-    assert offered_frames(motions, None, "clip") == every
-    assert offered_frames(motions, 1, "clip") == every[3:]
-    assert offered_frames(motions, None, 7) == [(0, 7)]
+    assert offered_frames(motions.lengths, None, "clip") == every
+    assert offered_frames(motions.lengths, 1, "clip") == every[3:]
+    assert offered_frames(motions.lengths, None, 7) == [(0, 7)]
     for sample, frame, message in ((2, "clip", "2 motions"), (1, 4, "4 frames")):
         with pytest.raises(UserError, match=message):
-            offered_frames(motions, sample, frame)
+            offered_frames(motions.lengths, sample, frame)
 
 
 def test_clip_chooses_the_frame_by_the_motions_text(options, asked, monkeypatch):

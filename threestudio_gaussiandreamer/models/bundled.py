@@ -60,7 +60,7 @@ def is_export(folder: Path) -> bool:
 def require_intact(folder: Path, part: str) -> None:
     """Compare the files of a part with their digests, once per process."""
     digests = read_digests(folder)
-    names = [name for name in digests if name.partition("/")[0] == part]
+    names = [name for name in digests if name.partition("/")[0] == part.partition("/")[0]]
     is_needed = folder == FOLDER or (folder / part).exists()  # an export needn't have all parts
     for name in names or [part] * is_needed:
         with contextlib.suppress(OSError):

@@ -61,15 +61,18 @@ COLOR = satisfies(
 SCALE = positive("world units", most=1e6)
 
 
-def preflight_prior(prior: Any, keep_attributes: bool) -> None:
-    """Check within seconds that a prior can run, and, if ``keep_attributes``, that every attribute
-    of its Gaussians can be taken; other hosts' priors have no check. Raise UserError if not.
+def preflight_prior(prior: Any, keep_attributes: bool, prompt: str = "") -> None:
+    """Check within seconds that a prior can run, with this prompt if it is known, and, if
+    ``keep_attributes``, that every attribute of its Gaussians can be taken; other hosts' priors
+    have no check. Raise UserError if not.
     """
     if hasattr(prior, "preflight"):
         require_method(type(prior), "preflight")
         prior.preflight()
     if keep_attributes and hasattr(prior, "preflight_attributes"):
         prior.preflight_attributes()
+    if prompt and not prompt.startswith("lib:") and hasattr(prior, "preflight_prompt"):
+        prior.preflight_prompt(prompt)
 
 
 class Prior(BaseObject):

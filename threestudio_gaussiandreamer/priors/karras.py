@@ -193,8 +193,8 @@ def sample_heun(
 
 # Files of weights ---------------------------------------------------------------------------------
 
-WRAPPER = "model_state_dict"
-"""The key of the weights in training checkpoints."""
+WRAPPERS = "model_state_dict", "model_avg", "model"
+"""Keys of the weights in training checkpoints, averaged ones first."""
 
 
 def read_state_dict(path: str, kind: str) -> dict[str, Tensor]:
@@ -219,9 +219,10 @@ def read_state_dict(path: str, kind: str) -> dict[str, Tensor]:
                     "it is no file of PyTorch, or holds more than tensors, which could run code"
                 )
                 raise Unreadable(unsafe) from error
-        state = content.get(WRAPPER, content) if isinstance(content, Mapping) else {}
+        state = content if isinstance(content, Mapping) else {}
+        state = next((state[key] for key in WRAPPERS if isinstance(state.get(key), Mapping)), state)
         weights = bool(state) and all(isinstance(value, Tensor) for value in state.values())
-        expected = f"a state dict, or a dict with {WRAPPER!r}, was expected"
+        expected = f"a state dict, or a dict with {WRAPPERS[0]!r}, was expected"
         require(weights, f"it holds no weights by name: {expected}")
         return dict(state)
 

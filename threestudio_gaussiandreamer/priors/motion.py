@@ -4,16 +4,17 @@ points on its surface.
 =================  =================================================================================
 option             meaning
 =================  =================================================================================
-motion             joint positions as MDM gives them, its results.npy or another NPY or NPZ: see
-                   below
+motion             a text-to-motion model: MDM's ``model*.pt`` with its files beside it, or
+                   ``toybox``; or joint positions as MDM gives them, its results.npy or another NPY
+                   or NPZ: see below
 body_model         the user's NPZ or PKL of SMPL, SMPL-H or SMPL-X (neutral), with the user's
-                   licence
-sample             which of the file's motions; null: any
+                   licence; or ``toybox``
+sample             which of the file's motions, or of the three that the model draws; null: any
 frame              a number, from 0; or ``clip``: the frame whose body fits the text best, of 16 of
                    each motion
 candidates         in place of a motion: mesh files of posed bodies, of which CLIP chooses the one
                    that fits the prompt best (the paper's appendix)
-clip               any CLIP in transformers' format, a folder or an id of the hub
+clip               any CLIP in transformers' format, a folder or an id of the hub, or ``toybox``
 motion_text        the motion of the prompt; null: found by the rules of ``motion_text.py``
 scale              half the longest side, world units
 num_points         points uniform over the surface (the released code), or 0 for the vertices (the
@@ -30,11 +31,10 @@ Files of motions are MDM's ``results.npy``, a pickled dict, of which no code is 
 one motion as (J, 3, F) or (F, J, 3). J is 22 (HumanML3D) or 24 joints in SMPL's order; metres, y
 up. The body is turned to face +x. A fit that is off by more than 50 mm in the mean is an error.
 
-The motion itself comes from MDM, outside this package; ``motion_text.py`` prints the sentence to
-ask it for.
+Where MDM runs elsewhere, ``motion_text.py`` prints the sentence to ask it for.
 
-The body model is the user's own file of SMPL, SMPL-H or SMPL-X, whose first 22 joints are the same,
-skinned as in SMPL's paper. What is minimised over the rotations of all joints (axis-angle), a
+The body model is a file of SMPL, SMPL-H or SMPL-X, whose first 22 joints are the same, skinned as
+in SMPL's paper. What is minimised over the rotations of all joints (axis-angle), a
 translation and a few shape coefficients, summed over the frames, which share nothing:
 
     sum_j |joint_j - target_j|^2 / s^2 + pose |theta|^2 + shape |beta|^2
@@ -70,11 +70,11 @@ from ..models.bundled import BODY, MOTION, model_part
 from ..models.clip import clip_source, picture_similarities, text_features
 from ..models.hub import Source, locate
 from .base import COLOR, SCALE, Prior, points
-from .body_pose import BODY_JOINTS, JOINTS, require_frame, world_mesh
+from .body_pose import BODY_JOINTS, JOINTS, PARENTS, require_frame, world_mesh
 from .karras import torch_generator
 from .mesh import centred, colored_cloud, face_normals
-from .motion_text import reduced_prompt
-from .text_to_motion import load_motion_model, sample_motions
+from .motion_text import motion_sentence, reduced_prompt
+from .text_to_motion import FRAMES, load_motion_model, sample_motions
 
 VIEW_AZIMUTHS = (-40.0, 0.0, 40.0)
 VIEW_ELEVATION, VIEW_DISTANCE, VIEW_FOVY = 10.0, 3.2, math.radians(40)
@@ -180,7 +180,7 @@ class MotionPrior(Prior):
             if cfg.motion and not cfg.body_model:
                 raise UserError(
                     "body_model: set it to your NPZ or PKL of SMPL (https://smpl.is.tue.mpg.de), "
-                    "SMPL-H or SMPL-X; the package brings none"
+                    "SMPL-H or SMPL-X, or to toybox, the package's own"
                 )
 
     cfg: Config
@@ -193,16 +193,25 @@ class MotionPrior(Prior):
             for path in cfg.candidates:
                 existing_file(path, "body mesh")
         else:
-            if is_model(name := model_part(cfg.motion, MOTION)):
+            name = model_part(cfg.motion, MOTION)
+            if is_model(name):
                 load_motion_model(name)
                 require_extra("diffusion", "transformers")
                 locate(motion_clip(cfg.motion, name), download=False)
+                lengths = [FRAMES] * SAMPLES
             else:
-                read_motions(cfg.motion)
+                lengths = read_motions(name).lengths
+            offered_frames(lengths, cfg.sample, cfg.frame)
             load_body_model(model_part(cfg.body_model, BODY))
         if len(cfg.candidates) > 1 if cfg.candidates else cfg.frame == "clip":
             require_extra("diffusion", "transformers")
             locate(clip_source(cfg.clip), download=False)
+
+    def preflight_prompt(self, prompt: str) -> None:
+        """Check that the prompt, or ``motion_text``, has an action that the model knows."""
+        name = self.cfg.motion and model_part(self.cfg.motion, MOTION)
+        if is_model(name):
+            motion_sentence(self.cfg.motion_text or prompt, load_motion_model(name).known)
 
     def generate(self, prompt: str, generator: np.random.Generator) -> PointCloud:
         self.preflight()
@@ -217,17 +226,13 @@ class MotionPrior(Prior):
         return centred(cloud) if self.cfg.center == "mean" else cloud
 
     def _motions(self, prompt: str, generator: np.random.Generator) -> Motions:
-        """Return the motions of the file, or those that its model draws for the prompt."""
+        """Return the motions of the file, or those that the model draws for the prompt."""
         name = model_part(self.cfg.motion, MOTION)
         if not is_model(name):
             return read_motions(name)
-        text = self.cfg.motion_text or reduced_prompt(prompt)
-        if text is None:
-            raise UserError(
-                f"no verb of motion was found in {prompt!r}: set motion_text, for instance to "
-                "'Someone stands with open arms'"
-            )
         model = load_motion_model(name)
+        text = motion_sentence(self.cfg.motion_text or prompt, model.known)
+        info(f"motion: {text!r}")
         features = text_features(motion_clip(self.cfg.motion, name), text)
         positions = sample_motions(model, features, SAMPLES, torch_generator(generator))
         return Motions(positions, [text] * SAMPLES, [positions.shape[1]] * SAMPLES)
@@ -236,7 +241,7 @@ class MotionPrior(Prior):
         """Return the body of the chosen frame, with z up, facing +x, centred and scaled."""
         cfg, motions = self.cfg, self._motions(prompt, generator)
         model = load_body_model(model_part(cfg.body_model, BODY))
-        choices = offered_frames(motions, cfg.sample, cfg.frame)
+        choices = offered_frames(motions.lengths, cfg.sample, cfg.frame)
         targets = np.stack([motions.positions[choice] for choice in choices])
         names = [f"motion {sample}, frame {frame}" for sample, frame in choices]
 
@@ -293,16 +298,16 @@ def motion_clip(motion: str, path: str) -> Source:
     )
 
 
-def offered_frames(motions: Motions, sample: Optional[int], frame: Any) -> list[tuple[int, int]]:
-    """Return the (motion, frame) pairs to choose from, as the options say."""
-    count = len(motions.lengths)
+def offered_frames(lengths: list[int], sample: Optional[int], frame: Any) -> list[tuple[int, int]]:
+    """Return the (motion, frame) pairs to choose from motions of these lengths, by the options."""
+    count = len(lengths)
     if sample is not None and sample >= count:
-        raise UserError(f"sample: the file has {count} motions, from 0; there is no {sample}")
+        raise UserError(f"sample: there are {count} motions, from 0; there is no {sample}")
     if frame != "clip":
-        require_frame(frame, motions.lengths[sample or 0], f"motion {sample or 0}")
+        require_frame(frame, lengths[sample or 0], f"motion {sample or 0}")
         return [(sample or 0, frame)]
     samples = range(count) if sample is None else [sample]
-    frames = {s: np.linspace(0, motions.lengths[s] - 1, NUM_FRAMES).round() for s in samples}
+    frames = {s: np.linspace(0, lengths[s] - 1, NUM_FRAMES).round() for s in samples}
     return [(s, int(f)) for s in samples for f in np.unique(frames[s])]
 
 
@@ -527,13 +532,17 @@ def _check(arrays: dict[str, np.ndarray]) -> None:
     parents, faces = arrays["kintree_table"].astype(np.int64), arrays["f"].astype(np.int64)
     shapes = ", ".join(f"{name} {arrays[name].shape}" for name in FIELDS)
     require(
-        joints >= BODY_JOINTS
-        and all(arrays[name].shape == shape for name, shape in expected.items())
+        all(arrays[name].shape == shape for name, shape in expected.items())
         and all(np.isfinite(values).all() for values in arrays.values())
         and ((parents[0, 1:] >= 0) & (parents[0, 1:] < np.arange(1, joints))).all()
         and ((faces >= 0) & (faces < vertices)).all(),
-        f"it is damaged, or has other arrays ({shapes}): finite numbers that fit each other, of "
-        f"{BODY_JOINTS} joints or more, were expected; get it again",
+        f"it is damaged, or has other arrays ({shapes}): finite numbers that fit each other were "
+        "expected; get it again",
+    )
+    require(
+        tuple(parents[0, 1:BODY_JOINTS]) == PARENTS[1:],
+        f"it has another skeleton, of {joints} joints: those of SMPL, or {BODY_JOINTS} like them "
+        "and others, were expected",
     )
 
 

@@ -4,11 +4,18 @@ The paper keeps "only the relevant parts related to the motion" and adds a subje
 with his left leg" becomes "Someone kicks with the left leg". Here: the first verb of motion and
 what follows it, up to the first comma or full stop, with "Someone" before it and "the" for "his",
 "her", "its" and "their". A small list of rules, no language model: the user can always give the
-text."""
+text.
+
+A model may list the phrases of its training, as the toybox's does: then the longest one in the
+prompt is asked for."""
 
 import re
 import sys
+from collections.abc import Sequence
+from difflib import get_close_matches
 from typing import Optional
+
+from ..core.errors import UserError
 
 SUBJECT = "Someone"
 VERBS = (
@@ -22,6 +29,21 @@ VERBS = (
     "stroll strum stumble swim swing swipe talk tap throw tiptoe toss trot tumble turn twirl twist "
     "type wait walk wave wield work yawn yell"
 ).split()
+CLOTHES = (
+    "armou?r boots cape cap cloak coat dress gloves hat helmet hoodie jacket jeans pants robe "
+    "scarf shirt shoes skirt suit sweater trousers uniform"
+).replace(" ", "|")
+DRESSED = re.compile(
+    r"\b(?:wearing|dressed|clad)\b.*"
+    rf"|\b(?:in|with)\s+(?:(?!(?:in|with)\b)[\w-]+\s+){{0,4}}(?:{CLOTHES})\b.*",
+    re.IGNORECASE | re.DOTALL,
+)
+PERSON = "(?:person|man|woman|boy|girl|child)"
+SEVERAL = re.compile(
+    r"(?:^|\bof )(?:two|three|four|five|several|many)\b"
+    r"|\b(?:people|persons|men|women|boys|girls|children|couple|crowd|each other)\b"
+    rf"|\b{PERSON}\b.* and (?:a|an|another|the) (?:\w+ ){{0,2}}{PERSON}\b"
+)
 POSSESSIVES = re.compile(r"\b(?:his|her|its|their|my|your|our)\b", re.IGNORECASE)
 
 
@@ -58,8 +80,41 @@ def reduced_prompt(prompt: str) -> Optional[str]:
             word = match.group().lower()
             if match.start() and is_verb(word):
                 clause = re.split(r"[,.;:!?]", prompt[match.end() :], maxsplit=1)[0]
+                clause = DRESSED.sub("", clause)
                 return " ".join(f"{SUBJECT} {form(word)} {POSSESSIVES.sub('the', clause)}".split())
     return None
+
+
+def motion_sentence(prompt: str, known: Sequence[str] = ()) -> str:
+    """Return the sentence to ask a text-to-motion model for.
+
+    Args:
+        known: phrases that the model was trained on ("kicks with the left leg"); empty for any.
+
+    Raises:
+        UserError: the prompt has no action, none of the known ones, or more than one person.
+    """
+    words = " ".join(re.findall(r"\w+", POSSESSIVES.sub("the", prompt.lower())))
+    if SEVERAL.search(words):
+        raise UserError(
+            f"the prompt {prompt!r} is about more than one person: a run makes one; set "
+            "motion_text to what this one does"
+        )
+    if found := [phrase for phrase in known if f" {phrase} " in f" {words} "]:
+        return f"{SUBJECT} {max(found, key=len)}"
+    sentence = reduced_prompt(prompt)
+    if sentence is None:
+        example = known[0] if known else "stands with open arms"
+        raise UserError(
+            f"no action was found in {prompt!r}: say what the person does, or set motion_text, for "
+            f"instance to '{SUBJECT} {example}'"
+        )
+    if known:
+        action = sentence.removeprefix(f"{SUBJECT} ").removeprefix("is ")
+        alike = [phrase for phrase in known if phrase.split()[0] == action.split()[0]]
+        near = map(repr, get_close_matches(action, alike or known, n=3, cutoff=0))
+        raise UserError(f"the model doesn't know the action {action!r}: near {', '.join(near)}")
+    return sentence
 
 
 def main() -> None:

@@ -8,6 +8,7 @@ features. Its text features are those of a CLIP, which isn't part of the file.""
 
 import json
 import math
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -26,9 +27,14 @@ FEATURES, HEADS, POSITIONS = 263, 4, 512
 KIND = "MDM checkpoint"
 STATISTICS = ("t2m_mean.npy", "t2m_std.npy"), ("Mean.npy", "Std.npy")
 """Names of the files with the mean and the standard deviation, in MDM's folder or HumanML3D's."""
+ACTIONS = "actions.txt"
+"""Where a model may list the phrases of its training, one a line; published ones have no such
+file."""
 SUPPORTED = {"dataset": "humanml", "arch": "trans_enc", "text_encoder_type": "clip",
              "noise_schedule": "cosine"}  # fmt: skip
 """What ``args.json`` must say where it says it."""
+IGNORED = re.compile(r"sequence_pos_encoder\.pe$|^clip_model\.")
+"""Entries of a checkpoint that are computed, or another model's."""
 GUIDANCE_SCALE, STEPS, FRAMES = 2.5, 50, 60
 """MDM's guidance, at most so many steps of the sampler, and frames at 20 per second."""
 
@@ -72,6 +78,8 @@ class TextToMotion(NamedTuple):
     """Timesteps of its training."""
     mean: Float[np.ndarray, "263"]
     std: Float[np.ndarray, "263"]
+    known: list[str]
+    """Phrases of its training; empty if it doesn't list them."""
 
 
 def load_motion_model(path: str) -> TextToMotion:
@@ -83,7 +91,7 @@ def load_motion_model(path: str) -> TextToMotion:
     file = existing_file(path, KIND)
     args = _arguments(file)
     state = read_state_dict(path, KIND)
-    state = {name: v for name, v in state.items() if not name.endswith("sequence_pos_encoder.pe")}
+    state = {name: value for name, value in state.items() if not IGNORED.search(name)}
     layers = len({n.split(".")[2] for n in state if n.startswith("seqTransEncoder.layers.")})
     first = state.get("input_process.poseEmbedding.weight", torch.zeros(0, 0))
     text = state.get("embed_text.weight", torch.zeros(0, 0))
@@ -96,8 +104,10 @@ def load_motion_model(path: str) -> TextToMotion:
         )
     network = MotionModel(width, layers, hidden, text.shape[1])
     load_exactly(network, state, f"{KIND} {path!r}")
-    mean, std = _statistics(file.parent)
-    return TextToMotion(network.eval().requires_grad_(False), args["diffusion_steps"], mean, std)
+    actions = file.parent / ACTIONS
+    known = actions.read_text(encoding="utf-8").splitlines() if actions.is_file() else []
+    network.eval().requires_grad_(False)
+    return TextToMotion(network, args["diffusion_steps"], *_statistics(file.parent), known)
 
 
 def _arguments(file: Path) -> dict[str, Any]:

@@ -31,8 +31,8 @@ from ..core.command import run_command
 from ..core.errors import UserError
 from ..core.files import atomic_file, output_folder
 from ..models.bundled import BODY, FOLDER, MOTION, RECORD, write_digests
-from ..priors.text_to_motion import STATISTICS, mdm_files
-from . import models
+from ..priors.text_to_motion import ACTIONS, STATISTICS, mdm_files
+from . import models, words
 from .clip_stage import trained_clip
 from .loop import averaged_weights, checkpoint_path, is_trained
 from .motion_stage import TIMESTEPS, MotionStage
@@ -114,6 +114,8 @@ def write_motion_model(path: Path, training: Path) -> None:
     with atomic_file(path) as file:
         torch.save({name: value.half() for name, value in state.items()}, file)
     _write_json(path.parent / "args.json", args)
+    with atomic_file(path.parent / ACTIONS) as file:
+        file.write("\n".join(words.ACTION_PHRASES).encode())
     for name, key in zip(STATISTICS[0], ("mean", "std"), strict=True):
         with atomic_file(path.parent / name) as file:
             np.save(file, np.float32(content["constants"][key]))

@@ -393,8 +393,8 @@ def preflight_parts(geometry: Any, cfg: Any) -> None:
     """
     checks: dict[str, Callable[[], None]] = {}
     if not len(geometry):
-        keep = geometry.cfg.keep_attributes
-        checks["geometry.prior"] = lambda: preflight_prior(geometry.prior(), keep)
+        keep, prompt = geometry.cfg.keep_attributes, cfg.prompt_processor.get("prompt") or ""
+        checks["geometry.prior"] = lambda: preflight_prior(geometry.prior(), keep, prompt)
     for name in ("guidance", "prompt_processor"):
         part = find(getattr(cfg, f"{name}_type"))
         if hasattr(part, "preflight"):
