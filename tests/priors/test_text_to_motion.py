@@ -82,7 +82,7 @@ def test_published_checkpoints_are_read_and_sampled(export):
         ("motion/args.json", b'{"dataset": "kit"}', "'humanml' is supported"),
         ("motion/args.json", b'{"diffusion_steps": 1}', "expected 2"),
         ("motion/t2m_std.npy", None, "has no t2m_mean.npy or Mean.npy.*dataset folder"),
-        ("motion/t2m_std.npy", np.ones(3), "expected 263 numbers"),
+        ("motion/t2m_std.npy", np.ones(3), "need 263 numbers"),
         ("body.npz", b"PK\x03\x04", "body model"),
         ("body.npz", "joints", "another skeleton, of 20 joints"),
         ("body.npz", "parents", "another skeleton, of 24 joints"),

@@ -188,24 +188,22 @@ class MotionPrior(Prior):
     """The chosen frame of the motion, metres, y up; saved beside the points."""
 
     def preflight(self) -> None:
-        cfg = self.cfg
-        if cfg.candidates:
-            for path in cfg.candidates:
-                existing_file(path, "body mesh")
-        else:
+        cfg, clips = self.cfg, []
+        for path in cfg.candidates:
+            existing_file(path, "body mesh")
+        if cfg.motion:
             name = model_part(cfg.motion, MOTION)
             if is_model(name):
                 load_motion_model(name)
-                require_extra("diffusion", "transformers")
-                locate(motion_clip(cfg.motion, name), download=False)
-                lengths = [FRAMES] * SAMPLES
-            else:
-                lengths = read_motions(name).lengths
+                clips.append(motion_clip(cfg.motion, name))
+            lengths = [FRAMES] * SAMPLES if is_model(name) else read_motions(name).lengths
             offered_frames(lengths, cfg.sample, cfg.frame)
             load_body_model(model_part(cfg.body_model, BODY))
         if len(cfg.candidates) > 1 if cfg.candidates else cfg.frame == "clip":
+            clips.append(clip_source(cfg.clip))
+        for clip in clips:
             require_extra("diffusion", "transformers")
-            locate(clip_source(cfg.clip), download=False)
+            locate(clip, download=False)
 
     def preflight_prompt(self, prompt: str) -> None:
         """Check that the prompt, or ``motion_text``, has an action that the model knows."""
@@ -235,7 +233,7 @@ class MotionPrior(Prior):
         info(f"motion: {text!r}")
         features = text_features(motion_clip(self.cfg.motion, name), text)
         positions = sample_motions(model, features, SAMPLES, torch_generator(generator))
-        return Motions(positions, [text] * SAMPLES, [positions.shape[1]] * SAMPLES)
+        return Motions(positions, [positions.shape[1]] * SAMPLES)
 
     def _body_of_motion(self, prompt: str, generator: np.random.Generator) -> Mesh:
         """Return the body of the chosen frame, with z up, facing +x, centred and scaled."""

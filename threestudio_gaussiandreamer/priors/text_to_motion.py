@@ -28,8 +28,7 @@ KIND = "MDM checkpoint"
 STATISTICS = ("t2m_mean.npy", "t2m_std.npy"), ("Mean.npy", "Std.npy")
 """Names of the files with the mean and the standard deviation, in MDM's folder or HumanML3D's."""
 ACTIONS = "actions.txt"
-"""Where a model may list the phrases of its training, one a line; published ones have no such
-file."""
+"""Where a model may list the phrases of its training, one a line; published ones don't."""
 SUPPORTED = {"dataset": "humanml", "arch": "trans_enc", "text_encoder_type": "clip",
              "noise_schedule": "cosine"}  # fmt: skip
 """What ``args.json`` must say where it says it."""
@@ -89,8 +88,7 @@ def load_motion_model(path: str) -> TextToMotion:
         UserError: a file is missing or damaged, or the model is of another kind.
     """
     file = existing_file(path, KIND)
-    args = _arguments(file)
-    state = read_state_dict(path, KIND)
+    steps, state = _timesteps(file), read_state_dict(path, KIND)
     state = {name: value for name, value in state.items() if not IGNORED.search(name)}
     layers = len({n.split(".")[2] for n in state if n.startswith("seqTransEncoder.layers.")})
     first = state.get("input_process.poseEmbedding.weight", torch.zeros(0, 0))
@@ -107,36 +105,32 @@ def load_motion_model(path: str) -> TextToMotion:
     actions = file.parent / ACTIONS
     known = actions.read_text(encoding="utf-8").splitlines() if actions.is_file() else []
     network.eval().requires_grad_(False)
-    return TextToMotion(network, args["diffusion_steps"], *_statistics(file.parent), known)
+    return TextToMotion(network, steps, *_statistics(file.parent), known)
 
 
-def _arguments(file: Path) -> dict[str, Any]:
+def _timesteps(file: Path) -> int:
     path = existing_file(file.parent / "args.json", "settings of the MDM checkpoint")
     try:
         args = json.loads(path.read_text(encoding="utf-8"))
-        args["diffusion_steps"] = steps = int(args.get("diffusion_steps", 1000))
+        steps = int(args.get("diffusion_steps", 1000))
     except (ValueError, TypeError, AttributeError) as error:
         raise UserError(f"settings of the MDM checkpoint {str(path)!r} are damaged") from error
     for name, value in SUPPORTED.items():
         if args.get(name, value) != value:
             raise UserError(f"{str(path)!r}: {name} is {args[name]!r}; only {value!r} is supported")
-    if not 2 <= steps <= POSITIONS * 8:
-        raise UserError(f"{str(path)!r}: diffusion_steps is {steps}; expected 2 to {POSITIONS * 8}")
-    return args
+    if not 2 <= steps <= 8 * POSITIONS:
+        raise UserError(f"{str(path)!r}: diffusion_steps is {steps}; expected 2 to {8 * POSITIONS}")
+    return steps
 
 
 def _statistics(folder: Path) -> tuple[np.ndarray, np.ndarray]:
     for pair in STATISTICS:
         if all((folder / name).is_file() for name in pair):
-            found = [
-                read_arrays(folder / name, "statistics of motions", ["array"]) for name in pair
-            ]
-            mean, std = (f["array"].astype(np.float64) for f in found)
+            found = (read_arrays(folder / name, "statistics", ["array"]) for name in pair)
+            mean, std = (arrays["array"].astype(np.float64) for arrays in found)
             if mean.shape == std.shape == (FEATURES,) and np.isfinite([mean, std]).all():
                 return mean, np.maximum(std, 1e-8)
-            raise UserError(
-                f"{pair[0]} and {pair[1]} in {str(folder)!r}: expected {FEATURES} numbers each"
-            )
+            raise UserError(f"{str(folder)!r}: {' and '.join(pair)} need {FEATURES} numbers each")
     raise UserError(
         f"{str(folder)!r} has no {' or '.join(pair[0] for pair in STATISTICS)} with its standard "
         "deviation: copy t2m_mean.npy and t2m_std.npy from MDM's dataset folder to the checkpoint"
@@ -200,16 +194,9 @@ def positions_of(features: Float[np.ndarray, "S T 263"]) -> Float[np.ndarray, "S
 
 def mdm_files(network: MotionModel, steps: int) -> tuple[Mapping[str, Tensor], dict[str, Any]]:
     """Return the state dict and the settings as MDM's authors publish them."""
-    empty = torch.zeros(1, 1, network.embed_text.out_features)
+    width, layers = network.embed_text.out_features, network.seqTransEncoder.layers
+    sizes = {"latent_dim": width, "layers": len(layers), "ff_size": layers[0].linear1.out_features}
+    others = {"cond_mask_prob": 0.1, "emb_trans_dec": False, "sigma_small": True}
     places = ("sequence_pos_encoder.pe", "embed_timestep.sequence_pos_encoder.pe")
-    layer = network.seqTransEncoder.layers[0]
-    args = SUPPORTED | {
-        "latent_dim": network.embed_text.out_features,
-        "layers": len(network.seqTransEncoder.layers),
-        "ff_size": layer.linear1.out_features,
-        "diffusion_steps": steps,
-        "cond_mask_prob": 0.1,
-        "emb_trans_dec": False,
-        "sigma_small": True,
-    }
-    return network.state_dict() | dict.fromkeys(places, empty), args
+    state = network.state_dict() | dict.fromkeys(places, torch.zeros(1, 1, width))
+    return state, SUPPORTED | sizes | {"diffusion_steps": steps} | others

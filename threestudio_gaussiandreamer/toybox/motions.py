@@ -16,7 +16,6 @@ from jaxtyping import Float
 from ..priors.body_pose import BODY_JOINTS, INDEX, PARENTS, SIDES
 
 RATE, FRAMES = 20, 60
-FEATURES = 263
 REST = np.zeros((BODY_JOINTS, 3))
 """Offset of each joint from its parent in a T-pose."""
 for _joint, _offset in {
@@ -29,11 +28,9 @@ for _joint, _offset in {
     REST[INDEX[_joint]] = _offset
     if _joint.startswith("left"):
         REST[INDEX[_joint.replace("left", "right")]] = np.array(_offset) * [-1, 1, 1]
-THIGH, SHIN = 0.40, 0.41
-ANKLE = 0.06
-"""Height of a standing person's ankles."""
+THIGH, SHIN, ANKLE = 0.40, 0.41, 0.06
 HEIGHT = 0.08 + THIGH + SHIN + ANKLE
-"""Height of a standing person's pelvis with straight legs."""
+"""Of a standing person's pelvis with straight legs; ANKLE is that of the ankles."""
 SIGN = {"left": 1.0, "right": -1.0}
 
 
@@ -68,6 +65,10 @@ class Arm(NamedTuple):
     up2: np.ndarray | float = 14.0
     ahead2: np.ndarray | float = 40.0
 
+    def towards(self, other: "Arm", share: np.ndarray) -> "Arm":
+        """Move by a share of the way."""
+        return Arm(*(a + (b - a) * share for a, b in zip(self, other, strict=True)))
+
 
 class Body(NamedTuple):
     """The person in all frames."""
@@ -79,6 +80,11 @@ class Body(NamedTuple):
     ankles: dict[str, Float[np.ndarray, "T 3"]]
     toes: dict[str, np.ndarray]
     """Pitch of each foot, degrees, upwards."""
+
+    def leaning(self, ahead: np.ndarray | float, turn: np.ndarray | float = 0.0) -> "Body":
+        """Lean and turn the trunk further, degrees."""
+        more = np.broadcast_arrays(ahead, turn, 0 * self.lean[:, 0])
+        return self._replace(lean=self.lean + np.stack(more, 1))
 
 
 def standing(s: Style, *, drop: float | np.ndarray = 0.02) -> Body:
@@ -94,17 +100,12 @@ def standing(s: Style, *, drop: float | np.ndarray = 0.02) -> Body:
     return Body(pelvis, lean, idle, ankles, dict.fromkeys(SIDES, 0 * s.t))
 
 
-def blend(first: Arm, second: Arm, share: np.ndarray) -> Arm:
-    """Return an arm that moves from one place to another."""
-    return Arm(*(a + (b - a) * share for a, b in zip(first, second, strict=True)))
-
-
 def arms(s: Style, body: Body, to: Arm, share: np.ndarray, sides=SIDES) -> Body:
     """Move these arms by a share towards ``to``, each with a style of its own."""
     found = dict(body.arms)
     for side in sides:
         goal = Arm(*(value + s.rng.uniform(-5, 5) for value in to))
-        found[side] = blend(found[side], goal, share)
+        found[side] = found[side].towards(goal, share)
     return body._replace(arms=found)
 
 
@@ -114,9 +115,8 @@ def open_arms(s: Style, side: str) -> Body:
 
 
 def t_pose(s: Style, side: str) -> Body:
-    return arms(s, standing(s), Arm(90, 0, 90, 0), 0 * s.t + 1)._replace(
-        lean=np.zeros((len(s.t), 3))
-    )
+    body = arms(s, standing(s), Arm(90, 0, 90, 0), 0 * s.t + 1)
+    return body._replace(lean=np.zeros_like(body.lean))
 
 
 def raise_arms(s: Style, side: str) -> Body:
@@ -139,12 +139,11 @@ def punch(s: Style, side: str) -> Body:
     guard, strike = Arm(32, 70, 135, 95), Arm(88, 92, 90, 96)
     out = s.wave(s.about(0.75, 0.15), s.rng.uniform()).clip(0, 1) ** 0.5
     body = arms(s, standing(s, drop=0.07), guard, s.rise(0, 0.3), (other,))
-    body = body._replace(arms=body.arms | {side: blend(guard, strike, out)})
+    body.arms[side] = guard.towards(strike, out)
     z = s.about(0.14)
     for leg in SIDES:  # one foot ahead
         body.ankles[leg][:, 2] += z if leg == other else -z
-    twist = -SIGN[side] * s.about(24) * out
-    return body._replace(lean=body.lean + np.stack([6 + 0 * out, twist, 0 * out], 1))
+    return body.leaning(6.0, -SIGN[side] * s.about(24) * out)
 
 
 def kick(s: Style, side: str) -> Body:
@@ -155,21 +154,17 @@ def kick(s: Style, side: str) -> Body:
     body.ankles[side][:, 1] += high * out
     body.ankles[side][:, 2] += far * np.sin(np.pi / 2 * out)
     body.toes[side] = 40 * out
-    body = arms(s, body, Arm(48, 15, 60, 40), out)
-    return body._replace(lean=body.lean - np.stack([10 * out, 0 * out, 0 * out], 1))
+    return arms(s, body, Arm(48, 15, 60, 40), out).leaning(-10 * out)
 
 
 def gait(s: Style, hertz: float, speed: float, lift: float, flight: float) -> Body:
     """Walk or run ahead: each foot rests for half a period less ``flight``, then swings."""
-    body, phase = standing(s, drop=0.05 + 0.04 * (flight > 0)), s.rng.uniform()
-    arms_out = {}
-    for side in SIDES:
-        cycle = hertz * s.t + phase + (0.5 if side == "right" else 0.0)
-        whole, part = np.floor(cycle), cycle % 1
-        rest = 0.5 - flight
-        swing = ((part - rest) / (1 - rest)).clip(0, 1)
+    body, phase, rest = standing(s, drop=0.05 + 0.04 * (flight > 0)), s.rng.uniform(), 0.5 - flight
+    for side, half in zip(SIDES, (0.0, 0.5), strict=True):
+        cycle = hertz * s.t + phase + half
+        swing = ((cycle % 1 - rest) / (1 - rest)).clip(0, 1)
         # of each stance, the place where the body passes over the foot in its middle
-        stance = speed * (whole + rest / 2 - phase - (0.5 if side == "right" else 0.0)) / hertz
+        stance = speed * (np.floor(cycle) + rest / 2 - phase - half) / hertz
         body.ankles[side][:, 2] = stance + speed / hertz * swing * swing * (3 - 2 * swing)
         body.ankles[side][:, 1] += lift * np.sin(np.pi * swing)
         body.ankles[side][:, 0] *= 0.7
@@ -178,11 +173,10 @@ def gait(s: Style, hertz: float, speed: float, lift: float, flight: float) -> Bo
         bend = 75 if flight else 18
         ahead = np.where(forward > 0, 88, -88)
         amount = s.about(46 if flight else 30) * np.abs(forward)
-        arms_out[side] = Arm(6 + amount, ahead, amount + bend, np.where(bend > 40, 88, ahead))
+        body.arms[side] = Arm(6 + amount, ahead, amount + bend, 88 if flight else ahead)
     body.pelvis[:, 1] += (0.04 if flight else 0.015) * np.abs(np.sin(2 * np.pi * hertz * s.t))
     body.pelvis[:, 2] = speed * s.t
-    lean = body.lean + [12 if flight else 2, 0, 0]
-    return body._replace(arms=arms_out, lean=lean)
+    return body.leaning(12 if flight else 2)
 
 
 def walk(s: Style, side: str) -> Body:
@@ -197,8 +191,7 @@ def sit(s: Style, side: str) -> Body:
     down = s.rise(0, s.about(0.9))
     body = standing(s, drop=0.02 + s.about(0.44, 0.05) * down)
     body.pelvis[:, 2] -= 0.42 * down
-    lean = body.lean + np.stack([25 * np.sin(np.pi * down) + 4, 0 * down, 0 * down], 1)
-    return arms(s, body._replace(lean=lean), Arm(28, 80, 72, 92), down)
+    return arms(s, body.leaning(25 * np.sin(np.pi * down) + 4), Arm(28, 80, 72, 92), down)
 
 
 def squat(s: Style, side: str) -> Body:
@@ -207,8 +200,7 @@ def squat(s: Style, side: str) -> Body:
     for leg in SIDES:
         body.ankles[leg][:, 0] *= 1.7
     body.pelvis[:, 2] -= 0.12 * down
-    lean = body.lean + np.stack([32 * down, 0 * down, 0 * down], 1)
-    return arms(s, body._replace(lean=lean), Arm(78, 85, 84, 90), down)
+    return arms(s, body.leaning(32 * down), Arm(78, 85, 84, 90), down)
 
 
 def jump(s: Style, side: str) -> Body:
@@ -221,17 +213,15 @@ def jump(s: Style, side: str) -> Body:
     for leg in SIDES:
         body.ankles[leg][:, 1] += (high + 0.06) * air
         body.toes[leg] = -45 * air
-    lean = body.lean + np.stack([22 * crouch, 0 * air, 0 * air], 1)
     back, up = Arm(35, -80, 40, -60), Arm(s.about(140), 40, 150, 40)
-    return arms(s, arms(s, body._replace(lean=lean), back, crouch), up, air)
+    return arms(s, arms(s, body.leaning(22 * crouch), back, crouch), up, air)
 
 
 def bow(s: Style, side: str) -> Body:
     down = s.rise(s.rng.uniform(0, 0.4), s.about(0.9))
     body = standing(s, drop=0.03)
     body.pelvis[:, 2] -= 0.16 * down
-    lean = body.lean + np.stack([s.about(72) * down, 0 * down, 0 * down], 1)
-    return arms(s, body._replace(lean=lean), Arm(10, 60, 16, 80), down)
+    return arms(s, body.leaning(s.about(72) * down), Arm(10, 60, 16, 80), down)
 
 
 class Action(NamedTuple):
@@ -279,12 +269,8 @@ class Motion(NamedTuple):
 
 def names() -> list[str]:
     """Return all actions with their sides: "kick left", "kick right", "walk", ..."""
-    pairs = ((name, action.sided) for name, action in ACTIONS.items())
-    return [
-        f"{name} {side}" if sided else name
-        for name, sided in pairs
-        for side in (SIDES if sided else SIDES[:1])
-    ]
+    sided = {name: SIDES if action.sided else ("",) for name, action in ACTIONS.items()}
+    return [f"{name} {side}".rstrip() for name, sides in sided.items() for side in sides]
 
 
 def draw(name: str, rng: np.random.Generator, frames: int = FRAMES) -> Motion:
@@ -329,9 +315,7 @@ def joint_positions(body: Body) -> Float[np.ndarray, "T 22 3"]:
     found, turns = np.zeros((frames, BODY_JOINTS, 3)), {}
     found[:, 0] = body.pelvis
     bend = Rotation.from_euler("yxz", body.lean[:, [1, 0, 2]], degrees=True)
-    for joint, parent in enumerate(PARENTS[:16]):
-        if parent < 0:
-            continue
+    for joint, parent in list(enumerate(PARENTS[:16]))[1:]:
         share = {0: 0.15, 3: 0.45, 6: 0.75}.get(parent, 1.0)
         turn = turns.setdefault(parent, Rotation.from_rotvec(share * bend.as_rotvec()))
         found[:, joint] = found[:, parent] + turn.apply(REST[joint])
@@ -341,11 +325,10 @@ def joint_positions(body: Body) -> Float[np.ndarray, "T 22 3"]:
         shoulder, elbow, wrist = (INDEX[f"{side} {n}"] for n in ("shoulder", "elbow", "wrist"))
         found[:, shoulder] = found[:, PARENTS[shoulder]] + chest.apply(REST[shoulder])
         for joint, up, ahead in ((elbow, arm.up, arm.ahead), (wrist, arm.up2, arm.ahead2)):
-            away = np.tile(
-                _direction(up, ahead, sign), (1 if np.ndim(up) or np.ndim(ahead) else frames, 1)
-            )
-            length = np.abs(REST[joint, 0])
-            found[:, joint] = found[:, PARENTS[joint]] + length * chest.apply(away)
+            up, ahead, _ = np.radians(np.broadcast_arrays(up, ahead, np.zeros(frames)))
+            away = (sign * np.sin(up) * np.cos(ahead), -np.cos(up), np.sin(up) * np.sin(ahead))
+            bone = np.abs(REST[joint, 0]) * chest.apply(np.stack(away, 1))
+            found[:, joint] = found[:, PARENTS[joint]] + bone
         hip, knee, ankle, foot = (INDEX[f"{side} {n}"] for n in ("hip", "knee", "ankle", "foot"))
         found[:, knee], found[:, ankle] = two_bones(found[:, hip], body.ankles[side])
         pitch = np.radians(np.broadcast_to(body.toes[side], frames))
@@ -368,12 +351,6 @@ def two_bones(
     ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
     out = np.sqrt((THIGH**2 - along**2).clip(0))
     return hip + along * away + out * ahead, hip + length * away
-
-
-def _direction(up, ahead, sign: float) -> np.ndarray:
-    up, ahead = np.radians(up), np.radians(ahead)
-    side = np.sin(up) * np.cos(ahead)
-    return np.stack(np.broadcast_arrays(sign * side, -np.cos(up), np.sin(up) * np.sin(ahead)), -1)
 
 
 # Features -------------------------------------------------------------------------------------
@@ -406,13 +383,8 @@ def features(positions: Float[np.ndarray, "T 22 3"]) -> Float[np.ndarray, "T-1 2
     return np.concatenate([part.reshape(len(steps), -1) for part in parts], 1).astype(np.float32)
 
 
-CHAINS = (
-    (0, 2, 5, 8, 11),
-    (0, 1, 4, 7, 10),
-    (0, 3, 6, 9, 12, 15),
-    (9, 14, 17, 19, 21),
-    (9, 13, 16, 18, 20),
-)
+LEGS, ARMS = ((0, 2, 5, 8, 11), (0, 1, 4, 7, 10)), ((9, 14, 17, 19, 21), (9, 13, 16, 18, 20))
+CHAINS = *LEGS, (0, 3, 6, 9, 12, 15), *ARMS
 
 
 def rotations(p: np.ndarray, heading) -> Float[np.ndarray, "T 21 6"]:

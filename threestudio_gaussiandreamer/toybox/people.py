@@ -35,18 +35,19 @@ def person(p: Proportions, joints: Float[np.ndarray, "22 3"]) -> Model:
     for side in SIDES:
         shapes += arm(at, side, sleeves, skin, p)
     head, top = head_shapes(at, trunk, skin, p)
-    neck = tuple(at["neck"] + 0.02 * trunk.up)
-    cape = (cape_shape(chest, trunk, p),)
+    neck, cape = tuple(at["neck"] + 0.02 * trunk.up), (cape_shape(chest, trunk, p),)
     return [*shapes, *head], Anchors(tuple(top), 0.14, neck, (0.1, 0.1), cape=cape)
 
 
 def trunk_axes(at: dict[str, np.ndarray]) -> Trunk:
+    up = unit(at["neck"] - at["lower spine"])
     left = at["left shoulder"] - at["right shoulder"]
-    up = at["neck"] - at["lower spine"]
-    up = up / np.linalg.norm(up)
-    left = left - up * (left @ up)
-    left = left / np.linalg.norm(left)
+    left = unit(left - up * (left @ up))
     return Trunk(np.cross(left, up), left, up)
+
+
+def unit(vector: np.ndarray) -> np.ndarray:
+    return vector / np.linalg.norm(vector)
 
 
 def upper_body(at: dict, chest: np.ndarray, trunk: Trunk, p: Proportions) -> list[Shape]:
@@ -59,19 +60,22 @@ def upper_body(at: dict, chest: np.ndarray, trunk: Trunk, p: Proportions) -> lis
         oriented("body", (chest + waist) / 2, (0.95 * deep, 0.85 * wide, 0.45 * long), trunk),
     ]
     middle = chest + 0.92 * deep * trunk.ahead
-    for step in (-0.1, 0.0, 0.1):
-        shapes += [ellipsoid("pale", middle + step * trunk.up, (0.03, 0.03, 0.03), rings=6)]
-    return shapes
+    return shapes + [
+        ellipsoid("pale", middle + step * trunk.up, (0.03,) * 3, rings=6)
+        for step in (-0.1, 0.0, 0.1)
+    ]
 
 
 def lower_body(at: dict, trunk: Trunk, p: Proportions) -> list[Shape]:
     """Make trousers, belt and shoes."""
     thigh = 0.108 * p(0.1)
     hips = (at["left hip"] + at["right hip"]) / 2
-    shapes = [oriented("part", (hips + at["pelvis"]) / 2, (0.14, 0.19, 0.13), trunk)]
     belt = (at["pelvis"] + at["lower spine"]) / 2
-    shapes += [oriented("dark", belt, (0.15, 0.195, 0.035), trunk)]
-    shapes += [ellipsoid("warm", belt + 0.145 * trunk.ahead, (0.03, 0.04, 0.035), rings=6)]
+    shapes = [
+        oriented("part", (hips + at["pelvis"]) / 2, (0.14, 0.19, 0.13), trunk),
+        oriented("dark", belt, (0.15, 0.195, 0.035), trunk),
+        ellipsoid("warm", belt + 0.145 * trunk.ahead, (0.03, 0.04, 0.035), rings=6),
+    ]
     for side in SIDES:
         hip, knee, ankle, toe = (at[f"{side} {n}"] for n in ("hip", "knee", "ankle", "foot"))
         shapes += [
@@ -125,29 +129,21 @@ def head_shapes(
 def cape_shape(chest: np.ndarray, trunk: Trunk, p: Proportions) -> Shape:
     """Make a cape that hangs from the shoulders to the knees."""
     top = chest + 0.16 * trunk.up - 0.165 * trunk.ahead
-    down = -0.65 * trunk.up + np.array([0.0, 0.0, -0.35]) - 0.12 * trunk.ahead
-    down = down / np.linalg.norm(down)
+    up = -unit(-0.65 * trunk.up + np.array([0.0, 0.0, -0.35]) - 0.12 * trunk.ahead)
     long = 0.36 * p(0.1)
     half = (0.025, 0.3 * p(0.08), long)
-    return oriented_box("accessory", top + long * down, half, (1.0, 0.68), trunk.left, -down)
+    ahead = unit(np.cross(trunk.left, up))
+    axes = np.stack([ahead, np.cross(up, ahead), up])
+    return turned(box("accessory", (0, 0, 0), half, (1.0, 0.68)), axes, top - long * up)
 
 
 def oriented(role: str, center, radii, trunk: Trunk) -> Shape:
     """Make an ellipsoid with half axes along the trunk's axes."""
-    return _turned(ellipsoid(role, (0, 0, 0), radii), np.stack(trunk), center)
+    return turned(ellipsoid(role, (0, 0, 0), radii), np.stack(trunk), center)
 
 
-def oriented_box(role: str, center, half, taper, left, up) -> Shape:
-    ahead = np.cross(left, up)
-    ahead /= np.linalg.norm(ahead)
-    axes = np.stack([ahead, np.cross(up, ahead), up])
-    return _turned(box(role, (0, 0, 0), half, taper), axes, center)
-
-
-def _turned(shape: Shape, axes: Float[np.ndarray, "3 3"], center) -> Shape:
-    return shape._replace(
-        vertices=shape.vertices @ axes + np.asarray(center), normals=shape.normals @ axes
-    )
+def turned(shape: Shape, axes: Float[np.ndarray, "3 3"], center) -> Shape:
+    return shape._replace(vertices=shape.vertices @ axes + center, normals=shape.normals @ axes)
 
 
 def posed_person(p: Proportions, action: str, rng: np.random.Generator) -> Model:
