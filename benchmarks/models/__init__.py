@@ -1,1 +1,1 @@
-"""What happens before the first training step, and what it costs."""
+"""Models of the toybox by themselves."""

@@ -41,9 +41,9 @@ from threestudio_gaussiandreamer.formats.ply import read_gaussians, read_points
 from threestudio_gaussiandreamer.launch.config import dump_config, load_config
 from threestudio_gaussiandreamer.launch.config_check import check_config, check_part
 from threestudio_gaussiandreamer.models import hub, model_files
+from threestudio_gaussiandreamer.models.model_files import read_state_dict
 from threestudio_gaussiandreamer.models.text_encoders import EmbeddingCache
 from threestudio_gaussiandreamer.priors.cache import read_cache
-from threestudio_gaussiandreamer.priors.karras import read_state_dict
 from threestudio_gaussiandreamer.priors.motion import load_body_model, read_motions
 from threestudio_gaussiandreamer.priors.point_cloud import load_points
 from threestudio_gaussiandreamer.training import system

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from ..core.errors import UserError
 from ..core.extras import require_extra
 from ..models.clip import preprocessed
-from ..priors.karras import load_exactly, read_state_dict
+from ..models.model_files import load_exactly, read_state_dict
 
 WEIGHTS, VOCABULARY = "ImageReward.pt", "vocab.txt"
 SOURCES = {

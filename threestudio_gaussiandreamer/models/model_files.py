@@ -1,19 +1,25 @@
 """Select the needed files of a model in diffusers' or transformers' format, load them, and keep
 networks for processes with several runs. A model of several components has a sub-folder for each
 (``unet``, ``vae``, ``text_encoder``, ...); the component of a single network is "". Weights are
-read from safetensors; if a caller allows ``.bin`` files, they are read with ``weights_only``."""
+read from safetensors; if a caller allows ``.bin`` files, they are read with ``weights_only``. Also
+checkpoints of one network, of any program."""
 
 import gc
 import hashlib
 import json
+import pickle
 import re
+import textwrap
+import zipfile
 from collections import Counter
-from collections.abc import Callable, Collection, Hashable, Iterable, Iterator
+from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple, Optional
 
 from ..core.errors import UserError
+from ..core.extras import require_extra
+from ..formats.reading import Unreadable, reading, require
 
 WITHOUT_WEIGHTS = {
     **dict.fromkeys(("tokenizer", "tokenizer_2", "tokenizer_3"), "tokenizer_config.json"),
@@ -220,3 +226,48 @@ def free_memory() -> None:
     gc.collect()
     if torch.cuda.is_available():
         torch.cuda.empty_cache()
+
+
+# Checkpoints of one network -----------------------------------------------------------------------
+
+WRAPPERS = "model_state_dict", "model_avg", "model"
+"""Keys of the weights in training checkpoints, averaged ones first."""
+
+
+def read_state_dict(path: str, kind: str) -> dict[str, Any]:
+    """Return the tensors of a checkpoint by name: of a ``.safetensors`` file, or of a pickle, which
+    is read with ``weights_only``, so that it can't run code.
+
+    Raises:
+        UserError: the file (``kind`` names it) is missing, refused, or holds no tensors by name.
+    """
+    import torch
+
+    with reading(path, kind) as file:
+        if file.suffix == ".safetensors":
+            require_extra("diffusion", "safetensors")
+            from safetensors.torch import load_file
+
+            content = load_file(file)
+        else:  # zip files are memory-mapped, so that unused tensors (optimiser state) aren't read
+            mapped = zipfile.is_zipfile(file)
+            try:
+                content = torch.load(file, map_location="cpu", weights_only=True, mmap=mapped)
+            except pickle.UnpicklingError as error:  # torch's message recommends to run it
+                unsafe = "it is no file of PyTorch, or has more than tensors, which could run code"
+                raise Unreadable(unsafe) from error
+        state = content if isinstance(content, Mapping) else {}
+        state = next((state[key] for key in WRAPPERS if isinstance(state.get(key), Mapping)), state)
+        weights = bool(state) and all(isinstance(value, torch.Tensor) for value in state.values())
+        expected = f"a state dict, or a dict with {WRAPPERS[0]!r}, was expected"
+        require(weights, f"it holds no weights by name: {expected}")
+        return dict(state)
+
+
+def load_exactly(module: Any, state: Mapping[str, Any], what: str) -> None:
+    """Load ``state``, converted to its dtype; raise UserError if names or shapes differ."""
+    try:
+        module.load_state_dict(state)
+    except RuntimeError as error:
+        problems = textwrap.shorten(str(error).partition(":")[2], 400)
+        raise UserError(f"{what} does not fit the model: {problems}") from error

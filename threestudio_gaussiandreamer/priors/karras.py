@@ -1,5 +1,5 @@
 """What Point-E and Shap-E have in common: their sampler, with Karras noise levels, Heun steps and
-guidance, the condition and the place of their results, and files of weights.
+guidance, the condition and the place of their results.
 
 ===================  ===============================================================================
 option               meaning (of ``point-e-prior`` and ``shap-e-prior``)
@@ -16,10 +16,7 @@ sqrt(abar_t) x0 + sqrt(1 - abar_t) eps``; the sampler works on ``x = x0 + sigma 
 Karras et al. 2022, with the conventions of the published samplers (openai/point-e, MIT)."""
 
 import math
-import pickle
-import textwrap
-import zipfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Literal, Optional
@@ -27,12 +24,9 @@ from typing import Any, ClassVar, Literal, Optional
 import numpy as np
 import torch
 from jaxtyping import Float
-from torch import Tensor, nn
+from torch import Tensor
 
-from ..core.errors import UserError
-from ..core.extras import require_extra
 from ..core.options import one_of, positive
-from ..formats.reading import Unreadable, reading, require
 from ..gaussians.point_cloud import PointCloud
 from ..meshes.load import AXES
 from ..models.clip import load_text_encoder, load_tokenizer, text_condition
@@ -189,48 +183,3 @@ def sample_heun(
         slope_there = (euler - denoise(euler, sigma_next)) / sigma_next
         x = x + (sigma_next - sigma_hat) * (slope + slope_there) / 2
     return x
-
-
-# Files of weights ---------------------------------------------------------------------------------
-
-WRAPPERS = "model_state_dict", "model_avg", "model"
-"""Keys of the weights in training checkpoints, averaged ones first."""
-
-
-def read_state_dict(path: str, kind: str) -> dict[str, Tensor]:
-    """Return the tensors of a checkpoint by name: of a ``.safetensors`` file, or of a pickle, which
-    is read with ``weights_only``, so that it can't run code.
-
-    Raises:
-        UserError: the file (``kind`` names it) is missing, refused, or holds no tensors by name.
-    """
-    with reading(path, kind) as file:
-        if file.suffix == ".safetensors":
-            require_extra("diffusion", "safetensors")
-            from safetensors.torch import load_file
-
-            content = load_file(file)
-        else:  # zip files are memory-mapped, so that unused tensors (optimiser state) aren't read
-            mapped = zipfile.is_zipfile(file)
-            try:
-                content = torch.load(file, map_location="cpu", weights_only=True, mmap=mapped)
-            except pickle.UnpicklingError as error:  # torch's message recommends to run it
-                unsafe = (
-                    "it is no file of PyTorch, or holds more than tensors, which could run code"
-                )
-                raise Unreadable(unsafe) from error
-        state = content if isinstance(content, Mapping) else {}
-        state = next((state[key] for key in WRAPPERS if isinstance(state.get(key), Mapping)), state)
-        weights = bool(state) and all(isinstance(value, Tensor) for value in state.values())
-        expected = f"a state dict, or a dict with {WRAPPERS[0]!r}, was expected"
-        require(weights, f"it holds no weights by name: {expected}")
-        return dict(state)
-
-
-def load_exactly(module: nn.Module, state: Mapping[str, Tensor], what: str) -> None:
-    """Load ``state``, converted to its dtype; raise UserError if names or shapes differ."""
-    try:
-        module.load_state_dict(state)
-    except RuntimeError as error:
-        problems = textwrap.shorten(str(error).partition(":")[2], 400)
-        raise UserError(f"{what} does not fit the model: {problems}") from error

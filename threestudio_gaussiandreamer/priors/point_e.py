@@ -43,10 +43,10 @@ from ..models.bundled import NAME as BUNDLED
 from ..models.bundled import POINTS, model_part
 from ..models.clip import clip_source
 from ..models.hub import locate
-from ..models.model_files import free_memory, loaded
+from ..models.model_files import free_memory, load_exactly, loaded, read_state_dict
 from . import karras
 from .base import points
-from .karras import SampledPrior, load_exactly, read_state_dict
+from .karras import SampledPrior
 
 UPSAMPLED = 3072
 """Number of points that the upsampler adds."""

@@ -44,9 +44,17 @@ from ..gaussians.point_cloud import PointCloud
 from ..host import info, register
 from ..meshes.mesh import linear_to_srgb
 from ..models.hub import Source, locate
-from ..models.model_files import free_memory, load_network, load_settings, loaded, needed_files
+from ..models.model_files import (
+    free_memory,
+    load_exactly,
+    load_network,
+    load_settings,
+    loaded,
+    needed_files,
+    read_state_dict,
+)
 from . import karras
-from .karras import SampledPrior, load_exactly, read_state_dict
+from .karras import SampledPrior
 
 COMPONENTS = ("tokenizer", "text_encoder", "prior", "scheduler", "shap_e_renderer")
 STEPS, SIGMA_MAX = 64, 160.0

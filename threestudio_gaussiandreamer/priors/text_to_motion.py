@@ -21,7 +21,8 @@ from torch import Tensor, nn
 from ..core.errors import UserError
 from ..core.files import existing_file
 from ..formats.array_files import read_arrays
-from .karras import cosine_alphas_cumprod, load_exactly, read_state_dict
+from ..models.model_files import load_exactly, read_state_dict
+from .karras import cosine_alphas_cumprod
 
 FEATURES, HEADS, POSITIONS = 263, 4, 512
 KIND = "MDM checkpoint"

@@ -46,7 +46,7 @@ def load_judge(name: str) -> Judge:
 
     Raises:
         UserError: there is no such file, or it doesn't hold a judge."""
-    from ..priors.karras import load_exactly, read_state_dict  # imports Lightning
+    from ..models.model_files import load_exactly, read_state_dict
 
     path, judge = model_part(name, JUDGE), Judge()
     kind = f"judge ({NAME}, or the export of a training that has one: make train-toybox)"
