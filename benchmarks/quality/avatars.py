@@ -45,7 +45,7 @@ VARIANTS = (
     Variant("the body in grey", 0, {"system.geometry.prior.color": "grey"}, CONFIG),
     Variant("random start", 0, BALL | {"system.geometry.prior.color": "random"}, CONFIG),
 )
-"""In order of priority."""
+"""The first three before the seeds of the third, and those before the others."""
 PROMPTS, SEEDS, PROMPTS_OF_SEEDS = 40, range(5), 10
 OF_PERSONS = ("action", "sides")
 COLUMNS = [*toybox.COLUMNS[:-3], *OF_PERSONS, *toybox.COLUMNS[-3:]]
@@ -73,13 +73,17 @@ def main() -> None:
 
 
 def tasks(arguments: argparse.Namespace) -> Iterator[toybox.Task]:
-    """Yield all tasks in order of priority: all variants with the first seed, then the others."""
+    """Yield all tasks in order of priority."""
     common = arguments.models, arguments.keep, arguments.gpu
-    found = prompts("persons", PROMPTS)
-    for seed in SEEDS:
-        for variant in VARIANTS if seed == 0 else VARIANTS[2:3]:
-            for prompt in found if seed == 0 else found[:PROMPTS_OF_SEEDS]:
-                yield toybox.Task(variant, prompt, seed, *common)
+    for variants, seeds, count in (
+        (VARIANTS[:3], SEEDS[:1], PROMPTS),
+        (VARIANTS[2:3], SEEDS[1:], PROMPTS_OF_SEEDS),
+        (VARIANTS[3:], SEEDS[:1], PROMPTS),
+    ):
+        for seed in seeds:
+            for prompt in prompts("persons", count):
+                for variant in variants:
+                    yield toybox.Task(variant, prompt, seed, *common)
 
 
 def draw_sheet(arguments: argparse.Namespace) -> None:
