@@ -26,14 +26,11 @@ from threestudio_gaussiandreamer.priors.body_pose import PARENTS
 from threestudio_gaussiandreamer.toybox import motions
 
 NAMES = motions.names()
-FITTED, FRESH, NEIGHBOURS = 40, 20, 5
-"""Motions of each action that classify and that validate, and the nearest ones that vote."""
-COLUMNS = (
-    "action", "recognised, %", "taken for", "bones, %, mean / most", "sliding, cm, mean / 95 %",
-    "between seeds, cm",
-)  # fmt: skip
+FITTED, FRESH, SEEDS, NEIGHBOURS = 40, 20, 5, 5
+"""Motions of each action that classify, that validate, samples, and nearest ones that vote."""
+COLUMNS = "action", "recognised, %", "taken for", "bones, %", "sliding, cm", "between seeds, cm"
+"""Of bones mean and most, of sliding mean and 95 %."""
 Drawn = dict[str, Float[np.ndarray, "S T 22 3"]]
-"""Motions of each action."""
 
 
 def generated(count: int, seed: int) -> Drawn:
@@ -102,10 +99,8 @@ def row(title: str, drawn: Drawn, found: dict[str, list[str]]) -> tuple[str, ...
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--models", default=NAME, help="toybox, or the folder of an export")
-    parser.add_argument("--seeds", type=int, default=5)
-    args = parser.parse_args()
     fitted, fresh = generated(FITTED, 1), generated(FRESH, 2)
-    drawn = sampled(args.models, args.seeds)
+    drawn = sampled(parser.parse_args().models, SEEDS)
     found, own = recognised(fitted, drawn), recognised(fitted, fresh)
     rows = [row(name, {name: drawn[name]}, found) for name in NAMES]
     rows += [row("all", drawn, found), row("the generator", fresh, own)]
