@@ -30,7 +30,7 @@ def export(tmp_path, clip):
     folder = tmp_path / "motion"
     folder.mkdir()
     network = t2m.MotionModel(16, 2, 32, tiny.FEATURES)
-    state, args = t2m.mdm_files(network, 10)
+    state, args = t2m.mdm_files(network, 1000)  # as the published ones
     torch.save(dict(state), folder / "model.pt")
     (folder / "args.json").write_text(json.dumps(args), encoding="utf-8")
     pose = motions.features(motions.draw("t pose", np.random.default_rng(0)).positions)
@@ -51,7 +51,7 @@ def test_published_checkpoints_are_read_and_sampled(export):
     """Newer ones have averaged weights and others, and CLIP's; the averaged ones are taken."""
     path = export / "motion/model.pt"
     model = t2m.load_motion_model(str(path))
-    assert model.steps == 10 and model.known == KNOWN.split("\n")
+    assert model.steps == 1000 and model.known == KNOWN.split("\n")
     state = torch.load(path)
     others = {name: torch.zeros_like(value) for name, value in state.items()}
     more = {"clip_model.positional_embedding": torch.zeros(3)}

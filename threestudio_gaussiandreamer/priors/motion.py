@@ -223,21 +223,27 @@ class MotionPrior(Prior):
         cloud = colored_cloud(body, self.cfg, generator)
         return centred(cloud) if self.cfg.center == "mean" else cloud
 
-    def _motions(self, prompt: str, generator: np.random.Generator) -> Motions:
-        """Return the motions of the file, or those that the model draws for the prompt."""
-        name = model_part(self.cfg.motion, MOTION)
+    def _motions(self, prompt: str, generator: np.random.Generator) -> tuple[Motions, str]:
+        """Return the file's motions, or those that the model draws, and the text CLIP compares."""
+        name, text = model_part(self.cfg.motion, MOTION), self.cfg.motion_text
         if not is_model(name):
-            return read_motions(name)
+            text = text or reduced_prompt(prompt)
+            if text is None and self.cfg.frame == "clip":
+                warn(
+                    f"no verb of motion was found in {prompt!r}: set motion_text, for instance to "
+                    "'Someone stands with open arms'"
+                )
+            return read_motions(name), text or prompt
         model = load_motion_model(name)
-        text = motion_sentence(self.cfg.motion_text or prompt, model.known)
+        text = motion_sentence(text or prompt, model.known)
         info(f"motion: {text!r}")
         features = text_features(motion_clip(self.cfg.motion, name), text)
         positions = sample_motions(model, features, SAMPLES, torch_generator(generator))
-        return Motions(positions, [positions.shape[1]] * SAMPLES)
+        return Motions(positions, [FRAMES] * SAMPLES), text
 
     def _body_of_motion(self, prompt: str, generator: np.random.Generator) -> Mesh:
         """Return the body of the chosen frame, with z up, facing +x, centred and scaled."""
-        cfg, motions = self.cfg, self._motions(prompt, generator)
+        cfg, (motions, text) = self.cfg, self._motions(prompt, generator)
         model = load_body_model(model_part(cfg.body_model, BODY))
         choices = offered_frames(motions.lengths, cfg.sample, cfg.frame)
         targets = np.stack([motions.positions[choice] for choice in choices])
@@ -249,15 +255,8 @@ class MotionPrior(Prior):
             meshes = [world_mesh(Mesh(v, model.faces), joints, cfg.scale) for v, joints in pairs]
             return fit.residuals, meshes
 
-        best = 0
-        if len(choices) > 1:
-            text = cfg.motion_text or reduced_prompt(prompt)
-            if text is None:
-                warn(
-                    f"no verb of motion was found in {prompt!r}: set motion_text, for instance to "
-                    "'Someone stands with open arms'"
-                )
-            best = self._best(fitted(targets, ROUGH)[1], text or prompt, names)
+        one = len(choices) == 1
+        best = 0 if one else self._best(fitted(targets, ROUGH)[1], text, names)
         # fitted separately, so that the result doesn't depend on the other choices
         (residuals,), (mesh,) = fitted(targets[[best]], FINE)
         worst, mean = int(residuals.argmax()), residuals.mean()
@@ -288,12 +287,9 @@ def is_model(motion: str) -> bool:
 
 
 def motion_clip(motion: str, path: str) -> Source:
-    """Return the CLIP whose text features a motion model takes: that of the same export of the
-    toybox, or the published models' own.
-    """
-    return clip_source(
-        MDM_CLIP if path == motion else motion, option="system.geometry.prior.motion"
-    )
+    """Return the CLIP whose text features a model takes: its export's, or the published models'."""
+    clip = MDM_CLIP if path == motion else motion
+    return clip_source(clip, option="system.geometry.prior.motion")
 
 
 def offered_frames(lengths: list[int], sample: Optional[int], frame: Any) -> list[tuple[int, int]]:

@@ -24,7 +24,7 @@ from ..formats.array_files import read_arrays
 from ..models.model_files import load_exactly, read_state_dict
 from .karras import cosine_alphas_cumprod
 
-FEATURES, HEADS, POSITIONS = 263, 4, 512
+FEATURES, HEADS, POSITIONS = 263, 4, 5000
 KIND = "MDM checkpoint"
 STATISTICS = ("t2m_mean.npy", "t2m_std.npy"), ("Mean.npy", "Std.npy")
 """Names of the files with the mean and the standard deviation, in MDM's folder or HumanML3D's."""
@@ -119,8 +119,8 @@ def _timesteps(file: Path) -> int:
     for name, value in SUPPORTED.items():
         if args.get(name, value) != value:
             raise UserError(f"{str(path)!r}: {name} is {args[name]!r}; only {value!r} is supported")
-    if not 2 <= steps <= 8 * POSITIONS:
-        raise UserError(f"{str(path)!r}: diffusion_steps is {steps}; expected 2 to {8 * POSITIONS}")
+    if not 2 <= steps <= POSITIONS:
+        raise UserError(f"{str(path)!r}: diffusion_steps is {steps}; expected 2 to {POSITIONS}")
     return steps
 
 
