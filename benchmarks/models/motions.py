@@ -36,7 +36,7 @@ Drawn = dict[str, Float[np.ndarray, "S T 22 3"]]
 def generated(count: int, seed: int) -> Drawn:
     """Return motions of the generator."""
     rng, n = np.random.default_rng(seed), t2m.FRAMES
-    positions = {name: [motions.draw(name, rng, n)[2] for _ in range(count)] for name in NAMES}
+    positions = {name: [motions.draw(name, rng, n)[0] for _ in range(count)] for name in NAMES}
     return {name: np.stack(group) for name, group in positions.items()}
 
 

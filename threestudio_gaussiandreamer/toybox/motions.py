@@ -225,52 +225,40 @@ def bow(s: Style, side: str) -> Body:
 
 
 class Action(NamedTuple):
-    """A kind of motion."""
+    """A kind of motion, and what follows its subject, where "{}" is left or right."""
 
     make: Callable[[Style, str], Body]
     phrases: tuple[str, ...]
-    """What follows the subject; "{}" is left or right."""
-    when: float
-    """Second of the frame that shows it best, or after which all do."""
-
-    @property
-    def sided(self) -> bool:
-        return "{}" in self.phrases[0]
 
 
 ACTIONS: dict[str, Action] = {
-    "open arms": Action(open_arms, 
-        ("stands with open arms", "opens the arms", "stands with the arms open"), 1.2),
-    "t pose": Action(t_pose, ("stands in a t pose", "is in a t pose", "holds a t pose"), 0.5),
-    "raise": Action(raise_arms, ("raises both arms", "lifts both arms", "raises the arms"), 1.2),
-    "wave": Action(wave, ("waves with the {} hand", "waves the {} hand", "waves the {} arm"), 1.2),
-    "point": Action(point, ("points with the {} hand", "points ahead with the {} arm"), 1.2),
-    "punch": Action(punch, ("punches with the {} hand", "punches with the {} fist"), 1.0),
-    "kick": Action(kick,
-        ("kicks with the {} leg", "kicks the {} leg", "kicks with the {} foot"), 1.2),
-    "walk": Action(walk, ("walks", "walks forward", "walks ahead"), 0.5),
-    "run": Action(run, ("runs", "runs forward", "runs ahead"), 0.5),
-    "sit": Action(sit, ("sits", "sits down"), 1.4),
-    "squat": Action(squat, ("squats", "squats down", "crouches"), 1.4),
-    "jump": Action(jump, ("jumps", "jumps up", "jumps high"), 1.0),
-    "bow": Action(bow, ("bows", "bows down", "takes a bow"), 1.6),
+    "open arms": Action(open_arms,
+        ("stands with open arms", "opens the arms", "stands with the arms open")),
+    "t pose": Action(t_pose, ("stands in a t pose", "is in a t pose", "holds a t pose")),
+    "raise": Action(raise_arms, ("raises both arms", "lifts both arms", "raises the arms")),
+    "wave": Action(wave, ("waves with the {} hand", "waves the {} hand", "waves the {} arm")),
+    "point": Action(point, ("points with the {} hand", "points ahead with the {} arm")),
+    "punch": Action(punch, ("punches with the {} hand", "punches with the {} fist")),
+    "kick": Action(kick, ("kicks with the {} leg", "kicks the {} leg", "kicks with the {} foot")),
+    "walk": Action(walk, ("walks", "walks forward", "walks ahead")),
+    "run": Action(run, ("runs", "runs forward", "runs ahead")),
+    "sit": Action(sit, ("sits", "sits down")),
+    "squat": Action(squat, ("squats", "squats down", "crouches")),
+    "jump": Action(jump, ("jumps", "jumps up", "jumps high")),
+    "bow": Action(bow, ("bows", "bows down", "takes a bow")),
 }  # fmt: skip
 
 
 class Motion(NamedTuple):
-    """One motion."""
-
-    action: str
-    side: Optional[str]
     positions: Float[np.ndarray, "T 22 3"]
     best: int
-    """The frame that shows the action."""
+    """The frame that shows the action: the last one of those that are held."""
 
 
 def names() -> list[str]:
     """Return all actions with their sides: "kick left", "kick right", "walk", ..."""
-    sided = {name: SIDES if action.sided else ("",) for name, action in ACTIONS.items()}
-    return [f"{name} {side}".rstrip() for name, sides in sided.items() for side in sides]
+    sides = {name: SIDES if "{}" in of.phrases[0] else ("",) for name, of in ACTIONS.items()}
+    return [f"{name} {side}".rstrip() for name, both in sides.items() for side in both]
 
 
 def draw(name: str, rng: np.random.Generator, frames: int = FRAMES) -> Motion:
@@ -278,7 +266,10 @@ def draw(name: str, rng: np.random.Generator, frames: int = FRAMES) -> Motion:
     action, side = split(name)
     style = Style(np.arange(frames) / RATE, rng)
     positions = joint_positions(ACTIONS[action].make(style, side or "left"))
-    return Motion(action, side, positions, peak(action, side, positions))
+    best = len(positions) - 1
+    if action in PEAKS:
+        best = int(PEAKS[action](positions, int(side == "right")).argmax())
+    return Motion(positions, best)
 
 
 def split(name: str) -> tuple[str, Optional[str]]:
@@ -295,13 +286,6 @@ PEAKS: dict[str, Callable[[np.ndarray, int], np.ndarray]] = {
 }
 """What is largest in the frame that shows an action best; the right side has ``i`` = 1."""
 PEAKS["run"] = PEAKS["walk"]
-
-
-def peak(action: str, side: Optional[str], positions: np.ndarray) -> int:
-    """Return the frame that shows an action best: the last one of those that are held."""
-    if action not in PEAKS:
-        return len(positions) - 1
-    return int(PEAKS[action](positions, int(side == "right")).argmax())
 
 
 # Kinematics -----------------------------------------------------------------------------------
