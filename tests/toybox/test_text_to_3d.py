@@ -12,6 +12,7 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 from PIL import Image
@@ -20,7 +21,8 @@ from tests.training.runs import CONFIGS
 from threestudio_gaussiandreamer.evaluation.scorecard import main as evaluate
 from threestudio_gaussiandreamer.launch.experiment import main as launch
 from threestudio_gaussiandreamer.models.bundled import JUDGE, write_digests
-from threestudio_gaussiandreamer.toybox import demo, models, views
+from threestudio_gaussiandreamer.priors import motion
+from threestudio_gaussiandreamer.toybox import demo, models, motions, views
 from threestudio_gaussiandreamer.toybox.export import write_weights
 from threestudio_gaussiandreamer.view.run_files import read_json
 
@@ -141,6 +143,81 @@ def test_an_interrupted_demo_continues_and_ends_with_a_sheet_and_a_table(
     assert Image.open(folder / "sheet.png").width == 9 * 128
     monkeypatch.setattr(demo, "launch", interrupted)
     assert demo.main(words) == 130 and len(list(tmp_path.iterdir())) == 2  # not the finished one
+
+
+# Avatars ------------------------------------------------------------------------------------------
+
+POSED = "a person in a red shirt and blue trousers stands in a T pose"
+
+
+@pytest.fixture
+def posing(exported, tmp_path, monkeypatch):
+    """Models whose motions are all a T pose, roughly fitted; few frames are offered to CLIP."""
+    folder = shutil.copytree(exported, tmp_path / "models")
+    pose = motions.features(motions.draw("t pose", np.random.default_rng(0)).positions)
+    np.save(folder / "motion/t2m_mean.npy", pose[0])
+    np.save(folder / "motion/t2m_std.npy", np.full(len(pose[0]), 1e-6))
+    write_digests(folder)
+    for name, value in {"NUM_FRAMES": 1, "ROUGH": 5, "FINE": 40}.items():
+        monkeypatch.setattr(motion, name, value)
+    return folder
+
+
+def test_the_demo_draws_an_avatar_which_goes_on_from_its_checkpoint(
+    posing, tmp_path, in_process, monkeypatch
+):
+    """Pose and body are the first cells of its row; the pose's left is blue, on the right."""
+    options = [option for option in OPTIONS if "prior" not in option]
+    words = [POSED, "--models", str(posing), "--output", str(tmp_path / "out"), *options]
+    assert demo.main(words) == 0 and in_process == [demo.AVATAR]
+    (folder,) = (tmp_path / "out").iterdir()
+    sheet = np.asarray(Image.open(folder / "sheet.png"))
+    assert sheet.shape[1] == 9 * views.SIZE
+    blue, red = (
+        (sheet[: views.SIZE, : views.SIZE] == c).all(-1) for c in ((0, 0, 255), (255, 0, 0))
+    )
+    assert blue.any() and red.any() and blue.nonzero()[1].mean() > red.nonzero()[1].mean() + 20
+    table = (folder / "table.md").read_text()
+    assert "| action |" in table.splitlines()[0] and POSED in table
+    (place,) = folder.glob("runs/prompt1_*/")
+    saved = np.load(place / "save/prior/points.npz")
+    assert saved["joints"].shape == (22, 3) and 1.3 < np.ptp(saved["points"][:, 2]) < 1.5
+    middle = (saved["points"].max(0) + saved["points"].min(0)) / 2
+    np.testing.assert_allclose(middle, 0, atol=1e-5)
+    monkeypatch.setattr(motion.MotionPrior, "generate", None)  # the cloud is the checkpoint's
+    more = ["--config", str(place / "configs/parsed.yaml"), "--train", "--gpu", "cpu"]
+    more += [f"resume={place / 'ckpts/last.ckpt'}", "trainer.max_steps=3"]
+    assert launch(more) == 0
+
+
+@pytest.mark.parametrize(
+    ("prompt", "config"),
+    [
+        ("a man in a green jacket and white pants bows", demo.AVATAR),
+        ("Iron man kicks with his left leg", demo.AVATAR),
+        ("two persons walk", demo.AVATAR),  # which names what is wrong
+        ("a person in a red shirt", demo.OBJECT),
+        ("a red fox running with a green scarf", demo.OBJECT),
+        ("a robot of a woman's size", demo.OBJECT),
+    ],
+)
+def test_a_persons_motion_makes_an_avatar(prompt, config):
+    assert demo.config_of(prompt) == config
+
+
+def test_a_prompt_that_is_no_avatars_is_refused_before_any_work(posing, tmp_path, capsys):
+    for prompt, message in (
+        ("a person in a red shirt and blue trousers", "no action"),
+        ("a person in a red shirt and blue trousers dances", "'dances'"),
+        ("a man in a red shirt and a woman in a blue shirt bow", "more than one person"),
+    ):
+        words = [f"exp_root_dir={tmp_path}/out", f"system.prompt_processor.prompt={prompt}"]
+        words += [f"{MODEL}={posing}", "--gpu", "cpu"]
+        assert launch(["--config", "toybox-avatar.yaml", "--train", *words]) == 2
+        assert message in capsys.readouterr().err and not (tmp_path / "out").exists()
+
+
+# Wrong input --------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

@@ -51,7 +51,7 @@ PROMPTS = (
 )
 """The last is of a combination that the models were not trained on."""
 OBJECT, AVATAR = "toybox.yaml", "toybox-avatar.yaml"
-PERSON = re.compile(rf"\b({'|'.join(NOUNS['person'])})\b", re.IGNORECASE)
+PERSON = re.compile(rf"\b({'|'.join(NOUNS['person'])}|persons|people|men|women)\b", re.IGNORECASE)
 SHOWN = [1, 3, 5]
 """Which of the judge's views the sheet has: from the front, the left and the back."""
 GUIDANCE, SAMPLE_STEPS = 3.0, 25
