@@ -131,12 +131,8 @@ def clip_batch(
     shard = shards.get(index)
     texts = training_prompts(shard, rows, rng)
     images = with_backgrounds(shard.rgba[rows], rng, random_share=RANDOM_BACKGROUNDS)
-    return ClipBatch(
-        clip_pixels(images),
-        token_ids(tokenizer, texts),
-        torch.from_numpy(shard.labels[rows]),
-        torch.tensor([bool(text) for text in texts]),
-    )
+    labels, has_text = torch.from_numpy(shard.labels[rows]), torch.tensor([*map(bool, texts)])
+    return ClipBatch(clip_pixels(images), token_ids(tokenizer, texts), labels, has_text)
 
 
 class ClipStage(Stage):

@@ -84,16 +84,12 @@ def write_stable_diffusion(folder: Path, training: Path, clip: Any) -> None:
 
 
 MODEL_INDEX = {
-    "_class_name": "StableDiffusionPipeline",
-    "feature_extractor": [None, None],
-    "safety_checker": [None, None],
-    "requires_safety_checker": False,
-    "scheduler": ["diffusers", "DDPMScheduler"],
-    "text_encoder": ["transformers", "CLIPTextModel"],
-    "tokenizer": ["transformers", "CLIPTokenizer"],
-    "unet": ["diffusers", "UNet2DConditionModel"],
+    "_class_name": "StableDiffusionPipeline", "feature_extractor": [None, None],
+    "safety_checker": [None, None], "requires_safety_checker": False,
+    "scheduler": ["diffusers", "DDPMScheduler"], "text_encoder": ["transformers", "CLIPTextModel"],
+    "tokenizer": ["transformers", "CLIPTokenizer"], "unet": ["diffusers", "UNet2DConditionModel"],
     "vae": ["diffusers", "AutoencoderKL"],
-}
+}  # fmt: skip
 
 
 def write_weights(path: Path, weights: dict[str, Tensor]) -> None:
@@ -129,13 +125,10 @@ def training_record(training: Path) -> dict[str, Any]:
             content = load_file(checkpoint_path(training, name))
             hours = round(content["seconds"] / 3600, 3)
             own = [{"device": content["device"], "hours": hours}] if hours else []
-            record[name] = {
-                "images": content["images"],
-                "steps": content["step"],
-                "trainings": content["earlier"] + own,
-                "last": content["history"][-1] if content["history"] else {},
-                "withheld": content["measured"],
-            }
+            last = content["history"][-1] if content["history"] else {}
+            seen = {"images": content["images"], "steps": content["step"]}
+            seen |= {"trainings": content["earlier"] + own, "last": last}
+            record[name] = seen | {"withheld": content["measured"]}
     return record
 
 

@@ -39,13 +39,10 @@ def points_batch(
     chosen = rng.permuted(np.tile(np.arange(shard.points.shape[1]), (len(rows), 1)), axis=1)
     places = np.take_along_axis(shard.points[rows], chosen[:, :POINTS, None], axis=1)
     points = network_units(torch.from_numpy(places).float())
-    return PointsBatch(
-        points,
-        normal(rng, points.shape),
-        sds.stratified_timesteps(len(rows), TIMESTEPS, torch_generator(rng)),
-        token_ids(tokenizer, texts),
-        torch.from_numpy(rng.uniform(size=len(rows)) < EMPTY_SHARE),
-    )
+    noise = normal(rng, points.shape)
+    t = sds.stratified_timesteps(len(rows), TIMESTEPS, torch_generator(rng))
+    empty = torch.from_numpy(rng.uniform(size=len(rows)) < EMPTY_SHARE)
+    return PointsBatch(points, noise, t, token_ids(tokenizer, texts), empty)
 
 
 class PointsStage(Stage):

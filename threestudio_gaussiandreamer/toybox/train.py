@@ -152,13 +152,9 @@ def start_from(weights: Path, options: Options, stages: Sequence[str]) -> None:
             ) from error
         training.ema.module.load_state_dict(training.model.state_dict())
         training.ema.n_averaged.fill_(seen["steps"])
-        training.progress = Progress(
-            seen["steps"],
-            seen["images"],
-            history=[seen["last"]] if seen["last"] else [],
-            measured=seen["withheld"],
-            earlier=seen["trainings"],
-        )
+        progress = training.progress = Progress(seen["steps"], seen["images"])
+        progress.history = [seen["last"]] if seen["last"] else []
+        progress.measured, progress.earlier = seen["withheld"], seen["trainings"]
         training.save()
 
 

@@ -86,23 +86,13 @@ def _draw(rng: np.random.Generator, person_share: float) -> Attributes:
     kind = str(rng.choice(list(KINDS)))
     accessory = str(rng.choice(THINGS_WORN)) if extra == "accessory" else None
     if rng.random() < person_share:
-        return Attributes(
-            PERSON,
-            colors[0],
-            part=colors[1],
-            accessory=(worn := (None, None, "hat", "cape")[int(rng.integers(4))]),
-            accessory_color=colors[2] if worn else None,
-            action=str(rng.choice(motions.names())),
-        )
-    return Attributes(
-        kind=kind,
-        color=colors[0],
-        pattern=pattern,
-        second=colors[1] if pattern != "plain" else None,
-        part=colors[2] if extra == "part" else None,
-        accessory=accessory,
-        accessory_color=colors[2] if extra == "accessory" else None,
-    )
+        accessory = (None, None, "hat", "cape")[int(rng.integers(4))]
+        worn = accessory, colors[2] if accessory else None
+        action = str(rng.choice(motions.names()))
+        return Attributes(PERSON, colors[0], "plain", None, colors[1], *worn, action)
+    second = colors[1] if pattern != "plain" else None
+    part, worn_color = (colors[2] if extra == name else None for name in ("part", "accessory"))
+    return Attributes(kind, colors[0], pattern, second, part, accessory, worn_color)
 
 
 def withheld(attributes: Attributes) -> bool:
