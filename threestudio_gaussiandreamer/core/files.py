@@ -110,6 +110,14 @@ def atomic_file(path: str | os.PathLike, *, durable: bool = True) -> Iterator[Bi
         temporary.unlink(missing_ok=True)
 
 
+def write_file(path: str | os.PathLike, content: bytes | str, *, durable: bool = True) -> None:
+    """Write a file by :func:`atomic_file`; text as UTF-8, names of files in it with their bytes."""
+    if isinstance(content, str):
+        content = content.encode(errors="surrogateescape")
+    with atomic_file(path, durable=durable) as file:
+        file.write(content)
+
+
 def json_text(content: Any, **options: Any) -> str:
     """Encode as JSON, with ``null`` for numbers that JSON doesn't have: NaN and the infinities."""
     return json.dumps(_without_infinities(content), allow_nan=False, **options)

@@ -10,7 +10,7 @@ from typing import Any, Optional
 import numpy as np
 
 from .errors import UserError
-from .files import atomic_file, existing_file
+from .files import existing_file, write_file
 
 _COLOR_MAPS = {
     "jet": "000080 0000ff 0080ff 00ffff 80ff80 ffff00 ff8000 ff0000 800000",
@@ -149,8 +149,7 @@ def _save(path: str | os.PathLike, image: Any, **options: Any) -> None:
 
     content = io.BytesIO()
     image.save(content, Image.registered_extensions()[Path(path).suffix.lower()], **options)
-    with atomic_file(path, durable=False) as file:
-        file.write(content.getvalue())
+    write_file(path, content.getvalue(), durable=False)
 
 
 def _normalize(image: np.ndarray, data_range: tuple[float, float]) -> np.ndarray:

@@ -24,7 +24,7 @@ from ..cameras import Orbit
 from ..core import images as picture_files
 from ..core.command import run_command
 from ..core.errors import UserError
-from ..core.files import atomic_file, existing_file, json_text, output_folder
+from ..core.files import existing_file, json_text, output_folder, write_file
 from ..core.options import RULE, between, in_range
 from ..core.streams import numpy_generator
 from ..host import get_device
@@ -218,8 +218,7 @@ def evaluate(
     total = _mean_and_spread(np.mean(scores, axis=0))
     about = {"clip": clip_folder, "unit": "100 * cosine", "protocol": protocol._asdict()}
     text = json_text({**about, **total, "results": each}, indent=2, ensure_ascii=False)
-    with atomic_file(output / "clip.json") as file:
-        file.write(text.encode(errors="surrogateescape"))  # paths may hold invalid UTF-8
+    write_file(output / "clip.json", text)  # paths may hold invalid UTF-8
     picture_files.write(output / "clip.png", np.concatenate(rows, axis=0))
     spread = total["std"] and f" +- {total['std']:.2f} over {len(protocol.seeds)} seeds"
     print(f"{total['mean']:6.2f}{spread or ''}: {output / 'clip.json'}, {output / 'clip.png'}")

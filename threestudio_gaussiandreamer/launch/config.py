@@ -17,7 +17,7 @@ from omegaconf import MISSING, DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from ..core.errors import UserError
-from ..core.files import atomic_file
+from ..core.files import write_file
 from ..core.options import escape, in_range, parse_structured, require_mapping
 from ..core.schedule import C_max
 from ..host import find, info, names
@@ -112,8 +112,7 @@ def dump_config(path: str | os.PathLike, cfg: Any) -> None:
     plain.pop("new_folder", None)
     if not plain.get("viewer"):
         plain.pop("viewer", None)  # threestudio doesn't know the key
-    with atomic_file(path) as file:
-        file.write(OmegaConf.to_yaml(OmegaConf.create(plain)).encode())
+    write_file(path, OmegaConf.to_yaml(OmegaConf.create(plain)))
 
 
 # -- files and overrides ---------------------------------------------------------------------------

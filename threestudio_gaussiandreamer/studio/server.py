@@ -21,7 +21,7 @@ import numpy as np
 
 from ..core.command import run_command
 from ..core.errors import UserError
-from ..core.files import atomic_file, json_text, output_folder
+from ..core.files import json_text, output_folder, write_file
 from ..formats.gaussian_files import StoredCloud
 from ..formats.ply import is_gaussian_ply
 from ..gaussians.axes import WORLD_UP
@@ -197,8 +197,7 @@ class Studio:
         path = Path(name.decode())
         ending = path.suffix[:12] if path.suffix[1:].isalnum() else ""
         path = folder / f"{safe_name(path.stem)}{ending}"
-        with atomic_file(path) as target:
-            target.write(content)
+        write_file(path, content)
         # a PLY is a mesh, points or Gaussians
         return {"path": str(path), "gaussians": is_gaussian_ply(path)}
 

@@ -25,7 +25,7 @@ from torch import Tensor
 from ..core.checkpoint_file import load_file
 from ..core.command import run_command
 from ..core.errors import UserError
-from ..core.files import atomic_file, output_folder
+from ..core.files import output_folder, write_file
 from ..models.bundled import write_digests
 from . import models
 from .clip_stage import trained_clip
@@ -51,8 +51,7 @@ def export(training: Path, target: Path) -> dict[str, Any]:
         if is_trained(training, name):
             write_weights(target / f"{name}.safetensors", averaged_weights(training, name))
     record = training_record(training)
-    with atomic_file(target / "training.json") as file:
-        file.write(json.dumps(record, indent=2).encode())
+    write_file(target / "training.json", json.dumps(record, indent=2))
     write_digests(target)
     return record
 
@@ -72,8 +71,7 @@ def write_stable_diffusion(folder: Path, training: Path, clip: Any) -> None:
         _save(network, folder / name)
     copy_tokenizer(training / "tokenizer", folder / "tokenizer")
     models.scheduler().save_pretrained(folder / "scheduler")
-    with atomic_file(folder / "model_index.json", durable=False) as file:
-        file.write(json.dumps(MODEL_INDEX, indent=2).encode())
+    write_file(folder / "model_index.json", json.dumps(MODEL_INDEX, indent=2), durable=False)
 
 
 MODEL_INDEX = {
@@ -93,8 +91,7 @@ def write_weights(path: Path, weights: dict[str, Tensor]) -> None:
     """Write weights by name as safetensors: Point-E's base checkpoint, or the judge's."""
     from safetensors.torch import save
 
-    with atomic_file(path) as file:
-        file.write(save({name: value.half().contiguous() for name, value in weights.items()}))
+    write_file(path, save({name: value.half().contiguous() for name, value in weights.items()}))
 
 
 def training_record(training: Path) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, Optional
 
 from ..core.errors import UserError
-from ..core.files import atomic_file
+from ..core.files import atomic_file, write_file
 from ..core.images import write_animation
 from ..exporters.files import RESERVED, BundleExporter, FileExporter, outputs_of, read_gaussians
 from ..formats.gaussian_files import StoredCloud, read_cloud, write_cloud
@@ -201,8 +201,7 @@ def write_pages(system: Any, folder: str) -> None:
     except UserError as error:
         warn(f"no {PAGE} is written: {error}")
         return
-    with atomic_file(system.get_save_path(f"{folder}/{PAGE}")) as file:
-        file.write(content.encode())
+    write_file(system.get_save_path(f"{folder}/{PAGE}"), content)
     with atomic_file(system.get_save_path(f"{folder}/{POSTER}"), durable=False) as file:
         picture(cloud, settings, first_pose(cloud), POSTER_SIZE).save(file, "png")
 

@@ -20,7 +20,7 @@ from torch import Tensor
 from .. import metrics
 from ..cameras import Orbit, held_out_orbit
 from ..core.errors import UserError
-from ..core.files import atomic_file, json_text
+from ..core.files import json_text, write_file
 from ..core.images import read as read_image
 from ..core.images import write as write_image
 from ..core.options import at_least, in_range, require_memory
@@ -219,8 +219,7 @@ class Measurements:
     def write(self) -> None:
         self.values |= self._elapsed()
         self.folder.mkdir(parents=True, exist_ok=True)
-        with atomic_file(self.path) as file:
-            file.write(json_text(self.values, indent=2).encode())
+        write_file(self.path, json_text(self.values, indent=2))
 
     def _save_pictures(self, key: str, renders: Tensor, truth: Tensor) -> None:
         """Save rows of six views to ``held_out``, also of prior, result and truth together."""

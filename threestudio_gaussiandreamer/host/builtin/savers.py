@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ...core import images as pictures
 from ...core.errors import UserError
-from ...core.files import atomic_file, json_text
+from ...core.files import atomic_file, json_text, write_file
 
 
 @dataclass
@@ -139,8 +139,7 @@ class SaverMixin:
 
     def save_json(self, filename: str, payload: Any) -> str:
         path = self.get_save_path(filename)
-        with atomic_file(path) as file:
-            file.write(json_text(payload).encode())
+        write_file(path, json_text(payload))
         return path
 
     def _log_file(self, kind: str, path: str, name: Optional[str], step: Optional[int]) -> None:
