@@ -55,9 +55,8 @@ def test_depth_and_normals_are_computed_when_they_are_read():
         opacities=lambda: torch.full((1,), 0.9),
         colors=lambda centers: torch.ones(1, 3),
     )
-    renderer = find("gaussiandreamer-splatting")(
-        {}, geometry=geometry, material=None, background=FlatBackground({})
-    )
+    parts = {"geometry": geometry, "material": None, "background": FlatBackground({})}
+    renderer = find("gaussiandreamer-splatting")({}, **parts)
     c2w = cameras.orbit_c2w(torch.tensor([10.0]), torch.tensor([30.0]), torch.tensor([2.5]))
     out = renderer(c2w=c2w, fovy=torch.tensor([0.7]), height=16, width=16)
     assert {"depth", "comp_normal"} <= out.keys() and len({**out}) == len(out)
@@ -99,14 +98,11 @@ def test_fixed_and_random_backgrounds():
 
 
 def test_learned_starts_at_the_colour_stays_in_range_and_learns():
-    background = FlatBackground(
-        {"mode": "learned", "color": [0.5, 0.5, 0.5], "lr": [0, 0.1, 0.2, 10]}
-    )
+    options = {"mode": "learned", "color": [0.5, 0.5, 0.5], "lr": [0, 0.1, 0.2, 10]}
+    background = FlatBackground(options)
     optimizer = torch.optim.Adam(background.parameter_groups())
-    rates, cloud = PartRates({}), GaussianCloud({})
-    rates.groups(
-        SimpleNamespace(geometry=cloud, background=background, material=None, renderer=None)
-    )
+    rates, parts = PartRates({}), {"geometry": GaussianCloud({}), "background": background}
+    rates.groups(SimpleNamespace(**parts, material=None, renderer=None))
     for step in range(400):
         rates.set(optimizer, 0, step)
         optimizer.zero_grad()
