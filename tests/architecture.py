@@ -18,7 +18,8 @@ PACKAGE = ROOT / NAME
 PAGE = ROOT / "docs/architecture.md"
 
 
-MATHS = ("core", "gaussians", "formats", "splatting", "diffusion", "meshes", "cameras", "metrics")
+FILES = ("cameras", "images", "metrics")
+MATHS = ("core", "gaussians", "formats", "splatting", "diffusion", "meshes", *FILES)
 RINGS = {
     "0 maths": MATHS,
     "1 host": ("host", "models"),

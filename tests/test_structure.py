@@ -26,7 +26,7 @@ from tests.architecture import (
 RINGS = ring_of()
 MATHS_MAY_USE = {"torch", "numpy", "scipy", "jaxtyping"} | set(sys.stdlib_module_names)
 LIBRARIES = {  # of ring 0, beyond MATHS_MAY_USE
-    "core": {"imageio_ffmpeg", "PIL"},
+    "images": {"PIL"},
     "formats": {"PIL", "pxr", "tqdm", "zstandard"},
     "meshes": {"trimesh", "embreex", "PIL", "tqdm"},
 }

@@ -8,7 +8,7 @@ import torch
 from tests.launch.cases import assert_refused
 from threestudio_gaussiandreamer import register_parts
 from threestudio_gaussiandreamer.core.checkpoint_file import load_checkpoint
-from threestudio_gaussiandreamer.core.images import read as read_image
+from threestudio_gaussiandreamer.images import read as read_image
 from threestudio_gaussiandreamer.training import held_out as evaluate
 
 register_parts()

@@ -12,8 +12,8 @@ from omegaconf import OmegaConf
 from tests.launch.cases import DEMO, SMALL, assert_refused
 from threestudio_gaussiandreamer import host, register_parts
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.core.methods import require_dataclass
 from threestudio_gaussiandreamer.host import BaseBackground, BaseModule, BaseObject, register
+from threestudio_gaussiandreamer.host.methods import require_dataclass
 from threestudio_gaussiandreamer.launch.config import load_config
 from threestudio_gaussiandreamer.launch.config_check import (
     check_config,

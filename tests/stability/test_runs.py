@@ -29,7 +29,7 @@ from tests.stability.backends import slow
 from tests.stability.report import row
 from tests.stability.small_runs import DEMO, EVERY_STEP, Ended, launch, refused, require_equal_ends
 from threestudio_gaussiandreamer import host
-from threestudio_gaussiandreamer.core import images as pictures
+from threestudio_gaussiandreamer import images as pictures
 from threestudio_gaussiandreamer.core.checkpoint_file import (
     load_checkpoint,
     load_file,
@@ -38,6 +38,7 @@ from threestudio_gaussiandreamer.core.checkpoint_file import (
 )
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.formats.ply import read_gaussians, read_points
+from threestudio_gaussiandreamer.host.builtin.savers import write_video
 from threestudio_gaussiandreamer.launch.config import dump_config, load_config
 from threestudio_gaussiandreamer.launch.config_check import check_config, check_part
 from threestudio_gaussiandreamer.models import hub, model_files
@@ -174,7 +175,7 @@ def test_a_partial_video_is_an_error(kind, tmp_path, measured):
         if kind == "png":
             pictures.write(path, noise[0])
         else:
-            pictures.write_video(str(path), frames, fps=5)
+            write_video(str(path), frames, fps=5)
 
     def fails(limit: int) -> None:
         with full_disk(limit), pytest.raises(UserError, match=f"out.{kind}"):

@@ -12,8 +12,8 @@ from benchmarks.viewers import browser, devtools
 from tests.helpers.painted_ball import painted_ball
 from tests.training.runs import launch, length, run_folder
 from tests.view.clouds import meta
-from threestudio_gaussiandreamer.core.images import read
 from threestudio_gaussiandreamer.exporters import files
+from threestudio_gaussiandreamer.images import read
 from threestudio_gaussiandreamer.training.export import discard_turntable
 
 SHORT = [*length(2)]

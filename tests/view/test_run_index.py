@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.core.images import write
+from threestudio_gaussiandreamer.images import write
 from threestudio_gaussiandreamer.view.page import cloud_page
 from threestudio_gaussiandreamer.view.run_index import (
     drawn,

@@ -21,13 +21,13 @@ from torch import Tensor
 
 from .. import register_parts
 from ..cameras import Orbit
-from ..core import images as picture_files
 from ..core.command import run_command
 from ..core.errors import UserError
 from ..core.files import existing_file, json_text, output_folder, write_file
 from ..core.options import RULE, between, in_range
 from ..core.streams import numpy_generator
 from ..host import get_device
+from ..images import write as write_image
 from ..models.bundled import CLIP, NAME, model_part
 from ..models.clip import PictureText, clip_source
 from ..toybox.views import DISTANCE, FOVY_DEG, SIZE
@@ -206,20 +206,24 @@ def evaluate(
     output: Path,
 ) -> None:
     """Score all results, print the scores, and write ``clip.json`` and ``clip.png``."""
+    from PIL import Image, ImageDraw
+
     clip, scores, each, rows = open_clip(clip_folder), [], [], []
     for item, (result, prompt) in enumerate(zip(results, prompts, strict=True)):
         per_seed, views = score(result, prompt, item, clip, protocol)
         scores.append(per_seed)
         numbers = _mean_and_spread(per_seed)
         text = f"{numbers['mean']:.2f}  {prompt}"
-        rows.append(picture_files.with_text(np.concatenate(views, axis=1), text))
+        canvas = Image.fromarray(np.concatenate(views, axis=1))
+        ImageDraw.Draw(canvas).text((2, 0), text, fill="black", stroke_width=1, stroke_fill="white")
+        rows.append(canvas)
         each.append({"result": str(result.file), "prompt": prompt, **numbers})
         print(f"{numbers['mean']:6.2f}  {prompt}  {result.file}", flush=True)
     total = _mean_and_spread(np.mean(scores, axis=0))
     about = {"clip": clip_folder, "unit": "100 * cosine", "protocol": protocol._asdict()}
     text = json_text({**about, **total, "results": each}, indent=2, ensure_ascii=False)
     write_file(output / "clip.json", text)  # paths may hold invalid UTF-8
-    picture_files.write(output / "clip.png", np.concatenate(rows, axis=0))
+    write_image(output / "clip.png", np.concatenate(rows, axis=0))
     spread = total["std"] and f" +- {total['std']:.2f} over {len(protocol.seeds)} seeds"
     print(f"{total['mean']:6.2f}{spread or ''}: {output / 'clip.json'}, {output / 'clip.png'}")
 

@@ -15,7 +15,6 @@ from omegaconf import OmegaConf
 
 from ..core.distributed import require_shareable
 from ..core.errors import UserError, unknown
-from ..core.methods import require_dataclass
 from ..core.options import (
     Rule,
     at_least,
@@ -26,6 +25,7 @@ from ..core.options import (
     satisfies,
 )
 from ..host import find, pl
+from ..host.methods import require_dataclass
 from ..training.data import sizes_of_stages
 from .live_viewer import ViewerConfig
 from .parts import check_kind, find_part

@@ -21,7 +21,6 @@ from torch import Tensor
 from ..core.devices import get_device
 from ..core.errors import UserError
 from ..core.files import existing_file, json_text, write_file
-from ..core.images import write as write_image
 from ..core.logs import warn
 from ..formats.gaussian_files import StoredCloud, as_stored, file_size
 from ..formats.spz import COLOR_REACH
@@ -39,6 +38,7 @@ from ..gaussians.views import (
     render_all,
     views_around,
 )
+from ..images import write as write_image
 from ..view.run_files import read_any
 from .options import PruneOptions, budget_of, combined_psnr, error_of, parse_bytes, parse_count
 

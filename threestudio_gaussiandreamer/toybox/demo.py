@@ -23,9 +23,8 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from .. import register_parts
+from .. import images, register_parts
 from ..cameras import Orbit
-from ..core import images
 from ..core.command import interrupt, raised_signals, run_command
 from ..core.errors import Terminated, UserError
 from ..core.files import json_text, output_folder, write_file

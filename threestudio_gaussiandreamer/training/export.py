@@ -20,7 +20,6 @@ from typing import Any, Optional
 
 from ..core.errors import UserError
 from ..core.files import atomic_file, write_file
-from ..core.images import write_animation
 from ..exporters.files import RESERVED, BundleExporter, FileExporter, outputs_of, read_gaussians
 from ..formats.gaussian_files import StoredCloud, read_cloud, write_cloud
 from ..formats.ply import write_points
@@ -29,6 +28,7 @@ from ..gaussians.axes import VIEWER_UP
 from ..gaussians.point_cloud import PointCloud
 from ..gaussians.surface import Surface
 from ..host import ExporterOutput, find, warn
+from ..images import write_animation
 from ..meshes.mesh import Mesh
 from ..meshes.write import write_obj, write_textured_mesh
 from ..prune import PruneOptions, prune_to_budget, write_report

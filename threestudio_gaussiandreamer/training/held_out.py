@@ -21,9 +21,9 @@ from .. import metrics
 from ..cameras import Orbit, held_out_orbit
 from ..core.errors import UserError
 from ..core.files import json_text, write_file
-from ..core.images import read as read_image
-from ..core.images import write as write_image
 from ..core.options import at_least, in_range, require_memory
+from ..images import read as read_image
+from ..images import write as write_image
 from ..meshes.mesh import SurfaceDistance
 from ..meshes.raycast import over_background
 from ..view.run_files import read_json

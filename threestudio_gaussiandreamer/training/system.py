@@ -39,12 +39,12 @@ from torch import Tensor
 from ..core.devices import flush_reads
 from ..core.distributed import average_gradients, from_first, rank
 from ..core.errors import UserError
-from ..core.methods import require_class_method
 from ..core.schedule import parse_schedule, validate_schedule
 from ..gaussians.gaussians import SHAPES, require_cloud
 from ..guidance import external
 from ..guidance.external import truth_of
 from ..host import BaseLift3DSystem, C, find, info, parse_structured, register, warn
+from ..host.methods import require_class_method
 from ..metrics import psnr_of_error
 from ..priors.base import preflight_prior
 from ..priors.cache import cached_cloud
