@@ -11,7 +11,11 @@ from threestudio_gaussiandreamer.host import find
 from threestudio_gaussiandreamer.training.background import FlatBackground
 from threestudio_gaussiandreamer.training.geometry import GaussianCloud
 from threestudio_gaussiandreamer.training.optimizer import PartRates
-from threestudio_gaussiandreamer.training.renderer import SplattingRenderer, normals_from_depth
+from threestudio_gaussiandreamer.training.renderer import (
+    LazyMapping,
+    SplattingRenderer,
+    normals_from_depth,
+)
 
 
 def plane(height: int, width: int) -> tuple[torch.Tensor, ...]:
@@ -122,3 +126,16 @@ def test_a_derived_background_with_colours_of_pixels_is_drawn():
             return dirs.abs()
 
     assert FlatBackground.is_flat(Derived({})) and not FlatBackground.is_flat(Gradient({}))
+
+
+def test_values_of_a_lazy_mapping_are_computed_once_when_they_are_read():
+    calls = []
+    mapping = LazyMapping({"a": 1}, {"b": lambda: calls.append("b") or 2, "c": lambda: 1 / 0})
+    assert "b" in mapping and "c" in mapping and "d" not in mapping
+    assert list(mapping) == ["a", "b", "c"] and len(mapping) == 3 and not calls
+    assert mapping["b"] == mapping.get("b") == 2 and calls == ["b"]
+    assert len(mapping) == 3 and mapping.get("d", 5) == 5
+    with pytest.raises(KeyError):
+        mapping["d"]
+    mapping["c"] = 3
+    assert {**mapping} == dict(mapping) == mapping == {"a": 1, "b": 2, "c": 3}

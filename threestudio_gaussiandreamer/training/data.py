@@ -28,7 +28,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import Any, ClassVar, List, Tuple
+from typing import Any, ClassVar, List, Optional, Tuple
 
 import torch
 from jaxtyping import Int
@@ -37,7 +37,7 @@ from torch.utils.data import DataLoader, IterableDataset
 
 from .. import cameras
 from ..cameras import Orbit, OrbitRanges
-from ..core.distributed import own_rows, require_shareable
+from ..core.distributed import own_rows, world_size
 from ..core.errors import UserError
 from ..core.options import (
     Rule,
@@ -149,6 +149,21 @@ def sizes_of_stages(cfg: Any) -> list[tuple[int, int, int]]:
     return [tuple(values[min(i, len(values) - 1)] for values in sizes) for i in stages]
 
 
+def require_shareable(cfg: Any, processes: Optional[int] = None) -> None:
+    """Raise UserError unless the processes, by default those that there are, can share the views of
+    a step equally, of which ``n_view`` consecutive ones stay in one process.
+    """
+    size, together = processes or world_size(), getattr(cfg, "n_view", 1)
+    for *_, views in sizes_of_stages(cfg):
+        if views % (size * together):
+            said = "fewer than" if views < size * together else "no multiple of"
+            said += f" the {size} processes that share the views of a step"
+            said += f" in groups of {together}" if together > 1 else ""
+            fits = f"set data.batch_size to {size * together} or a multiple"
+            fits += f", or use as many processes as divide {views // together}"
+            raise UserError(f"data.batch_size is {views}, {said}: {fits}")
+
+
 def orbit_batch(orbit: Orbit, height: int, width: int) -> dict[str, Any]:
     """Make the host's batch of B views, with the lights at the cameras; both sizes are ints."""
     c2w, proj = orbit.c2w, cameras.projection(orbit.fovy, width / height)
@@ -180,8 +195,7 @@ class TrainCameras(IterableDataset, Updateable):
         self.next_step: Callable[[], int] = lambda: 0
         self._pool_batches: dict[tuple[int, int], dict[str, Any]] = {}  # all views, by their size
         self.sizes = sizes_of_stages(cfg)
-        for _, _, batch_size in self.sizes:
-            require_shareable(batch_size, "data.batch_size", together=cfg.n_view)
+        require_shareable(cfg)
         ranges = cfg.elevation_range, cfg.azimuth_range, cfg.camera_distance_range, cfg.fovy_range
         self.ranges, count = OrbitRanges(*map(tuple, ranges)), cfg.train_views
         self.pool = cameras.camera_pool(count, self.ranges, run_seed()) if count else None
