@@ -23,9 +23,8 @@ _PNG_OPTIONS = {"compress_level": 1, "compress_type": zlib.Z_RLE}
 def rgb(
     image: np.ndarray, *, data_format: str = "HWC", data_range: tuple[float, float] = (0, 1)
 ) -> np.ndarray:
-    """Convert (H,W,C), or (C,H,W) with ``data_format="CHW"``, to uint8 (H, W*ceil(C/3), 3).
-
-    Channels lie side by side, three by three; missing ones are black.
+    """Convert (H,W,C), or (C,H,W) with ``data_format="CHW"``, to uint8 (H, W*ceil(C/3), 3):
+    channels lie side by side, three by three; missing ones are black.
     """
     image = np.moveaxis(np.asarray(image), {"HWC": -1, "CHW": 0}[data_format], -1)
     image = image if image.dtype == np.uint8 else _to_bytes(_normalize(image, data_range))

@@ -3,7 +3,6 @@ statistics are reduced over all of them. Random numbers belong to a view, not to
 renders it, so a step is the same as with one process but for the order of floating-point sums."""
 
 from collections.abc import Callable, Iterable
-from typing import Any
 
 import torch
 import torch.distributed as dist
@@ -40,15 +39,6 @@ def draw_shared(count: int, draw: Callable[[int], Tensor]) -> Tensor:
     """
     total = count * world_size()
     return draw(total)[own_rows(total)]
-
-
-def from_first(make: Callable[[], Any]) -> Any:
-    """Call ``make`` in the first process, and return its result in all of them."""
-    if not is_active():
-        return make()
-    shared = [make() if rank() == 0 else None]
-    dist.broadcast_object_list(shared)
-    return shared[0]
 
 
 def all_sum(tensor: Tensor, op: str = "SUM") -> Tensor:

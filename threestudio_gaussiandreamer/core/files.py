@@ -12,15 +12,13 @@ from typing import Any, BinaryIO
 
 from .errors import UserError
 
-WEB_PAGE = (
-    "a web page, not the file itself, as an address of a page gives it: download it again by the "
-    "link of the file"
-)
 PLACEHOLDERS = {
     b"version https://git-lfs": "a pointer of Git LFS, not the file itself: run `git lfs pull` "
     "where it is from, or download it again",
-    b"<!doctype html": WEB_PAGE,
-    b"<html": WEB_PAGE,
+    **dict.fromkeys(
+        (b"<!doctype html", b"<html"),
+        "a web page, not the file itself: download it again by the link of the file, not of a page",
+    ),
 }
 """What downloads leave in a file's place, by its first bytes in lower case."""
 
@@ -160,9 +158,7 @@ def require_other_file(
 
 def is_folder(path: str | os.PathLike) -> bool:
     """Return whether ``path`` is an existing folder; False for what can't be a file's name."""
-    with suppress(ValueError):
-        return os.path.isdir(os.path.expanduser(path))
-    return False
+    return os.path.isdir(os.path.expanduser(path))
 
 
 def output_folder(path: str | os.PathLike, option: str, files: Collection[str] = ()) -> Path:

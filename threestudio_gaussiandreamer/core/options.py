@@ -17,7 +17,6 @@ from collections.abc import Callable, Collection, Mapping, MutableMapping, Seque
 from enum import Enum
 from functools import cache
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 from .errors import UserError, unknown
@@ -26,8 +25,6 @@ from .schedule import parse_schedule, validate_schedule
 
 RULE = "option"
 """The key of a field's rule in its metadata."""
-MISSING = "???"
-"""A text that stands for a value that must be given."""
 SCALARS = {int: "a whole number", float: "a number", bool: "true or false", str: "a text"}
 SWITCHES = dict.fromkeys(("true", "yes", "y", "on", "1"), True)
 SWITCHES |= dict.fromkeys(("false", "no", "n", "off", "0"), False)
@@ -152,11 +149,7 @@ def count_of(things: str, low: int, bytes_each: int) -> Rule:
 
 def is_number(value: Any) -> bool:
     """Return whether ``value`` is a finite number within float32's range."""
-    return (
-        isinstance(value, (int, float))
-        and not isinstance(value, bool)
-        and -FLOAT32_MAX <= value <= FLOAT32_MAX
-    )
+    return isinstance(value, (int, float)) and type(value) is not bool and abs(value) <= FLOAT32_MAX
 
 
 def is_whole(value: Any) -> bool:
@@ -211,9 +204,8 @@ def memory_bytes() -> int:
     """Return the bytes of the largest memory: the machine's (or its container's) or one GPU's."""
     import torch
 
-    gpus = torch.cuda.device_count() if torch.cuda.is_available() else 0
-    found = [torch.cuda.get_device_properties(i).total_memory for i in range(gpus)]
-    return max([main_memory(), *found])
+    gpus = range(torch.cuda.device_count() if torch.cuda.is_available() else 0)
+    return max([main_memory(), *(torch.cuda.get_device_properties(i).total_memory for i in gpus)])
 
 
 def main_memory() -> int:
@@ -323,14 +315,13 @@ def _converted(path: str, value: Any, annotation: Any) -> Any:
 
 
 def _scalar(path: str, value: Any, kind: type) -> Any:
-    require_representable(path, value)
     inexact = kind is int and isinstance(value, float)
     switch = kind in (int, float) and isinstance(value, bool)
     try:
         if value is None or is_list(value) or isinstance(value, Mapping) or inexact or switch:
             raise TypeError
         return SWITCHES[str(value).lower()] if kind is bool else kind(value)
-    except (TypeError, ValueError, KeyError):
+    except (TypeError, ValueError, KeyError, OverflowError):
         raise wrong(path, SCALARS[kind], value) from None
 
 
@@ -379,8 +370,6 @@ def check_options(config_class: type, cfg: Any, prefix: str = "") -> None:
         if dataclasses.is_dataclass(option.type):
             check_options(option.type, value, f"{path}.")
             continue
-        if isinstance(value, str) and value == MISSING:
-            raise UserError(f"{path}: no value is given")
         require_representable(path, value)
         if RULE in option.metadata and not (value is None and option.default is None):
             option.metadata[RULE](path, value)
@@ -393,19 +382,14 @@ def check_options(config_class: type, cfg: Any, prefix: str = "") -> None:
 
 
 def require_defaults(
-    config_class: type,
-    cfg: Any,
-    names: Collection[str],
-    reason: str,
-    prefix: str = "",
-    neutral: Mapping[str, Any] = MappingProxyType({}),
+    config_class: type, cfg: Any, names: Collection[str], reason: str, prefix: str = ""
 ) -> None:
     """Raise UserError unless the options ``names``, which have no effect (``reason``: "with a=1"),
-    are at their defaults, or at the ``neutral`` values, by name, which do nothing.
+    are at their defaults.
     """
     for name in names:
         default = getattr(config_class, name, None)
-        if getattr(cfg, name, default) not in (default, neutral.get(name, default)):
+        if getattr(cfg, name, default) != default:
             raise UserError(f"{prefix}{name} has no effect {reason}: leave it at {default}")
 
 

@@ -92,6 +92,8 @@ def score(
     result: Result, prompt: str, item: int, clip: PictureText, protocol: Protocol
 ) -> tuple[Float[np.ndarray, " S"], list[np.ndarray]]:
     """Return a result's score for each seed, and the views of the first one, uint8."""
+    from PIL import Image
+
     draws = [protocol.draw(seed, item) for seed in protocol.seeds]
     needed = np.unique(np.concatenate(draws))
     orbit = protocol.orbit.rows(needed)
@@ -102,7 +104,9 @@ def score(
     for images in render_views(read_result(result), *views, **how):
         rows = list(islice(left, len(images)))
         similarity[rows] = PERCENT * clip.similarities(images, prompt)
-        thumbnails |= {row: _thumbnail(image) for row, image in zip(rows, images, strict=True)}
+        for row, image in zip(rows, images, strict=True):
+            small = Image.fromarray((image * 255).round().astype(np.uint8))
+            thumbnails[row] = np.asarray(small.resize((THUMBNAIL, THUMBNAIL), Image.LANCZOS))
     means = np.array([similarity[draw].mean() for draw in draws])
     return means, [thumbnails[row] for row in draws[0]]
 
@@ -110,13 +114,6 @@ def score(
 def _mean_and_spread(per_seed: Float[np.ndarray, " S"]) -> dict[str, Any]:
     spread = float(per_seed.std(ddof=1)) if len(per_seed) > 1 else None
     return {"mean": float(per_seed.mean()), "std": spread, "per_seed": per_seed.tolist()}
-
-
-def _thumbnail(image: Float[np.ndarray, "H W 3"]) -> np.ndarray:
-    from PIL import Image
-
-    small = Image.fromarray((image * 255).round().astype(np.uint8))
-    return np.asarray(small.resize((THUMBNAIL, THUMBNAIL), Image.Resampling.LANCZOS))
 
 
 def prompts_for(

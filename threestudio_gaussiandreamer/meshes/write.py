@@ -74,13 +74,10 @@ def write_textured_mesh(
     suffix = Path(path).suffix.lower()
     if suffix not in WRITERS:
         raise UserError(f"expected the name of a {' or '.join(WRITERS)} file, got {str(path)!r}")
-    WRITERS[suffix](path, mesh, unlit, _clean(name or Path(path).stem))
-
-
-def _clean(name: str) -> str:
-    """Return a name without spaces, which some readers of OBJ end a name at."""
-    printable = "".join(c if c.isprintable() else " " for c in name)
-    return "_".join(printable.split()).encode(errors="ignore")[:NAME_BYTES].decode(errors="ignore")
+    # some readers of OBJ end a name at a space
+    printable = "".join(c if c.isprintable() else " " for c in name or Path(path).stem)
+    name = "_".join(printable.split()).encode(errors="ignore")[:NAME_BYTES]
+    WRITERS[suffix](path, mesh, unlit, name.decode(errors="ignore"))
 
 
 def write_glb_file(

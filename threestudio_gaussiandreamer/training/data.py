@@ -206,7 +206,7 @@ class TrainCameras(IterableDataset, Updateable):
     def collate(self, step: int) -> dict[str, Any]:
         """Return this process's views of the batch for ``step``, a function of (seed, step)."""
         stage = bisect.bisect_right(self.cfg.resolution_milestones, step)
-        height, width, batch_size = self.sizes[stage]
+        (height, width, batch_size), (low, high) = self.sizes[stage], LIGHT_DISTANCES
         rng, size = generator(run_seed(), "camera", step), (height, width)
         if self.pool:
             if size not in self._pool_batches:
@@ -214,7 +214,11 @@ class TrainCameras(IterableDataset, Updateable):
             views = _rows(self._pool_batches[size], self._pick(batch_size, rng))
         else:
             views = orbit_batch(self._sample(batch_size, rng), *size)
-        views["light_positions"] = self._lights(views["c2w"], rng)
+        # point lights around the camera's direction, as in DreamFusion
+        towards = views["c2w"][:, :3, 3] + torch.randn(batch_size, 3, generator=rng)
+        towards /= torch.linalg.vector_norm(towards, dim=-1, keepdim=True).clamp_min(1e-12)
+        distances = torch.rand(batch_size, 1, generator=rng)
+        views["light_positions"] = towards * (low + (high - low) * distances)
         return _rows(views, own_rows(batch_size))
 
     def _sample(self, batch_size: int, rng: torch.Generator) -> Orbit:
@@ -229,13 +233,6 @@ class TrainCameras(IterableDataset, Updateable):
         if self.cfg.batch_uniform_azimuth:
             share = (share + torch.arange(batch_size)) / batch_size
         return (share * views).long().clamp_max(views - 1)
-
-    def _lights(self, c2w: Tensor, rng: torch.Generator) -> Tensor:
-        """Draw point lights around the camera's direction, as DreamFusion does."""
-        count, (low, high) = len(c2w), LIGHT_DISTANCES
-        towards = c2w[:, :3, 3] + torch.randn(count, 3, generator=rng)
-        towards = towards / torch.linalg.vector_norm(towards, dim=-1, keepdim=True).clamp_min(1e-12)
-        return towards * (low + (high - low) * torch.rand(count, 1, generator=rng))
 
 
 def ring_loader(cfg: CameraConfig, count: int) -> DataLoader:

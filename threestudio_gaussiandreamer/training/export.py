@@ -166,11 +166,6 @@ def export_pruned(system: Any, folder: str) -> None:
     write_report(system.get_save_path(f"{folder}/report"), result, suffix, options)
 
 
-def exported_files(folder: Path) -> list[str]:
-    """List the results below ``folder`` that a user wants to open."""
-    return [str(path) for pattern in SUMMARY for path in sorted(folder.glob(pattern))]
-
-
 # -- pages and turntables --------------------------------------------------------------------------
 
 
@@ -186,11 +181,15 @@ def write_pages(system: Any, folder: str) -> None:
     if not system.cfg.pages:
         return
     run, settings = RunFiles(Path(system.get_save_dir()).parent), settings_of(system)
+    color, background = WHITE, system.background
+    if FlatBackground.is_flat(background):
+        learned = background.cfg.mode == "learned"
+        color = tuple(background.color(1)[0].tolist() if learned else background.cfg.color)
     options = PageOptions(
         title=prompt_of(system) or run.folder.name,
         name="gaussians",
         settings=settings,
-        background=_background(system.background),
+        background=color,
         keep_background=run.background_is_given,
     )
     cloud = StoredCloud(read_gaussians(system.geometry)).in_axes(VIEWER_UP)
@@ -204,14 +203,6 @@ def write_pages(system: Any, folder: str) -> None:
     write_file(system.get_save_path(f"{folder}/{PAGE}"), content)
     with atomic_file(system.get_save_path(f"{folder}/{POSTER}"), durable=False) as file:
         picture(cloud, settings, first_pose(cloud), POSTER_SIZE).save(file, "png")
-
-
-def _background(background: Any) -> tuple[float, float, float]:
-    """Return the colour that test views are shown on; white for backgrounds that aren't flat."""
-    if not FlatBackground.is_flat(background):
-        return WHITE
-    learned = background.cfg.mode == "learned"
-    return tuple(background.color(1)[0].tolist() if learned else background.cfg.color)
 
 
 def _first_cloud(run: RunFiles) -> Optional[Shown]:

@@ -226,7 +226,9 @@ class Measurements:
         folder = self.folder / "held_out"
         folder.mkdir(parents=True, exist_ok=True)
         for name, images in ((key, renders), ("truth", truth)):
-            write_image(folder / f"{name}.png", _row(images))
+            chosen = images[:: max(1, len(images) // 6)][:6]
+            row = (torch.cat(list(chosen), 1).clamp(0, 1) * 255).round().byte().numpy()
+            write_image(folder / f"{name}.png", row)
         pictures = []
         for name in ("prior", "result", "truth"):
             with suppress(UserError):  # an earlier run's picture is missing or damaged
@@ -249,9 +251,3 @@ class Measurements:
 
 def _now() -> np.ndarray:
     return np.array([time.perf_counter(), time.process_time()])
-
-
-def _row(images: Float[Tensor, "V H W 3"], count: int = 6) -> np.ndarray:
-    """Join ``count`` views spread around the object side by side, as bytes."""
-    chosen = images[:: max(1, len(images) // count)][:count]
-    return (torch.cat(list(chosen), 1).clamp(0, 1) * 255).round().byte().numpy()
