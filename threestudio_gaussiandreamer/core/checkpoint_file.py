@@ -110,14 +110,20 @@ def newest_readable(folder: str | os.PathLike) -> Optional[tuple[Path, int]]:
     """Return the intact checkpoint of a folder with the highest step, ``last.ckpt`` among equal
     ones, and that step; None if there is none. Damaged files are reported in the log.
     """
-    found = []
-    for path in Path(folder).glob("*.ckpt"):
+
+    def claimed_order(path: Path) -> tuple[float, bool]:
+        try:  # without the checksum, which takes seconds for a large file
+            content = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
+            return int(content["global_step"]), path.stem == "last"
+        except Exception:
+            return float("inf"), False  # it is reported below
+
+    for path in sorted(Path(folder).glob("*.ckpt"), key=claimed_order, reverse=True):
         try:
-            found.append((load_checkpoint(path)["global_step"], path.stem == "last", path))
+            return path, load_checkpoint(path)["global_step"]
         except UserError as error:
             warn(str(error).removesuffix(_siblings(path)))  # they are checked here
-    step, _, path = max(found, default=(0, False, None))
-    return None if path is None else (path, step)
+    return None
 
 
 def load_module_weights(path: str, module_name: Optional[str] = None) -> tuple[dict, int, int]:

@@ -13,12 +13,10 @@ from typing import Any, BinaryIO
 from .errors import UserError
 
 PLACEHOLDERS = {
-    b"version https://git-lfs": "a pointer of Git LFS, not the file itself: run `git lfs pull` "
+    (b"version https://git-lfs",): "a pointer of Git LFS, not the file itself: run `git lfs pull` "
     "where it is from, or download it again",
-    **dict.fromkeys(
-        (b"<!doctype html", b"<html"),
-        "a web page, not the file itself: download it again by the link of the file, not of a page",
-    ),
+    (b"<!doctype html", b"<html"): "a web page, not the file itself: download it again by the link "
+    "of the file, not of a page",
 }
 """What downloads leave in a file's place, by its first bytes in lower case."""
 
@@ -59,8 +57,8 @@ def require_content(path: Path, name: str) -> None:
     """Raise UserError, which names it by ``name``, if a file is one of ``PLACEHOLDERS``."""
     with suppress(OSError), open(path, "rb") as file:
         start = file.read(64).lstrip().lower()
-        for placeholder, what in PLACEHOLDERS.items():
-            if start.startswith(placeholder):
+        for starts, what in PLACEHOLDERS.items():
+            if start.startswith(starts):
                 raise UserError(f"{name} is {what}")
 
 

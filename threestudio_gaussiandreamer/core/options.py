@@ -31,8 +31,6 @@ SWITCHES |= dict.fromkeys(("false", "no", "n", "off", "0"), False)
 FLOAT32_MAX, FLOAT32_TINY = 3.4028234663852886e38, 1.1754943508222875e-38
 """Largest and smallest normal float32: smaller positive options could be rounded to zero."""
 INT64_MAX = 2**63 - 1
-SHOWN = 80
-"""Maximum length of a value in a message, characters."""
 CGROUP_LIMIT = Path("/sys/fs/cgroup/memory.max")
 
 Rule = dict[str, Any]
@@ -168,13 +166,13 @@ def is_numbers(value: Any, count: int) -> bool:
 
 
 def shown(value: Any) -> str:
-    """Format ``value`` for a message, as in YAML if it is null, at most ``SHOWN`` characters."""
+    """Format ``value`` for a message, as in YAML if it is null, at most 80 characters."""
     if value is None:
         return "null"
     if isinstance(value, int) and value.bit_length() >= 256:  # repr has a limit
         return f"an integer of {value.bit_length()} bits"
     text = repr(list(value) if is_list(value) else value)
-    return text if len(text) <= SHOWN else f"{text[: SHOWN - 3]}..."
+    return text if len(text) <= 80 else f"{text[:77]}..."
 
 
 def wrong(path: str, expected: str, value: Any) -> UserError:
@@ -315,13 +313,13 @@ def _converted(path: str, value: Any, annotation: Any) -> Any:
 
 
 def _scalar(path: str, value: Any, kind: type) -> Any:
-    inexact = kind is int and isinstance(value, float)
-    switch = kind in (int, float) and isinstance(value, bool)
+    require_representable(path, value)
+    never = {int: (Mapping, bool, float), float: (Mapping, bool)}.get(kind, Mapping)
     try:
-        if value is None or is_list(value) or isinstance(value, Mapping) or inexact or switch:
+        if value in (None, "???") or is_list(value) or isinstance(value, never):  # "???": missing
             raise TypeError
         return SWITCHES[str(value).lower()] if kind is bool else kind(value)
-    except (TypeError, ValueError, KeyError, OverflowError):
+    except (TypeError, ValueError, KeyError):
         raise wrong(path, SCALARS[kind], value) from None
 
 

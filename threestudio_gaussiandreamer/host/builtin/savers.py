@@ -180,7 +180,7 @@ def write_video(path: str, frames: list[Path], *, fps: int) -> None:
         os.replace(part, path)
     except (ImportError, OSError, RuntimeError, subprocess.CalledProcessError) as error:
         said = getattr(error, "stderr", b"").decode(errors="replace").strip() or str(error)
-        why = said.splitlines()[0]
-        raise UserError(f"the video {path} could not be written: {why}") from error
+        why = "no ffmpeg: pip install imageio-ffmpeg" if isinstance(error, ImportError) else said
+        raise UserError(f"the video {path} could not be written: {why.splitlines()[0]}") from error
     finally:
         part.unlink(missing_ok=True)
