@@ -78,9 +78,7 @@ def pytest_generate_tests(metafunc) -> None:
 
 
 def pytest_addoption(parser) -> None:
-    parser.addoption(
-        "--stability-report", metavar="FILE", type=Path, help="JSON of the measurements"
-    )
+    parser.addoption("--stability-report", metavar="FILE", type=Path, help="measurements as JSON")
 
 
 def pytest_configure(config) -> None:

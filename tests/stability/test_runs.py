@@ -487,7 +487,7 @@ ALIKE = "x" * 4095, "🦊" * 999, "a_.._.._x", "two_lines", "a?b", "a*b", "con",
 @row("A5", "Prompt as path / YAML")
 @pytest.mark.parametrize("source", [*slow("command line"), "prompt file"])
 def test_a_prompt_stays_text_and_its_folder_below_the_root(source, tmp_path, measured):
-    """Also when read back; prompts alike in 64 bytes or allowed characters have other folders."""
+    """Also read back; prompts of one slug, or of equal first 64 bytes, have different folders."""
     names, prompts = set(), PROMPTS[::4] if source == "prompt file" else [*PROMPTS, *ALIKE]
     for number, prompt in enumerate(prompts):
         given = f"system.prompt_processor.prompt={prompt}"
