@@ -35,6 +35,7 @@ OPTIONS = [
     {"absgrad": True, "downsample": 2}, {"absgrad": True, "antialias": True, "eps2d": 0.1},
     {"alpha_max": 0.6, "absgrad": True}, {"near": 2.9, "far": 3.2, "background": TWO_BACKGROUNDS},
 ]  # fmt: skip
+each_options = pytest.mark.parametrize("options", OPTIONS, ids=str)
 TILTED = torch.tensor([[0.9, 0.2, 0.1, 0.4]], dtype=torch.float64)
 
 
@@ -50,7 +51,7 @@ class KernelContract:
     def test_sizes_that_are_no_multiple_of_a_tile(self, backend, size):
         compare(backend, random_cloud(60, seed=size[0]), cameras(2, *size), *size, BACKGROUND)
 
-    @pytest.mark.parametrize("options", OPTIONS, ids=str)
+    @each_options
     def test_options(self, backend, options):
         compare(backend, random_cloud(150, seed=1, size=0.2), cameras(2, 34, 18), 34, 18, **options)
 
