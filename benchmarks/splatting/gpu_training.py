@@ -28,19 +28,12 @@ REST_AIM = 0.03
 WINDOWS = {False: (10, 40), True: (1, 3)}
 """The first step that is timed and the one after the last, of a check and of a small one."""
 SMALL_PICTURES = {"data.eval_width": 64, "data.eval_height": 64}
-DEMOS = {
-    "demo.yaml": {},
-    "toybox.yaml": {"system.prompt_processor.prompt": "a red fox with a green scarf"},
-}
+PROMPT = {"system.prompt_processor.prompt": "a red fox with a green scarf"}
+DEMOS = {"demo.yaml": {}, "toybox.yaml": PROMPT}
 """Their options."""
-SMALL_DEMOS = {
-    "demo.yaml": {
-        "data.train_views": 4, "system.evaluation.views": 1, "system.evaluation.size": 16,
-    },
-    "toybox.yaml": {
-        "system.geometry.prior.num_steps": 2, "system.geometry.grow.num_candidates": 20_000,
-    },
-}  # fmt: skip
+FEW = {"data.train_views": 4, "system.evaluation.views": 1, "system.evaluation.size": 16}
+SHORT = {"system.geometry.prior.num_steps": 2, "system.geometry.grow.num_candidates": 20_000}
+SMALL_DEMOS = {"demo.yaml": FEW, "toybox.yaml": SHORT}
 """Further options of a small check."""
 
 
@@ -52,15 +45,11 @@ def train(args: argparse.Namespace) -> dict[str, Any]:
         environment = {"GPU_CHECK_MODEL": str(Path(folder) / "model"), "HF_HUB_OFFLINE": "1"}
         in_process("make_model", args, environment)
         overlays = {"default": "", "lowmem": "gaussiandreamer-lowmem.yaml"}
-        return {
-            name: guarded(
-                lambda _, overlay=overlay: in_process(
-                    "train_steps", args, environment | {"GPU_CHECK_OVERLAY": overlay}
-                ),
-                args,
-            )
-            for name, overlay in overlays.items()
-        }
+        found = {}
+        for name, overlay in overlays.items():
+            own = environment | {"GPU_CHECK_OVERLAY": overlay}
+            found[name] = guarded(lambda _, own=own: in_process("train_steps", args, own), args)
+        return found
 
 
 STABLE_DIFFUSION_2_1 = {
