@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from threestudio_gaussiandreamer.core.files import atomic_file
+from threestudio_gaussiandreamer.core.files import write_file
 
 
 def read(path: Path) -> list[dict[str, str]]:
@@ -29,8 +29,7 @@ def write(path: Path, columns: Sequence[str], rows: Iterable[Mapping[str, Any]])
     writer = csv.DictWriter(text, columns, lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
-    with atomic_file(path) as file:
-        file.write(text.getvalue().encode())
+    write_file(path, text.getvalue())
 
 
 def write_rows(path: Path, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:

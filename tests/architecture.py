@@ -1,7 +1,6 @@
 """Draw the package's rooms, rings and the path of a step: ``python -m tests.architecture``.
 
-Reads the source with :mod:`ast` and writes the parts between the markers of
-``docs/architecture.md``; ``tests/test_structure.py`` fails if they are stale.
+Writes the parts between the markers of ``docs/architecture.md``, which test_structure.py checks.
 """
 
 import ast
@@ -18,7 +17,8 @@ PACKAGE = ROOT / NAME
 PAGE = ROOT / "docs/architecture.md"
 
 
-MATHS = ("core", "gaussians", "formats", "splatting", "diffusion", "meshes", "cameras", "metrics")
+FILES = ("cameras", "images", "metrics")
+MATHS = ("core", "gaussians", "formats", "splatting", "diffusion", "meshes", *FILES)
 RINGS = {
     "0 maths": MATHS,
     "1 host": ("host", "models"),
@@ -115,9 +115,7 @@ def label(room: str) -> str:
 
 
 def diagram() -> str:
-    """Return a Mermaid diagram: a box per ring with its rooms, which name their functions of the
-    path of a step, and an arrow per import from one ring to the next lower one.
-    """
+    """Return a Mermaid diagram: rings with their rooms, and imports from one to the next lower."""
     lines, ring = ["```mermaid", "flowchart TB"], ring_of()
     for index, (name, rooms) in reversed(list(enumerate(RINGS.items()))):
         lines.append(f'  subgraph ring{index}["{name}"]')

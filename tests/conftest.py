@@ -24,9 +24,7 @@ settings.load_profile("repeatable")
 
 @pytest.fixture(autouse=True, scope="session")
 def default_signals():
-    """Restore the default handlers of Ctrl-C and SIGHUP, which a shell's background job and nohup
-    ignore; tests send both.
-    """
+    """Restore the handlers of Ctrl-C and SIGHUP, which background jobs and nohup ignore."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
     if hasattr(signal, "SIGHUP"):
         signal.signal(signal.SIGHUP, signal.SIG_DFL)
@@ -34,11 +32,26 @@ def default_signals():
 
 @pytest.fixture(autouse=True)
 def no_traces_of_runs(monkeypatch):
-    """Undo what a run in an earlier test left: the seed in the environment, and that pytest's
-    ``caplog`` doesn't see our messages.
-    """
+    """Undo what an earlier run left: the seed, and that ``caplog`` doesn't see our messages."""
     monkeypatch.setenv("PL_GLOBAL_SEED", "0")
     monkeypatch.setattr(logs.logger, "propagate", True)
+
+
+@pytest.fixture
+def recorded(monkeypatch):
+    """Return a function that lists the arguments and the result of each later call of a method."""
+
+    def record(owner, name):
+        calls, original = [], getattr(owner, name)
+
+        def call(*args, **options):
+            calls.append((args, original(*args, **options)))
+            return calls[-1][1]
+
+        monkeypatch.setattr(owner, name, call)
+        return calls
+
+    return record
 
 
 @pytest.fixture

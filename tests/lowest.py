@@ -3,8 +3,7 @@
     python -m tests.lowest                 # of the base and of the extra test
     python -m tests.lowest diffusion mesh  # and of these extras
 
-torch keeps the version of constraints.txt: its older builds come from PyPI with CUDA only, about
-3 GB.
+torch keeps the version of constraints.txt: its older builds come with 3 GB of CUDA only.
 """
 
 import re

@@ -63,9 +63,7 @@ def test_links_lead_somewhere(page):
 
 @pytest.mark.parametrize("name", TEXTS)
 def test_files_that_are_named_exist(name):
-    """Paths in backticks that begin with a folder of the repository, except what a run writes or a
-    user adds.
-    """
+    """Paths in backticks that begin with a folder of the repository."""
     folders = "configs|tests|benchmarks|docs|threestudio_gaussiandreamer|custom/threestudio"
     for path in re.findall(rf"`((?:{folders})[\w./-]*)`", TEXTS[name]):
         assert (ROOT / path).exists(), f"{name} names {path}"

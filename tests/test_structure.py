@@ -1,4 +1,4 @@
-"""Imports point inwards, the package is cheap to import, and no code stands twice."""
+"""Imports point inwards, the package is cheap to import, no code stands twice; sizes, the wheel."""
 
 import ast
 import re
@@ -9,42 +9,27 @@ from pathlib import Path
 
 import pytest
 
-from tests.architecture import (
-    NAME,
-    PACKAGE,
-    PAGE,
-    ROOT,
-    STEPS,
-    imports,
-    page,
-    purpose,
-    ring_of,
-    room_of,
-    sources,
-)
+from tests import architecture
+from tests.architecture import NAME, PACKAGE, PAGE, ROOT, STEPS, room_of, sources
+from tools import size
 
-RINGS = ring_of()
+RINGS = architecture.ring_of()
 MATHS_MAY_USE = {"torch", "numpy", "scipy", "jaxtyping"} | set(sys.stdlib_module_names)
 LIBRARIES = {  # of ring 0, beyond MATHS_MAY_USE
-    "core": {"imageio_ffmpeg", "PIL"},
+    "images": {"PIL"},
     "formats": {"PIL", "pxr", "tqdm", "zstandard"},
     "meshes": {"trimesh", "embreex", "PIL", "tqdm"},
 }
 HOST = {"lightning", "pytorch_lightning", "omegaconf", "threestudio"}
-HEAVY = HOST | set(
-    "trimesh embreex diffusers transformers PIL anny pxr zstandard skimage "
-    "fast_simplification xatlas".split()
-)
+HEAVY = {"fast_simplification", "xatlas", *HOST}
+HEAVY |= {*"trimesh embreex diffusers transformers PIL anny pxr zstandard skimage".split()}
 MODULES_AT_THE_TOP = 5
 MOST_EQUAL_LINES = 5
 PUNCTUATION = "()[]{}<>*,;:'\" "
 KERNEL_SOURCES = {".cpp", ".cu", ".cuh", ".h"}
 IMPORTS = re.compile(r"^from \S+ import \([^)]*\)", re.MULTILINE)
-CODE = [
-    path
-    for top in (NAME, "tests", "benchmarks", "tools")
-    for path in sorted((ROOT / top).rglob("*.py"))
-]
+TOPS = (NAME, "tests", "benchmarks", "tools")
+CODE = [path for top in TOPS for path in sorted((ROOT / top).rglob("*.py"))]
 
 
 def named(path: Path) -> str:
@@ -53,19 +38,17 @@ def named(path: Path) -> str:
 
 def test_every_room_has_a_ring_and_a_purpose_and_few_modules_lie_beside_them():
     assert {room_of(path) for path in sources()} == set(RINGS)
-    assert all(purpose(room) for room in RINGS)
+    assert all(architecture.purpose(room) for room in RINGS)
     assert len(list(PACKAGE.glob("*.py"))) <= MODULES_AT_THE_TOP
 
 
 def test_imports_point_inwards_and_libraries_are_imported_where_they_belong():
-    """The maths needs torch, numpy and scipy only; heavy libraries are imported where they are
-    used; one file imports threestudio.
-    """
+    """Heavy libraries are imported where they are used; one file imports threestudio."""
     wrong = []
     for path in sources():
         room, ring = room_of(path), RINGS[room_of(path)]
         maths = MATHS_MAY_USE | LIBRARIES.get(room, set())
-        for name, top_level in imports(path):
+        for name, top_level in architecture.imports(path):
             library, *rest = name.split(".")
             if library == NAME:
                 allowed = not rest or RINGS[rest[0]] <= ring
@@ -88,9 +71,6 @@ def test_importing_the_package_is_cheap():
     assert found.stdout.strip() == "[]"
 
 
-# ---- texts --------------------------------------------------------------------------------------
-
-
 def test_ruff_finds_nothing():
     """Short lines, no unused names, text in UTF-8 and not in the locale's encoding."""
     pytest.importorskip("ruff")
@@ -99,13 +79,8 @@ def test_ruff_finds_nothing():
     assert found.returncode == 0, found.stdout
 
 
-# ---- duplicates ----------------------------------------------------------------------------------
-
-
 def code_lines(path: Path) -> list[tuple[int, str]]:
-    """Return number and text of the lines of code: no blank lines, comments, imports, or lines of
-    punctuation alone; white space is folded.
-    """
+    """Return number and text of the lines of code, without imports and punctuation alone."""
     text = re.sub(IMPORTS, lambda found: "\n" * found[0].count("\n"), path.read_text())
     lines = [" ".join(line.split()) for line in text.splitlines()]
     return [
@@ -135,9 +110,6 @@ def test_no_lines_of_code_stand_twice():
     assert not duplicates([*CODE, *sorted(kernels)])
 
 
-# ---- the architecture page -----------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("step", STEPS, ids=lambda step: step.module)
 def test_every_function_of_the_step_exists(step):
     tree = ast.parse((PACKAGE / step.module).read_text())
@@ -146,4 +118,63 @@ def test_every_function_of_the_step_exists(step):
 
 def test_the_architecture_page_is_of_this_code():
     again = "it is stale: run python -m tests.architecture"
-    assert PAGE.read_text() == page(), again
+    assert PAGE.read_text() == architecture.page(), again
+
+
+@pytest.mark.parametrize("more", [[], pytest.param(["--frames"], marks=pytest.mark.slow)], ids=str)
+def test_no_figure_is_above_its_ceiling(more):
+    command = [sys.executable, "-m", "tools.size", *more]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout[-5000:] + done.stderr[-2000:]
+    assert not more or "frames to the U-Net" in done.stdout
+
+
+def test_circles_and_private_names_are_found(tmp_path, monkeypatch):
+    package = tmp_path / "package"
+    package.mkdir()
+    (package / "a.py").write_text("from . import b\nself._x = other._y._z\n")
+    (package / "b.py").write_text("if TYPE_CHECKING:\n    from .a import A\n")
+    (package / "c.py").write_text("from .a import A\n\n\ndef f():\n    from .d import D\n")
+    (package / "d.py").write_text("from .c import C\n")
+    for name, value in {"ROOT": tmp_path, "PACKAGE": package, "NAME": "package"}.items():
+        monkeypatch.setattr(architecture, name, value)
+        monkeypatch.setattr(size, name, value, raising=False)
+    architecture.modules.cache_clear()
+    try:
+        assert size.circles() == 1 and size.others_private(package) == 2
+    finally:
+        architecture.modules.cache_clear()
+
+
+NOT_INSTALLED = {".md", ".pyc", ".so", ".clang-format"}
+"""Documents, and what is compiled. The tests' editable installation hides missing files."""
+
+
+def files_in(folder: Path) -> set[str]:
+    return {
+        str(path.relative_to(folder))
+        for path in folder.rglob("*")
+        if path.is_file() and not {path.suffix, path.name} & NOT_INSTALLED
+    }
+
+
+def test_every_file_of_the_package_and_every_config_is_installed(tmp_path):
+    command = [sys.executable, "setup.py", "-q", "egg_info", "-e", str(tmp_path)]
+    command += ["build_py", "-d", str(tmp_path / "built")]
+    subprocess.run(command, cwd=ROOT, check=True, capture_output=True)
+    installed = files_in(tmp_path / "built" / NAME)
+    configs = {f"configs/{name}" for name in files_in(ROOT / "configs")}
+    assert installed == files_in(PACKAGE) | configs
+
+
+def test_a_wheel_is_for_every_python_3_of_one_platform():
+    """The libraries are called through ctypes and know nothing of Python."""
+    code = (
+        "import sys; sys.argv = ['setup.py', '-q', '--version']; import runpy; "
+        "setup = runpy.run_path('setup.py'); from setuptools.dist import Distribution; "
+        "wheel = setup['PlatformWheel'](Distribution({'name': 'x'})); "
+        "wheel.ensure_finalized(); print(*wheel.get_tag()[:2])"
+    )
+    command = [sys.executable, "-c", code]
+    said = subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True)
+    assert said.stdout.splitlines()[-1] == "py3 none"

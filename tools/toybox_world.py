@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from threestudio_gaussiandreamer.core import images
+from threestudio_gaussiandreamer import images
 from threestudio_gaussiandreamer.core.streams import numpy_generator
 from threestudio_gaussiandreamer.toybox.demo import contact_sheet
 from threestudio_gaussiandreamer.toybox.tokens import view_prompts

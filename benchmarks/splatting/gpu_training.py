@@ -28,19 +28,12 @@ REST_AIM = 0.03
 WINDOWS = {False: (10, 40), True: (1, 3)}
 """The first step that is timed and the one after the last, of a check and of a small one."""
 SMALL_PICTURES = {"data.eval_width": 64, "data.eval_height": 64}
-DEMOS = {
-    "demo.yaml": {},
-    "toybox.yaml": {"system.prompt_processor.prompt": "a red fox with a green scarf"},
-}
+PROMPT = {"system.prompt_processor.prompt": "a red fox with a green scarf"}
+DEMOS = {"demo.yaml": {}, "toybox.yaml": PROMPT}
 """Their options."""
-SMALL_DEMOS = {
-    "demo.yaml": {
-        "data.train_views": 4, "system.evaluation.views": 1, "system.evaluation.size": 16,
-    },
-    "toybox.yaml": {
-        "system.geometry.prior.num_steps": 2, "system.geometry.grow.num_candidates": 20_000,
-    },
-}  # fmt: skip
+FEW = {"data.train_views": 4, "system.evaluation.views": 1, "system.evaluation.size": 16}
+SHORT = {"system.geometry.prior.num_steps": 2, "system.geometry.grow.num_candidates": 20_000}
+SMALL_DEMOS = {"demo.yaml": FEW, "toybox.yaml": SHORT}
 """Further options of a small check."""
 
 
@@ -52,26 +45,32 @@ def train(args: argparse.Namespace) -> dict[str, Any]:
         environment = {"GPU_CHECK_MODEL": str(Path(folder) / "model"), "HF_HUB_OFFLINE": "1"}
         in_process("make_model", args, environment)
         overlays = {"default": "", "lowmem": "gaussiandreamer-lowmem.yaml"}
-        return {
-            name: guarded(
-                lambda _, overlay=overlay: in_process(
-                    "train_steps", args, environment | {"GPU_CHECK_OVERLAY": overlay}
-                ),
-                args,
-            )
-            for name, overlay in overlays.items()
-        }
+        found = {}
+        for name, overlay in overlays.items():
+            own = environment | {"GPU_CHECK_OVERLAY": overlay}
+            found[name] = guarded(lambda _, own=own: in_process("train_steps", args, own), args)
+        return found
+
+
+STABLE_DIFFUSION_2_1 = {
+    "unet": dict(
+        sample_size=64, block_out_channels=(320, 640, 1280, 1280), layers_per_block=2,
+        down_block_types=("CrossAttnDownBlock2D",) * 3 + ("DownBlock2D",),
+        up_block_types=("UpBlock2D",) + ("CrossAttnUpBlock2D",) * 3,
+        attention_head_dim=(5, 10, 20, 20),
+    ),
+    "vae": dict(sample_size=512, block_out_channels=(128, 256, 512, 512), layers_per_block=2),
+    "text_width": 1024,
+}  # fmt: skip
+"""The published UNet and VAE; of its text encoder, which a run frees at once, the width alone."""
 
 
 def make_model(args: argparse.Namespace) -> dict[str, Any]:
     from tests.helpers import tiny_models
 
-    sizes = tiny_models.TINY if args.small else tiny_models.STABLE_DIFFUSION_2_1
-    return {
-        "folder": str(
-            tiny_models.stable_diffusion(Path(os.environ["GPU_CHECK_MODEL"]), sizes=sizes)
-        )
-    }
+    sizes = tiny_models.TINY if args.small else tiny_models.Sizes(**STABLE_DIFFUSION_2_1)
+    folder = Path(os.environ["GPU_CHECK_MODEL"])
+    return {"folder": str(tiny_models.stable_diffusion(folder, sizes=sizes))}
 
 
 def train_steps(args: argparse.Namespace) -> dict[str, Any]:

@@ -1,6 +1,4 @@
-"""Short versions of the scripts: the kernel for ARM, a killed run, and configurations of measured
-runs, each of which the launcher accepts.
-"""
+"""Short versions of the scripts; the launcher accepts the configurations of measured runs."""
 
 import itertools
 import json
@@ -8,8 +6,7 @@ import shutil
 
 import pytest
 
-from benchmarks.quality import avatars, jobs, runs, toybox, toybox_options
-from benchmarks.quality.toybox_jobs import SAMPLES, TRUTH
+from benchmarks.quality import avatars, jobs, runs, toybox, toybox_jobs, toybox_options
 from benchmarks.robustness import long_run
 from benchmarks.splatting import emulated
 from threestudio_gaussiandreamer import register_parts
@@ -48,6 +45,6 @@ def test_the_options_of_every_chart_are_accepted():
     prompt = {"system.prompt_processor.prompt": "a red fox"}
     charts = [list(make()) for make in toybox_options.CHARTS.values()]
     for variant in itertools.chain(*charts, avatars.VARIANTS):
-        if variant.name not in (SAMPLES, TRUTH):
+        if variant.name not in (toybox_jobs.SAMPLES, toybox_jobs.TRUTH):
             options = words(toybox.QUICK | variant.options | prompt)
             check_config(load_config(runs.CONFIGS / variant.config, cli_args=options))

@@ -1,8 +1,6 @@
-"""In headless Chromium, Spark renders an exported file and three.js a GLB like this package:
-upright, facing the camera, in the same colours.
+"""In headless Chromium, Spark and three.js render exported files like this package.
 
-The environment variable VIEWER_NODE_MODULES names the folder node_modules with the npm packages of
-``benchmarks/viewers/browser.py``.
+VIEWER_NODE_MODULES names the folder with the npm packages of ``benchmarks/viewers/browser.py``.
 """
 
 import math
@@ -17,9 +15,8 @@ from benchmarks.viewers import browser
 from tests.helpers.painted_ball import painted_ball
 from threestudio_gaussiandreamer.cameras import orbit_c2w, to_opencv
 from threestudio_gaussiandreamer.formats.gaussian_files import StoredCloud, write_cloud
-from threestudio_gaussiandreamer.gaussians.axes import VIEWER_UP, WORLD_UP, rotation_between
+from threestudio_gaussiandreamer.gaussians import axes, sh
 from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
-from threestudio_gaussiandreamer.gaussians.sh import rgb_to_sh0, sh0_to_rgb
 from threestudio_gaussiandreamer.meshes.raycast import MeshCaster, over_background
 from threestudio_gaussiandreamer.meshes.write import write_textured_glb
 from threestudio_gaussiandreamer.metrics import psnr
@@ -39,7 +36,7 @@ def asymmetric_cloud(count: int = 300) -> Gaussians:
         quats=torch.randn(count, 4, generator=rng),
         log_scales=(0.03 + 0.05 * torch.rand(count, 3, generator=rng)).log(),
         logit_opacities=torch.full((count,), 2.0),
-        sh=rgb_to_sh0(torch.rand(count, 1, 3, generator=rng)),
+        sh=sh.rgb_to_sh0(torch.rand(count, 1, 3, generator=rng)),
     )
 
 
@@ -49,7 +46,7 @@ def drawn_from_the_front(cloud: Gaussians) -> torch.Tensor:
     viewmats, Ks = to_opencv(c2w, torch.full((1,), FOVY), SIZE, SIZE)
     shapes = cloud.means, cloud.quats, cloud.log_scales.exp(), cloud.logit_opacities.sigmoid()
     view, options = (viewmats, Ks, SIZE, SIZE), {"background": torch.ones(1, 3), "eps2d": DILATION}
-    return rasterize(*shapes, sh0_to_rgb(cloud.sh[:, 0]), *view, **options).image[0]
+    return rasterize(*shapes, sh.sh0_to_rgb(cloud.sh[:, 0]), *view, **options).image[0]
 
 
 @pytest.mark.slow
@@ -58,7 +55,7 @@ def test_spark_shows_an_exported_file_as_our_renderer_does(tmp_path, suffix):
     if lacking := browser.missing(MODULES):
         pytest.skip(lacking)
     cloud, path = asymmetric_cloud(), tmp_path / f"cloud{suffix}"
-    write_cloud(str(path), StoredCloud(cloud.arrays()).in_axes(VIEWER_UP))
+    write_cloud(str(path), StoredCloud(cloud.arrays()).in_axes(axes.VIEWER_UP))
     c2w = np.eye(4)
     c2w[2, 3] = DISTANCE
     how = {"options": {"preBlurAmount": DILATION, "blurAmount": 0.0}}
@@ -80,7 +77,7 @@ def test_three_draws_a_mesh_as_our_ray_caster_does(faces, tmp_path):
     means = ball.means * np.float32([1, 0.7, 0.9]) + np.float32([0.1, 0, 0.2])
     options = MeshOptions(faces=faces, texture=512, views=24, view_size=256, resolution=64)
     mesh = mesh_from_gaussians(ball._replace(means=means), options)
-    rotation = rotation_between(WORLD_UP, "y")
+    rotation = axes.rotation_between(axes.WORLD_UP, "y")
     y_up = mesh._replace(vertices=mesh.vertices @ rotation.T)
     write_textured_glb(tmp_path / "mesh.glb", y_up, unlit=True)
     angles = torch.tensor([0.0, 70.0, 200.0])

@@ -91,14 +91,18 @@ def test_a_damaged_file_names_its_neighbours(tmp_path):
     assert newest_readable(tmp_path / "nothing") is None
 
 
-def test_the_newest_of_a_folder_is_the_one_with_most_steps(tmp_path):
-    """Not by name or time, which a copied folder doesn't preserve."""
+def test_the_newest_of_a_folder_is_the_one_with_most_steps(tmp_path, caplog):
+    """Not by name or time, which a copied folder doesn't preserve; older ones aren't verified."""
     for name, step in (("last", 4), ("epoch=0-step=6", 6), ("epoch=0-step=2", 2)):
         save_file(tmp_path / f"{name}.ckpt", content(step))
     (tmp_path / "foreign.ckpt").write_bytes(b"no checkpoint at all")
     assert newest_readable(tmp_path) == (tmp_path / "epoch=0-step=6.ckpt", 6)
     save_file(tmp_path / "last.ckpt", content(6))
+    with open(tmp_path / "epoch=0-step=2.ckpt", "r+b") as older:
+        older.seek(-1, os.SEEK_END)
+        older.write(b"x")  # in the checksum
     assert newest_readable(tmp_path) == (tmp_path / "last.ckpt", 6)
+    assert "foreign.ckpt" in caplog.text and "step=2" not in caplog.text
 
 
 class Bomb:

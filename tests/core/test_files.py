@@ -2,12 +2,9 @@
 
 import json
 import math
-import os
 
-import numpy as np
 import pytest
 
-from threestudio_gaussiandreamer.core import images
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.core.files import atomic_file, existing_file, json_text
 
@@ -52,12 +49,3 @@ def test_what_a_download_left_in_a_files_place_is_named(tmp_path, content, said)
         existing_file("/dev/null", "mesh")
     with pytest.raises(UserError, match="mesh '~nobodyx/a': not a usable file name"):
         existing_file("~nobodyx/a", "mesh")
-
-
-def test_a_video_in_a_folder_with_a_colon(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    images.write("0.png", np.zeros((9, 7, 3), np.uint8))
-    images.write_video("runs:1.mp4", [tmp_path / "0.png"] * 2, fps=2)
-    assert sorted(os.listdir()) == ["0.png", "runs:1.mp4"]
-    with pytest.raises(UserError, match=r"could not be written: [^\n]*$"):
-        images.write_video("no/1.mp4", [tmp_path / "0.png"] * 2, fps=2)

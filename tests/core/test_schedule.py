@@ -10,7 +10,7 @@ from omegaconf import OmegaConf
 
 from threestudio_gaussiandreamer.core import schedule
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.core.schedule import C, C_max, validate_schedule
+from threestudio_gaussiandreamer.core.schedule import C, parse_schedule, validate_schedule
 
 
 @pytest.mark.parametrize(
@@ -69,7 +69,7 @@ def test_a_piecewise_schedule_is_numpys_interpolation(values, step):
     ]
     # exact up to the rounding of one multiplication
     assert C(knots, 0, step) == pytest.approx(np.interp(step, steps, values), abs=1e-12)
-    assert C_max(knots) == max(values)
+    assert max(parse_schedule(knots).values) == max(values)
 
 
 def test_a_schedule_in_epochs_is_warned_of_once(monkeypatch):

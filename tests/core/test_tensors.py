@@ -1,4 +1,4 @@
-"""Draws, rotations, given gradients, copies of a GPU's values, and values computed late."""
+"""Draws, rotations, given gradients, and copies of a GPU's values."""
 
 import itertools
 from types import SimpleNamespace
@@ -10,8 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from threestudio_gaussiandreamer.core import streams
 from threestudio_gaussiandreamer.core.devices import DelayedReads, HostCopy, flush_reads
-from threestudio_gaussiandreamer.core.quaternions import rotation_rows
-from threestudio_gaussiandreamer.core.tensors import LazyMapping, given_gradient
+from threestudio_gaussiandreamer.core.tensors import given_gradient, rotation_rows
 
 
 def test_a_draw_is_a_function_of_its_key_only():
@@ -97,16 +96,3 @@ def test_what_the_use_of_a_value_raises_is_raised_once(arrive):
         reads.poll(wait=True)
     reads.poll(wait=True)
     assert used == [2]
-
-
-def test_values_of_a_lazy_mapping_are_computed_once_when_they_are_read():
-    calls = []
-    mapping = LazyMapping({"a": 1}, {"b": lambda: calls.append("b") or 2, "c": lambda: 1 / 0})
-    assert "b" in mapping and "c" in mapping and "d" not in mapping
-    assert list(mapping) == ["a", "b", "c"] and len(mapping) == 3 and not calls
-    assert mapping["b"] == mapping.get("b") == 2 and calls == ["b"]
-    assert len(mapping) == 3 and mapping.get("d", 5) == 5
-    with pytest.raises(KeyError):
-        mapping["d"]
-    mapping["c"] = 3
-    assert {**mapping} == dict(mapping) == mapping == {"a": 1, "b": 2, "c": 3}

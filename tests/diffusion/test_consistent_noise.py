@@ -8,15 +8,7 @@ import torch.nn.functional as F
 
 from tests.surface.test_fusion import traced
 from threestudio_gaussiandreamer.cameras import focal_length, orbit_c2w, surface_points
-from threestudio_gaussiandreamer.diffusion.consistent_noise import (
-    LATTICES,
-    PRIMES,
-    TABLE,
-    attached_noise,
-    cell_size,
-    cell_values,
-    surface_cells,
-)
+from threestudio_gaussiandreamer.diffusion import consistent_noise
 
 
 def ball(azimuths, size):
@@ -27,12 +19,11 @@ def ball(azimuths, size):
 
 
 def table(seed=0, channels=4):
-    return cell_values(channels, torch.Generator().manual_seed(seed))
+    return consistent_noise.cell_values(channels, torch.Generator().manual_seed(seed))
 
 
 def noise_of(size, table, view, draw=0, first=0):
-    """Return the noise of latents of size x size pixels."""
-    return attached_noise((size, size), table, draw, first, *view)
+    return consistent_noise.attached_noise((size, size), table, draw, first, *view)
 
 
 def test_pixels_are_standard_normal_and_hardly_correlated():
@@ -71,22 +62,22 @@ def test_cells_are_cubes_of_each_lattice_also_of_renders_that_are_squeezed():
     """The hash by Python's integers; a pixel is the sum of its cells in all lattices."""
     depth, opacity, c2w, fovy = view = ball([30.0, 200.0], 16)
     focal = focal_length(fovy, 16)
-    points, size = surface_points(depth[..., 0], c2w, focal), cell_size(c2w, focal)
-    rows = surface_cells(points, size) % TABLE
+    points, size = surface_points(depth[..., 0], c2w, focal), consistent_noise.cell_size(c2w, focal)
+    rows = consistent_noise.surface_cells(points, size) % consistent_noise.TABLE
     for lattice, item, y, x in np.ndindex(*rows.shape):
-        shifted = (points[item, :, y, x] / size[item]).numpy() + np.float32(lattice / LATTICES)
-        cell = [int(c) for c in np.floor(shifted)]
-        expected = sum(c * prime for c, prime in zip(cell, PRIMES, strict=True))
-        expected += lattice * TABLE // LATTICES
-        assert rows[lattice, item, y, x] == expected % TABLE
+        shift = np.float32(lattice / consistent_noise.LATTICES)
+        cell = [int(c) for c in np.floor((points[item, :, y, x] / size[item]).numpy() + shift)]
+        expected = sum(c * prime for c, prime in zip(cell, consistent_noise.PRIMES, strict=True))
+        expected += lattice * consistent_noise.TABLE // consistent_noise.LATTICES
+        assert rows[lattice, item, y, x] == expected % consistent_noise.TABLE
     values = table()
     expected = sum(values[:, row.long()] for row in rows).transpose(0, 1)
     inside = opacity[:, None, :, :, 0] > 0
     torch.testing.assert_close(noise_of(16, values, view) * inside, expected * inside)
     depth, opacity, *cameras = ball([20.0], 96)
     wide = [F.pad(image[..., 0], (96, 96))[..., None] for image in (depth, opacity)]
-    squeezed = attached_noise((32, 32), table(), 0, 0, *wide, *cameras)
-    whole = attached_noise((32, 96), table(), 0, 0, *wide, *cameras)
+    squeezed = consistent_noise.attached_noise((32, 32), table(), 0, 0, *wide, *cameras)
+    whole = consistent_noise.attached_noise((32, 96), table(), 0, 0, *wide, *cameras)
     inside = wide[1][0, 1::3, 4::9, 0] > 0
     assert inside.sum() > 50
     assert torch.equal(squeezed[..., inside], whole[..., 1::3][..., inside])

@@ -12,6 +12,10 @@ from threestudio_gaussiandreamer.diffusion.inversion import SLICES, NoiseTable, 
 ABAR = sds.sd_alphas_cumprod()
 
 
+def still(step):
+    return torch.zeros_like(step.z)
+
+
 def test_items_end_at_their_own_timesteps_with_their_own_fresh_noise():
     asked = []
 
@@ -28,9 +32,6 @@ def test_items_end_at_their_own_timesteps_with_their_own_fresh_noise():
 
     def noise(index):
         return 10.0**index * torch.tensor([[1.0], [2.0], [3.0]], dtype=torch.float64)
-
-    def still(step):
-        return torch.zeros_like(step.z)
 
     together = invert(still, x, t, ABAR, 100, eta=1.0, fresh=noise)
     for item in range(3):
@@ -50,9 +51,7 @@ def test_an_inversion_is_undone_by_ddim_and_fresh_noise_is_ddpms():
     torch.testing.assert_close(z[0], ABAR[640].sqrt() * image + (1 - ABAR[640]).sqrt() * eps)
     x, t = torch.zeros(1, 20000, dtype=torch.float64), torch.tensor([400])
     drawn = torch.randn(1, 20000, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    z = invert(
-        lambda step: torch.zeros_like(step.z), x, t, ABAR, 400, eta=0.5, fresh=lambda index: drawn
-    )
+    z = invert(still, x, t, ABAR, 400, eta=0.5, fresh=lambda index: drawn)
     now, later = ABAR[0], ABAR[400]
     deviation = 0.5 * ((1 - now) / (1 - later) * (1 - later / now)).sqrt()
     torch.testing.assert_close(z, deviation * drawn)

@@ -15,11 +15,11 @@ from PIL import Image
 
 from tests.evaluation.conftest import blob, run_of, save
 from tests.helpers import tiny_3d_models as tiny
+from tests.helpers.refusals import refused
 from threestudio_gaussiandreamer import register_parts
 from threestudio_gaussiandreamer.core.checkpoint_file import save_file
-from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.evaluation import clip_similarity as module
-from threestudio_gaussiandreamer.evaluation import results
+from threestudio_gaussiandreamer.evaluation import results, t3bench
 from threestudio_gaussiandreamer.evaluation.clip_similarity import Protocol, main
 from threestudio_gaussiandreamer.formats.gaussian_files import StoredCloud, write_cloud
 from threestudio_gaussiandreamer.launch.config import dump_config, load_config
@@ -124,8 +124,7 @@ def test_weights_in_several_files_are_the_same_clip(clip, scored, tmp_path):
     # how the weights lie in memory changes the order of float32 sums
     assert written(tmp_path)["per_seed"] == pytest.approx(written(out)["per_seed"], rel=1e-5)
     next(sharded.glob("model-*.safetensors")).unlink()
-    with pytest.raises(UserError, match=r"--clip.*some of \*.safetensors are missing"):
-        module.open_clip(str(sharded))
+    refused(r"--clip.*some of \*.safetensors are missing", module.open_clip, str(sharded))
 
 
 def test_a_runs_folder_brings_its_prompt_and_background(clip, tmp_path, monkeypatch):
@@ -173,8 +172,7 @@ def test_a_prompt_of_a_library_is_compared_as_its_text(tmp_path, monkeypatch):
     library.write_text('["a corgi in the snow", "a fox"]')
     assert results.find_result(str(tmp_path)).prompt == "a corgi in the snow"
     library.unlink()
-    with pytest.raises(UserError, match="Give --prompt"):
-        module.prompts_for([results.find_result(str(tmp_path))], None, None)
+    refused("Give --prompt", module.prompts_for, [results.find_result(str(tmp_path))], None, None)
 
 
 def test_of_the_last_export_the_ply_is_taken_and_one_line_of_the_list(tmp_path, plys):
@@ -187,8 +185,7 @@ def test_of_the_last_export_the_ply_is_taken_and_one_line_of_the_list(tmp_path, 
     file = tmp_path / "prompts.txt"
     file.write_text("a fox\n\n  a cat \n", encoding="utf-8")
     assert module.prompts_for(found, None, str(file)) == ["a fox", "a cat"]
-    with pytest.raises(UserError, match="2 prompts for 1 results"):
-        module.prompts_for(found[:1], None, str(file))
+    refused("2 prompts for 1 results", module.prompts_for, found[:1], None, str(file))
 
 
 @pytest.mark.parametrize("antialiased", [False, True])
@@ -234,3 +231,51 @@ def test_mistakes_are_one_message(arguments, said, plys, tmp_path, capsys):
     assert main([word.format(folder=tmp_path / "empty", ply=plys[0]) for word in arguments]) == 2
     error = capsys.readouterr().err
     assert error.startswith("error: ") and said in error
+
+
+def t3bench_pose(v):
+    """Return T3Bench's camera: towards the centre, +z up, or +y near the poles."""
+    back = v / np.linalg.norm(v)
+    up = np.array([0.0, 0.0, 1.0]) if abs(back[2]) < 0.99 else np.array([0.0, 1.0, 0.0])
+    right = np.cross(up, back)
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3] = np.stack([right, np.cross(back, right), back, v], axis=1)
+    return pose
+
+
+def test_the_cameras_are_t3benchs_and_the_object_is_centred_and_scaled(monkeypatch):
+    monkeypatch.setattr(t3bench, "SIZE", 8)
+    drawn = []
+    monkeypatch.setattr(t3bench, "render_views", lambda _, *views, **how: drawn.extend(views))
+    t3bench.pictures(blob())
+    positions = drawn[0][::5, :3, 3].numpy()
+    assert drawn[0].shape == (810, 4, 4) and drawn[2] == 8
+    np.testing.assert_allclose(np.linalg.norm(positions, axis=1), 2.2, rtol=1e-6)
+    assert (np.abs(positions[:, 2]) > 2.19).sum() == 2  # the poles, where +z can't be up
+    poses = np.repeat([t3bench_pose(v) for v in positions], 5, 0)
+    np.testing.assert_allclose(drawn[0], poses, atol=2e-6)
+    np.testing.assert_allclose(drawn[1][:10].reshape(2, 5), [t3bench.FOVY] * 2)
+    arrays = blob(center=(3.0, -1.0, 0.5))
+    arrays.means[0], arrays.logit_opacities[0] = 100.0, -8.0
+    found = t3bench.normalized(arrays)
+    visible = found.means[1:]
+    np.testing.assert_allclose(visible.mean(axis=0), 0, atol=1e-5)
+    assert np.abs(visible).max() == pytest.approx(1)
+    scale = (visible[1] - visible[2])[0] / (arrays.means[2] - arrays.means[3])[0]
+    wanted = scale * np.exp(arrays.log_scales)
+    np.testing.assert_allclose(np.exp(found.log_scales), wanted, rtol=1e-4)
+
+
+def test_t3benchs_scripts_find_their_mesh(plys, tmp_path):
+    import trimesh
+
+    prompt, root = "A cat's blue hat", tmp_path / "T3Bench"
+    options = ["--t3bench-method", "dreamfusion"]
+    assert main([plys[0], "--prompt", prompt, "--t3bench", str(root), *options]) == 0
+    runs = root / "outputs_mesh_t3/dreamfusion_single"
+    (path,) = runs.glob(f"{prompt.replace(' ', '_')}*/save/it*-export/model.obj")
+    mesh = trimesh.load(path)  # as T3Bench's renderer does
+    assert isinstance(mesh, trimesh.Trimesh) and len(mesh.faces) > 100
+    color = mesh.visual.vertex_colors[:, :3].mean(axis=0) / 255
+    np.testing.assert_allclose(color, [0.9, 0.1, 0.1], atol=0.01)

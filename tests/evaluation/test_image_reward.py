@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from tests.helpers import tiny_image_reward as tiny
-from threestudio_gaussiandreamer.core.errors import UserError
+from tests.helpers.refusals import refused
 from threestudio_gaussiandreamer.evaluation import t3bench
 from threestudio_gaussiandreamer.models.clip import preprocessed
 
@@ -48,8 +48,7 @@ def without(part):
 )
 def test_other_files_are_refused(tmp_path, state, said):
     folder = tiny.write(tmp_path / "ir", state)
-    with pytest.raises(UserError, match=said):
-        ImageReward(str(folder), CPU)
+    refused(said, ImageReward, str(folder), CPU)
 
 
 @pytest.mark.parametrize(
@@ -67,8 +66,7 @@ def test_a_missing_or_other_file_is_named(tmp_path, name, content, said):
         (folder / name).unlink()
     else:
         (folder / name).write_bytes(content)
-    with pytest.raises(UserError, match=said):
-        ImageReward(str(folder), CPU)
+    refused(said, ImageReward, str(folder), CPU)
 
 
 def test_the_best_smoothed_vertex_counts_with_its_best_camera():

@@ -11,8 +11,7 @@ import torch
 from tests.evaluation.conftest import run_of
 from tests.helpers import tiny_3d_models as tiny
 from tests.helpers import tiny_image_reward
-from threestudio_gaussiandreamer.evaluation import t3bench
-from threestudio_gaussiandreamer.evaluation.scorecard import bootstrap, main, paired, per_prompt
+from threestudio_gaussiandreamer.evaluation import scorecard, t3bench
 from threestudio_gaussiandreamer.formats.gaussian_files import read_cloud, write_cloud
 from threestudio_gaussiandreamer.toybox import export, models
 
@@ -21,7 +20,6 @@ PERSON = "a man in a red shirt and blue trousers jumps"
 
 
 def finished(folder, prompts):
-    """Folders of finished runs with one cloud each."""
     for number, prompt in enumerate(prompts):
         run = folder / "gaussiandreamer" / f"run{number}"
         run_of(run, {"prompt_processor": {"prompt": prompt}}, number)
@@ -43,7 +41,7 @@ def judge(tmp_path):
 def test_rows_and_intervals_over_prompts(tmp_path, judge, capsys):
     runs = finished(tmp_path / "runs", (*PROMPTS, PERSON))
     arguments = ["--metrics", "judge,janus", "--judge", judge, "--output", str(tmp_path / "out")]
-    assert main([str(runs), *arguments]) == 0
+    assert scorecard.main([str(runs), *arguments]) == 0
     assert table(tmp_path / "out") == [*PROMPTS, PERSON]
     *others, of_person = table(tmp_path / "out", "action")  # a column of persons only
     assert others == ["nan"] * 4 and of_person in ("0.0", "1.0")
@@ -67,7 +65,7 @@ def test_a_run_in_several_folders_is_scored_once(tmp_path, judge, monkeypatch):
         (links / name).symlink_to(where)
     monkeypatch.chdir(tmp_path)
     again = ["runs/gaussiandreamer/run1", str(runs), "runs", "links"]
-    assert main([*again, "--metrics", "judge", "--judge", judge, "--output", "out"]) == 0
+    assert scorecard.main([*again, "--metrics", "judge", "--judge", judge, "--output", "out"]) == 0
     assert "pattern,accessory\n" in (tmp_path / "out/scorecard.csv").read_text()
     assert sorted(table(tmp_path / "out")) == sorted(PROMPTS[:2])
 
@@ -83,7 +81,7 @@ def test_what_can_not_be_scored_is_named_and_the_others_are_scored(tmp_path, jud
     for ply in (plys[0], plys[2]):
         ply.unlink()
     arguments = ["--metrics", "judge", "--judge", judge, "--output", str(tmp_path / "out")]
-    assert main([str(runs), *arguments]) == 2
+    assert scorecard.main([str(runs), *arguments]) == 2
     said = capsys.readouterr().err
     assert "3 of the assets can't be scored: " in said and "PLY file" in said
     assert f"{str(exports[2].parents[1])!r}" in said and "has no prompt" in said
@@ -96,7 +94,7 @@ def test_clip_of_two_folders_is_compared_by_prompt(tmp_path):
     first, second = finished(tmp_path / "a", PROMPTS[:2]), finished(tmp_path / "b", PROMPTS[1:3])
     arguments = ["--metrics", "clip,directions", "--clip", clip, "--size", "24"]
     arguments += ["--against", str(second), "--output", str(tmp_path / "out")]
-    assert main([str(first), *arguments]) == 0
+    assert scorecard.main([str(first), *arguments]) == 0
     content = json.loads((tmp_path / "out/scorecard.json").read_text())
     clip_score = content["clip"]
     assert clip_score["difference"]["count"] == 1  # the fox is in both
@@ -110,7 +108,7 @@ def test_rewards_of_views(tmp_path, monkeypatch):
     folder = str(tiny_image_reward.write(tmp_path / "ir"))
     runs = finished(tmp_path / "runs", PROMPTS[:1])
     arguments = ["--metrics", "imagereward,quality", "--imagereward", folder, "--size", "16"]
-    assert main([str(runs), *arguments, "--output", str(tmp_path / "out")]) == 0
+    assert scorecard.main([str(runs), *arguments, "--output", str(tmp_path / "out")]) == 0
     content = json.loads((tmp_path / "out/scorecard.json").read_text())
     reward, quality = (content[name]["mean"]["mean"] for name in ("imagereward", "quality"))
     assert abs(quality - (20 * reward + 50)) < 40  # of the same cloud, on another scale
@@ -134,20 +132,20 @@ def test_rewards_of_views(tmp_path, monkeypatch):
 def test_wrong_input_is_named(tmp_path, judge, capsys, arguments, message):
     run = finished(tmp_path / "runs", PROMPTS[:1]) / "gaussiandreamer/run0"
     arguments = [a.replace("{judge}", judge).replace("{}", str(run)) for a in arguments]
-    assert main(arguments) == 2
+    assert scorecard.main(arguments) == 2
     assert message in capsys.readouterr().err
 
 
 def test_intervals_of_many_undefined_and_paired_values():
     values = np.random.default_rng(0).normal(3.0, 2.0, 400)
-    found, error = bootstrap(values), values.std() / math.sqrt(len(values))
+    found, error = scorecard.bootstrap(values), values.std() / math.sqrt(len(values))
     assert found.mean == pytest.approx(values.mean())
     assert found.low == pytest.approx(values.mean() - 1.96 * error, abs=0.15 * error)
     assert found.high == pytest.approx(values.mean() + 1.96 * error, abs=0.15 * error)
-    assert bootstrap(np.array([1.0, np.nan, 1.0])) == (1.0, 1.0, 1.0, 2)
-    empty = bootstrap(np.array([np.nan]))
+    assert scorecard.bootstrap(np.array([1.0, np.nan, 1.0])) == (1.0, 1.0, 1.0, 2)
+    empty = scorecard.bootstrap(np.array([np.nan]))
     assert math.isnan(empty.mean) and empty.count == 0
-    means = per_prompt(["a", "a", "b", "c"], np.array([0.0, 1.0, 3.0, np.nan]))
+    means = scorecard.per_prompt(["a", "a", "b", "c"], np.array([0.0, 1.0, 3.0, np.nan]))
     assert means["a"] == 0.5 and means["b"] == 3.0 and math.isnan(means["c"])
     first, second = {"a": 2.0, "b": 5.0, "c": 9.0}, {"b": 4.0, "a": 1.0, "d": 0.0}
-    assert paired(first, second) == (1.0, 1.0, 1.0, 2)
+    assert scorecard.paired(first, second) == (1.0, 1.0, 1.0, 2)

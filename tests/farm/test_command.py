@@ -10,24 +10,16 @@ import pytest
 
 from tests.launch.cases import DEMO
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.farm import command
-from threestudio_gaussiandreamer.farm.command import main
+from threestudio_gaussiandreamer.farm import command, recipe
 from threestudio_gaussiandreamer.farm.place import Place
-from threestudio_gaussiandreamer.farm.recipe import (
-    Recipe,
-    Source,
-    check_recipe,
-    read_config,
-    require_same_farm,
-    root_of,
-)
+from threestudio_gaussiandreamer.farm.recipe import Recipe, Source, require_same_farm
 from threestudio_gaussiandreamer.farm.rows import Row, read_rows
 
 RECIPE = Recipe((Source("a.yaml", b"x: 1"),), ("y=2",), cpu=True, cores=1)
 
 
 def recipe_of(config, *overrides):
-    return Recipe((read_config(config),), overrides, cpu=True, cores=1)
+    return Recipe((recipe.read_config(config),), overrides, cpu=True, cores=1)
 
 
 @pytest.fixture
@@ -37,7 +29,7 @@ def farm(tmp_path, monkeypatch, capsys):
 
     def run(text, *arguments, name="prompts.txt"):
         (tmp_path / name).write_text(text)
-        code = main([name, "--config", str(DEMO), *arguments])
+        code = command.main([name, "--config", str(DEMO), *arguments])
         return code, capsys.readouterr().err
 
     return run
@@ -96,15 +88,14 @@ def test_the_report_and_a_finished_farm_need_no_ray(farm, no_ray, monkeypatch, t
     """Nor does a farm of another configuration start Ray to be refused."""
     monkeypatch.setenv("HERE", "s3://bucket")
     (tmp_path / "a.yaml").write_text("exp_root_dir: ${oc.env:HERE}/runs")
-    assert root_of([str(DEMO), str(tmp_path / "a.yaml")]) == "s3://bucket/runs"
-    assert root_of([str(DEMO)]) == "outputs"
+    assert recipe.root_of([str(DEMO), str(tmp_path / "a.yaml")]) == "s3://bucket/runs"
+    assert recipe.root_of([str(DEMO)]) == "outputs"
     require_same_farm(Place(tmp_path / "runs/farm-prompts"), RECIPE)
     assert farm("a fox", "--report", f"exp_root_dir={tmp_path}/runs")[0] == 0
     assert "waiting" in (tmp_path / "runs/farm-prompts/report/table.csv").read_text()
     arguments = ["--out", "out", "trainer.max_steps=3"]
-    recipe = recipe_of(str(DEMO), *arguments[2:])
     place = Place(tmp_path / "out")
-    require_same_farm(place, recipe)
+    require_same_farm(place, recipe_of(str(DEMO), *arguments[2:]))
     (tmp_path / "prompts.txt").write_text("a fox")
     (row,) = read_rows(tmp_path / "prompts.txt")
     place.publish(row, {"key": row.key})
@@ -118,9 +109,6 @@ def test_the_report_and_a_finished_farm_need_no_ray(farm, no_ray, monkeypatch, t
     assert code == 2 and "line 1 of the prompt list: 'a_fox' was begun in this farm with" in err
     monkeypatch.setattr(command, "make_assets", lambda *args: None)
     assert farm("a fox\na cat", *arguments) == (1, "")  # something is left to do
-
-
-# -- configurations --------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -137,15 +125,14 @@ def test_an_error_in_a_rows_configuration_names_its_line(monkeypatch, options, m
         monkeypatch.setattr("threestudio_gaussiandreamer.farm.recipe.MOST_CHECKS", 1)
     with pytest.raises(ValueError, match=message):
         rows = [Row("fox", "a fox"), Row("cat", "a cat", line=3, **options)]
-        check_recipe(recipe_of(str(DEMO)), rows)
+        recipe.check_recipe(recipe_of(str(DEMO)), rows)
 
 
 def test_the_low_memory_configuration_is_used_where_it_is_valid():
     row = [Row("fox", "a fox")]
-    demo = recipe_of(str(DEMO))
-    assert check_recipe(demo, row).low_memory is None  # its guidance has no such options
-    paper = recipe_of("gaussiandreamer.yaml")
-    assert check_recipe(paper, row).low_memory.name.endswith("gaussiandreamer-lowmem.yaml")
+    demo, paper = recipe_of(str(DEMO)), recipe_of("gaussiandreamer.yaml")
+    assert recipe.check_recipe(demo, row).low_memory is None  # its guidance has no such options
+    assert recipe.check_recipe(paper, row).low_memory.name.endswith("gaussiandreamer-lowmem.yaml")
 
 
 @pytest.mark.parametrize(

@@ -17,8 +17,7 @@ ROWS = [Row(f"toy{i}", f"toy {i}", i) for i in range(6)]
 LOW = Source("low.yaml", b"")
 
 
-class RayError(Exception):
-    pass
+class RayError(Exception): ...
 
 
 class FakeRay:
@@ -61,9 +60,8 @@ class Bench:
         recipe = Recipe((Source("a.yaml", b""),), (), True, 1, low_memory)
         self.place, self.answers = Place(path), answers
         self.ray, self.made, self.beats, self.stops = FakeRay(), [], {}, []
-        board = SimpleNamespace(
-            read=remote(lambda: self.beats), stop=remote(lambda: self.stops.append(1))
-        )
+        stop = remote(lambda: self.stops.append(1))
+        board = SimpleNamespace(read=remote(lambda: self.beats), stop=stop)
         workers = [SimpleNamespace(make=remote(self._make))]
         setting = Setting(recipe, self.place, board, "", "now", 3)
         jobs = iter([Job(row, spent=100.0) for row in rows])
@@ -119,9 +117,7 @@ def stopped_once():
         (lambda job: FAILS | {"error": job.row.name}, LOW, [FAILED] * 6, "toy0"),
     ],
 )
-def test_an_outcome_decides_what_becomes_of_an_asset(
-    tmp_path, capsys, answers, low_memory, states, error
-):
+def test_what_becomes_of_an_asset(tmp_path, capsys, answers, low_memory, states, error):
     bench = Bench(tmp_path, answers, low_memory=low_memory)
     bench.place.write = Mock(wraps=bench.place.write)
     bench.driver.run()
@@ -188,8 +184,6 @@ def test_ctrl_c_lets_the_workers_write_checkpoints(tmp_path):
     assert len(bench.stops) == 1 and bench.states() == [FINISHED, STOPPED, *[WAITING] * 4]
 
 
-# -- the cluster -----------------------------------------------------------------------------------
-
 CPU, GPUS = {"CPU": 8.0}, {"CPU": 8.0, "GPU": 2.0}
 
 
@@ -207,9 +201,8 @@ CPU, GPUS = {"CPU": 8.0}, {"CPU": 8.0, "GPU": 2.0}
         (GPUS, None, 1, 3, "with 1 GPU each, 2 fit"),
     ],
 )
-def test_as_many_workers_start_as_fit_with_a_gpu_each_where_there_are_some(
-    resources, gpus, cores, workers, plan
-):
+def test_as_many_workers_start_as_fit(resources, gpus, cores, workers, plan):
+    """With a GPU each where there are some."""
     if isinstance(plan, tuple):
         assert plan_workers(resources, gpus, cores, workers) == plan
         return

@@ -69,9 +69,7 @@ def write_farm(folder: Path, count: int, steps: int = 12) -> list[str]:
 
 
 def make_alone(folder: Path, number: int, steps: int = 12) -> Path:
-    """Make one of the assets with the launcher, without the farm's cache of embeddings and with one
-    thread, as its workers do: results depend on their number. Return the folder.
-    """
+    """Make an asset with the launcher, without cached embeddings; return its folder."""
     command = [
         *(sys.executable, str(ROOT / "launch.py"), "--train", "--gpu", "cpu"),
         *("--config", "gaussiandreamer.yaml", "--config", str(folder / "tiny.yaml")),
@@ -80,7 +78,7 @@ def make_alone(folder: Path, number: int, steps: int = 12) -> Path:
         f"system.prompt_processor.prompt=a toy number {number}",
         "system.prompt_processor.use_cache=false",
     ]
-    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}  # as the workers: results depend on it
     done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=environment)
     assert done.returncode == 0, done.stderr[-3000:]
     return folder / "alone" / "alone" / f"toy{number}"

@@ -12,16 +12,7 @@ from threestudio_gaussiandreamer.core.checkpoint_file import newest_readable, sa
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.farm import place as module
 from threestudio_gaussiandreamer.farm import worker
-from threestudio_gaussiandreamer.farm.place import (
-    CHANGED,
-    FINISHED,
-    LAST,
-    RUNNING,
-    STOPPED,
-    WAITING,
-    Place,
-    Unreachable,
-)
+from threestudio_gaussiandreamer.farm.place import CHANGED, FINISHED, STOPPED, WAITING, Place
 from threestudio_gaussiandreamer.farm.recipe import Job, Recipe, Source, job_of, unfinished
 from threestudio_gaussiandreamer.farm.report import write_report
 from threestudio_gaussiandreamer.farm.rows import Row, read_rows
@@ -98,10 +89,8 @@ def test_the_life_of_a_farm_below_a_url(url, memory, request, machine):
     first, second = machine("one", url), pickle.loads(pickle.dumps(machine("other", url)))
     folder = made(first)
     first.keep_checkpoint(FOX, False)
-    assert list(second.records([FOX, CAT])) == [
-        (FOX, {"state": RUNNING}),
-        (CAT, {"state": WAITING}),
-    ]
+    states = [record for _, record in second.records([FOX, CAT])]
+    assert states == [{"state": module.RUNNING}, {"state": WAITING}]
     second.fetch_checkpoint(FOX, False)
     assert (second.work_folder(FOX) / "ckpts/fetched.ckpt").read_text() == "ckpts/last.ckpt"
     other = FOX._replace(prompt="another")
@@ -134,9 +123,7 @@ def test_the_result_is_uploaded_last_and_a_reader_sees_no_half_asset(memory, mon
 
 
 @pytest.mark.parametrize("error", [ConnectionError("no route"), FileNotFoundError("no bucket")])
-def test_a_store_that_is_gone_is_named_and_a_bucket_that_does_not_exist_is_empty(
-    memory, monkeypatch, error
-):
+def test_a_store_that_is_gone_is_named_and_no_bucket_is_an_empty_one(memory, monkeypatch, error):
     place, lacks = Place(memory), isinstance(error, FileNotFoundError)
     for name in ("cat_file", "pipe_file", "put_file", "ls", "rm_file"):
         monkeypatch.setattr(place.system, name, Mock(side_effect=error))
@@ -150,13 +137,13 @@ def test_a_store_that_is_gone_is_named_and_a_bucket_that_does_not_exist_is_empty
         if lacks and not write:
             assert not act()
             continue
-        with pytest.raises(Unreachable, match=f"memory://farm can't be reached: .*{error}"):
+        with pytest.raises(module.Unreachable, match=f"memory://farm can't be reached: .*{error}"):
             act()
 
 
 def checkpoint(place, step):
     content = {"global_step": step, "epoch": 0, "state_dict": {}}
-    save_file(place.work_folder(FOX) / LAST, content)
+    save_file(place.work_folder(FOX) / module.LAST, content)
 
 
 def test_the_newer_checkpoint_wins_on_every_machine(memory, machine):
@@ -173,9 +160,7 @@ def test_the_newer_checkpoint_wins_on_every_machine(memory, machine):
     assert newest_readable(third.work_folder(FOX) / "ckpts")[1] == 7
 
 
-def test_every_machine_goes_on_with_the_checkpoint_of_its_configuration(
-    memory, machine, tmp_path, monkeypatch
-):
+def test_each_configuration_has_its_own_checkpoint(memory, machine, tmp_path, monkeypatch):
     """What the low-memory configuration made is only for those that use it."""
     seen = []
 
@@ -195,9 +180,6 @@ def test_every_machine_goes_on_with_the_checkpoint_of_its_configuration(
         outcome = worker.Worker().make(job, 0, setting)
         assert outcome["state"] == worker.STOPPED
     assert seen == [(False, None), (False, 91), (True, None), (True, 13), (True, 14)]
-
-
-# -- records ---------------------------------------------------------------------------------------
 
 
 def note(place, row, file, **record):
@@ -234,7 +216,6 @@ def test_many_records_are_read_in_the_order_of_the_rows(tmp_path, monkeypatch):
 def test_a_url_that_can_not_be_used_is_one_message(monkeypatch):
     with pytest.raises(UserError, match="nothing://farm can't be used"):
         Place("nothing://farm")
-
     refuses = Mock(side_effect=ConnectionRefusedError("Connection refused"))
     monkeypatch.setattr("fsspec.core.url_to_fs", refuses)
     with pytest.raises(UserError, match="ftp://host/farm can't be used: Connection refused"):

@@ -14,16 +14,7 @@ from threestudio_gaussiandreamer.farm.board import Beat, Board
 from threestudio_gaussiandreamer.farm.place import FAILED, STOPPED, AnotherRow, Place, Unreachable
 from threestudio_gaussiandreamer.farm.recipe import Job, Recipe, Source
 from threestudio_gaussiandreamer.farm.rows import Row
-from threestudio_gaussiandreamer.farm.worker import (
-    BLOCKED,
-    NO_MEMORY,
-    REFUSED,
-    Heartbeat,
-    Setting,
-    Worker,
-    count_attempts,
-    outcome_of,
-)
+from threestudio_gaussiandreamer.farm.worker import NO_MEMORY, Worker, count_attempts
 from threestudio_gaussiandreamer.launch import experiment
 from threestudio_gaussiandreamer.launch.run_folder import FolderInUse
 
@@ -43,14 +34,14 @@ def caused(error, cause):
         (torch.OutOfMemoryError("CUDA out of memory"), NO_MEMORY),
         (caused(UserError("the grid doesn't fit"), torch.OutOfMemoryError()), NO_MEMORY),
         (RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory"), NO_MEMORY),
-        (caused(UserError("can't write"), OSError(errno.ENOSPC, "full")), BLOCKED),
-        (Unreachable("s3://a can't be reached"), BLOCKED),
-        (AnotherRow(JOB.row), REFUSED),
+        (caused(UserError("can't write"), OSError(errno.ENOSPC, "full")), worker.BLOCKED),
+        (Unreachable("s3://a can't be reached"), worker.BLOCKED),
+        (AnotherRow(JOB.row), worker.REFUSED),
         (OSError(errno.ENOENT, "no such file"), FAILED),
     ],
 )
 def test_errors_have_states(error, state):
-    outcome = outcome_of(error)
+    outcome = worker.outcome_of(error)
     assert outcome["state"] == state and outcome["error"]
 
 
@@ -87,7 +78,7 @@ def test_attempts_that_earlier_versions_noted(tmp_path, text, saves_memory, coun
 
 def setting(place):
     recipe = Recipe((Source("a.yaml", b""),), (), True, 1, Source("low.yaml", b""))
-    return Setting(recipe, place, None, ".", "now", retries=1)
+    return worker.Setting(recipe, place, None, ".", "now", retries=1)
 
 
 @pytest.fixture
@@ -111,7 +102,6 @@ def test_a_folder_that_a_dying_process_still_holds_is_waited_for(place, monkeypa
     monkeypatch.setattr(worker.time, "sleep", lambda seconds: None)
     monkeypatch.setattr(worker.Heartbeat, "report", lambda self, beat: False)
     codes = [FolderInUse("held"), FolderInUse("held"), 128 + 15]
-
     run = Mock(**{"run.side_effect": codes})
     monkeypatch.setattr(experiment, "prepare", Mock(return_value=run))
     outcome = Worker().make(JOB, 0, setting(place))
@@ -153,8 +143,6 @@ def test_an_exit_of_a_part_fails_its_asset_and_one_of_ray_ends_the_worker(place,
         Worker().make(JOB, 0, setting(place))
 
 
-# -- reports of workers, and how the farm's stop reaches them -----------------------------------
-
 BEAT = Beat("fox", 1, "training", 3, 12)
 
 
@@ -177,8 +165,9 @@ def test_reports_are_rare_and_a_run_is_stopped_once(monkeypatch):
     monkeypatch.setattr(worker.time, "monotonic", lambda: now.seconds)
     told, stops, setting = [], [], Mock()
     monkeypatch.setattr(worker.signal, "raise_signal", stops.append)
-    monkeypatch.setattr(Heartbeat, "report", lambda _, beat: told.append(beat) or len(told) > 2)
-    beats = Heartbeat(JOB, 1, 0, setting)
+    report = lambda _, beat: told.append(beat) or len(told) > 2  # noqa: E731
+    monkeypatch.setattr(worker.Heartbeat, "report", report)
+    beats = worker.Heartbeat(JOB, 1, 0, setting)
     for _ in range(4):
         now.seconds += 0.5
         beats.on_train_batch_end(SimpleNamespace(global_step=3, max_steps=12))

@@ -10,6 +10,7 @@ import pytest
 import scipy.sparse
 
 from tests.helpers.memory import memory_below
+from tests.helpers.refusals import refused
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.formats.array_files import read_arrays
 
@@ -30,15 +31,13 @@ def test_what_numpy_wrote_is_read(tmp_path, save):
     for name, array in ARRAYS.items():
         assert read[name].dtype == array.dtype and np.array_equal(read[name], array)
     said = "motion file .*x.npz': it has no array 'points', 'c', only a, b, text, none, one"
-    with pytest.raises(UserError, match=said):
-        read_arrays(tmp_path / "x.npz", "motion file", ["a", "points", "c"])
+    refused(said, read_arrays, tmp_path / "x.npz", "motion file", ["a", "points", "c"])
     np.save(tmp_path / "x.npy", ARRAYS["a"])
     found = read_arrays(tmp_path / "x.npy", "file", ["points"])
     assert np.array_equal(found["points"], ARRAYS["a"])
     np.savez(tmp_path / "y.npz", good=np.ones(3), bad=np.array({"a": 1}, dtype=object))
     assert read_arrays(tmp_path / "y.npz", "file", ["good"])["good"].sum() == 3
-    with pytest.raises(UserError, match="could run code"):
-        read_arrays(tmp_path / "y.npz", "file", ["bad"])
+    refused("could run code", read_arrays, tmp_path / "y.npz", "file", ["bad"])
 
 
 @pytest.mark.parametrize("protocol", range(pickle.HIGHEST_PROTOCOL + 1))
@@ -74,8 +73,7 @@ class Runs:
 def test_pickles_run_no_code(tmp_path, monkeypatch, data, said):
     monkeypatch.delenv("RAN", raising=False)
     (tmp_path / "x.pkl").write_bytes(data)
-    with pytest.raises(UserError, match=said):
-        read_arrays(tmp_path / "x.pkl", "file", ["a"])
+    refused(said, read_arrays, tmp_path / "x.pkl", "file", ["a"])
     assert "RAN" not in os.environ
 
 

@@ -1,9 +1,7 @@
 """Programs of others read what we write, as we read it, and we read what they write.
 
-PlayCanvas' splat-transform and Babylon.js (npm: @playcanvas/splat-transform, @babylonjs/core and
-@babylonjs/loaders in the folder node_modules that the environment variable VIEWER_NODE_MODULES
-names), and from PyPI gaussforge; each is skipped where it isn't installed. OpenUSD's
-parser reads USDA in ``test_usda.py``.
+Each is skipped where it isn't installed: in the folder that VIEWER_NODE_MODULES names the npm
+packages @playcanvas/splat-transform, @babylonjs/core, @babylonjs/loaders; from PyPI gaussforge.
 """
 
 import os
@@ -15,12 +13,7 @@ import numpy as np
 import pytest
 
 from tests.helpers.object_clouds import assert_close, ball, in_order_of
-from threestudio_gaussiandreamer.formats.gaussian_files import (
-    StoredCloud,
-    read_cloud,
-    suffix_of,
-    write_cloud,
-)
+from threestudio_gaussiandreamer.formats.gaussian_files import StoredCloud, read_cloud, write_cloud
 from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
 
 MODULES = Path(os.environ.get("VIEWER_NODE_MODULES", "node_modules"))
@@ -114,6 +107,6 @@ def from_gaussforge(ir):
 def test_gaussforge_reads_what_we_write(tmp_path, name, degree):
     gaussforge = pytest.importorskip("gaussforge", reason="gaussforge isn't installed")
     path = write(tmp_path / name, ball(300, degree))
-    found = gaussforge.GaussForge().read(path.read_bytes(), suffix_of(name)[1:])
+    found = gaussforge.GaussForge().read(path.read_bytes(), name.partition(".")[2])
     theirs, ours = from_gaussforge(found["data"]), read_cloud(str(path)).gaussians
     assert_close(in_order_of(ours, theirs), theirs, opacities=2e-3, sh=0.02)

@@ -47,7 +47,6 @@ def put(header, at, kind, *values):
 
 
 def section(cloud, level):
-    """The header and the content of a section."""
     degree, centers = cloud.sh_degree, np.array([[0, 0, 0], [1, 0, 0], [0, 0.5, 0], [0, 0, -1]])
     lengths = [*[BUCKET] * FULL, *PARTLY]
     places = np.rint((cloud.means - np.repeat(centers, lengths, axis=0)) / (BLOCK / 2) * STEPS)

@@ -13,11 +13,10 @@ import zstandard
 from tests.helpers.memory import memory_below
 from tests.helpers.object_clouds import in_order_of
 from tests.helpers.ply_files import gaussians
+from tests.helpers.refusals import refused
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.formats import spz
+from threestudio_gaussiandreamer.formats import packing, spz
 from threestudio_gaussiandreamer.formats.gaussian_files import StoredCloud, write_cloud
-from threestudio_gaussiandreamer.formats.packing import ANTIALIASED
-from threestudio_gaussiandreamer.formats.spz import spz_arrays, spz_bytes, write_spz
 from threestudio_gaussiandreamer.gaussians.sh import sh_to_colors
 
 packed = functools.partial(gzip.compress, mtime=0)
@@ -101,9 +100,9 @@ def test_harmonics_of_degree_4_are_read(tmp_path):
 @pytest.mark.parametrize("degree", [0, 3])
 def test_values_are_rounded_to_half_a_step(tmp_path, degree):
     arrays = cloud(degree=degree)
-    write_spz(tmp_path / "a.spz", arrays, ["kept", "up: y", ANTIALIASED])
+    spz.write_spz(tmp_path / "a.spz", arrays, ["kept", "up: y", packing.ANTIALIASED])
     read, notes = spz.read_spz(tmp_path / "a.spz")
-    assert notes == ["kept", "up: y", ANTIALIASED]
+    assert notes == ["kept", "up: y", packing.ANTIALIASED]
     arrays = in_order_of(arrays, read)
     size = np.exp(np.median(arrays.log_scales.mean(1)))
     assert np.abs(read.means - arrays.means).max() <= size / 64 * 1.001
@@ -118,12 +117,12 @@ def test_values_are_rounded_to_half_a_step(tmp_path, degree):
 def test_both_versions_hold_the_same_and_files_are_small_and_reproducible():
     arrays, found = cloud(2000, 3), []
     for version in (3, 4):
-        data = spz_bytes(arrays, version=version)
-        assert data == spz_bytes(arrays.rows(slice(None, None, -1)), version=version)
+        data = spz.spz_bytes(arrays, version=version)
+        assert data == spz.spz_bytes(arrays.rows(slice(None, None, -1)), version=version)
         assert len(data) < 51 * 2000  # random values pack worse than trained ones
-        found.append(spz_arrays(data)[0])
-        assert spz_arrays(spz_bytes(cloud(0), version=version))[0].sh.shape == (0, 1, 3)
-        assert spz_arrays(spz_bytes(cloud(5), [ANTIALIASED], version=version))[1]
+        found.append(spz.spz_arrays(data)[0])
+        assert spz.spz_arrays(spz.spz_bytes(cloud(0), version=version))[0].sh.shape == (0, 1, 3)
+        assert spz.spz_arrays(spz.spz_bytes(cloud(5), [packing.ANTIALIASED], version=version))[1]
     assert all(np.array_equal(a, b) for a, b in zip(*found, strict=True))
 
 
@@ -133,7 +132,7 @@ def test_extremes_are_stored_within_the_formats_reach_and_nan_is_refused():
     arrays.logit_opacities[:] = [np.inf, -np.inf, 50, -50]
     arrays.quats[0], arrays.sh[:] = 0, 100
     arrays.means[:] = np.arange(12).reshape(4, 3) * 1000.0
-    read = spz_arrays(spz_bytes(arrays))[0]
+    read = spz.spz_arrays(spz.spz_bytes(arrays))[0]
     read = read.rows(read.means[:, 0].argsort())
     np.testing.assert_array_equal(read.log_scales[:, 0], [-10, -10, 255 / 16 - 10, 0])
     assert np.isfinite(read.logit_opacities).all()
@@ -142,19 +141,18 @@ def test_extremes_are_stored_within_the_formats_reach_and_nan_is_refused():
     assert (sh_to_colors(torch.from_numpy(read.sh), torch.ones(4, 3)) > 1.4).all()
     np.testing.assert_allclose(read.means, arrays.means, atol=0.001)
     # Niantic's reader takes the logit of the byte over 255
-    assert sorted(gzip.decompress(spz_bytes(arrays))[16 + 4 * 9 :][:4]) == [0, 0, 254, 254]
+    assert sorted(gzip.decompress(spz.spz_bytes(arrays))[16 + 4 * 9 :][:4]) == [0, 0, 254, 254]
     arrays = cloud(20)
     arrays.means[3], arrays.sh[5] = np.nan, np.inf
     high = cloud(1)._replace(sh=np.zeros((1, 25, 3), np.float32))
     for bad, match in ((arrays, "can't hold NaN or"), (high, "up to degree 3, not 4")):
-        with pytest.raises(UserError, match=match):
-            spz_bytes(bad)
+        refused(match, spz.spz_bytes, bad)
 
 
 def test_one_gaussian_beyond_the_range_is_clipped_and_the_rest_stays_precise(tmp_path, caplog):
     arrays, size = cloud(300), float(np.exp(-4))
     arrays.means[7], arrays.means[9, 1], arrays.log_scales[11, 0] = 1e7, -3e38, 9
-    write_spz(tmp_path / "a.spz", arrays)
+    spz.write_spz(tmp_path / "a.spz", arrays)
     assert caplog.text.count("a.spz: 3 of 300 Gaussians are farther away or larger") == 1
     read = read_spz(tmp_path / "a.spz")
     assert len(read.means) == 300 and all(np.isfinite(values).all() for values in read)
@@ -163,7 +161,7 @@ def test_one_gaussian_beyond_the_range_is_clipped_and_the_rest_stays_precise(tmp
     assert nearest.max() <= size / 2
     caplog.clear()
     far = cloud(50)._replace(means=cloud(50).means + np.float32(1e6))  # as a whole
-    write_spz(tmp_path / "b.spz", far._replace(log_scales=far.log_scales - 20))
+    spz.write_spz(tmp_path / "b.spz", far._replace(log_scales=far.log_scales - 20))
     read = read_spz(tmp_path / "b.spz")
     assert not caplog.text and np.abs(read.means.mean(axis=0) - 1e6).max() < 1
 
@@ -252,8 +250,7 @@ SIZES = [18, 2, 6, 6, 8, 18]
     ids=range(20),
 )
 def test_damaged_and_foreign_files_are_refused(tmp_path, data, said):
-    with pytest.raises(UserError, match=f"a.spz': .*{said}"):
-        read_spz(stored(tmp_path, data))
+    refused(f"a.spz': .*{said}", read_spz, stored(tmp_path, data))
 
 
 def test_a_file_that_unpacks_to_more_than_it_announces_costs_no_memory(tmp_path):
@@ -280,7 +277,5 @@ def test_a_small_file_of_many_gaussians_is_refused_before_they_are_unpacked(tmp_
 def test_without_zstandard_version_4_is_refused_by_name(tmp_path, monkeypatch):
     path = stored(tmp_path, version_4())
     monkeypatch.setitem(sys.modules, "zstandard", None)
-    with pytest.raises(UserError, match="pip install zstandard"):
-        spz_bytes(cloud(), version=4)
-    with pytest.raises(UserError, match="pip install zstandard"):
-        read_spz(path)
+    refused("pip install zstandard", spz.spz_bytes, cloud(), version=4)
+    refused("pip install zstandard", read_spz, path)

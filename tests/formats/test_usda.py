@@ -9,6 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tests.helpers.object_clouds import assert_close, ball
+from tests.helpers.refusals import refused
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.formats.gaussian_files import StoredCloud, read_cloud, write_cloud
 from threestudio_gaussiandreamer.formats.usda import (
@@ -164,12 +165,10 @@ def test_a_usdz_is_as_phones_want_it_and_read_without_openusd(tmp_path, monkeypa
         archive.writestr("a.usda", data[start:])
     for number, said in enumerate(["damaged", "damaged", "it is a compressed zip archive"]):
         for read in (read_usda, read_usd):
-            with pytest.raises(UserError, match=f"{number}.usdz': .*{said}"):
-                read(tmp_path / f"{number}.usdz")
+            refused(f"{number}.usdz': .*{said}", read, tmp_path / f"{number}.usdz")
     monkeypatch.setitem(sys.modules, "pxr", None)
     (tmp_path / "a.usdc").write_bytes(b"PXR-USDC" + bytes(100))
-    with pytest.raises(UserError, match="pip install usd-core"):
-        read_usd(tmp_path / "a.usdc")
+    refused("pip install usd-core", read_usd, tmp_path / "a.usdc")
     write_usdz(tmp_path / "a.usdz", ball(20))
     assert len(read_usd(tmp_path / "a.usdz")[0].means) == 20
 
@@ -195,15 +194,12 @@ def test_binary_files_are_read_and_what_openusd_cant_read_is_said(tmp_path):
     by_openusd(tmp_path / "a.usda")
     cut = (tmp_path / "a.usdc").read_bytes()[:900]
     (tmp_path / "b.usdc").write_bytes(cut)
-    with pytest.raises(UserError, match="b.usdc.*OpenUSD: .*corrupt"):
-        read_usd(tmp_path / "b.usdc")
+    refused("b.usdc.*OpenUSD: .*corrupt", read_usd, tmp_path / "b.usdc")
     (tmp_path / "c.usda").write_text('#usda 1.0\ndef Sphere "a"\n{\n}\n')
-    with pytest.raises(UserError, match="c.usda'.*none of its prims is a ParticleField3DGauss"):
-        read_usd(tmp_path / "c.usda")
+    refused("c.usda'.*none of its prims is a ParticleField3DGauss", read_usd, tmp_path / "c.usda")
     text = (tmp_path / "a.usda").read_text().replace("Degree = 0", "Degree = 1")
     (tmp_path / "d.usda").write_text(text)
-    with pytest.raises(UserError, match="has 20 values, expected 80"):
-        read_usd(tmp_path / "d.usda")
+    refused("has 20 values, expected 80", read_usd, tmp_path / "d.usda")
 
 
 def test_scenes_with_transforms_and_half_precision_are_read(tmp_path):

@@ -44,9 +44,6 @@ def _range(data: bytes, rng: Rng) -> tuple[int, int]:
     return start, min(start + int(2 ** rng.uniform(0, 10)), len(data))
 
 
-# ---- damage to bytes -----------------------------------------------------------------------------
-
-
 def flip_bits(data: bytes, rng: Rng) -> bytes:
     damaged = bytearray(data)
     for _ in range(int(rng.integers(1, 9))):
@@ -94,8 +91,6 @@ def insert_token(data: bytes, rng: Rng) -> bytes:
     at = int(rng.integers(0, len(data) + 1))
     return data[:at] + _choice(TOKENS, rng) + data[at:]
 
-
-# ---- damage to text ------------------------------------------------------------------------------
 
 WORD = re.compile(rb"[^\s\[\]{}(),:=\"']+")
 NUMBER = re.compile(rb"[-+]?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?")
@@ -175,9 +170,6 @@ TEXT: list[Mutator] = [
 ]  # fmt: skip
 
 
-# ---- compressed and checksummed formats ----------------------------------------------------------
-
-
 class Packing(NamedTuple):
     """Functions that split a file into named pieces and join them again."""
 
@@ -222,10 +214,8 @@ GZIP = Packing(
 )
 GLB = Packing(_unglb, glb_bytes, text=("JSON",))
 PLY = Packing(_unply, lambda pieces: b"".join(part for _, part in pieces), text=("header",))
-UNPACKABLE = (
-    *(ValueError, IndexError, OSError, zipfile.BadZipFile, zlib.error, struct.error),
-    zstandard.ZstdError,
-)
+UNPACKABLE = ValueError, IndexError, OSError, zipfile.BadZipFile, zlib.error, struct.error
+UNPACKABLE += (zstandard.ZstdError,)
 
 
 def damaged(data: bytes, rng: Rng, mutators: list[Mutator]) -> bytes:
@@ -236,9 +226,7 @@ def damaged(data: bytes, rng: Rng, mutators: list[Mutator]) -> bytes:
     return data
 
 
-def mutant(
-    seeds: list[bytes], rng: Rng, mutators: list[Mutator], packing: Optional[Packing]
-) -> bytes:
+def mutant(seeds: list[bytes], rng: Rng, mutators: list[Mutator], packing: Optional[Packing]):
     """Return a damaged copy of one of ``seeds``, or a splice of two."""
     data = _choice(seeds, rng)
     if rng.random() < 0.05:

@@ -23,9 +23,6 @@ class Illegal(Exception):
     """The bytes are not a valid file of this format."""
 
 
-# ---- PLY -----------------------------------------------------------------------------------------
-
-
 class PlyVertices(NamedTuple):
     """The first element called "vertex"."""
 
@@ -148,9 +145,6 @@ def _ply_property(words: list[str]) -> tuple[str, str, str]:
     raise Illegal("property")
 
 
-# ---- NPY, gzip, checkpoints, GLB -----------------------------------------------------------------
-
-
 def npy_array(data: bytes) -> np.ndarray:
     """An NPY file of version 1 to 3 with one array of plain numbers or text and nothing else."""
     if data[:6] != b"\x93NUMPY" or data[6:7] not in (b"\1", b"\2", b"\3"):
@@ -201,9 +195,6 @@ def glb_document(data: bytes) -> dict:
         return json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
     except (ValueError, RecursionError) as error:
         raise Illegal("JSON") from error
-
-
-# ---- compact formats of Gaussians ----------------------------------------------------------------
 
 
 def compressed_means(data: bytes) -> np.ndarray:

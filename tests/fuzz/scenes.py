@@ -147,9 +147,8 @@ def _corrupt(g: torch.Generator, values: Tensor, extremes: tuple[float, ...], sh
 def _cameras(g: torch.Generator, views: int, width: int, height: int) -> tuple[Tensor, Tensor]:
     """Draw cameras around the cloud; in two of five scenes unusual ones."""
     viewmats, Ks = torch.eye(4).repeat(views, 1, 1), torch.eye(3).repeat(views, 1, 1)
-    viewmats[:, :3, :3] = quats_to_rotations(
-        torch.randn(views, 4, generator=g, dtype=torch.float64)
-    ).float()
+    quats = torch.randn(views, 4, generator=g, dtype=torch.float64)
+    viewmats[:, :3, :3] = quats_to_rotations(quats).float()
     odd = torch.rand(views, generator=g) < (0.7 if _chance(g, 0.4) else 0.0)
 
     def drawn(unusual: tuple[float, ...], usual: tuple[float, ...]) -> Tensor:
@@ -191,9 +190,8 @@ def draw(scene: Scene, backend: str, dtype: torch.dtype = torch.float32) -> Run:
 
 
 def fault(scene: Scene, drawn: Run) -> Optional[str]:
-    """Return the first value or gradient that isn't finite, or alpha outside [0, 1]; but radii may
-    be infinite for a Gaussian larger than float32, and the gradient of SH coefficients NaN where
-    the mean is, since it has no viewing direction.
+    """Return what isn't finite, or alpha outside [0, 1]; but radii may be infinite for a Gaussian
+    larger than float32, and the gradient of SH coefficients NaN where the mean is.
     """
     for name in ("image", "alpha", "depth", "means2d", "contribution"):
         if not getattr(drawn.out, name).isfinite().all():

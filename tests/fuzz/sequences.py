@@ -4,16 +4,9 @@ import copy
 from typing import Any
 
 import torch
-from hypothesis import HealthCheck, settings
+from hypothesis import HealthCheck, settings, stateful
 from hypothesis import strategies as st
-from hypothesis.stateful import (
-    RuleBasedStateMachine,
-    initialize,
-    invariant,
-    precondition,
-    rule,
-    run_state_machine_as_test,
-)
+from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 from torch import Tensor
 
 from tests.fuzz.targets import require_picture
@@ -57,8 +50,6 @@ class CloudSequence(RuleBasedStateMachine):
             self.step(seed)
         self._mark(torch.ones(count, dtype=torch.bool))
         self._record_changes()
-
-    # -- operations ------------------------------------------------------------------------------
 
     @rule(seed=SEEDS)
     def step(self, seed: int) -> None:
@@ -140,8 +131,6 @@ class CloudSequence(RuleBasedStateMachine):
         require_picture(self.cloud)
         self.optimizer.zero_grad()
 
-    # -- invariants --------------------------------------------------------------------------------
-
     @invariant()
     def everything_fits(self) -> None:
         n, parameters = len(self.cloud), self.cloud.parameters_by_name()
@@ -163,9 +152,7 @@ class CloudSequence(RuleBasedStateMachine):
             rows = state["exp_avg"].reshape(len(ids), -1)
             assert (rows == ids[:, None]).all(), "a row of moments is misplaced"
 
-    def _round(
-        self, budget: Any = None, densify: dict | None = None, prune: dict | None = None
-    ) -> None:
+    def _round(self, budget: Any = None, densify: dict | None = None, prune: dict | None = None):
         """Run one round of densification, pruning or both, and check its bounds."""
         CloudSequence.steps += 1
         rules, before = self.cloud.cfg, len(self.cloud)
@@ -230,4 +217,5 @@ def run_sequences(count: int, **options: Any) -> None:
     """Run the same sequences every time; invariants hold after every rule."""
     options |= {"derandomize": True, "deadline": None, "database": None}
     options |= {"stateful_step_count": 20, "suppress_health_check": list(HealthCheck)}
-    run_state_machine_as_test(CloudSequence, settings=settings(max_examples=count, **options))
+    options |= {"max_examples": count}
+    stateful.run_state_machine_as_test(CloudSequence, settings=settings(**options))

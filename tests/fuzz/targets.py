@@ -68,8 +68,6 @@ class Target(NamedTuple):
     """Whether memory is traced, which is slow."""
 
 
-# ---- what every target checks --------------------------------------------------------------------
-
 EYE = torch.eye(4)[None].clone()
 EYE[:, 2, 3] = 3.0
 FOCAL = torch.tensor([[[12.0, 0, 6], [0, 12, 6], [0, 0, 1]]])
@@ -122,8 +120,6 @@ def strictly(read: Callable[[bytes], Any], path: Path) -> Any:
         raise AssertionError(f"the file was read though it is illegal: {error}") from error
 
 
-# ---- PLY files of Gaussians and points -----------------------------------------------------------
-
 RGB = ("red", "green", "blue")
 
 
@@ -153,9 +149,8 @@ def gaussian_plys() -> list[bytes]:
 def point_plys() -> list[bytes]:
     rng = np.random.default_rng(1)
     places = {name: ("float", rng.normal(size=20)) for name in "xyz"}
-    bytes_, shorts = (
-        {name: (kind, rng.integers(0, 255, 20)) for name in RGB} for kind in ("uchar", "ushort")
-    )
+    kinds = "uchar", "ushort"
+    bytes_, shorts = ({n: (kind, rng.integers(0, 255, 20)) for n in RGB} for kind in kinds)
     floats = {name: ("double", rng.random(20)) for name in RGB}
     normals = {name: ("float", np.full(20, 0.577)) for name in ("nx", "ny", "nz")}
     return [
@@ -206,8 +201,6 @@ def exercise_points_ply(path: Path) -> None:
         assert close, "colours aren't what the file says"
     exercise_points(path)
 
-
-# ---- arrays and text -----------------------------------------------------------------------------
 
 MOTION = np.random.default_rng(0).normal(size=(2, 22, 3, 5)).astype(np.float32)
 ROWS = np.random.default_rng(1).random((15, 6))
@@ -265,12 +258,7 @@ def texts() -> list[bytes]:
     return [points, b"x,y,z,r,g,b\n" + colored, scan]
 
 
-# ---- compact formats of Gaussians ----------------------------------------------------------------
-
-
-def files(
-    suffix: str, shapes: Sequence[tuple[int, int]] = ((12, 0), (9, 1)), **options: Any
-) -> list[bytes]:
+def files(suffix: str, shapes=((12, 0), (9, 1)), **options: Any) -> list[bytes]:
     """Return files of a format, of (count, degree) each."""
     made = []
     with tempfile.TemporaryDirectory() as folder:
@@ -408,9 +396,6 @@ def _spz(pieces: list[tuple[str, bytes]]) -> bytes:
 SOG, SPZ_4 = Packing(_unsog, _sog), Packing(_unspz, _spz)
 
 
-# ---- meshes --------------------------------------------------------------------------------------
-
-
 def meshes(kind: str) -> list[bytes]:
     """Return a box with a texture, with colours, and as two objects of a scene."""
     import trimesh
@@ -447,9 +432,6 @@ def exercise_mesh(path: Path) -> None:
 def exercise_ply_mesh(path: Path) -> None:
     exercise_mesh(path)
     strictly(oracles.ply_vertices, path)
-
-
-# ---- checkpoints, configurations, command lines --------------------------------------------------
 
 
 def checkpoints() -> list[bytes]:
@@ -536,22 +518,15 @@ def exercise_command(path: Path) -> None:
     arguments = [argument for argument in arguments if not argument.startswith("--typecheck")]
     out, err = io.StringIO(), io.StringIO()
     of_logger = {name: getattr(logger, name) for name in ("propagate", "level")}
-    with (
-        mock.patch.dict(os.environ),
-        mock.patch.multiple(logger, handlers=[*logger.handlers], **of_logger),
-        mock.patch.object(Run, "run", lambda self: 0),
-        warnings.catch_warnings(),
-        contextlib.redirect_stdout(out),
-        contextlib.redirect_stderr(err),
-    ):
-        code = experiment.main(arguments)
+    of_logger["handlers"] = [*logger.handlers]
+    with mock.patch.dict(os.environ), mock.patch.multiple(logger, **of_logger):
+        with mock.patch.object(Run, "run", lambda self: 0), warnings.catch_warnings():
+            with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+                code = experiment.main(arguments)
     assert code in (0, 2), f"exit code {code}"
     if code == 2:
         assert "error: " in err.getvalue(), "exit code 2 without a message"
         raise UserError(err.getvalue())
-
-
-# ---- the table -----------------------------------------------------------------------------------
 
 
 def npy_files() -> list[bytes]:
@@ -604,8 +579,6 @@ def mutant(name: str, seed: int, index: int) -> bytes:
     target, rng = TARGETS[name], np.random.default_rng([seed, index, *name.encode()])
     return mutations.mutant(seeds(name), rng, target.mutators, target.packing)
 
-
-# ---- running them, each file with a limit of time and memory -------------------------------------
 
 SECONDS = 10.0
 """CPU time that one file may take; the slowest valid one takes a tenth of a second."""

@@ -9,15 +9,8 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 
-from tests.fuzz.scenes import (
-    disagreement,
-    disagreement_on,
-    draw,
-    extreme_scene,
-    fault,
-    fault_of,
-    well_posed,
-)
+from tests.fuzz import scenes
+from tests.fuzz.scenes import disagreement, draw, fault, well_posed
 from tests.fuzz.sequences import CloudSequence, run_sequences
 from tests.fuzz.targets import TARGETS, Target, outcome_of, outcomes, seeds
 from tests.stability.backends import BACKENDS, backends_of, cuda_on_the_host
@@ -70,7 +63,7 @@ def test_a_faulty_reader_is_detected(fault, reader, monkeypatch):
     assert outcome.kind == "failed" and outcome.detail.startswith(f"{fault}: ")
 
 
-scene = functools.cache(functools.partial(extreme_scene, most=MOST))
+scene = functools.cache(functools.partial(scenes.extreme_scene, most=MOST))
 
 
 @pytest.fixture
@@ -81,13 +74,13 @@ def stand_in_for_a_gpu(monkeypatch) -> None:
 
 @pytest.mark.parametrize("backend", backends_of())
 def test_nothing_that_is_drawn_is_nan(backend, stand_in_for_a_gpu):
-    faults = {seed: fault_of(scene(seed), backend) for seed in SCENES}
+    faults = {seed: scenes.fault_of(scene(seed), backend) for seed in SCENES}
     assert not any(faults.values()), faults
 
 
 def test_backends_agree_on_what_is_well_posed(stand_in_for_a_gpu):
     parts = {seed: well_posed(scene(seed)) for seed in SCENES}
-    faults = {seed: disagreement_on(part, BACKENDS) for seed, part in parts.items()}
+    faults = {seed: scenes.disagreement_on(part, BACKENDS) for seed, part in parts.items()}
     assert not any(faults.values()), faults
     assert sum(len(part.cloud.means) for part in parts.values()) > 500, "too little is well-posed"
 

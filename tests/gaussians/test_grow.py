@@ -26,7 +26,6 @@ def sphere(count=2000, seed=1):
 
 
 def grown(cloud, candidates, radius, seed=0, **options):
-    """Return the grown points alone."""
     found = grow(cloud, num_candidates=candidates, radius=radius, generator=rng(seed), **options)
     return found.split(len(cloud.points))[1]
 

@@ -97,9 +97,8 @@ def test_the_removal_error_is_that_of_leaving_each_gaussian_out():
     with torch.no_grad():
         without = [drawn(geometry, opacities * (torch.arange(12) != row)) for row in range(12)]
         exact = torch.stack([(image - images).square().sum() for image in without])
-    samples = torch.stack(
-        [importance.removal_error(images, opacities, generator(0, "r", i)) for i in range(3000)]
-    )
+    drawing = (generator(0, "r", i) for i in range(3000))
+    samples = torch.stack([importance.removal_error(images, opacities, rng) for rng in drawing])
     error = (samples.mean(0) - exact).abs() / (samples.std(0) / 3000**0.5 + 1e-12)
     assert exact.amin() > 1e-4 and error.amax() < 4  # standard errors
     assert (samples.mean(0) / exact - 1).abs().amax() < 0.15
@@ -129,11 +128,8 @@ def test_sampling_leaves_the_gradients_of_the_loss_alone(backend):
         geometry = cloud(12, budget=budget, densify={"enabled": True, "absgrad": True})
         geometry.sh0.data[0] = -0.5 / 0.28209479177387814  # black, as the background
         opacities = geometry.opacities()
-        shape, colors = (
-            (geometry.means, geometry.quats, geometry.scales()),
-            geometry.colors(c2w[:, :3, 3]),
-        )
-        inputs = *shape, opacities, colors, viewmats, Ks, 32, 32
+        shape = geometry.means, geometry.quats, geometry.scales()
+        inputs = *shape, opacities, geometry.colors(c2w[:, :3, 3]), viewmats, Ks, 32, 32
         out = rasterize(*inputs, absgrad=True, backend=backend)
         pictures = {"comp_rgb": out.image, "opacity": out.alpha, "rasterized": out}
         pictures |= {"comp_rgb_bg": torch.zeros(1, 1, 1, 3), "gaussian_opacities": opacities}

@@ -36,7 +36,6 @@ def copies(params, times):
 
 
 def repeated(times):
-    """Return the first Gaussian several times."""
     return {k: v[:1].repeat(times, *[1] * (v.dim() - 1)) for k, v in shell().items()}
 
 

@@ -6,10 +6,9 @@ import pytest
 import torch
 
 from tests.helpers.pruning import ball
-from threestudio_gaussiandreamer.core.errors import UserError
+from tests.helpers.refusals import refused
 from threestudio_gaussiandreamer.gaussians import recover
 from threestudio_gaussiandreamer.gaussians import simplify as simplifying
-from threestudio_gaussiandreamer.gaussians.recover import Recovery, Round
 from threestudio_gaussiandreamer.gaussians.simplify import (
     Budget,
     keep_best,
@@ -29,7 +28,7 @@ from threestudio_gaussiandreamer.metrics import psnr
 def recovery(cloud, size):
     """Recover with two steps on eight views, validated on eight others."""
     views = (views_around(cloud, 8, size, turn=turn) for turn in (0.0, 45.0))
-    return Recovery(cloud, *views, steps=2)
+    return recover.Recovery(cloud, *views, steps=2)
 
 
 def test_recovery_pays_and_grey_gaussians_are_not_lost_before_grey():
@@ -82,9 +81,8 @@ def test_any_quality_or_gain_ends_the_search():
         assert len(simplify(apart, Budget(psnr=least), recovery(apart, 48)).means) == count
     cloud = ball()
     budgets = (Budget(gain=5.0), Budget(gain=0.5), Budget(gain=0.01), Budget(gain=0.5, error=0.1))
-    most, some, least, rough = (
-        len(simplify(cloud, budget, recovery(cloud, 48)).means) for budget in budgets
-    )
+    found = (simplify(cloud, budget, recovery(cloud, 48)) for budget in budgets)
+    most, some, least, rough = (len(each.means) for each in found)
     assert 0 < most <= some <= least <= 600 and rough < some < 600
 
 
@@ -92,33 +90,21 @@ def test_any_quality_or_gain_ends_the_search():
 def test_a_gain_counts_the_error_of_the_input(before, after, met):
     """A fifth fewer, a third of a doubling, may lose a sixth of a dB of 40 dB to the truth."""
     some, fewer = (keep_best(ball(), torch.arange(600.0), count) for count in (500, 400))
-    assert Budget(gain=0.5).met_by(Round(fewer, after), Round(some, before)) == met
+    assert Budget(gain=0.5).met_by(recover.Round(fewer, after), recover.Round(some, before)) == met
 
 
-def test_a_large_cloud_loses_its_hidden_gaussians_without_a_recovery(monkeypatch):
+def test_a_large_cloud_loses_its_hidden_gaussians_without_a_recovery(monkeypatch, recorded):
     """Fewer are left before the first recovery and the first ranking."""
-    fitted, ranked, original = [], [], recover.recover
-
-    def counted(cloud, *rest):
-        fitted.append(len(cloud.means))
-        return original(cloud, *rest)
-
-    def rank(cloud, views, seed):
-        ranked.append(len(cloud.means))
-        return view_importance(cloud, views, seed)
-
-    monkeypatch.setattr(recover, "recover", counted)
     monkeypatch.setattr(simplifying, "LARGE", 450)
     monkeypatch.setattr(simplifying, "LOSSLESS", 30.0)
     cloud = ball()
-    monkeypatch.setattr(simplifying, "view_importance", rank)
+    calls = recorded(recover, "recover"), recorded(simplifying, "view_importance")
     found = simplify(cloud, Budget(count=200), recovery(cloud, 48))
+    fitted, ranked = ([len(args[0].means) for args, _ in each] for each in calls)
     assert len(found.means) == 200 and ranked and max(ranked) < len(cloud.means)
     assert fitted and max(fitted) < simplifying.KEEP * len(cloud.means)
-    monkeypatch.setattr(simplifying, "LARGE", 450)
     hidden = ball()._replace(logit_opacities=torch.full((600,), -20.0))
-    with pytest.raises(UserError, match="none of the 600 Gaussians"):
-        simplify(hidden, Budget(count=200), recovery(hidden, 48))
+    refused("none of the 600 Gaussians", simplify, hidden, Budget(count=200), recovery(hidden, 48))
 
 
 @pytest.mark.parametrize("needed", [1, 79, 81, 400, 600])

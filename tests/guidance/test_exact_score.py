@@ -6,36 +6,23 @@ import numpy as np
 import pytest
 import torch
 
-from tests.diffusion.test_exact_score import denoised
+from tests.diffusion.test_sds import denoised
 from tests.guidance.conftest import batch, guidance, step, uniform
-from threestudio_gaussiandreamer.core.errors import UserError
+from tests.helpers.refusals import refused
 from threestudio_gaussiandreamer.diffusion import exact_score as closed_form
 from threestudio_gaussiandreamer.diffusion import sds
 from threestudio_gaussiandreamer.guidance import exact_score
-from threestudio_gaussiandreamer.guidance.exact_score import (
-    Bank,
-    ExactScoreGuidance,
-    composite,
-    mixture_of,
-    scores,
-)
 from threestudio_gaussiandreamer.meshes.raycast import MeshCaster
 from threestudio_gaussiandreamer.splatting.cpu import backend as cpu
 
 pytest.importorskip("embreex")
 
-
 VIEWS = (0.0, 100.0, 180.0)
 BACKGROUNDS = torch.tensor([[0.0, 0, 0], [1, 1, 1], [0.3, 0.9, 0.1]])[:, None, None]
 
 
-def test_planned_pictures_are_cast_with_the_first_one_and_not_again(mesh_path, monkeypatch):
-    views, cast, render = batch(*VIEWS), [], MeshCaster.render_views
-    monkeypatch.setattr(
-        MeshCaster,
-        "render_views",
-        lambda self, c, *size, **o: cast.append(len(c)) or render(self, c, *size, **o),
-    )
+def test_planned_pictures_are_cast_with_the_first_one_and_not_again(mesh_path, recorded):
+    views, cast = batch(*VIEWS), recorded(MeshCaster, "render_views")
     # if the first would be gone when the last is there, none is cast ahead
     for most, expected in ((512, [3]), (2, [1, 2])):
         truth = guidance(mesh_path, max_cached_targets=most).truth
@@ -43,7 +30,7 @@ def test_planned_pictures_are_cast_with_the_first_one_and_not_again(mesh_path, m
         assert not cast
         truth.render({**views, "c2w": views["c2w"][:1], "fovy": views["fovy"][:1]})
         seen = truth.render(views)
-        assert cast == expected
+        assert [len(cameras) for (_, cameras, *_), _ in cast] == expected
         assert torch.equal(seen, guidance(mesh_path).truth.render(views))
         cast.clear()
 
@@ -79,7 +66,7 @@ def test_view_exact_is_a_weighted_squared_error(mesh_path, monkeypatch):
     assert none.abs().max() < 1e-5  # float32 rounding of z against noise of size 1
     # with the noise, which isn't drawn otherwise
     in_general(monkeypatch)
-    monkeypatch.setattr(ExactScoreGuidance, "known_residual", lambda *_: None)
+    monkeypatch.setattr(exact_score.ExactScoreGuidance, "known_residual", lambda *_: None)
     by_noise, expected = step(guidance(mesh_path), rgb, **views)
     torch.testing.assert_close(grad, expected, rtol=1e-4, atol=1e-5 * float(expected.abs().max()))
     assert torch.isclose(out["loss_sds"], by_noise["loss_sds"], rtol=1e-4)
@@ -87,15 +74,12 @@ def test_view_exact_is_a_weighted_squared_error(mesh_path, monkeypatch):
 
 
 def in_general(monkeypatch):
-    """Turn the pass over the pixels off."""
-    monkeypatch.setattr(ExactScoreGuidance, "_in_one_pass", lambda *_, **__: None)
+    monkeypatch.setattr(exact_score.ExactScoreGuidance, "_in_one_pass", lambda *_, **__: None)
 
 
 @pytest.mark.skipif(cpu.unavailable() is not None, reason=str(cpu.unavailable()))
 @pytest.mark.parametrize("width, weighting", [(16, "sds"), (19, "x0")])
-def test_one_pass_over_the_pixels_gives_the_bits_of_the_general_path(
-    mesh_path, monkeypatch, width, weighting
-):
+def test_one_pass_gives_the_bits_of_the_general_path(mesh_path, monkeypatch, width, weighting):
     options = {"weighting_strategy": weighting}
     rgb, views = uniform(3, 16, width, 3), batch(*VIEWS, width=width)
     views["comp_rgb_bg"] = BACKGROUNDS
@@ -115,8 +99,7 @@ def test_one_pass_over_the_pixels_gives_the_bits_of_the_general_path(
 def test_what_one_pass_cannot_compute_takes_the_general_path(mesh_path):
     rgb, views = uniform(3, 16, 16, 3), batch(*VIEWS)
     assert guidance(mesh_path, grad_clip=0.1)._in_one_pass(rgb, **views) is None
-    with pytest.raises(UserError, match="can't take rgb_as_latents"):
-        guidance(mesh_path)(rgb, **views, rgb_as_latents=True)
+    refused("can't take rgb_as_latents", guidance(mesh_path), rgb, **views, rgb_as_latents=True)
     rgb[1, 0, 0, 0] = torch.inf
     out, grad = step(guidance(mesh_path), rgb, **views)
     assert out["bad_items"] == 1 and grad.isfinite().all() and grad[0].abs().max() > 0
@@ -173,15 +156,13 @@ def test_the_cameras_own_view_is_one_of_the_modes(mesh_path, mode, modes):
 
 
 def test_sizes_that_do_not_fit_are_named(mesh_path):
-    with pytest.raises(UserError, match="pictures of 64x64 can't be pooled to a latent 33 high"):
-        ExactScoreGuidance(
-            {"mesh": "no.glb", "space": "latent", "latent_size": 33, "image_size": 64}
-        )
+    odd = {"mesh": "no.glb", "space": "latent", "latent_size": 33, "image_size": 64}
+    said = "pictures of 64x64 can't be pooled to a latent 33 high"
+    refused(said, exact_score.ExactScoreGuidance, odd)
     latent = guidance(mesh_path, space="latent", latent_size=5)
     large = guidance(mesh_path, mode="view-agnostic", bank_views=2000)
     for exact, size, said in ((latent, 16, "latent_size"), (large, 512, "GiB")):
-        with pytest.raises(UserError, match=said):
-            step(exact, uniform(1, size, size, 3), **batch(0.0))
+        refused(said, step, exact, uniform(1, size, size, 3), **batch(0.0))
 
 
 def test_a_view_without_its_direction_in_the_bank_and_the_count_of_evaluations(mesh_path):
@@ -204,9 +185,7 @@ def test_a_view_without_its_direction_in_the_bank_and_the_count_of_evaluations(m
     assert guide.evaluations == 8
 
 
-MEMBERS = torch.tensor(
-    [[True, True, False, True, False, True, True], [False] * 6 + [True], [True] * 7]
-)
+MEMBERS = torch.tensor([[1, 1, 0, 1, 0, 1, 1], [0, 0, 0, 0, 0, 0, 1], [1] * 7]).bool()
 """Of each item, in the bank."""
 ABAR = sds.sd_alphas_cumprod()[torch.tensor([20, 300, 900])]
 
@@ -216,36 +195,34 @@ def bank(request):
     rgba = (255 * uniform(7, 8, 8, 4, seed=0)).byte()
     pixels = rgba.movedim(-1, 1) / 255
     if request.param == "pixel":
-        return Bank.of(rgba, pixels, closed_form.LinearLatent())
+        return exact_score.Bank.of(rgba, pixels, closed_form.LinearLatent())
     pooled = torch.nn.functional.avg_pool2d(pixels, 2)
     latent = closed_form.LinearLatent(2, closed_form.COLOR_MATRIX)
-    return Bank.of(rgba, pooled, latent.normalised(pooled[:, :3]))
+    return exact_score.Bank.of(rgba, pooled, latent.normalised(pooled[:, :3]))
 
 
 def predicted(mixtures, z, abar, conditional):
-    eps, perplexity, unconditional = scores(z.flatten(1), abar, mixtures)
+    eps, perplexity, unconditional = exact_score.scores(z.flatten(1), abar, mixtures)
     return (eps, perplexity) if conditional else (unconditional(), None)
 
 
 @pytest.mark.parametrize("guided", [False, True])
-@pytest.mark.parametrize("size, pictures_at_a_time", [(1, 100), (1, 3), (8, 1)])
-def test_scores_are_those_of_pictures_composited_on_the_background_of_each_item(
-    bank, monkeypatch, size, guided, pictures_at_a_time
-):
+@pytest.mark.parametrize("size, at_a_time", [(1, 100), (1, 3), (8, 1)])
+def test_scores_are_those_of_composited_pictures(bank, monkeypatch, size, guided, at_a_time):
     elements = bank.pictures.layers[0].numel()
-    monkeypatch.setattr(closed_form, "CPU_CHUNK_ELEMENTS", pictures_at_a_time * elements)
+    monkeypatch.setattr(closed_form, "CPU_CHUNK_ELEMENTS", at_a_time * elements)
     backgrounds = uniform(len(MEMBERS), size, size, 3, seed=1)
-    z = bank.latent.encode(composite(bank.rgba[: len(MEMBERS)], backgrounds)) + 0.1
+    z = bank.latent.encode(exact_score.composite(bank.rgba[: len(MEMBERS)], backgrounds)) + 0.1
     own = z.flip(0)
     items = zip(own, MEMBERS, backgrounds, strict=True)
-    mixtures = [mixture_of(*item, bank, guided) for item in items]
+    mixtures = [exact_score.mixture_of(*item, bank, guided) for item in items]
     of_a_color = size == 1  # whose items have the same pictures
     for conditional in (True, False) if guided else (True,):
         together = predicted(mixtures, z, ABAR, conditional) if of_a_color else None
         for i in range(len(MEMBERS)):
             item = slice(i, i + 1)
             pictures = bank.rgba[MEMBERS[i]] if conditional else bank.rgba
-            modes = bank.latent.encode(composite(pictures, backgrounds[item]))
+            modes = bank.latent.encode(exact_score.composite(pictures, backgrounds[item]))
             modes = torch.cat([own[item], modes])
             alone = predicted(mixtures[item], z[item], ABAR[item], conditional)
             expected = denoised(z[item].flatten(1).double(), ABAR[item], modes.flatten(1).double())

@@ -5,13 +5,7 @@ import torch
 from torch import nn
 
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.guidance.external import (
-    call_guidance,
-    learnt_weights,
-    own_randomness,
-    restore_learnt,
-    trainable_groups,
-)
+from threestudio_gaussiandreamer.guidance import external
 from threestudio_gaussiandreamer.host import BaseModule, register
 
 
@@ -85,7 +79,7 @@ def test_each_signature_gets_what_it_takes():
     options = {"rgb_as_latents": False, "comp_rgb_bg": torch.zeros(2, 1, 1, 3)}
 
     def called(double):
-        return call_guidance(double, rgb, "prompts", batch(), **options)
+        return external.call_guidance(double, rgb, "prompts", batch(), **options)
 
     others = {"height", "width", "c2w", "mvp_mtx", "comp_rgb_bg", "prompt_utils"}
     assert set(called(ImageDouble())["kwargs"]) == others
@@ -110,30 +104,30 @@ def test_each_signature_gets_what_it_takes():
 def test_content_that_no_run_can_use_is_named(returned, message):
     inputs = part(lambda rgb: returned), torch.zeros(1, 2, 2, 3), None, {}
     if message is None:  # a loss that is off may be a plain number
-        out = call_guidance(*inputs)
+        out = external.call_guidance(*inputs)
         assert torch.stack([out["loss_sds"], out["loss_off"]]).tolist() == [1, 0]
         return
     with pytest.raises(UserError, match=f"Double {message}"):
-        call_guidance(*inputs)
+        external.call_guidance(*inputs)
 
 
 def test_what_a_guidance_learnt_is_put_back_and_its_draws_are_functions_of_the_step():
     guidance, other = LearningDouble(), LearningDouble()
-    assert trainable_groups(ImageDouble(), 1e-3) == []
-    (group,) = trainable_groups(guidance, 1e-3)
+    assert external.trainable_groups(ImageDouble(), 1e-3) == []
+    (group,) = external.trainable_groups(guidance, 1e-3)
     assert (group["name"], group["lr"]) == ("guidance", 1e-3)
     assert [id(parameter) for parameter in group["params"]] == [id(guidance.lora.weight)]
-    weights = learnt_weights(guidance)
+    weights = external.learnt_weights(guidance)
     assert list(weights) == ["lora.weight"] and not weights["lora.weight"].requires_grad
-    restore_learnt(other, weights)
+    external.restore_learnt(other, weights)
     assert torch.equal(other.lora.weight, guidance.lora.weight) and other.lora.weight.requires_grad
-    assert learnt_weights(ImageDouble()) == {}
-    restore_learnt(ImageDouble(), {})
+    assert external.learnt_weights(ImageDouble()) == {}
+    external.restore_learnt(ImageDouble(), {})
     with pytest.raises(UserError, match="had learnt 1 tensors, and ImageDouble learns 0"):
-        restore_learnt(ImageDouble(), weights)
+        external.restore_learnt(ImageDouble(), weights)
 
     def draw(step):
-        with own_randomness(step):
+        with external.own_randomness(step):
             return torch.rand(3)
 
     torch.manual_seed(5)

@@ -2,23 +2,21 @@
 
 import json
 import math
+import shutil
+from pathlib import Path
+from pkgutil import iter_modules
 
 import pytest
 import torch
 import torch.nn.functional as F
 
+from tests.guidance import test_mvdream
 from tests.helpers import tiny_guidance as tiny
 from tests.helpers import tiny_large_guidance as large_tiny
 from tests.helpers import tiny_models
-from tests.helpers.tiny_guidance import BATCH, Recorder, in_double, relative, renders
+from tests.helpers.refusals import refused
 from tests.helpers.tiny_large_guidance import gradient, guidance
-from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.guidance import base, text_to_image
-from threestudio_gaussiandreamer.guidance.base import NonFiniteScore
-from threestudio_gaussiandreamer.guidance.stable_diffusion import (
-    StableDiffusionGuidance,
-    with_loss_scales,
-)
+from threestudio_gaussiandreamer.guidance import base, stable_diffusion, text_to_image, variants
 from threestudio_gaussiandreamer.guidance.text_to_image import weights_type
 from threestudio_gaussiandreamer.models.text_encoders import unpack
 
@@ -38,15 +36,15 @@ def reference_gradient(kind, model, prompt_utils, rgb, *, prediction="epsilon", 
     """Compute the gradient in float64, of Stable Diffusion 3 that of RFDS: v_hat - (eps - x)."""
     from diffusers import AutoencoderKL, DDPMScheduler, SD3Transformer2DModel, UNet2DConditionModel
 
-    text = prompt_utils.get_text_embeddings(**BATCH).double()
+    text = prompt_utils.get_text_embeddings(**tiny.BATCH).double()
     if kind == SD3:
-        transformer = in_double(SD3Transformer2DModel, model, "transformer")
+        transformer = tiny.in_double(SD3Transformer2DModel, model, "transformer")
         options |= {"last": 700, "velocity": True}
     else:
-        unet = in_double(UNet2DConditionModel, model, "unet")
+        unet = tiny.in_double(UNet2DConditionModel, model, "unet")
         betas = DDPMScheduler.from_pretrained(model, subfolder="scheduler").betas.double()
         diffusion = tiny.diffusion_path(torch.cumprod(1 - betas, 0))
-    vae = None if kind == IF else in_double(AutoencoderKL, model, "vae")
+    vae = None if kind == IF else tiny.in_double(AutoencoderKL, model, "vae")
 
     def path(t):
         return (1 - sigma_of(t), sigma_of(t)) if kind == SD3 else diffusion(t)
@@ -54,9 +52,8 @@ def reference_gradient(kind, model, prompt_utils, rgb, *, prediction="epsilon", 
     def network(z, t, row):
         if kind == SD3:
             tokens, pooled = unpack(text[row], 2 * POOLED)
-            return transformer(
-                z, tokens, pooled, torch.tensor([1000 * sigma_of(t)]).double()
-            ).sample
+            time = torch.tensor([1000 * sigma_of(t)]).double()
+            return transformer(z, tokens, pooled, time).sample
         tokens, more = text[row], {}
         if kind == XL:
             tokens, pooled = unpack(tokens, POOLED)
@@ -86,7 +83,7 @@ def reference_gradient(kind, model, prompt_utils, rgb, *, prediction="epsilon", 
     ],
 )
 def test_the_gradient_is_that_of_a_float64_reference(large, models, kind, size, options, step):
-    (model, prompts), prediction, rgb = large(SD), "epsilon", renders(size=size)
+    (model, prompts), prediction, rgb = large(SD), "epsilon", tiny.renders(size=size)
     if kind == "v_prediction":
         model, kind, prediction = models[kind], SD, kind
     elif kind != SD:
@@ -98,7 +95,7 @@ def test_the_gradient_is_that_of_a_float64_reference(large, models, kind, size, 
     scale = options["guidance_scale"]
     expected = reference_gradient(kind, model, prompts, rgb, scale=scale, **more)
     # guidance 100 magnifies the rounding of float32 (6e-8) a hundredfold; measured 1e-6 to 3e-6
-    assert relative(mine, expected) < 1e-5
+    assert tiny.relative(mine, expected) < 1e-5
 
 
 @pytest.fixture
@@ -111,7 +108,7 @@ def half(monkeypatch):
 def test_half_precision_on_a_cpu_is_bfloat16_where_it_is_native(monkeypatch, native):
     monkeypatch.setattr(text_to_image, "cpu_multiplies_bfloat16", lambda: native)
     cpu, gpu = torch.device("cpu"), torch.device("cuda")
-    cfg = StableDiffusionGuidance.Config()
+    cfg = stable_diffusion.StableDiffusionGuidance.Config()
     assert (weights_type(cfg, gpu), weights_type(cfg, cpu)) == (torch.float16, torch.float32)
     cfg.half_precision_on_cpu = True
     assert weights_type(cfg, cpu) == (torch.bfloat16 if native else torch.float32)
@@ -125,16 +122,16 @@ def test_the_gradient_in_bfloat16_on_a_cpu(large, monkeypatch):
     guide = guidance(SD, model, guidance_scale=4.0, enable_channels_last_format=True, **options)
     assert guide.unet.dtype == guide.vae.dtype == torch.bfloat16
     assert guide.vae.encoder.conv_in.weight.is_contiguous()
-    mine, _ = gradient(guide, prompts, rgb := renders())
+    mine, _ = gradient(guide, prompts, rgb := tiny.renders())
     expected = reference_gradient(SD, model, prompts, rgb, scale=4.0)
     assert mine.dtype == torch.float32
-    assert 0 < relative(mine, expected) < 0.1  # bfloat16 rounds to 4e-3
+    assert 0 < tiny.relative(mine, expected) < 0.1  # bfloat16 rounds to 4e-3
 
 
 def test_half_precision_stays_inside_the_networks(large, half):
     model, prompts = large(SD)
-    guide, rgb = guidance(SD, model), renders()
-    guide.unet = recorder = Recorder(guide.unet)
+    guide, rgb = guidance(SD, model), tiny.renders()
+    guide.unet = recorder = tiny.Recorder(guide.unet)
     networks = (guide.unet, guide.vae)
     assert {p.dtype for network in networks for p in network.parameters()} == {torch.float16}
     latents = guide.encode(rgb.movedim(-1, 1))
@@ -147,10 +144,10 @@ def test_half_precision_stays_inside_the_networks(large, half):
     assert torch.equal(mine, torch.autograd.grad(loss, rgb)[0])
     expected = reference_gradient(SD, model, prompts, rgb, scale=100.0)
     # float16 rounds to 5e-4, which guidance 100 magnifies: the right gradient, not an exact one
-    assert relative(mine, expected) < 0.1
+    assert tiny.relative(mine, expected) < 0.1
     assert (mine != 0).float().mean() > 0.99
     for loss_scale in (2.0**-30, 2.0**40):
-        loss = guide(rgb, prompts, **BATCH)["loss_sds"] * loss_scale
+        loss = guide(rgb, prompts, **tiny.BATCH)["loss_sds"] * loss_scale
         assert torch.equal(torch.autograd.grad(loss, rgb)[0] / loss_scale, mine)
 
 
@@ -164,7 +161,7 @@ def test_the_loss_scale_of_each_item_is_undone():
         return inner * 1.0
 
     weights = torch.tensor([[1e-12], [0.0], [3e12]])
-    (with_loss_scales(network, x, results.append) * weights).sum().backward()
+    (stable_diffusion.with_loss_scales(network, x, results.append) * weights).sum().backward()
     torch.testing.assert_close(x.grad, weights.expand(3, 5), rtol=0, atol=0)
     peaks = seen[0].abs().amax(1)
     assert (peaks[[0, 2]] >= 64).all() and (peaks[[0, 2]] < 128).all() and peaks[1] == 0
@@ -174,7 +171,7 @@ def test_the_loss_scale_of_each_item_is_undone():
 def test_a_gradient_that_overflows_in_the_encoder_is_left_out_and_counted(large, half, monkeypatch):
     monkeypatch.setattr(base, "MAX_BAD_STEPS", 3)
     model, prompts = large(SD)
-    guide, rgb = guidance(SD, model), renders()
+    guide, rgb = guidance(SD, model), tiny.renders()
     clean, _ = gradient(guide, prompts, rgb)
     encode = guide.vae.encode
 
@@ -186,7 +183,7 @@ def test_a_gradient_that_overflows_in_the_encoder_is_left_out_and_counted(large,
     corrupted, _ = gradient(guide, prompts, rgb)
     assert not corrupted[1].any() and guide.bad_items == 1
     assert torch.equal(corrupted[[0, 2, 3]], clean[[0, 2, 3]])
-    with pytest.raises(NonFiniteScore, match="VAE.*half_precision_weights=false"):
+    with pytest.raises(base.NonFiniteScore, match="VAE.*half_precision_weights=false"):
         for _ in range(2):
             gradient(guide, prompts, rgb)
 
@@ -194,31 +191,29 @@ def test_a_gradient_that_overflows_in_the_encoder_is_left_out_and_counted(large,
 @pytest.mark.parametrize(
     "half_type, force_upcast", [("float16", True), ("float16", False), ("bfloat16", True)]
 )
-def test_a_vae_that_overflows_stays_in_float32(
-    large, tmp_path, monkeypatch, half_type, force_upcast
-):
+def test_a_vae_that_overflows_is_float32(large, tmp_path, monkeypatch, half_type, force_upcast):
     folder = tiny_models.stable_diffusion_xl(tmp_path / "xl", force_upcast=force_upcast)
     dtype, prompts = getattr(torch, half_type), large(XL)[1]
     monkeypatch.setattr(text_to_image, "weights_type", lambda *options: dtype)
-    guide, rgb = guidance(XL, folder, half_precision_type=half_type), renders()
+    guide, rgb = guidance(XL, folder, half_precision_type=half_type), tiny.renders()
     stays = force_upcast and dtype == torch.float16
     assert (guide.unet.dtype, guide.vae.dtype) == (dtype, torch.float32 if stays else dtype)
     mine, _ = gradient(guide, prompts, rgb)
     # bfloat16 rounds to 4e-3, which guidance 100 magnifies
-    assert relative(mine, reference_gradient(XL, folder, prompts, rgb, scale=100.0)) < 0.5
+    assert tiny.relative(mine, reference_gradient(XL, folder, prompts, rgb, scale=100.0)) < 0.5
 
 
 def test_what_the_unets_of_xl_and_if_get_and_give(large):
     model, prompts = large(XL)
     guide = guidance(XL, model, image_size=128)
-    guide.unet = recorder = Recorder(guide.unet)
-    gradient(guide, prompts, renders())
+    guide.unet = recorder = tiny.Recorder(guide.unet)
+    gradient(guide, prompts, tiny.renders())
     ((_, options),) = recorder.calls
     added = options["added_cond_kwargs"]
     assert added["time_ids"].tolist() == [[128, 128, 0, 0, 128, 128]] * 8
     assert torch.equal(added["text_embeds"][4:], prompts.uncond_text_embeddings_vd[:4, -1, :POOLED])
     model, _ = large(IF)
-    guide, rgb = guidance(IF, model), renders(size=16)
+    guide, rgb = guidance(IF, model), tiny.renders(size=16)
     prompts = large_tiny.prompts(IF, model, use_perp_neg=True)
     before, _ = gradient(guide, prompts, rgb)
     with torch.no_grad():
@@ -247,7 +242,7 @@ def test_the_gradient_of_a_flow_towards_one_known_latent_is_the_closed_form(larg
     mine, _ = gradient(guide, prompts, latents, rgb_as_latents=True)
     sigma = sigma_of(guide.draw_timesteps(latents)[0].double(), shift or 3.0)
     expected = (latents.detach().double() - target.movedim(1, -1)) / sigma[:, None, None, None] / 4
-    assert relative(mine, expected) < 1e-5
+    assert tiny.relative(mine, expected) < 1e-5
 
 
 @pytest.mark.parametrize(
@@ -266,25 +261,97 @@ def test_the_size_is_the_models_unless_given(large, caplog, kind, trained, other
     guide = guidance(kind, model, image_size=other)
     assert guide.image_size == other
     assert f"was trained on images of {trained} x {trained}" in caplog.text
-    mine, _ = gradient(guide, prompts, renders(size=32))
+    mine, _ = gradient(guide, prompts, tiny.renders(size=32))
     assert (mine != 0).all(), "a pixel that the model doesn't see is never trained"
-    with pytest.raises(UserError, match=f"image_size: {said}"):
-        guidance(kind, model, image_size=wrong)
+    refused(f"image_size: {said}", guidance, kind, model, image_size=wrong)
 
 
 def test_other_models_and_shifts_that_depend_on_the_picture_are_refused(tmp_path, large):
     folder = tiny_models.stable_diffusion_3(tmp_path / "dynamic")
     file = folder / "scheduler" / "scheduler_config.json"
     file.write_text(json.dumps(json.loads(file.read_text()) | {"use_dynamic_shifting": True}))
-    with pytest.raises(UserError, match="set system.guidance.flow_shift"):
-        guidance(SD3, folder)
+    refused("set system.guidance.flow_shift", guidance, SD3, folder)
     assert guidance(SD3, folder, flow_shift=3.0).image_size == 64
     (model, prompts), (other, _) = large(XL), large(SD)
     said = "isn't Stable Diffusion XL, but Stable Diffusion 1.x.*--config gaussiandreamer.yaml"
     for build in (guidance, large_tiny.prompts):
-        with pytest.raises(UserError, match=said):
-            build(XL, other)
-    with pytest.raises(UserError, match="isn't Stable Diffusion 1.x.*gaussiandreamer-sdxl.yaml"):
-        guidance(SD, model)
-    with pytest.raises(UserError, match="64 channels.*takes 32"):
-        gradient(guidance(SD, other), prompts, renders())
+        refused(said, build, XL, other)
+    refused("isn't Stable Diffusion 1.x.*gaussiandreamer-sdxl.yaml", guidance, SD, model)
+    refused("64 channels.*takes 32", gradient, guidance(SD, other), prompts, tiny.renders())
+
+
+DTYPES = {"fp16": torch.float16, "bf16": torch.bfloat16}
+NO_LORA = {SD3: "is a transformer", "mvdream": "predicts several together"}
+VARIANTS = [module.name for module in iter_modules(variants.__path__) if module.name != "base"]
+
+
+def ring():
+    """Return four views around the object, and what the renderer gives of them."""
+    depth, opacity = torch.full((4, 16, 16, 1), 2.0), torch.ones(4, 16, 16, 1)
+    return test_mvdream.ring() | {"depth": depth, "opacity": opacity, "fovy": torch.ones(4)}
+
+
+@pytest.mark.parametrize(
+    "kind, variant",
+    [*((SD, variant) for variant in VARIANTS), (XL, "sdi"), (SD3, "cfd"), ("mvdream", "nfsd")],
+)
+def test_variants_give_a_gradient(large, prompts, kind, variant):
+    folder, prompt_utils = large(kind)
+    prompt_utils = prompts[True] if kind == SD else prompt_utils
+    guide = guidance(kind, folder, guidance_scale=7.5, variant_type=f"{variant}-variant")
+    plain = guidance(kind, folder, guidance_scale=7.5)
+    plain, _ = gradient(plain, prompt_utils, tiny.renders(), **ring())
+    grad, out = gradient(guide, prompt_utils, tiny.renders(), **ring())
+    assert grad.isfinite().all() and (grad != 0).float().mean() > 0.9 and out["bad_items"] == 0
+    assert torch.allclose(grad, plain) == (variant == "sds") and out["evaluations"] >= 8
+
+
+def test_several_views_together_have_an_empty_prompt_with_their_cameras(large):
+    folder, prompt_utils = large("mvdream")
+    guide = guidance("mvdream", folder, variant_type="nfsd-variant")
+    condition = guide.condition(prompt_utils, **ring())
+    negative = condition.embeddings[4:]
+    assert condition.empty.shape == negative.shape and not torch.equal(condition.empty, negative)
+    z, t = torch.randn(4, 4, 8, 8), torch.full((4,), 600)
+    empty = guide.empty_prompt(z, t, condition)
+    assert not torch.allclose(empty, guide.unconditional(z, t, condition))
+    rows = torch.tensor([2, 0])
+    assert torch.equal(condition.select(rows).empty, condition.empty[rows])
+
+
+@pytest.mark.parametrize("kind", [XL, *NO_LORA])
+def test_a_lora_is_trained_in_unets_of_single_views(large, kind):
+    folder, prompt_utils = large(kind)
+    options = {"pretrained_model_name_or_path": str(folder), "variant_type": "vsd-variant"}
+    if kind in NO_LORA:
+        part = type(guidance(kind, folder))
+        refused(f"vsd-variant trains a LoRA .*{NO_LORA[kind]}", part.preflight, options)
+    else:
+        guide = guidance(kind, folder, variant_type="vsd-variant")
+        for option in ("enable_torch_compile", "enable_sequential_cpu_offload"):
+            said = f"system.guidance.{option}: vsd-variant trains"
+            refused(said, guide.preflight, options | {option: True})
+        grad, out = gradient(guide, prompt_utils, tiny.renders(), **ring())
+        assert grad.isfinite().all() and grad.any() and out["bad_items"] == 0
+
+
+@pytest.mark.parametrize(
+    "kind, variant, named", [(XL, "fp16", True), (SD3, "bf16", True), ("mvdream", "fp16", False)]
+)
+def test_models_published_in_half_precision_only(large, kind, variant, named, tmp_path):
+    """With the precision in the files' names, or without."""
+    from safetensors.torch import load_file, save_file
+
+    folder, prompts = large(kind)
+    copy = Path(shutil.copytree(folder, tmp_path / "model"))
+    for path in copy.rglob("*.safetensors"):
+        tensors = load_file(path)
+        for name, value in tensors.items():
+            tensors[name] = value.to(DTYPES[variant]) if value.is_floating_point() else value
+        path.unlink()
+        new = path.with_name(f"{path.stem}.{variant}.safetensors") if named else path
+        save_file(tensors, new, metadata={"format": "pt"})
+    guides = (guidance(kind, model) for model in (folder, copy))
+    full, half = (gradient(guide, prompts, tiny.renders(), **ring())[0] for guide in guides)
+    # bfloat16 rounds to 4e-3, which guidance 100 magnifies
+    assert 0 < tiny.relative(half, full.double()) < (0.1 if variant == "fp16" else 0.5)

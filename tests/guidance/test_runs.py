@@ -11,9 +11,8 @@ from tests.helpers import tiny_models
 from threestudio_gaussiandreamer import register_parts
 from threestudio_gaussiandreamer.guidance.mock import prompt_color
 from threestudio_gaussiandreamer.host import BaseObject, register
+from threestudio_gaussiandreamer.launch import config_check, experiment
 from threestudio_gaussiandreamer.launch.config import load_config
-from threestudio_gaussiandreamer.launch.config_check import check_config
-from threestudio_gaussiandreamer.launch.experiment import main
 from threestudio_gaussiandreamer.launch.options import find_config
 
 register_parts()
@@ -83,7 +82,7 @@ def diffusion(model):
 
 def run(path, folder, *options):
     arguments = ["--config", str(path), "--train", "--gpu", "cpu", f"exp_root_dir={folder}"]
-    return main([*arguments, *options])
+    return experiment.main([*arguments, *options])
 
 
 def checkpoint(folder):
@@ -161,7 +160,7 @@ def test_a_guidance_by_name_gets_the_full_batch_and_all_its_losses_count(tmp_pat
 def test_the_mock_guidance_takes_the_place_of_stable_diffusion():
     overrides = ["system.guidance_type=mock-guidance", "system.prompt_processor.prompt=a fox"]
     cfg = load_config(find_config("gaussiandreamer.yaml"), cli_args=overrides)
-    check_config(cfg)
+    config_check.check_config(cfg)
     assert cfg.system.guidance.guidance_scale > 1
     assert "view_dependent_prompting" not in cfg.system.guidance
     assert prompt_color("a fox") != prompt_color("a ball")

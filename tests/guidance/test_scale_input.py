@@ -8,7 +8,6 @@ import torch
 from tests.helpers import tiny_guidance as tiny
 from tests.helpers import tiny_models
 from threestudio_gaussiandreamer.guidance import text_to_image
-from threestudio_gaussiandreamer.guidance.text_to_image import TextToImageDistillation
 from threestudio_gaussiandreamer.prompts import prompt_processors  # noqa: F401
 
 diffusers = pytest.importorskip("diffusers")
@@ -28,7 +27,7 @@ def models(tmp_path_factory):
 
 def scale_input(scale, width, count):
     part = SimpleNamespace(scale_width=width, device=torch.device("cpu"), dtype=torch.float32)
-    return TextToImageDistillation.scale_input(part, scale, count)
+    return text_to_image.TextToImageDistillation.scale_input(part, scale, count)
 
 
 @pytest.fixture(scope="module")
@@ -83,9 +82,7 @@ def test_one_evaluation_per_view_with_the_published_embedding(models, prompts, c
         (False, {"variant_type": "csd-variant"}, 8),
     ],
 )
-def test_what_needs_other_predictions_gets_them_without_guidance(
-    models, prompts, perp_neg, options, rows
-):
+def test_other_predictions_are_without_guidance(models, prompts, perp_neg, options, rows):
     _, calls = recorded(models, prompts[perp_neg], guidance_scale=4.0, **options)
     assert sum(len(args[0]) for args, _ in calls) == rows
     for args, inputs in calls:

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from tests.guidance.conftest import step, uniform
+from tests.helpers.refusals import refused
 from threestudio_gaussiandreamer.core import streams
-from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.diffusion import sds
 from threestudio_gaussiandreamer.guidance.base import ScoreDistillation
 
@@ -80,8 +80,7 @@ def test_bad_items_of_the_encoder_are_masked_and_the_others_keep_their_gradient(
 )
 def test_what_predict_returns_is_checked(monkeypatch, returned, message):
     monkeypatch.setattr(Stub, "predict", lambda self, z, t, condition: returned(z))
-    with pytest.raises(UserError, match=f"Stub.predict {message}"):
-        step(Stub({"guidance_scale": 7.5}), uniform(4, 6, 5, 3))
+    refused(f"Stub.predict {message}", step, Stub({"guidance_scale": 7.5}), uniform(4, 6, 5, 3))
 
 
 def test_a_scale_without_an_unconditional_prediction_is_reported_once(caplog):

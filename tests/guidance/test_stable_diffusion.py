@@ -8,11 +8,10 @@ import torch.nn.functional as F
 
 from tests.helpers import tiny_guidance as tiny
 from tests.helpers import tiny_models
+from tests.helpers.refusals import refused
 from tests.helpers.tiny_guidance import Recorder, gradient, guidance, relative, renders
-from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.diffusion.sds import perp_neg
-from threestudio_gaussiandreamer.guidance.text_to_image import resized
-from threestudio_gaussiandreamer.guidance.types import view_of_row
+from threestudio_gaussiandreamer.guidance import mvdream, text_to_image, types
 
 pytest.importorskip("diffusers")
 
@@ -49,8 +48,8 @@ def test_perp_neg_is_that_of_each_view_and_takes_away_what_is_perpendicular(mode
         alone = guide.predict_noise(z[i : i + 1], t[i : i + 1], condition)
         # another batch size rounds differently, and guidance 100 magnifies that
         assert tiny.relative(together[i : i + 1], alone.double()) < 1e-5
-    assert view_of_row(3, 12).tolist() == [0, 1, 2, 0, 1, 2, 0, 0, 1, 1, 2, 2]
-    assert view_of_row(3, 6).tolist() == [0, 1, 2, 0, 1, 2]
+    assert types.view_of_row(3, 12).tolist() == [0, 1, 2, 0, 1, 2, 0, 0, 1, 1, 2, 2]
+    assert types.view_of_row(3, 6).tolist() == [0, 1, 2, 0, 1, 2]
     draw = torch.Generator().manual_seed(0)
     cond, uncond = torch.randn(2, 1, 4, 4, 4, generator=draw).double()
     direction = cond - uncond
@@ -79,24 +78,20 @@ def test_the_models_own_schedule_is_used_and_other_models_are_refused(models, tm
     from diffusers import FlowMatchEulerDiscreteScheduler, UNet2DConditionModel
 
     folder = tiny_models.stable_diffusion(tmp_path / "other", prediction="flow_prediction")
-    with pytest.raises(UserError, match="prediction_type.*did you mean 'v_prediction'"):
-        guidance({"epsilon": folder})
+    refused("prediction_type.*did you mean 'v_prediction'", guidance, {"epsilon": folder})
     FlowMatchEulerDiscreteScheduler().save_pretrained(folder / "scheduler")
-    with pytest.raises(UserError, match="no beta_schedule"):
-        guidance({"epsilon": folder})
+    refused("no beta_schedule", guidance, {"epsilon": folder})
     folder = tiny_models.stable_diffusion(tmp_path / "model")
     config = UNet2DConditionModel.load_config(folder / "unet")
     for trained in (None, [8, 8]):
         text = json.dumps(dict(config) | {"sample_size": trained})
         (folder / "unet" / "config.json").write_text(text)
-        with pytest.raises(UserError, match="set system.guidance.image_size"):
-            guidance({"epsilon": folder})
+        refused("set system.guidance.image_size", guidance, {"epsilon": folder})
     assert guidance({"epsilon": folder}, image_size=64).image_size == 64
     for other in ({"in_channels": 9}, {"class_embed_type": "timestep"}):
         UNet2DConditionModel.from_config(config | other).save_pretrained(folder / "unet")
         said = "needs other inputs than text .*" + " ".join(map(str, *other.items()))
-        with pytest.raises(UserError, match=said):
-            guidance({"epsilon": folder})
+        refused(said, guidance, {"epsilon": folder})
 
 
 @pytest.mark.parametrize(
@@ -118,18 +113,15 @@ def test_slicing_keeps_the_activations_of_one_image(models):
         kept.clear()
         guide = guidance(models, enable_vae_slicing=slicing)
         guide.vae.encoder = recorder = Recorder(guide.vae.encoder)
-        with torch.autograd.graph.saved_tensors_hooks(
-            lambda tensor: kept.append(tensor.numel()) or tensor, lambda tensor: tensor
-        ):
+        hooks = lambda tensor: kept.append(tensor.numel()) or tensor, lambda tensor: tensor
+        with torch.autograd.graph.saved_tensors_hooks(*hooks):
             guide.encode(renders().movedim(-1, 1))
         assert [len(args[0]) for args, _ in recorder.calls] == passes
         sizes[slicing] = sum(kept)
     assert sizes[True] < sizes[False] / 20
 
 
-def test_an_unusual_guidance_scale_is_told_and_compiling_asked_for_once(
-    models, caplog, monkeypatch
-):
+def test_an_unusual_scale_is_told_and_compiling_asked_for_once(models, caplog, monkeypatch):
     asked = []
     monkeypatch.setattr(torch, "compile", lambda network: asked.append(network) or network)
     for scale, warned in ((-5, True), (101, False), (1e6, True)):
@@ -142,7 +134,47 @@ def test_an_unusual_guidance_scale_is_told_and_compiling_asked_for_once(
 
 def test_halving_is_the_mean_of_four_pixels_and_more_loses_none():
     images = torch.rand(2, 3, 128, 128)
-    torch.testing.assert_close(resized(images, 64), F.avg_pool2d(images, 2))
+    torch.testing.assert_close(text_to_image.resized(images, 64), F.avg_pool2d(images, 2))
     images = torch.rand(1, 3, 256, 256, requires_grad=True)
-    (grad,) = torch.autograd.grad(resized(images, 16).sum(), images)
+    (grad,) = torch.autograd.grad(text_to_image.resized(images, 16).sum(), images)
     assert (grad > 0).all()
+
+
+CONTRAST = 0.75
+BATCH = tiny.BATCH | {"elevation": torch.tensor([0.0, 10.0, 20.0, -5.0])}
+"""Front, left, back and right."""
+TURNED = BATCH | {"azimuth": BATCH["azimuth"] + 180}
+
+
+def test_the_conditional_prediction_moves_away_from_the_opposite_views(models):
+    """Of timesteps 40, 400, 700 and 950 of 1000 at those from 400 on."""
+    views = tiny.left_and_right(models)
+    z = torch.randn(4, 4, 8, 8, generator=torch.Generator().manual_seed(0))
+
+    def predictions(batch, contrast):
+        guide = tiny.guidance(models, guidance_scale=4.0, view_contrast=contrast)
+        guide.evaluations = 0
+        return guide, *guide.predict(z, tiny.TIMESTEPS, guide.condition(views, **batch))
+
+    _, plain, uncond = predictions(BATCH, 0.0)
+    _, other, _ = predictions(TURNED, 0.0)
+    guide, cond, same = predictions(BATCH, CONTRAST)
+    torch.testing.assert_close(cond[1:], (plain + CONTRAST * (plain - other))[1:])
+    torch.testing.assert_close(cond[0], plain[0])
+    torch.testing.assert_close(same, uncond)
+    assert guide.evaluations == 8 + 3
+    assert all(tiny.relative(*pair) > 1e-3 for pair in zip(cond[1:], plain[1:], strict=True))
+    options = {"guidance_scale": 4.0, "view_contrast": CONTRAST}
+    guide = tiny.guidance(models, **options, guidance_interval=(0.5, 1.0))
+    condition = guide.condition(views, **BATCH)
+    got = guide.predict_noise(z, tiny.TIMESTEPS, condition)
+    expected = tiny.guidance(models, **options).predict_noise(z, tiny.TIMESTEPS, condition)
+    torch.testing.assert_close(got[2:], expected[2:])
+    plain = guide.conditional(z, tiny.TIMESTEPS, condition)
+    torch.testing.assert_close(got[:2], plain[:2])
+
+
+def test_what_has_one_prompt_for_all_views_refuses_it(models):
+    refused("one prompt for all views", mvdream.MVDreamGuidance, {"view_contrast": 1.0})
+    contrast = {"view_contrast": 1.0, "view_dependent_prompting": False}
+    refused("view_dependent_prompting=true", tiny.guidance, models, **contrast)

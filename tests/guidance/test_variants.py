@@ -11,14 +11,9 @@ from tests.helpers.pixel_guidance import (
     mixture_guidance,
     noise_of,
 )
+from tests.helpers.refusals import refused
 from threestudio_gaussiandreamer.core import streams
-from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.diffusion.consistent_noise import (
-    TABLE,
-    attached_noise,
-    cell_values,
-)
-from threestudio_gaussiandreamer.diffusion.inversion import NoiseTable
+from threestudio_gaussiandreamer.diffusion import consistent_noise, inversion
 from threestudio_gaussiandreamer.guidance.variants import vsd
 
 EXACT = 1e-10
@@ -118,7 +113,7 @@ def test_sdi_and_ism_follow_their_formulas_step_by_step():
         cond, uncond = both_scores(guidance, z, torch.tensor([t]))
         return cond + scale * (cond - uncond)
 
-    z, table = x, NoiseTable(0, (1, 1, 3))
+    z, table = x, inversion.NoiseTable(0, (1, 1, 3))
     times = [*range(0, int(t), 100), int(t)]
     for index, (now, later) in enumerate(zip(times, times[1:], strict=False)):
         eps = predicted(z, now, -7.5)
@@ -159,18 +154,14 @@ def test_cfd_uses_the_surfaces_noise():
         "c2w": torch.eye(4).repeat(2, 1, 1),
         "fovy": torch.full((2,), 0.8),
     }
-    noise = attached_noise(
-        x.shape[-2:],
-        cell_values(x.shape[1], streams.generator(0, "surface noise")),  # the same in each step
-        streams.derive_seed(0, "background cells", guidance.step) % TABLE,
-        0,
-        *(batch[name] for name in ("depth", "opacity", "c2w", "fovy")),
-    )
+    generator = streams.generator(0, "surface noise")  # the same in each step
+    cells = consistent_noise.cell_values(x.shape[1], generator)
+    seed = streams.derive_seed(0, "background cells", guidance.step) % consistent_noise.TABLE
+    noise = consistent_noise.attached_noise(x.shape[-2:], cells, seed, 0, *batch.values())
     t, a, sigma, *_ = draws(guidance, x)
     z = a * x + sigma * noise
     cond, uncond = both_scores(guidance, z, t)
     assert_close(error_of(guidance, x, batch), uncond + 7.5 * (cond - uncond) - noise)
-    with pytest.raises(UserError, match="cfd-variant needs the renderer's depth and opacity"):
-        error_of(guidance, x)
+    refused("cfd-variant needs the renderer's depth and opacity", error_of, guidance, x)
     assert torch.equal(noise[0], noise[1])  # two views from the same place
     assert not torch.equal(noise, guidance.normal(x, "noise"))

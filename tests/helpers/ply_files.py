@@ -4,21 +4,17 @@ from pathlib import Path
 
 import numpy as np
 
-from threestudio_gaussiandreamer.formats.ply import (
-    BYTE_ORDERS,
-    NUMBER_TYPES,
-    gaussian_columns,
-    gaussian_properties,
-    write_table,
-)
+from threestudio_gaussiandreamer.formats import ply
 from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
 from threestudio_gaussiandreamer.gaussians.point_cloud import PointCloud
+
+FLOATS = "float x", "float y", "float z"
 
 
 def write_raw_gaussians(path: Path, gaussians: Gaussians, comments: tuple[str, ...] = ()) -> None:
     """Write Gaussians as they are, NaN and infinity included."""
-    properties = gaussian_properties(gaussians.sh.shape[1])
-    write_table(path, properties, gaussian_columns(gaussians), comments)
+    properties = ply.gaussian_properties(gaussians.sh.shape[1])
+    ply.write_table(path, properties, ply.gaussian_columns(gaussians), comments)
 
 
 def rng(seed=0):
@@ -28,19 +24,15 @@ def rng(seed=0):
 def gaussians(count=50, degree=0, seed=0):
     """Draw Gaussians of normally distributed values."""
     shapes = [(count, 3), (count, 4), (count, 3), (count,), (count, (degree + 1) ** 2, 3)]
-    return Gaussians(
-        *(rng(seed + i).normal(size=shape).astype(np.float32) for i, shape in enumerate(shapes))
-    )
+    values = (rng(seed + i).normal(size=shape) for i, shape in enumerate(shapes))
+    return Gaussians(*(value.astype(np.float32) for value in values))
 
 
 def cloud(count=50, normals=True):
     """Draw coloured points, whose normals equal their positions."""
     values = rng(9).normal(size=(count, 3)).astype(np.float32)
-    return PointCloud(
-        points=values,
-        colors=rng(8).random((count, 3), np.float32),
-        normals=values if normals else None,
-    )
+    colors = rng(8).random((count, 3), np.float32)
+    return PointCloud(points=values, colors=colors, normals=values if normals else None)
 
 
 def ply_bytes(columns, encoding="ascii", *, count=None, before=("", b""), after=("", b"")):
@@ -50,8 +42,8 @@ def ply_bytes(columns, encoding="ascii", *, count=None, before=("", b""), after=
         columns: type and values of each property, by name.
         count: what the header announces, if not the number of values.
     """
-    order = BYTE_ORDERS[encoding] or "<"
-    kinds = [(name, order + NUMBER_TYPES[kind]) for name, (kind, _) in columns.items()]
+    order = ply.BYTE_ORDERS[encoding] or "<"
+    kinds = [(name, order + ply.NUMBER_TYPES[kind]) for name, (kind, _) in columns.items()]
     rows = np.array([*zip(*(values for _, values in columns.values()), strict=True)], kinds)
     lines = (b" ".join(b"%.9g" % value for value in row) + b"\n" for row in rows.tolist())
     body = b"".join(lines) if encoding == "ascii" else rows.tobytes()
@@ -61,9 +53,7 @@ def ply_bytes(columns, encoding="ascii", *, count=None, before=("", b""), after=
     return head.encode() + before[1] + body + after[1]
 
 
-def header(
-    encoding="ascii", count=2, properties=("float x", "float y", "float z"), before="", after=""
-):
+def header(encoding="ascii", count=2, properties=FLOATS, before="", after=""):
     """Return the header of a PLY file as other programs write it."""
     lines = ["ply", f"format {encoding} 1.0", *filter(None, [before]), f"element vertex {count}"]
     lines += [f"property {entry}" for entry in properties]

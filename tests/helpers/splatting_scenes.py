@@ -18,9 +18,7 @@ SINGLE = 2e-5
 NO_CUTOFFS = {"alpha_min": 0.0, "alpha_max": 1.0, "stop": 0.0}
 NAMES = ("means", "quats", "scales", "opacities", "colors")
 BACKGROUND = torch.tensor([0.2, 0.5, 0.9])
-repeatable = settings(
-    derandomize=True, deadline=None, max_examples=25, suppress_health_check=list(HealthCheck)
-)
+repeatable = settings(max_examples=25, suppress_health_check=list(HealthCheck))
 
 
 def rasterize(*arguments, **options) -> Rasterized:
@@ -56,9 +54,7 @@ def scene_of(cloud: Cloud, viewmats: Tensor, Ks: Tensor, width: int, height: int
     return Scene(**gaussians, **cameras, width=width, height=height)
 
 
-def random_cloud(
-    n: int, seed: int = 0, channels: int = 3, size: float = 0.15, stretch: float = 0.6
-) -> Cloud:
+def random_cloud(n: int, seed=0, channels=3, size=0.15, stretch=0.6) -> Cloud:
     """Draw a float64 cloud in a ball of radius 1, moderately anisotropic, below the cap."""
     g = torch.Generator().manual_seed(seed)
     means = torch.randn(n, 3, generator=g, dtype=torch.float64) * 0.4
@@ -101,9 +97,7 @@ def stacks_on_one_pixel(n: int = 10_000) -> Iterator[Cloud]:
         yield random_cloud(n, seed=5)._replace(means=means, opacities=opacities.double())
 
 
-def cameras(
-    views: int, width: int, height: int, distance: float = 3.0, fov=50.0, dtype=torch.float64
-) -> tuple[Tensor, Tensor]:
+def cameras(views: int, width: int, height: int, distance=3.0, fov=50.0, dtype=torch.float64):
     """Return viewmats and Ks on a circle that look at the origin; ``fov`` vertical, degrees."""
     focal = 0.5 * height / math.tan(math.radians(fov) / 2)
     K = [[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]
@@ -147,9 +141,8 @@ class Run(NamedTuple):
 
 
 def run(
-    cloud: Cloud, viewmats: Tensor, Ks: Tensor, width: int, height: int, background=None,
-    camera_gradient=False, **options,
-) -> Run:  # fmt: skip
+    cloud: Cloud, viewmats, Ks, width, height, background=None, camera_gradient=False, **options
+):
     """Run forward and backward in the cloud's precision with fixed cotangents."""
     dtype, leaves = cloud.means.dtype, cloud.leaves()
     viewmats = viewmats.detach().to(dtype).requires_grad_(camera_gradient)
@@ -189,9 +182,7 @@ def equal(a: Run, b: Run) -> bool:
     return outputs and all(torch.equal(grad, b.grads[name]) for name, grad in a.grads.items())
 
 
-def draw(
-    backend: str, cloud: Cloud, camera, width: int, height: int, background=None, **options
-) -> Run:
+def draw(backend: str, cloud: Cloud, camera, width, height, background=None, **options) -> Run:
     """Run forward and backward in float32."""
     view = *(x.to(torch.float32) for x in camera), width, height, background
     return run(cloud.to(torch.float32), *view, backend=backend, **options)

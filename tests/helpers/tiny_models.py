@@ -13,10 +13,8 @@ TEXT_WIDTH = 32
 PUBLISHED_VAE_NAMES = {"to_q.": "query.", "to_k.": "key.", "to_v.": "value."}
 PUBLISHED_VAE_NAMES |= {"to_out.0.": "proj_attn."}
 """The attention's names in Stable Diffusion's VAE files, which are older than today's."""
-CORPUS = (
-    "a photo of an iron man fox corgi in the snow, side view front back overhead kicks "
-    "with his left leg, ugly blurry"
-)
+CORPUS = "a photo of an iron man fox corgi in the snow, side view front back overhead kicks "
+CORPUS += "with his left leg, ugly blurry"
 
 
 def nothing_cached(monkeypatch, folder: Path) -> None:
@@ -45,31 +43,12 @@ TINY = Sizes(
     ),
     text_width=TEXT_WIDTH,
 )  # fmt: skip
-STABLE_DIFFUSION_2_1 = Sizes(
-    unet=dict(
-        sample_size=64, block_out_channels=(320, 640, 1280, 1280), layers_per_block=2,
-        down_block_types=("CrossAttnDownBlock2D",) * 3 + ("DownBlock2D",),
-        up_block_types=("UpBlock2D",) + ("CrossAttnUpBlock2D",) * 3,
-        attention_head_dim=(5, 10, 20, 20),
-    ),
-    vae=dict(sample_size=512, block_out_channels=(128, 256, 512, 512), layers_per_block=2),
-    text_width=1024,
-)  # fmt: skip
-"""The published UNet and VAE; of its text encoder, which a run frees at once, the width alone."""
 
 
-def stable_diffusion(
-    folder: Path, *, prediction: str = "epsilon", seed: int = 0, sizes: Sizes = TINY
-) -> Path:
+def stable_diffusion(folder: Path, *, prediction="epsilon", seed=0, sizes: Sizes = TINY) -> Path:
     """Write a tiny Stable Diffusion 2.1 on 8x8x4 latents; epsilon or v_prediction."""
-    from diffusers import UNet2DConditionModel
-
-    torch.manual_seed(seed)
-    unet = UNet2DConditionModel(
-        **sizes.unet, cross_attention_dim=sizes.text_width, use_linear_projection=True
-    )
-    listen_to_text(unet)
-    unet.save_pretrained(folder / "unet")
+    options = {"cross_attention_dim": sizes.text_width, "use_linear_projection": True}
+    plain_unet(sizes.unet | options, seed).save_pretrained(folder / "unet")
     vae(folder, sizes.vae, latent_channels=4)
     _rename(folder / "vae" / "diffusion_pytorch_model.safetensors", _published_vae)
     clip_text_encoder(folder, sizes.text_width)
@@ -102,10 +81,9 @@ def _stable_diffusion_scheduler(prediction: str) -> Any:
 
 def deep_floyd(folder: Path, *, seed: int = 0) -> Path:
     """Write a tiny DeepFloyd IF, stage 1, on 16x16 pixels, with a T5 encoder."""
-    from diffusers import DDPMScheduler, UNet2DConditionModel
+    from diffusers import DDPMScheduler
 
-    torch.manual_seed(seed)
-    unet = UNet2DConditionModel(
+    options = dict(
         sample_size=16, in_channels=3, out_channels=6, block_out_channels=(16, 32),
         layers_per_block=1, mid_block_type="UNetMidBlock2DSimpleCrossAttn",
         down_block_types=("ResnetDownsampleBlock2D", "SimpleCrossAttnDownBlock2D"),
@@ -115,8 +93,7 @@ def deep_floyd(folder: Path, *, seed: int = 0) -> Path:
         cross_attention_norm="group_norm", resnet_time_scale_shift="scale_shift",
         norm_num_groups=8, act_fn="gelu",
     )  # fmt: skip
-    listen_to_text(unet)
-    unet.save_pretrained(folder / "unet")
+    plain_unet(options, seed).save_pretrained(folder / "unet")
     t5_text_encoder(folder)
     options = {"beta_schedule": "squaredcos_cap_v2", "prediction_type": "epsilon"}
     options |= {"variance_type": "learned_range", "thresholding": True, "sample_max_value": 1.5}
@@ -131,15 +108,9 @@ def listen_to_text(unet: torch.nn.Module) -> None:
             weight.data *= 10
 
 
-def clip_text_encoder(
-    folder: Path, width: int = TEXT_WIDTH, *, suffix: str = "", projection: int = 0
-) -> None:
-    """Write ``text_encoder`` and ``tokenizer`` of Stable Diffusion 2.1: CLIP, padded with "!",
-    which one of its two files contradicts.
-
-    Args:
-        suffix: of the names of both components.
-        projection: width of the pooled embedding; 0 for an encoder without.
+def clip_text_encoder(folder: Path, width: int = TEXT_WIDTH, *, suffix="", projection=0) -> None:
+    """Write ``text_encoder`` and ``tokenizer``, with a suffix: CLIP, padded with "!", which one of
+    its two files contradicts; ``projection`` is the width of the pooled embedding, 0 for none.
     """
     from transformers import CLIPTextModel, CLIPTextModelWithProjection
 
@@ -177,12 +148,7 @@ def clip_tokenizer(folder: Path) -> dict[str, str]:
 
 
 def t5_text_encoder(folder: Path, width: int = TEXT_WIDTH, *, suffix: str = "") -> None:
-    """Write ``text_encoder`` and ``tokenizer`` of DeepFloyd IF: T5 v1.1 and a
-    sentencepiece model.
-
-    Args:
-        suffix: of the names of both components.
-    """
+    """Write ``text_encoder`` and ``tokenizer``, with a suffix: T5 v1.1 and sentencepiece."""
     from transformers import T5Config, T5EncoderModel
 
     tokenizer = folder / f"tokenizer{suffix}"
@@ -254,8 +220,6 @@ def write_json(path: Path, content: dict) -> None:
     path.write_text(json.dumps(content, ensure_ascii=False), encoding="utf-8")
 
 
-# ---- Stable Diffusion XL, Stable Diffusion 3 and MVDream -----------------------------------------
-
 CLIP_WIDTHS = (32, 32)
 """Widths of the tokens of the two CLIP encoders."""
 T5_WIDTH = 96
@@ -271,16 +235,12 @@ MULTI_VIEW = dict(
 
 def stable_diffusion_xl(folder: Path, *, seed: int = 0, force_upcast: bool = True) -> Path:
     """Write a tiny Stable Diffusion XL base: UNet on 8x8x4 latents, two CLIP encoders."""
-    from diffusers import EulerDiscreteScheduler, UNet2DConditionModel
+    from diffusers import EulerDiscreteScheduler
 
-    torch.manual_seed(seed)
-    unet = UNet2DConditionModel(
-        **TINY.unet, cross_attention_dim=sum(CLIP_WIDTHS), use_linear_projection=True,
-        addition_embed_type="text_time", addition_time_embed_dim=8,
-        projection_class_embeddings_input_dim=6 * 8 + POOLED,
-    )  # fmt: skip
-    listen_to_text(unet)
-    unet.save_pretrained(folder / "unet")
+    options = {"cross_attention_dim": sum(CLIP_WIDTHS), "use_linear_projection": True}
+    options |= {"addition_embed_type": "text_time", "addition_time_embed_dim": 8}
+    options |= {"projection_class_embeddings_input_dim": 6 * 8 + POOLED}
+    plain_unet(TINY.unet | options, seed).save_pretrained(folder / "unet")
     vae(folder, latent_channels=4, scaling_factor=0.13025, force_upcast=force_upcast)
     clip_text_encoder(folder, CLIP_WIDTHS[0])
     clip_text_encoder(folder, CLIP_WIDTHS[1], suffix="_2", projection=POOLED)
@@ -317,10 +277,10 @@ def mvdream(folder: Path, *, seed: int = 0, **settings: Any) -> Path:
     from threestudio_gaussiandreamer.models.multiview_unet import unet_options
 
     stable_diffusion(folder, seed=seed)
-    unet = plain_unet(unet_options(MULTI_VIEW), seed)
+    state = plain_unet(unet_options(MULTI_VIEW), seed).state_dict()
     for file in (folder / "unet").iterdir():
         file.unlink()
-    tensors = {compvis_name(name, MULTI_VIEW): value for name, value in unet.state_dict().items()}
+    tensors = {compvis_name(name, MULTI_VIEW): value for name, value in state.items()}
     save_file(tensors, folder / "unet" / "diffusion_pytorch_model.safetensors")
     named = {"_class_name": "MultiViewUNetModel"}
     write_json(folder / "unet" / "config.json", named | MULTI_VIEW | settings)
@@ -336,9 +296,9 @@ def plain_unet(options: dict[str, Any], seed: int = 0) -> nn.Module:
     from diffusers import UNet2DConditionModel
 
     torch.manual_seed(seed)
-    unet = UNet2DConditionModel(**options)
-    listen_to_text(unet)
-    return unet.eval()
+    made = UNet2DConditionModel(**options)
+    listen_to_text(made)
+    return made.eval()
 
 
 RESNET = {

@@ -9,21 +9,10 @@ import torch
 from torch import nn
 from torch.utils.data import DataLoader, IterableDataset
 
+from threestudio_gaussiandreamer import host
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.core.streams import generator
-from threestudio_gaussiandreamer.host import (
-    BaseGeometry,
-    BaseLift3DSystem,
-    BaseObject,
-    Exporter,
-    ExporterOutput,
-    Rasterizer,
-    Updateable,
-    find,
-    pl,
-    register,
-    run_seed,
-)
+from threestudio_gaussiandreamer.host import BaseGeometry, BaseLift3DSystem, BaseObject, register
 
 
 @register("tiny-prior")
@@ -51,7 +40,7 @@ class TinyGeometry(BaseGeometry):
     cfg: Config
 
     def configure(self) -> None:
-        self.count = find(self.cfg.prior_type)(self.cfg.prior).cfg.count
+        self.count = host.find(self.cfg.prior_type)(self.cfg.prior).cfg.count
         self.means = nn.Parameter(torch.zeros(self.cfg.size))
         self.updates: list[int] = []
 
@@ -60,7 +49,7 @@ class TinyGeometry(BaseGeometry):
 
 
 @register("tiny-renderer")
-class TinyRenderer(Rasterizer):
+class TinyRenderer(host.Rasterizer):
     def forward(self, **batch: Any) -> dict[str, Any]:
         return {"comp_rgb": self.geometry.means.sigmoid().expand(1, 4, 4, 3)}
 
@@ -75,18 +64,16 @@ class TinyPrompts(BaseObject):
 
 
 @register("tiny-exporter")
-class TinyExporter(Exporter):
-    def __call__(self) -> list[ExporterOutput]:
-        return [ExporterOutput("means", "data", {"data": {"means": self.geometry.means}})]
+class TinyExporter(host.Exporter):
+    def __call__(self) -> list[host.ExporterOutput]:
+        return [host.ExporterOutput("means", "data", {"data": {"means": self.geometry.means}})]
 
 
 @register("tiny-system")
 class TinySystem(BaseLift3DSystem):
     @dataclass
     class Config(BaseLift3DSystem.Config):
-        # what a test wants to happen: fail in configure, on_fit_start or at a step; receive a
-        # signal at a step
-        fail_in: str = ""
+        fail_in: str = ""  # configure, on_fit_start or "step <number>"
         signal_at: int = -1
         signal_name: str = "SIGINT"
 
@@ -113,7 +100,7 @@ class TinySystem(BaseLift3DSystem):
         self._fail(f"step {step}")
         if step == self.cfg.signal_at:
             os.kill(os.getpid(), getattr(signal, self.cfg.signal_name))
-        target = torch.randn(3, generator=generator(run_seed(), "target", step))
+        target = torch.randn(3, generator=generator(host.run_seed(), "target", step))
         weight = self.C(self.cfg.loss.get("lambda_fit", 1.0))
         loss = weight * (self.geometry.means - target).square().sum()
         optimizer = self.optimizers()
@@ -139,14 +126,14 @@ class TinySystem(BaseLift3DSystem):
         self.save_image_grid(name, [{"type": "rgb", "img": self.renderer()["comp_rgb"][0]}])
 
 
-class Steps(IterableDataset, Updateable):
+class Steps(IterableDataset, host.Updateable):
     def __iter__(self):
         while True:
             yield {"index": torch.tensor([0])}
 
 
 @register("tiny-data")
-class TinyData(pl.LightningDataModule):
+class TinyData(host.pl.LightningDataModule):
     @dataclass
     class Config:
         views: int = 2

@@ -9,20 +9,13 @@ from typing import Any
 import pytest
 import torch
 
+from tests.helpers.refusals import refused
 from threestudio_gaussiandreamer import host
 from threestudio_gaussiandreamer.core.checkpoint_file import save_file
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.host.builtin import base as registry
-from threestudio_gaussiandreamer.host.builtin.base import BaseModule, BaseObject
-from threestudio_gaussiandreamer.host.builtin.models import (
-    BaseGeometry,
-    NoMaterial,
-    Rasterizer,
-    SolidColorBackground,
-)
+from threestudio_gaussiandreamer.host.builtin import models
 from threestudio_gaussiandreamer.host.builtin.system import BaseLift3DSystem, BaseSystem
-
-# -- registry --------------------------------------------------------------------------------------
 
 
 def test_a_class_is_found_by_its_name_and_may_be_entered_again(monkeypatch):
@@ -32,16 +25,11 @@ def test_a_class_is_found_by_its_name_and_may_be_entered_again(monkeypatch):
     for part in (first, first, second):
         assert registry.register("some-part")(part) is registry.find("some-part") is part
     assert registry.names() == ["some-part"]
-    with pytest.raises(UserError, match="'some-part' is taken by .*Part"):
-        registry.register("some-part")(type("Other", (), {}))
-    with pytest.raises(UserError, match="unknown part 'some-prat': did you mean 'some-part'"):
-        registry.find("some-prat")
+    refused("'some-part' is taken by .*Part", registry.register("some-part"), type("Other", (), {}))
+    refused("unknown part 'some-prat': did you mean 'some-part'", registry.find, "some-prat")
 
 
-# -- parts -----------------------------------------------------------------------------------------
-
-
-class Counter(BaseObject):
+class Counter(registry.BaseObject):
     def configure(self, *, inner: Any = None) -> None:
         self.inner, self.steps, self.ends = inner, [], []
 
@@ -53,9 +41,9 @@ class Counter(BaseObject):
 
 
 def test_updates_reach_parts_inside_parts_and_modules():
-    class Holder(BaseModule):
+    class Holder(registry.BaseModule):
         def configure(self) -> None:
-            self.child = BaseModule()
+            self.child = registry.BaseModule()
             self.child.counter = Counter({})
 
     outer, holder = Counter({}, inner=Counter({})), Holder({})
@@ -66,7 +54,7 @@ def test_updates_reach_parts_inside_parts_and_modules():
     assert holder.child.counter.steps == [(0, 3, True)]
 
 
-class Points(BaseGeometry):
+class Points(models.BaseGeometry):
     def configure(self) -> None:
         self.means = torch.nn.Parameter(torch.zeros(2))
 
@@ -75,8 +63,7 @@ def test_weights_of_one_module_are_loaded_from_a_checkpoint(tmp_path):
     state = {"geometry.means": torch.tensor([1.0, 2.0]), "background.color": torch.ones(3)}
     save_file(tmp_path / "a.ckpt", {"state_dict": state, "epoch": 1, "global_step": 7})
     assert Points({"weights": f"{tmp_path / 'a.ckpt'}:geometry"}).means.tolist() == [1.0, 2.0]
-    with pytest.raises(UserError, match="no parameters of 'nothing'"):
-        Points({"weights": f"{tmp_path / 'a.ckpt'}:nothing"})
+    refused("no parameters of 'nothing'", Points, {"weights": f"{tmp_path / 'a.ckpt'}:nothing"})
     state = {"geometry.means": torch.ones(3)}
     save_file(tmp_path / "b.ckpt", {"state_dict": state, "epoch": 1, "global_step": 7})
     with pytest.raises(UserError, match="b.ckpt:geometry don't fit these options .*size mismatch"):
@@ -84,23 +71,20 @@ def test_weights_of_one_module_are_loaded_from_a_checkpoint(tmp_path):
 
 
 def test_a_renderer_refers_to_its_parts_without_owning_them():
-    parts = {"material": NoMaterial(), "background": SolidColorBackground()}
-    renderer = Rasterizer({"radius": 2.0}, geometry=(geometry := Points()), **parts)
+    parts = {"material": models.NoMaterial(), "background": models.SolidColorBackground()}
+    renderer = models.Rasterizer({"radius": 2.0}, geometry=(geometry := Points()), **parts)
     assert renderer.geometry is geometry and list(renderer.state_dict()) == ["bbox"]
     assert renderer.bbox.tolist() == [[-2.0] * 3, [2.0] * 3]
 
 
 def test_a_solid_background_has_one_colour_everywhere(caplog):
-    background = SolidColorBackground({"color": [0.25, 0.5, 1.0], "random_aug": True})
+    background = models.SolidColorBackground({"color": [0.25, 0.5, 1.0], "random_aug": True})
     assert "random_aug is no option any more" in caplog.text
     drawn = background(torch.zeros(2, 4, 5, 3))
     assert drawn.shape == (2, 4, 5, 3) and drawn[1, 3, 4].tolist() == [0.25, 0.5, 1.0]
-    learned = SolidColorBackground({"learned": True})
+    learned = models.SolidColorBackground({"learned": True})
     learned(torch.zeros(1, 2, 2, 3)).sum().backward()
     assert learned.env_color.grad.tolist() == [4.0, 4.0, 4.0]
-
-
-# -- the system ------------------------------------------------------------------------------------
 
 
 def test_a_system_configures_then_loads_weights_then_post_configures(tmp_path):
@@ -140,9 +124,6 @@ def test_an_output_that_the_system_cannot_write_is_named():
         BaseLift3DSystem.on_predict_epoch_end(SimpleNamespace(exporter=Odd()))
 
 
-# -- which host ------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("content", "is_host"),
     [(None, False), ("def register(name): ...", True), ("import none", None)],
@@ -157,8 +138,7 @@ def test_threestudio_is_the_host_if_it_imports(tmp_path, monkeypatch, content, i
     if content is not None:
         (tmp_path / "threestudio/__init__.py").write_text(content)
     if is_host is None:
-        with pytest.raises(UserError, match="can't be imported: No module named 'none'"):
-            host._threestudio_is_importable()
+        refused("can't be imported: No module named 'none'", host._threestudio_is_importable)
     else:
         assert host._threestudio_is_importable() == is_host
 

@@ -1,8 +1,7 @@
-"""SDI and VSD against threestudio's own classes, which run beside them in its environment: see
-``tests/helpers/threestudio_variants.py``.
+"""SDI and VSD against threestudio's own classes, by ``tests/helpers/threestudio_variants.py``.
 
-The results agree where the choices do. The inversions start at timestep 0 (``steps_offset: 0`` of
-the scheduler) and end at t; the LoRA is given the same text as the UNet."""
+The results agree where the choices do: the inversions start at timestep 0 and end at t; the LoRA is
+given the same text as the UNet."""
 
 import json
 
@@ -15,7 +14,6 @@ pytestmark = real_host.NEEDED
 
 @pytest.fixture(scope="module")
 def errors(tmp_path_factory):
-    """Return the relative errors of each comparison."""
     folder = tmp_path_factory.mktemp("variants")
     printed = real_host.output_of("tests.helpers.threestudio_variants", folder)
     return json.loads(printed.splitlines()[-1])

@@ -1,6 +1,7 @@
 """The built-in host's savers: images, videos, arrays and meshes that can be read back."""
 
 import json
+import os
 import subprocess
 from pathlib import Path
 from types import SimpleNamespace
@@ -10,9 +11,9 @@ import numpy as np
 import pytest
 import torch
 
-from threestudio_gaussiandreamer.core import images as pictures
+from threestudio_gaussiandreamer import images as pictures
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.host.builtin.savers import SaverMixin
+from threestudio_gaussiandreamer.host.builtin.savers import SaverMixin, write_video
 
 TRIANGLE = SimpleNamespace(v_pos=torch.eye(3), t_pos_idx=torch.tensor([[0, 1, 2]]))
 
@@ -125,3 +126,12 @@ def test_files_are_replaced_whole_and_links_are_not_followed(saver, tmp_path, na
     path = Path(save(saver, name))
     assert (tmp_path / "mine").read_text() == "mine"
     assert path.stat().st_size > 0 and not path.is_symlink()
+
+
+def test_a_video_in_a_folder_with_a_colon(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    pictures.write("0.png", np.zeros((9, 7, 3), np.uint8))
+    write_video("runs:1.mp4", [tmp_path / "0.png"] * 2, fps=2)
+    assert sorted(os.listdir()) == ["0.png", "runs:1.mp4"]
+    with pytest.raises(UserError, match=r"could not be written: [^\n]*$"):
+        write_video("no/1.mp4", [tmp_path / "0.png"] * 2, fps=2)

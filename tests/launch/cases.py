@@ -5,8 +5,6 @@ from pathlib import Path
 from threestudio_gaussiandreamer.launch.config import load_config
 
 DEMO = Path(__file__).parents[2] / "configs" / "demo.yaml"
-
-
 SMALL = [
     "data.width=16", "data.height=16", "data.eval_width=16", "data.eval_height=16",
     "data.n_test_views=2", "data.train_views=4", "system.geometry.prior.num_points=80",

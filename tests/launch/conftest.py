@@ -13,14 +13,10 @@ from threestudio_gaussiandreamer.launch.experiment import main
 
 
 @pytest.fixture
-def launch(tmp_path, monkeypatch, capsys):
-    """``launch("--train", overrides...)`` in an empty folder; returns (exit code, stdout,
-    stderr).
-    """
-    monkeypatch.chdir(tmp_path)
+def launch(folder, monkeypatch, capsys):
+    """``launch("--train", overrides...)`` returns (exit code, stdout, stderr)."""
     monkeypatch.setattr(threestudio_gaussiandreamer, "register_parts", lambda: None)
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
-    (tmp_path / "tiny.yaml").write_text(tiny_parts.CONFIG)
 
     def run(*arguments: str, config: str = "tiny.yaml") -> tuple[int, str, str]:
         code = main(["--config", config, *arguments])
@@ -50,9 +46,7 @@ def trained(launch):
 
 @pytest.fixture
 def launch_demo(tmp_path, monkeypatch, capsys):
-    """``launch_demo(overrides...)`` trains a tiny demo in an empty folder; returns (exit code,
-    stderr).
-    """
+    """``launch_demo(overrides...)`` trains a tiny demo; returns (exit code, stderr)."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
 

@@ -9,9 +9,9 @@ from threestudio_gaussiandreamer.launch.experiment import main
 
 TINY = [
     "trainer.max_steps=3", "trainer.val_check_interval=3", "data.width=16", "data.height=16",
-    "data.eval_width=16", "data.eval_height=16", "data.n_test_views=2",
-    "system.geometry.budget=none",
-    "system.geometry.densify.enabled=false", "use_timestamp=false", "tag=t", "system.pages=false",
+    "data.eval_width=16", "data.eval_height=16", "data.n_test_views=2", "system.pages=false",
+    "system.geometry.budget=none", "system.geometry.densify.enabled=false", "use_timestamp=false",
+    "tag=t",
 ]  # fmt: skip
 
 
@@ -32,15 +32,12 @@ from threestudio_gaussiandreamer.training.density import DensityRule
 class Own(DensityRule):
 """
 OWN_DENSITY = "system.geometry.density_type=own-density"
-
-
 REGULARISER = """
 import torch
 from threestudio_gaussiandreamer.host import register
 
 @register("mine-regulariser")
 """
-OWN_REGULARISER = "system.loss.lambda_mine=1"
 
 
 def test_own_parts_are_called_in_every_step(tmp_path, monkeypatch):
@@ -90,7 +87,7 @@ from threestudio_gaussiandreamer.{1} import {2}
 class Own{0}({2}):
 """
 OPTIONS = {
-    "regulariser": OWN_REGULARISER,
+    "regulariser": "system.loss.lambda_mine=1",
     "name": "system.loss.lambda_smooth=1",
     "density rule": OWN_DENSITY,
     "prior": "system.geometry.prior_type=own-prior",

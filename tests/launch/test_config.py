@@ -22,9 +22,6 @@ PROMPTS = [
 ]
 
 
-# -- loading ---------------------------------------------------------------------------------------
-
-
 def test_sections_interpolations_and_overrides(folder):
     cfg = load("trainer.max_steps=12", "data.views=3", "seed=7")
     assert cfg.trainer.max_steps == cfg.checkpoint.every_n_train_steps == 12
@@ -74,9 +71,8 @@ def test_a_bad_override_is_named(folder, override, message):
 
 
 def test_missing_values_are_all_named(folder):
-    Path("open.yaml").write_text(
-        "system: {prompt_processor: {prompt: '???'}, a: '${system.prompt_processor.prompt}'}\n"
-    )
+    text = "system: {prompt_processor: {prompt: '???'}, a: '${system.prompt_processor.prompt}'}\n"
+    Path("open.yaml").write_text(text)
     Path("data.yaml").write_text("data: {views: '???'}")
     with pytest.raises(UserError, match="no value for data.views, system.prompt_processor.prompt"):
         load_config("open.yaml", "data.yaml")
@@ -84,10 +80,8 @@ def test_missing_values_are_all_named(folder):
     assert load_config("open.yaml", "data.yaml", cli_args=given).system.a == "x"
 
 
-LAUGHS = b"".join(
-    b"a%d: &a%d [%s]\n" % (i, i, b", ".join(9 * [b"*a%d" % (i - 1) if i else b"x"]))
-    for i in range(9)
-)
+LEVELS = (b", ".join(9 * [b"*a%d" % (i - 1) if i else b"x"]) for i in range(9))
+LAUGHS = b"".join(b"a%d: &a%d [%s]\n" % (i, i, level) for i, level in enumerate(LEVELS))
 """Nine levels of nine references each."""
 
 
@@ -114,9 +108,6 @@ def test_a_bad_file_is_named(folder, content, message):
     with pytest.raises(UserError, match=f"bad.yaml.*{re.escape(message)}"):
         load_config("bad.yaml")
     assert not Path("pwned").exists()
-
-
-# -- texts -----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("prompt", PROMPTS)
@@ -184,9 +175,6 @@ def test_paths_may_hold_what_yaml_reads_otherwise(folder):
     cfg = load("exp_root_dir=out #1", "system.weights=a: b.ckpt", "resume=[x].ckpt")
     assert (cfg.exp_root_dir, cfg.system.weights, cfg.resume) == ("out #1", "a: b.ckpt", "[x].ckpt")
     assert load("resume=null").resume is None
-
-
-# -- folders ---------------------------------------------------------------------------------------
 
 
 def test_a_timestamp_never_leaves_the_output_root(folder):

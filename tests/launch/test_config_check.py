@@ -12,14 +12,11 @@ from omegaconf import OmegaConf
 from tests.launch.cases import DEMO, SMALL, assert_refused
 from threestudio_gaussiandreamer import host, register_parts
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.core.methods import require_dataclass
 from threestudio_gaussiandreamer.host import BaseBackground, BaseModule, BaseObject, register
+from threestudio_gaussiandreamer.host.methods import require_dataclass
+from threestudio_gaussiandreamer.launch import config_check
 from threestudio_gaussiandreamer.launch.config import load_config
-from threestudio_gaussiandreamer.launch.config_check import (
-    check_config,
-    check_part,
-    check_shared_views,
-)
+from threestudio_gaussiandreamer.launch.config_check import check_config, check_part
 from threestudio_gaussiandreamer.launch.parts import check_kind, find_part, load_extensions
 
 register_parts()
@@ -148,9 +145,7 @@ BAD_VALUES = ([1, 2, 3, 4, 5, 6, 7], {"a": 1}, float("nan"), None, "abc", -1)
     [n for n in host.names() if host.find(n).__module__.startswith("threestudio_gaussiandreamer")],
 )
 def test_no_option_of_any_part_ends_in_a_traceback(name):
-    """The check accepts or names any value of any option; a value that is neither number nor text
-    is never accepted as one.
-    """
+    """Nor is a value that is neither number nor text accepted as one."""
     config = getattr(host.find(name), "Config", None)
     for option in dataclasses.fields(config) if config else ():
         for value in BAD_VALUES:
@@ -166,13 +161,8 @@ def test_no_option_of_any_part_ends_in_a_traceback(name):
                 assert not (single and wrong), f"{name}.{option.name} takes {value!r}"
 
 
-class Uncallable(BaseObject): ...
-
-
-class NoForward(BaseModule): ...
-
-
-class Unfinished(BaseBackground): ...
+BASES = {"Uncallable": BaseObject, "NoForward": BaseModule, "Unfinished": BaseBackground}
+Uncallable, NoForward, Unfinished = (type(name, (BASES[name],), {}) for name in BASES)
 
 
 class NoArgument(BaseObject):
@@ -215,9 +205,7 @@ def test_an_extension_that_can_not_be_loaded_is_one_message(folder, monkeypatch)
 
 
 def test_another_part_forgets_the_options_that_only_the_earlier_one_has():
-    """Another prior or guidance needs one override: options of the new part are kept, misspelt ones
-    are still errors.
-    """
+    """So that it needs one override; misspelt options are still errors."""
     prior = "system.geometry.prior"
     other = [f"{prior}_type=random-prior", f"{prior}.size=0.5"]
     cfg = load_config(DEMO, cli_args=other)
@@ -280,8 +268,6 @@ def test_options_that_would_be_ignored_are_named():
     require_dataclass(InheritedConfig)
 
 
-# -- options of different sections -----------------------------------------------------------------
-
 PERP_NEG = "system.prompt_processor.use_perp_neg=true"
 LATENT = "system.guidance.space=latent"
 
@@ -326,16 +312,13 @@ def test_options_of_different_sections(names, overrides, message):
     ("overrides", "message"),
     [
         (["batch_size=4"], "data.batch_size is 4, no multiple of the 3 processes"),
-        (
-            ["batch_size=[6,2]", "resolution_milestones=[9]"],
-            "size is 2, fewer than the 3 processes",
-        ),
+        (["batch_size=[6,2]", "resolution_milestones=[9]"], "is 2, fewer than the 3 processes"),
     ],
 )
 def test_processes_that_cant_share_the_views_are_found_before_they_start(overrides, message):
     data = [f"data.{override}" for override in overrides]
     cfg = load_config(DEMO, cli_args=[*data, "trainer.devices=3"])
     with pytest.raises(UserError, match=message):
-        check_shared_views(cfg)
+        config_check.check_shared_views(cfg)
     cfg.n_gpus = 2
-    check_shared_views(cfg)
+    config_check.check_shared_views(cfg)

@@ -17,14 +17,7 @@ from threestudio_gaussiandreamer.core.command import run_main
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.core.launcher import require_launcher, train_alone
 from threestudio_gaussiandreamer.launch import ddp, experiment
-from threestudio_gaussiandreamer.launch.ddp import (
-    LONGEST_WAIT,
-    Processes,
-    ReplicatedStrategy,
-    is_lost_process,
-    planned_processes,
-    trainer_options,
-)
+from threestudio_gaussiandreamer.launch.ddp import Processes, planned_processes, trainer_options
 
 ROOT = Path(__file__).parents[2]
 TOLERANCE = 0.01
@@ -148,7 +141,7 @@ def test_strategy_and_plugins_of_the_trainer(environment):
     """Lightning starts the processes in a job with one task; a single one needs no strategy."""
     assert trainer_options(Processes(1, 1)) == {"devices": 1, "num_nodes": 1}
     strategy = trainer_options(Processes(2, 2))["strategy"]
-    assert isinstance(strategy, ReplicatedStrategy) and strategy._timeout == LONGEST_WAIT
+    assert isinstance(strategy, ddp.ReplicatedStrategy) and strategy._timeout == ddp.LONGEST_WAIT
     assert plugins(Processes(2, 1)) is None
     environment(SLURM | {"SLURM_NTASKS": "1"} | dict.fromkeys(launcher.SLURM, "0"))
     (plugin,) = plugins(planned_processes(2, {}))
@@ -177,10 +170,8 @@ def raised(error, module):
 )
 def test_which_errors_mean_a_lost_process(monkeypatch, error, module, active, lost):
     monkeypatch.setattr(ddp, "is_active", lambda: active)
-    assert is_lost_process(raised(error, module)) == lost
+    assert ddp.is_lost_process(raised(error, module)) == lost
 
-
-# ---- whole runs ----------------------------------------------------------------------------------
 
 CHANGES = [*runs.DENSIFY, *runs.PRUNE, "data.batch_size=4"]
 # without it Adam's first steps would magnify the rounding of gradients that are zero
@@ -235,17 +226,12 @@ def two_tasks(folder, line):
     """Start a command as SLURM's two tasks, on a machine each."""
     job = SLURM | {"SLURM_NTASKS": "2", "SLURM_NTASKS_PER_NODE": "1", "SLURM_JOB_ID": "7"}
     job |= {"MASTER_PORT": free_port(), "MASTER_ADDR": "127.0.0.1"}
-    tasks = [
-        job | {"SLURM_PROCID": str(rank), "SLURM_NODEID": str(rank), "SLURM_LOCALID": "0"}
-        for rank in (0, 1)
-    ]
-    return [started(folder, line, **task) for task in tasks]
+    ranks = ({"SLURM_PROCID": r, "SLURM_NODEID": r, "SLURM_LOCALID": "0"} for r in "01")
+    return [started(folder, line, **job, **rank) for rank in ranks]
 
 
 def require_same_training(ours, theirs):
-    """Compare the results of runs with different numbers of processes: as many Gaussians, and the
-    same quality but for the order of sums in float32.
-    """
+    """Compare two results: as many Gaussians, of the same quality but for the order of sums."""
     one, other = (runs.cloud_of(folder / "ckpts" / "last.ckpt") for folder in (ours, theirs))
     assert {n: v.shape for n, v in one.items()} == {n: v.shape for n, v in other.items()}
     scores = (json.loads((folder / "save/metrics.json").read_text()) for folder in (ours, theirs))
@@ -267,15 +253,10 @@ def test_two_processes_of_lightning_and_a_resumed_run_with_one(alone, mesh, tmp_
 
 @pytest.mark.slow
 def test_four_processes_of_torchrun_on_two_machines(alone, mesh, tmp_path):
-    port = free_port()
-    module = ["-m", "torch.distributed.run", "--nnodes=2", "--nproc-per-node=2"]
-    machines = [
-        [*module, f"--node-rank={rank}", "--master-addr=127.0.0.1", f"--master-port={port}"]
-        for rank in (0, 1)
-    ]
-    lines = [
-        command(tmp_path, mesh, "trainer.max_steps=6", launcher=machine) for machine in machines
-    ]
+    port = ["--master-addr=127.0.0.1", f"--master-port={free_port()}"]
+    module = ["-m", "torch.distributed.run", "--nnodes=2", "--nproc-per-node=2", *port]
+    nodes = ([*module, f"--node-rank={rank}"] for rank in (0, 1))
+    lines = [command(tmp_path, mesh, "trainer.max_steps=6", launcher=node) for node in nodes]
     require_success(*(started(tmp_path, line) for line in lines))
     run = runs.run_folder(tmp_path)
     require_same_training(run, alone)
@@ -284,9 +265,7 @@ def test_four_processes_of_torchrun_on_two_machines(alone, mesh, tmp_path):
 
 
 def written(folder):
-    """The files of a run but for TensorBoard's, whose names have the time, and the sources, which
-    those in the working directory belong to.
-    """
+    """The files of a run but for TensorBoard's, whose names have the time, and the sources."""
     return {name for name in files(folder) if not name.startswith(("tb_logs", "code"))}
 
 

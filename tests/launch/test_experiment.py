@@ -12,8 +12,6 @@ from tests.helpers.gallery import files, only_run
 from threestudio_gaussiandreamer.core.checkpoint_file import load_file
 from threestudio_gaussiandreamer.launch.config import load_config
 
-# -- the stages ------------------------------------------------------------------------------------
-
 
 def evaluate(launch, trained, stage: str, *options: str) -> set[str]:
     before = files(trained)
@@ -31,14 +29,11 @@ def test_validation_test_and_export_of_a_checkpoint_write_under_its_step(launch,
     assert evaluate(launch, trained, "--export") == {"save/it6-export/means.npz"}
     # the cloud of the checkpoint, not the one that training starts from
     means = load_file(trained / "ckpts/last.ckpt")["state_dict"]["geometry.means"]
-    assert (
-        iio.imread(trained / "save/it6-0.png")[0, 0].tolist()
-        == (means.sigmoid() * 255).round().int().tolist()
-    )
+    pixel = iio.imread(trained / "save/it6-0.png")[0, 0]
+    assert pixel.tolist() == (means.sigmoid() * 255).round().int().tolist()
     shutil.rmtree(trained / "save")
     video = evaluate(launch, trained, "--export", "system.exporter.save_video=true")
     assert video >= {"save/it6-export/means.npz", "save/it6-test.mp4"}
-
     # into a new folder, with a record
     code, _, _ = launch("--export", f"resume={trained}/ckpts/last.ckpt", "tag=other")
     (other,) = Path("outputs").glob("*/other*")
@@ -67,17 +62,12 @@ def test_evaluating_without_a_checkpoint_gives_a_message(launch):
 
 
 def test_parts_are_told_every_step(launch, monkeypatch):
-    systems = []
-    original = tiny_parts.TinySystem.configure
-    monkeypatch.setattr(
-        tiny_parts.TinySystem, "configure", lambda self: (original(self), systems.append(self))[0]
-    )
+    systems, original = [], tiny_parts.TinySystem.configure
+    configure = lambda self: (original(self), systems.append(self))[0]  # noqa: E731
+    monkeypatch.setattr(tiny_parts.TinySystem, "configure", configure)
     assert launch("--train", "trainer.limit_val_batches=0")[0] == 0
     # six training batches, then two test views at the last step
     assert systems[0].geometry.updates == [0, 1, 2, 3, 4, 5, 6, 6]
-
-
-# -- mistakes --------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("place", ["configure", "on_fit_start", "step 0"])

@@ -14,9 +14,7 @@ from threestudio_gaussiandreamer.launch.live_viewer import LiveViewer
 
 
 class Buttons:
-    """Buttons without a panel; the score model's picture is asked for in every step, which begins
-    with a short pause if ``pausing``.
-    """
+    """Without a panel; each step asks for the picture, and begins with a pause if ``pausing``."""
 
     pausing = paused = waited = False
     steps = 0
@@ -94,9 +92,7 @@ def test_updates_take_at_most_their_share_of_the_time(viewer):
     assert shown == ["step 3, 10 Gaussians, 20.0 dB"] * 2 and not made.view.show_cameras.called
 
 
-def test_a_pause_ends_with_one_step_or_with_a_signal_and_nothing_is_read_without_a_browser(
-    viewer, monkeypatch
-):
+def test_a_pause_ends_with_a_step_or_a_signal_and_reads_nothing_unwatched(viewer, monkeypatch):
     made, trainer, system, _ = viewer
     waits = []
     monkeypatch.setattr(live_viewer.time, "sleep", waits.append)

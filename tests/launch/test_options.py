@@ -1,4 +1,4 @@
-"""Arguments, before heavy imports: usage, configuration files by name, GPUs."""
+"""Arguments, before heavy imports: usage, configuration files by name, GPUs; what is imported."""
 
 import os
 import subprocess
@@ -7,16 +7,18 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.start.first_step import PROBE, ROOT
+from benchmarks.start.launched import run_with_probe
+from tests.training.runs import SMALL
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.launch import experiment, options
-from threestudio_gaussiandreamer.launch.options import (
-    announce_device,
-    choose_gpu,
-    find_config,
-    parse_arguments,
-)
+from threestudio_gaussiandreamer.launch.options import announce_device, choose_gpu, find_config
 
-REPOSITORY = Path(__file__).resolve().parents[2]
+UNUSED = {
+    "trimesh", "networkx", "diffusers", "transformers", "viser", "imageio", "smplx", "matplotlib",
+    "tensorboard.backend", "accelerate", "scipy.stats", "scipy.signal", "torchmetrics.functional",
+    "torch._dynamo.eval_frame", "sympy",
+}  # fmt: skip
 
 
 def test_help_imports_neither_torch_nor_lightning():
@@ -25,8 +27,26 @@ def test_help_imports_neither_torch_nor_lightning():
         "assert main(['--help']) == 0; print('torch' in sys.modules, 'omegaconf' in sys.modules)"
     )
     line = [sys.executable, "-c", code]
-    done = subprocess.run(line, cwd=REPOSITORY, capture_output=True, text=True)
+    done = subprocess.run(line, cwd=ROOT, capture_output=True, text=True)
     assert done.stdout.startswith("usage:") and done.stdout.endswith("False False\n"), done.stderr
+
+
+@pytest.mark.slow
+def test_a_demo_run_imports_nothing_heavy_that_it_does_not_use():
+    modules = set(run_with_probe(PROBE, ROOT, *SMALL)["modules"])
+    assert {"torch", "lightning", "threestudio_gaussiandreamer.training.system"} <= modules
+    assert not UNUSED & modules
+
+
+@pytest.mark.slow
+def test_the_commands_for_files_import_no_lightning():
+    """It takes three times as long as what they use."""
+    rooms = ("convert", "prune", "view")
+    names = ", ".join(f"threestudio_gaussiandreamer.{room}.command" for room in rooms)
+    code = f"import sys, {names}; print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    modules = set(done.stdout.split())
+    assert "torch" in modules and not {"lightning", "pytorch_lightning", "omegaconf"} & modules
 
 
 @pytest.mark.parametrize("said", [{}, {"OMP_WAIT_POLICY": "passive"}, {"GOMP_SPINCOUNT": "7"}])
@@ -53,7 +73,7 @@ def test_usage_mistakes_exit_with_2(arguments, message, capsys):
 
 def test_several_configurations_and_overrides_in_any_place():
     line = ["a=1", "--config", "a.yaml", "--config", "b.yaml", "b=2", "--export", "prompt=-x --y"]
-    args = parse_arguments(line)
+    args = options.parse_arguments(line)
     assert (args.config, args.stage, args.gpu) == (["a.yaml", "b.yaml"], "export", None)
     assert args.overrides == ["a=1", "b=2", "prompt=-x --y"]
 
@@ -66,7 +86,7 @@ def test_a_configuration_is_found_by_path_or_name(tmp_path, monkeypatch):
     assert find_config("other.yaml") == Path("other.yaml")
     assert find_config("mine.yaml") == find_config("mine") == Path("configs/mine.yaml")
     # the shipped ones, from any folder
-    assert find_config("demo.yaml").resolve() == REPOSITORY / "configs" / "demo.yaml"
+    assert find_config("demo.yaml").resolve() == ROOT / "configs" / "demo.yaml"
     for name, said in (("mien.yaml", ": did you mean 'mine.yaml'"), ("there/mine.yaml", "")):
         with pytest.raises(UserError, match=f"unknown configuration '{name}'{said}"):
             find_config(name)

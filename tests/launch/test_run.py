@@ -12,8 +12,6 @@ from threestudio_gaussiandreamer.launch.config import load_config
 from threestudio_gaussiandreamer.launch.ddp import ReplicatedStrategy
 from threestudio_gaussiandreamer.launch.run_folder import claim
 
-# -- files beside the run --------------------------------------------------------------------------
-
 
 def test_what_is_no_source_in_custom_is_neither_loaded_nor_copied(launch):
     Path("custom/package").mkdir(parents=True)
@@ -40,9 +38,7 @@ def test_a_source_that_can_not_be_read_is_left_out_of_the_copy(monkeypatch, tmp_
 
 
 def test_the_record_holds_what_was_read_and_said(launch, monkeypatch):
-    """Of a configuration that is deleted meanwhile and whose name is no UTF-8; in the place of the
-    copy is a pipe, where writing would wait for a reader.
-    """
+    """Of a file that is deleted meanwhile, of a name that is no UTF-8, and over a pipe."""
     name = os.fsdecode(b"caf\xe9.yaml")
     Path(name).write_text(tiny_parts.CONFIG)
     folder = Path("outputs/tiny/t")
@@ -70,25 +66,19 @@ def test_options_of_the_trainer(launch, monkeypatch):
     assert made[0]["profiler"] == "simple" and len(made) == 3
 
 
-# -- runs that meet --------------------------------------------------------------------------------
-
 ONE_FOLDER = ["use_timestamp=false", "tag=run"]
 
 
 def test_a_run_from_step_0_puts_earlier_work_aside(launch, monkeypatch):
-    """Else resume=auto may take a later step of the earlier run, and the page of the run show one;
-    the prior serves again.
-    """
+    """Else resume=auto may take a later step of the earlier run; the prior serves again."""
     folder = Path("outputs/tiny/run")
     save, aside = folder / "save", folder / "save-2"
     for name in ("it9-export", "prior"):
         (save / name).mkdir(parents=True)
         (save / name / "file").write_text(name)
-
     assert launch("--train", *ONE_FOLDER, "trainer.max_steps=4")[0] == 0
     assert {path.name for path in aside.iterdir()} == {"it9-export"}
     assert (save / "prior/file").read_text() == "prior" and not (save / "it9-export").exists()
-
     # a run may start from the weights of the checkpoints that it puts aside
     weights = f"system.weights={folder}/ckpts/last.ckpt"
     assert launch("--train", *ONE_FOLDER, "trainer.max_steps=2", weights)[0] == 0
@@ -171,9 +161,7 @@ def test_runs_of_one_second_have_a_folder_each(launch, noon):
 
 
 def test_two_stages_in_one_folder(launch, trained, monkeypatch):
-    """A second --test is refused, one beside a training isn't; a file that another stage removes,
-    as the pictures of a turntable, is named in one line.
-    """
+    """A second --test is refused, one beside a training isn't; a file that is gone is named."""
     options = ("--test", f"resume={trained}/ckpts/last.ckpt")
     config = f"{trained}/configs/parsed.yaml"
     training, other = claim(trained), claim(trained / ".test")
@@ -182,7 +170,6 @@ def test_two_stages_in_one_folder(launch, trained, monkeypatch):
     other.discard()
     assert launch(*options, config=config)[0] == 0 and not (trained / ".test").exists()
     training.release()
-
     test_step = tiny_parts.TinySystem.test_step
 
     def removed_after(system, batch, batch_idx):

@@ -1,6 +1,4 @@
-"""The folder of a run: that of one that is resumed, also if it was moved, copied or renamed; it is
-created by one process, locked, and removed only by its creator.
-"""
+"""The folder of a run: found again when it was moved, locked, removed only by its creator."""
 
 import fcntl
 import json
@@ -20,13 +18,7 @@ from threestudio_gaussiandreamer.core.checkpoint_file import save_file
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.launch import run_folder
 from threestudio_gaussiandreamer.launch.config import dump_config, load_config
-from threestudio_gaussiandreamer.launch.run_folder import (
-    FolderInUse,
-    claim,
-    claim_new,
-    make_folder,
-    require_writable,
-)
+from threestudio_gaussiandreamer.launch.run_folder import FolderInUse, claim, require_writable
 
 CHECKPOINT = {"state_dict": {}, "epoch": 0, "global_step": 3}
 
@@ -86,9 +78,6 @@ def test_a_run_of_the_same_second_is_resumed_in_its_folder(folder, noon):
     assert first.new_folder and not again.new_folder and again.trial_dir == first.trial_dir
 
 
-# -- the lock --------------------------------------------------------------------------------------
-
-
 @pytest.fixture
 def place(tmp_path, monkeypatch) -> Path:
     monkeypatch.chdir(tmp_path)
@@ -107,10 +96,7 @@ def stop_before(monkeypatch, owner, name) -> None:
 
 
 def stopped_child(work) -> int:
-    """Fork a process that does ``work`` until it stops itself; return its id.
-
-    It exits with 0, with 3 for a folder in use, else with 1.
-    """
+    """Fork a process that does ``work`` until it stops itself; it exits with 0, 3 (in use) or 1."""
     child = os.fork()
     if child == 0:
         try:
@@ -187,7 +173,7 @@ def test_a_parent_that_was_just_removed_is_made_again(place, monkeypatch):
         os.makedirs(path)
 
     monkeypatch.setattr(Path, "mkdir", mkdir)
-    assert make_folder(place) == Path("outputs") and place.is_dir()
+    assert run_folder.make_folder(place) == Path("outputs") and place.is_dir()
 
 
 def test_the_message_names_the_process_that_holds_the_folder(place, monkeypatch):
@@ -221,7 +207,7 @@ def test_without_flock_a_file_keeps_a_second_run_away(place, monkeypatch):
     first = claim(place)
     with pytest.raises(FolderInUse, match="another run is training in outputs/tiny/run.*remove"):
         claim(place)
-    other = claim_new(place)
+    other = run_folder.claim_new(place)
     assert other.path == place.with_name("run-2")
     rename = Path.rename
 
@@ -251,7 +237,7 @@ def test_a_folder_that_can_not_be_renamed_is_removed_in_place(place, monkeypatch
 
 def claim_numbered(path: Path, start, results) -> None:
     start.wait()
-    results.put(str(claim_new(path).path))
+    results.put(str(run_folder.claim_new(path).path))
     time.sleep(0.2)  # as a run would keep it
 
 

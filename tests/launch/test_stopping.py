@@ -89,9 +89,7 @@ def test_a_resumed_run_keeps_its_first_configuration_and_adds_its_command(launch
 
 
 @pytest.mark.parametrize("error", [ValueError, UserError])
-def test_an_error_after_training_prints_the_command_and_stays_as_it_is(
-    launch, monkeypatch, capsys, error
-):
+def test_an_error_after_training_prints_the_command_and_stays(launch, monkeypatch, capsys, error):
     def fail(self, batch, batch_idx):
         raise error("of the test")
 
@@ -132,9 +130,7 @@ def test_under_nohup_a_hang_up_changes_nothing(launch):
 
 
 def test_a_closed_terminal_leaves_a_checkpoint(launch, monkeypatch):
-    """The process loses its terminal in the middle of a step: it receives SIGHUP, and all later
-    writes fail.
-    """
+    """In the middle of a step: the process receives SIGHUP, and all later writes fail."""
     child, terminal = pty.fork()
     if child == 0:
         sys.stdout, sys.stderr = open(1, "w", closefd=False), open(2, "w", closefd=False)
@@ -150,13 +146,10 @@ def test_a_closed_terminal_leaves_a_checkpoint(launch, monkeypatch):
     assert load_file(only_run() / "ckpts/last.ckpt")["global_step"] > 0
 
 
-@pytest.mark.parametrize(
-    ("seconds", "writing", "steps"), [(20.0, 0.0, [3, 6, 9]), (100.0, 5.0, [1, 6, 11])]
-)
-def test_checkpoints_are_written_about_every_minute_in_a_hundredth_of_the_time(
-    launch, monkeypatch, seconds, writing, steps
-):
+@pytest.mark.parametrize("times, steps", [((20, 0), [3, 6, 9]), ((100, 5), [1, 6, 11])])
+def test_checkpoints_come_every_minute_and_take_a_hundredth(launch, monkeypatch, times, steps):
     """A run that is killed between its own checkpoints loses at most that much."""
+    seconds, writing = times
     clock, saved, training_step = [0.0], [], tiny_parts.TinySystem.training_step
 
     def slow_step(system, batch, batch_idx):

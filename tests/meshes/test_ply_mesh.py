@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from threestudio_gaussiandreamer.core.errors import UserError
+from tests.helpers.refusals import refused
 from threestudio_gaussiandreamer.meshes.load import load_mesh, read_parts
 from threestudio_gaussiandreamer.meshes.mesh import vertex_surface_colors
 
@@ -127,5 +127,4 @@ def test_colours_of_faces(tmp_path, faces):
 def test_damaged_files_are_refused(tmp_path, change, said):
     path = ply(tmp_path, faces=TRIANGLES)
     path.write_bytes(change(path.read_bytes()))
-    with pytest.raises(UserError, match=said):
-        load_mesh(path)
+    refused(said, load_mesh, path)

@@ -14,12 +14,6 @@ from threestudio_gaussiandreamer import cameras
 from threestudio_gaussiandreamer.meshes import raycast
 from threestudio_gaussiandreamer.meshes.load import load_mesh
 from threestudio_gaussiandreamer.meshes.mesh import Mesh
-from threestudio_gaussiandreamer.meshes.raycast import (
-    MeshCaster,
-    TargetCache,
-    over_background,
-    zbuffer_hits,
-)
 
 SIDES = {"+x": (0, 0), "+y": (0, 90), "-x": (0, 180), "-y": (0, -90), "+z": (89.9, 0)}
 SIDES["-z"] = (-89.9, 0)
@@ -29,7 +23,6 @@ COLORS["-z"] = (1, 1, 0)
 
 @pytest.fixture(params=["embree", "zbuffer"])
 def caster_name(request, monkeypatch):
-    """Run a test with both casters."""
     if request.param == "zbuffer":  # importing it is an ImportError now
         monkeypatch.setitem(sys.modules, "embreex.mesh_construction", None)
     else:
@@ -47,7 +40,6 @@ def look(elevation, azimuth, distance):
 
 
 def cube(size=1.0):
-    """Return a cube with one colour per side."""
     source = trimesh.creation.box((size, size, size))
     sides = source.face_normals.round().astype(int)
     names = ["+-"[int(side.sum() < 0)] + "xyz"[int(np.abs(side).argmax())] for side in sides]
@@ -68,7 +60,7 @@ def picture(caster, c2w, fovy, height, width, supersample=2):
 def test_the_silhouette_of_a_sphere(distance=3.0, fovy=40.0, height=80, width=120):
     """Radius r at distance d subtends the angle asin(r / d): a disc of radius f tan of it."""
     view = look(20, 30, distance), math.radians(fovy)
-    image = picture(MeshCaster(sphere(0.8)), *view, height, width, supersample=4)
+    image = picture(raycast.MeshCaster(sphere(0.8)), *view, height, width, supersample=4)
     focal = height / (2 * math.tan(math.radians(fovy) / 2))
     radius = focal * math.tan(math.asin(0.8 / distance))
     # the icosphere's edges lie 5e-4 inside; 16 samples a pixel leave about 0.2 % of the area
@@ -82,7 +74,7 @@ def test_the_silhouette_of_a_sphere(distance=3.0, fovy=40.0, height=80, width=12
 @both
 def test_a_cube_is_seen_upright_not_mirrored_and_from_inside():
     """From the front, +y is on the right and +z on top."""
-    caster = MeshCaster(cube())
+    caster = raycast.MeshCaster(cube())
     for side, angles in SIDES.items():
         image = picture(caster, look(*angles, 3), math.radians(40), 32, 32)
         np.testing.assert_allclose(image[16, 16], [*COLORS[side], 1], atol=1e-6)
@@ -90,7 +82,7 @@ def test_a_cube_is_seen_upright_not_mirrored_and_from_inside():
     red, green, blue = image[..., 0] > 0.1, image[..., 1] > 0.9, image[..., 2] > 0.9
     assert np.nonzero(green & ~red & (image[..., 2] < 0.1))[1].mean() > 36  # +y
     assert np.nonzero(blue & ~red)[0].mean() < 24  # +z
-    caster = MeshCaster(cube())
+    caster = raycast.MeshCaster(cube())
     inside, away = look(10, 20, 0.1), look(10, 20, 3)
     away[:3, :3] *= [-1, 1, -1]  # looks the other way
     assert picture(caster, inside, 1.0, 8, 8)[..., 3].min() == 1
@@ -106,7 +98,7 @@ def test_a_point_lands_where_the_intrinsics_say():
     mesh = sphere(0.02, 2)
     mesh = mesh._replace(vertices=mesh.vertices + position)
     c2w, fovy, height, width = look(25, 70, 2.5), math.radians(50), 60, 100
-    image = picture(MeshCaster(mesh), c2w, fovy, height, width, supersample=8)
+    image = picture(raycast.MeshCaster(mesh), c2w, fovy, height, width, supersample=8)
     viewmats, Ks = cameras.to_opencv(torch.tensor(c2w)[None], torch.tensor([fovy]), height, width)
     projected = Ks[0].double() @ (viewmats[0, :3, :3] @ torch.tensor(position) + viewmats[0, :3, 3])
     weights = image[..., 3] / image[..., 3].sum()
@@ -117,12 +109,12 @@ def test_a_point_lands_where_the_intrinsics_say():
 
 @both
 def test_colour_is_premultiplied_and_supersampling_is_the_mean_of_a_larger_picture(monkeypatch):
-    caster = MeshCaster(cube())
+    caster = raycast.MeshCaster(cube())
     image = picture(caster, look(0, 0, 3), math.radians(40), 30, 30, supersample=4)
     edge = (image[..., 3] > 0) & (image[..., 3] < 1)
     assert edge.any()
     np.testing.assert_allclose(image[..., 0], image[..., 3], atol=1e-6)  # the front is red
-    over = over_background(image, np.array([0.0, 1.0, 0.0]))
+    over = raycast.over_background(image, np.array([0.0, 1.0, 0.0]))
     np.testing.assert_allclose(over[..., :2].sum(axis=-1), 1, atol=1e-6)
     view = look(30, 40, 2.5), math.radians(50)
     large = picture(caster, *view, 48, 72, 1).reshape(16, 3, 24, 3, 4).mean(axis=(1, 3))
@@ -135,7 +127,7 @@ def test_colour_is_premultiplied_and_supersampling_is_the_mean_of_a_larger_pictu
 def test_many_views_are_the_single_views(terminal, capfd, monkeypatch):
     """With a progress bar in terminals, where it has a name."""
     monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal)
-    caster = MeshCaster(cube())
+    caster = raycast.MeshCaster(cube())
     views = [(look(10 * i, 40 * i, 2 + 0.1 * i), 0.8) for i in range(6)]
     capfd.readouterr()
     together = caster.render_views(views, 12, 18, supersample=2)
@@ -154,18 +146,12 @@ def orbit_tensors(*azimuths):
     return c2w, torch.full_like(azimuth, 0.7)
 
 
-def test_the_cache_casts_each_picture_once_and_drops_the_oldest_use(monkeypatch):
-    caster, cast = MeshCaster(cube()), []
-    cache, render = TargetCache(caster, 2, capacity=3), caster.render_views
-
-    def counted(views, *args, **options):
-        cast.append(len(views))
-        return render(views, *args, **options)
-
-    monkeypatch.setattr(caster, "render_views", counted)
+def test_the_cache_casts_each_picture_once_and_drops_the_oldest_use(recorded):
+    caster = raycast.MeshCaster(cube())
+    cache, cast = raycast.TargetCache(caster, 2, capacity=3), recorded(caster, "render_views")
     c2w, fovy = orbit_tensors(0, 90, 0)
     first = cache(c2w, fovy, 10, 12)
-    assert cast == [2]
+    assert [len(views) for (views, *_), _ in cast] == [2]
     expected = picture(caster, c2w[1].numpy(), float(fovy[1]), 10, 12, 2)
     np.testing.assert_allclose(first[1] / 255.0, expected, atol=0.5 / 255 + 1e-6)
     cast.clear()
@@ -176,7 +162,7 @@ def test_the_cache_casts_each_picture_once_and_drops_the_oldest_use(monkeypatch)
     cache(*orbit_tensors(20, 0, 30), 4, 4)
     assert not cast
     cache(*orbit_tensors(10), 4, 4)
-    assert cast == [1]
+    assert [len(views) for (views, *_), _ in cast] == [1]
     larger = cache(*orbit_tensors(1, 2, 3, 4, 5), 4, 4)  # a batch larger than the cache
     assert larger.shape == (5, 4, 4, 4)
 
@@ -184,8 +170,8 @@ def test_the_cache_casts_each_picture_once_and_drops_the_oldest_use(monkeypatch)
 def test_a_missing_embree_is_reported_once(caster_name, caplog):
     raycast._report_slow_caster.cache_clear()
     with caplog.at_level(logging.WARNING, logger=raycast.__name__):
-        MeshCaster(cube())
-        MeshCaster(cube())
+        raycast.MeshCaster(cube())
+        raycast.MeshCaster(cube())
     assert caplog.text.count("pip install embreex") == (caster_name == "zbuffer")
 
 
@@ -196,7 +182,7 @@ PLACES = np.arange(-16, 16) + 0.5
 def draw(vertices, faces, rows=PLACES, columns=PLACES):
     """Return the hits of a camera at the origin along -z."""
     mesh = np.array(vertices, dtype=float), np.array(faces)
-    return zbuffer_hits(*mesh, np.eye(4), FOCAL, rows, columns)
+    return raycast.zbuffer_hits(*mesh, np.eye(4), FOCAL, rows, columns)
 
 
 def cast(vertices, faces):
@@ -278,6 +264,6 @@ def test_the_toy_has_the_faces_that_embree_finds():
     for view, degrees in (((20, 30, 2.5), 50), ((60, -75, 4.0), 40), ((5, 100, 0.6), 90)):
         camera = look(*view), 48 / math.tan(math.radians(degrees) / 2), places, places
         expected, _ = raycast._fastest_hits(toy)(*camera)
-        found, _ = zbuffer_hits(toy.vertices, toy.faces, *camera)
+        found, _ = raycast.zbuffer_hits(toy.vertices, toy.faces, *camera)
         covered = (found >= 0) | (expected >= 0)
         assert (found == expected)[covered].mean() > 0.995  # ties on edges; Embree's are float32

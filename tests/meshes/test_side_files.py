@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from tests.helpers.gltf_builder import FOUR, NEAREST, RED, color_at, png, textured_quad
+from tests.helpers.refusals import refused
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.meshes.load import load_mesh
 from threestudio_gaussiandreamer.meshes.mesh import surface_colors
@@ -40,8 +41,7 @@ def test_pictures_and_buffers_are_found_and_a_missing_one_is_named(tmp_path, cap
     for uri, said in (("no.bin", "is missing: a file"), ("data:,a", "is shorter .* truncated")):
         document["buffers"][0]["uri"] = uri
         path.write_text(json.dumps(document))
-        with pytest.raises(UserError, match=f"buffer 0 {said}"):
-            load_mesh(path)
+        refused(f"buffer 0 {said}", load_mesh, path)
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="FIFOs are of Unix")
@@ -73,7 +73,6 @@ def test_a_fifo_beside_a_mesh_is_refused(kind, tmp_path):
 
 
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nusemtl m\nf 1/1 2/2 3/3\n"
-
 
 GREY = "map_Kd grey.png\n"
 
@@ -154,8 +153,7 @@ def test_a_texture_of_an_obj_that_is_no_picture_is_refused(name, content, tmp_pa
     (tmp_path / "a.mtl").write_text(f"newmtl m\nmap_Kd {name}\n")
     (tmp_path / "a.obj").write_text("mtllib a.mtl\n" + TRIANGLE)
     (tmp_path / name.strip()).write_bytes(content)
-    with pytest.raises(UserError, match=rf"{name.strip()}.* in none of the formats PNG"):
-        load_mesh(tmp_path / "a.obj")
+    refused(rf"{name.strip()}.* in none of the formats PNG", load_mesh, tmp_path / "a.obj")
 
 
 @pytest.mark.parametrize("picture, expected", [(None, [1, 0.5, 0]), (np.uint16([[0x8080]]), 0.5)])

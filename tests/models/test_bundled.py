@@ -2,7 +2,7 @@
 
 import pytest
 
-from threestudio_gaussiandreamer.core.errors import UserError
+from tests.helpers.refusals import refused
 from threestudio_gaussiandreamer.models import bundled
 from threestudio_gaussiandreamer.models.bundled import CLIP, DIFFUSION, POINTS, model_part
 
@@ -40,8 +40,7 @@ def test_a_damaged_file_is_named_with_how_to_get_it_again(folder, monkeypatch, c
         monkeypatch.setattr(bundled, "FOLDER", folder / "elsewhere")
     name = "toybox" if is_bundled else str(folder)
     remedy = "install.*git checkout" if is_bundled else "write the folder again"
-    with pytest.raises(UserError, match=f"unet/weights' is missing or damaged: {remedy}"):
-        model_part(name, DIFFUSION)
+    refused(f"unet/weights' is missing or damaged: {remedy}", model_part, name, DIFFUSION)
     assert model_part(name, CLIP)  # the other parts can be used
     if not is_bundled:
         assert model_part(name, "another")  # an export needn't have all parts
@@ -56,9 +55,7 @@ def test_without_the_list_or_with_a_damaged_one_nothing_is_used(folder, monkeypa
     digests = folder / "SHA256SUMS"
     digests.unlink() if content is None else digests.write_bytes(content)
     said = f"{part}' is missing or damaged: "
-    with pytest.raises(UserError, match=f"{said}install the package again"):
-        model_part("toybox", part)
+    refused(f"{said}install the package again", model_part, "toybox", part)
     if content is not None:
         monkeypatch.setattr(bundled, "FOLDER", folder / "elsewhere")
-        with pytest.raises(UserError, match=f"{said}write the folder again"):
-            model_part(str(folder), part)
+        refused(f"{said}write the folder again", model_part, str(folder), part)

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from tests.helpers import tiny_models
+from tests.helpers.refusals import refused
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.core.extras import require_extra
 from threestudio_gaussiandreamer.models import hub, model_files
@@ -68,10 +69,8 @@ class FakeHub(BaseHTTPRequestHandler):
             self.reply(401, b"", {"X-Error-Code": "RepoNotFound", "X-Error-Message": said}, body)
 
     def api(self, path):
-        sizes = {
-            name: (self.folder / name).stat().st_size
-            for name in model_files.files_below(self.folder)
-        }
+        names = model_files.files_below(self.folder)
+        sizes = {name: (self.folder / name).stat().st_size for name in names}
         if "/tree/" in path:
             same = {"type": "file", "oid": "0" * 40}
             content = [same | {"path": name, "size": size} for name, size in sizes.items()]
@@ -117,20 +116,17 @@ def connect_to(monkeypatch, cache, address):
 
 
 def test_a_folder_needs_no_network_and_near_ones_are_named(model, monkeypatch, tmp_path):
-    with pytest.raises(UserError, match="no such folder.*near.*tiny"):
-        hub.find_model(str(model.parent / "tini"), TEXT)
+    refused("no such folder.*near.*tiny", hub.find_model, str(model.parent / "tini"), TEXT)
     for name in ("./models/none", "no-owner", "../a/b", "a/b/c", "a\0b", "x" * 5000, "a/b.git"):
-        with pytest.raises(UserError, match="no such folder"):
-            hub.find_model(name, TEXT)
+        refused("no such folder", hub.find_model, name, TEXT)
     # "models/tini" could be a model of the owner "models" too
     tiny_models.nothing_cached(monkeypatch, tmp_path)
     copied(model, tmp_path / "models" / "tiny")
     monkeypatch.chdir(tmp_path)
     with pytest.raises(UserError, match=r"The folder 'models' has no 'tini' \(near: models/tiny\)"):
         hub.find_model("models/tini", IMAGE)
-    monkeypatch.setattr(
-        socket, "getaddrinfo", lambda *args, **kwargs: pytest.fail("asked the network")
-    )
+    asked = lambda *args, **kwargs: pytest.fail("asked the network")  # noqa: E731
+    monkeypatch.setattr(socket, "getaddrinfo", asked)
     assert hub.find_model(str(model), (*TEXT, *IMAGE)) == model
 
 
@@ -140,11 +136,9 @@ def test_folders_without_usable_weights_are_named(model, tmp_path):
     folder = copied(model, tmp_path / "tiny")
     (weights,) = (folder / "unet").glob("*.safetensors")
     weights.write_bytes(b"version https://git-lfs.github.com/spec/v1\n")
-    with pytest.raises(UserError, match="unet/.*safetensors is a pointer of Git LFS"):
-        hub.find_model(str(folder), IMAGE)
+    refused("unet/.*safetensors is a pointer of Git LFS", hub.find_model, str(folder), IMAGE)
     weights.rename(weights.with_suffix(".bin"))
-    with pytest.raises(UserError, match="pickled.*safe_serialization"):
-        hub.find_model(str(folder), ["unet"])
+    refused("pickled.*safe_serialization", hub.find_model, str(folder), ["unet"])
     (folder / "tokenizer" / "merges.txt").unlink()
     with pytest.raises(UserError, match="tokenizer/merges.txt, are missing; .*pickled"):
         hub.find_model(str(folder), ["tokenizer", "unet"])
@@ -161,8 +155,7 @@ def test_the_wanted_precision_is_preferred_and_the_other_one_will_do(variant):
         assert pick([full], "unet", half=True) == ([full], None, True)
     shards = [f"unet/model-0000{i}-of-00003.safetensors" for i in (1, 2, 3)]
     assert pick(["unet/config.json", *shards], "unet") == (shards, None, True)
-    with pytest.raises(UserError, match=r"some of unet/\*.safetensors are missing"):
-        pick(shards[:-1], "unet")
+    refused(r"some of unet/\*.safetensors are missing", pick, shards[:-1], "unet")
 
 
 def test_the_fingerprint_is_of_the_content_and_missing_weights_are_not_made_up(model, tmp_path):
@@ -195,8 +188,7 @@ def test_only_what_is_needed_is_downloaded_and_then_read_from_the_disk(online, m
     online.asked.clear()
     assert hub.find_model("people/tiny", IMAGE) == folder
     assert not online.asked
-    with pytest.raises(UserError, match="HF_HUB_OFFLINE"):
-        hub.find_model("people/tiny", TEXT)
+    refused("HF_HUB_OFFLINE", hub.find_model, "people/tiny", TEXT)
     monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_OFFLINE", False)
     assert set(model_files.files_below(hub.find_model("people/tiny", TEXT))) > wanted
 
@@ -216,8 +208,7 @@ def test_half_precision_downloads_the_small_files(online):
     ],
 )
 def test_what_the_hub_does_not_give_is_explained(online, name, said):
-    with pytest.raises(UserError, match=said):
-        hub.find_model(name, IMAGE)
+    refused(said, hub.find_model, name, IMAGE)
     error = OSError(28, "No space left on device")
     assert "HF_HOME" in hub.explain(hub.Source("a/b", list), error)
 
@@ -225,8 +216,7 @@ def test_what_the_hub_does_not_give_is_explained(online, name, said):
 def test_a_hub_model_without_safe_weights(online):
     for name in ("", ".fp16", ".non_ema"):
         (online.folder / "unet" / f"diffusion_pytorch_model{name}.safetensors").unlink()
-    with pytest.raises(UserError, match="people/tiny.*pickled"):
-        hub.find_model("people/tiny", IMAGE)
+    refused("people/tiny.*pickled", hub.find_model, "people/tiny", IMAGE)
 
 
 def test_no_network_and_no_libraries_are_one_clear_message(monkeypatch, tmp_path):
@@ -237,13 +227,11 @@ def test_no_network_and_no_libraries_are_one_clear_message(monkeypatch, tmp_path
 
     monkeypatch.setattr(socket, "getaddrinfo", blocked)
     said = "could not be reached.*--local-dir models/tiny.*HF_ENDPOINT"
-    with pytest.raises(UserError, match=said):
-        hub.find_model("people/tiny", IMAGE)
+    refused(said, hub.find_model, "people/tiny", IMAGE)
     require_extra("diffusion", "json")
     monkeypatch.setitem(sys.modules, "diffusers", None)
     said = r"needs diffusers .*pip install 'threestudio-gaussiandreamer\[diffusion\]'"
-    with pytest.raises(UserError, match=said):
-        require_extra("diffusion", "json", "diffusers")
+    refused(said, require_extra, "diffusion", "json", "diffusers")
 
 
 def test_a_network_is_loaded_once_for_each_key_if_networks_are_kept_and_again_after_an_error():

@@ -4,13 +4,8 @@ import pytest
 import torch
 
 from tests.helpers import tiny_models
-from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.models.multiview_unet import (
-    attend_across_views,
-    load_multiview_unet,
-    unet_options,
-    views_attended_together,
-)
+from tests.helpers.refusals import refused
+from threestudio_gaussiandreamer.models import multiview_unet
 
 diffusers = pytest.importorskip("diffusers")
 VIEWS = 4
@@ -22,9 +17,8 @@ def folder(tmp_path_factory):
 
 
 def load(folder, dtype=torch.float32):
-    return load_multiview_unet(
-        diffusers.UNet2DConditionModel, folder, "unet", half=False, torch_dtype=dtype
-    )
+    kind, options = diffusers.UNet2DConditionModel, {"half": False, "torch_dtype": dtype}
+    return multiview_unet.load_multiview_unet(kind, folder, "unet", **options)
 
 
 @torch.no_grad()
@@ -41,7 +35,7 @@ def inputs(rows, seed=0):
 
 def test_the_published_names_give_the_same_network(folder):
     mine = load(folder)
-    original = tiny_models.plain_unet(unet_options(tiny_models.MULTI_VIEW))
+    original = tiny_models.plain_unet(multiview_unet.unet_options(tiny_models.MULTI_VIEW))
     for name, value in original.state_dict().items():
         assert torch.equal(mine.state_dict()[name], value), name
     z, text, cameras = inputs(3)
@@ -54,14 +48,14 @@ def test_views_see_those_of_their_own_object_and_equal_ones_give_what_one_gives(
     unet = load(folder)
     z, text, cameras = (values.repeat_interleave(VIEWS, 0) for values in inputs(2))
     alone = predict(unet, z, text, cameras)
-    with views_attended_together(unet, VIEWS):
+    with multiview_unet.views_attended_together(unet, VIEWS):
         together = predict(unet, z, text, cameras)
     torch.testing.assert_close(together, alone, rtol=1e-5, atol=1e-5)
-    with views_attended_together(unet, 1):
+    with multiview_unet.views_attended_together(unet, 1):
         assert torch.equal(predict(unet, z, text, cameras), alone)
     assert not torch.allclose(predict(unet, z, text, cameras + 1), alone, atol=1e-3)
     unet = load(folder)
-    attend_across_views(unet, VIEWS)
+    multiview_unet.attend_across_views(unet, VIEWS)
     z, text, cameras = inputs(2 * VIEWS)
     before, order = predict(unet, z, text, cameras), [2, 0, 3, 1]
     turned = predict(unet, z[order], text[order], cameras[order])
@@ -74,8 +68,6 @@ def test_views_see_those_of_their_own_object_and_equal_ones_give_what_one_gives(
 
 def test_models_that_do_not_fit_are_reported(tmp_path):
     folder = tiny_models.mvdream(tmp_path / "other", model_channels=64)
-    with pytest.raises(UserError, match="(?s)unet of the model in .* can't .*size mismatch"):
-        load(folder)
+    refused("(?s)unet of the model in .* can't .*size mismatch", load, folder)
     (folder / "unet" / "diffusion_pytorch_model.safetensors").write_bytes(b"no weights")
-    with pytest.raises(UserError, match="unet of the model in .* can't be loaded"):
-        load(folder)
+    refused("unet of the model in .* can't be loaded", load, folder)

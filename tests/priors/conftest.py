@@ -8,7 +8,6 @@ import pytest
 import trimesh
 
 from tests.helpers import tiny_3d_models as tiny
-from tests.helpers.tiny_makehuman import tiny_makehuman
 from tests.priors.cases import rng, walk
 from threestudio_gaussiandreamer.formats import ply
 from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
@@ -104,7 +103,7 @@ def tiny_anny(tmp_path_factory):
     """Write a tiny package ``anny`` for the persons in the tests."""
     middle = Person()
     persons = (middle, middle._replace(height=1.0), middle._replace(gender=1.0, age=0.25))
-    return tiny_makehuman(tmp_path_factory.mktemp("packages"), *persons)
+    return tiny.tiny_makehuman(tmp_path_factory.mktemp("packages"), *persons)
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from tests.helpers.prior_contract import PriorContract, assert_valid
-from tests.helpers.tiny_makehuman import HEADS, TALLER
+from tests.helpers.tiny_3d_models import HEADS, TALLER
 from tests.priors.cases import bvh_text, needs_anny, random_local
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.host import find

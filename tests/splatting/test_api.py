@@ -5,6 +5,7 @@ import logging
 import pytest
 import torch
 
+from tests.helpers.refusals import refused
 from tests.helpers.splatting_scenes import NAMES, cameras, random_cloud
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.splatting import (
@@ -122,11 +123,9 @@ def test_means2d_has_a_gradient_if_any_input_has(only, backend):
 
 
 def test_an_unavailable_backend_says_why_and_auto_says_it_once(monkeypatch, caplog):
-    with pytest.raises(UserError, match="(?s)float32.*float64"):
-        call(**arguments(dtype=torch.float64), backend="cpu")
+    refused("(?s)float32.*float64", call, **arguments(dtype=torch.float64), backend="cpu")
     monkeypatch.setattr(cpu, "unavailable", lambda: "the library wasn't built")
-    with pytest.raises(UserError, match="(?s)'cpu'.*the library wasn't built.*torch"):
-        call(backend="cpu")
+    refused("(?s)'cpu'.*the library wasn't built.*torch", call, backend="cpu")
     chosen = []
     for module, name in ((cpu, "cpu"), (torch_backend, "torch")):
         monkeypatch.setattr(module, "rasterize", lambda *_, name=name: chosen.append(name))
@@ -153,7 +152,6 @@ def test_logarithms_and_logits_are_refused(name, value, said):
     values = arguments()[name].clone()
     values.view(-1)[-1] = value
     for _ in range(2):
-        with pytest.raises(UserError, match=f"{name} must be .*got {value:g}: pass {said}"):
-            call(**{name: values})
+        refused(f"{name} must be .*got {value:g}: pass {said}", call, **{name: values})
     values.view(-1)[0] = torch.inf  # drops its Gaussian; it isn't out of the range
     call(**{name: values.clamp_min(0).where(values.isinf(), values.clamp(0, 1))})

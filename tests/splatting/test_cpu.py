@@ -14,33 +14,19 @@ from unittest import mock
 import pytest
 import torch
 
+from tests.helpers import splatting_scenes as scenes
+from tests.helpers.refusals import refused
 from tests.helpers.splatting_contract import KernelContract
-from tests.helpers.splatting_scenes import (
-    BACKGROUND,
-    Cloud,
-    cameras,
-    compare,
-    draw,
-    equal,
-    front_camera,
-    one_gaussian,
-    random_cloud,
-    rasterize,
-)
 from threestudio_gaussiandreamer.core import options as memory
 from threestudio_gaussiandreamer.core.devices import torch_threads
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.splatting import validation
 from threestudio_gaussiandreamer.splatting.cpu import backend as cpu
-from threestudio_gaussiandreamer.splatting.validation import LARGEST_SIDE
 
 EMULATED, SLOW = "v4 emulated", pytest.mark.slow
 HEADER = pathlib.Path(__file__).parents[1] / "helpers" / "avx512_emulated.h"
-EMULATION = (
-    "-std=c++17 -O1 -march=x86-64-v3 -fPIC -shared -pthread -fvisibility=hidden "
-    "-ffp-contract=off -fno-math-errno -fno-trapping-math -Wno-psabi"
-).split()
-
+EMULATION = "-std=c++17 -O1 -march=x86-64-v3 -fPIC -shared -pthread -fvisibility=hidden".split()
+EMULATION += "-ffp-contract=off -fno-math-errno -fno-trapping-math -Wno-psabi".split()
 pytestmark = pytest.mark.skipif(cpu.unavailable() is not None, reason=str(cpu.unavailable()))
 
 
@@ -56,8 +42,6 @@ def emulated() -> tempfile.TemporaryDirectory:
 
 @pytest.fixture
 def force(monkeypatch):
-    """Return a function that selects one build."""
-
     def force(name):
         if name == EMULATED:
             name, folder = "v4", pathlib.Path(emulated().name)
@@ -81,9 +65,7 @@ def isa(request, force):
     return request.param
 
 
-@pytest.fixture(
-    params=[name if name == BUILDS[0] else pytest.param(name, marks=SLOW) for name in BUILDS]
-)
+@pytest.fixture(params=[*BUILDS[:1], *(pytest.param(name, marks=SLOW) for name in BUILDS[1:])])
 def backend(request, force):
     """Select a build; the fast tests have the whole contract of the one that a run uses."""
     force(request.param)
@@ -96,55 +78,59 @@ class TestCpuKernel(KernelContract):
 
 def test_buffers_that_were_used_before_change_nothing(isa):
     """Faint Gaussians take all three chunks of a tile, opaque ones in their place the first."""
-    faint = random_cloud(1200, seed=6, size=0.6)
+    faint = scenes.random_cloud(1200, seed=6, size=0.6)
     faint.opacities.mul_(0.02)
     opaque = faint._replace(opacities=torch.full_like(faint.opacities, 0.9))
+    view = scenes.cameras(1, 34, 18), 34, 18
     for cloud in (faint, opaque, faint):
-        compare("cpu", cloud, cameras(1, 34, 18), 34, 18, preset="accurate", absgrad=True)
+        scenes.compare("cpu", cloud, *view, preset="accurate", absgrad=True)
 
 
 def test_both_passes_stop_at_the_same_gaussian(isa):
     """Also when the transmittance equals ``stop`` up to its last bit."""
     generator = torch.Generator().manual_seed(0)
-    row = one_gaussian(scale=1e4)
+    row, view = scenes.one_gaussian(scale=1e4), (scenes.front_camera(1, 1, 1.0), 1, 1)
     for _ in range(30):
         opacities = 0.05 + 0.45 * torch.rand(12, generator=generator)
-        stack = Cloud(*(x.repeat(12, *[1] * (x.dim() - 1)) for x in row))
+        stack = scenes.Cloud(*(x.repeat(12, *[1] * (x.dim() - 1)) for x in row))
         stack = stack._replace(opacities=opacities.double())
         stop = (1 - opacities).cumprod(0)[6].item()
         for scale in (1 - 1.2e-7, 1, 1 + 1.2e-7):
-            drawn = draw("cpu", stack, front_camera(1, 1, 1.0), 1, 1, stop=stop * scale)
+            drawn = scenes.draw("cpu", stack, *view, stop=stop * scale)
             assert torch.equal(drawn.out.contribution[0] > 0, drawn.grads["colors"].any(1))
 
 
 def test_the_number_of_threads_changes_no_bit(isa):
     """Also with more Gaussians than one task takes, and more threads than views."""
-    cloud, camera = random_cloud(9000, seed=10, size=0.03), cameras(3, 150, 90)
+    cloud, camera = scenes.random_cloud(9000, seed=10, size=0.03), scenes.cameras(3, 150, 90)
     options, results = {"camera_gradient": True, "absgrad": True}, []
     for count in (1, 2, 4, 4):
         with torch_threads(count):
-            results.append(draw("cpu", cloud, camera, 150, 90, BACKGROUND, **options))
-    assert all(equal(results[0], other) for other in results[1:])
+            results.append(scenes.draw("cpu", cloud, camera, 150, 90, scenes.BACKGROUND, **options))
+    assert all(scenes.equal(results[0], other) for other in results[1:])
 
 
 def test_backward_frees_its_memory_and_threads_may_draw_at_once(monkeypatch):
     """With the saved tensors, not with the graph's last tensor."""
     states, create = weakref.WeakSet(), cpu._State
     monkeypatch.setattr(cpu, "_State", lambda *x: states.add(state := create(*x)) or state)
-    cloud, camera = random_cloud(30).to(torch.float32), cameras(1, 12, 12, dtype=torch.float32)
-    out = rasterize(*cloud.leaves(), *camera, 12, 12, backend="cpu")
+    cloud, camera = (
+        scenes.random_cloud(30).to(torch.float32),
+        scenes.cameras(1, 12, 12, dtype=torch.float32),
+    )
+    out = scenes.rasterize(*cloud.leaves(), *camera, 12, 12, backend="cpu")
     assert len(states) == 1
     out.image.sum().backward()
     assert len(states) == 0 and out.image.grad_fn is not None
-    clouds = [random_cloud(200, seed=n) for n in range(4)]
-    alone = [draw("cpu", cloud, cameras(2, 60, 40), 60, 40) for cloud in clouds]
+    clouds = [scenes.random_cloud(200, seed=n) for n in range(4)]
+    view = {"camera": scenes.cameras(2, 60, 40), "width": 60, "height": 40}
+    render = functools.partial(scenes.draw, "cpu", **view)
+    alone = [render(cloud) for cloud in clouds]
     # one stand-in for all threads, whose own would be left behind
     with mock.patch.object(validation, "check_ranges"), ThreadPoolExecutor(4) as pool:
         for _ in range(5):
-            together = pool.map(
-                lambda cloud: draw("cpu", cloud, cameras(2, 60, 40), 60, 40), clouds
-            )
-            assert all(equal(a, b) for a, b in zip(alone, together, strict=True))
+            together = zip(alone, pool.map(render, clouds), strict=True)
+            assert all(scenes.equal(a, b) for a, b in together)
 
 
 SCENE = """
@@ -192,34 +178,33 @@ def test_threads_that_are_not_there(text):
 
 def test_more_memory_than_there_is_or_the_container_has_is_a_named_error(monkeypatch, tmp_path):
     """At least 2.6e9 pairs of Gaussian and tile: beyond 32 bits and the memory of any machine."""
-    cloud, camera = random_cloud(40_000), cameras(1, 8192, 8192, dtype=torch.float32)
+    cloud, camera = scenes.random_cloud(40_000), scenes.cameras(1, 8192, 8192, dtype=torch.float32)
     cloud = cloud._replace(scales=torch.full((40_000, 3), 1e3)).to(torch.float32)
     with pytest.raises(UserError, match="GiB"), torch.no_grad():
-        rasterize(*cloud, *camera, 8192, 8192, backend="cpu")
-    cloud = random_cloud(50_000).to(torch.float32)
-    scene = *cloud, *cameras(4, 256, 256, dtype=torch.float32), 256, 256
+        scenes.rasterize(*cloud, *camera, 8192, 8192, backend="cpu")
+    cloud = scenes.random_cloud(50_000).to(torch.float32)
+    scene = *cloud, *scenes.cameras(4, 256, 256, dtype=torch.float32), 256, 256
     build = os.environ.get("GAUSSIANDREAMER_ISA") or cpu.usable_builds()[0]
     monkeypatch.setattr(memory, "CGROUP_LIMIT", tmp_path / "memory.max")
     (tmp_path / "memory.max").write_text(str(1 << 20))
     try:
         cpu._load(build)
-        with pytest.raises(UserError, match="GiB"):
-            rasterize(*scene, backend="cpu")
+        refused("GiB", scenes.rasterize, *scene, backend="cpu")
     finally:
         monkeypatch.undo()
         cpu._load(build)
-    rasterize(*scene, backend="cpu")
+    scenes.rasterize(*scene, backend="cpu")
 
 
 @pytest.mark.parametrize("threads", [1, 4])
 def test_the_last_tile_of_the_tallest_image(threads):
     """Its number and the one behind it still have 16 bits."""
-    cloud, sums = one_gaussian(mean=(0.0, 0.0, 2.0), scale=0.01).to(torch.float32), []
-    for height in (64, LARGEST_SIDE):
-        viewmats, Ks = (x.to(torch.float32) for x in front_camera(1, height, 100.0))
+    cloud, sums = scenes.one_gaussian(mean=(0.0, 0.0, 2.0), scale=0.01).to(torch.float32), []
+    for height in (64, validation.LARGEST_SIDE):
+        viewmats, Ks = (x.to(torch.float32) for x in scenes.front_camera(1, height, 100.0))
         Ks[:, 1, 2] = height - 3.0
         with torch_threads(threads):
-            out = rasterize(*cloud, viewmats, Ks, 1, height, backend="cpu")
+            out = scenes.rasterize(*cloud, viewmats, Ks, 1, height, backend="cpu")
         sums.append(out.alpha[0, -64:].flatten())
         assert out.alpha.sum() == sums[-1].sum() > 0.1
     torch.testing.assert_close(*sums, rtol=0, atol=1e-6)
@@ -230,8 +215,7 @@ def test_builds_of_another_version_or_name_and_none_are_refused(monkeypatch, for
         patch.setattr(cpu, "INTERFACE", cpu.INTERFACE + 1)
         cpu._load(cpu.usable_builds()[0])
     force("v5")
-    with pytest.raises(UserError, match="GAUSSIANDREAMER_ISA=v5, but .* only have .*base"):
-        cpu.library()
+    refused("GAUSSIANDREAMER_ISA=v5, but .* only have .*base", cpu.library)
     monkeypatch.setattr(cpu, "FOLDER", tmp_path)
     cpu.library.cache_clear()
     try:

@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from tests.helpers.cuda_shim.device import library, needs_nvrtc, unavailable
+from tests.helpers.refusals import refused
 from tests.helpers.splatting_scenes import cameras, equal, random_cloud, run
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.splatting import available_backends, backends
@@ -31,11 +32,8 @@ def cache(monkeypatch, tmp_path):
 
 @pytest.fixture
 def compiled(monkeypatch):
-    """Record the units that are compiled from now on."""
-    units, compile_unit = [], nvrtc.compile_unit
-    monkeypatch.setattr(
-        nvrtc, "compile_unit", lambda unit, target: units.append(unit) or compile_unit(unit, target)
-    )
+    units, compiled = [], nvrtc.compile_unit
+    monkeypatch.setattr(nvrtc, "compile_unit", lambda *a: units.append(a[0]) or compiled(*a))
     return units
 
 
@@ -46,10 +44,8 @@ def units():
 def properties(log: str) -> dict[str, list[int]]:
     """Return registers, shared bytes, spilled bytes and stack of each kernel."""
     entry = r"Compiling entry function '(\w+)'(.*?)(?=Compiling entry function|\Z)"
-    numbers = (
-        r"Used (\d+) registers",
-        *(rf"(\d+) bytes {name}" for name in ("smem", "spill", "stack")),
-    )
+    numbers = [rf"(\d+) bytes {name}" for name in ("smem", "spill", "stack")]
+    numbers = [r"Used (\d+) registers", *numbers]
     return {
         name: [sum(map(int, re.findall(pattern, text))) for pattern in numbers]
         for name, text in re.findall(entry, log, re.DOTALL)
@@ -77,8 +73,7 @@ def test_every_kernel_compiles_without_spills(architecture):
 def test_what_the_compiler_rejects_is_named(monkeypatch):
     monkeypatch.setattr(nvrtc, "source", lambda unit: "void f() { undeclared = 1; }")
     rejected = r"NVRTC of CUDA .* can't compile blend.cu for sm_90: (.|\n)*\"undeclared\" is undef"
-    with pytest.raises(UserError, match=rejected):
-        nvrtc.compile_unit("blend", "sm_90")
+    refused(rejected, nvrtc.compile_unit, "blend", "sm_90")
 
 
 def test_what_the_compiler_torch_and_the_device_need_of_each_other(monkeypatch, tmp_path):
@@ -107,8 +102,7 @@ def test_what_the_compiler_torch_and_the_device_need_of_each_other(monkeypatch, 
     for known in ([52, 70, 75, 90], [75, 90], [80, 90]):
         monkeypatch.setattr(nvrtc, "architectures", lambda known=known: known)
         needed = f"needs {max(75, known[0]) / 10} or later: use backend='torch'"
-        with pytest.raises(UserError, match=rf"capability 7\.0;.*CUDA 13\.0, {needed}"):
-            nvrtc.target_for((7, 0))
+        refused(rf"capability 7\.0;.*CUDA 13\.0, {needed}", nvrtc.target_for, (7, 0))
     monkeypatch.setattr(torch.version, "cuda", None)
     cuda_driver.unavailable.cache_clear()
     try:
@@ -118,9 +112,7 @@ def test_what_the_compiler_torch_and_the_device_need_of_each_other(monkeypatch, 
 
 
 @needs_nvrtc
-def test_what_was_compiled_once_is_read_from_the_disk_by_a_name_of_all_that_matters(
-    cache, compiled, tmp_path, monkeypatch, caplog
-):
+def test_compiled_code_is_kept_on_the_disk(cache, compiled, tmp_path, monkeypatch, caplog):
     first = nvrtc.machine_code("bin", "sm_80")
     assert nvrtc.machine_code("bin", "sm_80") == first and compiled == ["bin"]
     (path,) = cache.iterdir()
@@ -168,9 +160,7 @@ def driver(monkeypatch, cache):
     for name, value in gpu.items():
         monkeypatch.setattr(torch.cuda, name, value)
     empty = torch.empty
-    monkeypatch.setattr(
-        torch, "empty", lambda *shape, pin_memory=False, **options: empty(*shape, **options)
-    )
+    monkeypatch.setattr(torch, "empty", lambda *a, pin_memory=False, **more: empty(*a, **more))
     monkeypatch.setattr(torch.version, "cuda", "13.0")
     monkeypatch.setattr(cuda_driver, "LIBRARY", library()._name)
     caches = (cuda_driver._driver, cuda_driver._gpu, cuda_driver.unavailable)

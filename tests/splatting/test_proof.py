@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from tests.helpers.cuda_shim.device import HostDevice, library, unavailable
+from tests.helpers.refusals import refused
 from tests.helpers.splatting_scenes import cameras, random_cloud, rasterize
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.splatting import backends
@@ -37,6 +38,13 @@ def other_constants(*arguments, eps2d: float = 0.4, halved: bool = False) -> Non
     settings = settings_of(arguments)
     if not halved or settings.downsample == 2:
         settings.eps2d, settings.alpha_max = eps2d, 0.5
+
+
+other_constants_if_halved = functools.partial(other_constants, halved=True)
+
+
+def double_the_last_two_columns(rows) -> None:
+    rows[:, -2:].mul_(2)
 
 
 def no_antialiasing(*arguments) -> None:
@@ -67,12 +75,8 @@ FAULTS = {
     "project, antialias": Fault("project", no_antialiasing),
     "project_backward, antialias": Fault("project_backward", no_antialiasing),
     "blend, downsample": Fault("blend", alpha_for_depth_if_halved),
-    "blend_backward, downsample": Fault(
-        "blend_backward", functools.partial(other_constants, halved=True)
-    ),
-    "sums of absolute values": Fault(  # the last two columns
-        "blend_backward_absolute", after=lambda rows: rows[:, -2:].mul_(2)
-    ),
+    "blend_backward, downsample": Fault("blend_backward", other_constants_if_halved),
+    "sums of absolute values": Fault("blend_backward_absolute", after=double_the_last_two_columns),
 }
 """A fault in every kernel, and in those branches that only some options run."""
 QUICK = ("project", "list_tiles", "project_backward", "sums of absolute values")
@@ -182,16 +186,13 @@ def test_the_verdict_about_broken_kernels_is_cached_until_its_file_is_removed(us
     """And they are refused before a run begins; NaN is a difference."""
     nan = functools.partial(other_constants, eps2d=float("nan"))
     use(BrokenDevice(Fault("project_backward", nan)))
-    with pytest.raises(UserError, match="a.backend: .*cuda' can't run: .*differ from plain"):
-        check_backend("a.backend", "cuda")
+    refused("a.backend: .*cuda' can't run: .*differ from plain", check_backend, "a.backend", "cuda")
     check_backend("a.backend", "auto")
-    with pytest.raises(UserError, match="'cuda' can't run: .*gradient of means by nan"):
-        picture("cuda")
+    refused("'cuda' can't run: .*gradient of means by nan", picture, "cuda")
     mended = use(HostDevice())
     assert torch.equal(picture(), picture("torch")) and not mended.launched
     (verdict,) = (tmp_path / "cubins").iterdir()
-    with pytest.raises(UserError, match=f"delete {verdict} and start again"):
-        picture("cuda")
+    refused(f"delete {verdict} and start again", picture, "cuda")
     verdict.unlink()
     use(mended)
     picture()
@@ -221,9 +222,7 @@ def test_another_driver_is_compared_again(use, monkeypatch, tmp_path):
     assert len(compared) == 3
 
 
-def test_a_library_that_fails_means_plain_torch_until_the_next_start(
-    use, caplog, monkeypatch, tmp_path
-):
+def test_a_failing_library_means_torch_until_the_next_start(use, caplog, monkeypatch, tmp_path):
     """At a kernel, and before the GPU's name is known."""
     broken = BrokenDevice(FAULTS["blend"], OSError("no libnvrtc.so"))
     lacking = r"AttributeError: .*undefined symbol: nvrtc.* \[unknown GPU, torch "
@@ -237,8 +236,7 @@ def test_a_library_that_fails_means_plain_torch_until_the_next_start(
             assert torch.equal(picture(), picture("torch"))
             expected = f"its compiler or the driver can't be used: {message}.*Please report"
             assert re.search(expected, the_warning(caplog))
-            with pytest.raises(UserError, match="'cuda' can't run: its compiler or the driver"):
-                picture("cuda")
+            refused("'cuda' can't run: its compiler or the driver", picture, "cuda")
         caplog.clear()
         assert not (tmp_path / "cubins").exists()
     mended = use(HostDevice())
@@ -256,9 +254,7 @@ def test_a_library_that_fails_means_plain_torch_until_the_next_start(
         (UserError("CUDA failed at loading blend.cu: out of memory (2)."), False),
     ],
 )
-def test_a_failed_launch_means_plain_torch_but_short_memory_is_no_verdict(
-    use, caplog, tmp_path, error, is_verdict
-):
+def test_a_failed_launch_counts_but_not_short_memory(use, caplog, tmp_path, error, is_verdict):
     use(BrokenDevice(FAULTS["blend"], error))
     if is_verdict:
         assert torch.equal(picture(), picture("torch"))
@@ -270,9 +266,7 @@ def test_a_failed_launch_means_plain_torch_but_short_memory_is_no_verdict(
 
 
 @pytest.mark.parametrize("owner, name", [(torch, "ones"), (proof.torch_backend, "rasterize")])
-def test_an_error_of_earlier_work_or_of_torch_is_no_verdict(
-    use, tmp_path, monkeypatch, owner, name
-):
+def test_an_error_of_earlier_work_is_no_verdict(use, tmp_path, monkeypatch, owner, name):
     def fails(*_, **__):
         raise RuntimeError("CUDA error: device-side assert triggered")
 

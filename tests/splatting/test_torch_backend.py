@@ -28,7 +28,6 @@ ROUNDING = 1e-9
 
 
 def compare(cloud, camera, width, height, **options):
-    """Compare every output and every gradient in float64."""
     ours, truth = (
         run(cloud, *camera, width, height, camera_gradient=True, backend=b, **options)
         for b in ("torch", "reference")
@@ -38,10 +37,8 @@ def compare(cloud, camera, width, height, **options):
     assert torch.equal(ours.out.radii, truth.out.radii)
     for name, grad in truth.grads.items():
         # Absolute where nothing is left but rounding, relative elsewhere.
-        assert (
-            error(ours.grads[name], grad) < ROUNDING
-            or (ours.grads[name] - grad).abs().max() < 1e-12
-        ), name
+        difference = ours.grads[name] - grad
+        assert error(ours.grads[name], grad) < ROUNDING or difference.abs().max() < 1e-12, name
     if options.get("absgrad"):
         assert error(ours.out.means2d.absgrad, truth.out.means2d.absgrad) < ROUNDING
     return ours, truth
@@ -77,25 +74,22 @@ WITH_BRIGHT_COLORS = EXTREMES | {"colors": [*EXTREMES["colors"], 1e3]}
 def test_extreme_clouds(seed, n, antialias):
     """Equal in float64, finite in float32."""
     cloud, camera = extreme_cloud(seed, n, WITH_BRIGHT_COLORS), cameras(2, 19, 13)
-    both = [
-        run(cloud, *camera, 19, 13, backend=b, antialias=antialias) for b in ("torch", "reference")
-    ]
+    options = {"antialias": antialias}
+    both = [run(cloud, *camera, 19, 13, backend=b, **options) for b in ("torch", "reference")]
     for ours, truth in zip(both[0].out, both[1].out, strict=True):
         assert torch.allclose(ours, truth, rtol=1e-7, atol=1e-9)
     for name, truth in both[1].grads.items():
-        assert torch.allclose(
-            both[0].grads[name], truth, rtol=1e-6, atol=1e-7 * truth.abs().max().item()
-        ), name
-    single = run(cloud.to(torch.float32), *camera, 19, 13, backend="torch", antialias=antialias)
+        atol = 1e-7 * truth.abs().max().item()
+        assert torch.allclose(both[0].grads[name], truth, rtol=1e-6, atol=atol), name
+    single = run(cloud.to(torch.float32), *camera, 19, 13, backend="torch", **options)
     assert all(x.isfinite().all() for x in (*single.out, *single.grads.values()))
 
 
 def test_gradients_behind_an_alpha_of_one_are_finite_and_add_up():
     """1 / (1 - alpha) is infinite there; what is behind is invisible, so its share is zero."""
     three = Cloud(*(x.repeat(3, *[1] * (x.dim() - 1)) for x in one_gaussian(opacity=1.0)))
-    result = run(
-        three.to(torch.float32), *front_camera(9, 9, 20.0), 9, 9, backend="torch", **NO_CUTOFFS
-    )
+    view = *front_camera(9, 9, 20.0), 9, 9
+    result = run(three.to(torch.float32), *view, backend="torch", **NO_CUTOFFS)
     assert result.out.alpha.max() == 1
     assert all(grad.isfinite().all() and grad.abs().max() < 1e3 for grad in result.grads.values())
     out = rasterize(*random_cloud(30).leaves(), *cameras(1, 12, 12), 12, 12, backend="torch")
@@ -105,39 +99,30 @@ def test_gradients_behind_an_alpha_of_one_are_finite_and_add_up():
     assert torch.allclose(out.means2d.grad, 2 * once)
 
 
-def test_small_budgets_change_nothing(monkeypatch):
+def test_small_budgets_change_nothing(monkeypatch, recorded):
     """Many slices, tests, blocks, steps and parts, as only large scenes take."""
     cloud, camera = random_cloud(60, seed=7, size=0.3), cameras(2, 37, 29)
-    splits = []
+    splits = recorded(torch_backend, "slices")
     monkeypatch.setattr(torch_backend, "PROJECTED_AT_ONCE", 30)
     monkeypatch.setattr(torch_backend, "CANDIDATES_PER_SLICE", 100)
     monkeypatch.setattr(torch_backend, "CANDIDATES_PER_TEST", 37)
     monkeypatch.setattr(torch_backend, "SPLATS_PER_STEP", 4)
     monkeypatch.setattr(torch_backend, "ELEMENTS_PER_BLOCK", 3 * 4 * 64)
-    original = torch_backend.slices
-    monkeypatch.setattr(
-        torch_backend, "slices", lambda *a: splits.append(original(*a)) or splits[-1]
-    )
     compare(cloud, camera, 37, 29, absgrad=True)
     compare(cloud._replace(opacities=torch.full((60,), 0.99).double()), camera, 37, 29)
-    assert min(map(len, splits)) > torch_backend.KEPT_SLICES
+    assert min(len(found) for _, found in splits) > torch_backend.KEPT_SLICES
 
 
-def test_blocks_and_saved_tensors_are_bounded(monkeypatch):
+def test_blocks_and_saved_tensors_are_bounded(monkeypatch, recorded):
     """No tensor of the size pixels x splats is kept for the backward pass."""
     cloud, camera = random_cloud(400, seed=8, size=1.0), cameras(1, 64, 64)
-    sizes, saved = [], []
-    original = torch_backend._block
+    saved, blocks = [], recorded(torch_backend, "_block")
     monkeypatch.setattr(torch_backend, "ELEMENTS_PER_BLOCK", 2**14)
-    monkeypatch.setattr(
-        torch_backend, "_block", lambda *a: sizes.append(len(a[2]) * a[4] * 64) or original(*a)
-    )
-    leaves = cloud.leaves()
-    with torch.autograd.graph.saved_tensors_hooks(
-        lambda x: saved.append(x.numel()) or x, lambda x: x
-    ):
-        out = rasterize(*leaves, *camera, 64, 64, backend="torch")
+    hooks = lambda x: saved.append(x.numel()) or x, lambda x: x
+    with torch.autograd.graph.saved_tensors_hooks(*hooks):
+        out = rasterize(*cloud.leaves(), *camera, 64, 64, backend="torch")
     out.image.sum().backward()
+    sizes = [len(args[2]) * args[4] * 64 for args, _ in blocks]
     assert max(sizes) <= 2**14 and sum(sizes) > 20 * max(sizes)
     # Every one of these Gaussians covers most of 4096 pixels: keeping any (pixel, splat) tensor
     # would take over a million.

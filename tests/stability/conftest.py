@@ -53,21 +53,18 @@ def said(caplog) -> pytest.LogCaptureFixture:
 
 @pytest.fixture
 def fault(measured, record_property) -> Callable[..., None]:
-    """``fault(deviation, ours, emulation, at_most)``: assert that ``deviation(ours)`` holds the bar
-    and that of the emulated fault does not.
-
-    Use ``at_least`` if more is better; ``raises`` is what an emulation raises that crashes instead
-    of returning a wrong number.
+    """``fault(deviation, ours, theirs, at_most)``: assert that ``deviation(ours)`` holds the bar,
+    and that of the emulated fault does not, or raises; with ``at_least`` if more is better.
     """
 
     def hold(
-        deviation, ours, emulation, at_most=0.0, unit="", *, at_least=None, raises=AssertionError
-    ) -> None:
+        deviation, ours, theirs, at_most=0.0, unit="", *, at_least=None, raises=AssertionError
+    ):
         bound = {"at_most": at_most} if at_least is None else {"at_least": at_least}
         measured(deviation(ours), unit, **bound)
         found: list[tuple] = []
         with pytest.raises(raises) as caught:
-            measure(found.append, deviation(emulation), unit, **bound)
+            measure(found.append, deviation(theirs), unit, **bound)
         record_property("emulation", (*found, (caught.type.__name__, "", "", "max"))[0])
 
     return hold
@@ -81,15 +78,12 @@ def pytest_generate_tests(metafunc) -> None:
 
 
 def pytest_addoption(parser) -> None:
-    parser.addoption(
-        "--stability-report", metavar="FILE", type=Path, help="write what the rows measured as JSON"
-    )
+    parser.addoption("--stability-report", metavar="FILE", type=Path, help="measurements as JSON")
 
 
 def pytest_configure(config) -> None:
-    config.addinivalue_line(
-        "markers", "stability(group, name, bar): the row of the stability tables that a test is"
-    )
+    marker = "stability(group, name, bar): the row of the stability tables that a test is"
+    config.addinivalue_line("markers", marker)
 
 
 def pytest_collection_modifyitems(items) -> None:
@@ -98,10 +92,8 @@ def pytest_collection_modifyitems(items) -> None:
             *row, bar = marker.args
             reason = inspect.getdoc(item.function) or ""
             assert reason or not bar, f"{item.nodeid}: a changed bar needs a docstring"
-            names = {"file": item.path.stem, "name": item.originalname}
-            item.user_properties.append(
-                ("row", {"row": row, "bar": bar, "reason": reason, **names})
-            )
+            entry = {"reason": reason, "file": item.path.stem, "name": item.originalname}
+            item.user_properties.append(("row", {"row": row, "bar": bar, **entry}))
 
 
 def pytest_runtest_logreport(report) -> None:

@@ -38,11 +38,7 @@ class Row(NamedTuple):
 
 
 TABLE = yaml.safe_load(Path(__file__).with_name("rows.yaml").read_text())
-ROWS = {
-    (group, name): Row(*cells)
-    for group, section in TABLE.items()
-    for name, *cells in section["rows"]
-}
+ROWS = {(group, name): Row(*cells) for group in TABLE for name, *cells in TABLE[group]["rows"]}
 
 
 def row(group: str, name: str, *, bar: Optional[str] = None) -> pytest.MarkDecorator:
@@ -63,19 +59,15 @@ def main(source: str) -> None:
 
 def summary_of(key: tuple[str, str], tests: list[dict]) -> dict:
     """Return what a row's tests measured, as one entry of stability.json."""
-    return {
-        "group": key[0],
-        "name": key[1],
-        "failed": sorted({test["name"] for test in tests if test["outcome"] != "passed"}),
-        "measured": worst_of(tests, "measured"),
-        "emulation": worst_of(tests, "emulation"),
-        "tests": list(dict.fromkeys(f"{test['file']}::{test['name']}" for test in tests)),
-        "changed_bars": {
-            test["name"]: {"bar": test["bar"], "reason": " ".join(test["reason"].split())}
-            for test in tests
-            if test["bar"]
-        },
-    }
+    found = dict(zip(("group", "name"), key, strict=True))
+    found["failed"] = sorted({test["name"] for test in tests if test["outcome"] != "passed"})
+    found |= {kind: worst_of(tests, kind) for kind in ("measured", "emulation")}
+    found["tests"] = list(dict.fromkeys(f"{test['file']}::{test['name']}" for test in tests))
+    found["changed_bars"] = {}
+    for test in (test for test in tests if test["bar"]):
+        reason = " ".join(test["reason"].split())
+        found["changed_bars"][test["name"]] = {"bar": test["bar"], "reason": reason}
+    return found
 
 
 def worst_of(tests: list[dict], kind: str) -> str:

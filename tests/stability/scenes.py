@@ -44,10 +44,8 @@ def joined(*clouds: Cloud) -> Cloud:
 
 def stack(opacities: list[float], **options) -> Cloud:
     """Return Gaussians of these opacities with equal shape and position."""
-    one = one_gaussian(**options)
-    return Cloud(*(x.repeat(len(opacities), *[1] * (x.dim() - 1)) for x in one))._replace(
-        opacities=torch.tensor(opacities).double()
-    )
+    equal = one_gaussian(**options).pick([0] * len(opacities))
+    return equal._replace(opacities=torch.tensor(opacities).double())
 
 
 def drawn(backend: str, cloud: Cloud, width: int, height: int, focal: float, **options):
@@ -94,9 +92,7 @@ def clamped_slope(x: Tensor, z: Tensor, limit: float) -> Tensor:
     return torch.clamp(x / z, -limit, limit)
 
 
-def clamped_alpha(
-    mean: Tensor, scales: Tensor, width: int, focal: float, opacity: float, slope_of=clamped_slope
-) -> Tensor:
+def clamped_alpha(mean, scales, width: int, focal: float, opacity: float, slope_of=clamped_slope):
     """Return the alpha (width, width) of an unrotated Gaussian, with J at the clamped slope."""
     x, y, z = mean
     slopes = [slope_of(a, z, 1.3 * 0.5 * width / focal) for a in (x, y)]
@@ -108,9 +104,7 @@ def clamped_alpha(
     return opacity * torch.exp(-0.5 * (offsets @ covariance.inverse() * offsets).sum(-1))
 
 
-def plain_image(
-    cloud: Cloud, width: int, height: int, focal: float, visible: Tensor, order: Tensor
-) -> Tensor:
+def plain_image(cloud: Cloud, width: int, height: int, focal: float, visible, order) -> Tensor:
     """Composite isotropic Gaussians in ``order``, (height, width, 3), if ``visible``."""
     image, T = torch.zeros(height, width, 3).double(), torch.ones(height, width).double()
     middle = torch.tensor([0.5 * width, 0.5 * height])

@@ -1,11 +1,11 @@
 """Short runs through the launcher, in this process, for the rows about training and files."""
 
-import contextlib
 import csv
 import io
 import json
 import os
 from collections.abc import Sequence
+from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import Any, NamedTuple
 from unittest import mock
@@ -49,27 +49,19 @@ class Ended(NamedTuple):
 
     def logged(self, name: str) -> list[float]:
         """Return the values logged under a name, in order."""
-        files = sorted(
-            self.folder.glob("csv_logs/version_*/metrics.csv"),
-            key=lambda path: int(path.parent.name.removeprefix("version_")),
-        )
+        files = self.folder.glob("csv_logs/version_*/metrics.csv")
+        files = sorted(files, key=lambda path: int(path.parent.name.removeprefix("version_")))
         rows = [row for path in files for row in csv.DictReader(open(path))]
         return [float(row[name]) for row in rows if row.get(name)]
 
 
-def launch(
-    folder: Path, *overrides: str, stage: str = "--train", config: Path = DEMO, code: int = 0
-) -> Ended:
+def launch(folder: Path, *overrides: str, stage="--train", config: Path = DEMO, code=0) -> Ended:
     """Run the small demo below ``folder``, which ends with ``code``; restore the environment."""
     out, err = io.StringIO(), io.StringIO()
     prior = any(option.startswith("system.geometry.prior_type=") for option in overrides)
     small = [o for o in SMALL if not (prior and o.startswith("system.geometry.prior."))]
     arguments = ["--config", str(config), stage, "--gpu", "cpu", f"exp_root_dir={folder}"]
-    with (
-        mock.patch.dict(os.environ),
-        contextlib.redirect_stdout(out),
-        contextlib.redirect_stderr(err),
-    ):
+    with mock.patch.dict(os.environ), redirect_stdout(out), redirect_stderr(err):
         found = experiment.main([*arguments, *small, *overrides])
     assert found == code and "Traceback" not in err.getvalue(), f"{found}: {err.getvalue()}"
     return Ended(out.getvalue(), err.getvalue(), Path(folder) / "demo" / "t")

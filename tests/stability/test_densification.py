@@ -32,6 +32,7 @@ from threestudio_gaussiandreamer.training.geometry import GaussianCloud
 NO_LIMITS = {"min_opacity": 0.0, "max_scale": 1e9}
 EACH_STEP = {"start": 0, "stop": 10_000, "every": 1}
 EVERY_STEP = EACH_STEP | {"enabled": True, "start": 1}
+SCALED = {"loss_scale": 65536.0}
 each_gradient = pytest.mark.parametrize("absgrad", [False, True], ids=["gradient", "absgrad"])
 
 
@@ -75,10 +76,6 @@ class Training:
             DensityControl(self.geometry).after_step(self.optimizer, self.step)
             counts.append(len(self.geometry))
         return counts
-
-    @torch.no_grad()
-    def quality(self) -> float:
-        return psnr(self.render(self.geometry).comp_rgb, self.truth).mean().item()
 
 
 SCHEDULES = [f"system.geometry.{key}" for key in (
@@ -236,9 +233,7 @@ def counts_at(run: Ended, step: int) -> tuple[int, int]:
 @row("A3", "Densify x resume")
 @pytest.mark.parametrize("k", [29, 30, 31, 35, 90])
 def test_resumed_anywhere_the_cloud_is_the_same(k, whole, tmp_path, measured):
-    """Before, at and after a round that densifies and prunes, between rounds, and at the last; the
-    checkpoints are those of the uninterrupted run, so writing them changes nothing.
-    """
+    """Before, at and after a round that densifies and prunes, between rounds, and at the last."""
     counts, new = zip(*(counts_at(whole, step) for step in (29, 30, 31, 89, 90)), strict=True)
     assert counts[0] > counts[1] == counts[2] and new[1] > new[0] and new[4] > new[3]
     resumed = launch(tmp_path, *SCHEDULES, "trainer.max_steps=100", f"resume={whole.at_step(k)}")
@@ -246,9 +241,7 @@ def test_resumed_anywhere_the_cloud_is_the_same(k, whole, tmp_path, measured):
     measured(differing, "tensors that differ, moments too", at_most=0)
 
 
-def accumulated(
-    size: int = 128, batch: int = 4, loss_scale: float = 1.0, autocast=False, absgrad=False
-) -> GaussianCloud:
+def accumulated(size=128, batch=4, loss_scale=1.0, autocast=False, absgrad=False) -> GaussianCloud:
     """Return the first cloud after the four views were processed, ``batch`` at a time."""
     geometry = started(densify=EVERY_STEP | NO_LIMITS | {"absgrad": absgrad})
     training = Training(geometry, size)
@@ -272,11 +265,7 @@ def middle(geometry: GaussianCloud) -> float:
 
 @row("A3", "Threshold's meaning")
 @each_gradient
-@pytest.mark.parametrize(
-    "other",
-    [{"loss_scale": 65536.0}, {"loss_scale": 65536.0, "autocast": True}, {"batch": 1}],
-    ids=str,
-)
+@pytest.mark.parametrize("other", [{"batch": 1}, SCALED, SCALED | {"autocast": True}], ids=str)
 def test_neither_precision_nor_batch_affects_the_selection(other, absgrad, measured):
     """Half of the Gaussians are above the threshold; the loss is the mean over the batch."""
     usual = accumulated(absgrad=absgrad)

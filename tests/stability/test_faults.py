@@ -1,5 +1,6 @@
 """A0: faults of other projects' code, which ours doesn't have and an emulation shows."""
 
+import contextlib
 import functools
 import math
 from pathlib import Path
@@ -12,49 +13,25 @@ import torch
 import yaml
 from torch import nn
 
-from tests.helpers.splatting_scenes import (
-    NO_CUTOFFS,
-    Cloud,
-    cameras,
-    front_camera,
-    one_gaussian,
-    psnr,
-    random_cloud,
-    rasterize,
-)
+from tests.helpers import splatting_scenes
+from tests.helpers.splatting_scenes import NO_CUTOFFS, one_gaussian, random_cloud, rasterize
+from tests.stability import scenes
 from tests.stability.backends import backends_of
 from tests.stability.report import row
-from tests.stability.scenes import (
-    CorruptedScore,
-    ball,
-    clamped_alpha,
-    clamped_slope,
-    drawn,
-    joined,
-    plain_image,
-    score_gradient,
-    seeded,
-    stack,
-    started,
-)
+from tests.stability.scenes import ball, drawn, joined, plain_image, seeded, stack, started
 from threestudio_gaussiandreamer import cameras as host_cameras
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.core.streams import generator
 from threestudio_gaussiandreamer.diffusion import sds
 from threestudio_gaussiandreamer.gaussians import densify
-from threestudio_gaussiandreamer.gaussians.densify import PARAMETERS
 from threestudio_gaussiandreamer.gaussians.grow import grow, nearest_distance_scales
 from threestudio_gaussiandreamer.gaussians.point_cloud import PointCloud
 from threestudio_gaussiandreamer.guidance.base import NonFiniteScore
 from threestudio_gaussiandreamer.splatting import torch_backend
 from threestudio_gaussiandreamer.splatting.projection import quats_to_rotations
+from threestudio_gaussiandreamer.training import geometry as clouds
 from threestudio_gaussiandreamer.training.density import DensifyConfig, DensityControl
-from threestudio_gaussiandreamer.training.geometry import (
-    LEARNING_RATES,
-    STATISTICS,
-    GaussianCloud,
-    grow_points,
-)
+from threestudio_gaussiandreamer.training.geometry import LEARNING_RATES, GaussianCloud
 from threestudio_gaussiandreamer.training.system import GaussianDreamerSystem
 
 CONFIGS = Path(__file__).parents[2] / "configs"
@@ -85,8 +62,9 @@ def test_f1_the_clamp_of_the_jacobian_depends_on_depth(backend, fault):
     def mean(z):
         return torch.stack([0 * z + 3.2, 0 * z + 0.1, z])
 
-    def by_hand(z, slope=clamped_slope):
-        return clamped_alpha(mean(z), torch.tensor(scales).double(), 32, 20.0, 0.7, slope).sum()
+    def by_hand(z, slope=scenes.clamped_slope):
+        spread = torch.tensor(scales).double()
+        return scenes.clamped_alpha(mean(z), spread, 32, 20.0, 0.7, slope).sum()
 
     def constant_x(x, z, limit):
         clamped = (torch.clamp(x / z, -limit, limit) * z).detach()
@@ -111,11 +89,8 @@ def test_f2_no_gaussians_show_the_background(backend, fault):
         assert all(leaf.grad.shape == leaf.shape for leaf in leaves)
         return image
 
-    fault(
-        lambda draw: (draw(random_cloud(0)) - background).abs().max(),
-        ours,
-        lambda _: torch.zeros(1, 6, 8, 3),  # black
-    )
+    black = torch.zeros(1, 6, 8, 3)
+    fault(lambda image: (image - background).abs().max(), ours(random_cloud(0)), black)
 
 
 @row("A0", "F3")
@@ -130,12 +105,9 @@ def test_f3_no_gradient_flows_through_the_cap(backend, fault):
         alpha = opacity * torch.ones(2, 2)
         return (alpha + (alpha.clamp(max=0.5) - alpha).detach()).sum()
 
-    fault(
-        lambda f: abs(slope_of(f, 0.95) - central_difference(f, 0.95, 1e-3)),
-        ours,
-        through_the_cap,
-        1e-3,
-    )
+    both = ours, through_the_cap
+    errors = (slope_of(f, 0.95) - central_difference(f, 0.95, 1e-3) for f in both)
+    fault(abs, *errors, 1e-3)
 
 
 @row("A0", "F4")
@@ -151,13 +123,9 @@ def test_f4_the_gaussian_that_crosses_the_stop_counts(backend, fault):
         return 1 - T
 
     everything = 1 - np.prod(1 - np.array(opacities))
-    fault(
-        lambda f: abs(f(opacities) - everything),
-        lambda opacities: drawn(backend, stack(opacities, scale=10.0), 1, 1, 1.0).alpha.item(),
-        stops_before,
-        1e-4,
-        "of alpha",
-    )
+    ours = drawn(backend, stack(opacities, scale=10.0), 1, 1, 1.0).alpha.item()
+    theirs = stops_before(opacities)
+    fault(lambda alpha: abs(alpha - everything), ours, theirs, 1e-4, "of alpha")
 
 
 @row("A0", "F5")
@@ -168,7 +136,8 @@ def test_f5_the_threshold_of_alpha(backend, fault):
     cloud = random_cloud(4000, seed=1)._replace(
         means=means, scales=torch.full((4000, 3), 0.03), opacities=torch.full((4000,), 0.1)
     )
-    scene = *cloud.to(torch.float32), *cameras(1, 64, 64, dtype=torch.float32), 64, 64
+    camera = splatting_scenes.cameras(1, 64, 64, dtype=torch.float32)
+    scene = *cloud.to(torch.float32), *camera, 64, 64
 
     def ours(**options):
         with torch.no_grad():
@@ -176,7 +145,7 @@ def test_f5_the_threshold_of_alpha(backend, fault):
 
     truth = ours(**NO_CUTOFFS, backend="torch")
     common = functools.partial(ours, alpha_min=1 / 255)
-    fault(lambda f: psnr(f(), truth), ours, common, at_least=55, unit="dB")
+    fault(lambda f: splatting_scenes.psnr(f(), truth), ours, common, at_least=55, unit="dB")
 
 
 @row("A0", "F6")
@@ -187,7 +156,7 @@ def test_f6_what_is_not_finite_is_culled(backend, attribute, value, fault):
     """The emulation culls by two comparisons that are false for NaN."""
     scene = random_cloud(6, seed=2)
     scene.means[:, 2] += 3
-    corrupted = Cloud(*(torch.cat([x, x[:1].clone()]) for x in scene))
+    corrupted = scene.pick([*range(6), 0])
     getattr(corrupted, attribute)[6] = value
 
     def numbers(image, leaves):
@@ -274,16 +243,11 @@ def test_f10_depth_has_a_gradient(backend, fault):
         return drawn(backend, at(z), 8, 8, 8.0, **NO_CUTOFFS).depth.double().sum()
 
     def truth(z):
-        camera = front_camera(8, 8, 8.0)
-        return rasterize(*at(z), *camera, 8, 8, backend="reference", **NO_CUTOFFS).depth.sum()
+        camera = *splatting_scenes.front_camera(8, 8, 8.0), 8, 8
+        return rasterize(*at(z), *camera, backend="reference", **NO_CUTOFFS).depth.sum()
 
-    fault(
-        lambda f: slope_error(f, 2.0, truth),
-        ours,
-        lambda z: truth(z).detach() + 0 * z,
-        1e-4,
-        "relative",
-    )
+    both = ours, lambda z: truth(z).detach() + 0 * z
+    fault(float, *(slope_error(f, 2.0, truth) for f in both), 1e-4, "relative")
 
 
 @row("A0", "F11")
@@ -302,7 +266,7 @@ def test_f11_the_loss_scale_does_not_affect_the_selection(fault):
 @row("A0", "F12")
 def test_f12_a_checkpoint_holds_the_cloud_and_its_statistics(fault):
     """The emulation keeps the cloud in a plain object. Ours doesn't run the prior on loading."""
-    names = (*PARAMETERS, *STATISTICS)
+    names = (*densify.PARAMETERS, *clouds.STATISTICS)
 
     def plain(source=None):
         module = nn.Module()
@@ -316,17 +280,13 @@ def test_f12_a_checkpoint_holds_the_cloud_and_its_statistics(fault):
         return geometry
 
     def deviation(pair):
-        saved, fresh = pair()
+        saved, fresh = pair
         fresh.load_state_dict(saved.state_dict())
         one, other = (getattr(module, "cloud", module) for module in (saved, fresh))
         return sum(not torch.equal(getattr(one, name), getattr(other, name)) for name in names)
 
-    fault(
-        deviation,
-        lambda: (trained(), GaussianCloud({"prior_type": "a-prior-that-does-not-exist"})),
-        lambda: (plain(trained()), plain()),
-        unit="tensors lost",
-    )
+    ours = trained(), GaussianCloud({"prior_type": "a-prior-that-does-not-exist"})
+    fault(deviation, ours, (plain(trained()), plain()), unit="tensors lost")
 
 
 def left_of(geometry, contribution, most=500_000):
@@ -340,13 +300,10 @@ def left_of(geometry, contribution, most=500_000):
 @row("A0", "F13")
 def test_f13_one_gaussian_keeps_its_shape(fault):
     """The emulation squeezes the (1, 1) mask to a scalar, which adds a dimension."""
-
-    fault(
-        lambda pruned: float(pruned(started(1)).shape != (1, 3)),
-        lambda geometry: left_of(geometry, torch.ones(1)).values["means"],
-        lambda geometry: geometry.means[(geometry.opacities()[:, None] >= 0).squeeze()],
-        unit="wrong shapes",
-    )
+    geometry = started(1)
+    ours = left_of(geometry, torch.ones(1)).values["means"]
+    squeezed = geometry.means[(geometry.opacities()[:, None] >= 0).squeeze()]
+    fault(lambda means: float(means.shape != (1, 3)), ours, squeezed, unit="wrong shapes")
 
 
 def grown(points, **options):
@@ -366,15 +323,11 @@ def test_f14_without_grown_points_the_input_is_returned(fault):
     """A cube of side 2 has eight corners; none of 100 candidates is near one."""
     corners = np.float32([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
 
-    fault(
-        lambda count: count(corners, num_candidates=100),
-        grown,
-        # appended to an empty list
-        lambda points, num_candidates: len(
-            np.concatenate((points, np.array(brute_force(points, 0.01, num_candidates))))
-        ),
-        raises=ValueError,
-    )
+    def appended_to_a_list(points, num_candidates):
+        return len(np.concatenate((points, np.array(brute_force(points, 0.01, num_candidates)))))
+
+    both = grown, appended_to_a_list
+    fault(lambda count: count(corners, num_candidates=100), *both, raises=ValueError)
 
 
 @row("A0", "F15")
@@ -385,17 +338,12 @@ def test_f15_growth_does_not_depend_on_the_unit(fault):
         counts = np.array([accepted(ball().points * unit) for unit in (1e-3, 1.0, 1e3)])
         return np.ptp(counts) / counts.mean()
 
-    fault(
-        deviation,
-        lambda points: grown(points, num_candidates=20_000, radius=0.05),
-        lambda points: len(brute_force(points, 0.05)),
-        0.01,
-        "relative",
-    )
+    ours = functools.partial(grown, num_candidates=20_000, radius=0.05)
+    fault(deviation, ours, lambda points: len(brute_force(points, 0.05)), 0.01, "relative")
     flat = ball().points * np.float32([1, 1, 0])  # every candidate in its box is near it
     options = {"enabled": True, "num_candidates": 20_000, "radius": 0.9, "max_points": 500}
     growing = GaussianCloud({"grow": options}).cfg.grow
-    assert len(grow_points(PointCloud(flat, np.zeros_like(flat)), growing).points) <= 800
+    assert len(clouds.grow_points(PointCloud(flat, np.zeros_like(flat)), growing).points) <= 800
 
 
 @row("A0", "F16")
@@ -437,9 +385,8 @@ def test_f17_a_sphere_is_round_on_a_wide_image(backend, fault):
 @row("A0", "F18")
 def test_f18_densification_loses_no_step(fault):
     """The emulation replaces the rows between backward and step."""
-    none_selected = dict(
-        enabled=True, start=1, stop=9, every=2, min_opacity=1e-9, grad_threshold=1e9, max_scale=1e9
-    )
+    limits = dict(min_opacity=1e-9, grad_threshold=1e9, max_scale=1e9)
+    none_selected = dict(enabled=True, start=1, stop=9, every=2, **limits)
 
     def step_first(geometry, optimizer, step):
         optimizer.step()
@@ -461,12 +408,8 @@ def test_f18_densification_loses_no_step(fault):
         return geometry.means.detach()
 
     plain = trajectory(step_first)
-    fault(
-        lambda f: (trajectory(f, densify=none_selected) - plain).abs().max(),
-        step_first,
-        densify_first,
-        unit="moved",
-    )
+    both = (trajectory(f, densify=none_selected) for f in (step_first, densify_first))
+    fault(lambda means: (means - plain).abs().max(), *both, unit="moved")
 
 
 @row("A0", "F19")
@@ -499,21 +442,17 @@ def test_f19_a_negative_loss_is_back_propagated(fault):
 @row("A0", "F20")
 def test_f20_every_learning_rate_in_the_config_reaches_the_optimiser(fault):
     """The emulation reads ``scaling_lr`` from a configuration that sets ``scale_lr``."""
-
-    def ours(rates):
-        geometry = started(sh_degree=1, **rates)
-        optimizer = torch.optim.Adam(geometry.parameter_groups())
-        geometry.set_learning_rates(optimizer, 0, 0)
-        return {LEARNING_RATES[group["name"]]: group["lr"] for group in optimizer.param_groups}
-
     rates = {name: 0.25 + 0.5**i for i, name in enumerate(LEARNING_RATES.values())}
+    geometry = started(sh_degree=1, **rates)
+    optimizer = torch.optim.Adam(geometry.parameter_groups())
+    geometry.set_learning_rates(optimizer, 0, 0)
+    ours = {LEARNING_RATES[group["name"]]: group["lr"] for group in optimizer.param_groups}
     misspelt = {name: rates.get(name.replace("scales", "scaling"), 0.005) for name in rates}
-    fault(
-        lambda found: sum(found.get(name) != rate for name, rate in rates.items()),
-        ours(rates),
-        misspelt,
-        unit="keys that are never read",
-    )
+
+    def unread(found):
+        return sum(found.get(name) != rate for name, rate in rates.items())
+
+    fault(unread, ours, misspelt, unit="keys that are never read")
 
 
 @row("A0", "F21")
@@ -533,23 +472,21 @@ def test_f21_the_cap_takes_what_contributes_least(fault):
 def test_f22_a_non_finite_score_is_reported(fault):
     """The first of three items is NaN in every step; counts steps of twenty without a message."""
     rgb = torch.rand(3, 4, 4, 3, generator=seeded())
-    guidance, healthy = (CorruptedScore({"guidance_scale": 1.0}) for _ in range(2))
+    guidance, healthy = (scenes.CorruptedScore({"guidance_scale": 1.0}) for _ in range(2))
     guidance.corrupted = {step: {0: math.nan} for step in range(20)}
 
     def ours(step):
-        broken, out = score_gradient(guidance, rgb, step)
-        whole, _ = score_gradient(healthy, rgb, step)
+        broken, out = scenes.score_gradient(guidance, rgb, step)
+        whole, _ = scenes.score_gradient(healthy, rgb, step)
         assert (broken[0] == 0).all() and torch.equal(broken[1:], whole[1:])
         return out["bad_items"] > 0
 
     def deviation(said):
         silent = 0
-        for step in range(20):
-            try:
+        with contextlib.suppress(NonFiniteScore):
+            for step in range(20):
                 silent += not said(step)
-            except NonFiniteScore:
-                assert step == 9  # the tenth
-                return silent
+        assert step == 9 or silent  # the tenth ends it
         return silent
 
     fault(deviation, ours, lambda step: False, unit="steps without a message")
@@ -637,12 +574,9 @@ def test_f27_any_size_and_a_gaussian_behind_the_camera(backend, fault):
         means, variances = cloud.means[cloud.means[:, 2] > 0], cloud.scales[:, 0] ** 2
         return (means[:, :2] / variances[:, None]).sum() * torch.ones(256, 256, 3)
 
-    fault(
-        lambda draw: (draw(scene) - draw(scene.pick([0, 2]))).abs().max(),
-        lambda cloud: drawn(backend, cloud, 17, 9, 8.0).image[0],
-        half_masked,
-        raises=RuntimeError,
-    )
+    changed = lambda draw: (draw(scene) - draw(scene.pick([0, 2]))).abs().max()  # noqa: E731
+    ours = lambda cloud: drawn(backend, cloud, 17, 9, 8.0).image[0]  # noqa: E731
+    fault(changed, ours, half_masked, raises=RuntimeError)
 
 
 @row("A0", "F27")
@@ -653,9 +587,7 @@ def test_f27_the_size_that_was_asked_for(backend, fault):
         sizes = [(1, 1), (40, 1), (17, 9), (31, 33)]
         return sum(draw(*s).shape != s[::-1] or bool((draw(*s) == 0).any()) for s in sizes)
 
-    fault(
-        deviation,
-        lambda *size: drawn(backend, one_gaussian(scale=5.0), *size, 8.0).alpha[0, ..., 0],
-        lambda *size: torch.ones(256, 256),
-        unit="of 4 sizes wrong",
-    )
+    def ours(*size):
+        return drawn(backend, one_gaussian(scale=5.0), *size, 8.0).alpha[0, ..., 0]
+
+    fault(deviation, ours, lambda *size: torch.ones(256, 256), unit="of 4 sizes wrong")

@@ -63,9 +63,7 @@ def picture(geometry: GaussianCloud, frame: GaussianCloud | None = None) -> torc
     return render_all(cloud, views_around(seen, 3, 64))
 
 
-def write(
-    path: Path, points: np.ndarray, colors: np.ndarray | None = None, faces: np.ndarray | tuple = ()
-) -> Path:
+def write(path: Path, points: np.ndarray, colors: np.ndarray | None = None, faces=()) -> Path:
     """Write what a file of this suffix can hold: .obj without colours, .xyz and .npz no faces."""
     rows = points if colors is None else np.concatenate([points, colors], axis=1)
     columns = zip((*"xyz", "red", "green", "blue"), rows.T, strict=False)
@@ -142,10 +140,8 @@ def test_an_isolated_point_is_capped_and_flagged(rule, measured, said):
 @row("A2", "Isolated point: huge scale")
 def test_an_isolated_point_does_not_stretch_the_growing(measured):
     """The bounding box of all points would make the radius 500 times larger."""
-    usual, stray = (
-        grow(colored(points), **GROWING, generator=rng()).points[len(points) :]
-        for points in (sphere(), np.concatenate([sphere(), FAR]))
-    )
+    both = sphere(), np.concatenate([sphere(), FAR])
+    usual, stray = (grow(colored(p), **GROWING, generator=rng()).points[len(p) :] for p in both)
     assert len(usual) > 500 and np.array_equal(usual, stray)
     measured("the same points grow")
 
@@ -162,10 +158,7 @@ def test_few_points(count, rule, measured):
     measured(geometry.scales().min() / bounding_radius, "bounding radii, smallest", at_least=0.09)
 
 
-NOTHING = {
-    "empty.glb": "",
-    "empty.obj": "",
-    "empty.ply": "",
+NOTHING = dict.fromkeys(("empty.glb", "empty.obj", "empty.ply"), "") | {
     "no_faces.obj": "v 0 0 0\nv 1 0 0\nv 0 1 0\n",
     "one_vertex.obj": "v 1 2 3\n",
     "one_vertex.ply": "ply\nformat ascii 1.0\nelement vertex 1\n"
@@ -233,9 +226,7 @@ def test_a_few_bad_rows_are_counted_and_many_refused(source, what, tmp_path, mea
 
 
 @row("A2", "No colours")
-@pytest.mark.parametrize(
-    "kind, suffix", [("mesh", "obj"), ("point-cloud", "xyz"), ("point-cloud", "ply")]
-)
+@pytest.mark.parametrize("kind, suffix", [("mesh", "obj"), *COLOURED[1:]])
 def test_without_colours_the_cloud_is_grey_with_a_message(kind, suffix, tmp_path, measured, said):
     points, faces = ball_mesh()
     path = write(tmp_path / f"a.{suffix}", points, faces=faces if kind == "mesh" else ())

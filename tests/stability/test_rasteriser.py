@@ -30,15 +30,7 @@ from tests.helpers.splatting_scenes import (
 )
 from tests.stability.backends import BACKENDS, backends_of
 from tests.stability.report import row
-from tests.stability.scenes import (
-    clamped_alpha,
-    drawn,
-    finite,
-    joined,
-    seeded,
-    stack,
-    started,
-)
+from tests.stability.scenes import clamped_alpha, drawn, finite, joined, seeded, stack, started
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
 from threestudio_gaussiandreamer.splatting import PRESETS
@@ -46,10 +38,12 @@ from threestudio_gaussiandreamer.splatting.cpu import backend as cpu
 
 EXACT = ["torch", "reference"]  # those that support float64
 THREADED = [name for name in BACKENDS if name not in ("reference", "cuda")]  # of torch's threads
-AROUND_THE_CLAMP = list(
-    itertools.product((0.99, 1.0, 1.29, 1.3, 1.31, 5.0, 50.0), (0.01, 0.1, 1.0))
-)
+PLACES = (0.99, 1.0, 1.29, 1.3, 1.31, 5.0, 50.0)
+AROUND_THE_CLAMP = list(itertools.product(PLACES, (0.01, 0.1, 1.0)))
 """Places in units of the image's half-width, and scales."""
+BY_ATTRIBUTE = "finite; gradients rel L2 <= 1e-3 per attribute, where it is > 1e-6 of the largest"
+NAMED = "600 k over all of 8192 x 8192: the exact memory in a named error, none allocated"
+CROPPED = "crop of a larger render to 5e-6 in float32; circle's axes within 0.5 px"
 
 
 def rounded(cloud: Cloud) -> Cloud:
@@ -197,12 +191,9 @@ def test_opacities_near_0_and_1(backend, measured):
 def needles() -> list[Cloud]:
     """Return every multiset of three scales in five rotations, rounded to float32."""
     scales = itertools.combinations_with_replacement((1e-8, 1e-4, 1e-2, 1.0, 1e2, 1e4), 3)
-    quats = torch.randn(5, 4, generator=seeded(2)).double()
-    clouds = (
-        one_gaussian((0.1, -0.2, 2.0), scale, 0.8)._replace(quats=quat[None])
-        for scale, quat in itertools.product(scales, quats)
-    )
-    return [rounded(cloud) for cloud in clouds]
+    pairs = itertools.product(scales, torch.randn(5, 1, 4, generator=seeded(2)).double())
+    one = functools.partial(one_gaussian, (0.1, -0.2, 2.0), opacity=0.8)
+    return [rounded(one(scale)._replace(quats=quat)) for scale, quat in pairs]
 
 
 @functools.cache
@@ -225,11 +216,7 @@ def test_needles_and_discs(backend, measured):
 
 
 @pytest.mark.slow
-@row(
-    "A1",
-    "Needle, disc, scale 1e-8..1e4",
-    bar="finite; gradients rel L2 <= 1e-3 per attribute, where it is > 1e-6 of the largest",
-)
+@row("A1", "Needle, disc, scale 1e-8..1e4", bar=BY_ATTRIBUTE)
 @pytest.mark.parametrize("antialias", [False, True])
 def test_gradients_of_needles_and_discs(backend, antialias, measured):
     """Per element the bar cannot be met: an element at 1e-6 of the largest is a sum of terms as
@@ -451,11 +438,7 @@ def test_the_same_bits_for_any_number_of_threads(backend, measured):
     measured("10 runs bit-identical")
 
 
-@row(
-    "A1",
-    "int32 overflow",
-    bar="600 k over all of 8192 x 8192: the exact memory in a named error, none allocated",
-)
+@row("A1", "int32 overflow", bar=NAMED)
 @pytest.mark.slow  # counts 3.9e10 pairs
 @pytest.mark.skipif("cpu" not in BACKENDS, reason="the kernel isn't built")
 def test_more_tile_intersections_than_32_bits_count(measured):
@@ -494,10 +477,9 @@ def test_antialiasing_of_a_cloud_of_subpixel_gaussians(backend, measured):
     with torch.no_grad():
         large = rasterize(*cloud.to(torch.float32), *camera, 512, 512).image
     truth = large.reshape(1, 32, 16, 32, 16, 3).mean((2, 4))
-    classic, smooth = (
-        psnr(draw(backend, cloud, cameras(1, 32, 32), 32, 32, antialias=a).out.image, truth)
-        for a in (False, True)
-    )
+    view = cameras(1, 32, 32), 32, 32
+    images = (draw(backend, cloud, *view, antialias=a).out.image for a in (False, True))
+    classic, smooth = (psnr(image, truth) for image in images)
     measured(smooth - classic, "dB", what="better than classic", at_least=10)
 
 
@@ -505,13 +487,9 @@ def test_antialiasing_of_a_cloud_of_subpixel_gaussians(backend, measured):
 def test_popping_is_one_jump_of_the_analytic_size(backend, measured):
     """The means of two crossing discs swap their depth order as the camera turns."""
     a1, a2 = 0.6, 0.7
-    flat = random_cloud(2)._replace(
-        means=torch.tensor([[0.1, 0.0, 0.0], [-0.1, 0.0, 0.0]]).double(),
-        scales=torch.full((2, 3), 0.5).double(),
-        quats=torch.tensor([[0.9, 0.2, 0.1, 0.4]], dtype=torch.float64).repeat(2, 1),
-        opacities=torch.tensor([a1, a2]).double(),
-        colors=torch.tensor([[1.0, 0, 0], [0, 0, 1.0]]).double(),
-    )
+    one = one_gaussian((0.1, 0.0, 0.0), 0.5, a1, (1.0, 0, 0))
+    flat = joined(one, one_gaussian((-0.1, 0.0, 0.0), 0.5, a2, (0, 0, 1.0)))
+    flat.quats[:] = torch.tensor([0.9, 0.2, 0.1, 0.4])
 
     def frame(degrees: float) -> torch.Tensor:
         angle, viewmat = math.radians(degrees), torch.eye(4)
@@ -543,11 +521,7 @@ def test_empty_views(backend, measured):
     measured("bit for bit")
 
 
-@row(
-    "A1",
-    "Tiny, non-square, non-multiple of tile",
-    bar="crop of a larger render to 5e-6 in float32; circle's axes within 0.5 px",
-)
+@row("A1", "Tiny, non-square, non-multiple of tile", bar=CROPPED)
 @pytest.mark.parametrize("width, height", [(1, 1), (1, 7), (17, 33), (31, 16), (1024, 1)])
 def test_any_size_is_a_crop_of_a_larger_one(backend, width, height, measured):
     """1e-6 is below the rounding of positions: a coordinate of 40 pixels has a float32 spacing of
@@ -588,10 +562,8 @@ def test_other_precisions(backend, measured):
     assert equal(plain, cast) and cast.out.image.dtype == torch.float32
     view = *(x.to(torch.float32) for x in camera), 10, 8
     for dtype in (torch.float16, torch.bfloat16):
-        half, single = (
-            rasterize(*same, *view, backend=backend).image
-            for same in (cloud.to(dtype), cloud.to(dtype).to(torch.float32))
-        )
+        both = cloud.to(dtype), cloud.to(dtype).to(torch.float32)
+        half, single = (rasterize(*same, *view, backend=backend).image for same in both)
         assert half.dtype == torch.float32 and torch.equal(half, single)
     measured("float32, same bits")
 

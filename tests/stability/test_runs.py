@@ -16,6 +16,7 @@ import tracemalloc
 from dataclasses import fields, is_dataclass
 from functools import partial
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -29,15 +30,11 @@ from tests.stability.backends import slow
 from tests.stability.report import row
 from tests.stability.small_runs import DEMO, EVERY_STEP, Ended, launch, refused, require_equal_ends
 from threestudio_gaussiandreamer import host
-from threestudio_gaussiandreamer.core import images as pictures
-from threestudio_gaussiandreamer.core.checkpoint_file import (
-    load_checkpoint,
-    load_file,
-    previous_of,
-    save_file,
-)
+from threestudio_gaussiandreamer import images as pictures
+from threestudio_gaussiandreamer.core.checkpoint_file import load_checkpoint, load_file, save_file
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.formats.ply import read_gaussians, read_points
+from threestudio_gaussiandreamer.host.builtin.savers import write_video
 from threestudio_gaussiandreamer.launch.config import dump_config, load_config
 from threestudio_gaussiandreamer.launch.config_check import check_config, check_part
 from threestudio_gaussiandreamer.models import hub, model_files
@@ -51,6 +48,7 @@ from threestudio_gaussiandreamer.training.system import GaussianDreamerSystem
 
 PACKAGE = Path(threestudio_gaussiandreamer.__file__).parent
 FIVE = "trainer.max_steps=5"
+HOOKS = ["ensure_cloud", "on_test_start", "on_test_epoch_end"]
 
 
 def at_step(monkeypatch, step, act) -> None:
@@ -65,9 +63,6 @@ def at_step(monkeypatch, step, act) -> None:
     monkeypatch.setattr(GaussianDreamerSystem, "training_step", wrapped)
 
 
-# ---- checkpoints and full disks ------------------------------------------------------------------
-
-
 def content(step: int, size: int = 20_000) -> dict:
     means = torch.arange(float(size)) + step
     return {"state_dict": {"means": means}, "epoch": 0, "global_step": step}
@@ -77,7 +72,7 @@ def content(step: int, size: int = 20_000) -> dict:
 @row("A5", "Crash mid checkpoint")
 def test_killed_at_random_moments_of_200_saves(tmp_path, measured):
     """The file stays intact and not older than the last save that the child has reported."""
-    path, rng = tmp_path / "last.ckpt", random.Random(0)
+    path, previous, rng = tmp_path / "last.ckpt", tmp_path / "last-prev.ckpt", random.Random(0)
     save_file(path, content(0))
     saved, kills, lost = 0, 0, 0
     while saved < 200 or kills < 20:
@@ -97,8 +92,7 @@ def test_killed_at_random_moments_of_200_saves(tmp_path, measured):
         saved = found["global_step"]
         assert found["state_dict"]["means"].equal(content(saved)["state_dict"]["means"])
         lost += max(0, told - saved)
-        if previous_of(path).exists():
-            assert load_checkpoint(previous_of(path))["global_step"] <= saved
+        assert not previous.exists() or load_checkpoint(previous)["global_step"] <= saved
     save_file(path, content(saved + 1))  # which removes partially written files
     assert {entry.name for entry in tmp_path.iterdir()} <= {"last.ckpt", "last-prev.ckpt"}
     measured(kills, "kills", what="kills in 200 saves or more", at_least=20)
@@ -140,9 +134,7 @@ def test_a_full_disk_in_the_middle_of_a_run(tmp_path, monkeypatch, measured):
 
 @pytest.mark.slow
 @row("A5", "Disk full, read-only")
-@pytest.mark.parametrize(
-    "hook", ["ensure_cloud", "score", "on_test_start", "on_test_epoch_end", "export"]
-)
+@pytest.mark.parametrize("hook", ["export", "score", *HOOKS])
 def test_a_disk_that_is_full_by_then(hook, tmp_path, monkeypatch, measured):
     """While the prior is cached, views and video written, or the cloud exported."""
     owner = system.export if hook == "export" else GaussianDreamerSystem
@@ -174,7 +166,7 @@ def test_a_partial_video_is_an_error(kind, tmp_path, measured):
         if kind == "png":
             pictures.write(path, noise[0])
         else:
-            pictures.write_video(str(path), frames, fps=5)
+            write_video(str(path), frames, fps=5)
 
     def fails(limit: int) -> None:
         with full_disk(limit), pytest.raises(UserError, match=f"out.{kind}"):
@@ -242,13 +234,8 @@ def test_a_damaged_checkpoint_is_refused_and_passed_over_by_resume_auto(whole, t
     require_equal_ends(measured, whole, ended, "different after resume=auto")
 
 
-def with_means(value):
-    return lambda c: c["state_dict"].update({"geometry.means": value})
-
-
-def without_a_group(checkpoint) -> None:
-    checkpoint["optimizer_states"][0]["param_groups"].pop()
-
+groups_of = lambda c: c["optimizer_states"][0]["param_groups"]  # noqa: E731
+with_means = lambda value: lambda c: c["state_dict"].update({"geometry.means": value})  # noqa: E731
 
 INCONSISTENT = {
     "without loops": (lambda c: c.pop("loops"), "it has no loops"),
@@ -256,7 +243,7 @@ INCONSISTENT = {
     "a mean more": (with_means(torch.zeros(121, 3)), "geometry.log_scales"),
     "means as a list": (with_means([1.0, 2.0]), "geometry.means"),
     "no means": (lambda c: c["state_dict"].pop("geometry.means"), "geometry.means"),
-    "moments of another size": (without_a_group, "another configuration"),
+    "moments of another size": (lambda c: groups_of(c).pop(), "another configuration"),
     "a word": (lambda c: c.update(global_step="three"), "no valid global_step"),
 }
 
@@ -273,9 +260,6 @@ def test_an_inconsistent_checkpoint_is_named(what, whole, tmp_path, measured):
     refused(tmp_path / "run", *options, words=["made.ckpt", message])
     assert not (tmp_path / "run").exists()
     measured("named error, nothing written")
-
-
-# ---- signals -------------------------------------------------------------------------------------
 
 
 @row("A5", "Ctrl-C / SIGTERM")
@@ -296,19 +280,12 @@ def test_a_signal_at_a_random_step(stop, whole, tmp_path, monkeypatch, measured)
 @row("A5", "Ctrl-C / SIGTERM")
 def test_a_second_signal_stops_at_once(tmp_path, monkeypatch, measured):
     """In the middle of a step: the checkpoint of the previous step remains."""
-
-    def impatient(system):
-        os.kill(os.getpid(), signal.SIGINT)
-        os.kill(os.getpid(), signal.SIGINT)
-
-    at_step(monkeypatch, 3, impatient)
+    at_step(monkeypatch, 3, lambda _: [os.kill(os.getpid(), signal.SIGINT) for _ in range(2)])
     ended = launch(tmp_path, *EVERY_STEP, code=130)
     assert f"resume={ended.last}" in ended.out
     late = 3 - load_checkpoint(ended.last)["global_step"]
     measured(late, "steps", what="lost by a second signal", at_most=1)
 
-
-# ---- modules of the user -------------------------------------------------------------------------
 
 TAKEN = "from threestudio_gaussiandreamer.host import register\n@register('mesh-prior')\nclass A: 0"
 MODULES = {
@@ -344,11 +321,7 @@ def test_a_part_that_calls_sys_exit_in_the_middle_of_a_run_is_named(
     measured("named, exit code 2")
 
 
-# ---- no network ----------------------------------------------------------------------------------
-
-
-def refuse(*args, **kwargs):
-    raise OSError(101, "Network is unreachable")
+refuse = Mock(side_effect=OSError(101, "Network is unreachable"))
 
 
 @row("A5", "Hub offline")
@@ -391,9 +364,6 @@ def test_the_guidance_without_weights_asks_no_network(tmp_path, monkeypatch, mea
     measured("a whole run without a socket")
 
 
-# ---- configuration -------------------------------------------------------------------------------
-
-
 def config_classes():
     """Return the Config of every part of this package by name, nested dataclasses included."""
     found = {}
@@ -424,9 +394,7 @@ def names_that_are_read():
     return read
 
 
-COMPUTED = set(
-    "exp_dir trial_name trial_dir n_gpus timestamp resume description use_timestamp".split()
-)
+COMPUTED = "exp_dir trial_name trial_dir n_gpus timestamp resume description use_timestamp".split()
 FOX = ["system.prompt_processor.prompt=a fox"]
 
 
@@ -456,7 +424,7 @@ def test_every_key_misspelt_by_one_letter_is_refused_with_the_right_one(measured
         path = DEMO.with_stem(name)
         cfg = load_config(path, cli_args=FOX)
         check_config(cfg)
-        keys = set(keys_of(cfg)) - COMPUTED - tried
+        keys = set(keys_of(cfg)).difference(COMPUTED, tried)
         tried |= keys
         for key in keys:
             section, dot, word = key.rpartition(".")
@@ -519,9 +487,7 @@ ALIKE = "x" * 4095, "🦊" * 999, "a_.._.._x", "two_lines", "a?b", "a*b", "con",
 @row("A5", "Prompt as path / YAML")
 @pytest.mark.parametrize("source", [*slow("command line"), "prompt file"])
 def test_a_prompt_stays_text_and_its_folder_below_the_root(source, tmp_path, measured):
-    """Also after parsed.yaml was read back; prompts that share their first 64 bytes, or are equal
-    when forbidden characters are replaced, have different folders.
-    """
+    """Also read back; prompts of one slug, or of equal first 64 bytes, have different folders."""
     names, prompts = set(), PROMPTS[::4] if source == "prompt file" else [*PROMPTS, *ALIKE]
     for number, prompt in enumerate(prompts):
         given = f"system.prompt_processor.prompt={prompt}"
@@ -547,12 +513,8 @@ def test_a_prompt_stays_text_and_its_folder_below_the_root(source, tmp_path, mea
     measured(shared, f"of {len(prompts)}", what="prompts that share a folder", at_most=0)
 
 
-# ---- PLY files of other programs -----------------------------------------------------------------
-
-GAUSSIAN = [
-    *"xyz", *(f"f_dc_{i}" for i in range(3)), "opacity",
-    *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4)),
-]  # fmt: skip
+GAUSSIAN = [*"xyz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2"]
+GAUSSIAN += [f"rot_{i}" for i in range(4)]
 
 
 def ply(rows: np.ndarray, names=GAUSSIAN, encoding="binary_little_endian", count=None) -> bytes:
@@ -604,9 +566,6 @@ def test_a_damaged_ply_is_an_error_in_little_memory(what, tmp_path, measured):
     peak = tracemalloc.get_traced_memory()[1] / 1e6
     tracemalloc.stop()
     measured(peak, "MB", what="peak memory for a file with a wrong count", at_most=1.0)
-
-
-# ---- files that would run code -------------------------------------------------------------------
 
 
 class Bomb:
@@ -702,15 +661,10 @@ def test_nothing_that_is_opened_runs_code(reader, tmp_path, measured):
     measured("nothing executed")
 
 
-SAFE = {
-    "torch.load": ("weights_only", True),
-    "np.load": ("allow_pickle", False),
-    "npy.read_array": ("allow_pickle", False),
-}
-NEVER = set(
-    "pickle.load pickle.loads yaml.load yaml.unsafe_load yaml.full_load torch.hub.load "
-    "marshal.loads joblib.load shelve.open eval exec os.system dill.load".split()
-)
+SAFE = dict.fromkeys(("np.load", "npy.read_array"), ("allow_pickle", False))
+SAFE["torch.load"] = "weights_only", True
+NEVER = "pickle.load pickle.loads yaml.load yaml.unsafe_load yaml.full_load torch.hub.load".split()
+NEVER += "marshal.loads joblib.load shelve.open eval exec os.system dill.load".split()
 
 
 @row("A5", "Untrusted pickle")

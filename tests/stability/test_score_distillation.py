@@ -49,10 +49,8 @@ def test_bad_items_are_masked_and_the_others_keep_every_bit(items, value, measur
     measured(changed, what="changed numbers of other items", at_most=0)
 
 
-CORRUPTED = (
-    "system.guidance_type=stability-corrupted-guidance",
-    "system.geometry.prior.path=toy.glb",
-)
+CORRUPTED = ["system.guidance_type=stability-corrupted-guidance"]
+CORRUPTED += ["system.geometry.prior.path=toy.glb"]
 
 
 def finite_cloud(ended: Ended) -> bool:
@@ -135,11 +133,8 @@ def test_the_clip_at_its_knots(measured):
         (0, 1.0, 2.0, 10, 0.5, 20): {0: 1.0, 5: 1.5, 10: 2.0, 15: 1.25, 20: 0.5, 30: 0.5},
         (500, 0.98, 0.55, 501): {499: 0.98, 500: 0.98, 501: 0.55},
     }
-    wrong = [
-        abs(C(list(knots), 0, step) - value)
-        for knots, values in schedules.items()
-        for step, value in values.items()
-    ]
+    rows = ((knots, *pair) for knots, values in schedules.items() for pair in values.items())
+    wrong = [abs(C(list(knots), 0, step) - value) for knots, step, value in rows]
     by_epoch = {0: 1.5, 5: 1.75, 10: 2.0}.items()
     wrong += [abs(C([0, 1.5, 2.0, 10.0], epoch, 99_999) - value) for epoch, value in by_epoch]
     guidance = CorruptedScore({"grad_clip": [0, 1.5, 2.0, 1000]})
@@ -200,7 +195,6 @@ EDGE = [
     "system.geometry.lr_means=[5,1e-2,1e-3,6]", "data.train_views=0",
     "system.loss.lambda_sds=[5,1.0,0.5,6]",
 ]  # fmt: skip
-
 DENSIFYING = [
     *NINE,
     "system.geometry.densify={enabled: true, start: 1, every: 2, stop: 9, grad_threshold: 1e-4}",
@@ -268,17 +262,14 @@ RATES = {
     "means": (4e-4, 2e-5), "scales": (6e-2, 1e-3), "quats": (6e-2, 2e-3),
     "opacities": (1e-1, 5e-3), "sh": (1e-1, 2e-3),
 }  # fmt: skip
-
 POINTS = ["system.geometry.prior.num_points=1500"]
 LATENT = [f"system.guidance.{x}" for x in ("space=latent", "latent_size=16", "bank_views=100")]
 STRONG = [*LATENT, "system.guidance.guidance_scale=101.0"]
-
 BLIND = [
     *LATENT, "system.guidance.mode=view-agnostic", "data.camera_distance_range=[2.5,2.5]",
     "data.fovy_range=[50,50]", "system.guidance.bank_distance_range=[2.5,2.5]",
     "system.guidance.bank_fovy_range=[50,50]",
 ]  # fmt: skip
-
 RANDOM_START = [f"system.geometry.prior{x}" for x in ("_type=random-prior", ".shape=sphere")]
 
 
@@ -300,12 +291,9 @@ def trained(folder, steps, size, *options) -> Ended:
 @row("A4", "Guidance 100: over-saturation")
 def test_annealing_helps_and_clipping_helps_more(tmp_path, measured):
     """The exact score of the toy in a latent; over-saturation is measured out of gamut."""
-    variants = {
-        "as it is": [*STRONG, "system.guidance.max_step_percent=0.98"],
-        "annealed": STRONG,
-        "annealed and clipped": [*STRONG, "system.guidance.grad_clip=[0,1.5,2.0,150]"],
-        "no guidance": LATENT,
-    }
+    variants = {"as it is": [*STRONG, "system.guidance.max_step_percent=0.98"], "annealed": STRONG}
+    variants["annealed and clipped"] = [*STRONG, "system.guidance.grad_clip=[0,1.5,2.0,150]"]
+    variants["no guidance"] = LATENT
     dB, outside = [], []
     for name, options in variants.items():
         options = ["data.batch_size=4", "system.geometry.bound_colors=false", *POINTS, *options]
@@ -347,10 +335,8 @@ def test_the_table_of_five_seeds(measured):
 @pytest.mark.slow
 @row("A4", "Colour drift, background shortcut")
 def test_the_cloud_does_not_depend_on_the_background(tmp_path, measured):
-    """Only the alpha error differs between backgrounds, mostly at the outline; the spread is below
-    1 dB at the end of the demo's schedules, not yet after three fifths of them. With the usual
-    dilation of 0.3 square pixels instead of the demo's 0.03 the spread is larger, and larger still
-    for training on black alone, as in the paper's code.
+    """Only the alpha error differs, mostly at the outline: below 1 dB at the end of the demo's
+    schedules, more after three fifths of them, with a dilation of 0.3, or for training on black.
     """
     options = "system.geometry.prior.num_points=3000", "data.train_views=60"
     state = trained(tmp_path, 500, 96, *options).checkpoint()["state_dict"]
@@ -380,14 +366,9 @@ def rendered(cloud, c2w, fovy, size, **options):
     return rasterize(*gaussians, viewmats, Ks, size, size, **options).image
 
 
-EXTREME = {
-    "above": (90.0, 0.0, 2.5, 50.0),
-    "below": (-90.0, 45.0, 2.5, 50.0),
-    "inside": (0.0, 0.0, 0.1, 50.0),
-    "fov 1": (0.0, 10.0, 2.5, 1.0),
-    "fov 170": (15.0, 200.0, 2.5, 170.0),
-}
-
+EXTREME = {"above": (90.0, 0.0, 2.5, 50.0), "below": (-90.0, 45.0, 2.5, 50.0)}
+EXTREME |= {"inside": (0.0, 0.0, 0.1, 50.0), "fov 1": (0.0, 10.0, 2.5, 1.0)}
+EXTREME |= {"fov 170": (15.0, 200.0, 2.5, 170.0)}
 ORDINARY = (15.0, 30.0, 2.5, 50.0)
 
 

@@ -45,17 +45,14 @@ class Tab:
         self.page.call("Input.insertText", text=text)
 
     def start(self, prompt, choice="smoke.yaml", more="", keep="null", **fields):
-        """Fill the form and press Start; tests may choose any configuration, and ``keep`` a file
-        that was uploaded.
-        """
+        """Fill the form with any configuration, ``keep`` an uploaded file, and press Start."""
         self.js(f"document.getElementById('form').reset(), setFile({keep}), say('')")
         option = f"Object.assign(document.createElement('option'), {{value: '{choice}'}})"
         self.js(f"document.getElementById('choice').append({option})")
         self.js(f"document.getElementById('choice').value = '{choice}'")
         for name, text in {"prompt": prompt, "more": more, **fields}.items():
-            self.js(
-                f"document.getElementById('{name}').closest('details')?.setAttribute('open', '')"
-            )
+            field = f"document.getElementById('{name}')"
+            self.js(f"{field}.closest('details')?.setAttribute('open', '')")
             self.type(name, text)
         jobs = "[state.job, state.last, ...state.queue].map(job => job ? job.id : 0)"
         before = self.js(f"Math.max(...{jobs})")
@@ -63,7 +60,6 @@ class Tab:
         self.until(f"Math.max(...{jobs}) > {before}")
 
     def until(self, condition):
-        """Wait until a JavaScript expression is true, and return its value."""
         end = time.monotonic() + SECONDS
         while time.monotonic() < end:
             if value := self.js(condition):
@@ -80,11 +76,8 @@ class Tab:
         return json.loads(self.js("JSON.stringify(shelf[0] || null)"))
 
     def worker(self):
-        """Return the process id of the run at work."""
-        children = subprocess.run(
-            ["pgrep", "-P", str(self.process.pid)], capture_output=True, text=True, check=True
-        )
-        return int(children.stdout.split()[0])
+        children = subprocess.check_output(["pgrep", "-P", str(self.process.pid)], text=True)
+        return int(children.split()[0])
 
     def other_tab(self):
         """Open the page in another tab of the same browser."""
@@ -111,12 +104,8 @@ def opened(root: Path, size: tuple[int, int] = (1000, 600)) -> Iterator[Tab]:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
     command = [sys.executable, "-m", "threestudio_gaussiandreamer.studio", "--port", str(port)]
-    process = subprocess.Popen(
-        [*command, "--output", str(root)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
-        text=True,
-    )
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL, "text": True}
+    process = subprocess.Popen([*command, "--output", str(root)], **pipes)
     try:
         found = (re.search(r"http://\S+\d", line) for line in process.stdout)
         address = next(filter(None, found))[0] + "/"

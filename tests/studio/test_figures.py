@@ -25,7 +25,6 @@ HEADER = (
 
 
 def upload(studio, path):
-    """Choose a file with the browser's dialog."""
     studio.page.session = studio.session
     root = studio.page.call("DOM.getDocument")["root"]["nodeId"]
     node = studio.page.call("DOM.querySelector", nodeId=root, selector="#upload")["nodeId"]

@@ -12,9 +12,7 @@ import urllib.request
 import pytest
 
 from tests.view.test_live import handshake
-from threestudio_gaussiandreamer.launch.config import load_config
-from threestudio_gaussiandreamer.launch.experiment import main
-from threestudio_gaussiandreamer.launch.options import find_config
+from threestudio_gaussiandreamer.launch import config, experiment, options
 from threestudio_gaussiandreamer.studio.server import WEB
 
 HOSTILE = (
@@ -46,14 +44,11 @@ def test_a_prompt_is_text_and_the_ply_is_that_of_the_command_line(studio, made, 
     assert studio.js("window.hurt === undefined && !document.querySelector('main img[onerror]')")
     assert HOSTILE[:100] in studio.text("cards")
     argv = ["--config", "smoke.yaml", "--train", f"exp_root_dir={tmp_path}", "trainer.max_steps=6"]
-    assert main([*argv, "seed=3", f"system.prompt_processor.prompt={HOSTILE}"]) == 0
+    assert experiment.main([*argv, "seed=3", f"system.prompt_processor.prompt={HOSTILE}"]) == 0
     (own,) = tmp_path.glob("smoke/*/save/it6-export/gaussians.ply")
     assert fetched(studio, file_of(made, "gaussians.ply")) == own.read_bytes()
-    assert made["command"].split()[1:4] == [
-        "-m",
-        "threestudio_gaussiandreamer.launch.experiment",
-        "--config",
-    ]
+    module = "threestudio_gaussiandreamer.launch.experiment"
+    assert made["command"].split()[1:4] == ["-m", module, "--config"]
     assert "files/" in studio.js("document.querySelector('.card img').src")
 
 
@@ -76,13 +71,8 @@ def test_a_run_is_compared_pruned_taken_away_and_repeated(studio, made):
     studio.press_text("Again with this changed")
     fields = "['prompt', 'steps', 'seed', 'choice', 'more'].map(id => [id, $(id).value])"
     form = json.loads(studio.js(f"JSON.stringify(Object.fromEntries({fields}))"))
-    assert form == {
-        "prompt": HOSTILE,
-        "steps": "6",
-        "seed": "3",
-        "choice": "smoke.yaml",
-        "more": "",
-    }
+    given = {"prompt": HOSTILE, "steps": "6", "seed": "3"}
+    assert form == given | {"choice": "smoke.yaml", "more": ""}
     assert fetched(studio, file_of(studio.newest(), "parsed.yaml"))
     page = file_of(made, "view.html")
     with urllib.request.urlopen(studio.address + "files/" + urllib.request.quote(page)) as answer:
@@ -133,7 +123,7 @@ def test_every_choice_of_the_page_is_a_whole_configuration():
     assert len(choices) == 9
     prompt = ["system.prompt_processor.prompt=a fox"]
     for choice in choices:
-        cfg = load_config(*map(find_config, choice.split()), cli_args=prompt)
+        cfg = config.load_config(*map(options.find_config, choice.split()), cli_args=prompt)
         assert cfg.system_type and cfg.data_type and cfg.trainer["max_steps"] > 0, choice
 
 
@@ -161,7 +151,7 @@ def test_wrong_requests_and_damaged_runs_leave_the_page_alive(studio):
 
 def test_errors_are_those_of_the_command_line(studio, capfd):
     argv = ["--config", "smoke.yaml", "--train", "trainer.max_stepz=3"]
-    assert main(argv) == 2
+    assert experiment.main(argv) == 2
     expected = capfd.readouterr().err.split("error: ")[1].strip()
     studio.start("a ball", more="trainer.max_stepz=3")
     studio.until("$('message').textContent.includes('error:')")
@@ -229,13 +219,8 @@ def test_a_phone_a_keyboard_and_the_dark(studio):
         reached = []
         for _ in range(20):
             for kind in ("keyDown", "keyUp"):
-                page.call(
-                    "Input.dispatchKeyEvent",
-                    type=kind,
-                    key="Tab",
-                    code="Tab",
-                    windowsVirtualKeyCode=9,
-                )
+                key = {"key": "Tab", "code": "Tab", "windowsVirtualKeyCode": 9}
+                page.call("Input.dispatchKeyEvent", type=kind, **key)
             reached.append(studio.js("document.activeElement.id"))
         assert {"choice", "upload", "steps", "count", "start", "refresh"} <= set(reached)
     finally:

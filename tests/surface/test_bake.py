@@ -31,7 +31,6 @@ def on_ball(atlas):
 
 
 def front():
-    """A camera in front."""
     orbit = Orbit(*(torch.tensor([value]) for value in (0.0, 0.0, 3.0, FOVY)))
     return orbit.c2w.double().numpy()
 

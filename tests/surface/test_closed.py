@@ -4,14 +4,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.surface.closed import (
-    is_closed,
-    separated,
-    simplified,
-    without_folds,
-    without_small_parts,
-)
+from tests.helpers.refusals import refused
+from threestudio_gaussiandreamer.surface import closed
 
 
 def ball(radius=1.0, subdivisions=3, place=(0, 0, 0)):
@@ -38,51 +32,53 @@ def two_boxes(offset):
 def test_small_parts_and_folds_are_dropped_and_what_cant_be_closed_is_refused():
     vertices, faces = ball(subdivisions=2)
     cavity = ball(0.5, 2)[0], ball(0.5, 2)[1][:, ::-1]
-    kept = without_small_parts(*joined(ball(0.05, 1, (2, 0, 0)), cavity, (vertices, faces)), 0.01)
+    three = joined(ball(0.05, 1, (2, 0, 0)), cavity, (vertices, faces))
+    kept = closed.without_small_parts(*three, 0.01)
     np.testing.assert_array_equal(kept[0], vertices)
     np.testing.assert_array_equal(kept[1], faces)
     assert kept[2] == 1  # a cavity can't be seen
 
     for radius, dropped in ((0.5, 0), (0.11, 0), (0.095, 1)):
         two = joined(ball(), ball(radius, 2, (2, 0, 0)))
-        _, faces, count = without_small_parts(*two, 0.01)
+        _, faces, count = closed.without_small_parts(*two, 0.01)
         assert count == dropped and (len(faces) == len(two[1])) == (not dropped)
     _, faces = ball(subdivisions=1)
-    kept = without_folds(np.concatenate([faces, [[90, 91, 92], [92, 91, 90], [3, 3, 4]]]))
+    kept = closed.without_folds(np.concatenate([faces, [[90, 91, 92], [92, 91, 90], [3, 3, 4]]]))
     np.testing.assert_array_equal(kept, faces)
     vertices, faces = ball(subdivisions=1)
-    again = simplified(vertices, faces, 5000)
-    assert len(again[1]) == len(faces) and is_closed(again[1])
+    again = closed.simplified(vertices, faces, 5000)
+    assert len(again[1]) == len(faces) and closed.is_closed(again[1])
     np.testing.assert_allclose(np.sort(again[0], axis=0), np.sort(vertices, axis=0))
     parts = joined(*(ball(subdivisions=1, place=(3 * k, 0, 0)) for k in range(60)))
-    with pytest.raises(UserError, match="can't be closed with 100 faces"):
-        simplified(*parts, 100)
-    with pytest.raises(UserError, match="closed with 5000 faces"):
-        simplified(vertices, faces[1:], 5000)  # with a hole
+    refused("can't be closed with 100 faces", closed.simplified, *parts, 100)
+    refused("closed with 5000 faces", closed.simplified, vertices, faces[1:], 5000)  # with a hole
 
 
 @pytest.mark.parametrize("factor", [2.0**-20, 2.0**20])
 def test_simplified_meshes_stay_closed_and_keep_their_size_at_any_scale(factor):
     vertices, faces = ball()
-    plain, scaled = simplified(vertices, faces, 300), simplified(factor * vertices, faces, 300)
+    plain, scaled = (
+        closed.simplified(vertices, faces, 300),
+        closed.simplified(factor * vertices, faces, 300),
+    )
     np.testing.assert_array_equal(scaled[0] / factor, plain[0])
     np.testing.assert_array_equal(scaled[1], plain[1])
-    for vertices, faces in (plain, simplified(*ball(), 100)):
-        assert len(faces) <= 300 and is_closed(faces)
+    for vertices, faces in (plain, closed.simplified(*ball(), 100)):
+        assert len(faces) <= 300 and closed.is_closed(faces)
         found = trimesh.Trimesh(vertices, faces, process=False)
         assert found.volume == pytest.approx(4.12, rel=0.08)
 
 
 def test_boxes_that_share_an_edge_or_a_corner_are_separated():
     vertices, faces = two_boxes([1, 1, 0])
-    assert not is_closed(faces)
-    moved, apart = separated(vertices, faces)
-    assert is_closed(apart) and is_closed(welded(moved, apart)[1])
+    assert not closed.is_closed(faces)
+    moved, apart = closed.separated(vertices, faces)
+    assert closed.is_closed(apart) and closed.is_closed(welded(moved, apart)[1])
     parts = trimesh.Trimesh(moved, apart, process=False).split()
     assert len(parts) == 2
     assert all(part.volume == pytest.approx(1, abs=0.1) for part in parts)
-    moved, apart = separated(*two_boxes(1))
-    assert len(moved) == 16 and len(np.unique(moved, axis=0)) == 16 and is_closed(apart)
+    moved, apart = closed.separated(*two_boxes(1))
+    assert len(moved) == 16 and len(np.unique(moved, axis=0)) == 16 and closed.is_closed(apart)
 
 
 def cells_to_mesh(cells):
@@ -108,12 +104,12 @@ def test_cells_that_touch_at_an_edge_and_random_ones_are_closed():
     cells[[0, 0, 0, 1, 2, 2], [0, 1, 2, 2, 2, 1]] = True
     cells[1, 0] = True  # touches (2, 1) at an edge
     vertices, faces = cells_to_mesh(cells)
-    assert not is_closed(faces)
-    moved, apart = separated(vertices, faces)
-    assert is_closed(welded(moved, apart)[1])
+    assert not closed.is_closed(faces)
+    moved, apart = closed.separated(vertices, faces)
+    assert closed.is_closed(welded(moved, apart)[1])
     volume = trimesh.Trimesh(moved, apart, process=False).volume
     assert volume == pytest.approx(cells.sum(), rel=0.05)
     for seed in range(3):
         cells = np.random.default_rng(seed).random((5, 5, 5)) < 0.4
-        moved, apart = separated(*cells_to_mesh(cells))
-        assert is_closed(welded(moved.astype(np.float32), apart)[1])
+        moved, apart = closed.separated(*cells_to_mesh(cells))
+        assert closed.is_closed(welded(moved.astype(np.float32), apart)[1])

@@ -9,14 +9,14 @@ import torch
 import trimesh
 
 from tests.helpers.painted_ball import painted_ball, sphere_points
+from tests.helpers.refusals import refused
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
 from threestudio_gaussiandreamer.gaussians.views import FOVY, rasterize_views, views_around
 from threestudio_gaussiandreamer.meshes.raycast import MeshCaster
 from threestudio_gaussiandreamer.meshes.write import welded
-from threestudio_gaussiandreamer.surface import textured
+from threestudio_gaussiandreamer.surface import fusion, textured
 from threestudio_gaussiandreamer.surface.closed import is_closed
-from threestudio_gaussiandreamer.surface.fusion import opengl
 from threestudio_gaussiandreamer.surface.textured import MeshOptions, mesh_from_gaussians
 
 SMALL = MeshOptions(faces=600, texture=128, views=16, view_size=128, resolution=32)
@@ -32,7 +32,7 @@ def psnr_to_cloud(mesh, gaussians, size=128):
     views = views_around(cloud, 12, size, turn=33, distances=(1.2,))
     rows, white = torch.arange(12), torch.ones(3)
     truth = rasterize_views(cloud, views, rows, white).image.numpy()
-    cameras = [(c2w, FOVY) for c2w in opengl(views)]
+    cameras = [(c2w, FOVY) for c2w in fusion.opengl(views)]
     ours = MeshCaster(mesh).render_views(cameras, size, size)
     error = np.square(ours[..., :3] + 1 - ours[..., 3:] - truth).mean()
     return -10 * np.log10(error)
@@ -97,14 +97,12 @@ def test_a_cloud_without_visible_gaussians_and_a_missing_library_are_refused(mon
         mesh_from_gaussians(painted_ball(30, opacity=0.05), SMALL)
     monkeypatch.setattr(textured, "render", None)
     for gaussians in (painted_ball(300).rows(slice(0)), painted_ball(300, opacity=0.01)):
-        with pytest.raises(UserError, match="form no surface"):
-            mesh_from_gaussians(gaussians, SMALL)
+        refused("form no surface", mesh_from_gaussians, gaussians, SMALL)
     monkeypatch.setattr(textured, "finite", None)
     for library in ("xatlas", "fast_simplification", "skimage"):  # the first of many is named
         monkeypatch.setitem(sys.modules, library, None)
         said = rf"needs {library} .*threestudio-gaussiandreamer\[mesh\]"
-        with pytest.raises(UserError, match=said):
-            mesh_from_gaussians(painted_ball(20))
+        refused(said, mesh_from_gaussians, painted_ball(20))
 
 
 def test_a_part_as_thin_as_a_cell_stays(caplog):
@@ -115,9 +113,8 @@ def test_a_part_as_thin_as_a_cell_stays(caplog):
     plate = (rng.random((800, 3)) - 0.5) * [0.3, 0.3, 2 * cell] + [0, 0, 1.15]
     means = np.concatenate([ball, rod, plate]).astype(np.float32)
     sizes = np.repeat([0.03, cell / 3, cell / 2], [len(ball), len(rod), len(plate)])
-    cloud = painted_ball(len(means), opacity=0.99)._replace(
-        means=means, log_scales=np.log(np.repeat(sizes[:, None], 3, 1)).astype(np.float32)
-    )
+    scales = np.log(np.repeat(sizes[:, None], 3, 1)).astype(np.float32)
+    cloud = painted_ball(len(means), opacity=0.99)._replace(means=means, log_scales=scales)
     options = dataclasses.replace(SMALL, faces=2000, resolution=48, view_size=192)
     mesh = mesh_from_gaussians(cloud, options)
     assert mesh.vertices[:, 2].max() > 1.1 and len(parts(mesh)) == 1
@@ -137,5 +134,4 @@ def test_a_part_as_thin_as_a_cell_stays(caplog):
 )
 def test_wrong_options_are_refused_before_any_work(options, message, monkeypatch):
     monkeypatch.setattr(textured, "finite", None)
-    with pytest.raises(UserError, match=message):
-        mesh_from_gaussians(painted_ball(20), MeshOptions(**options), "--")
+    refused(message, mesh_from_gaussians, painted_ball(20), MeshOptions(**options), "--")

@@ -19,7 +19,6 @@ SMALL = [
     "trainer.log_every_n_steps=1", "use_timestamp=false", "tag=t", "system.geometry.budget=null",
 ]  # fmt: skip
 
-
 DENSIFY = [
     f"system.geometry.densify.{option}"
     for option in "enabled=true start=2 stop=8 every=2 grad_threshold=1e-4 min_opacity=0.01".split()

@@ -6,7 +6,7 @@ import math
 import pytest
 import torch
 
-from threestudio_gaussiandreamer.core.errors import UserError
+from tests.helpers.refusals import refused
 from threestudio_gaussiandreamer.training.data import GaussianDreamerDataModule, orbit_batch
 
 KEYS = dict.fromkeys(("elevation", "azimuth", "camera_distances", "fovy"), (4,))
@@ -92,5 +92,4 @@ def test_a_pool_repeats_its_cameras_to_the_bit_and_covers_the_circle():
     ],
 )
 def test_a_wrong_value_is_named(wrong, named):
-    with pytest.raises(UserError, match=named):
-        module(**wrong)
+    refused(named, module, **wrong)

@@ -52,7 +52,6 @@ def test_a_round_says_how_many_it_left_and_opacities_decay_between_those_of_auto
 
 
 def sampled(density, removal, error):
-    """Set the statistics of the views since the last round."""
     density.cloud.removal.copy_(removal)
     density.cloud.error.fill_(error)
     return density

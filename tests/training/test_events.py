@@ -11,10 +11,8 @@ from tests.training.runs import launch, length, run_folder
 from threestudio_gaussiandreamer.core.devices import HostCopy
 from threestudio_gaussiandreamer.metrics import psnr
 from threestudio_gaussiandreamer.splatting.cpu import backend as cpu
-from threestudio_gaussiandreamer.training import events
+from threestudio_gaussiandreamer.training import events, system
 from threestudio_gaussiandreamer.training.data import GaussianDreamerDataModule
-from threestudio_gaussiandreamer.training.events import StepLog
-from threestudio_gaussiandreamer.training.system import GaussianDreamerSystem
 
 
 @pytest.fixture
@@ -31,7 +29,7 @@ def logged(trainer):
 
 
 def test_numbers_reach_loggers_progress_bar_and_callbacks(trainer):
-    StepLog().write(trainer, {"loss": torch.tensor(2.5), "gaussians": 7}, ["gaussians"])
+    events.StepLog().write(trainer, {"loss": torch.tensor(2.5), "gaussians": 7}, ["gaussians"])
     assert logged(trainer) == [(9, {"loss": 2.5, "gaussians": 7.0, "epoch": 0})]
     trainer.loggers[0].save.assert_called_once()
     assert trainer.callback_metrics == {"loss": torch.tensor(2.5), "gaussians": torch.tensor(7.0)}
@@ -41,7 +39,7 @@ def test_numbers_reach_loggers_progress_bar_and_callbacks(trainer):
 def test_numbers_that_arrive_late_are_logged_at_their_own_step(trainer, monkeypatch):
     """As from a GPU."""
     monkeypatch.setattr(HostCopy, "ready", lambda copy: False)
-    log = StepLog()
+    log = events.StepLog()
     log.write(trainer, {"loss": torch.tensor(1.0)}, ["loss"])
     trainer.global_step, trainer.current_epoch = 11, 1
     log.write(trainer, {"loss": torch.tensor(2.0)})
@@ -51,16 +49,14 @@ def test_numbers_that_arrive_late_are_logged_at_their_own_step(trainer, monkeypa
     assert trainer.progress_bar_metrics == {"loss": 1.0}
     monkeypatch.setattr(HostCopy, "ready", lambda copy: False)
     trainer.checkpoint_callbacks = [object(), SimpleNamespace(monitor="loss")]
-    StepLog().write(trainer, {"loss": torch.tensor(1.0)})
+    events.StepLog().write(trainer, {"loss": torch.tensor(1.0)})
     assert trainer.callback_metrics == {"loss": torch.tensor(1.0)}
 
 
 @pytest.mark.skipif(cpu.unavailable() is not None, reason=str(cpu.unavailable()))
-def test_a_run_logs_each_number_once_and_the_error_that_its_guidance_returns(
-    tmp_path, painted_box, monkeypatch
-):
+def test_a_run_logs_each_number_once_and_its_guidances_error(tmp_path, painted_box, monkeypatch):
     """At the steps of the learning rates; no truth is rendered for it."""
-    expected, report = [], GaussianDreamerSystem.report
+    expected, report = [], system.GaussianDreamerSystem.report
 
     def compare(own, out, batch, *numbers):
         truth = events.true_views(own.guidance, batch, out)
@@ -69,7 +65,7 @@ def test_a_run_logs_each_number_once_and_the_error_that_its_guidance_returns(
             without.delattr(events, "true_views")
             report(own, out, batch, *numbers)
 
-    monkeypatch.setattr(GaussianDreamerSystem, "report", compare)
+    monkeypatch.setattr(system.GaussianDreamerSystem, "report", compare)
     assert launch(tmp_path, painted_box, *length(4), "trainer.log_every_n_steps=2") == 0
     with open(run_folder(tmp_path) / "csv_logs" / "version_0" / "metrics.csv") as file:
         rows = list(csv.DictReader(file))
@@ -88,9 +84,7 @@ def test_a_run_logs_each_number_once_and_the_error_that_its_guidance_returns(
         ({"train_views": 8, "height": [16, 32], "resolution_milestones": [3]}, 9, []),
     ],
 )
-def test_the_views_of_a_pool_are_announced_if_most_are_drawn_and_none_moves(
-    options, steps, announced
-):
+def test_views_of_a_pool_are_announced_if_most_are_drawn_and_none_moves(options, steps, announced):
     data = GaussianDreamerDataModule({"batch_size": 4, "height": 32, "width": 48, **options})
     data.setup("fit")
     found = []

@@ -7,14 +7,11 @@ import numpy as np
 import pytest
 
 from tests.training.runs import cloud_of, launch, length, run_folder
-from threestudio_gaussiandreamer.formats.gaussian_files import read_cloud
-from threestudio_gaussiandreamer.formats.ply import read_gaussians
+from threestudio_gaussiandreamer.formats import gaussian_files, ply
 from threestudio_gaussiandreamer.host import Exporter, ExporterOutput, register
 
 
-def test_every_format_notes_how_it_was_trained_and_pruned_and_later_stages_read_no_prior(
-    tmp_path, painted_box, capsys
-):
+def test_formats_note_training_and_pruning_and_stages_read_no_prior(tmp_path, painted_box, capsys):
     mesh = tmp_path / "box.glb"
     mesh.write_bytes(painted_box.read_bytes())
     options = ["system.renderer.antialias=true", "system.prune.psnr=25", "system.prune.size=32"]
@@ -24,14 +21,14 @@ def test_every_format_notes_how_it_was_trained_and_pruned_and_later_stages_read_
     save, said = run_folder(tmp_path) / "save", capsys.readouterr().out
     export, last = save / "it3-export", run_folder(tmp_path) / "ckpts" / "last.ckpt"
     suffixes = ["ply", "compressed.ply", "spz", "sog", "glb"]
-    stored = [read_cloud(str(export / f"gaussians.{suffix}")) for suffix in suffixes]
+    stored = [gaussian_files.read_cloud(str(export / f"gaussians.{suffix}")) for suffix in suffixes]
     assert [cloud.antialiased for cloud in stored] == [True] * 5
     assert [len(cloud.gaussians.means) for cloud in stored] == [200] * 5
     assert "SplatRenderMode: mip" in (export / "gaussians.usda").read_text()
     pruned = [export / "pruned" / f"gaussians.{suffix}" for suffix in ("ply", "spz")]
     report = json.loads((export / "pruned" / "report.json").read_text())
     for path in pruned:
-        cloud = read_cloud(str(path))
+        cloud = gaussian_files.read_cloud(str(path))
         assert str(path) in said and cloud.pruned_to == 25
         assert len(cloud.gaussians.means) == report["after"]["gaussians"] < 200
     # as the demo draws
@@ -46,7 +43,7 @@ def test_every_format_notes_how_it_was_trained_and_pruned_and_later_stages_read_
         assert launch(tmp_path, mesh, *options, f"resume={last}", stage=stage) == 0
     assert [path.read_bytes() for path in kept] == before and (save / "it3-0.png").is_file()
     means = cloud_of(last)["geometry.means"].numpy()[:, [1, 2, 0]] * np.float32([1, -1, -1])
-    assert np.array_equal(read_gaussians(export / "gaussians.ply").means, means)
+    assert np.array_equal(ply.read_gaussians(export / "gaussians.ply").means, means)
 
 
 @register("test-raising-exporter")
@@ -62,8 +59,6 @@ class Unbuildable(Raising):
 
 
 class Returning(Exporter):
-    """Returns one JSON file."""
-
     name = "numbers.json"
 
     def __call__(self):
@@ -96,7 +91,7 @@ def test_formats_that_fail_leave_the_others(tmp_path, painted_box, capsys):
     assert said.count("no memory") == said.count("system.prune failed: RuntimeError") == 1
     assert "test-unbuildable failed: RuntimeError: not installed" in said
     assert "save_name 'Gaussians.ply': another file of the export" in said
-    assert len(read_gaussians(export / "pruned" / "gaussians.ply").means) == 100
+    assert len(ply.read_gaussians(export / "pruned" / "gaussians.ply").means) == 100
     wanted = {"gaussians.ply", "points.ply"}
     for folder in (export, export / "pruned"):
         assert {path.name for path in folder.iterdir()} >= wanted

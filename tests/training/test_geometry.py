@@ -1,19 +1,22 @@
-"""The cloud: its start from points, its size, its learning rates, its checkpoint."""
+"""The cloud: its start from points, its size, its rates, its checkpoint; the preflight of parts."""
+
+from dataclasses import dataclass
+from types import SimpleNamespace
 
 import pytest
 import torch
 
-from threestudio_gaussiandreamer import register_parts
-from threestudio_gaussiandreamer.cameras import orbit_c2w
+from tests.helpers.refusals import refused
+from threestudio_gaussiandreamer import cameras, register_parts
 from threestudio_gaussiandreamer.core.errors import UserError
+from threestudio_gaussiandreamer.core.files import existing_file
 from threestudio_gaussiandreamer.formats.gaussian_files import StoredCloud, write_cloud
-from threestudio_gaussiandreamer.gaussians import densify, sh
-from threestudio_gaussiandreamer.gaussians.densify import screen_gradients
+from threestudio_gaussiandreamer.gaussians import densify, grow, sh
 from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
-from threestudio_gaussiandreamer.gaussians.grow import nearest_distance_scales
-from threestudio_gaussiandreamer.host import BaseGeometry, find
+from threestudio_gaussiandreamer.host import BaseGeometry, BaseObject, find, register
 from threestudio_gaussiandreamer.training.density import DensityControl
 from threestudio_gaussiandreamer.training.geometry import GaussianCloud, grow_points
+from threestudio_gaussiandreamer.training.system import preflight_parts
 
 register_parts()
 NO_GROWTH = {"enabled": False}
@@ -30,10 +33,9 @@ def test_each_point_becomes_one_gaussian_whose_rates_follow_their_schedules(sphe
     assert len(geometry) == 400
     assert torch.equal(geometry.means, torch.from_numpy(sphere_points.points))
     assert torch.allclose(geometry.opacities(), torch.tensor(0.1))
-    assert torch.allclose(
-        geometry.colors(torch.zeros(1, 3)), torch.from_numpy(sphere_points.colors), atol=1e-6
-    )
-    nearest = torch.from_numpy(nearest_distance_scales(sphere_points.points, "nearest"))
+    colors = torch.from_numpy(sphere_points.colors)
+    assert torch.allclose(geometry.colors(torch.zeros(1, 3)), colors, atol=1e-6)
+    nearest = torch.from_numpy(grow.nearest_distance_scales(sphere_points.points, "nearest"))
     assert torch.allclose(geometry.scales(), nearest[:, None].expand(-1, 3), rtol=1e-5)
     assert torch.equal(geometry.quats, torch.tensor([1.0, 0, 0, 0]).expand(400, 4))
     geometry = started(sphere_points, lr_means=[0, 2e-4, 1e-4, 100], lr_sh_rest=0.5, sh_degree=1)
@@ -49,9 +51,8 @@ def test_the_object_grows_first_and_the_ground_is_added_then():
     prior = {"num_points": 400, "size": 0.7}
     options = {"prior_type": "random-prior", "grow": {"num_candidates": 20_000, "radius": 0.04}}
     ground = {"ground": True, "ground_points": 100, "ground_size": 3.0}
-    alone, with_ground = (
-        GaussianCloud({**options, "prior": prior | more}) for more in ({}, ground)
-    )
+    priors = prior, prior | ground
+    alone, with_ground = (GaussianCloud({**options, "prior": each}) for each in priors)
     for geometry in (alone, with_ground):
         geometry.initialize("a fox")
     assert len(alone) > 500
@@ -100,24 +101,22 @@ def test_a_step_moves_means_in_the_unit_of_their_rate(sphere_points, unit):
 
 @pytest.mark.parametrize("absgrad", [False, True])
 def test_the_rasteriser_collects_absolute_gradients_where_they_decide(sphere_points, absgrad):
-    densify = {"enabled": True, "absgrad": absgrad}
-    geometry = started(sphere_points, densify=densify, init_opacity=0.5)
+    options = {"enabled": True, "absgrad": absgrad}
+    geometry = started(sphere_points, densify=options, init_opacity=0.5)
     parts = {"geometry": geometry, "material": None}
     parts["background"] = find("gaussiandreamer-background")({"color": [1.0, 1.0, 1.0]})
-    c2w = orbit_c2w(torch.zeros(2), torch.tensor([0.0, 90.0]), torch.full((2,), 2.5))
+    c2w = cameras.orbit_c2w(torch.zeros(2), torch.tensor([0.0, 90.0]), torch.full((2,), 2.5))
     out = find("gaussiandreamer-splatting")({}, **parts)(c2w, torch.full((2,), 0.8), 40, 24)
     (out["comp_rgb"] ** 2).mean().backward()
     DensityControl(geometry).after_backward(out["rasterized"], 40, 24)
     means2d = out["rasterized"].means2d
     assert hasattr(means2d, "absgrad") == absgrad
-    expected = screen_gradients(means2d.absgrad if absgrad else means2d.grad, 40, 24).sum(0)
+    expected = densify.screen_gradients(means2d.absgrad if absgrad else means2d.grad, 40, 24).sum(0)
     assert torch.equal(geometry.gradient_sum, expected) and expected.max() > 0
 
 
 @pytest.mark.parametrize("degree, told", [(0, True), (2, False)])
-def test_colours_by_direction_that_are_dropped_are_told(
-    sphere_points, tmp_path, caplog, degree, told
-):
+def test_colours_that_are_dropped_are_told(sphere_points, tmp_path, caplog, degree, told):
     trained = started(sphere_points, sh_degree=2)
     trained.sh_rest.data[:, 5] = 0.1  # of degree 2
     write_cloud(str(tmp_path / "a.ply"), StoredCloud(Gaussians.of(trained).arrays()))
@@ -142,17 +141,54 @@ def test_colours_by_direction_that_are_dropped_are_told(
     ],
 )
 def test_a_value_out_of_range_is_named(wrong, named):
-    with pytest.raises(UserError, match=named):
-        GaussianCloud(wrong)
+    refused(named, GaussianCloud, wrong)
 
 
 def test_an_empty_cloud_and_a_geometry_without_gaussians_are_refused(sphere_points):
     empty = find("gaussiandreamer-cloud")({})
-    with pytest.raises(UserError, match="is empty.*system_type must be gaussiandreamer-system"):
-        empty.do_update_step(0, 0)
+    refused("is empty.*system_type must be gaussiandreamer-system", empty.do_update_step, 0, 0)
     empty.do_update_step(0, 0, on_load_weights=True)
     started(sphere_points).do_update_step(0, 0)
     for part in ("gaussiandreamer-splatting", "mesh-exporter"):
         with pytest.raises(UserError, match="BaseGeometry is no cloud of Gaussians: it has no"):
             made = find(part)({}, geometry=BaseGeometry({}), material=None, background=None)
             made()
+
+
+@register("test-weights-guidance")
+class WeightsGuidance(BaseObject):
+    @dataclass
+    class Config(BaseObject.Config):
+        weights: str = "missing.bin"
+
+    @classmethod
+    def preflight(cls, cfg):
+        existing_file(cfg.weights, "weights")
+
+
+@register("test-instance-preflight-guidance")
+class InstancePreflight(WeightsGuidance):
+    def preflight(self):
+        """Take no options."""
+
+
+WRONG = {
+    "^system.guidance: weights 'missing.bin' does not exist": ("test-weights-guidance", {}),
+    "InstancePreflight.preflight needs @classmethod": ("test-instance-preflight-guidance", {}),
+    "^system.guidance: mesh 'no.glb' does not exist": ("exact-score-guidance", {"mesh": "no.glb"}),
+    "^system.guidance: unknown mesh format of": ("exact-score-guidance", {"mesh": __file__}),
+}
+
+
+@pytest.mark.parametrize("message", WRONG)
+def test_what_a_guidance_lacks_is_named_before_any_folder_is_made(message, tmp_path, monkeypatch):
+    """Also of options that aren't given, and after what the prior lacks."""
+    monkeypatch.chdir(tmp_path)
+    prompts = "gaussiandreamer-stable-diffusion-prompt-processor"
+    cfg = SimpleNamespace(prompt_processor_type=prompts, prompt_processor={})
+    cfg.guidance_type, cfg.guidance = WRONG[message]
+    refused(message, preflight_parts, GaussianCloud({}), cfg)
+    if "Instance" not in message:
+        cloud = GaussianCloud({"prior_type": "mesh-prior", "prior": {"path": "no.glb"}})
+        refused("^system.geometry.prior: mesh 'no.glb' does not exi", preflight_parts, cloud, cfg)
+    assert not [*tmp_path.iterdir()]

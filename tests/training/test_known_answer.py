@@ -85,9 +85,7 @@ def trained(geometry, views, pictures):
 def test_auto_finds_the_true_number_with_visible_floaters_and_copies():
     true = torus(0)
     start = with_copies_and_floaters(true)
-    views, unseen = (
-        views_around(true, count, SIZE, turn=turn) for count, turn in ((48, 0.0), (16, 60.0))
-    )
+    views, unseen = (views_around(true, n, SIZE, turn=t) for n, t in ((48, 0.0), (16, 60.0)))
     truth = render_all(true, unseen)
     assert len(start.means) == 4 * M and psnr_to_original(start, unseen, truth) < 24
     schedule = {"start": STEPS // 12, "stop": STEPS * 3 // 4, "every": STEPS // 24}

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
+from tests.helpers.refusals import refused
 from tests.training.runs import CONFIGS, SMALL, mocked_config, run_folder
 from threestudio_gaussiandreamer import register_parts
 from threestudio_gaussiandreamer.core.errors import UserError
@@ -49,9 +50,7 @@ def test_the_colour_of_another_background_is_learned_and_resumed(train, tmp_path
     assert rates["background.parameters"] == pytest.approx(0.0425)  # that of step 3
 
 
-def test_parameters_need_a_rate_and_changed_arguments_hold_in_a_resumed_run(
-    train, tmp_path, capsys
-):
+def test_parameters_need_a_rate_and_changed_arguments_hold_on_resume(train, tmp_path, capsys):
     assert train(tmp_path, "system.geometry.prior.path=missing.glb") == 2
     said = capsys.readouterr().err
     assert "SolidColorBackground has parameters without" in said and "params.background.lr" in said
@@ -92,8 +91,7 @@ def test_a_rate_without_parameters_is_refused(name, part, said):
     ],
 )
 def test_wrong_rates_are_named(params, message):
-    with pytest.raises(UserError, match=message):
-        check_optimizer({"name": "Adam", "params": params})
+    refused(message, check_optimizer, {"name": "Adam", "params": params})
 
 
 @pytest.mark.parametrize("name", ["SGD", "Adafactor", "ASGD"])
@@ -127,6 +125,5 @@ def test_only_optimisers_that_can_train_are_named_and_no_parameter_is_left_untra
             own = {"name": "bright", "lr": 0.1, "params": [self.bright]}
             return [*super().parameter_groups(), own]
 
-    with pytest.raises(UserError, match="Own has the parameter bright without a learning rate"):
-        groups(Own({}))
+    refused("Own has the parameter bright without a learning rate", groups, Own({}))
     assert groups(Grouped({})) == []

@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from benchmarks.viewers.browser import chromium
-from benchmarks.viewers.devtools import open_page
+from benchmarks.viewers import browser, devtools
 from tests.helpers.painted_ball import painted_ball
 from tests.training.runs import launch, length, run_folder
 from tests.view.clouds import meta
-from threestudio_gaussiandreamer.core.images import read
 from threestudio_gaussiandreamer.exporters import files
+from threestudio_gaussiandreamer.images import read
 from threestudio_gaussiandreamer.training.export import discard_turntable
 
 SHORT = [*length(2)]
@@ -37,7 +36,6 @@ def meshes():
 
 @pytest.fixture(scope="module")
 def save(tmp_path_factory, painted_box, meshes):
-    """The results of a run of two steps."""
     folder = tmp_path_factory.mktemp("pages")
     options = ["system.prompt_processor.prompt=a <painted> box", "system.renderer.eps2d=0.2"]
     options += ["system.renderer.antialias=true", "system.exporter.formats=[ply,mesh]"]
@@ -71,9 +69,7 @@ def test_a_run_ends_with_a_page_and_a_mesh_of_its_cloud(save, meshes):
     assert f'"name":"{name}"' in (export / "mesh.glb").read_bytes().decode(errors="ignore")
 
 
-def test_a_run_without_ffmpeg_or_a_page_exports_its_cloud_all_the_same(
-    tmp_path, painted_box, monkeypatch, capfd
-):
+def test_without_ffmpeg_or_a_page_the_cloud_is_exported(tmp_path, painted_box, monkeypatch, capfd):
     monkeypatch.setattr("threestudio_gaussiandreamer.view.page.MAX_GAUSSIANS", 100)
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     assert launch(tmp_path, painted_box, "system.prompt_processor.prompt=a box", *SHORT) == 0
@@ -94,10 +90,10 @@ VIDEO = (
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(chromium() is None, reason="no Chromium is installed")
+@pytest.mark.skipif(browser.chromium() is None, reason="no Chromium is installed")
 def test_a_browser_and_a_phone_show_the_index_of_a_run(save):
     index = save.parent / "index.html"
-    with open_page(index) as page:
+    with devtools.open_page(index) as page:
         page.evaluate("document.querySelectorAll('img').forEach(image => image.loading = 'eager')")
         widths = page.evaluate(f"Promise.all({IMAGES})")
         assert len(widths) >= 3 and min(widths) > 0
@@ -111,9 +107,7 @@ def test_a_browser_and_a_phone_show_the_index_of_a_run(save):
         assert index.as_uri() in page.requests
 
 
-def test_export_writes_the_page_again_and_the_next_test_discards_earlier_pictures(
-    save, painted_box
-):
+def test_export_writes_the_page_again_and_a_test_discards_old_pictures(save, painted_box):
     pictures = sorted((save / "it2-test").glob("*.png"))
     page = save / "it2-export/view.html"
     page.unlink()

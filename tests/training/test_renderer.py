@@ -11,7 +11,11 @@ from threestudio_gaussiandreamer.host import find
 from threestudio_gaussiandreamer.training.background import FlatBackground
 from threestudio_gaussiandreamer.training.geometry import GaussianCloud
 from threestudio_gaussiandreamer.training.optimizer import PartRates
-from threestudio_gaussiandreamer.training.renderer import SplattingRenderer, normals_from_depth
+from threestudio_gaussiandreamer.training.renderer import (
+    LazyMapping,
+    SplattingRenderer,
+    normals_from_depth,
+)
 
 
 def plane(height: int, width: int) -> tuple[torch.Tensor, ...]:
@@ -55,9 +59,8 @@ def test_depth_and_normals_are_computed_when_they_are_read():
         opacities=lambda: torch.full((1,), 0.9),
         colors=lambda centers: torch.ones(1, 3),
     )
-    renderer = find("gaussiandreamer-splatting")(
-        {}, geometry=geometry, material=None, background=FlatBackground({})
-    )
+    parts = {"geometry": geometry, "material": None, "background": FlatBackground({})}
+    renderer = find("gaussiandreamer-splatting")({}, **parts)
     c2w = cameras.orbit_c2w(torch.tensor([10.0]), torch.tensor([30.0]), torch.tensor([2.5]))
     out = renderer(c2w=c2w, fovy=torch.tensor([0.7]), height=16, width=16)
     assert {"depth", "comp_normal"} <= out.keys() and len({**out}) == len(out)
@@ -99,14 +102,11 @@ def test_fixed_and_random_backgrounds():
 
 
 def test_learned_starts_at_the_colour_stays_in_range_and_learns():
-    background = FlatBackground(
-        {"mode": "learned", "color": [0.5, 0.5, 0.5], "lr": [0, 0.1, 0.2, 10]}
-    )
+    options = {"mode": "learned", "color": [0.5, 0.5, 0.5], "lr": [0, 0.1, 0.2, 10]}
+    background = FlatBackground(options)
     optimizer = torch.optim.Adam(background.parameter_groups())
-    rates, cloud = PartRates({}), GaussianCloud({})
-    rates.groups(
-        SimpleNamespace(geometry=cloud, background=background, material=None, renderer=None)
-    )
+    rates, parts = PartRates({}), {"geometry": GaussianCloud({}), "background": background}
+    rates.groups(SimpleNamespace(**parts, material=None, renderer=None))
     for step in range(400):
         rates.set(optimizer, 0, step)
         optimizer.zero_grad()
@@ -126,3 +126,16 @@ def test_a_derived_background_with_colours_of_pixels_is_drawn():
             return dirs.abs()
 
     assert FlatBackground.is_flat(Derived({})) and not FlatBackground.is_flat(Gradient({}))
+
+
+def test_values_of_a_lazy_mapping_are_computed_once_when_they_are_read():
+    calls = []
+    mapping = LazyMapping({"a": 1}, {"b": lambda: calls.append("b") or 2, "c": lambda: 1 / 0})
+    assert "b" in mapping and "c" in mapping and "d" not in mapping
+    assert list(mapping) == ["a", "b", "c"] and len(mapping) == 3 and not calls
+    assert mapping["b"] == mapping.get("b") == 2 and calls == ["b"]
+    assert len(mapping) == 3 and mapping.get("d", 5) == 5
+    with pytest.raises(KeyError):
+        mapping["d"]
+    mapping["c"] = 3
+    assert {**mapping} == dict(mapping) == mapping == {"a": 1, "b": 2, "c": 3}

@@ -10,8 +10,7 @@ from tests.training.runs import SMALL, cloud_of, launch, length, mocked_config, 
 from threestudio_gaussiandreamer.formats.ply import read_gaussians
 from threestudio_gaussiandreamer.gaussians.sh import sh0_to_rgb
 from threestudio_gaussiandreamer.launch.experiment import main
-from threestudio_gaussiandreamer.training import events, held_out
-from threestudio_gaussiandreamer.training.system import GaussianDreamerSystem
+from threestudio_gaussiandreamer.training import events, held_out, system
 
 
 def test_training_against_a_known_truth_improves_on_held_out_views(tmp_path, painted_box, capsys):
@@ -38,22 +37,19 @@ def test_training_against_a_known_truth_improves_on_held_out_views(tmp_path, pai
 
 
 def tensorboard_events(folder):
-    """Return the scalars and images that a run has written for TensorBoard."""
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     return EventAccumulator(str(folder / "tb_logs" / "version_0")).Reload()
 
 
-def test_looking_at_pictures_is_no_training_time_and_pages_can_be_switched_off(
-    tmp_path, painted_box, monkeypatch
-):
+def test_pictures_are_no_training_time_and_pages_can_be_off(tmp_path, painted_box, monkeypatch):
     clock = np.zeros(2)
     monkeypatch.setattr(held_out, "_now", clock.copy)
 
     def taking(hours, body):
         return lambda *args: (clock.__iadd__(hours), body(*args))[1]
 
-    slow = (GaussianDreamerSystem, "training_step", 1), (events, "save_pictures", 100)
+    slow = (system.GaussianDreamerSystem, "training_step", 1), (events, "save_pictures", 100)
     for owner, name, hours in slow:
         monkeypatch.setattr(owner, name, taking(hours, getattr(owner, name)))
     options = ["trainer.max_steps=2", "trainer.val_check_interval=1", "system.pages=false"]

@@ -37,7 +37,6 @@ def cloud(
 
 
 def meta(page: str) -> dict:
-    """Return what a page says of itself."""
     return json.loads(re.search(r'id="meta">(.*?)</script>', page)[1])
 
 

@@ -7,17 +7,15 @@ from pathlib import Path
 import pytest
 import torch
 
-from benchmarks.viewers.browser import chromium
-from benchmarks.viewers.devtools import open_page
+from benchmarks.viewers import browser, devtools
 from tests.helpers.pruning import ball
+from tests.helpers.refusals import refused
 from tests.view.clouds import cloud, meta
 from threestudio_gaussiandreamer.convert import command as convert
-from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.formats.gaussian_files import write_cloud
-from threestudio_gaussiandreamer.view import notebook, page
+from threestudio_gaussiandreamer.view import notebook, page, run_files
 from threestudio_gaussiandreamer.view.command import main, parse
 from threestudio_gaussiandreamer.view.notebook import show
-from threestudio_gaussiandreamer.view.run_files import RunFiles, read_any
 
 
 @pytest.fixture
@@ -107,10 +105,10 @@ def test_a_run_gets_the_page_of_any_export_but_of_a_ply_first(run_folder):
     (export / "gaussians.spz").unlink()
     for name in ("gaussians.sog", "gaussians.compressed.ply"):
         write_cloud(str(export / name), cloud(30))
-        assert RunFiles(run_folder).cloud == export / name
+        assert run_files.RunFiles(run_folder).cloud == export / name
     write_cloud(str(export / "gaussians.ply"), cloud(30))
     (export / "mesh.ply").write_bytes(b"ply\nformat ascii 1.0\nelement vertex 0\nend_header\n")
-    assert RunFiles(run_folder).cloud == export / "gaussians.ply"
+    assert run_files.RunFiles(run_folder).cloud == export / "gaussians.ply"
 
 
 def test_a_run_gets_an_index_and_a_page_and_a_folder_of_runs_a_gallery(run_folder, capsys):
@@ -153,22 +151,19 @@ def test_what_can_not_be_shown_is_named(tmp_path, ply, monkeypatch):
         ({"background": "red"}, "--background: expected RRGGBB"),
         ({"eps2d": -1.0}, "--eps2d: expected a number of square pixels"),
     ):
-        with pytest.raises(UserError, match=message):
-            show(ply, **options)
-    with pytest.raises(UserError, match="is no run with an exported cloud"):
-        show(tmp_path)
+        refused(message, show, ply, **options)
+    refused("is no run with an exported cloud", show, tmp_path)
     monkeypatch.setattr(notebook, "MAX_BYTES", 1000)
-    with pytest.raises(UserError, match="prune the cloud first, or write the page to a file"):
-        show(ply)
+    refused("prune the cloud first, or write the page to a file", show, ply)
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(chromium() is None, reason="no Chromium is installed")
+@pytest.mark.skipif(browser.chromium() is None, reason="no Chromium is installed")
 def test_the_frame_draws_and_can_be_turned(tmp_path, ply):
     path = tmp_path / "notebook.html"  # without an encoding, as in some notebooks
     path.write_text(f"<body>{show(ply)._repr_html_()}</body>")
     # in the process of the notebook, so that its exceptions are seen here
-    with open_page(path, flags=("--disable-features=IsolateSandboxedIframes",)) as page:
+    with devtools.open_page(path, flags=("--disable-features=IsolateSandboxedIframes",)) as page:
         wait = "new Promise(done => setTimeout(done, 5000))"
         page.evaluate(wait)
         before, turn = page.screenshot(), {"x": 400, "y": 250, "button": "left", "clickCount": 1}
@@ -195,5 +190,5 @@ def test_a_checkpoint_has_the_antialiasing_of_its_run(tmp_path, option):
     (tmp_path / "run/configs").mkdir()
     parsed = tmp_path / "run/configs/parsed.yaml"
     parsed.write_text(f"system: {{renderer: {{antialias: {option}}}}}")
-    assert read_any(path).antialiased == (option == "true")
-    assert not read_any(checkpoint(tmp_path / "alone")).antialiased
+    assert run_files.read_any(path).antialiased == (option == "true")
+    assert not run_files.read_any(checkpoint(tmp_path / "alone")).antialiased

@@ -8,17 +8,15 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from tests.helpers.refusals import refused
 from tests.view.clouds import cloud
-from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.formats.gaussian_files import write_cloud
 from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
-from threestudio_gaussiandreamer.view import live
-from threestudio_gaussiandreamer.view.command import main
+from threestudio_gaussiandreamer.view import command, live
 
 
 @pytest.fixture
 def port():
-    """A port that is free."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return probe.getsockname()[1]
@@ -26,7 +24,6 @@ def port():
 
 @pytest.fixture
 def taken():
-    """A port on which another server listens."""
     with socket.socket() as server:
         server.bind(("127.0.0.1", 0))
         server.listen()
@@ -72,7 +69,6 @@ def test_what_viser_gets_and_the_buttons_of_a_training():
 
 @pytest.fixture(scope="module")
 def view():
-    """A view at any free port."""
     pytest.importorskip("viser")
     view = live.LiveView("127.0.0.1", 0, "<img src=x onerror=hurt()>\n# [a](b) **cloud**")
     yield view
@@ -125,8 +121,7 @@ def test_a_server_that_cannot_be_guarded_is_not_used(monkeypatch):
     stopped = []
     server = SimpleNamespace(stop=lambda: stopped.append(1))
     monkeypatch.setattr(pytest.importorskip("viser"), "ViserServer", lambda **_: server)
-    with pytest.raises(UserError, match="this version of viser"):
-        live.LiveView("127.0.0.1", 0, "cloud")
+    refused("this version of viser", live.LiveView, "127.0.0.1", 0, "cloud")
     assert stopped
     assert live.is_own_page("gpu7.lab:80", "http://gpu7.lab:80", "gpu7.lab")
     assert live.is_own_page("192.168.0.7:80", "https://192.168.0.7:80", "0.0.0.0")
@@ -136,8 +131,7 @@ def test_a_server_that_cannot_be_guarded_is_not_used(monkeypatch):
 
 def test_without_viser_the_extra_is_named(monkeypatch, port):
     monkeypatch.setitem(sys.modules, "viser", None)
-    with pytest.raises(UserError, match=r"\[viewer\]"):
-        live.require_server("127.0.0.1", port)
+    refused(r"\[viewer\]", live.require_server, "127.0.0.1", port)
 
 
 @pytest.mark.parametrize(
@@ -165,5 +159,5 @@ def test_wrong_input_is_named_before_serving(tmp_path, capsys, port, taken, argu
     (tmp_path / "text.ply").write_text("hello")
     arguments = [x.replace("{}", str(tmp_path)) for x in arguments]
     arguments = [x.replace("{taken}", str(taken)) for x in arguments]
-    assert main(["--port", str(port), *arguments]) == 2
+    assert command.main(["--port", str(port), *arguments]) == 2
     assert message in capsys.readouterr().err

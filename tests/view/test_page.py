@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from tests.helpers.refusals import refused
 from tests.view.clouds import PROMPT, cloud, meta, options
-from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.formats.gaussian_files import StoredCloud
-from threestudio_gaussiandreamer.formats.ply import gaussian_columns
+from threestudio_gaussiandreamer.formats import gaussian_files, ply
 from threestudio_gaussiandreamer.gaussians.gaussians import Gaussians
 from threestudio_gaussiandreamer.view import page as page_module
 from threestudio_gaussiandreamer.view.page import COARSE_MEANS, Shown, coarse, packed, page
@@ -76,8 +75,7 @@ def test_what_can_not_be_shown_is_left_out_or_refused(monkeypatch, caplog):
         (large, "float32 can't render"),
         (cloud(101), "prune it first.*threestudio_gaussiandreamer.prune"),
     ):
-        with pytest.raises(UserError, match=message):
-            page(Shown(stored, "result"), options())
+        refused(message, page, Shown(stored, "result"), options())
 
 
 def unpacked(data: bytes, count: int) -> np.ndarray:
@@ -88,7 +86,7 @@ def unpacked(data: bytes, count: int) -> np.ndarray:
 
 def test_packing_keeps_every_bit_and_a_coarse_cloud_is_a_fraction_of_the_size():
     gaussians = cloud(50, degree=2).gaussians
-    columns = gaussian_columns(gaussians)
+    columns = ply.gaussian_columns(gaussians)
     found = unpacked(packed(gaussians), 50)
     assert np.array_equal(found[:3].T, columns[:, :3])
     assert np.array_equal(found[3:].T, columns[:, 6:])
@@ -103,7 +101,7 @@ def test_packing_keeps_every_bit_and_a_coarse_cloud_is_a_fraction_of_the_size():
     assert np.allclose(coarse(point).means, point.means)
 
 
-def stored(means, scale=0.03, logit=3.0) -> StoredCloud:
+def stored(means, scale=0.03, logit=3.0) -> gaussian_files.StoredCloud:
     """A cloud of round Gaussians with z up; ``scale`` and ``logit`` are numbers or one for each."""
     count = len(means)
     arrays = Gaussians(
@@ -113,7 +111,7 @@ def stored(means, scale=0.03, logit=3.0) -> StoredCloud:
         logit_opacities=np.broadcast_to(logit, count),
         sh=np.zeros((count, 1, 3)),
     )
-    return StoredCloud(arrays.map(lambda values: values.astype(np.float32)), "z")
+    return gaussian_files.StoredCloud(arrays.map(lambda values: values.astype(np.float32)), "z")
 
 
 def ball(count=4000) -> np.ndarray:
@@ -126,8 +124,7 @@ HAT = np.linspace([0, 0, 1.0], [0.3, 0, 4.0], 35)
 """A pole of less than a hundredth of the Gaussians, on top of the ball."""
 
 
-def alpha(cloud: StoredCloud) -> np.ndarray:
-    """The opacity of the first view's pixels."""
+def alpha(cloud: gaussian_files.StoredCloud) -> np.ndarray:
     return render(cloud, RenderSettings(), [first_pose(cloud)], 96)[0, ..., 3].numpy()
 
 

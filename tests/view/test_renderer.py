@@ -9,8 +9,7 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
-from benchmarks.viewers.browser import chromium
-from benchmarks.viewers.devtools import NO_WEBGL, difference_to_ours, open_page, orbit_poses
+from benchmarks.viewers import browser, devtools
 from tests.view.clouds import PROMPT, cloud, options
 from threestudio_gaussiandreamer.formats.gaussian_files import StoredCloud, write_cloud
 from threestudio_gaussiandreamer.view.page import Shown, write_page
@@ -18,7 +17,7 @@ from threestudio_gaussiandreamer.view.render import Pose, first_pose
 
 pytestmark = [
     pytest.mark.slow,
-    pytest.mark.skipif(chromium() is None, reason="no Chromium is installed"),
+    pytest.mark.skipif(browser.chromium() is None, reason="no Chromium is installed"),
 ]
 SIZE = 192
 CLOUDS = {
@@ -39,7 +38,7 @@ def shown(folder, stored: StoredCloud, *, flags=(), before=None, **settings):
     """Open the page of a cloud; gives the page and the options."""
     path, how = folder / "view.html", options(**settings)
     write_page(path, Shown(stored, "result", "30.0 dB"), how, before and Shown(before, "prior"))
-    with open_page(path, flags=flags) as page:
+    with devtools.open_page(path, flags=flags) as page:
         yield page, how
 
 
@@ -52,15 +51,15 @@ def requests_that_leave(page) -> list[str]:
 def test_the_page_draws_what_our_rasteriser_draws(name, tmp_path):
     stored, settings = CLOUDS[name]
     with shown(tmp_path, stored, **settings) as (page, how):
-        poses = orbit_poses(first_pose(stored), 8)
-        found = difference_to_ours(page, stored, how, poses, SIZE)
+        poses = devtools.orbit_poses(first_pose(stored), 8)
+        found = devtools.difference_to_ours(page, stored, how, poses, SIZE)
         assert min(found) >= 40.0, found
         # what the comparison would miss if both were blank
-        wrong = difference_to_ours(page, stored, how, poses[:1], SIZE, drawn=poses[4:5])
+        wrong = devtools.difference_to_ours(page, stored, how, poses[:1], SIZE, drawn=poses[4:5])
         assert wrong[0] < 25.0 or "faint" in name
         # a moving picture is blended into half floats, which many faint layers need most
         page.evaluate("viewer.then(v => { v.renderer.targets.still = v.renderer.targets.moving; })")
-        assert min(difference_to_ours(page, stored, how, poses[:2], SIZE)) >= 40.0
+        assert min(devtools.difference_to_ours(page, stored, how, poses[:2], SIZE)) >= 40.0
         assert requests_that_leave(page) == [(tmp_path / "view.html").as_uri()]
         assert page.problems == []
 
@@ -84,13 +83,12 @@ def test_a_prompt_is_shown_and_not_run_and_the_prior_can_be_chosen(opened):
     assert page.evaluate(facts) == "result · 70 Gaussians · 30.0 dB"
     page.evaluate("viewer.then(v => v.show(1))")
     assert page.evaluate(facts) == "prior · 200 Gaussians"
-    poses = orbit_poses(first_pose(STORED), 2)
-    assert min(difference_to_ours(page, PRIOR, how, poses, 96)) > 30.0  # it is rounded
+    poses = devtools.orbit_poses(first_pose(STORED), 2)
+    assert min(devtools.difference_to_ours(page, PRIOR, how, poses, 96)) > 30.0  # it is rounded
     page.evaluate("viewer.then(v => v.show(0))")
 
 
 def saved_file(page, button: str) -> bytes:
-    """Click a button that saves a file and return the file."""
     page.evaluate(
         "window.saved = new Promise(done => { HTMLAnchorElement.prototype.click = function () {"
         " fetchedParts.then(done); }; }); var fetchedParts; { const make = URL.createObjectURL;"
@@ -163,7 +161,7 @@ def test_dragging_turns_the_wheel_zooms_and_every_control_works(opened):
 
 
 def test_without_webgl2_the_page_gives_a_message_and_shows_the_poster(tmp_path):
-    with shown(tmp_path, cloud(50), flags=NO_WEBGL) as (page, _):
+    with shown(tmp_path, cloud(50), flags=devtools.NO_WEBGL) as (page, _):
         assert page.evaluate("viewer") is None
         assert "WebGL2" in page.evaluate("document.getElementById('message').textContent")
         box = "document.getElementById('poster').getBoundingClientRect().width"

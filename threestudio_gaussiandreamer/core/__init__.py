@@ -1,1 +1,1 @@
-"""Utilities of every ring: errors, random streams, files, checkpoints, schedules, images."""
+"""Utilities of every ring: errors, random streams, files, checkpoints, schedules."""

@@ -7,7 +7,6 @@ comment, the hash of all bytes before the digest. ``torch.load`` can read it too
 import glob
 import hashlib
 import io
-import math
 import mmap
 import os
 import pickle
@@ -111,21 +110,20 @@ def newest_readable(folder: str | os.PathLike) -> Optional[tuple[Path, int]]:
     """Return the intact checkpoint of a folder with the highest step, ``last.ckpt`` among equal
     ones, and that step; None if there is none. Damaged files are reported in the log.
     """
-    for candidate in sorted(Path(folder).glob("*.ckpt"), key=_claimed_order, reverse=True):
+
+    def claimed_order(path: Path) -> tuple[float, bool]:
+        try:  # without the checksum, which takes seconds for a large file
+            content = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
+            return int(content["global_step"]), path.stem == "last"
+        except Exception:
+            return float("inf"), False  # it is reported below
+
+    for path in sorted(Path(folder).glob("*.ckpt"), key=claimed_order, reverse=True):
         try:
-            return candidate, load_checkpoint(candidate)["global_step"]
+            return path, load_checkpoint(path)["global_step"]
         except UserError as error:
-            warn(str(error).removesuffix(_siblings(candidate)))  # they are checked here
+            warn(str(error).removesuffix(_siblings(path)))  # they are checked here
     return None
-
-
-def _claimed_order(path: Path) -> tuple[float, bool]:
-    """Read a checkpoint's step without its checksum; infinity if it can't be read."""
-    try:
-        content = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
-        return int(content["global_step"]), path.stem == "last"
-    except Exception:
-        return math.inf, False
 
 
 def load_module_weights(path: str, module_name: Optional[str] = None) -> tuple[dict, int, int]:

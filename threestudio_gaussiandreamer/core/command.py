@@ -95,14 +95,12 @@ def joined_values(
     """Join each of these options by ``=`` to the value behind it, which argparse would take for an
     option if it begins with a hyphen; ``argv`` None means the arguments of this process.
     """
-    joined: list[str] = []
-    for word in sys.argv[1:] if argv is None else argv:
+    words = list(sys.argv[1:] if argv is None else argv)
+    for i in range(len(words) - 1, 0, -1):
         # a wrong "-z" too, so that it is a wrong value and no missing one
-        if joined and joined[-1] in options and {word, word.lstrip("-")} & {*values}:
-            joined[-1] += f"={word}"
-        else:
-            joined.append(word)
-    return joined
+        if words[i - 1] in options and {words[i], words[i].lstrip("-")} & {*values}:
+            words[i - 1 : i + 1] = [f"{words[i - 1]}={words[i]}"]
+    return words
 
 
 # -- signals ---------------------------------------------------------------------------------------
@@ -166,15 +164,12 @@ class Tolerant:
 
     def write(self, text: str) -> int:
         encoding = getattr(self.stream, "encoding", None) or "utf-8"
-        self._try(self.stream.write, text.encode(encoding, "backslashreplace").decode(encoding))
+        self.flush(text.encode(encoding, "backslashreplace").decode(encoding))
         return len(text)
 
-    def flush(self) -> None:
-        self._try(self.stream.flush)
-
-    def _try(self, call: Callable, *arguments: Any) -> None:
+    def flush(self, text: str = "") -> None:
         try:
-            call(*arguments)
+            self.stream.write(text) if text else self.stream.flush()
         except BrokenPipeError:
             raise
         except OSError as error:

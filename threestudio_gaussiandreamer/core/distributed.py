@@ -3,13 +3,10 @@ statistics are reduced over all of them. Random numbers belong to a view, not to
 renders it, so a step is the same as with one process but for the order of floating-point sums."""
 
 from collections.abc import Callable, Iterable
-from typing import Any, Optional
 
 import torch
 import torch.distributed as dist
 from torch import Tensor
-
-from .errors import UserError
 
 
 def is_active() -> bool:
@@ -42,31 +39,6 @@ def draw_shared(count: int, draw: Callable[[int], Tensor]) -> Tensor:
     """
     total = count * world_size()
     return draw(total)[own_rows(total)]
-
-
-def require_shareable(
-    views: int, option: str, *, together: int = 1, processes: Optional[int] = None
-) -> None:
-    """Raise UserError, which names ``option``, unless the processes can share the views of a step
-    equally, of which ``together`` consecutive ones stay in one process. ``processes`` is how many
-    there will be, by default those that there are.
-    """
-    size = processes or world_size()
-    if views % (size * together):
-        said = "fewer than" if views < size * together else "no multiple of"
-        said += f" the {size} processes that share the views of a step"
-        said += f" in groups of {together}" if together > 1 else ""
-        fits = f"{size * together} or a multiple, or use as many processes as divide"
-        raise UserError(f"{option} is {views}, {said}: set {option} to {fits} {views // together}")
-
-
-def from_first(make: Callable[[], Any]) -> Any:
-    """Call ``make`` in the first process, and return its result in all of them."""
-    if not is_active():
-        return make()
-    shared = [make() if rank() == 0 else None]
-    dist.broadcast_object_list(shared)
-    return shared[0]
 
 
 def all_sum(tensor: Tensor, op: str = "SUM") -> Tensor:

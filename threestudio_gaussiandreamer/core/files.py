@@ -12,15 +12,11 @@ from typing import Any, BinaryIO
 
 from .errors import UserError
 
-WEB_PAGE = (
-    "a web page, not the file itself, as an address of a page gives it: download it again by the "
-    "link of the file"
-)
 PLACEHOLDERS = {
-    b"version https://git-lfs": "a pointer of Git LFS, not the file itself: run `git lfs pull` "
+    (b"version https://git-lfs",): "a pointer of Git LFS, not the file itself: run `git lfs pull` "
     "where it is from, or download it again",
-    b"<!doctype html": WEB_PAGE,
-    b"<html": WEB_PAGE,
+    (b"<!doctype html", b"<html"): "a web page, not the file itself: download it again by the link "
+    "of the file, not of a page",
 }
 """What downloads leave in a file's place, by its first bytes in lower case."""
 
@@ -61,8 +57,8 @@ def require_content(path: Path, name: str) -> None:
     """Raise UserError, which names it by ``name``, if a file is one of ``PLACEHOLDERS``."""
     with suppress(OSError), open(path, "rb") as file:
         start = file.read(64).lstrip().lower()
-        for placeholder, what in PLACEHOLDERS.items():
-            if start.startswith(placeholder):
+        for starts, what in PLACEHOLDERS.items():
+            if start.startswith(starts):
                 raise UserError(f"{name} is {what}")
 
 
@@ -110,6 +106,14 @@ def atomic_file(path: str | os.PathLike, *, durable: bool = True) -> Iterator[Bi
         temporary.unlink(missing_ok=True)
 
 
+def write_file(path: str | os.PathLike, content: bytes | str, *, durable: bool = True) -> None:
+    """Write a file by :func:`atomic_file`; text as UTF-8, names of files in it with their bytes."""
+    if isinstance(content, str):
+        content = content.encode(errors="surrogateescape")
+    with atomic_file(path, durable=durable) as file:
+        file.write(content)
+
+
 def json_text(content: Any, **options: Any) -> str:
     """Encode as JSON, with ``null`` for numbers that JSON doesn't have: NaN and the infinities."""
     return json.dumps(_without_infinities(content), allow_nan=False, **options)
@@ -152,9 +156,7 @@ def require_other_file(
 
 def is_folder(path: str | os.PathLike) -> bool:
     """Return whether ``path`` is an existing folder; False for what can't be a file's name."""
-    with suppress(ValueError):
-        return os.path.isdir(os.path.expanduser(path))
-    return False
+    return os.path.isdir(os.path.expanduser(path))
 
 
 def output_folder(path: str | os.PathLike, option: str, files: Collection[str] = ()) -> Path:

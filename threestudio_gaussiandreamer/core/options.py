@@ -17,7 +17,6 @@ from collections.abc import Callable, Collection, Mapping, MutableMapping, Seque
 from enum import Enum
 from functools import cache
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 from .errors import UserError, unknown
@@ -26,16 +25,12 @@ from .schedule import parse_schedule, validate_schedule
 
 RULE = "option"
 """The key of a field's rule in its metadata."""
-MISSING = "???"
-"""A text that stands for a value that must be given."""
 SCALARS = {int: "a whole number", float: "a number", bool: "true or false", str: "a text"}
 SWITCHES = dict.fromkeys(("true", "yes", "y", "on", "1"), True)
 SWITCHES |= dict.fromkeys(("false", "no", "n", "off", "0"), False)
 FLOAT32_MAX, FLOAT32_TINY = 3.4028234663852886e38, 1.1754943508222875e-38
 """Largest and smallest normal float32: smaller positive options could be rounded to zero."""
 INT64_MAX = 2**63 - 1
-SHOWN = 80
-"""Maximum length of a value in a message, characters."""
 CGROUP_LIMIT = Path("/sys/fs/cgroup/memory.max")
 
 Rule = dict[str, Any]
@@ -152,11 +147,7 @@ def count_of(things: str, low: int, bytes_each: int) -> Rule:
 
 def is_number(value: Any) -> bool:
     """Return whether ``value`` is a finite number within float32's range."""
-    return (
-        isinstance(value, (int, float))
-        and not isinstance(value, bool)
-        and -FLOAT32_MAX <= value <= FLOAT32_MAX
-    )
+    return isinstance(value, (int, float)) and type(value) is not bool and abs(value) <= FLOAT32_MAX
 
 
 def is_whole(value: Any) -> bool:
@@ -175,13 +166,13 @@ def is_numbers(value: Any, count: int) -> bool:
 
 
 def shown(value: Any) -> str:
-    """Format ``value`` for a message, as in YAML if it is null, at most ``SHOWN`` characters."""
+    """Format ``value`` for a message, as in YAML if it is null, at most 80 characters."""
     if value is None:
         return "null"
     if isinstance(value, int) and value.bit_length() >= 256:  # repr has a limit
         return f"an integer of {value.bit_length()} bits"
     text = repr(list(value) if is_list(value) else value)
-    return text if len(text) <= SHOWN else f"{text[: SHOWN - 3]}..."
+    return text if len(text) <= 80 else f"{text[:77]}..."
 
 
 def wrong(path: str, expected: str, value: Any) -> UserError:
@@ -211,9 +202,8 @@ def memory_bytes() -> int:
     """Return the bytes of the largest memory: the machine's (or its container's) or one GPU's."""
     import torch
 
-    gpus = torch.cuda.device_count() if torch.cuda.is_available() else 0
-    found = [torch.cuda.get_device_properties(i).total_memory for i in range(gpus)]
-    return max([main_memory(), *found])
+    gpus = range(torch.cuda.device_count() if torch.cuda.is_available() else 0)
+    return max([main_memory(), *(torch.cuda.get_device_properties(i).total_memory for i in gpus)])
 
 
 def main_memory() -> int:
@@ -324,10 +314,9 @@ def _converted(path: str, value: Any, annotation: Any) -> Any:
 
 def _scalar(path: str, value: Any, kind: type) -> Any:
     require_representable(path, value)
-    inexact = kind is int and isinstance(value, float)
-    switch = kind in (int, float) and isinstance(value, bool)
+    never = {int: (Mapping, bool, float), float: (Mapping, bool)}.get(kind, Mapping)
     try:
-        if value is None or is_list(value) or isinstance(value, Mapping) or inexact or switch:
+        if value in (None, "???") or is_list(value) or isinstance(value, never):  # "???": missing
             raise TypeError
         return SWITCHES[str(value).lower()] if kind is bool else kind(value)
     except (TypeError, ValueError, KeyError):
@@ -379,8 +368,6 @@ def check_options(config_class: type, cfg: Any, prefix: str = "") -> None:
         if dataclasses.is_dataclass(option.type):
             check_options(option.type, value, f"{path}.")
             continue
-        if isinstance(value, str) and value == MISSING:
-            raise UserError(f"{path}: no value is given")
         require_representable(path, value)
         if RULE in option.metadata and not (value is None and option.default is None):
             option.metadata[RULE](path, value)
@@ -393,19 +380,14 @@ def check_options(config_class: type, cfg: Any, prefix: str = "") -> None:
 
 
 def require_defaults(
-    config_class: type,
-    cfg: Any,
-    names: Collection[str],
-    reason: str,
-    prefix: str = "",
-    neutral: Mapping[str, Any] = MappingProxyType({}),
+    config_class: type, cfg: Any, names: Collection[str], reason: str, prefix: str = ""
 ) -> None:
     """Raise UserError unless the options ``names``, which have no effect (``reason``: "with a=1"),
-    are at their defaults, or at the ``neutral`` values, by name, which do nothing.
+    are at their defaults.
     """
     for name in names:
         default = getattr(config_class, name, None)
-        if getattr(cfg, name, default) not in (default, neutral.get(name, default)):
+        if getattr(cfg, name, default) != default:
             raise UserError(f"{prefix}{name} has no effect {reason}: leave it at {default}")
 
 

@@ -47,11 +47,6 @@ def C(value: Any, epoch: int, global_step: int) -> float:
     return values[-1]
 
 
-def C_max(value: Any) -> float:
-    """Return the largest value of a schedule."""
-    return max(parse_schedule(value).values)
-
-
 def validate_schedule(value: Any, name: str = "the schedule") -> Any:
     """Return ``value`` if it is a schedule; else raise UserError, which begins with ``name``."""
     schedule = parse_schedule(value, name)

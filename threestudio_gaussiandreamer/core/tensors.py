@@ -1,12 +1,13 @@
-"""A number whose gradient is given, and values that are computed when they are read."""
+"""A number whose gradient is given, and the rotation matrix of a quaternion."""
 
-from collections import UserDict
-from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
+
+T = TypeVar("T")
+Row = tuple[T, T, T]
 
 
 def given_gradient(
@@ -30,17 +31,10 @@ class _GivenGradient(torch.autograd.Function):
         return upstream * gradient, None, None
 
 
-class LazyMapping(UserDict):
-    """Values by name; ``later`` are functions of no argument, each called at most once."""
-
-    def __init__(self, values: Mapping[str, Any], later: Mapping[str, Callable[[], Any]]) -> None:
-        self.data, self.later = {**values, **later}, {*later}
-
-    def __getitem__(self, name: str) -> Any:
-        if name in self.later:
-            self[name] = self.data[name]()
-        return self.data[name]
-
-    def __setitem__(self, name: str, value: Any) -> None:
-        self.later.discard(name)
-        self.data[name] = value
+def rotation_rows(w: T, x: T, y: T, z: T) -> tuple[Row, Row, Row]:
+    """Return the rows of a unit quaternion's rotation matrix, of the arguments' type and shape."""
+    return (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )

@@ -21,13 +21,13 @@ from torch import Tensor
 
 from .. import register_parts
 from ..cameras import Orbit
-from ..core import images as picture_files
 from ..core.command import run_command
 from ..core.errors import UserError
-from ..core.files import atomic_file, existing_file, json_text, output_folder
+from ..core.files import existing_file, json_text, output_folder, write_file
 from ..core.options import RULE, between, in_range
 from ..core.streams import numpy_generator
 from ..host import get_device
+from ..images import write as write_image
 from ..models.bundled import CLIP, NAME, model_part
 from ..models.clip import PictureText, clip_source
 from ..toybox.views import DISTANCE, FOVY_DEG, SIZE
@@ -92,6 +92,8 @@ def score(
     result: Result, prompt: str, item: int, clip: PictureText, protocol: Protocol
 ) -> tuple[Float[np.ndarray, " S"], list[np.ndarray]]:
     """Return a result's score for each seed, and the views of the first one, uint8."""
+    from PIL import Image
+
     draws = [protocol.draw(seed, item) for seed in protocol.seeds]
     needed = np.unique(np.concatenate(draws))
     orbit = protocol.orbit.rows(needed)
@@ -102,7 +104,9 @@ def score(
     for images in render_views(read_result(result), *views, **how):
         rows = list(islice(left, len(images)))
         similarity[rows] = PERCENT * clip.similarities(images, prompt)
-        thumbnails |= {row: _thumbnail(image) for row, image in zip(rows, images, strict=True)}
+        for row, image in zip(rows, images, strict=True):
+            small = Image.fromarray((image * 255).round().astype(np.uint8))
+            thumbnails[row] = np.asarray(small.resize((THUMBNAIL, THUMBNAIL), Image.LANCZOS))
     means = np.array([similarity[draw].mean() for draw in draws])
     return means, [thumbnails[row] for row in draws[0]]
 
@@ -110,13 +114,6 @@ def score(
 def _mean_and_spread(per_seed: Float[np.ndarray, " S"]) -> dict[str, Any]:
     spread = float(per_seed.std(ddof=1)) if len(per_seed) > 1 else None
     return {"mean": float(per_seed.mean()), "std": spread, "per_seed": per_seed.tolist()}
-
-
-def _thumbnail(image: Float[np.ndarray, "H W 3"]) -> np.ndarray:
-    from PIL import Image
-
-    small = Image.fromarray((image * 255).round().astype(np.uint8))
-    return np.asarray(small.resize((THUMBNAIL, THUMBNAIL), Image.Resampling.LANCZOS))
 
 
 def prompts_for(
@@ -206,21 +203,24 @@ def evaluate(
     output: Path,
 ) -> None:
     """Score all results, print the scores, and write ``clip.json`` and ``clip.png``."""
+    from PIL import Image, ImageDraw
+
     clip, scores, each, rows = open_clip(clip_folder), [], [], []
     for item, (result, prompt) in enumerate(zip(results, prompts, strict=True)):
         per_seed, views = score(result, prompt, item, clip, protocol)
         scores.append(per_seed)
         numbers = _mean_and_spread(per_seed)
         text = f"{numbers['mean']:.2f}  {prompt}"
-        rows.append(picture_files.with_text(np.concatenate(views, axis=1), text))
+        canvas = Image.fromarray(np.concatenate(views, axis=1))
+        ImageDraw.Draw(canvas).text((2, 0), text, fill="black", stroke_width=1, stroke_fill="white")
+        rows.append(canvas)
         each.append({"result": str(result.file), "prompt": prompt, **numbers})
         print(f"{numbers['mean']:6.2f}  {prompt}  {result.file}", flush=True)
     total = _mean_and_spread(np.mean(scores, axis=0))
     about = {"clip": clip_folder, "unit": "100 * cosine", "protocol": protocol._asdict()}
     text = json_text({**about, **total, "results": each}, indent=2, ensure_ascii=False)
-    with atomic_file(output / "clip.json") as file:
-        file.write(text.encode(errors="surrogateescape"))  # paths may hold invalid UTF-8
-    picture_files.write(output / "clip.png", np.concatenate(rows, axis=0))
+    write_file(output / "clip.json", text)  # paths may hold invalid UTF-8
+    write_image(output / "clip.png", np.concatenate(rows, axis=0))
     spread = total["std"] and f" +- {total['std']:.2f} over {len(protocol.seeds)} seeds"
     print(f"{total['mean']:6.2f}{spread or ''}: {output / 'clip.json'}, {output / 'clip.png'}")
 

@@ -18,7 +18,7 @@ from tqdm import tqdm
 from .. import register_parts
 from ..core.command import run_command
 from ..core.errors import UserError, unknown
-from ..core.files import atomic_file, json_text, output_folder
+from ..core.files import json_text, output_folder, write_file
 from ..core.options import RULE
 from ..core.streams import numpy_generator
 from ..models.bundled import NAME
@@ -208,8 +208,7 @@ def write(output: Path, rows: Rows, content: dict[str, Any]) -> None:
     writer.writeheader()
     writer.writerows(rows)
     for name, body in zip(FILES, (text.getvalue(), json_text(content, indent=2)), strict=True):
-        with atomic_file(output / name) as file:
-            file.write(body.encode(errors="surrogateescape"))  # paths may hold invalid UTF-8
+        write_file(output / name, body)  # paths may hold invalid UTF-8
 
 
 def table(content: dict[str, Any]) -> list[str]:

@@ -66,7 +66,10 @@ def pictures(
     """Render the views for quality of a normalised cloud: those of each vertex together."""
     positions = np.repeat(_icosphere().vertices, len(FOVY), 0)
     angles = torch.tensor(FOVY).repeat(len(positions) // len(FOVY))
-    c2w = towards_origin(positions)
+    place = torch.from_numpy(positions).float()
+    at_pole = (place[:, 2] / place.norm(dim=1)).abs() >= NEAR_POLE  # where +y is up, not +z
+    up = torch.where(at_pole[:, None], torch.tensor([0.0, 1.0, 0.0]), torch.tensor([0.0, 0.0, 1.0]))
+    c2w = look_at(place, torch.zeros_like(place), up)
     return render_views(arrays, c2w, angles, SIZE, antialias=antialias, chunk=8)
 
 
@@ -84,14 +87,6 @@ def _icosphere():
     import trimesh
 
     return trimesh.creation.icosphere(subdivisions=2, radius=RADIUS)
-
-
-def towards_origin(positions: Float[np.ndarray, "V 3"]) -> Float[torch.Tensor, "V 4 4"]:
-    """Return OpenGL ``c2w`` of cameras that look at the origin, +z up, or +y near the poles."""
-    place = torch.from_numpy(positions).float()
-    at_pole = (place[:, 2] / place.norm(dim=1)).abs() >= NEAR_POLE
-    up = torch.where(at_pole[:, None], torch.tensor([0.0, 1.0, 0.0]), torch.tensor([0.0, 0.0, 1.0]))
-    return look_at(place, torch.zeros_like(place), up)
 
 
 def normalized(arrays: Gaussians) -> Gaussians:

@@ -37,7 +37,6 @@ from typing import Any, Dict, List, Optional
 import numpy as np
 
 from ..core.errors import UserError
-from ..core.methods import find_method, require_dataclass, require_method
 from ..core.options import Rule, each, in_range, one_of, require_mapping, rule, wrong
 from ..formats.gaussian_files import FORMATS, StoredCloud, suffix_of
 from ..formats.glb import GLB_UP
@@ -59,6 +58,7 @@ from ..host import (
     register_builtin,
     warn,
 )
+from ..host.methods import find_method, require_dataclass, require_method
 from ..surface.textured import MeshOptions, mesh_from_gaussians, require_mesh_libraries
 
 SUFFIX = "-exporter"

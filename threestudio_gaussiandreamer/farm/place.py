@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, Optional
 
 from ..core.errors import UserError
-from ..core.files import atomic_file, json_text
+from ..core.files import json_text, write_file
 from ..launch.run_folder import make_folder
 from .rows import Row
 
@@ -128,8 +128,7 @@ class Place:
                 self.system.pipe_file(f"{self.url}/{name}", text)
         else:
             make_folder((self.folder / name).parent)
-            with atomic_file(self.folder / name) as file:
-                file.write(text)
+            write_file(self.folder / name, text)
 
     def upload(self, name: str, path: Optional[Path] = None) -> None:
         """Make a file that was written below :attr:`folder` available to readers."""

@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Integer
 
 from ..core.errors import UserError
-from ..core.files import atomic_file
+from ..core.files import write_file
 from ..gaussians.axes import rotate
 from ..gaussians.gaussians import Gaussians, finite, usable
 from . import packing
@@ -96,8 +96,7 @@ def write_spz(
     if clipped := int(out_of_range(gaussians).sum()):
         said = "%s: %d of %d Gaussians are farther away or larger than SPZ can hold: clipped to its"
         logger.warning(f"{said} range", path, clipped, len(gaussians.means))
-    with atomic_file(path) as file:
-        file.write(data)
+    write_file(path, data)
 
 
 def spz_bytes(

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..core.quaternions import rotation_rows
+from ..core.tensors import rotation_rows
 from .gaussians import Gaussians, opaque
 from .sh import sh0_colors
 

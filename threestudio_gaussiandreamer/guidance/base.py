@@ -46,10 +46,10 @@ from ..core import streams
 from ..core.devices import DelayedReads, to_device, without_autocast
 from ..core.distributed import first_item
 from ..core.errors import UserError, unknown
-from ..core.methods import require_method
 from ..core.options import in_range, interval, one_of, schedule
 from ..diffusion import sds
 from ..host import BaseObject, C, find, names, parse_structured, run_seed, warn
+from ..host.methods import require_method
 from .types import Batch, Latents, Noised, Residual, State, Timesteps, items_of, require_pair
 from .variants import Variant
 from .variants.base import GUIDANCE_SCALE, require_unset

@@ -14,7 +14,7 @@ from typing import Any, Optional
 from ..core.checkpoint_file import load_file, save_file
 from ..core.command import interrupt, restore_handlers, set_handlers
 from ..core.devices import flush_reads
-from ..core.files import atomic_file
+from ..core.files import write_file
 from ..host import info, pl, warn
 from .config import dump_config
 from .run_folder import PARSED
@@ -97,8 +97,7 @@ class RunRecord(pl.Callback):
                 self._files[configs / (f"raw-{i}.yaml" if i else "raw.yaml")] = content
         for path, content in self._files.items():
             path.parent.mkdir(parents=True, exist_ok=True)
-            with atomic_file(path, durable=False) as file:
-                file.write(content)
+            write_file(path, content, durable=False)
         self._files = {}
         configs.mkdir(parents=True, exist_ok=True)
         dump_config(self.folder / PARSED, self.cfg)

@@ -17,9 +17,9 @@ from omegaconf import MISSING, DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from ..core.errors import UserError
-from ..core.files import atomic_file
+from ..core.files import write_file
 from ..core.options import escape, in_range, parse_structured, require_mapping
-from ..core.schedule import C_max
+from ..core.schedule import parse_schedule
 from ..host import find, info, names
 from ..prompts.prompts import read_prompt
 from ..training.losses import foreign_weights
@@ -112,8 +112,7 @@ def dump_config(path: str | os.PathLike, cfg: Any) -> None:
     plain.pop("new_folder", None)
     if not plain.get("viewer"):
         plain.pop("viewer", None)  # threestudio doesn't know the key
-    with atomic_file(path) as file:
-        file.write(OmegaConf.to_yaml(OmegaConf.create(plain)).encode())
+    write_file(path, OmegaConf.to_yaml(OmegaConf.create(plain)))
 
 
 # -- files and overrides ---------------------------------------------------------------------------
@@ -342,6 +341,10 @@ def _resolved(merged: dict[str, Any], n_gpus: int) -> dict[str, Any]:
 
 def register_resolvers() -> None:
     """Register threestudio's functions that a YAML file may call as ``${name:...}``."""
+
+    def largest(*schedules: Any) -> float:
+        return max(max(parse_schedule(value).values) for value in schedules)
+
     resolvers = {
         "calc_exp_lr_decay_rate": lambda factor, n: factor ** (1.0 / n),
         "add": lambda a, b: a + b,
@@ -353,9 +356,9 @@ def register_resolvers() -> None:
         "rmspace": lambda text, substitute: str(text).replace(" ", substitute),
         "tuple2": lambda value: ListConfig([float(value), float(value)]),  # 2.3: no list
         "gt0": lambda value: value > 0,
-        "cmaxgt0": lambda value: C_max(value) > 0,
+        "cmaxgt0": lambda value: largest(value) > 0,
         "not": lambda value: not value,
-        "cmaxgt0orcmaxgt0": lambda a, b: C_max(a) > 0 or C_max(b) > 0,
+        "cmaxgt0orcmaxgt0": lambda a, b: largest(a, b) > 0,
     }
     # 2.4 gave this function the name that another one had before
     is_old = [int(part) for part in omegaconf.__version__.split(".")[:2]] < [2, 4]

@@ -13,9 +13,7 @@ from typing import Any
 import torch
 from omegaconf import OmegaConf
 
-from ..core.distributed import require_shareable
 from ..core.errors import UserError, unknown
-from ..core.methods import require_dataclass
 from ..core.options import (
     Rule,
     at_least,
@@ -26,7 +24,8 @@ from ..core.options import (
     satisfies,
 )
 from ..host import find, pl
-from ..training.data import sizes_of_stages
+from ..host.methods import require_dataclass
+from ..training.data import require_shareable, sizes_of_stages
 from .live_viewer import ViewerConfig
 from .parts import check_kind, find_part
 
@@ -209,7 +208,4 @@ def check_shared_views(cfg: Any) -> None:
     """Raise UserError if the processes that are to train can't share the views of a step."""
     if cfg.data_type in DATA:
         data = parse_structured(find(cfg.data_type).Config, cfg.data)
-        for *_, views in sizes_of_stages(data):
-            require_shareable(
-                views, "data.batch_size", together=getattr(data, "n_view", 1), processes=cfg.n_gpus
-            )
+        require_shareable(data, cfg.n_gpus)

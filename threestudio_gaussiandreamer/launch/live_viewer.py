@@ -18,7 +18,7 @@ from typing import Any, Optional
 
 import torch
 
-from ..core import images
+from .. import images
 from ..core.options import in_range
 from ..formats.gaussian_files import StoredCloud
 from ..gaussians.gaussians import Gaussians, drawable

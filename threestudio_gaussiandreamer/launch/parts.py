@@ -13,11 +13,11 @@ from torch import nn
 
 from .. import host
 from ..core.errors import Terminated, UserError
-from ..core.methods import require_method
 from ..exporters.files import require_export
 from ..guidance.base import ScoreDistillation
 from ..guidance.variants import Variant
 from ..host import find, info, names, pl
+from ..host.methods import require_method
 from ..priors.base import Prior
 from ..prompts.prompt_processors import TextEncoderPromptProcessor
 from ..training.density import DensityRule

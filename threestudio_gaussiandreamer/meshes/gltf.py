@@ -18,7 +18,7 @@ from typing import Any, NamedTuple, Optional
 import numpy as np
 from jaxtyping import Float, Integer, UInt8
 
-from ..core.quaternions import rotation_rows
+from ..core.tensors import rotation_rows
 from ..formats.reading import reading, require, whole_number
 from .mesh import CLAMP, MIRROR, REPEAT, Mesh, Tile, linear_to_srgb, unit_rgb
 from .side_files import Budget, SideFiles, decode_texture

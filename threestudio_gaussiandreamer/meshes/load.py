@@ -93,7 +93,7 @@ def mesh_file(path: str | Path) -> Path:
     Raises:
         UserError: the file is missing or its format is unknown.
     """
-    path = existing_file(find_mesh(path), "mesh", bundled_meshes())
+    path = existing_file(find_mesh(path), "mesh", [mesh.name for mesh in ASSETS.glob("*.glb")])
     _extension(path)
     return path
 
@@ -103,11 +103,6 @@ def find_mesh(path: str | Path) -> Path:
     bundled = ASSETS / Path(path).name
     is_bare = str(path) == bundled.name and not Path(path).exists()
     return bundled if is_bare and bundled.is_file() else Path(path)
-
-
-def bundled_meshes() -> list[str]:
-    """Return the bare names of the meshes in the package."""
-    return sorted(file.name for file in ASSETS.glob("*.glb"))
 
 
 def read_parts(path: Path) -> list[Mesh]:

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from ..core.errors import UserError
-from ..core.files import atomic_file
+from ..core.files import atomic_file, write_file
 from ..gaussians.surface import Surface
 from .mesh import Mesh
 
@@ -74,13 +74,10 @@ def write_textured_mesh(
     suffix = Path(path).suffix.lower()
     if suffix not in WRITERS:
         raise UserError(f"expected the name of a {' or '.join(WRITERS)} file, got {str(path)!r}")
-    WRITERS[suffix](path, mesh, unlit, _clean(name or Path(path).stem))
-
-
-def _clean(name: str) -> str:
-    """Return a name without spaces, which some readers of OBJ end a name at."""
-    printable = "".join(c if c.isprintable() else " " for c in name)
-    return "_".join(printable.split()).encode(errors="ignore")[:NAME_BYTES].decode(errors="ignore")
+    # some readers of OBJ end a name at a space
+    printable = "".join(c if c.isprintable() else " " for c in name or Path(path).stem)
+    name = "_".join(printable.split()).encode(errors="ignore")[:NAME_BYTES]
+    WRITERS[suffix](path, mesh, unlit, name.decode(errors="ignore"))
 
 
 def write_glb_file(
@@ -180,11 +177,8 @@ def write_textured_obj(
     """
     _require_finite(path, mesh.vertices, mesh.uv)
     texture, material = companions(path)
-    with atomic_file(texture) as file:
-        file.write(png_bytes(mesh.texture))
-    with atomic_file(material) as file:
-        text = MTL.format(name=name, illum=0 if unlit else 1, texture=texture.name)
-        file.write(text.encode(errors="surrogateescape"))
+    write_file(texture, png_bytes(mesh.texture))
+    write_file(material, MTL.format(name=name, illum=0 if unlit else 1, texture=texture.name))
     joined = welded(mesh)
     position, coordinate = joined.rows[mesh.faces] + 1, mesh.faces + 1
     corners = np.stack([position, coordinate, position], axis=2).reshape(-1, 9)

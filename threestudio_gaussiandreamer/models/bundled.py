@@ -10,7 +10,7 @@ import re
 from pathlib import Path
 
 from ..core.errors import UserError
-from ..core.files import atomic_file
+from ..core.files import write_file
 
 NAME = "toybox"
 FOLDER = Path(__file__).parents[1] / "assets" / NAME
@@ -83,8 +83,7 @@ def write_digests(folder: Path) -> None:
     """Write the list of digests of the files below ``folder``."""
     paths = sorted(path for path in folder.rglob("*") if path.is_file() and path.name != DIGESTS)
     lines = [f"{digest_of(path)}  {path.relative_to(folder).as_posix()}\n" for path in paths]
-    with atomic_file(folder / DIGESTS) as file:
-        file.write("".join(lines).encode())
+    write_file(folder / DIGESTS, "".join(lines))
 
 
 def digest_of(path: Path) -> str:

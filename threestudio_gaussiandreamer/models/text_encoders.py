@@ -17,7 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..core.extras import require_extra
-from ..core.files import atomic_file, output_folder
+from ..core.files import output_folder, write_file
 from ..host import debug, get_device, warn
 from .model_files import free_memory, load_network, load_settings, loaded
 
@@ -232,8 +232,7 @@ class EmbeddingCache:
 
         require_cache_folder(self.folder)
         content = {"embedding": embedding.float().cpu().contiguous()}
-        with atomic_file(self.path(text)) as file:
-            file.write(save(content, metadata={"text": text}))
+        write_file(self.path(text), save(content, metadata={"text": text}))
 
     def embed(
         self, texts: list[str], encode: Callable[[list[str]], list[Any]]

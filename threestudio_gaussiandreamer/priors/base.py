@@ -22,7 +22,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..core.errors import UserError
-from ..core.methods import require_method
 from ..core.options import (
     Rule,
     count_of,
@@ -37,6 +36,7 @@ from ..core.streams import numpy_generator
 from ..formats.producers import PRODUCERS, producer_axes
 from ..gaussians.point_cloud import PointCloud
 from ..host import BaseObject, run_seed
+from ..host.methods import require_method
 from ..meshes.mesh import GREY, MAX_NON_FINITE
 
 logger = logging.getLogger(__name__)

@@ -20,8 +20,7 @@ from torch import Tensor
 
 from ..core.devices import get_device
 from ..core.errors import UserError
-from ..core.files import atomic_file, existing_file, json_text
-from ..core.images import write as write_image
+from ..core.files import existing_file, json_text, write_file
 from ..core.logs import warn
 from ..formats.gaussian_files import StoredCloud, as_stored, file_size
 from ..formats.spz import COLOR_REACH
@@ -39,6 +38,7 @@ from ..gaussians.views import (
     render_all,
     views_around,
 )
+from ..images import write as write_image
 from ..view.run_files import read_any
 from .options import PruneOptions, budget_of, combined_psnr, error_of, parse_bytes, parse_count
 
@@ -229,8 +229,7 @@ def write_report(
     quality = psnr_to_original(clouds[1], views, render_all(clouds[0], views))
     report = {"before": before, "after": after, "psnr_on_unseen_views": quality}
     report |= {"met": result.met, "seconds": round(result.seconds, 1)}
-    with atomic_file(f"{path}.json") as file:
-        file.write(json_text(report | {"options": asdict(options)}, indent=2).encode())
+    write_file(f"{path}.json", json_text(report | {"options": asdict(options)}, indent=2))
     write_image(f"{path}.png", sheet([render_all(cloud, shown) for cloud in clouds]))
     for name in ("before", "after"):
         count, size, ms = report[name].values()

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ..core.quaternions import rotation_rows
+from ..core.tensors import rotation_rows
 from .scene import RasterizeOptions, Scene
 
 SMALLEST_QUATERNION = 1e-12

@@ -11,7 +11,7 @@ import math
 import mimetypes
 import os
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import Any, Optional
@@ -21,7 +21,7 @@ import numpy as np
 
 from ..core.command import run_command
 from ..core.errors import UserError
-from ..core.files import atomic_file, json_text, output_folder
+from ..core.files import json_text, output_folder, write_file
 from ..formats.gaussian_files import StoredCloud
 from ..formats.ply import is_gaussian_ply
 from ..gaussians.axes import WORLD_UP
@@ -84,7 +84,8 @@ class Studio:
         import viser.transforms
 
         self.rotation = viser.transforms.SO3
-        with self.routes(host), live.own_pages_only(host):
+        given = host, self.respond, self.routed
+        with live.own_pages_only(*given, max_size=LARGEST_UPLOAD):
             self.server = viser.ViserServer(host=host, port=port, verbose=False)
         self.server.scene.set_up_direction("+z")
         self.server.gui.configure_theme(show_logo=False, show_share_button=False)
@@ -99,39 +100,25 @@ class Studio:
         self.tools.close()
         self.server.stop()
 
-    @contextlib.contextmanager
-    def routes(self, host: str) -> Iterator[None]:
-        """Let the viser server that is started in this context answer requests of our page, too."""
-        import websockets.asyncio.server as module
+    def routed(self, handler: Callable) -> Callable:
+        """Return the handler of connections: of our page, and viser's."""
+
+        async def handle(connection: Any) -> None:
+            own = urlsplit(connection.request.path).path == "/studio"
+            await (self.talk(connection) if own else handler(connection))
+
+        return handle
+
+    def respond(self, request: Any) -> Any:
+        """Return the response to a request of our page; None for a connection, or viser's."""
         from websockets.datastructures import Headers
         from websockets.http11 import Response
 
-        serve_all = module.serve
-
-        def serve(handler: Callable, *args: Any, process_request: Any, **options: Any) -> Any:
-            async def handle(connection: Any) -> None:
-                own = urlsplit(connection.request.path).path == "/studio"
-                await (self.talk(connection) if own else handler(connection))
-
-            def check(connection: Any, request: Any) -> Any:
-                own = live.is_own_page(
-                    request.headers.get("Host"), request.headers.get("Origin"), host
-                )
-                is_page = own and "Upgrade" not in request.headers
-                found = self.answer(unquote(urlsplit(request.path).path)) if is_page else None
-                if found is None:
-                    return process_request(connection, request)
-                headers = {"Content-Length": str(len(found[0])), "Cache-Control": "no-cache"}
-                return Response(http.HTTPStatus.OK, "OK", Headers(**headers, **found[1]), found[0])
-
-            options |= {"max_size": LARGEST_UPLOAD, "process_request": check}
-            return serve_all(handle, *args, **options)
-
-        module.serve = serve
-        try:
-            yield
-        finally:
-            module.serve = serve_all
+        found = self.answer(unquote(urlsplit(request.path).path))
+        if found is None or "Upgrade" in request.headers:
+            return None
+        headers = {"Content-Length": str(len(found[0])), "Cache-Control": "no-cache"}
+        return Response(http.HTTPStatus.OK, "OK", Headers(**headers, **found[1]), found[0])
 
     def answer(self, path: str) -> Optional[tuple[bytes, dict[str, str]]]:
         """Answer the request for our page, a file of a run, or the picture of the current one."""
@@ -197,8 +184,7 @@ class Studio:
         path = Path(name.decode())
         ending = path.suffix[:12] if path.suffix[1:].isalnum() else ""
         path = folder / f"{safe_name(path.stem)}{ending}"
-        with atomic_file(path) as target:
-            target.write(content)
+        write_file(path, content)
         # a PLY is a mesh, points or Gaussians
         return {"path": str(path), "gaussians": is_gaussian_ply(path)}
 

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
-from ..core import images
+from .. import images
 from ..core.command import run_command
 from ..core.files import atomic_file, json_text
 from ..diffusion import sds

@@ -24,12 +24,11 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from .. import register_parts
+from .. import images, register_parts
 from ..cameras import Orbit
-from ..core import images
 from ..core.command import interrupt, raised_signals, run_command
 from ..core.errors import Terminated, UserError
-from ..core.files import atomic_file, json_text, output_folder
+from ..core.files import json_text, output_folder, write_file
 from ..core.streams import generator
 from ..diffusion import sds
 from ..evaluation.asset_metrics import ATTRIBUTES, Scores, prior_of, rendered, result_of
@@ -113,8 +112,7 @@ def open_folder(root: Path, record: dict[str, Any]) -> RunFolder:
             print(f"continuing {path.parent}", flush=True)
             return claim(path.parent, "another demo is working", "")
     claimed = claim_new(root / datetime.now().strftime("%Y%m%d-%H%M%S"))
-    with atomic_file(claimed.path / RECORD) as file:
-        file.write(json_text(record, indent=1).encode())
+    write_file(claimed.path / RECORD, json_text(record, indent=1))
     return claimed
 
 
@@ -127,8 +125,7 @@ def train(folder: Path, index: int, place: Path, args: argparse.Namespace) -> in
     record = read_json(place.with_suffix(".json"), dict)
     if record.get("finished"):
         return 0
-    with atomic_file(text, durable=False) as file:
-        file.write(prompt.encode())
+    write_file(text, prompt, durable=False)
     print(f"\n{index + 1}/{len(args.prompts)}: {prompt}", flush=True)
     place.parent.mkdir(exist_ok=True)
     start, code = time.monotonic(), None
@@ -145,8 +142,8 @@ def train(folder: Path, index: int, place: Path, args: argparse.Namespace) -> in
         ])  # fmt: skip
     finally:
         seconds = round(record.get("seconds", 0.0) + time.monotonic() - start, 1)
-        with atomic_file(place.with_suffix(".json")) as file:
-            file.write(json_text({"seconds": seconds, "finished": code == 0}).encode())
+        done = json_text({"seconds": seconds, "finished": code == 0})
+        write_file(place.with_suffix(".json"), done)
     return code
 
 
@@ -184,8 +181,7 @@ def write_results(folder: Path, args: argparse.Namespace, runs: list[Path]) -> N
     scores, pairs = Scores(args.models), zip(args.prompts, runs, strict=True)
     stages = [stages_of(prompt, place, args.models, scores) for prompt, place in pairs]
     text = table(args.prompts, runs, stages)
-    with atomic_file(folder / TABLE) as file:
-        file.write(f"{text}\n".encode())
+    write_file(folder / TABLE, f"{text}\n")
     pictures = torch.cat([each[name][0] for each in stages for name in STAGES])
     shown = {OBJECT: STAGES, AVATAR: ("pose, body", *STAGES[1:])}
     first = [f"{name}: {prompt}" for prompt in args.prompts for name in shown[config_of(prompt)]]

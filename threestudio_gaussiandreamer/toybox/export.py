@@ -29,7 +29,7 @@ from torch import Tensor
 from ..core.checkpoint_file import load_file
 from ..core.command import run_command
 from ..core.errors import UserError
-from ..core.files import atomic_file, output_folder
+from ..core.files import atomic_file, output_folder, write_file
 from ..models.bundled import BODY, FOLDER, MOTION, RECORD, write_digests
 from ..priors.text_to_motion import ACTIONS, STATISTICS, mdm_files
 from . import models, words
@@ -57,10 +57,9 @@ def export(training: Path, target: Path) -> dict[str, Any]:
             write_weights(target / f"{name}.safetensors", averaged_weights(training, name))
     if is_trained(training, "motion"):
         write_motion_model(target / MOTION, training)
-        with atomic_file(target / BODY) as file:
-            file.write((FOLDER / BODY).read_bytes())
+        write_file(target / BODY, (FOLDER / BODY).read_bytes())
     record = training_record(training)
-    _write_json(target / RECORD, record)
+    write_file(target / RECORD, json.dumps(record, indent=2))
     write_digests(target)
     return record
 
@@ -80,7 +79,7 @@ def write_stable_diffusion(folder: Path, training: Path, clip: Any) -> None:
         _save(network, folder / name)
     copy_tokenizer(training / "tokenizer", folder / "tokenizer")
     models.scheduler().save_pretrained(folder / "scheduler")
-    _write_json(folder / "model_index.json", MODEL_INDEX)
+    write_file(folder / "model_index.json", json.dumps(MODEL_INDEX, indent=2))
 
 
 MODEL_INDEX = {
@@ -96,8 +95,7 @@ def write_weights(path: Path, weights: dict[str, Tensor]) -> None:
     """Write weights by name as safetensors: Point-E's base checkpoint, or the judge's."""
     from safetensors.torch import save
 
-    with atomic_file(path) as file:
-        file.write(save({name: value.half().contiguous() for name, value in weights.items()}))
+    write_file(path, save({name: value.half().contiguous() for name, value in weights.items()}))
 
 
 def write_motion_model(path: Path, training: Path) -> None:
@@ -109,9 +107,8 @@ def write_motion_model(path: Path, training: Path) -> None:
     output_folder(path.parent, "the motion model")
     with atomic_file(path) as file:
         torch.save({name: value.half() for name, value in state.items()}, file)
-    _write_json(path.parent / "args.json", args)
-    with atomic_file(path.parent / ACTIONS) as file:
-        file.write("\n".join(words.ACTION_PHRASES).encode())
+    write_file(path.parent / "args.json", json.dumps(args, indent=2))
+    write_file(path.parent / ACTIONS, "\n".join(words.ACTION_PHRASES))
     for name, key in zip(STATISTICS[0], ("mean", "std"), strict=True):
         with atomic_file(path.parent / name) as file:
             np.save(file, np.float32(content["constants"][key]))
@@ -130,11 +127,6 @@ def training_record(training: Path) -> dict[str, Any]:
             seen |= {"trainings": content["earlier"] + own, "last": last}
             record[name] = seen | {"withheld": content["measured"]}
     return record
-
-
-def _write_json(path: Path, content: dict[str, Any]) -> None:
-    with atomic_file(path) as file:
-        file.write(json.dumps(content, indent=2).encode())
 
 
 def _save(network: Any, folder: Path) -> None:

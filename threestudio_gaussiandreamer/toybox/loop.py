@@ -21,7 +21,7 @@ from torch.utils.data import DataLoader, Dataset
 from ..core.checkpoint_file import entries_below, load_file, save_file
 from ..core.command import restore_handlers, set_handlers
 from ..core.errors import UserError
-from ..core.files import atomic_file
+from ..core.files import write_file
 from ..core.streams import numpy_generator
 from . import views
 from .views import Shards
@@ -296,8 +296,8 @@ class Training:
         history = self.progress.history
         columns = list(history[-1]) if history else []
         rows = [columns, *([row.get(name, "") for name in columns] for row in history)]
-        with atomic_file(self.path.with_suffix(".csv"), durable=False) as file:
-            file.write("".join(",".join(map(str, row)) + "\n" for row in rows).encode())
+        text = "".join(",".join(map(str, row)) + "\n" for row in rows)
+        write_file(self.path.with_suffix(".csv"), text, durable=False)
 
     def _resume(self) -> None:
         content = load_file(self.path)

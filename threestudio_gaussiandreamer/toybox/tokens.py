@@ -11,7 +11,7 @@ from jaxtyping import Int
 from torch import Tensor
 
 from ..core.errors import UserError
-from ..core.files import atomic_file, existing_file, output_folder
+from ..core.files import existing_file, output_folder, write_file
 from ..models.bundled import WORDS_FILE
 from . import words
 from .views import Shard, attributes_of
@@ -46,16 +46,14 @@ def write_tokenizer(folder: Path, words: Sequence[str]) -> None:
         text = "\n".join([*content, ""])
         if isinstance(content, dict):
             text = json.dumps(content, ensure_ascii=False, indent=0)
-        with atomic_file(folder / name) as file:
-            file.write(text.encode())
+        write_file(folder / name, text)
 
 
 def copy_tokenizer(source: Path, folder: Path) -> None:
     """Copy the files of a tokenizer."""
     output_folder(folder, "the tokenizer")
     for path in sorted(source.iterdir(), key=lambda path: path.name == SETTINGS):
-        with atomic_file(folder / path.name) as file:
-            file.write(path.read_bytes())
+        write_file(folder / path.name, path.read_bytes())
 
 
 def word_merges(words: Sequence[str]) -> list[tuple[str, str]]:

@@ -28,7 +28,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import Any, ClassVar, List, Tuple
+from typing import Any, ClassVar, List, Optional, Tuple
 
 import torch
 from jaxtyping import Int
@@ -37,7 +37,7 @@ from torch.utils.data import DataLoader, IterableDataset
 
 from .. import cameras
 from ..cameras import Orbit, OrbitRanges
-from ..core.distributed import own_rows, require_shareable
+from ..core.distributed import own_rows, world_size
 from ..core.errors import UserError
 from ..core.options import (
     Rule,
@@ -149,6 +149,21 @@ def sizes_of_stages(cfg: Any) -> list[tuple[int, int, int]]:
     return [tuple(values[min(i, len(values) - 1)] for values in sizes) for i in stages]
 
 
+def require_shareable(cfg: Any, processes: Optional[int] = None) -> None:
+    """Raise UserError unless the processes, by default those that there are, can share the views of
+    a step equally, of which ``n_view`` consecutive ones stay in one process.
+    """
+    size, together = processes or world_size(), getattr(cfg, "n_view", 1)
+    for *_, views in sizes_of_stages(cfg):
+        if views % (size * together):
+            said = "fewer than" if views < size * together else "no multiple of"
+            said += f" the {size} processes that share the views of a step"
+            said += f" in groups of {together}" if together > 1 else ""
+            fits = f"set data.batch_size to {size * together} or a multiple"
+            fits += f", or use as many processes as divide {views // together}"
+            raise UserError(f"data.batch_size is {views}, {said}: {fits}")
+
+
 def orbit_batch(orbit: Orbit, height: int, width: int) -> dict[str, Any]:
     """Make the host's batch of B views, with the lights at the cameras; both sizes are ints."""
     c2w, proj = orbit.c2w, cameras.projection(orbit.fovy, width / height)
@@ -180,8 +195,7 @@ class TrainCameras(IterableDataset, Updateable):
         self.next_step: Callable[[], int] = lambda: 0
         self._pool_batches: dict[tuple[int, int], dict[str, Any]] = {}  # all views, by their size
         self.sizes = sizes_of_stages(cfg)
-        for _, _, batch_size in self.sizes:
-            require_shareable(batch_size, "data.batch_size", together=cfg.n_view)
+        require_shareable(cfg)
         ranges = cfg.elevation_range, cfg.azimuth_range, cfg.camera_distance_range, cfg.fovy_range
         self.ranges, count = OrbitRanges(*map(tuple, ranges)), cfg.train_views
         self.pool = cameras.camera_pool(count, self.ranges, run_seed()) if count else None
@@ -192,7 +206,7 @@ class TrainCameras(IterableDataset, Updateable):
     def collate(self, step: int) -> dict[str, Any]:
         """Return this process's views of the batch for ``step``, a function of (seed, step)."""
         stage = bisect.bisect_right(self.cfg.resolution_milestones, step)
-        height, width, batch_size = self.sizes[stage]
+        (height, width, batch_size), (low, high) = self.sizes[stage], LIGHT_DISTANCES
         rng, size = generator(run_seed(), "camera", step), (height, width)
         if self.pool:
             if size not in self._pool_batches:
@@ -200,7 +214,11 @@ class TrainCameras(IterableDataset, Updateable):
             views = _rows(self._pool_batches[size], self._pick(batch_size, rng))
         else:
             views = orbit_batch(self._sample(batch_size, rng), *size)
-        views["light_positions"] = self._lights(views["c2w"], rng)
+        # point lights around the camera's direction, as in DreamFusion
+        towards = views["c2w"][:, :3, 3] + torch.randn(batch_size, 3, generator=rng)
+        towards /= torch.linalg.vector_norm(towards, dim=-1, keepdim=True).clamp_min(1e-12)
+        distances = torch.rand(batch_size, 1, generator=rng)
+        views["light_positions"] = towards * (low + (high - low) * distances)
         return _rows(views, own_rows(batch_size))
 
     def _sample(self, batch_size: int, rng: torch.Generator) -> Orbit:
@@ -215,13 +233,6 @@ class TrainCameras(IterableDataset, Updateable):
         if self.cfg.batch_uniform_azimuth:
             share = (share + torch.arange(batch_size)) / batch_size
         return (share * views).long().clamp_max(views - 1)
-
-    def _lights(self, c2w: Tensor, rng: torch.Generator) -> Tensor:
-        """Draw point lights around the camera's direction, as DreamFusion does."""
-        count, (low, high) = len(c2w), LIGHT_DISTANCES
-        towards = c2w[:, :3, 3] + torch.randn(count, 3, generator=rng)
-        towards = towards / torch.linalg.vector_norm(towards, dim=-1, keepdim=True).clamp_min(1e-12)
-        return towards * (low + (high - low) * torch.rand(count, 1, generator=rng))
 
 
 def ring_loader(cfg: CameraConfig, count: int) -> DataLoader:

@@ -29,13 +29,13 @@ from torch import Tensor
 from ..core.devices import to_device
 from ..core.distributed import all_max, all_sum, draw_shared
 from ..core.errors import UserError
-from ..core.methods import require_method
 from ..core.options import at_least, between, in_range, positive
 from ..core.streams import generator
 from ..gaussians import densify, importance
 from ..gaussians.densify import Change
 from ..gaussians.importance import Need
 from ..host import find, parse_structured, register, run_seed
+from ..host.methods import require_method
 from ..splatting import Rasterized
 
 AUTO = "auto"

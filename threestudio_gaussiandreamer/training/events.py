@@ -12,10 +12,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..core.devices import DelayedReads
-from ..core.images import read as read_image
 from ..guidance.base import ScoreDistillation
 from ..guidance.external import truth_of
 from ..host import info
+from ..images import read as read_image
 from .data import GaussianDreamerDataModule
 
 LOGGED_SCORES = ("psnr", "ssim", "multi_face", "floater_mass")

@@ -19,8 +19,7 @@ from pathlib import Path
 from typing import Any, Optional
 
 from ..core.errors import UserError
-from ..core.files import atomic_file
-from ..core.images import write_animation
+from ..core.files import atomic_file, write_file
 from ..exporters.files import RESERVED, BundleExporter, FileExporter, outputs_of, read_gaussians
 from ..formats.gaussian_files import StoredCloud, read_cloud, write_cloud
 from ..formats.ply import write_points
@@ -29,6 +28,7 @@ from ..gaussians.axes import VIEWER_UP
 from ..gaussians.point_cloud import PointCloud
 from ..gaussians.surface import Surface
 from ..host import ExporterOutput, find, warn
+from ..images import write_animation
 from ..meshes.mesh import Mesh
 from ..meshes.write import write_obj, write_textured_mesh
 from ..prune import PruneOptions, prune_to_budget, write_report
@@ -166,11 +166,6 @@ def export_pruned(system: Any, folder: str) -> None:
     write_report(system.get_save_path(f"{folder}/report"), result, suffix, options)
 
 
-def exported_files(folder: Path) -> list[str]:
-    """List the results below ``folder`` that a user wants to open."""
-    return [str(path) for pattern in SUMMARY for path in sorted(folder.glob(pattern))]
-
-
 # -- pages and turntables --------------------------------------------------------------------------
 
 
@@ -186,11 +181,15 @@ def write_pages(system: Any, folder: str) -> None:
     if not system.cfg.pages:
         return
     run, settings = RunFiles(Path(system.get_save_dir()).parent), settings_of(system)
+    color, background = WHITE, system.background
+    if FlatBackground.is_flat(background):
+        learned = background.cfg.mode == "learned"
+        color = tuple(background.color(1)[0].tolist() if learned else background.cfg.color)
     options = PageOptions(
         title=prompt_of(system) or run.folder.name,
         name="gaussians",
         settings=settings,
-        background=_background(system.background),
+        background=color,
         keep_background=run.background_is_given,
     )
     cloud = StoredCloud(read_gaussians(system.geometry)).in_axes(VIEWER_UP)
@@ -201,18 +200,9 @@ def write_pages(system: Any, folder: str) -> None:
     except UserError as error:
         warn(f"no {PAGE} is written: {error}")
         return
-    with atomic_file(system.get_save_path(f"{folder}/{PAGE}")) as file:
-        file.write(content.encode())
+    write_file(system.get_save_path(f"{folder}/{PAGE}"), content)
     with atomic_file(system.get_save_path(f"{folder}/{POSTER}"), durable=False) as file:
         picture(cloud, settings, first_pose(cloud), POSTER_SIZE).save(file, "png")
-
-
-def _background(background: Any) -> tuple[float, float, float]:
-    """Return the colour that test views are shown on; white for backgrounds that aren't flat."""
-    if not FlatBackground.is_flat(background):
-        return WHITE
-    learned = background.cfg.mode == "learned"
-    return tuple(background.color(1)[0].tolist() if learned else background.cfg.color)
 
 
 def _first_cloud(run: RunFiles) -> Optional[Shown]:

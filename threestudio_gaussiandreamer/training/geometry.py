@@ -55,7 +55,6 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from ..core.errors import UserError
-from ..core.methods import require_method
 from ..core.options import (
     at_least,
     between,
@@ -79,6 +78,7 @@ from ..gaussians.point_cloud import PointCloud
 from ..gaussians.simplify import keep_best, view_importance
 from ..gaussians.views import views_around
 from ..host import BaseGeometry, C, find, register, run_seed, warn
+from ..host.methods import require_method
 from .density import AUTO, DensifyConfig, PruneConfig, min_count
 
 logger = logging.getLogger(__name__)

@@ -20,10 +20,10 @@ from torch import Tensor
 from .. import metrics
 from ..cameras import Orbit, held_out_orbit
 from ..core.errors import UserError
-from ..core.files import atomic_file, json_text
-from ..core.images import read as read_image
-from ..core.images import write as write_image
+from ..core.files import json_text, write_file
 from ..core.options import at_least, in_range, require_memory
+from ..images import read as read_image
+from ..images import write as write_image
 from ..meshes.mesh import SurfaceDistance
 from ..meshes.raycast import over_background
 from ..view.run_files import read_json
@@ -219,15 +219,16 @@ class Measurements:
     def write(self) -> None:
         self.values |= self._elapsed()
         self.folder.mkdir(parents=True, exist_ok=True)
-        with atomic_file(self.path) as file:
-            file.write(json_text(self.values, indent=2).encode())
+        write_file(self.path, json_text(self.values, indent=2))
 
     def _save_pictures(self, key: str, renders: Tensor, truth: Tensor) -> None:
         """Save rows of six views to ``held_out``, also of prior, result and truth together."""
         folder = self.folder / "held_out"
         folder.mkdir(parents=True, exist_ok=True)
         for name, images in ((key, renders), ("truth", truth)):
-            write_image(folder / f"{name}.png", _row(images))
+            chosen = images[:: max(1, len(images) // 6)][:6]
+            row = (torch.cat(list(chosen), 1).clamp(0, 1) * 255).round().byte().numpy()
+            write_image(folder / f"{name}.png", row)
         pictures = []
         for name in ("prior", "result", "truth"):
             with suppress(UserError):  # an earlier run's picture is missing or damaged
@@ -250,9 +251,3 @@ class Measurements:
 
 def _now() -> np.ndarray:
     return np.array([time.perf_counter(), time.process_time()])
-
-
-def _row(images: Float[Tensor, "V H W 3"], count: int = 6) -> np.ndarray:
-    """Join ``count`` views spread around the object side by side, as bytes."""
-    chosen = images[:: max(1, len(images) // count)][:count]
-    return (torch.cat(list(chosen), 1).clamp(0, 1) * 255).round().byte().numpy()

@@ -15,6 +15,8 @@ downsample  1, or 2: return the 2x2 box of the rendered size (the paper renders 
 ==========  ========================================================================================
 """
 
+from collections import UserDict
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, ClassVar
@@ -28,7 +30,6 @@ from .. import cameras
 from ..core.devices import get_device, without_autocast
 from ..core.errors import UserError
 from ..core.options import at_least, in_range, one_of, positive, rule
-from ..core.tensors import LazyMapping
 from ..gaussians.gaussians import require_attributes
 from ..host import Rasterizer, register
 from ..splatting import PRESETS, Rasterized, rasterize
@@ -73,7 +74,7 @@ class SplattingRenderer(Rasterizer):
 
     def forward(
         self, c2w: Tensor, fovy: Tensor, height: int, width: int, **unused: Any
-    ) -> LazyMapping:
+    ) -> "LazyMapping":
         """Render B views, in float32 whatever the trainer's precision is: half precision would move
         cameras by thousandths.
 
@@ -134,6 +135,22 @@ class SplattingRenderer(Rasterizer):
         if getattr(background, "shape", None) != wanted:
             raise UserError(f"{name} returned {found}; expected a tensor of colours {wanted}")
         return out.image + (1 - out.alpha) * background, background
+
+
+class LazyMapping(UserDict):
+    """Values by name; ``later`` are functions of no argument, each called at most once."""
+
+    def __init__(self, values: Mapping[str, Any], later: Mapping[str, Callable[[], Any]]) -> None:
+        self.data, self.later = {**values, **later}, {*later}
+
+    def __getitem__(self, name: str) -> Any:
+        if name in self.later:
+            self[name] = self.data[name]()
+        return self.data[name]
+
+    def __setitem__(self, name: str, value: Any) -> None:
+        self.later.discard(name)
+        self.data[name] = value
 
 
 def normals_from_depth(

@@ -37,14 +37,14 @@ import torch
 from torch import Tensor
 
 from ..core.devices import flush_reads
-from ..core.distributed import average_gradients, from_first, rank
+from ..core.distributed import average_gradients, is_active, rank
 from ..core.errors import UserError
-from ..core.methods import require_class_method
 from ..core.schedule import parse_schedule, validate_schedule
 from ..gaussians.gaussians import SHAPES, require_cloud
 from ..guidance import external
 from ..guidance.external import truth_of
 from ..host import BaseLift3DSystem, C, find, info, parse_structured, register, warn
+from ..host.methods import require_class_method
 from ..metrics import psnr_of_error
 from ..priors.base import preflight_prior
 from ..priors.cache import cached_cloud
@@ -172,9 +172,11 @@ class GaussianDreamerSystem(export.GaussianSavers, BaseLift3DSystem):
             return {name: value.cpu() for name, value in self.geometry.state_dict().items()}
 
         # one process runs the prior: on a GPU two runs may differ in their last bits
-        state = from_first(first_state)
+        states = [None if rank() else first_state()]
+        if is_active():
+            torch.distributed.broadcast_object_list(states)
         if rank():
-            self.geometry.load_state_dict(state)
+            self.geometry.load_state_dict(states[0])
         info(f"the cloud starts with {len(self.geometry)} Gaussians")
 
     def on_fit_start(self) -> None:
@@ -321,7 +323,9 @@ class GaussianDreamerSystem(export.GaussianSavers, BaseLift3DSystem):
 
     def summary(self) -> str:
         """List the files of results and the scores; printed at the end of a run."""
-        lines = [*export.exported_files(Path(self._save_dir or ".")), "", self.density.summary()]
+        folder = Path(self._save_dir or ".")
+        lines = [str(path) for name in export.SUMMARY for path in sorted(folder.glob(name))]
+        lines += ["", self.density.summary()]
         return "\n".join([*lines, *(["", self.measurements.table()] if self.measurements else [])])
 
     # -- pictures ----------------------------------------------------------------------------------

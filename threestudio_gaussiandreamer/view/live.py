@@ -188,25 +188,35 @@ def is_own_page(site: Optional[str], origin: Optional[str], host: str) -> bool:
 
 
 @contextlib.contextmanager
-def own_pages_only(host: str) -> Iterator[list[Any]]:
+def own_pages_only(
+    host: str, answer: Any = None, routed: Any = None, **options: Any
+) -> Iterator[list[Any]]:
     """Let the viser server that is started in this context refuse what isn't :func:`is_own_page`;
     yield the guards, of which an unknown viser asks for none.
+
+    Args:
+        answer: returns the response to a request, or None for viser's own.
+        routed: returns the handler of connections in the place of viser's.
+        options: of websockets' ``serve``.
     """
     import websockets.asyncio.server as sockets
 
     guards: list[Any] = []
     serve_all = sockets.serve
 
-    def serve_own(*args: Any, process_request: Any = None, **kwargs: Any) -> Any:
+    def serve_own(handler: Any, *args: Any, process_request: Any = None, **kwargs: Any) -> Any:
         def check(connection: Any, request: Any) -> Any:
             headers = request.headers
             if not is_own_page(headers.get("Host"), headers.get("Origin"), host):
                 reason = "viewer: only its own page, at an address or a known name, is answered\n"
                 return connection.respond(http.HTTPStatus.FORBIDDEN, reason)
+            if answer and (found := answer(request)):
+                return found
             return process_request(connection, request) if process_request else None
 
         guards.append(check)
-        return serve_all(*args, process_request=check, **kwargs)
+        handler = routed(handler) if routed else handler
+        return serve_all(handler, *args, process_request=check, **kwargs | options)
 
     sockets.serve = serve_own
     try:

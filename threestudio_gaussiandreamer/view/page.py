@@ -18,7 +18,7 @@ from urllib.parse import quote
 import numpy as np
 
 from ..core.errors import UserError
-from ..core.files import atomic_file
+from ..core.files import write_file
 from ..formats.gaussian_files import StoredCloud, notes_of
 from ..formats.ply import NORMALS, gaussian_columns, gaussian_properties, header_bytes
 from ..formats.spz import SPZ_UP, spz_bytes
@@ -72,9 +72,8 @@ class PageOptions(NamedTuple):
 def write_page(path: Path, *shown: Any) -> None:
     """Write the page of :func:`page`; raises UserError also if the file can't be written."""
     content = page(*shown)
-    with atomic_file(path) as file:
-        # a title may be a file's name, whose bytes needn't be UTF-8
-        file.write(content.encode(errors="replace"))
+    # a title may be a file's name, whose bytes needn't be UTF-8
+    write_file(path, content.encode(errors="replace"))
 
 
 def page(shown: Shown, options: PageOptions, before: Optional[Shown] = None) -> str:
@@ -238,8 +237,7 @@ def template(name: str) -> Any:
 def write_static(path: Path, name: str, **values: Any) -> None:
     """Write the page of a template that has no scripts; raises UserError if it can't be written."""
     content = template(name).render(values).encode(errors="replace")  # a name needn't be UTF-8
-    with atomic_file(path, durable=False) as file:
-        file.write(content)
+    write_file(path, content, durable=False)
 
 
 def address(path: Path, page_folder: Path) -> str:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Optional
 
 from ..core.errors import UserError
-from ..core.files import atomic_file, json_text
+from ..core.files import json_text, write_file
 from ..core.logs import warn
 from ..metrics import MULTI_FACE_NOTE
 from .page import address, decibels, write_static
@@ -129,8 +129,7 @@ def note_time(folder: Path, stage: str, began: datetime, seconds: float) -> None
     """Append a finished stage to the times of a run; raises UserError if it can't be written."""
     entry = {"stage": stage, "began": began.isoformat(sep=" ", timespec="seconds")}
     times = [*read_json(folder / TIMES, list), entry | {"seconds": round(seconds, 1)}]
-    with atomic_file(folder / TIMES, durable=False) as file:
-        file.write(json_text(times, indent=1).encode())
+    write_file(folder / TIMES, json_text(times, indent=1), durable=False)
 
 
 def config_changes(folder: Path) -> list[tuple[str, Any, Any]]:

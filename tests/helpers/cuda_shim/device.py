@@ -21,10 +21,9 @@ FOLDER = Path(__file__).parent
 # Nothing is fused but what the kernels fuse on purpose; reading four floats as one is usual in
 # CUDA, though not in C++; jumps from stack to stack are meant.
 FLAGS = (
-    "-std=c++17 -O2 -fPIC -shared -ffp-contract=off -fno-math-errno -fno-strict-aliasing "
-    "-U_FORTIFY_SOURCE"
-).split()
-WARNINGS = ["-Wall", "-Wno-unknown-pragmas"]
+    "-std=c++17 -O2 -fPIC -shared -ffp-contract=off -fno-math-errno -fno-strict-aliasing".split()
+)
+FLAGS += ["-U_FORTIFY_SOURCE", "-Wall", "-Wno-unknown-pragmas"]
 
 
 def unavailable() -> Optional[str]:
@@ -57,7 +56,7 @@ def library() -> ctypes.CDLL:
         target.parent.mkdir(exist_ok=True)
         part = target.with_suffix(f".{os.getpid()}")
         files = [*(f"-I{folder}" for folder in folders), *map(str, FOLDER.glob("*.cpp"))]
-        subprocess.run(["g++", *FLAGS, *WARNINGS, *files, "-o", str(part)], check=True)
+        subprocess.run(["g++", *FLAGS, *files, "-o", str(part)], check=True)
         part.replace(target)
     kernels = ctypes.CDLL(str(target))
     kernels.shim_error.restype = ctypes.c_char_p
@@ -82,15 +81,12 @@ class HostDevice:
     """Like `driver.Gpu`, for CPU tensors.
 
     Args:
-        order: of the threads of a block between two barriers: "forward", "backward" or
-            "shuffled".
+        order: of the threads of a block between barriers: "forward", "backward" or "shuffled".
         most_intersections: larger lists or rows raise an out-of-memory error.
         arrived: whether values that are read later are reported as arrived.
     """
 
-    def __init__(
-        self, order: str = "forward", most_intersections: int = NOWHERE, arrived: bool = True
-    ):
+    def __init__(self, order="forward", most_intersections=NOWHERE, arrived=True):
         self.order, self.most_intersections = ORDERS[order], most_intersections
         self.arrived, self.waits = arrived, 0
         self.launched: list[str] = []

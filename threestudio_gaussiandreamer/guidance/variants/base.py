@@ -19,9 +19,9 @@ GUIDANCE_SCALE = in_range(-1e6, 1e6)
 
 
 def require_unset(guidance: type, cfg: Any, names: Collection[str], reason: str) -> None:
-    """Raise UserError if options without effect are set; see :func:`.require_defaults`."""
-    off = {"prefix": guidance.SECTION, "neutral": {"recon_std_rescale": 0.0}}
-    require_defaults(guidance.Config, cfg, names, reason, **off)
+    """Raise UserError if options without effect are set; a rescaling by 0 does nothing anyway."""
+    names = [n for n in names if n != "recon_std_rescale" or getattr(cfg, n, 0) != 0]
+    require_defaults(guidance.Config, cfg, names, reason, guidance.SECTION)
 
 
 class Variant(BaseObject, ABC):

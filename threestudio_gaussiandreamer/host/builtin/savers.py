@@ -3,6 +3,7 @@
 import os
 import re
 import shutil
+import subprocess
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
@@ -11,9 +12,19 @@ from typing import Any, Optional
 import numpy as np
 from torch import Tensor
 
-from ...core import images as pictures
+from ... import images as pictures
 from ...core.errors import UserError
-from ...core.files import atomic_file, json_text
+from ...core.files import atomic_file, json_text, write_file
+
+MP4 = (
+    *("-codec:v", "libx264", "-crf", "25", "-pix_fmt", "yuv420p"),
+    # put the index first, so that a browser can start to play before it has the whole file
+    *("-movflags", "+faststart"),
+    # ffmpeg takes BT.601's matrix and says nothing; players assume BT.709's above 720 lines
+    *("-vf", "scale=ceil(iw/2)*2:ceil(ih/2)*2:out_color_matrix=bt709:out_range=tv"),
+    *("-colorspace", "bt709", "-color_primaries", "bt709"),
+    *("-color_trc", "bt709", "-color_range", "tv"),
+)
 
 
 @dataclass
@@ -75,7 +86,7 @@ class SaverMixin:
         self, filename: str, imgs: list, name: Optional[str] = None, step: Optional[int] = None
     ) -> str:
         """Save a row of ``{"type": "rgb"|"grayscale", "img": ..., "kwargs": {...}}``, or a list of
-        rows, as an image; ``kwargs`` as for the functions of this name in ``core.images``.
+        rows, as an image; ``kwargs`` as for the functions of this name in ``images.py``.
         """
         path = self.get_save_path(filename)
         pictures.write(path, pictures.grid(self.convert_data(imgs)))
@@ -104,7 +115,7 @@ class SaverMixin:
         frames = sorted((int(match[1]), picture) for match, picture in matches if match)
         if not frames:
             raise FileNotFoundError(f"no picture in {folder} matches {matcher}")
-        pictures.write_video(path, [picture for _, picture in frames], fps=fps)
+        write_video(path, [picture for _, picture in frames], fps=fps)
         self._log_file("Video", path, name, step)
         return path
 
@@ -139,8 +150,7 @@ class SaverMixin:
 
     def save_json(self, filename: str, payload: Any) -> str:
         path = self.get_save_path(filename)
-        with atomic_file(path) as file:
-            file.write(json_text(payload).encode())
+        write_file(path, json_text(payload))
         return path
 
     def _log_file(self, kind: str, path: str, name: Optional[str], step: Optional[int]) -> None:
@@ -150,3 +160,27 @@ class SaverMixin:
             self._wandb_logger.experiment.log(
                 {name: getattr(wandb, kind)(path), "trainer/global_step": step}
             )
+
+
+def write_video(path: str, frames: list[Path], *, fps: int) -> None:
+    """Write the images as an mp4 (H.264, yuv420p, index first; scaled to an even size) or gif;
+    raise UserError if the disk is full, or there is no ffmpeg.
+    """
+    if path.endswith(".gif"):
+        pictures.write_animation(path, frames, None, len(frames) / fps)
+        return
+    part = Path(path).with_name(f".part-{Path(path).name}")
+    try:
+        from imageio_ffmpeg import get_ffmpeg_exe
+
+        command = [get_ffmpeg_exe(), "-v", "error", "-xerror", "-y", "-framerate", str(fps)]
+        command += ["-i", "-", *MP4, str(part.absolute())]
+        content = b"".join(frame.read_bytes() for frame in frames)
+        subprocess.run(command, input=content, capture_output=True, check=True)
+        os.replace(part, path)
+    except (ImportError, OSError, RuntimeError, subprocess.CalledProcessError) as error:
+        said = getattr(error, "stderr", b"").decode(errors="replace").strip() or str(error)
+        why = "no ffmpeg: pip install imageio-ffmpeg" if isinstance(error, ImportError) else said
+        raise UserError(f"the video {path} could not be written: {why.splitlines()[0]}") from error
+    finally:
+        part.unlink(missing_ok=True)

@@ -21,7 +21,7 @@ from typing import Optional
 import torch
 
 from ...core.errors import UserError
-from ...core.files import atomic_file
+from ...core.files import write_file
 
 KERNELS = Path(__file__).parent
 SHARED = KERNELS.parent / "shared"  # formulas, which the CPU kernel includes too
@@ -169,8 +169,7 @@ def write_cached(name: str, content: bytes) -> None:
     try:
         path = cache_folder() / name
         path.parent.mkdir(parents=True, exist_ok=True)
-        with atomic_file(path) as file:
-            file.write(content + hashlib.sha256(content).digest())
+        write_file(path, content + hashlib.sha256(content).digest())
     except (OSError, RuntimeError, UserError) as error:
         log.warning("compiled CUDA kernels can't be kept for the next start: %s", error)
 

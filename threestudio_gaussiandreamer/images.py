@@ -1,16 +1,15 @@
-"""8 bit RGB images from arrays, and image and video files: colour maps, grids, captions."""
+"""8 bit RGB images from arrays, and image files: colour maps, grids, animations."""
 
 import io
 import os
-import subprocess
 import zlib
 from pathlib import Path
 from typing import Any, Optional
 
 import numpy as np
 
-from .errors import UserError
-from .files import atomic_file, existing_file
+from .core.errors import UserError
+from .core.files import existing_file, write_file
 
 _COLOR_MAPS = {
     "jet": "000080 0000ff 0080ff 00ffff 80ff80 ffff00 ff8000 ff0000 800000",
@@ -19,23 +18,13 @@ _COLOR_MAPS = {
 """Knots at equal distances over [0, 1]."""
 _PNG_OPTIONS = {"compress_level": 1, "compress_type": zlib.Z_RLE}
 """As OpenCV's: renders take a third of the time that Pillow's own take, and no more bytes."""
-_MP4_OPTIONS = (
-    *("-codec:v", "libx264", "-crf", "25", "-pix_fmt", "yuv420p"),
-    # put the index first, so that a browser can start to play before it has the whole file
-    *("-movflags", "+faststart"),
-    # ffmpeg takes BT.601's matrix and says nothing; players assume BT.709's above 720 lines
-    *("-vf", "scale=ceil(iw/2)*2:ceil(ih/2)*2:out_color_matrix=bt709:out_range=tv"),
-    *("-colorspace", "bt709", "-color_primaries", "bt709"),
-    *("-color_trc", "bt709", "-color_range", "tv"),
-)
 
 
 def rgb(
     image: np.ndarray, *, data_format: str = "HWC", data_range: tuple[float, float] = (0, 1)
 ) -> np.ndarray:
-    """Convert (H,W,C), or (C,H,W) with ``data_format="CHW"``, to uint8 (H, W*ceil(C/3), 3).
-
-    Channels lie side by side, three by three; missing ones are black.
+    """Convert (H,W,C), or (C,H,W) with ``data_format="CHW"``, to uint8 (H, W*ceil(C/3), 3):
+    channels lie side by side, three by three; missing ones are black.
     """
     image = np.moveaxis(np.asarray(image), {"HWC": -1, "CHW": 0}[data_format], -1)
     image = image if image.dtype == np.uint8 else _to_bytes(_normalize(image, data_range))
@@ -65,6 +54,8 @@ def grayscale(
 
 def grid(cells: list) -> np.ndarray:
     """Compose a row of ``{"type", "img", "kwargs"}``, or a list of rows, into one image."""
+    from PIL import Image
+
     if isinstance(cells[0], list):
         rows = [grid(row) for row in cells]
         width = max(row.shape[1] for row in rows)
@@ -72,17 +63,8 @@ def grid(cells: list) -> np.ndarray:
     makers = {"rgb": rgb, "grayscale": grayscale}
     images = [makers[cell["type"]](cell["img"], **cell.get("kwargs", {})) for cell in cells]
     height, width = np.max([image.shape[:2] for image in images], axis=0).tolist()
-    return np.concatenate([_resize(image, height, width) for image in images], axis=1)
-
-
-def with_text(image: np.ndarray, text: str) -> np.ndarray:
-    """Draw one line of text at the top of an image."""
-    from PIL import Image, ImageDraw
-
-    canvas = Image.fromarray(image)
-    black_on_white = {"fill": (0, 0, 0), "stroke_width": 1, "stroke_fill": (255, 255, 255)}
-    ImageDraw.Draw(canvas).text((2, 0), text, **black_on_white)
-    return np.asarray(canvas)
+    size, method = (width, height), Image.Resampling.BILINEAR
+    return np.concatenate([Image.fromarray(x).resize(size, method) for x in images], axis=1)
 
 
 def read(path: str | os.PathLike) -> np.ndarray:
@@ -101,32 +83,6 @@ def write(path: str | os.PathLike, image: np.ndarray) -> None:
     from PIL import Image
 
     _save(path, Image.fromarray(image), **_PNG_OPTIONS)
-
-
-def write_video(path: str, frames: list[Path], *, fps: int) -> None:
-    """Write the images as an mp4 (H.264, yuv420p, index first; scaled to an even size) or gif;
-    raise UserError if the disk is full, or there is no ffmpeg.
-    """
-    if path.endswith(".gif"):
-        write_animation(path, frames, None, len(frames) / fps)
-        return
-    part = Path(path).with_name(f".part-{Path(path).name}")
-    try:
-        from imageio_ffmpeg import get_ffmpeg_exe
-
-        command = [get_ffmpeg_exe(), "-v", "error", "-xerror", "-y", "-framerate", str(fps)]
-        command += ["-i", "-", *_MP4_OPTIONS, str(part.absolute())]
-        pictures = b"".join(frame.read_bytes() for frame in frames)
-        subprocess.run(command, input=pictures, capture_output=True, check=True)
-        os.replace(part, path)
-    except ImportError as error:
-        raise UserError(f"the video {path} needs ffmpeg: pip install imageio-ffmpeg") from error
-    except (OSError, RuntimeError, subprocess.CalledProcessError) as error:
-        said = getattr(error, "stderr", b"").decode(errors="replace").strip() or str(error)
-        why = said.splitlines()[0]
-        raise UserError(f"the video {path} could not be written: {why}") from error
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def write_animation(
@@ -149,8 +105,7 @@ def _save(path: str | os.PathLike, image: Any, **options: Any) -> None:
 
     content = io.BytesIO()
     image.save(content, Image.registered_extensions()[Path(path).suffix.lower()], **options)
-    with atomic_file(path, durable=False) as file:
-        file.write(content.getvalue())
+    write_file(path, content.getvalue(), durable=False)
 
 
 def _normalize(image: np.ndarray, data_range: tuple[float, float]) -> np.ndarray:
@@ -161,11 +116,3 @@ def _normalize(image: np.ndarray, data_range: tuple[float, float]) -> np.ndarray
 
 def _to_bytes(values: np.ndarray) -> np.ndarray:
     return (values * 255).round().astype(np.uint8)
-
-
-def _resize(image: np.ndarray, height: int, width: int) -> np.ndarray:
-    if image.shape[:2] == (height, width):
-        return image
-    from PIL import Image
-
-    return np.asarray(Image.fromarray(image).resize((width, height), Image.Resampling.BILINEAR))

@@ -3,14 +3,12 @@
 import inspect
 from typing import Any
 
-from .errors import UserError
+from ..core.errors import UserError
 
 
 def find_method(owner: type, name: str) -> Any:
-    """Return what a class or its bases define under a name; None if nothing, if it is abstract, or
-    if it is the ``forward`` with which ``nn.Module`` says that there is none.
-
-    Unlike ``getattr``, this doesn't find ``__call__`` of the metaclass.
+    """Return what a class or its bases define under a name, but not its metaclass; None if nothing,
+    if it is abstract, or if it is the ``forward`` with which ``nn.Module`` says that there is none.
     """
     found = next((vars(base)[name] for base in owner.__mro__ if name in vars(base)), None)
     is_missing = getattr(found, "__name__", "") == "_forward_unimplemented"

@@ -6,7 +6,7 @@ from abc import abstractmethod
 import pytest
 
 from threestudio_gaussiandreamer.core.errors import UserError
-from threestudio_gaussiandreamer.core.methods import (
+from threestudio_gaussiandreamer.host.methods import (
     find_method,
     require_class_method,
     require_method,
