@@ -33,7 +33,7 @@ from benchmarks.quality.toybox_jobs import (
     setup_of_samples,
 )
 from benchmarks.quality.toybox_options import BALL
-from threestudio_gaussiandreamer.core import images
+from threestudio_gaussiandreamer import images
 
 CHARTS = "avatars", "avatars_gpu"
 CONFIG = "toybox-avatar.yaml"
