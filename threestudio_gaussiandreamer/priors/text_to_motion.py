@@ -22,6 +22,7 @@ from ..core.errors import UserError
 from ..core.files import existing_file
 from ..formats.array_files import read_arrays
 from ..models.model_files import load_exactly, read_state_dict
+from .body_pose import BODY_JOINTS, PARENTS
 from .karras import cosine_alphas_cumprod
 
 FEATURES, HEADS, POSITIONS = 263, 4, 5000
@@ -76,6 +77,7 @@ class TextToMotion(NamedTuple):
     network: MotionModel
     steps: int
     """Timesteps of its training."""
+    guidance_scale: float
     mean: Float[np.ndarray, "263"]
     std: Float[np.ndarray, "263"]
     known: list[str]
@@ -89,7 +91,7 @@ def load_motion_model(path: str) -> TextToMotion:
         UserError: a file is missing or damaged, or the model is of another kind.
     """
     file = existing_file(path, KIND)
-    steps, state = _timesteps(file), read_state_dict(path, KIND)
+    (steps, guidance), state = _settings(file), read_state_dict(path, KIND)
     state = {name: value for name, value in state.items() if not IGNORED.search(name)}
     layers = len({n.split(".")[2] for n in state if n.startswith("seqTransEncoder.layers.")})
     first = state.get("input_process.poseEmbedding.weight", torch.zeros(0, 0))
@@ -106,14 +108,15 @@ def load_motion_model(path: str) -> TextToMotion:
     actions = file.parent / ACTIONS
     known = actions.read_text(encoding="utf-8").splitlines() if actions.is_file() else []
     network.eval().requires_grad_(False)
-    return TextToMotion(network, steps, *_statistics(file.parent), known)
+    return TextToMotion(network, steps, guidance, *_statistics(file.parent), known)
 
 
-def _timesteps(file: Path) -> int:
+def _settings(file: Path) -> tuple[int, float]:
     path = existing_file(file.parent / "args.json", "settings of the MDM checkpoint")
     try:
         args = json.loads(path.read_text(encoding="utf-8"))
         steps = int(args.get("diffusion_steps", 1000))
+        guidance = float(args.get("guidance_param", GUIDANCE_SCALE))
     except (ValueError, TypeError, AttributeError) as error:
         raise UserError(f"settings of the MDM checkpoint {str(path)!r} are damaged") from error
     for name, value in SUPPORTED.items():
@@ -121,7 +124,7 @@ def _timesteps(file: Path) -> int:
             raise UserError(f"{str(path)!r}: {name} is {args[name]!r}; only {value!r} is supported")
     if not 2 <= steps <= POSITIONS:
         raise UserError(f"{str(path)!r}: diffusion_steps is {steps}; expected 2 to {POSITIONS}")
-    return steps
+    return steps, guidance
 
 
 def _statistics(folder: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -159,7 +162,7 @@ def sample_motions(
     for i in range(len(kept) - 1, -1, -1):
         t = torch.full((2 * count,), int(kept[i]), device=device)
         given, none = network(torch.cat([x, x]), t, both).chunk(2)
-        clean = none + GUIDANCE_SCALE * (given - none)
+        clean = none + model.guidance_scale * (given - none)
         before = abar[i - 1] if i else 1.0
         beta = 1 - abar[i] / before
         # the mean and the variance of q(z before | z now, clean)
@@ -169,7 +172,19 @@ def sample_motions(
         if i:
             fresh = torch.randn(shape, generator=generator).to(device)
             x = x + math.sqrt(beta * (1 - before) / (1 - abar[i])) * fresh
-    return positions_of(x.double().cpu().numpy() * model.std + model.mean)
+    return rigid(positions_of(x.double().cpu().numpy() * model.std + model.mean))
+
+
+def rigid(positions: Float[np.ndarray, "S T 22 3"]) -> Float[np.ndarray, "S T 22 3"]:
+    """Give each bone its mean length over the motion, in the direction it has in each frame."""
+    found = positions.copy()
+    for joint, parent in enumerate(PARENTS[1:BODY_JOINTS], 1):
+        bone = positions[..., joint, :] - positions[..., parent, :]
+        length = np.linalg.norm(bone, axis=-1, keepdims=True)
+        found[..., joint, :] = found[..., parent, :] + bone * (
+            length.mean(1, keepdims=True) / length
+        )
+    return found
 
 
 def positions_of(features: Float[np.ndarray, "S T 263"]) -> Float[np.ndarray, "S T 22 3"]:
@@ -197,7 +212,7 @@ def mdm_files(network: MotionModel, steps: int) -> tuple[Mapping[str, Tensor], d
     """Return the state dict and the settings as MDM's authors publish them."""
     width, layers = network.embed_text.out_features, network.seqTransEncoder.layers
     sizes = {"latent_dim": width, "layers": len(layers), "ff_size": layers[0].linear1.out_features}
-    others = {"cond_mask_prob": 0.1, "emb_trans_dec": False, "sigma_small": True}
+    others = {"cond_mask_prob": 0.1, "emb_trans_dec": False, "guidance_param": 1.0}
     places = ("sequence_pos_encoder.pe", "embed_timestep.sequence_pos_encoder.pe")
     state = network.state_dict() | dict.fromkeys(places, torch.zeros(1, 1, width))
     return state, SUPPORTED | sizes | {"diffusion_steps": steps} | others
