@@ -3,7 +3,7 @@
     python -m tests.lowest                 # of the base and of the extra test
     python -m tests.lowest diffusion mesh  # and of these extras
 
-torch keeps the version of constraints.txt: its older builds come with 3 GB of CUDA only.
+torch keeps the version of constraints.txt: its older builds come only with CUDA, about 3 GB.
 """
 
 import re

@@ -89,8 +89,8 @@ def test_the_life_of_a_farm_below_a_url(url, memory, request, machine):
     first, second = machine("one", url), pickle.loads(pickle.dumps(machine("other", url)))
     folder = made(first)
     first.keep_checkpoint(FOX, False)
-    states = [record for _, record in second.records([FOX, CAT])]
-    assert states == [{"state": module.RUNNING}, {"state": WAITING}]
+    found = list(second.records([FOX, CAT]))
+    assert found == [(FOX, {"state": module.RUNNING}), (CAT, {"state": WAITING})]
     second.fetch_checkpoint(FOX, False)
     assert (second.work_folder(FOX) / "ckpts/fetched.ckpt").read_text() == "ckpts/last.ckpt"
     other = FOX._replace(prompt="another")

@@ -74,11 +74,8 @@ def test_every_generator_is_among_the_exports_and_others_have_axes_or_are_refuse
     found = producers.from_producer(raw, "supersplat", ".spz").gaussians.means
     np.testing.assert_allclose(found, raw.gaussians.means * [1, -1, -1], atol=1e-6)
     for name, up in (("3dgs", "-y"), ("lgm", "y"), ("nerfstudio", "z")):
-        np.testing.assert_allclose(
-            producers.to_y_up(producers.producer_axes(name, producers.GAUSSIANS)),
-            AXES[up],
-            atol=1e-12,
-        )
+        axes = producers.producer_axes(name, producers.GAUSSIANS)
+        np.testing.assert_allclose(producers.to_y_up(axes), AXES[up], atol=1e-12)
 
 
 @pytest.mark.parametrize("name", producers.producers_of(producers.GAUSSIANS))

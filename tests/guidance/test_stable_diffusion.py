@@ -113,7 +113,7 @@ def test_slicing_keeps_the_activations_of_one_image(models):
         kept.clear()
         guide = guidance(models, enable_vae_slicing=slicing)
         guide.vae.encoder = recorder = Recorder(guide.vae.encoder)
-        hooks = lambda tensor: kept.append(tensor.numel()) or tensor, lambda tensor: tensor
+        hooks = (lambda tensor: kept.append(tensor.numel()) or tensor), (lambda tensor: tensor)
         with torch.autograd.graph.saved_tensors_hooks(*hooks):
             guide.encode(renders().movedim(-1, 1))
         assert [len(args[0]) for args, _ in recorder.calls] == passes

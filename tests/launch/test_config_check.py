@@ -161,8 +161,9 @@ def test_no_option_of_any_part_ends_in_a_traceback(name):
                 assert not (single and wrong), f"{name}.{option.name} takes {value!r}"
 
 
-BASES = {"Uncallable": BaseObject, "NoForward": BaseModule, "Unfinished": BaseBackground}
-Uncallable, NoForward, Unfinished = (type(name, (BASES[name],), {}) for name in BASES)
+Uncallable = type("Uncallable", (BaseObject,), {})
+NoForward = type("NoForward", (BaseModule,), {})
+Unfinished = type("Unfinished", (BaseBackground,), {})
 
 
 class NoArgument(BaseObject):
@@ -312,7 +313,7 @@ def test_options_of_different_sections(names, overrides, message):
     ("overrides", "message"),
     [
         (["batch_size=4"], "data.batch_size is 4, no multiple of the 3 processes"),
-        (["batch_size=[6,2]", "resolution_milestones=[9]"], "is 2, fewer than the 3 processes"),
+        (["batch_size=[6,2]", "resolution_milestones=[9]"], "batch_size is 2, fewer than the 3"),
     ],
 )
 def test_processes_that_cant_share_the_views_are_found_before_they_start(overrides, message):

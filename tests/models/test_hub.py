@@ -125,8 +125,7 @@ def test_a_folder_needs_no_network_and_near_ones_are_named(model, monkeypatch, t
     monkeypatch.chdir(tmp_path)
     with pytest.raises(UserError, match=r"The folder 'models' has no 'tini' \(near: models/tiny\)"):
         hub.find_model("models/tini", IMAGE)
-    asked = lambda *args, **kwargs: pytest.fail("asked the network")  # noqa: E731
-    monkeypatch.setattr(socket, "getaddrinfo", asked)
+    monkeypatch.setattr(socket, "getaddrinfo", lambda *_, **__: pytest.fail("asked the network"))
     assert hub.find_model(str(model), (*TEXT, *IMAGE)) == model
 
 

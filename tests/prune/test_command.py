@@ -294,9 +294,8 @@ def test_the_psnr_that_loses_a_tenth_of_a_decibel():
 def test_sizes_and_decibels_are_read_with_their_units():
     sizes = {"500kB": 500_000, " 2 MB ": 2_000_000, "1.5g": 1_500_000_000, 7: 7}
     assert [budgets.parse_bytes(text, "bytes") for text in sizes] == [*sizes.values()]
-    assert {
-        budgets.parse_number(text, "psnr", "dB") for text in ("40", " 40dB ", "40 db", 40.0)
-    } == {40.0}
+    for text in ("40", " 40dB ", "40 db", 40.0):
+        assert budgets.parse_number(text, "psnr", "dB") == 40.0
 
 
 @pytest.mark.parametrize(
@@ -323,10 +322,8 @@ def test_a_budget_that_is_none_is_named(given, said):
 
 def test_a_gain_is_a_budget():
     assert budgets.budget_of(PruneOptions(auto="0.25dB"), "--")[-2:] == (0.25, pytest.approx(1e-4))
-    assert budgets.budget_of(PruneOptions(auto=1, quality=30.0), "--")[-2:] == (
-        1.0,
-        pytest.approx(1e-3),
-    )
+    found = budgets.budget_of(PruneOptions(auto=1, quality=30.0), "--")[-2:]
+    assert found == (1.0, pytest.approx(1e-3))
     for words in ("--auto in.ply out.ply", "in.ply out.ply --auto"):
         assert command.parse(words.split()).auto == "0.5"
     assert command.parse("in.ply --auto 1dB o".split()).auto == "1dB"

@@ -114,10 +114,8 @@ def test_backward_frees_its_memory_and_threads_may_draw_at_once(monkeypatch):
     """With the saved tensors, not with the graph's last tensor."""
     states, create = weakref.WeakSet(), cpu._State
     monkeypatch.setattr(cpu, "_State", lambda *x: states.add(state := create(*x)) or state)
-    cloud, camera = (
-        scenes.random_cloud(30).to(torch.float32),
-        scenes.cameras(1, 12, 12, dtype=torch.float32),
-    )
+    cloud = scenes.random_cloud(30).to(torch.float32)
+    camera = scenes.cameras(1, 12, 12, dtype=torch.float32)
     out = scenes.rasterize(*cloud.leaves(), *camera, 12, 12, backend="cpu")
     assert len(states) == 1
     out.image.sum().backward()

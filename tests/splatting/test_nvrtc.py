@@ -32,8 +32,8 @@ def cache(monkeypatch, tmp_path):
 
 @pytest.fixture
 def compiled(monkeypatch):
-    units, compiled = [], nvrtc.compile_unit
-    monkeypatch.setattr(nvrtc, "compile_unit", lambda *a: units.append(a[0]) or compiled(*a))
+    units, original = [], nvrtc.compile_unit
+    monkeypatch.setattr(nvrtc, "compile_unit", lambda *a: units.append(a[0]) or original(*a))
     return units
 
 
@@ -44,8 +44,8 @@ def units():
 def properties(log: str) -> dict[str, list[int]]:
     """Return registers, shared bytes, spilled bytes and stack of each kernel."""
     entry = r"Compiling entry function '(\w+)'(.*?)(?=Compiling entry function|\Z)"
-    numbers = [rf"(\d+) bytes {name}" for name in ("smem", "spill", "stack")]
-    numbers = [r"Used (\d+) registers", *numbers]
+    numbers = [r"Used (\d+) registers"]
+    numbers += [rf"(\d+) bytes {name}" for name in ("smem", "spill", "stack")]
     return {
         name: [sum(map(int, re.findall(pattern, text))) for pattern in numbers]
         for name, text in re.findall(entry, log, re.DOTALL)

@@ -99,10 +99,8 @@ def test_downsampling_is_the_mean_of_boxes_and_radii_bound_what_is_drawn():
 
 def test_means2d_gradient_is_per_view_in_pixels_and_absgrad_adds_up_absolute_values():
     """Shifting the principal point of a view shifts its means2d and nothing else."""
-    cloud, (viewmats, Ks) = (
-        scenes.random_cloud(20, seed=9, size=0.1),
-        scenes.cameras(2, 12, 10, distance=6.0),
-    )
+    cloud = scenes.random_cloud(20, seed=9, size=0.1)
+    viewmats, Ks = scenes.cameras(2, 12, 10, distance=6.0)
     grads = scenes.run(cloud, viewmats, Ks, 12, 10, downsample=2, **TRUTH).grads["means2d"]
 
     def loss(Ks):

@@ -118,7 +118,7 @@ def test_blocks_and_saved_tensors_are_bounded(monkeypatch, recorded):
     cloud, camera = random_cloud(400, seed=8, size=1.0), cameras(1, 64, 64)
     saved, blocks = [], recorded(torch_backend, "_block")
     monkeypatch.setattr(torch_backend, "ELEMENTS_PER_BLOCK", 2**14)
-    hooks = lambda x: saved.append(x.numel()) or x, lambda x: x
+    hooks = (lambda x: saved.append(x.numel()) or x), (lambda x: x)
     with torch.autograd.graph.saved_tensors_hooks(*hooks):
         out = rasterize(*cloud.leaves(), *camera, 64, 64, backend="torch")
     out.image.sum().backward()

@@ -526,8 +526,7 @@ def test_empty_views(backend, measured):
 def test_any_size_is_a_crop_of_a_larger_one(backend, width, height, measured):
     """1e-6 is below the rounding of positions: a coordinate of 40 pixels has a float32 spacing of
     4e-6 pixels. A Gaussian one pixel wide changes by 0.6 of its opacity per pixel, 2e-6, and
-    several overlap at each pixel; in float64 the crop is exact to 1e-12
-    (test_splatting_reference.py).
+    several overlap at each pixel; in float64 the crop is exact to 1e-12.
 
     The principal point moves the window. All means are inside it: beyond 1.3 of the half-width the
     Jacobian is clamped by each image's own size, so a crop would differ there.
@@ -544,6 +543,10 @@ def test_any_size_is_a_crop_of_a_larger_one(backend, width, height, measured):
     large = draw(backend, cloud, (viewmats, moved), width + 16, height + 11, BACKGROUND).out
     window = large.image[:, 5 : 5 + height, 9 : 9 + width]
     measured((small.image - window).abs().max(), what="crop", at_most=5e-6)
+    if backend in EXACT:
+        large = rasterize(*cloud, viewmats, moved, width + 16, height + 11, backend=backend).image
+        small = rasterize(*cloud, viewmats, Ks, width, height, backend=backend).image
+        assert (small - large[:, 5 : 5 + height, 9 : 9 + width]).abs().max() < 1e-12
 
 
 @row("A1", "Tiny, non-square, non-multiple of tile")

@@ -26,7 +26,7 @@ def test_one_number_that_is_not_finite_is_named(value):
         (["system.geometry.lr_scales=20", *length(3)], (".log_scales are beyond 30", "lr_*")),
     ],
 )
-def test_a_run_of_nan_saves_nothing(tmp_path, painted_box, monkeypatch, capsys, options, said):
+def test_a_diverged_run_saves_nothing(tmp_path, painted_box, monkeypatch, capsys, options, said):
     monkeypatch.setattr(finite, "CHECK_EVERY", 4)
     assert launch(tmp_path, painted_box, *options, "system.pages=false") == 2
     errors = capsys.readouterr().err
