@@ -10,7 +10,6 @@ import pytest
 from tests.helpers.gallery import assert_same_training
 from tests.view.clouds import cloud
 from threestudio_gaussiandreamer.launch import live_viewer
-from threestudio_gaussiandreamer.launch.live_viewer import LiveViewer
 
 
 class Buttons:
@@ -51,7 +50,8 @@ def test_the_training_is_the_same_with_a_viewer(launch_demo, view, tmp_path, mon
     monkeypatch.setattr(Buttons, "pausing", True)
     run = ["use_timestamp=false", "trainer.max_steps=4"]
     assert launch_demo(*run, "tag=off")[0] == 0
-    monkeypatch.setattr(live_viewer, "SECONDS_BETWEEN", 0.03)
+    monkeypatch.setattr(live_viewer, "SECONDS_BETWEEN", 0.0)
+    monkeypatch.setattr(live_viewer, "SHARE_OF_TIME", float("inf"))  # also if all is slow
     shown = ["viewer.enabled=true", "viewer.updates_per_second=30", "viewer.keep_serving=false"]
     code, err = launch_demo(*run, *shown, "tag=on")
     assert code == 0 and "viewer.updates_per_second is no option any more" in err
@@ -66,7 +66,7 @@ def test_the_training_is_the_same_with_a_viewer(launch_demo, view, tmp_path, mon
 @pytest.fixture
 def viewer(monkeypatch):
     """A viewer at the start of a training, its trainer, its system and a clock."""
-    made = LiveViewer(Mock(watched=True), lambda: False)
+    made = live_viewer.LiveViewer(Mock(watched=True), lambda: False)
     geometry = SimpleNamespace(**cloud(10).gaussians._asdict())
     trainer = SimpleNamespace(global_step=3, callback_metrics={"dB": 20.04})
     made.controls = Buttons(made.view)
