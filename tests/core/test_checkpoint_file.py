@@ -12,7 +12,6 @@ from threestudio_gaussiandreamer.core.checkpoint_file import (
     load_checkpoint,
     load_file,
     newest_readable,
-    previous_of,
     save_file,
 )
 from threestudio_gaussiandreamer.core.errors import UserError
@@ -40,14 +39,13 @@ def test_plain_torch_and_this_package_read_each_others_files(tmp_path):
 
 
 def test_the_file_that_is_replaced_is_kept(tmp_path):
-    path = tmp_path / "last.ckpt"
+    path, kept = tmp_path / "last.ckpt", tmp_path / "last-prev.ckpt"
     for step in (1, 2, 3):
         save_file(path, content(step))
-    assert previous_of(path).name == "last-prev.ckpt"
-    assert [load_file(p)["global_step"] for p in (path, previous_of(path))] == [3, 2]
+    assert [load_file(p)["global_step"] for p in (path, kept)] == [3, 2]
     # after a kill between keeping and replacing both are hard links to one file
-    previous_of(path).unlink()
-    os.link(path, previous_of(path))
+    kept.unlink()
+    os.link(path, kept)
     for name in (".last.ckpt.1-2.tmp", ".of another.ckpt.1-2.tmp"):
         (tmp_path / name).touch()
     save_file(path, content(4))
@@ -56,7 +54,7 @@ def test_the_file_that_is_replaced_is_kept(tmp_path):
     (tmp_path / f".{100 * 'a'}.1-2.tmp").touch()  # names of temporary files are cut
     save_file(tmp_path / f"{120 * 'a'}.ckpt", content(4))
     assert not (tmp_path / f".{100 * 'a'}.1-2.tmp").exists()
-    assert [load_file(p)["global_step"] for p in (path, previous_of(path))] == [4, 3]
+    assert [load_file(p)["global_step"] for p in (path, kept)] == [4, 3]
 
 
 @pytest.mark.parametrize("own", [True, False])

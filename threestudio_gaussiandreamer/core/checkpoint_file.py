@@ -100,12 +100,6 @@ def _require_stored(content: Any, size: int) -> None:
             _require_stored(item, size)
 
 
-def previous_of(path: str | os.PathLike) -> Path:
-    """Return the path at which :func:`save_file` keeps the file that it replaces."""
-    path = Path(path)
-    return path.with_name(f"{path.stem}-prev{path.suffix}")
-
-
 def newest_readable(folder: str | os.PathLike) -> Optional[tuple[Path, int]]:
     """Return the intact checkpoint of a folder with the highest step, ``last.ckpt`` among equal
     ones, and that step; None if there is none. Damaged files are reported in the log.
@@ -160,7 +154,7 @@ def load_checkpoint(path: str | os.PathLike, map_location: Any = "cpu") -> dict:
 
 
 def _keep_previous(path: Path) -> None:
-    kept = previous_of(path)
+    kept = path.with_name(f"{path.stem}-prev{path.suffix}")
     # both names are hard links to one file where the last save was killed after os.replace below,
     # and renaming one of them to the other would do nothing
     if not path.exists() or kept.exists() and kept.samefile(path):

@@ -95,12 +95,14 @@ def joined_values(
     """Join each of these options by ``=`` to the value behind it, which argparse would take for an
     option if it begins with a hyphen; ``argv`` None means the arguments of this process.
     """
-    words = list(sys.argv[1:] if argv is None else argv)
-    for i in range(len(words) - 1, 0, -1):
+    joined: list[str] = []
+    for word in sys.argv[1:] if argv is None else argv:
         # a wrong "-z" too, so that it is a wrong value and no missing one
-        if words[i - 1] in options and {words[i], words[i].lstrip("-")} & {*values}:
-            words[i - 1 : i + 1] = [f"{words[i - 1]}={words[i]}"]
-    return words
+        if joined and joined[-1] in options and {word, word.lstrip("-")} & {*values}:
+            joined[-1] += f"={word}"
+        else:
+            joined.append(word)
+    return joined
 
 
 # -- signals ---------------------------------------------------------------------------------------
@@ -164,12 +166,15 @@ class Tolerant:
 
     def write(self, text: str) -> int:
         encoding = getattr(self.stream, "encoding", None) or "utf-8"
-        self.flush(text.encode(encoding, "backslashreplace").decode(encoding))
+        self._try(self.stream.write, text.encode(encoding, "backslashreplace").decode(encoding))
         return len(text)
 
-    def flush(self, text: str = "") -> None:
+    def flush(self) -> None:
+        self._try(self.stream.flush)
+
+    def _try(self, call: Callable, *arguments: Any) -> None:
         try:
-            self.stream.write(text) if text else self.stream.flush()
+            call(*arguments)
         except BrokenPipeError:
             raise
         except OSError as error:

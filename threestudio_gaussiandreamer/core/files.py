@@ -156,7 +156,9 @@ def require_other_file(
 
 def is_folder(path: str | os.PathLike) -> bool:
     """Return whether ``path`` is an existing folder; False for what can't be a file's name."""
-    return os.path.isdir(os.path.expanduser(path))
+    with suppress(ValueError):
+        return os.path.isdir(os.path.expanduser(path))
+    return False
 
 
 def output_folder(path: str | os.PathLike, option: str, files: Collection[str] = ()) -> Path:

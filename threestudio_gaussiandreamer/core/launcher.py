@@ -59,12 +59,8 @@ def _wrong(name: str, said: str, unset: str) -> UserError:
 
 def many_tasks(environment: Mapping[str, str] = os.environ) -> bool:
     """Return whether SLURM has several tasks for this run, and isn't an interactive shell."""
-    return int(environment.get("SLURM_NTASKS", 1)) > 1 and not is_shell(environment)
-
-
-def is_shell(environment: Mapping[str, str] = os.environ) -> bool:
-    """Return whether this is a shell that SLURM has opened, as ``salloc`` does."""
-    return environment.get("SLURM_JOB_NAME") in ("bash", "interactive")
+    is_shell = environment.get("SLURM_JOB_NAME") in ("bash", "interactive")  # as salloc opens
+    return int(environment.get("SLURM_NTASKS", 1)) > 1 and not is_shell
 
 
 def train_alone() -> None:

@@ -219,7 +219,7 @@ def evaluate(
     total = _mean_and_spread(np.mean(scores, axis=0))
     about = {"clip": clip_folder, "unit": "100 * cosine", "protocol": protocol._asdict()}
     text = json_text({**about, **total, "results": each}, indent=2, ensure_ascii=False)
-    write_file(output / "clip.json", text)  # paths may hold invalid UTF-8
+    write_file(output / "clip.json", text)
     write_image(output / "clip.png", np.concatenate(rows, axis=0))
     spread = total["std"] and f" +- {total['std']:.2f} over {len(protocol.seeds)} seeds"
     print(f"{total['mean']:6.2f}{spread or ''}: {output / 'clip.json'}, {output / 'clip.png'}")

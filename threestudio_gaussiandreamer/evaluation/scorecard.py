@@ -208,7 +208,7 @@ def write(output: Path, rows: Rows, content: dict[str, Any]) -> None:
     writer.writeheader()
     writer.writerows(rows)
     for name, body in zip(FILES, (text.getvalue(), json_text(content, indent=2)), strict=True):
-        write_file(output / name, body)  # paths may hold invalid UTF-8
+        write_file(output / name, body)
 
 
 def table(content: dict[str, Any]) -> list[str]:

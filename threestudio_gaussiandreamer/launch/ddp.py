@@ -90,7 +90,7 @@ def trainer_options(processes: Processes) -> dict[str, Any]:
     """
     options: dict[str, Any] = {"devices": processes.devices, "num_nodes": processes.nodes}
     tasks, alone = os.environ.get("SLURM_NTASKS", "1"), processes.started_by is None
-    if launcher.is_shell() and alone and int(tasks) > processes.total:
+    if alone and int(tasks) > processes.total:  # else ``many_tasks`` would have counted them
         warn(
             f"SLURM has {tasks} tasks, which a shell (SLURM_JOB_NAME="
             f"{os.environ['SLURM_JOB_NAME']}) doesn't start: the number of processes that train "

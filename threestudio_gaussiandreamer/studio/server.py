@@ -114,8 +114,8 @@ class Studio:
         from websockets.datastructures import Headers
         from websockets.http11 import Response
 
-        found = self.answer(unquote(urlsplit(request.path).path))
-        if found is None or "Upgrade" in request.headers:
+        path = unquote(urlsplit(request.path).path)
+        if "Upgrade" in request.headers or (found := self.answer(path)) is None:
             return None
         headers = {"Content-Length": str(len(found[0])), "Cache-Control": "no-cache"}
         return Response(http.HTTPStatus.OK, "OK", Headers(**headers, **found[1]), found[0])

@@ -14,7 +14,7 @@ import torch.nn.functional as F
 
 from .. import images
 from ..core.command import run_command
-from ..core.files import atomic_file, json_text
+from ..core.files import atomic_file, json_text, write_file
 from ..diffusion import sds
 from ..guidance.base import ScoreDistillation
 from ..guidance.types import items_of
@@ -94,8 +94,8 @@ class Snapshots(pl.Callback):
 
     def write(self, **status: Any) -> None:
         self.status |= status
-        with NOT_FATAL, atomic_file(self.folder / "status.json", durable=False) as file:
-            file.write(json_text(self.status).encode())
+        with NOT_FATAL:
+            write_file(self.folder / "status.json", json_text(self.status), durable=False)
 
 
 def main() -> int:
