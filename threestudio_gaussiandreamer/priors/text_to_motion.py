@@ -181,9 +181,8 @@ def rigid(positions: Float[np.ndarray, "S T 22 3"]) -> Float[np.ndarray, "S T 22
     for joint, parent in enumerate(PARENTS[1:BODY_JOINTS], 1):
         bone = positions[..., joint, :] - positions[..., parent, :]
         length = np.linalg.norm(bone, axis=-1, keepdims=True)
-        found[..., joint, :] = found[..., parent, :] + bone * (
-            length.mean(1, keepdims=True) / length
-        )
+        bone *= length.mean(1, keepdims=True) / length
+        found[..., joint, :] = found[..., parent, :] + bone
     return found
 
 

@@ -90,21 +90,10 @@ class AutoencoderStage(Stage):
 
 
 def rough_render(shard: Shard, row: int, rng: np.random.Generator) -> UInt8[np.ndarray, "s s 4"]:
-    """Render the object of picture ``row`` as a few hundred half-transparent Gaussians."""
+    """Render the object of picture ``row`` as Gaussians at points on its surface, of a random
+    number, size, opacity and error of place and colour."""
     views = len(shard.rgba) // len(shard.points)
-    gaussians = rough_gaussians(shard.points[row // views].astype(np.float32), rng)
-    angles = (shard.elevation[row], shard.azimuth[row], np.mean(DISTANCE), math.radians(FOVY_DEG))
-    orbit = Orbit(*(torch.tensor([float(value)]) for value in angles))
-    (rgba,) = render_gaussians(gaussians, orbit, eps2d=0.3)
-    return (rgba * 255).round().astype(np.uint8)
-
-
-def rough_gaussians(
-    points: Float[np.ndarray, "P 6"], rng: np.random.Generator
-) -> tuple[np.ndarray, ...]:
-    """Make Gaussians, the first arguments of ``rasterize``, of a random number, size, opacity and
-    error of place and colour from places on a surface and their colours."""
-    points = points[: int(rng.integers(200, 1000))]
+    points = shard.points[row // views].astype(np.float32)[: int(rng.integers(200, 1000))]
     count = len(points)
     grey = rng.uniform(0, 1)
     colors = grey * 0.5 + (1 - grey) * points[:, 3:]
@@ -112,4 +101,8 @@ def rough_gaussians(
     means = points[:, :3] + rng.normal(0, rng.uniform(0, 0.08), (count, 3))
     scales = rng.uniform(0.01, 0.06) * rng.uniform(0.6, 1.6, (count, 3))
     opacities = rng.uniform(0.1, 0.9) * rng.uniform(0.6, 1, count)
-    return means, rng.normal(size=(count, 4)), scales, opacities, colors
+    gaussians = means, rng.normal(size=(count, 4)), scales, opacities, colors
+    angles = (shard.elevation[row], shard.azimuth[row], np.mean(DISTANCE), math.radians(FOVY_DEG))
+    orbit = Orbit(*(torch.tensor([float(value)]) for value in angles))
+    (rgba,) = render_gaussians(gaussians, orbit, eps2d=0.3)
+    return (rgba * 255).round().astype(np.uint8)

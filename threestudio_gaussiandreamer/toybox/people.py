@@ -1,8 +1,7 @@
 """The toybox's person: clothes, hair and face around the joints of a pose, in the kinds' axes.
 
 Roles beside those of ``kinds.py``: "body" is the shirt, "part" the trousers; "skin", "tan" and
-"hair" are fixed details. Hair and a cape are at the back, the face, a belt's buckle and buttons in
-front.
+"hair" are fixed details. Hair and a cape are at the back; face, buckle and buttons in front.
 """
 
 from typing import NamedTuple
@@ -11,7 +10,6 @@ import numpy as np
 from jaxtyping import Float
 
 from ..priors.body_pose import INDEX, SIDES, Z_UP
-from . import motions
 from .kinds import Anchors, Model, Proportions
 from .shapes import Shape, box, ellipsoid, limb
 
@@ -27,7 +25,10 @@ class Trunk(NamedTuple):
 def person(p: Proportions, joints: Float[np.ndarray, "22 3"]) -> Model:
     """Dress a pose (y up, looking along +z)."""
     at = {name: joints[index][Z_UP] for name, index in INDEX.items()}
-    trunk = trunk_axes(at)
+    up = unit(at["neck"] - at["lower spine"])
+    left = at["left shoulder"] - at["right shoulder"]
+    left = unit(left - up * (left @ up))
+    trunk = Trunk(np.cross(left, up), left, up)
     chest = (at["middle spine"] + 2 * at["upper spine"] + at["neck"]) / 4
     skin = "skin" if p.chance(0.6) else "tan"
     shapes = [*upper_body(at, chest, trunk, p), *lower_body(at, trunk, p)]
@@ -37,13 +38,6 @@ def person(p: Proportions, joints: Float[np.ndarray, "22 3"]) -> Model:
     head, top = head_shapes(at, trunk, skin, p)
     neck, cape = tuple(at["neck"] + 0.02 * trunk.up), (cape_shape(chest, trunk, p),)
     return [*shapes, *head], Anchors(tuple(top), 0.14, neck, (0.1, 0.1), cape=cape)
-
-
-def trunk_axes(at: dict[str, np.ndarray]) -> Trunk:
-    up = unit(at["neck"] - at["lower spine"])
-    left = at["left shoulder"] - at["right shoulder"]
-    left = unit(left - up * (left @ up))
-    return Trunk(np.cross(left, up), left, up)
 
 
 def unit(vector: np.ndarray) -> np.ndarray:
@@ -144,9 +138,3 @@ def oriented(role: str, center, radii, trunk: Trunk) -> Shape:
 
 def turned(shape: Shape, axes: Float[np.ndarray, "3 3"], center) -> Shape:
     return shape._replace(vertices=shape.vertices @ axes + center, normals=shape.normals @ axes)
-
-
-def posed_person(p: Proportions, action: str, rng: np.random.Generator) -> Model:
-    """Make a person in a frame that shows this action (:func:`motions.names`)."""
-    motion = motions.draw(action, rng)
-    return person(p, motion.positions[motion.best])

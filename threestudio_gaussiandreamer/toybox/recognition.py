@@ -16,11 +16,10 @@ multi_face   share of the views that the judge takes for views from another quad
 ===========  ===================================================================================
 """
 
-import functools
 import math
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from ..cameras import Orbit
@@ -102,19 +101,14 @@ def most_probable_pattern(found: dict[str, Tensor]) -> tuple[str, str, str]:
 
     The probability of a combination is the product of the three, averaged over the views."""
     pattern, color, second = (found[name].mean(dim=0) for name in ("pattern", "color", "second"))
-    joint = pattern[:, None, None] * color[:, None] * second * _possible()
+    plain = torch.tensor([[[name == "plain"]] for name in LABELS["pattern"]])
+    none = torch.tensor([name == "none" for name in LABELS["second"]])
+    different = torch.tensor([[a != b for b in LABELS["second"]] for a in LABELS["color"]])
+    possible = (plain == none) & different
+    joint = pattern[:, None, None] * color[:, None] * second * possible
     chosen = int(joint.sum(dim=(1, 2)).argmax())
     first, other = divmod(int(joint[chosen].argmax()), len(second))
     return LABELS["pattern"][chosen], LABELS["color"][first], LABELS["second"][other]
-
-
-@functools.cache
-def _possible() -> Bool[Tensor, "pattern color second"]:
-    """Return which combinations of pattern, colour and second colour objects can have."""
-    plain = torch.tensor([name == "plain" for name in LABELS["pattern"]])
-    none = torch.tensor([name == "none" for name in LABELS["second"]])
-    different = torch.tensor([[a != b for b in LABELS["second"]] for a in LABELS["color"]])
-    return (plain[:, None, None] == none) & different
 
 
 def multi_face(found: dict[str, Tensor], wanted: Attributes) -> float:

@@ -122,19 +122,15 @@ def joined(shapes: list[Shape]) -> tuple[Shape, list[str]]:
 def _revolve(role: str, rows, slopes, center=(0, 0, 0), axis=(0, 0, 1), segments=SEGMENTS) -> Shape:
     """Revolve pairs (radius, height), an array, with their normals ``slopes``."""
     angle = np.linspace(-np.pi, np.pi, segments + 1)  # a pattern's seam is at the back
-    around = np.stack([np.cos(angle), np.sin(angle)], 1)
-    vertices, normals = (_revolved(pairs, around).reshape(-1, 3) for pairs in (rows, slopes))
+    around = np.stack([np.cos(angle), np.sin(angle), np.ones_like(angle)], 1)
+    vertices, normals = (
+        (pairs[:, None, [0, 0, 1]] * around).reshape(-1, 3) for pairs in (rows, slopes)
+    )
     along = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(rows, axis=0), axis=1))])
     widest = rows[:, 0].max()
     uv = np.stack(np.broadcast_arrays(angle[None] * widest, along[:, None]), -1)
     faces = _grid_faces(len(rows), len(angle))[:, ::-1]
     return _placed(vertices, faces, normals, uv.reshape(-1, 2), center, axis, role)
-
-
-def _revolved(pairs: np.ndarray, around: np.ndarray) -> Float[np.ndarray, "R A 3"]:
-    """Turn pairs (radius, height) to each of the directions ``around``."""
-    height = np.broadcast_to(pairs[:, None, 1:], (len(pairs), len(around), 1))
-    return np.concatenate([pairs[:, None, :1] * around, height], -1)
 
 
 def _placed(vertices, faces, normals, uv, center, axis, role: str) -> Shape:

@@ -2,7 +2,10 @@
 tokenizer: it has one token for every word of the toybox, and makes bytes and pieces of others."""
 
 import json
+import re
+from collections import Counter
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -58,28 +61,14 @@ def copy_tokenizer(source: Path, folder: Path) -> None:
 
 def word_merges(words: Sequence[str]) -> list[tuple[str, str]]:
     """Return byte pair merges (Sennrich et al. 2016) that make each of ``words`` one token."""
-    split = [[*word[:-1], f"{word[-1]}</w>"] for word in sorted(set(words))]
+    split = [" ".join([*word[:-1], f"{word[-1]}</w>"]) for word in sorted(set(words))]
     merges = []
-    while any(len(pieces) > 1 for pieces in split):
-        counts: dict[tuple[str, str], int] = {}
-        for pieces in split:
-            for pair in zip(pieces, pieces[1:], strict=False):
-                counts[pair] = counts.get(pair, 0) + 1
+    while counts := Counter(pair for pieces in split for pair in pairwise(pieces.split())):
         best = min(counts, key=lambda pair: (-counts[pair], pair))
-        split = [_merged(pieces, best) for pieces in split]
+        both = re.compile(rf"(?<!\S){re.escape(' '.join(best))}(?!\S)")
+        split = [both.sub("".join(best), pieces) for pieces in split]
         merges.append(best)
     return merges
-
-
-def _merged(pieces: list[str], pair: tuple[str, str]) -> list[str]:
-    """Join each occurrence of ``pair`` in ``pieces``, from left to right."""
-    out: list[str] = []
-    for piece in pieces:
-        if out and (out[-1], piece) == pair:
-            out[-1] += piece
-        else:
-            out.append(piece)
-    return out
 
 
 JOINED_PLAIN_SHARE = 0.03

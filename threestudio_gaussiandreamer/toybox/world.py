@@ -16,7 +16,7 @@ from ..core.streams import numpy_generator
 from ..meshes.mesh import Mesh
 from . import motions
 from .kinds import ACCESSORIES, KINDS, Proportions
-from .people import posed_person
+from .people import person
 from .shapes import Shape, joined
 
 VERSION = 3
@@ -113,7 +113,8 @@ def object_mesh(attributes: Attributes, rng: np.random.Generator) -> Mesh:
     """Make an object's mesh with random proportions, a texture and baked light."""
     proportions = Proportions(rng)
     if attributes.action:
-        shapes, anchors = posed_person(proportions, attributes.action, rng)
+        motion = motions.draw(attributes.action, rng)
+        shapes, anchors = person(proportions, motion.positions[motion.best])
     else:
         shapes, anchors = KINDS[attributes.kind](proportions)
     if attributes.accessory:
