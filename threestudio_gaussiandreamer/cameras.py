@@ -201,8 +201,7 @@ def sample_orbit(
 
     As in threestudio, the elevations of a batch are uniform in angle with probability 1/2, and
     otherwise uniform on the sphere (uniform in the sine); ``by_angle`` sets which. With
-    ``uniform_azimuth`` the azimuth range is divided into ``batch`` equal sectors with one view in
-    each."""
+    ``uniform_azimuth`` the azimuth range has one view in each of ``batch`` equal sectors."""
     drawn, u = _draw_by_angle(rng), torch.rand(4, batch, generator=rng)
     by_angle = drawn if by_angle is None else by_angle
     elevation = _lerp(ranges.elevation, u[0])

@@ -382,9 +382,7 @@ def check_options(config_class: type, cfg: Any, prefix: str = "") -> None:
 def require_defaults(
     config_class: type, cfg: Any, names: Collection[str], reason: str, prefix: str = ""
 ) -> None:
-    """Raise UserError unless the options ``names``, which have no effect (``reason``: "with a=1"),
-    are at their defaults.
-    """
+    """Raise UserError unless options without effect (``reason``: "with a=1") are at defaults."""
     for name in names:
         default = getattr(config_class, name, None)
         if getattr(cfg, name, default) != default:

@@ -53,8 +53,7 @@ def invert(
         stride: timesteps of one step; the last one ends at t.
         eta: standard deviation of the noise that a step adds, as a share of that of DDPM's reverse
             step (Song et al. 2021, eq. 16), as threestudio's SDI does.
-        fresh: returns the standard normal noise of all items in a step, given its index; needed if
-            ``eta`` isn't 0.
+        fresh: returns a step's standard normal noise of all items, by its index; for ``eta`` > 0.
     """
     # in this order, the items that have ended are always the first
     ends, rows = t.cpu().sort(stable=True)

@@ -85,8 +85,7 @@ def timesteps(
 ) -> Int[Tensor, " B"]:
     """Draw one timestep per item, uniform on [min_step, max_step] clamped to [1, num_train - 1].
 
-    Each item, numbered from ``first``, has its own random stream, so its timestep doesn't depend on
-    ``batch``.
+    Each item, numbered from ``first``, has its own random stream, independent of ``batch``.
     """
     low, high = (min(max(value, 1), num_train - 1) for value in (min_step, max_step))
     draws = [
@@ -222,8 +221,7 @@ PREDICTIONS = {
     ),
 }
 """Conversions of the network's output to the noise, by prediction type: the noise itself,
-v = sqrt(abar) eps - sqrt(1 - abar) x0 (Salimans and Ho 2022), the velocity eps - x0 of a rectified
-flow, or x0.
+v = sqrt(abar) eps - sqrt(1 - abar) x0 (Salimans and Ho 2022), a flow's eps - x0, or x0.
 """
 
 

@@ -36,8 +36,7 @@ MAX_STORED_LOG = 20.0
 def write_compressed_ply(
     path: str | os.PathLike, gaussians: Gaussians, comments: Sequence[str] = ()
 ) -> None:
-    """Write a compressed PLY atomically, along a Morton curve, without Gaussians that can't be
-    drawn.
+    """Write a compressed PLY atomically, along a Morton curve, of the Gaussians that can be drawn.
 
     Args:
         comments: ASCII lines for the header.

@@ -117,9 +117,7 @@ def holds_gaussians(path: Path) -> bool:
 
 
 def require_format(name: str, option: str, formats: Collection[str] = WRITTEN) -> str:
-    """Return the extension of a file name; UserError, which names the ``option``, unless it is one
-    of ``formats``.
-    """
+    """Return the extension of a file name; UserError, naming ``option``, if none of ``formats``."""
     suffix = suffix_of(name)
     if suffix not in formats:
         *others, last = formats
@@ -203,8 +201,7 @@ def write_cloud(
         spz_up: the axis that is up in an SPZ, y or, in version 4, -y.
 
     Raises:
-        UserError: the format is unknown or doesn't support the harmonics' degree, or the file can't
-            be written.
+        UserError: the format is unknown or without these harmonics, or the file isn't writable.
     """
     suffix = suffix or require_format(path, "OUT")
     known = FORMATS[suffix]

@@ -120,8 +120,7 @@ def needed_count(
     gain: float,
     keep: float,
 ) -> Need:
-    """Return how many Gaussians the next round keeps, so that rounds end where twice as many would
-    gain ``gain`` dB.
+    """Return how many Gaussians the next round keeps: rounds end where twice as many gain ``gain``.
 
     If k of N Gaussians with the removal errors e_i are dropped, the squared error E grows by about
     the sum of e_i: a cost of 10 log10(1 + sum e_i / E) dB for log2(N / (N - k)) halvings. Training

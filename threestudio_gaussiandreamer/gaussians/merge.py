@@ -60,8 +60,7 @@ class _Shapes(NamedTuple):
 
 
 def merge_duplicates(params: Mapping[str, Tensor], *, at_least: int = 1) -> dict[str, Tensor]:
-    """Merge all duplicates; return new parameters, with the merged Gaussian in the place of the
-    first of its pair.
+    """Merge all duplicates; return new parameters, a merged Gaussian in the place of its first one.
 
     Args:
         params: means, log_scales, quats, logit_opacities and the spherical harmonics (sh, or sh0

@@ -44,9 +44,7 @@ class NeighbourSearch:
     def nearest(
         self, queries: Float[np.ndarray, "Q 3"], reach: float
     ) -> tuple[Float[np.ndarray, " Q"], Int[np.ndarray, " Q"]]:
-        """Return the distance to the nearest point and its row; infinity and -1 if none is nearer
-        than ``reach``.
-        """
+        """Return distance and row of the nearest point; infinity and -1 if beyond ``reach``."""
         distances, nearest = np.empty(len(queries)), np.empty(len(queries), np.int64)
         rows = np.append(self.order, -1)  # the tree gives P where there is none
         order = spatial_order(queries) if len(queries) else np.empty(0, np.int64)

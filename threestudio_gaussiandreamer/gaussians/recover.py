@@ -21,9 +21,7 @@ LEARNING_RATES = {
     "logit_opacities": 2e-2,
     "sh": 5e-3,
 }
-"""Learning rates of Adam after a round that prunes 20 %; that of the means is in standard
-deviations along each axis.
-"""
+"""Rates of Adam after a round that prunes 20 %; of the means, in standard deviations by axis."""
 LR_SCALES = (1.0, 1 / 4, 1 / 16, 1 / 64)
 """Learning-rate multipliers, tried from largest to smallest: the length of Adam's steps doesn't
 decrease near an optimum, so a small error needs a small rate.

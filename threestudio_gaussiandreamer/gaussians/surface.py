@@ -65,7 +65,11 @@ def gaussian_surface(gaussians: Gaussians, *, resolution: int = 128, level: floa
     density, colored = _summed(gaussians, covariances, origin, cell, shape)
     centers = np.round((gaussians.means - origin) / cell).astype(int)
     corners, faces = surface_nets(density, level * float(np.median(density[tuple(centers.T)])))
-    return Surface(corners * cell + origin, faces, _colors_at(corners, density, colored))
+    # of each vertex the mean over its cell's corners, weighted by opacity
+    cells = tuple(np.floor(corners).astype(int).T)
+    total = sum(density[_corner(bits)][cells] for bits in range(8))
+    color = sum(colored[_corner(bits)][cells] for bits in range(8))
+    return Surface(corners * cell + origin, faces, (color / total[:, None]).clip(0, 1))
 
 
 def surface_nets(
@@ -214,15 +218,3 @@ def _quads(
     backwards = ~along[a, b, c]  # the far end is inside, so outside lies towards -axis
     ring[backwards] = ring[backwards, ::-1]
     return ring
-
-
-def _colors_at(
-    corners: Float[np.ndarray, "V 3"],
-    density: Float[np.ndarray, "X Y Z"],
-    colored: Float[np.ndarray, "X Y Z 3"],
-) -> Float[np.ndarray, "V 3"]:
-    """Return the colour at each vertex: the mean over its cell's corners, weighted by opacity."""
-    cell = tuple(np.floor(corners).astype(int).T)
-    total = sum(density[_corner(bits)][cell] for bits in range(8))
-    color = sum(colored[_corner(bits)][cell] for bits in range(8))
-    return (color / total[:, None]).clip(0, 1)

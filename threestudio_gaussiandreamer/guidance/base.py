@@ -370,9 +370,7 @@ class ScoreDistillation(BaseObject, ABC):
         return self.both(z, t, condition)[1]
 
     def empty_prompt(self, z: Latents, t: Timesteps, condition: Any) -> Optional[Latents]:
-        """Predict the noise for an empty prompt, where the unconditional score is that of a
-        negative prompt; else None.
-        """
+        """Predict the noise for an empty prompt if the negative one isn't empty; else None."""
         return None
 
     def _pair(self, found: Any, z: Latents) -> tuple[Latents, Optional[Latents]]:

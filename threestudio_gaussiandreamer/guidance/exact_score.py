@@ -122,9 +122,7 @@ class MeshTruth:
     def prefetch(
         self, c2w: Float[Tensor, "V 4 4"], fovy: Float[Tensor, " V"], height: int, width: int
     ) -> None:
-        """Plan to cast these views, most of which training will need, in large batches, if all fit
-        into the cache.
-        """
+        """Plan to cast these views, which training will need, at once, if the cache holds all."""
         if len(c2w) <= self.pictures.capacity:
             self.pictures.plan(c2w, fovy, *self._prefetch_size(height, width))
 
@@ -243,8 +241,7 @@ def mixture_of(
     bank: Bank,
     whole: bool,
 ) -> Mixture:
-    """Return a mixture whose conditional modes are the camera's own view and the ``members`` of a
-    bank.
+    """Return a mixture whose conditional modes are the camera's view and ``members`` of a bank.
 
     Args:
         background: what the bank is composited on: one colour (1, 1, 3) or pixels (H', W', 3).
@@ -460,9 +457,7 @@ class ExactScoreGuidance(ScoreDistillation):
         return super().unconditional(z, t, condition)
 
     def known_residual(self, latents: Latents, condition: list[Mixture]) -> Optional[Residual]:
-        """Return sqrt(abar / (1 - abar)) (x - x_1) for mixtures of one picture, where the noise
-        cancels.
-        """
+        """Return sqrt(abar / (1 - abar)) (x - x_1) of one picture each, where the noise cancels."""
         if any(mixture.pictures is not None for mixture in condition):
             return None
         _, abar = self.draw_timesteps(latents)

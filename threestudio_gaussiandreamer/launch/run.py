@@ -6,6 +6,7 @@ import errno
 import threading
 import time
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from typing import Any, Optional
@@ -35,6 +36,7 @@ MISMATCHES = ("loading state_dict", "loaded state dict", "optimizer_states", "re
 """In the messages of torch and Lightning about a state that doesn't match."""
 
 
+@dataclass(eq=False)
 class Run:
     """A checked configuration and the stage to run on it.
 
@@ -47,26 +49,21 @@ class Run:
         records_code: copy the package's sources into the folder when training starts.
     """
 
-    def __init__(
-        self,
-        cfg: Any,
-        args: argparse.Namespace,
-        sources: Sequence[tuple[Path, bytes]],
-        command: str,
-        n_gpus: int,
-        *,
-        callbacks: Sequence[Any] = (),
-        records_code: bool = True,
-    ) -> None:
-        self.cfg, self.args, self.n_gpus = cfg, args, n_gpus
-        self.callbacks, self.records_code = list(callbacks), records_code
-        self.sources, self.command = sources, command
-        self.training = args.stage == "train"
+    cfg: Any
+    args: argparse.Namespace
+    sources: Sequence[tuple[Path, bytes]]
+    command: str
+    n_gpus: int
+    callbacks: Sequence[Any] = ()
+    records_code: bool = True
+
+    def __post_init__(self) -> None:
+        self.training = self.args.stage == "train"
         self.claimed = run_folder.RunFolder(self.folder)
         self.resumed_step, self.has_trained = -1, False
         self.size_changes: list[str] = []
         self.trainer: Any = None
-        self.viewer = parse_structured(ViewerConfig, cfg.viewer)
+        self.viewer = parse_structured(ViewerConfig, self.cfg.viewer)
         self.view: Optional[LiveView] = None
 
     @property
@@ -188,7 +185,7 @@ class Run:
         with_code = self.records_code and self.training
         record = RunRecord(self.folder, self.cfg, self.sources, self.command, with_code, at_zero)
         self.checkpoint_io = AtomicCheckpointIO(record.first_checkpoint)
-        callbacks = self.callbacks + ([ProgressBar()] if options["enable_progress_bar"] else [])
+        callbacks = [*self.callbacks, *([ProgressBar()] if options["enable_progress_bar"] else [])]
         if self.training:
             callbacks += [record, *self.training_callbacks()]
         elif not (self.folder / run_folder.PARSED).is_file():

@@ -132,9 +132,7 @@ class MeshCaster:
 def over_background(
     rgba: Float[np.ndarray | Tensor, "... 4"], background: Float[np.ndarray | Tensor, "... 3"]
 ) -> Float[np.ndarray | Tensor, "... 3"]:
-    """Composite premultiplied ``rgba`` over ``background``, for NumPy arrays or tensors:
-    C + (1 - coverage) background.
-    """
+    """Composite premultiplied ``rgba`` over ``background``, NumPy arrays or tensors."""
     return rgba[..., :3] + (1 - rgba[..., 3:]) * background
 
 

@@ -34,9 +34,7 @@ consulted: dict[str, Optional[tuple[int, int]]] = {}
 
 
 class Budget:
-    """The memory in bytes that a mesh may take: more with every file that is read, less with what
-    is decoded.
-    """
+    """Bytes that a mesh may take: more with every file that is read, less with what is decoded."""
 
     def __init__(self, path: Path) -> None:
         self.left = self.total = FIXED_BYTES

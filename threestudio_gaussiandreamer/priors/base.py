@@ -107,8 +107,7 @@ class Prior(BaseObject):
         """Return the points for ``prompt``: float32, finite, colours in [0, 1], z up, +x the front.
 
         Raises:
-            UserError: the source is missing, unreadable or empty, or more than 5 % of its points
-                aren't finite.
+            UserError: the source is missing, unreadable, empty, or more than 5 % of it not finite.
         """
         cloud = self.generate(prompt, numpy_generator(run_seed(), "prior"))
         cloud = validated(cloud, type(self).__name__)
@@ -181,8 +180,7 @@ def points_of(prior: Any, prompt: str) -> PointCloud:
 
 
 def validated(cloud: PointCloud, name: str) -> PointCloud:
-    """Return ``cloud`` as float32 without the rows that are not finite, its colours clipped to
-    [0, 1].
+    """Return ``cloud`` as float32 without rows that aren't finite, its colours clipped to [0, 1].
 
     Raises:
         UserError: it is empty or no PointCloud of arrays (P, 3) with faces among the points, more

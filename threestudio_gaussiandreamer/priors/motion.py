@@ -104,9 +104,7 @@ class Motions(NamedTuple):
 
 
 def read_motions(path: str) -> Motions:
-    """Return the motions of a file; raise UserError if it is missing, of another layout, without
-    frames, or not finite.
-    """
+    """Return a file's motions; UserError if missing, of another layout, empty or not finite."""
     with reading(path, "motion file") as file:
         arrays = read_arrays(file, "motion file", ["motion"], ["lengths"])
         positions = _sample_frame_joint(arrays["motion"])

@@ -3,8 +3,7 @@
 The paper keeps "only the relevant parts related to the motion" and adds a subject: "Iron man kicks
 with his left leg" becomes "Someone kicks with the left leg". Here: the first verb of motion and
 what follows it, up to the first comma or full stop, with "Someone" before it and "the" for "his",
-"her", "its" and "their". A small list of rules, no language model: the user can always give the
-text.
+"her", "its" and "their". No language model: the user can always give the text.
 
 A model may list the phrases of its training, as the toybox's does: then the longest one in the
 prompt is asked for."""
@@ -65,12 +64,10 @@ THIRD_PERSONS = set(map(third_person, VERBS))
 
 
 def reduced_prompt(prompt: str) -> Optional[str]:
-    """Return the motion of ``prompt`` as a sentence about someone; None when no verb of motion is
-    found.
+    """Return the motion of ``prompt`` as a sentence about someone; None without a verb of motion.
 
-    A verb of the kind "kicks" comes before one of the kind "kicking", which may belong to the
-    subject ("a flying fox jumps"), and both before one of the kind "kick", which may be a noun, and
-    which becomes "kicks"."""
+    A verb of the kind "kicks" comes before one of the kind "kicking", which may be the subject's
+    ("a flying fox jumps"), and both before "kick", which may be a noun and becomes "kicks"."""
     for is_verb, form in (
         (THIRD_PERSONS.__contains__, str),
         (is_progressive, "is {}".format),

@@ -47,6 +47,8 @@ from .base import FilePrior, file_axes
 
 logger = logging.getLogger(__name__)
 
+KIND = "point cloud"
+
 
 @register("point-cloud-prior")
 class PointCloudPrior(FilePrior):
@@ -81,7 +83,7 @@ class PointCloudPrior(FilePrior):
 
 def point_file(path: str) -> Path:
     """Return the path of a file of points, of which no more than a PLY's header is read."""
-    file, known = existing_file(path, "point cloud"), [f".{name}" for name in mesh_formats()]
+    file, known = existing_file(path, KIND), [f".{name}" for name in mesh_formats()]
     if file.suffix.lower() == ".ply":
         require_ply(file)
     elif file.suffix.lower() not in (*READERS, *known):
@@ -96,7 +98,7 @@ def axes_kind(path: Path) -> str:
 
 def load_points(path: Path) -> PointCloud:
     """Read the points of a file in its own axes; the extension determines the format."""
-    with reading(path, "point cloud"):
+    with reading(path, KIND):
         return READERS.get(path.suffix.lower(), read_mesh_points)(path)
 
 
@@ -117,16 +119,8 @@ def normalized(cloud: PointCloud, scale: float) -> PointCloud:
     return cloud._replace(points=(points - centre) * (scale / (longest_side(finite) / 2 or 1.0)))
 
 
-def read_npz(path: Path) -> PointCloud:
-    """Read ``points``, and optionally ``colors`` and ``normals``, each (P, 3)."""
-    arrays = read_arrays(path, "point cloud", ["points"], ["colors", "normals"])
-    return _cloud(path, arrays["points"], arrays.get("colors"), arrays.get("normals"))
-
-
 def read_text(path: Path) -> PointCloud:
-    """Read numbers separated by blanks, commas or semicolons; a first line that isn't numbers,
-    and lines with #, are skipped.
-    """
+    """Read numbers between blanks, commas or semicolons; skip a heading and lines with #."""
     text = path.read_text(encoding="utf-8", errors="replace")
     lines = re.sub("[,;]", " ", text).splitlines()
     try:
@@ -171,7 +165,7 @@ def _cloud(path: Path, points: np.ndarray, colors=None, normals=None) -> PointCl
 
 READERS: dict[str, Callable[[Path], PointCloud]] = {
     ".ply": read_points,
-    ".npz": read_npz,
-    ".npy": lambda path: _from_columns(path, read_arrays(path, "point cloud", ["rows"])["rows"]),
+    ".npz": lambda path: _cloud(path, **read_arrays(path, KIND, ["points"], ["colors", "normals"])),
+    ".npy": lambda path: _from_columns(path, read_arrays(path, KIND, ["rows"])["rows"]),
     **dict.fromkeys([".xyz", ".txt", ".pts", ".csv"], read_text),
 }

@@ -55,8 +55,7 @@ CHANNELS = 6
 """x, y, z, red, green, blue of a point; the networks give these and as many for the variance."""
 SCALES = torch.tensor([2.0] * 3 + [2 / 255] * 3)[:, None]
 BIASES = torch.tensor([0.0] * 3 + [-1.0] * 3)[:, None]
-"""The networks' inputs are ``points * SCALES + BIASES``, of positions in [-0.5, 0.5] and colours in
-[0, 255]."""
+"""Inputs are ``points * SCALES + BIASES``, of positions in [-0.5, 0.5] and colours up to 255."""
 CHECKPOINT = required(
     "Point-E's weights are a file that you download; set checkpoint to base_40m_textvec.pt"
 )
@@ -198,7 +197,11 @@ class PointTransformer(nn.Module):
         self.output_proj = nn.Linear(width, 2 * CHANNELS)
 
     def time_token(self, timesteps: Real[Tensor, " B"]) -> Float[Tensor, "B 1 W"]:
-        return self.time_embed(timestep_embedding(timesteps, self.width))[:, None]
+        """Embed cosines, then sines, of frequencies from 1 to 1/10000 (Vaswani et al. 2017)."""
+        steps = torch.arange(self.width // 2, device=timesteps.device)
+        frequencies = torch.exp(-math.log(10000) * steps / (self.width // 2))
+        angles = timesteps.float()[:, None] * frequencies
+        return self.time_embed(torch.cat([angles.cos(), angles.sin()], dim=-1))[:, None]
 
     def transform(
         self, points: Float[Tensor, "B 6 N"], tokens: list[Tensor]
@@ -251,14 +254,6 @@ class Upsampler(PointTransformer):
             self.cond_point_proj(scaled.transpose(1, 2)),
         ]
         return self.transform(points, tokens)
-
-
-def timestep_embedding(timesteps: Real[Tensor, " B"], width: int) -> Float[Tensor, "B W"]:
-    """Return cosines, then sines, of frequencies from 1 to 1/10000 (Vaswani et al. 2017)."""
-    steps = torch.arange(width // 2, device=timesteps.device)
-    frequencies = torch.exp(-math.log(10000) * steps / (width // 2))
-    angles = timesteps.float()[:, None] * frequencies
-    return torch.cat([angles.cos(), angles.sin()], dim=-1)
 
 
 # Loading ------------------------------------------------------------------------------------------

@@ -52,7 +52,11 @@ class MotionModel(nn.Module):
         self.embed_timestep = nn.ModuleDict({"time_embed": embed})
         self.embed_text = nn.Linear(text, width)
         self.output_process = nn.ModuleDict({"poseFinal": nn.Linear(width, FEATURES)})
-        self.register_buffer("positions", sinusoids(POSITIONS, width), persistent=False)
+        # sines and cosines in turn (Vaswani et al. 2017)
+        rates = torch.exp(torch.arange(0, width, 2) * (-math.log(10000.0) / width))
+        angles = torch.arange(POSITIONS)[:, None] * rates
+        waves = torch.stack([angles.sin(), angles.cos()], -1).flatten(1)
+        self.register_buffer("positions", waves, persistent=False)
 
     def forward(
         self, x: Float[Tensor, "B T 263"], t: Tensor, text: Float[Tensor, "B D"]
@@ -62,13 +66,6 @@ class MotionModel(nn.Module):
         tokens = torch.cat([first[:, None], self.input_process["poseEmbedding"](x)], 1)
         tokens = (tokens + self.positions[: tokens.shape[1]]).transpose(0, 1)
         return self.output_process["poseFinal"](self.seqTransEncoder(tokens)[1:].transpose(0, 1))
-
-
-def sinusoids(count: int, width: int) -> Float[Tensor, "count width"]:
-    """Return sines and cosines in turn (Vaswani et al. 2017)."""
-    rates = torch.exp(torch.arange(0, width, 2) * (-math.log(10000.0) / width))
-    angles = torch.arange(count)[:, None] * rates
-    return torch.stack([angles.sin(), angles.cos()], -1).flatten(1)
 
 
 class TextToMotion(NamedTuple):

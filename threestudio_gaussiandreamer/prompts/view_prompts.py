@@ -1,5 +1,4 @@
-"""Text embeddings per view, the output of prompt processors with a text encoder. The interface is
-threestudio's.
+"""Text embeddings per view, the output of prompt processors with a text encoder, as threestudio's.
 
 The direction of a view (side, or left and right side; front, back, overhead) selects the prompt,
 such as "a fox, front view". With Perp-Neg (Armandpour et al. 2023) a view between two directions
@@ -97,9 +96,7 @@ class PromptEmbeddings:
     prompt: str
     prompts_vd: List[str]
     empty: Optional[Callable[[], Float[Tensor, "1 N F"]]] = None
-    """Returns the embedding of an empty prompt; None if the negative prompt is empty too. Not in
-    threestudio.
-    """
+    """Returns the embedding of an empty prompt; None if the negative one is. Not threestudio's."""
 
     def direction_indices(
         self,

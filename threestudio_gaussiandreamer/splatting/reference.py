@@ -48,7 +48,9 @@ def render_view(
     """Return the sums of `blend` (H*W, C + 2) for one view, and the contributions (N,)."""
     front_to_back = sort(splats, colors, view)
     absgrad = splats.means2d.absgrad[view] if hasattr(splats.means2d, "absgrad") else None
-    chunks = pixel_centres(width, height, splats.depths).split(_pixels_per_chunk(front_to_back))
+    pairs = splats.opacities.element_size() * max(1, len(front_to_back.ids))
+    at_once = max(1, CHUNK_BYTES // (TENSORS_PER_PAIR * pairs))
+    chunks = pixel_centres(width, height, splats.depths).split(at_once)
     blended = [
         _blend_in_bounded_memory(len(chunks) > 1, pixels, front_to_back, options, absgrad)
         for pixels in chunks
@@ -72,8 +74,7 @@ def sort(splats: Splats, colors: Tensor, view: int) -> Sorted:
 def blend(
     pixels: Tensor, splats: Sorted, options: RasterizeOptions, absgrad: Optional[Tensor]
 ) -> tuple[Tensor, Tensor]:
-    """Composite M Gaussians at P pixels, front to back (Porter and Duff 1984; Kerbl et al. 2023,
-    eq. 3).
+    """Composite M Gaussians at P pixels, front to back (Porter and Duff 1984; Kerbl et al. 2023).
 
     ``alpha_i = min(alpha_max, opacity_i exp(-q_i / 2))``, zero below ``alpha_min``; ``T_i =
     prod_{j<i} (1 - alpha_j)``. Gaussians with ``T_i >= stop`` are blended, so the one that brings T
@@ -110,11 +111,6 @@ def _blend_in_bounded_memory(bounded: bool, *arguments) -> tuple[Tensor, Tensor]
         return blend(*arguments)
     # A closure, because absgrad is modified in backward, which checkpoint forbids for arguments.
     return checkpoint(lambda: blend(*arguments), use_reentrant=False, preserve_rng_state=False)
-
-
-def _pixels_per_chunk(splats: Sorted) -> int:
-    per_pixel = TENSORS_PER_PAIR * splats.opacities.element_size() * max(1, len(splats.ids))
-    return max(1, CHUNK_BYTES // per_pixel)
 
 
 def track_means2d(splats: Splats, others: tuple[Tensor, ...], absgrad: bool) -> Tensor:

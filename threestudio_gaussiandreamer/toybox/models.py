@@ -99,22 +99,19 @@ def start_as_identity(network: nn.Module) -> None:
         if name.endswith(("conv2", "proj_out")):
             _start_at_zero(module)
         elif name.endswith(("downsamplers.0.conv", "upsamplers.0.conv", "conv_shortcut")):
-            _start_as_average(module, places=2 if "downsamplers" in name else 1)
+            # the average of places^2 inputs per channel; missing channels keep small random weights
+            places = 2 if "downsamplers" in name else 1
+            module.weight.mul_(0.1)
+            nn.init.zeros_(module.bias)
+            start = 0 if module.stride == (2, 2) else module.kernel_size[0] // 2
+            rows = slice(start, start + places)
+            for channel in range(min(module.weight.shape[:2])):
+                module.weight[channel, channel, rows, rows] += 1 / places**2
 
 
 def _start_at_zero(layer: Any) -> None:
     nn.init.zeros_(layer.weight)
     nn.init.zeros_(layer.bias)
-
-
-def _start_as_average(convolution: nn.Conv2d, places: int) -> None:
-    """Average ``places``^2 inputs per channel; missing channels keep small random weights."""
-    convolution.weight.mul_(0.1)
-    nn.init.zeros_(convolution.bias)
-    start = 0 if convolution.stride == (2, 2) else convolution.kernel_size[0] // 2
-    rows = slice(start, start + places)
-    for channel in range(min(convolution.weight.shape[:2])):
-        convolution.weight[channel, channel, rows, rows] += 1 / places**2
 
 
 def scheduler() -> Any:

@@ -3,8 +3,7 @@ features per frame that text-to-motion models of HumanML3D (Guo et al. 2022) are
 
 y is up, the person looks along +z and has its left at +x; metres, :data:`RATE` frames a second. An
 action sets the pelvis, the lean of the trunk, the directions of both arms, and the places of both
-ankles; knees follow by inverse kinematics, so bones keep their lengths and standing feet their
-places.
+ankles; knees follow by inverse kinematics, so bones keep their lengths, standing feet their places.
 """
 
 from collections.abc import Callable

@@ -68,8 +68,7 @@ def probabilities(judge: Judge, pictures: Float[Tensor, "V 3 s s"]) -> dict[str,
 
 
 def recognized(found: dict[str, Tensor], wanted: Attributes) -> dict[str, float]:
-    """Return whether the pictures show each attribute as the prompt does, which may name none: 1,
-    0 or NaN."""
+    """Return 1, 0 or NaN for each attribute: whether the pictures show the prompt's, or none."""
     names = ("kind", "color", "part", "accessory", "accessory_color", "action")
     shown = {name: LABELS[name][int(found[name].mean(dim=0).argmax())] for name in names}
     right = {name: shown[name] == (getattr(wanted, name) or "none") for name in names}

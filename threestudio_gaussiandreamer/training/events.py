@@ -116,9 +116,7 @@ def _grey_panel(image: Float[Tensor, "H W"], data_range: Any, cmap: Any) -> Pane
 def true_views(
     guidance: Any, batch: dict[str, Any], out: Mapping[str, Any]
 ) -> Optional[Float[Tensor, "B H W 3"]]:
-    """Render the ground truth of a batch, with the background and size of its renders ``out``; None
-    if ``guidance`` has none.
-    """
+    """Render a batch's ground truth with the background and size of ``out``; None without one."""
     truth = truth_of(guidance)
     if truth is None:
         return None

@@ -84,9 +84,7 @@ class HeldOut:
 
     @torch.no_grad()
     def render(self, renderer: Any, chunk: int = 4) -> tuple[Tensor, Tensor]:
-        """Render the held-out views; return unclamped pictures (V, H, W, 3) and their background
-        colours (V, 3), on the CPU.
-        """
+        """Return unclamped renders (V, H, W, 3) and background colours (V, 3), on the CPU."""
         modes = [(module, module.training) for module in (renderer, renderer.background)]
         for module, _ in modes:
             module.eval()

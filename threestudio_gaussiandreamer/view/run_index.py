@@ -158,9 +158,7 @@ Curve = list[tuple[float, float]]
 
 
 def read_curves(folder: Path, names: Sequence[str]) -> dict[str, Curve]:
-    """Return the columns with at least two finite values of the CSV logs of a run, of which later
-    ones win.
-    """
+    """Return the columns of a run's CSV logs with two or more finite values; later logs win."""
     values: dict[str, dict[float, float]] = {name: {} for name in names}
     logs = folder.glob("csv_logs/version_*/metrics.csv")
     for path in sorted(logs, key=lambda path: (len(path.parent.name), path.parent.name)):
@@ -202,9 +200,7 @@ def _in_unit(values: Sequence[float]) -> list[float]:
 
 
 def write_gallery(folder: Path) -> Path:
-    """Write the gallery of the runs in a folder, and their own indices, if that is possible; return
-    its path.
-    """
+    """Write the gallery of a folder's runs, and their own indices, if possible; return its path."""
     patterns = ["/".join(["*"] * depth) for depth in range(1, MAX_DEPTH + 1)]
     found = [path for pattern in patterns for path in folder.glob(pattern) if is_run(path)]
     if not found:

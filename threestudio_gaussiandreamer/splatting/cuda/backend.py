@@ -154,8 +154,7 @@ def no_lists(batch: Batch, splats: Splats) -> Lists:
 def blend(batch: Batch, splats: Splats, lists: Lists, images: Images, contribution: Tensor) -> None:
     """Run stage 6: fill the images, and raise the contributions.
 
-    If the lists are incomplete, every splat is tested in every tile; the result is bitwise the
-    same.
+    If the lists are incomplete, every splat is tested in every tile, with bitwise the same result.
     """
     arguments = (batch.settings, _lists(splats, lists), pointers(*images), contribution)
     batch.launch("blend", (batch.tiles, batch.views), BLEND_THREADS, *arguments)

@@ -64,9 +64,7 @@ def device(device: torch.device) -> "Gpu":
 
 
 class Gpu:
-    """One device. Its kernels are compiled, or read from the cache, when they are first
-    launched.
-    """
+    """One device. Kernels are compiled, or read from the cache, when they are first launched."""
 
     def __init__(self, index: int):
         self.index = index
@@ -89,9 +87,7 @@ class Gpu:
         )
 
     def launch(self, name: str, grid: tuple[int, int], threads: int, *arguments: Any) -> None:
-        """Queue a kernel on torch's current stream of the device; ``arguments`` are tensors,
-        structures and C numbers.
-        """
+        """Queue a kernel on torch's stream; ``arguments`` are tensors, structures and C numbers."""
         values = [ctypes.c_void_p(x.data_ptr()) if isinstance(x, Tensor) else x for x in arguments]
         pointers = (ctypes.c_void_p * len(values))(*(ctypes.addressof(x) for x in values))
         with torch.cuda.device(self.index):

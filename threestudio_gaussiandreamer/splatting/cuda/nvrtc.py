@@ -58,9 +58,8 @@ def architectures() -> list[int]:
 def target_for(capability: tuple[int, int]) -> str:
     """Return the compilation target for a device of this compute capability.
 
-    It is machine code ("sm_90") if the compiler supports the device. For a newer device it is PTX
-    for the newest architecture that the compiler supports ("compute_..."), which the driver
-    compiles.
+    It is machine code ("sm_90") if the compiler supports the device. For a newer one it is PTX for
+    the newest architecture that the compiler supports ("compute_..."), compiled by the driver.
 
     Raises:
         UserError: the device is older than what the kernels or the compiler support.
