@@ -26,8 +26,7 @@ exclusive or, cells that are near each other never share a row.
 """
 ITEM = 61045
 """Distance between the rows of neighbouring items. Neither it nor its multiples up to 6 are a
-distance between the rows of two pixels of 64 x 64: the background of an item isn't that of another
-one, shifted.
+distance between the rows of two pixels of 64 x 64: no item's background is another's, shifted.
 """
 OPAQUE = 0.5
 """Alpha below which a pixel belongs to the background."""

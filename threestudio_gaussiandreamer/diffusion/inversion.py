@@ -1,6 +1,4 @@
-"""DDIM inversion, the deterministic trajectory from a clean latent towards noise, and the noise
-that its steps may add.
-"""
+"""DDIM inversion, the trajectory from a clean latent to noise, and noise that its steps may add."""
 
 from collections.abc import Callable, Sequence
 from typing import NamedTuple, Optional

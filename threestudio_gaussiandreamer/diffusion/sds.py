@@ -5,8 +5,7 @@ Notation of DDPM (Ho et al. 2020): ``abar`` is the cumulative product of 1 - bet
 
     z = sqrt(abar) x + sqrt(1 - abar) eps.
 
-``abar`` is given per item, (B,), usually in float64; square roots are taken before the conversion
-to z's type.
+``abar`` is given per item, (B,), usually in float64; its square roots are converted to z's type.
 
 A rectified flow (Liu et al. 2023; Esser et al. 2024, eq. 13) is trained on the straight path
 
@@ -118,8 +117,7 @@ def predict_x0(
 def classifier_free(
     eps_cond: Float[Tensor, "B *d"], eps_uncond: Float[Tensor, "B *d"], scale: float
 ) -> Float[Tensor, "B *d"]:
-    """Compute eps_u + scale (eps_c - eps_u), where a scale of 1 is no guidance (Ho and Salimans
-    2022, scale = 1 + w).
+    """Compute eps_u + scale (eps_c - eps_u), a scale of 1 being none (Ho and Salimans 2022: 1 + w).
 
     threestudio's formula is eps_c + g (eps_c - eps_u): its g = 100 is scale = 101 here.
     """

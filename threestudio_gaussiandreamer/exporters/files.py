@@ -127,8 +127,7 @@ def outputs_of(exporter: Exporter) -> list[ExporterOutput]:
 # ---- formats -------------------------------------------------------------------------------------
 
 Params = Callable[[Gaussians, Any], dict[str, Any]]
-"""From Gaussians in the world's axes and an exporter's options to the arguments of the system's
-``save_<save_type>``."""
+"""From Gaussians in the world's axes and the options to the arguments of ``save_<save_type>``."""
 
 
 def stored(suffix: str, *variants: str) -> Params:

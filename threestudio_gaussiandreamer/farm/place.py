@@ -21,8 +21,7 @@ from ..launch.run_folder import make_folder
 from .rows import Row
 
 ASSETS, PARTS = "assets", "parts"
-"""The folders that hold one folder per asset: of its run, whose ``name`` this is too, and of its
-last checkpoint."""
+"""The folders with a folder per asset: of its run (also the ``name``), and of its checkpoint."""
 RESULT, FAILURE = "result.json", "failed.json"
 WAITING, RUNNING, STOPPED, FAILED, FINISHED = "waiting", "running", "stopped", "failed", "finished"
 CHANGED = "changed"

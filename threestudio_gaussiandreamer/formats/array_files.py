@@ -2,9 +2,8 @@
 code of theirs, within a memory budget (``numpy.load`` allocates what the header says), and with one
 type of error for every kind of damage.
 
-In a pickle every class and function is replaced by one that only keeps what it was called with.
-Of those, NumPy's arrays, SciPy's sparse matrices, and chumpy's arrays in the files of SMPL and MANO
-are read."""
+In a pickle every class and function is replaced by one that only keeps what it was called with. Of
+those, NumPy's arrays, SciPy's sparse matrices, and chumpy's (in SMPL's files) are read."""
 
 import io
 import math

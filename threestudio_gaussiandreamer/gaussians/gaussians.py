@@ -17,9 +17,7 @@ from .sh import COEFFICIENTS, MAX_DEGREE
 logger = logging.getLogger(__name__)
 Array = np.ndarray | Tensor
 MAX_LOG = 87.0
-"""Largest absolute value of stored logits and logarithms of scales: exp(-87) is about the smallest
-normal float32.
-"""
+"""Largest stored logit or logarithm of a scale: exp(-87) is about the smallest normal float32."""
 SHAPES: dict[str, tuple[int, ...]] = {
     "means": (3,),
     "log_scales": (3,),

@@ -28,8 +28,7 @@ decrease near an optimum, so a small error needs a small rate.
 """
 VIEWS_PER_STEP = 4
 MOST = 100_000
-"""Of more Gaussians a recovery takes fewer steps, so that it takes no longer: further rounds, with
-a recovery each, follow."""
+"""Of more Gaussians a recovery takes fewer steps, and no longer, since further rounds follow."""
 
 
 class Round(NamedTuple):

@@ -75,8 +75,7 @@ def gaussian_surface(gaussians: Gaussians, *, resolution: int = 128, level: floa
 def surface_nets(
     values: Float[np.ndarray, "X Y Z"], level: float
 ) -> tuple[Float[np.ndarray, "V 3"], Int[np.ndarray, "F 3"]]:
-    """Return the vertices, in units of cells, and the triangles of a level set; values below
-    ``level`` are outside.
+    """Return the vertices, in cells, and triangles of a level set; below ``level`` is outside.
 
     The surface is open where values at the boundary of the grid are above ``level``.
     """

@@ -28,8 +28,7 @@ NEAR = 0.01
 MAX_RADIUS = 1e15
 """Largest radius of a cloud, in its units: squares of distances stay within float32's range."""
 VIEWS_PER_CALL, GAUSSIANS_PER_CALL = 4, 2_000_000
-"""Most views that are rendered at once, and most of their Gaussians together, which take about half
-a kilobyte each."""
+"""Most views that are rendered at once, and most Gaussians of all of them, about 500 bytes each."""
 SINES, DISTANCES = (-0.5, 0.9), (1.0, 1.4)
 """Of the views by default: the range of the sine of the elevation, and relative distances."""
 

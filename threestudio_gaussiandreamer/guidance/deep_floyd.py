@@ -1,8 +1,7 @@
 """Guidance ``gaussiandreamer-deep-floyd-guidance``: score distillation in the pixels of DeepFloyd
 IF's first stage, 64 x 64.
 
-Options: those of ``guidance/text_to_image.py``; ``guidance_scale`` is 20 unless given, as in
-threestudio."""
+Options: those of ``guidance/text_to_image.py``; ``guidance_scale`` is 20 by default."""
 
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -178,8 +178,9 @@ def load_body(person: Person) -> Body:
     try:
         shape, groups = read_base_mesh(folder / "3dobjs" / "base.obj")
         for name, weight in target_weights(person).items():
-            rows, offsets = read_target(folder / "targets" / f"{name}.target.gz")
-            shape[rows] += weight * offsets
+            with gzip.open(folder / "targets" / f"{name}.target.gz", "rt") as file:
+                values = np.array(file.read().split(), np.float64).reshape(-1, 4)
+            shape[values[:, 0].astype(np.int64)] += weight * values[:, 1:]
         rig = json.loads((folder / "rigs" / "standard" / "rig.default.json").read_bytes())
         skin = json.loads((folder / "rigs" / "standard" / "weights.default.json").read_bytes())
         bones = rig.get("bones", rig)
@@ -218,13 +219,6 @@ def shares(value: float, *names: str) -> dict[str, float]:
     place = value * (len(names) - 1)
     weights = {name: 1 - abs(place - i) for i, name in enumerate(names)}
     return {name: weight for name, weight in weights.items() if weight > 1e-9}
-
-
-def read_target(path: Path) -> tuple[Int[np.ndarray, " N"], Float[np.ndarray, "N 3"]]:
-    """Read a target: lines of a vertex index and its offset."""
-    with gzip.open(path, "rt") as file:
-        values = np.array(file.read().split(), np.float64).reshape(-1, 4)
-    return values[:, 0].astype(np.int64), values[:, 1:]
 
 
 def read_base_mesh(path: Path) -> tuple[Float[np.ndarray, "V 3"], Groups]:

@@ -1,5 +1,4 @@
-"""``motion-prior``: the paper's avatars. A pose from a text-to-motion model, SMPL fitted to it,
-points on its surface.
+"""``motion-prior``: the paper's avatars. A pose by text to motion, SMPL fitted to it, points on it.
 
 =================  =================================================================================
 option             meaning

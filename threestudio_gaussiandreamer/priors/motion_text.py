@@ -5,8 +5,7 @@ with his left leg" becomes "Someone kicks with the left leg". Here: the first ve
 what follows it, up to the first comma or full stop, with "Someone" before it and "the" for "his",
 "her", "its" and "their". No language model: the user can always give the text.
 
-A model may list the phrases of its training, as the toybox's does: then the longest one in the
-prompt is asked for."""
+A model may list the phrases of its training, as the toybox's: the prompt's longest is taken."""
 
 import re
 import sys

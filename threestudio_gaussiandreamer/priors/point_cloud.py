@@ -1,5 +1,4 @@
-"""``point-cloud-prior``: coloured points from a file, such as a scan or the output of another
-text-to-3D model.
+"""``point-cloud-prior``: coloured points from a file: a scan, or another text-to-3D model's output.
 
 ============  ======================================================================================
 option        meaning

@@ -1,5 +1,4 @@
-"""``shap-e-prior``: OpenAI's Shap-E, the text-to-3D model that the paper starts from, with
-diffusers' networks.
+"""``shap-e-prior``: OpenAI's Shap-E, with which the paper starts, by diffusers' networks.
 
 ===================  ===============================================================================
 option               meaning

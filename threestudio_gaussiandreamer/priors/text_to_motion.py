@@ -1,6 +1,5 @@
 """Text to motion with MDM (Tevet et al. 2022, "Human Motion Diffusion Model"), from the files that
-its authors publish: ``model*.pt`` with ``args.json`` and the mean and deviation of HumanML3D's
-features beside it.
+its authors publish: ``model*.pt``, ``args.json``, mean and deviation of HumanML3D's features.
 
 The network is written from the architecture that the checkpoints fix: a transformer encoder whose
 first token is the sum of the timestep's and the text's embedding, and which predicts the clean

@@ -131,8 +131,7 @@ def parse_bytes(value: Any, option: str) -> int:
 
 
 def psnr_for_loss(loss: float, quality: float) -> float:
-    """Return the PSNR to the original at which the PSNR to the ground truth is ``loss`` below
-    ``quality``, all in dB.
+    """Return the PSNR to the original at which that to the truth is ``loss`` below ``quality``, dB.
 
     For independent errors ``10^(loss / 10) = 1 + 10^((quality - psnr) / 10)``.
     """

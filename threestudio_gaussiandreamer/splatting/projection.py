@@ -3,8 +3,7 @@ float type.
 
 The formulas are EWA splatting (Zwicker et al. 2001) with the conventions of 3D Gaussian Splatting
 (Kerbl et al. 2023): a Gaussian with mean ``t`` in camera coordinates becomes a 2-D Gaussian with
-mean ``pinhole(t)`` and covariance ``J W S W' J' + eps2d I``, where ``J`` is the pinhole's Jacobian
-at ``t``."""
+mean ``pinhole(t)`` and covariance ``J W S W' J' + eps2d I``, with the pinhole's Jacobian ``J``."""
 
 from typing import NamedTuple
 
@@ -42,13 +41,11 @@ class Splats(NamedTuple):
 
 
 def project(scene: Scene, options: RasterizeOptions) -> Splats:
-    """Project all Gaussians into all views; differentiable in means, quats, scales, opacities and
-    viewmats.
+    """Project all Gaussians into all views; differentiable in the Gaussians and the viewmats.
 
     A first pass without gradients finds the visible Gaussians. The second pass replaces the inputs
     of all others by constants *before* the formulas, so that no NaN or overflow reaches a gradient
-    (0 * NaN is NaN). A Gaussian with a colour that isn't finite is invisible; the colours aren't
-    used otherwise."""
+    (0 * NaN is NaN). A Gaussian with a colour that isn't finite is invisible."""
     means, quats, scales, opacities, viewmats, colors, _, Ks = scene.tensors
     width, height = scene.size
     finite = torch.stack([_finite(x) for x in (means, quats, scales, opacities)]).all(0)

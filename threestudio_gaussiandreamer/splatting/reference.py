@@ -1,5 +1,4 @@
-"""The specification of the image model: every pixel evaluates every visible Gaussian, and autograd
-differentiates.
+"""The image model's specification: every pixel evaluates every visible Gaussian, under autograd.
 
 Four stages: `project` (projection.py), `sort`, `blend`, `compose`. Written for readability and as
 the reference in tests, in float32 and float64. There are no tiles; pixels are processed in chunks

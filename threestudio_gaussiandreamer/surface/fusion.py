@@ -1,5 +1,4 @@
-"""Render Gaussians from all sides, and fuse their depths to a signed distance on a grid (Curless
-and Levoy 1996).
+"""Render Gaussians from all sides, fuse depths to signed distances on a grid (Curless, Levoy 1996).
 
 The surface that a pixel shows is assumed to lie one standard deviation in front of the mean depth,
 since Gaussians behind the surface contribute to the mean too. Each view adds to a grid point the

@@ -1,5 +1,4 @@
-"""Data module ``gaussiandreamer-datamodule``: random training cameras, a ring of validation and
-test cameras.
+"""Data module ``gaussiandreamer-datamodule``: random training cameras, rings for the other stages.
 
 Batch keys, units and options are those of threestudio's ``random-camera-datamodule``, under whose
 name it is also registered in the built-in host, except that cameras aren't perturbed, that there

@@ -75,8 +75,7 @@ class SplattingRenderer(Rasterizer):
     def forward(
         self, c2w: Tensor, fovy: Tensor, height: int, width: int, **unused: Any
     ) -> "LazyMapping":
-        """Render B views, in float32 whatever the trainer's precision is: half precision would move
-        cameras by thousandths.
+        """Render B views, in float32 whatever the trainer's precision is: half would move cameras.
 
         Args:
             c2w: (B, 4, 4) OpenGL.

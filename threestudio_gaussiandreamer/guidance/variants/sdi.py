@@ -17,8 +17,8 @@ inversion_steps  DDIM steps from no noise to all, at most: each is a whole numbe
 eta              0 to 1: share of fresh noise in each step of the inversion; threestudio: 0.3
 ===============  ===================================================================================
 
-The paper also anneals t linearly (see ``min_step_percent``), with a ``guidance_scale`` of 7.5,
-which is 8.5 here."""
+The paper also anneals t linearly (see ``min_step_percent``), and its ``guidance_scale``
+is 7.5, which is 8.5 here."""
 
 from dataclasses import dataclass, field
 from typing import Any, Optional

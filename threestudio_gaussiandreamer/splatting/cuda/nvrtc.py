@@ -137,8 +137,7 @@ def cache_folder() -> Path:
     """Return where compiled kernels are kept.
 
     Raises:
-        RuntimeError: neither the variables nor the system say where the user's home is, as in some
-            containers.
+        RuntimeError: neither variables nor the system say where the user's home is (in containers).
     """
     if folder := os.environ.get("GAUSSIANDREAMER_CACHE"):
         return Path(folder).expanduser()
