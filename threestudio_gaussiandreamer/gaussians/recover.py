@@ -3,6 +3,7 @@ squared error and Adam. No diffusion model is involved, so the appearance stays 
 
 import math
 from collections.abc import Callable, Iterator
+from dataclasses import InitVar, dataclass
 from typing import NamedTuple
 
 import torch
@@ -43,6 +44,7 @@ class Round(NamedTuple):
         return len(self.cloud.means)
 
 
+@dataclass(eq=False)
 class Recovery:
     """Recovers Gaussians after each round of pruning; never lowers the validation PSNR.
 
@@ -57,23 +59,18 @@ class Recovery:
         sh_reach: largest absolute value of the constant harmonic that the file can store.
     """
 
-    def __init__(
-        self,
-        original: Gaussians,
-        train_views: Views,
-        val_views: Views,
-        *,
-        steps: int = 60,
-        seed: int = 0,
-        as_stored: Callable[[Gaussians], Gaussians] = lambda cloud: cloud,
-        sh_reach: float = math.inf,
-    ) -> None:
-        self.train_views, self.val_views = train_views, val_views
-        self.train_images, trained = render_with_contribution(original, train_views)
-        self.val_images, validated = render_with_contribution(original, val_views)
+    original: InitVar[Gaussians]
+    train_views: Views
+    val_views: Views
+    steps: int = 60
+    seed: int = 0
+    as_stored: Callable[[Gaussians], Gaussians] = lambda cloud: cloud
+    sh_reach: float = math.inf
+
+    def __post_init__(self, original: Gaussians) -> None:
+        self.train_images, trained = render_with_contribution(original, self.train_views)
+        self.val_images, validated = render_with_contribution(original, self.val_views)
         self.contribution = torch.maximum(trained, validated)  # (N,) of the original
-        self.steps, self.seed = steps, seed
-        self.as_stored, self.sh_reach = as_stored, sh_reach
         self.first_scale = 0  # index into LR_SCALES
 
     def __call__(self, cloud: Gaussians, round_number: int) -> Round:

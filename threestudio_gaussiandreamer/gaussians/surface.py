@@ -147,12 +147,10 @@ def _add_many(
             flat[:, channel] += np.bincount(index, added.ravel(), minlength=len(flat))
 
 
-def _add_one(
-    sums: Float[np.ndarray, "X Y Z 4"], gaussians: _InCells, row: int, half_side: int
-) -> None:
+def _add_one(sums: Float[np.ndarray, "X Y Z 4"], gaussians: _InCells, row: int, half: int) -> None:
     """Add one Gaussian of any size."""
     place, shape = gaussians.places[row], np.array(sums.shape[:3])
-    first, last = (np.round(place).astype(int) + sign * half_side for sign in (-1, 1))
+    first, last = (np.round(place).astype(int) + sign * half for sign in (-1, 1))
     box = tuple(slice(a, b) for a, b in zip(first.clip(0), (last + 1).clip(0, shape), strict=True))
     away = np.ogrid[box]
     away = [(axis - at).astype(np.float32) for axis, at in zip(away, place, strict=True)]

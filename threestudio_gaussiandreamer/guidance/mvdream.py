@@ -55,9 +55,8 @@ class MVDreamGuidance(StableDiffusionGuidance):
         @staticmethod
         def check(cfg: Any) -> None:
             if cfg.view_contrast:
-                raise UserError(
-                    "view_contrast: this model has one prompt for all views: set it to 0"
-                )
+                said = "this model has one prompt for all views: set it to 0"
+                raise UserError(f"view_contrast: {said}")
             StableDiffusionGuidance.Config.check(cfg)
 
     cfg: Config

@@ -81,9 +81,7 @@ class LiveViewer(pl.Callback):
         step = f"step {trainer.global_step}, {len(cloud.means):,} Gaussians{quality}"
         self.view.show(cloud, step)
 
-    def _update(
-        self, trainer: Any, system: Any, batch: dict[str, Any], cameras: bool = True
-    ) -> None:
+    def _update(self, trainer: Any, system: Any, batch: Any, cameras: bool = True) -> None:
         """Show what is asked for or due: the score model's picture, the cloud, its cameras."""
         if self.controls.picture.is_set():
             self.controls.picture.clear()

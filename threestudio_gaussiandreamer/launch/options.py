@@ -44,10 +44,8 @@ def parse_arguments(argv: Sequence[str]) -> argparse.Namespace:
     for flag, text in flags.items():
         parser.add_argument(flag, action="store_true", help=text)
     stages = parser.add_mutually_exclusive_group(required=True)
-    for stage, text in STAGES.items():
-        stages.add_argument(
-            f"--{stage}", dest="stage", action="store_const", const=stage, help=text
-        )
+    for name, text in STAGES.items():
+        stages.add_argument(f"--{name}", dest="stage", action="store_const", const=name, help=text)
     parser.add_argument(
         "--gpu",
         help="0, or cpu, or 0,1 for a process on each; default: GPU 0 if there is one. Ignored "

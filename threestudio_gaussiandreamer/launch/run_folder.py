@@ -290,9 +290,8 @@ def claim(
                 text = (path / LOCK_FILE).read_text(encoding="utf-8", errors="replace")
                 host, process, command = text.split(" ", 2)
                 holder = f" (process {process} on {host}: {command})"
-            raise FolderInUse(
-                f"{busy} in {path}{holder}: wait until it ends{advice}{error}"
-            ) from error
+            said = f"wait until it ends{advice}{error}"
+            raise FolderInUse(f"{busy} in {path}{holder}: {said}") from error
 
 
 def make_folder(path: Path, attempts: int = 10) -> Optional[Path]:

@@ -166,9 +166,8 @@ def pose_rotation(extension: str, up: str, front: Optional[str]) -> np.ndarray:
     if front not in AXES:
         raise unknown("front axis", front, AXES)
     if front[1] == up[1]:
-        raise UserError(
-            f"the front of a mesh can't lie along its up axis: up is {up}, front is {front}"
-        )
+        found = f"up is {up}, front is {front}"
+        raise UserError(f"the front of a mesh can't lie along its up axis: {found}")
     return np.stack([AXES[front], np.cross(AXES[up], AXES[front]), AXES[up]])
 
 

@@ -122,13 +122,11 @@ def clip_tokens(folder: Path, texts: list[str], suffix: str = "") -> Any:
     return _tokenize(tokenizer, texts, min(tokenizer.model_max_length, LENGTH))
 
 
-def with_encoder(
-    encoder_class: Any, folder: Path, component: str, run: Callable[[Any], Any]
-) -> Any:
+def with_encoder(kind: Any, folder: Path, component: str, run: Callable[[Any], Any]) -> Any:
     """Load a CLIP text encoder in float32, call ``run`` with it, and free it."""
 
     def load(device: torch.device) -> Any:
-        return load_network(encoder_class, folder, component, dtype=torch.float32).to(device)
+        return load_network(kind, folder, component, dtype=torch.float32).to(device)
 
     return _freed(lambda d: run(loaded((component, str(folder), d), lambda: load(d))))
 

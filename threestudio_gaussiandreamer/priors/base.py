@@ -142,9 +142,8 @@ class FilePrior(Prior):
         @staticmethod
         def check(cfg: Any) -> None:
             if cfg.producer and (cfg.up != "auto" or getattr(cfg, "front", None)):
-                raise UserError(
-                    "producer: it says which axes the file has; give it, or up and front"
-                )
+                said = "it says which axes the file has; give it, or up and front"
+                raise UserError(f"producer: {said}")
             if getattr(cfg, "normalize", True) is None and not cfg.producer:
                 unused = "without normalize or producer"
                 require_defaults(FilePrior.Config, cfg, ("scale",), unused)

@@ -52,6 +52,8 @@ SPINE = {"lower spine": 1 / 3, "middle spine": 2 / 3, "upper spine": 1.0}
 """How far each joint of the spine turns from the pelvis' orientation to the chest's."""
 NEEDED = [f"{side} {joint}" for side in SIDES for joint in ("hip", "knee", "shoulder", "elbow")]
 """Joints without whose positions there is no pose."""
+Pose = Float[np.ndarray, "22 3 3"]
+Point = Float[np.ndarray, "3"]
 Z_UP = [2, 0, 1]
 """The axes of z up, front +x, among those of y up, front +z."""
 POSES: dict[str, dict[str, tuple[float, float, float]]] = {
@@ -83,7 +85,7 @@ class Body(NamedTuple):
     """By how much each vertex moves with each joint; rows sum to 1."""
 
 
-def posed(body: Body, pose: Float[np.ndarray, "22 3 3"]) -> Body:
+def posed(body: Body, pose: Pose) -> Body:
     """Return the body in a pose, with its pelvis where it is at rest."""
     joints = body.joints.copy()
     for joint, parent in enumerate(PARENTS):
@@ -95,7 +97,7 @@ def posed(body: Body, pose: Float[np.ndarray, "22 3 3"]) -> Body:
     return body._replace(vertices=moved + body.weights @ shifts, joints=joints)
 
 
-def named_pose(body: Body, name: str) -> Float[np.ndarray, "22 3 3"]:
+def named_pose(body: Body, name: str) -> Pose:
     """Return a pose of ``POSES``."""
     from scipy.spatial.transform import Rotation
 
@@ -105,9 +107,7 @@ def named_pose(body: Body, name: str) -> Float[np.ndarray, "22 3 3"]:
     return pose_of_rotations(body, local)
 
 
-def pose_of_rotations(
-    body: Body, local: Float[np.ndarray, "22 3 3"]
-) -> Float[np.ndarray, "22 3 3"]:
+def pose_of_rotations(body: Body, local: Pose) -> Pose:
     """Return the pose in which each joint is rotated relative to its parent, from a T-pose, as
     SMPL's; the first rotation is that of the whole body.
     """
@@ -126,9 +126,7 @@ def pose_of_rotations(
     return turned @ to_t_pose
 
 
-def pose_of_positions(
-    body: Body, positions: dict[str, Float[np.ndarray, "3"]]
-) -> Float[np.ndarray, "22 3 3"]:
+def pose_of_positions(body: Body, positions: dict[str, Point]) -> Pose:
     """Return the pose in which hips, chest and limbs point as those of a skeleton of any size, of
     which at least the positions of the joints in ``NEEDED`` are known.
     """
@@ -150,7 +148,7 @@ def pose_of_positions(
     return pose
 
 
-def part_frame(positions: dict[str, Float[np.ndarray, "3"]], part: str) -> Float[np.ndarray, "3 3"]:
+def part_frame(positions: dict[str, Point], part: str) -> Float[np.ndarray, "3 3"]:
     """Return the columns left, up and front of the hips ("hip") or of the chest ("shoulder")."""
     left, right = positions[f"left {part}"], positions[f"right {part}"]
     low, chest = (
@@ -159,7 +157,7 @@ def part_frame(positions: dict[str, Float[np.ndarray, "3"]], part: str) -> Float
     high = positions.get("neck", chest)
     if part == "hip":
         high = positions.get("lower spine", high)
-    across, width = _unit(left - right), np.linalg.norm(left - right)
+    across, width = unit(left - right), np.linalg.norm(left - right)
     rise = (high - low) - ((high - low) @ across) * across
     size = np.linalg.norm(high - low) + width
     if min(width, np.linalg.norm(rise)) <= 1e-6 * size:
@@ -167,27 +165,25 @@ def part_frame(positions: dict[str, Float[np.ndarray, "3"]], part: str) -> Float
             f"the pose has its {part}s and spine on one line: there is no front; choose another "
             "frame or file"
         )
-    up = _unit(rise)
+    up = unit(rise)
     return np.stack([across, up, np.cross(across, up)], axis=1)
 
 
-def swing(
-    source: Float[np.ndarray, "3"], target: Float[np.ndarray, "3"]
-) -> Float[np.ndarray, "3 3"]:
+def swing(source: Point, target: Point) -> Float[np.ndarray, "3 3"]:
     """Return the smallest rotation from ``source`` to ``target``; the identity if one is zero."""
     from scipy.spatial.transform import Rotation
 
     if not (np.linalg.norm(source) > 1e-9 and np.linalg.norm(target) > 1e-9):
         return np.eye(3)
-    a, b = _unit(source), _unit(target)
+    a, b = unit(source), unit(target)
     axis = np.cross(a, b)
     angle = np.arctan2(np.linalg.norm(axis), a @ b)
     if np.linalg.norm(axis) < 1e-9:  # parallel, or opposite: any perpendicular axis
         axis = np.cross(a, np.eye(3)[np.abs(a).argmin()])
-    return Rotation.from_rotvec(angle * _unit(axis)).as_matrix()
+    return Rotation.from_rotvec(angle * unit(axis)).as_matrix()
 
 
-def _unit(vector: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+def unit(vector: Point) -> Point:
     return vector / max(float(np.linalg.norm(vector)), 1e-12)
 
 
@@ -248,9 +244,7 @@ PAIRED = {
 """Parts of the names of each joint, the most specific one first."""
 
 
-def read_pose(
-    path: str, body: Body, *, frame: int = 0, up: str = "auto"
-) -> Float[np.ndarray, "22 3 3"]:
+def read_pose(path: str, body: Body, *, frame: int = 0, up: str = "auto") -> Pose:
     """Return one frame of a pose file, or a pose of ``POSES``, as a pose of the body.
 
     Args:
@@ -274,7 +268,7 @@ def read_pose(
     return TO_BODY[stated if up == "auto" else up] @ pose
 
 
-def read_axis_angles(path: Path, frame: int) -> tuple[Float[np.ndarray, "22 3 3"], str]:
+def read_axis_angles(path: Path, frame: int) -> tuple[Pose, str]:
     """Return the rotations of one frame, and the axis that is up."""
     from scipy.spatial.transform import Rotation
 
@@ -324,7 +318,7 @@ def _angles(arrays: dict[str, np.ndarray]) -> Optional[Float[np.ndarray, "F J3"]
 # BVH -----------------------------------------------------------------------------------------
 
 
-def read_bvh(path: Path, frame: int) -> dict[str, Float[np.ndarray, "3"]]:
+def read_bvh(path: Path, frame: int) -> dict[str, Point]:
     """Return the positions of the known joints in one frame of a BVH, in its unit and axes. A
     joint's position channels replace its offset.
     """

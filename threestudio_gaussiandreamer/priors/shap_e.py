@@ -162,7 +162,13 @@ def decoded(renderer: Any, latents: Float[Tensor, "1 N D"], colors: str) -> Poin
     """Return the mesh of ``latents`` by marching cubes, with the texture field's colours."""
     if not torch.isfinite(latents).all():
         raise UserError("Shap-E's latents are not finite: check its weights")
-    hook = renderer.mesh_decoder.register_forward_hook(_refuse_empty)
+
+    def require_faces(decoder: Any, inputs: tuple, mesh: Any) -> None:
+        if not len(mesh.faces):  # the renderer's next steps would fail
+            said = "try another seed or another prompt"
+            raise UserError(f"Shap-E found no surface for this prompt: {said}")
+
+    hook = renderer.mesh_decoder.register_forward_hook(require_faces)
     try:
         options = {"grid_size": GRID_SIZE, "query_batch_size": QUERY_BATCH_SIZE}
         mesh = renderer.decode_to_mesh(latents, latents.device, **options)
@@ -175,14 +181,6 @@ def decoded(renderer: Any, latents: Float[Tensor, "1 N D"], colors: str) -> Poin
         colors=linear if colors == "linear" else linear_to_srgb(linear),
         faces=mesh.faces.cpu().numpy(),
     )
-
-
-def _refuse_empty(decoder: Any, inputs: tuple, mesh: Any) -> None:
-    """Raise UserError for a mesh without faces, on which the renderer's next steps would fail."""
-    if not len(mesh.faces):
-        raise UserError(
-            "Shap-E found no surface for this prompt: try another seed or another prompt"
-        )
 
 
 # Weights in OpenAI's own format, as Cap3D publishes its finetuned ones ----------------------------

@@ -248,9 +248,8 @@ def resolve_prompt(prompt: str) -> str:
             another structure than a JSON list of texts, or an object of such lists.
     """
     if not prompt.strip():
-        raise UserError(
-            'no prompt: give one, for instance system.prompt_processor.prompt="a corgi"'
-        )
+        example = 'system.prompt_processor.prompt="a corgi"'
+        raise UserError(f"no prompt: give one, for instance {example}")
     if not prompt.startswith("lib:"):
         return prompt
     with reading(PROMPT_LIBRARY, "prompt library") as file:

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ..priors.body_pose import INDEX, SIDES, Z_UP
+from ..priors.body_pose import INDEX, SIDES, Z_UP, unit
 from .kinds import Anchors, Model, Proportions
 from .shapes import Shape, box, ellipsoid, limb
 
@@ -38,10 +38,6 @@ def person(p: Proportions, joints: Float[np.ndarray, "22 3"]) -> Model:
     head, top = head_shapes(at, trunk, skin, p)
     neck, cape = tuple(at["neck"] + 0.02 * trunk.up), (cape_shape(chest, trunk, p),)
     return [*shapes, *head], Anchors(tuple(top), 0.14, neck, (0.1, 0.1), cape=cape)
-
-
-def unit(vector: np.ndarray) -> np.ndarray:
-    return vector / np.linalg.norm(vector)
 
 
 def upper_body(at: dict, chest: np.ndarray, trunk: Trunk, p: Proportions) -> list[Shape]:

@@ -138,14 +138,12 @@ ACTION_PHRASES: dict[str, str] = {
 """The action of each phrase, in both forms of its verb."""
 
 
-def prompt_of(
-    attributes: Attributes, elevation: float, azimuth: float, rng: np.random.Generator
-) -> str:
+def prompt_of(a: Attributes, elevation: float, azimuth: float, rng: np.random.Generator) -> str:
     """Write a view's prompt: empty, without a direction, or with it as prompt processors do."""
     share = rng.random()
     if share < EMPTY_SHARE:
         return ""
-    text, view = describe(attributes, rng), direction(elevation, azimuth)
+    text, view = describe(a, rng), direction(elevation, azimuth)
     if share < EMPTY_SHARE + PLAIN_SHARE:
         return text
     if view.endswith("side") and rng.random() < UNNAMED_SIDE_SHARE:

@@ -114,9 +114,8 @@ class CameraConfig:
     def check(cfg: Any) -> None:
         milestones = list(cfg.resolution_milestones)
         if any(later <= earlier for earlier, later in pairwise([0, *milestones])):
-            raise UserError(
-                f"resolution_milestones: expected increasing steps above 0, got {milestones}"
-            )
+            expected = "expected increasing steps above 0"
+            raise UserError(f"resolution_milestones: {expected}, got {milestones}")
         counts = {}
         for name in ("height", "width", "batch_size"):
             counts[name] = len(values) if is_list(values := getattr(cfg, name)) else 1

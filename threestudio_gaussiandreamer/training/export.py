@@ -134,9 +134,8 @@ def writers(
             # names that differ only in case are the same on some file systems
             name = os.path.normpath(out.save_name).casefold()
             if name in written or Path(name).parts[:1] in [(reserved,) for reserved in RESERVED]:
-                raise UserError(
-                    f"save_name {out.save_name!r}: another file of the export has this name"
-                )
+                said = "another file of the export has this name"
+                raise UserError(f"save_name {out.save_name!r}: {said}")
             written.add(name)
             noted = {"pruned_to": pruned_to} if out.save_type in CLOUDS else {}
             save = getattr(system, f"save_{out.save_type}")

@@ -137,9 +137,8 @@ def cloud_file(path: str | os.PathLike, hint: str = "") -> Path:
     folder = Path(path).expanduser()
     found = RunFiles(folder).cloud if is_run(folder) else None
     if found is None:
-        raise UserError(
-            f"{str(path)!r} is no run with an exported cloud: name a file or a run{hint}"
-        )
+        advice = f"name a file or a run{hint}"
+        raise UserError(f"{str(path)!r} is no run with an exported cloud: {advice}")
     return found
 
 
@@ -235,6 +234,5 @@ def from_checkpoint(file: Path) -> Gaussians:
             values = {name: state[stored].detach().float() for name, stored in names.items()}
             harmonics = torch.cat([values.pop("sh0"), values.pop("sh_rest")], 1)
             return Gaussians(sh=harmonics, **values).arrays()
-    raise UserError(
-        f"{file} holds no cloud of Gaussians: neither geometry.means nor gsplat's splats"
-    )
+    said = "neither geometry.means nor gsplat's splats"
+    raise UserError(f"{file} holds no cloud of Gaussians: {said}")

@@ -215,9 +215,8 @@ def write_gallery(folder: Path) -> Path:
             warn(str(error))
     path = folder / NAME
     if path.exists() and OWN_PAGE not in path.read_bytes()[:1000].decode(errors="replace"):
-        raise UserError(
-            f"{str(path)!r} isn't a page of this package, so it isn't replaced: move it"
-        )
+        advice = "so it isn't replaced: move it"
+        raise UserError(f"{str(path)!r} isn't a page of this package, {advice}")
     cards = [_card(RunFiles(run), folder) for run in sorted(found)]
     title = f"{len(cards)} runs in {folder.resolve().name}"
     write_static(path, "gallery.html", title=title, cards=cards)
