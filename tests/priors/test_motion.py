@@ -196,10 +196,10 @@ def test_pictures_show_the_front_and_both_sides():
     """A plate that faces +x is widest in the middle one, one that faces +y is thin there."""
     plate = trimesh.creation.box(extents=[0.02, 1, 1])
     front, side = (
-        (body_pictures(Mesh(plate.vertices[:, order], np.asarray(plate.faces))) < 0.99).all(-1)
+        (body_pictures(Mesh(plate.vertices[:, order], np.asarray(plate.faces))) != 0.5).all(-1)
         for order in ([0, 1, 2], [1, 0, 2])
     )
-    assert front.shape == (3, 224, 224) and not front[:, 0, 0].any()  # white
+    assert front.shape == (3, 224, 224) and not front[:, 0, 0].any()  # grey
     left, middle, right = front.mean(axis=(1, 2))
     assert middle > 1.2 * max(left, right) and side[1].mean() < 0.2 * middle
 
@@ -329,7 +329,7 @@ def test_bodies_with_hands_are_read(tmp_path, body):
 
 
 def test_skinning_by_another_implementation(body):
-    """That of poses in ``body_pose``, and smplx where it is installed."""
+    """That of poses in ``body_pose``."""
     generator = torch.Generator().manual_seed(0)
     directions = torch.randn(body.pose_directions.shape, generator=generator, dtype=torch.float64)
     body = body._replace(pose_directions=0.01 * directions)
@@ -350,8 +350,6 @@ def test_skinning_by_another_implementation(body):
         oracle = posed(Body(bent, body.faces, rest, weights), pose22)
         np.testing.assert_allclose(found[i], oracle.vertices + 1, atol=1e-9)
         np.testing.assert_allclose(joints[i, :22], oracle.joints + 1, atol=1e-9)
-    lbs = pytest.importorskip("smplx.lbs").lbs
-    np.testing.assert_allclose(found, lbs(shape, pose.flatten(1), *body[:-1])[0] + 1, atol=1e-6)
 
 
 def test_known_poses_and_surfaces_are_found(body):

@@ -41,6 +41,7 @@ def sure(attributes, sides=None):
 def test_one_wrong_attribute_of_a_person_is_missed_alone(change, missed):
     found = recognition.recognized(sure(KICK._replace(**change)), KICK)
     assert [name for name, right in found.items() if right == 0] == missed
+    assert math.isnan(found["sides"]) == (missed == ["action"])  # nothing to be swapped
     wanted = KICK._replace(action="sit")  # has no side
     found = recognition.recognized(sure(wanted._replace(**change)), wanted)
     assert math.isnan(found["sides"]) and found["action"] == ("action" not in change)

@@ -195,6 +195,7 @@ def test_the_demo_draws_an_avatar_which_goes_on_from_its_checkpoint(
     [
         ("a man in a green jacket and white pants bows", demo.AVATAR),
         ("Iron man kicks with his left leg", demo.AVATAR),
+        ("someone bows", demo.AVATAR),
         ("two persons walk", demo.AVATAR),  # which names what is wrong
         ("a person in a red shirt", demo.OBJECT),
         ("a red fox running with a green scarf", demo.OBJECT),
@@ -215,6 +216,21 @@ def test_a_prompt_that_is_no_avatars_is_refused_before_any_work(posing, tmp_path
         words += [f"{MODEL}={posing}", "--gpu", "cpu"]
         assert launch(["--config", "toybox-avatar.yaml", "--train", *words]) == 2
         assert message in capsys.readouterr().err and not (tmp_path / "out").exists()
+        words = [PROMPT, prompt, "--models", str(posing), "--output", str(tmp_path / "demo")]
+        if message != "no action":  # the demo's are then objects
+            assert demo.main(words) == 2 and message in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_clip_chooses_frames_that_show_the_action(tmp_path):
+    """The bundled CLIP, of the bundled model's motions, which begin from rest."""
+    heights = {"stands with open arms": 0.3, "raises both arms": 0.6, "stands in a T pose": 0.4}
+    for action, height in heights.items():
+        options = {**dict.fromkeys(("motion", "body_model", "clip"), "toybox"), "sample": 0}
+        made = motion.MotionPrior(options)
+        made(f"a person in a red shirt and blue trousers {action}")
+        joints = made.joints
+        assert joints[[20, 21], 1].min() > joints[0, 1] + height  # wrists above the pelvis
 
 
 # Wrong input --------------------------------------------------------------------------------------

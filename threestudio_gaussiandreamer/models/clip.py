@@ -59,7 +59,7 @@ def text_condition(tokenizer: Any, encoder: Any, text: str) -> Float[Tensor, "1 
 def text_features(source: Source, text: str) -> Float[Tensor, "1 D"]:
     """Return the text's features as the encoder gives them, of any length, on the CPU."""
     folder = locate(source)
-    encoder = load_text_encoder(folder)
+    encoder = load_text_encoder(folder, allow_bin=True)  # where the source allows it
     return encoder(token_ids(load_tokenizer(folder), text)).text_embeds.float()
 
 

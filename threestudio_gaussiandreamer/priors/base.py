@@ -71,7 +71,7 @@ def preflight_prior(prior: Any, keep_attributes: bool, prompt: str = "") -> None
         prior.preflight()
     if keep_attributes and hasattr(prior, "preflight_attributes"):
         prior.preflight_attributes()
-    if prompt and not prompt.startswith("lib:") and hasattr(prior, "preflight_prompt"):
+    if prompt and hasattr(prior, "preflight_prompt"):
         prior.preflight_prompt(prompt)
 
 

@@ -14,7 +14,8 @@ frame              a number, from 0; or ``clip``: the frame whose body fits the 
 candidates         in place of a motion: mesh files of posed bodies, of which CLIP chooses the one
                    that fits the prompt best (the paper's appendix)
 clip               any CLIP in transformers' format, a folder or an id of the hub, or ``toybox``
-motion_text        the motion of the prompt; null: found by the rules of ``motion_text.py``
+motion_text        the motion of the prompt; null, or with ``toybox``: found by the rules of
+                   ``motion_text.py``
 scale              half the longest side, world units
 num_points         points uniform over the surface (the released code), or 0 for the vertices (the
                    paper)
@@ -43,6 +44,7 @@ The limits keep knees and elbows from bending backwards, which positions alone w
 the whole body is placed, then the pose is fitted under a strong prior, then under the final one."""
 
 import math
+import os
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, List, NamedTuple, Optional
@@ -73,7 +75,7 @@ from .body_pose import BODY_JOINTS, JOINTS, PARENTS, require_frame, world_mesh
 from .karras import torch_generator
 from .mesh import centred, colored_cloud, face_normals
 from .motion_text import motion_sentence, reduced_prompt
-from .text_to_motion import FRAMES, load_motion_model, sample_motions
+from .text_to_motion import FRAMES, TextToMotion, load_motion_model, sample_motions
 
 VIEW_AZIMUTHS = (-40.0, 0.0, 40.0)
 VIEW_ELEVATION, VIEW_DISTANCE, VIEW_FOVY = 10.0, 3.2, math.radians(40)
@@ -192,7 +194,7 @@ class MotionPrior(Prior):
             name = model_part(cfg.motion, MOTION)
             if is_model(name):
                 load_motion_model(name)
-                clips.append(motion_clip(cfg.motion, name))
+                clips.append(motion_clip(name))
             lengths = [FRAMES] * SAMPLES if is_model(name) else read_motions(name).lengths
             offered_frames(lengths, cfg.sample, cfg.frame)
             load_body_model(model_part(cfg.body_model, BODY))
@@ -206,7 +208,7 @@ class MotionPrior(Prior):
         """Check that the prompt, or ``motion_text``, has an action that the model knows."""
         name = self.cfg.motion and model_part(self.cfg.motion, MOTION)
         if is_model(name):
-            motion_sentence(self.cfg.motion_text or prompt, load_motion_model(name).known)
+            self._sentence(prompt, load_motion_model(name))
 
     def generate(self, prompt: str, generator: np.random.Generator) -> PointCloud:
         self.preflight()
@@ -220,6 +222,10 @@ class MotionPrior(Prior):
         cloud = colored_cloud(body, self.cfg, generator)
         return centred(cloud) if self.cfg.center == "mean" else cloud
 
+    def _sentence(self, prompt: str, model: TextToMotion) -> str:
+        text = self.cfg.motion_text
+        return text if text and not model.known else motion_sentence(text or prompt, model.known)
+
     def _motions(self, prompt: str, generator: np.random.Generator) -> tuple[Motions, str]:
         """Return the file's motions, or those that the model draws, and the text CLIP compares."""
         name, text = model_part(self.cfg.motion, MOTION), self.cfg.motion_text
@@ -232,11 +238,13 @@ class MotionPrior(Prior):
                 )
             return read_motions(name), text or prompt
         model = load_motion_model(name)
-        text = motion_sentence(text or prompt, model.known)
-        info(f"motion: {text!r}")
-        features = text_features(motion_clip(self.cfg.motion, name), text)
+        sentence = self._sentence(prompt, model)
+        info(f"motion: {sentence!r}")
+        features = text_features(motion_clip(name), sentence)
         positions = sample_motions(model, features, SAMPLES, torch_generator(generator))
-        return Motions(positions, [FRAMES] * SAMPLES), text
+        # the bundled CLIP has seen persons in clothes only
+        compared = text or prompt if model.known else sentence
+        return Motions(positions, [FRAMES] * SAMPLES), compared
 
     def _body_of_motion(self, prompt: str, generator: np.random.Generator) -> Mesh:
         """Return the body of the chosen frame, with z up, facing +x, centred and scaled."""
@@ -283,10 +291,14 @@ def is_model(motion: str) -> bool:
     return Path(motion).suffix == ".pt"
 
 
-def motion_clip(motion: str, path: str) -> Source:
-    """Return the CLIP whose text features a model takes: its export's, or the published models'."""
-    clip = MDM_CLIP if path == motion else motion
-    return clip_source(clip, option="system.geometry.prior.motion")
+def motion_clip(path: str) -> Source:
+    """Return the CLIP whose text features a model takes: one beside it, or the published models'.
+
+    An export's is beside the model's folder."""
+    near = [str(folder / "clip") for folder in Path(path).parents[:2]]
+    found = next(filter(os.path.isdir, near), MDM_CLIP)
+    place = f"the folder or link {near[0]}"
+    return clip_source(found, option=place, allow_bin=True)  # published in both formats
 
 
 def offered_frames(lengths: list[int], sample: Optional[int], frame: Any) -> list[tuple[int, int]]:
@@ -303,7 +315,7 @@ def offered_frames(lengths: list[int], sample: Optional[int], frame: Any) -> lis
 
 
 def body_pictures(mesh: Mesh) -> Float[np.ndarray, "V H W 3"]:
-    """Render the body in Lambertian grey on white, from the front and from both sides of it."""
+    """Render the body in Lambertian grey on grey, from the front and from both sides of it."""
     normals = np.zeros_like(mesh.vertices)
     for corner in range(3):
         np.add.at(normals, mesh.faces[:, corner], face_normals(mesh))
@@ -314,7 +326,7 @@ def body_pictures(mesh: Mesh) -> Float[np.ndarray, "V H W 3"]:
     azimuths, ones = torch.tensor(VIEW_AZIMUTHS), torch.ones(len(VIEW_AZIMUTHS))
     views = orbit_c2w(VIEW_ELEVATION * ones, azimuths, VIEW_DISTANCE * ones).numpy()
     pictures = caster.render_views([(c2w, VIEW_FOVY) for c2w in views], PICTURE_SIZE, PICTURE_SIZE)
-    return over_background(pictures, np.ones(3, np.float32))
+    return over_background(pictures, np.full(3, 0.5, np.float32))
 
 
 # SMPL fitted to joint positions -------------------------------------------------------------------

@@ -5,7 +5,8 @@ with his left leg" becomes "Someone kicks with the left leg". Here: the first ve
 what follows it, up to the first comma or full stop, with "Someone" before it and "the" for "his",
 "her", "its" and "their". No language model: the user can always give the text.
 
-A model may list the phrases of its training, as the toybox's: the prompt's longest is taken."""
+A model may list the phrases of its training, as the toybox's: the first in that sentence, or else
+in the prompt, is taken."""
 
 import re
 import sys
@@ -38,9 +39,11 @@ DRESSED = re.compile(
 )
 PERSON = "(?:person|man|woman|boy|girl|child)"
 SEVERAL = re.compile(
-    r"(?:^|\bof )(?:two|three|four|five|several|many)\b"
-    r"|\b(?:people|persons|men|women|boys|girls|children|couple|crowd|each other)\b"
-    rf"|\b{PERSON}\b.* and (?:a|an|another|the) (?:\w+ ){{0,2}}{PERSON}\b"
+    r"^ (?:.*(?:photo|picture|image|model|render|rendering) of )?"
+    r"(?:two(?! face)|three|four|five|several|many) "
+    r"| (?:people|persons|(?<! x )men|women|boys|girls|children|twins|couple(?! of)|each other) "
+    rf"| {PERSON} .*(?:and|with) (?:a|an|another) (?:\w+ ){{0,2}}{PERSON} "
+    rf"| and (?:an? )?(?!(?:can|may|then|to) )\w+ (?:{'|'.join(VERBS)}) "  # Batman and Robin run
 )
 POSSESSIVES = re.compile(r"\b(?:his|her|its|their|my|your|our)\b", re.IGNORECASE)
 
@@ -90,27 +93,35 @@ def motion_sentence(prompt: str, known: Sequence[str] = ()) -> str:
     Raises:
         UserError: the prompt has no action, none of the known ones, or more than one person.
     """
-    words = " ".join(re.findall(r"\w+", POSSESSIVES.sub("the", prompt.lower())))
-    if SEVERAL.search(words):
+    if SEVERAL.search(plain(prompt)):
         raise UserError(
             f"the prompt {prompt!r} is about more than one person: a run makes one; set "
             "motion_text to what this one does"
         )
-    if found := [phrase for phrase in known if f" {phrase} " in f" {words} "]:
-        return f"{SUBJECT} {max(found, key=len)}"
     sentence = reduced_prompt(prompt)
-    if sentence is None:
-        example = known[0] if known else "stands with open arms"
-        raise UserError(
-            f"no action was found in {prompt!r}: say what the person does, or set motion_text, for "
-            f"instance to '{SUBJECT} {example}'"
-        )
-    if known:
-        action = sentence.removeprefix(f"{SUBJECT} ").removeprefix("is ")
-        alike = [phrase for phrase in known if phrase.split()[0] == action.split()[0]]
-        near = map(repr, get_close_matches(action, alike or known, n=3, cutoff=0))
-        raise UserError(f"the model doesn't know the action {action!r}: near {', '.join(near)}")
-    return sentence
+    for text in map(plain, (sentence or "", prompt)):
+        keys = [plain(phrase.removeprefix("is ")) for phrase in known]
+        if found := [key for key in keys if key in text]:
+            first = min(found, key=lambda key: (text.index(key), -len(key)))
+            return f"{SUBJECT} {known[keys.index(first)]}"
+    if sentence and not known:
+        return sentence
+    action = (sentence or prompt).removeprefix(f"{SUBJECT} ").removeprefix("is ")
+    alike = [phrase for phrase in known if phrase.split()[0] == action.split()[0]]
+    near = get_close_matches(action, alike or known, 3, cutoff=0) or ["stands with open arms"]
+    if sentence:
+        names = ", ".join(map(repr, near))
+        raise UserError(f"the model doesn't know the action {action!r}: near {names}")
+    raise UserError(
+        f"no action was found in {prompt!r}: say what the person does, or set motion_text, for "
+        f"instance to '{SUBJECT} {near[0]}'"
+    )
+
+
+def plain(text: str) -> str:
+    """Return the words in lower case between spaces, without articles that vary."""
+    words = re.findall(r"\w+", POSSESSIVES.sub("the", text.lower()))
+    return f" {' '.join(word for word in words if word != 'the')} "
 
 
 def main() -> None:

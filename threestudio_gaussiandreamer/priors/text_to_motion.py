@@ -18,8 +18,9 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from ..core.errors import UserError
-from ..core.files import existing_file
 from ..formats.array_files import read_arrays
+from ..formats.reading import reading, require
+from ..meshes.side_files import consulted, stamp
 from ..models.model_files import load_exactly, read_state_dict
 from .body_pose import BODY_JOINTS, PARENTS
 from .karras import cosine_alphas_cumprod
@@ -28,15 +29,15 @@ FEATURES, HEADS, POSITIONS = 263, 4, 5000
 KIND = "MDM checkpoint"
 STATISTICS = ("t2m_mean.npy", "t2m_std.npy"), ("Mean.npy", "Std.npy")
 """Names of the files with the mean and the standard deviation, in MDM's folder or HumanML3D's."""
-ACTIONS = "actions.txt"
-"""Where a model may list the phrases of its training, one a line; published ones don't."""
+SETTINGS, ACTIONS = "args.json", "actions.txt"
+"""The latter may list the phrases of the training, one a line; published models have none."""
 SUPPORTED = {"dataset": "humanml", "arch": "trans_enc", "text_encoder_type": "clip",
              "noise_schedule": "cosine"}  # fmt: skip
 """What ``args.json`` must say where it says it."""
 IGNORED = re.compile(r"sequence_pos_encoder\.pe$|^clip_model\.")
 """Entries of a checkpoint that are computed, or another model's."""
-GUIDANCE_SCALE, STEPS, FRAMES = 2.5, 50, 60
-"""MDM's guidance, at most so many steps of the sampler, and frames at 20 per second."""
+STEPS, FRAMES = 50, 60
+"""At most so many steps of the sampler, and frames at 20 per second."""
 
 
 class MotionModel(nn.Module):
@@ -86,49 +87,43 @@ def load_motion_model(path: str) -> TextToMotion:
     Raises:
         UserError: a file is missing or damaged, or the model is of another kind.
     """
-    file = existing_file(path, KIND)
-    (steps, guidance), state = _settings(file), read_state_dict(path, KIND)
-    state = {name: value for name, value in state.items() if not IGNORED.search(name)}
-    layers = len({n.split(".")[2] for n in state if n.startswith("seqTransEncoder.layers.")})
-    first = state.get("input_process.poseEmbedding.weight", torch.zeros(0, 0))
-    text = state.get("embed_text.weight", torch.zeros(0, 0))
-    hidden = len(state.get("seqTransEncoder.layers.0.linear1.weight", ()))
-    width = len(first)
-    if first.shape[1:] != (FEATURES,) or not layers or len(text) != width or width % HEADS:
-        raise UserError(
-            f"{KIND} {path!r} holds another model: one of HumanML3D's {FEATURES} features with "
-            "CLIP's text was expected, such as humanml_trans_enc_512"
+    with reading(path, KIND) as file:
+        beside = [file.parent / name for name in (SETTINGS, ACTIONS, *sum(STATISTICS, ()))]
+        consulted.update((str(one), stamp(one)) for one in beside)
+        state = read_state_dict(path, KIND)
+        state = {name: value for name, value in state.items() if not IGNORED.search(name)}
+        layers = len({n.split(".")[2] for n in state if n.startswith("seqTransEncoder.layers.")})
+        first = state.get("input_process.poseEmbedding.weight", torch.zeros(0, 0))
+        text = state.get("embed_text.weight", torch.zeros(0, 0))
+        hidden = len(state.get("seqTransEncoder.layers.0.linear1.weight", ()))
+        width = len(first)
+        require(
+            first.shape[1:] == (FEATURES,) and layers and len(text) == width and not width % HEADS,
+            f"it holds another model: one of HumanML3D's {FEATURES} features with CLIP's text was "
+            "expected, such as humanml_trans_enc_512",
         )
-    network = MotionModel(width, layers, hidden, text.shape[1])
-    load_exactly(network, state, f"{KIND} {path!r}")
-    actions = file.parent / ACTIONS
-    known = actions.read_text(encoding="utf-8").splitlines() if actions.is_file() else []
-    network.eval().requires_grad_(False)
-    return TextToMotion(network, steps, guidance, *_statistics(file.parent), known)
-
-
-def _settings(file: Path) -> tuple[int, float]:
-    path = existing_file(file.parent / "args.json", "settings of the MDM checkpoint")
-    try:
-        args = json.loads(path.read_text(encoding="utf-8"))
-        steps = int(args.get("diffusion_steps", 1000))
-        guidance = float(args.get("guidance_param", GUIDANCE_SCALE))
-    except (ValueError, TypeError, AttributeError) as error:
-        raise UserError(f"settings of the MDM checkpoint {str(path)!r} are damaged") from error
-    for name, value in SUPPORTED.items():
-        if args.get(name, value) != value:
-            raise UserError(f"{str(path)!r}: {name} is {args[name]!r}; only {value!r} is supported")
-    if not 2 <= steps <= POSITIONS:
-        raise UserError(f"{str(path)!r}: diffusion_steps is {steps}; expected 2 to {POSITIONS}")
-    return steps, guidance
+        network = MotionModel(width, layers, hidden, text.shape[1])
+        load_exactly(network, state, f"{KIND} {path!r}")
+        network.eval().requires_grad_(False)
+        known = beside[1].read_text(encoding="utf-8") if beside[1].is_file() else ""
+    with reading(beside[0], f"settings of the {KIND}") as file:
+        args = json.loads(file.read_text(encoding="utf-8"))
+        steps, guidance = args.get("diffusion_steps", 1000), args.get("guidance_param", 2.5)
+        for name, value in SUPPORTED.items():
+            found = args.get(name, value)
+            require(found == value, f"{name} is {found!r}; only {value!r} is supported")
+        usual = steps in range(2, POSITIONS + 1) and math.isfinite(guidance)
+        require(usual, f"diffusion_steps is {steps}; expected 2 to {POSITIONS}")
+    statistics, known = _statistics(beside[0].parent), list(filter(str.strip, known.splitlines()))
+    return TextToMotion(network, steps, guidance, *statistics, known)
 
 
 def _statistics(folder: Path) -> tuple[np.ndarray, np.ndarray]:
     for pair in STATISTICS:
         if all((folder / name).is_file() for name in pair):
-            found = (read_arrays(folder / name, "statistics", ["array"]) for name in pair)
-            mean, std = (arrays["array"].astype(np.float64) for arrays in found)
-            if mean.shape == std.shape == (FEATURES,) and np.isfinite([mean, std]).all():
+            found = [read_arrays(folder / name, "statistics", ["array"])["array"] for name in pair]
+            if all(a.shape == (FEATURES,) and a.dtype.kind == "f" for a in found):
+                mean, std = np.float64(found)
                 return mean, np.maximum(std, 1e-8)
             raise UserError(f"{str(folder)!r}: {' and '.join(pair)} need {FEATURES} numbers each")
     raise UserError(
@@ -148,7 +143,16 @@ def sample_motions(
 ) -> Float[np.ndarray, "S T 22 3"]:
     """Draw ``count`` motions for a text: ancestral steps (Ho et al. 2020) over at most ``STEPS`` of
     the timesteps, with classifier-free guidance. Metres, y up.
+
+    Raises:
+        UserError: the features of the text have another size, or positions aren't finite.
     """
+    given, expected = text.shape[1], model.network.embed_text.in_features
+    if given != expected:
+        raise UserError(
+            f"the motion model takes {expected} features of a text, but its CLIP gives {given}: "
+            "it was trained with another CLIP"
+        )
     network, device = model.network, text.device
     kept = np.unique(np.linspace(0, model.steps - 1, min(STEPS, model.steps)).round().astype(int))
     abar = cosine_alphas_cumprod(model.steps)[kept]
@@ -168,7 +172,10 @@ def sample_motions(
         if i:
             fresh = torch.randn(shape, generator=generator).to(device)
             x = x + math.sqrt(beta * (1 - before) / (1 - abar[i])) * fresh
-    return rigid(positions_of(x.double().cpu().numpy() * model.std + model.mean))
+    positions = rigid(positions_of(x.double().cpu().numpy() * model.std + model.mean))
+    if not np.isfinite(positions).all():
+        raise UserError("the motion model gives positions that aren't finite: get its files again")
+    return positions
 
 
 def rigid(positions: Float[np.ndarray, "S T 22 3"]) -> Float[np.ndarray, "S T 22 3"]:

@@ -35,9 +35,10 @@ from ..evaluation.asset_metrics import ATTRIBUTES, Scores, prior_of, rendered, r
 from ..formats.array_files import read_arrays
 from ..host import find
 from ..launch.run_folder import RunFolder, claim, claim_new
-from ..models.bundled import NAME, is_export
+from ..models.bundled import MOTION, NAME, is_export, model_part
 from ..priors.body_pose import JOINTS, PARENTS, Z_UP, facing
-from ..priors.motion_text import reduced_prompt
+from ..priors.motion_text import motion_sentence, reduced_prompt
+from ..priors.text_to_motion import load_motion_model
 from ..view.run_files import read_json
 from . import recognition
 from .views import BACKGROUND, SIZE
@@ -50,7 +51,8 @@ PROMPTS = (
 )
 """The last is of a combination that the models were not trained on."""
 OBJECT, AVATAR = "toybox.yaml", "toybox-avatar.yaml"
-PERSON = re.compile(rf"\b({'|'.join(NOUNS['person'])}|persons|people|men|women)\b", re.IGNORECASE)
+PEOPLE = "|".join((*NOUNS["person"], "someone", "persons", "people", "men", "women"))
+PERSON = re.compile(rf"\b({PEOPLE})\b", re.IGNORECASE)
 SHOWN = [1, 3, 5]
 """Which of the judge's views the sheet has: from the front, the left and the back."""
 GUIDANCE, SAMPLE_STEPS = 3.0, 25
@@ -89,6 +91,9 @@ def run(args: argparse.Namespace) -> int:
             raise UserError(f"the prompt {prompt!r} isn't valid UTF-8")
     if args.models != NAME and not is_export(Path(args.models).expanduser()):
         raise UserError(f"--models {args.models}: expected {NAME}, or a folder of toybox.export")
+    for prompt in args.prompts:
+        if config_of(prompt) == AVATAR:  # as the run does, but before the others' training
+            motion_sentence(prompt, load_motion_model(model_part(args.models, MOTION)).known)
     root = output_folder(args.output, "--output")
     recognition.load_judge(args.models)  # a missing file is reported before the training
     claimed = open_folder(root, {key: vars(args)[key] for key in ("prompts", "options", "models")})
@@ -201,9 +206,10 @@ def stages_of(prompt: str, place: Path, models: str, scores: Scores) -> Stages:
     for name, asset in assets.items():
         pictures = rendered(asset, views.rows(SHOWN), SIZE, background=BACKGROUND)
         found[name] = torch.from_numpy(pictures).movedim(-1, 1), scores.of_asset(asset)
-    if config_of(prompt) == AVATAR:
-        joints = read_arrays(place / "save/prior/points.npz", "prior", ["joints"])["joints"]
-        pose, (body, rates) = stick_figure(joints, views.azimuth[SHOWN[0]]), found["prior"]
+    arrays = read_arrays(place / "save/prior/points.npz", "prior", [], ["joints"])
+    if "joints" in arrays:  # of a motion
+        pose = stick_figure(arrays["joints"], views.azimuth[SHOWN[0]])
+        body, rates = found["prior"]
         found["prior"] = torch.cat([pose[None], body[:-1]]), rates
     own = samples(models, prompt, views, guidance_scale=GUIDANCE)
     return found | {"2D model": (own[SHOWN], scores.of_pictures(own, prompt))}

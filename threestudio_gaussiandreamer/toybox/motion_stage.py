@@ -91,7 +91,7 @@ class MotionStage(Stage):
 
     def __init__(self, options: Options) -> None:
         super().__init__(options)
-        self.statistics = mean, std = statistics(drawn_features(options.seed))
+        mean, std = statistics(drawn_features(options.seed))
         self.constants = {"mean": mean.tolist(), "std": std.tolist()}
 
     def build(self) -> nn.Module:
@@ -106,7 +106,8 @@ class MotionStage(Stage):
         return MotionModel(*sizes)
 
     def data(self) -> MotionData:
-        return MotionData(self.options.seed, self.batch, self.tokenizer, self.statistics)
+        mean, std = (np.array(self.constants[name]) for name in ("mean", "std"))
+        return MotionData(self.options.seed, self.batch, self.tokenizer, (mean, std))
 
     def loss(self, model: nn.Module, batch: MotionBatch) -> tuple[Tensor, dict[str, Tensor]]:
         text = self.condition(batch.ids) * ~batch.empty[:, None]

@@ -84,12 +84,11 @@ def recognized(found: dict[str, Tensor], wanted: Attributes) -> dict[str, float]
     }
     if wanted.action:
         (does, side), (action, wanted_side) = map(motions.split, (shown["action"], wanted.action))
-        swapped = does == action and side != wanted_side
         rights |= {
             "colors": right["color"] and right["part"],
             "accessory": worn,
             "action": does == action,
-            "sides": not swapped if wanted_side else math.nan,
+            "sides": side == wanted_side if wanted_side and does == action else math.nan,
         }
     return {name: float(value) for name, value in rights.items()}
 

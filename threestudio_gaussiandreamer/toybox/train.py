@@ -145,6 +145,9 @@ def start_from(weights: Path, options: Options, stages: Sequence[str]) -> None:
             if name == "unet":
                 vae = read_json(weights / "stable-diffusion/vae/config.json", dict)
                 training.stage.constants[LATENT_SCALE] = float(vae["scaling_factor"])
+            if name == "motion":
+                found = load_motion_model(str(weights / MOTION))
+                training.stage.constants |= {"mean": found.mean.tolist(), "std": found.std.tolist()}
         except (RuntimeError, KeyError) as error:
             raise UserError(
                 f"the weights of {name!r} in {str(weights)!r} are of another model than those "
