@@ -7,6 +7,7 @@ import torch
 
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.toybox import export, models, recognition
+from threestudio_gaussiandreamer.toybox.judge_stage import mirrored
 from threestudio_gaussiandreamer.toybox.views import LABELS, label_row
 from threestudio_gaussiandreamer.toybox.world import Attributes
 
@@ -45,6 +46,12 @@ def test_one_wrong_attribute_of_a_person_is_missed_alone(change, missed):
     wanted = KICK._replace(action="sit")  # has no side
     found = recognition.recognized(sure(wanted._replace(**change)), wanted)
     assert math.isnan(found["sides"]) and found["action"] == ("action" not in change)
+
+
+def test_a_mirrored_person_has_the_other_sides():
+    seen = torch.from_numpy(label_row(KICK, 90.0))
+    other = torch.from_numpy(label_row(KICK._replace(action="kick right"), -90.0))
+    assert mirrored(torch.stack([seen, other])).tolist() == [other.tolist(), seen.tolist()]
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ Most of its pictures show objects as Gaussians with errors, as results of score 
 blurred edges a classifier of ray-cast pictures alone takes for other colours."""
 
 import dataclasses
+import re
 from typing import NamedTuple
 
 import numpy as np
@@ -17,7 +18,7 @@ from ..core.streams import numpy_generator
 from ..meshes.mesh import Mesh, face_areas, sample_surface, surface_colors
 from .loop import MixedData, Options, Stage, moved
 from .models import Judge, accuracies, classified
-from .views import Shards, render_gaussians, with_backgrounds
+from .views import LABELS, Shards, render_gaussians, with_backgrounds
 
 SEED_OFFSET = 1000
 """Added to the seed, so that the judge has training pictures of its own."""
@@ -29,6 +30,8 @@ COUNT, BLENDED = (800, 4000), 12
 """Range of the number of Gaussians, and of how many neighbours at most colours are averaged."""
 WAVES, WAVELENGTH = 6, (0.15, 0.8)
 """Number of plane waves of a smooth error, and the range of their lengths, world units."""
+SHIFT, OTHER = 6, {"left": "right", "right": "left"}
+"""Largest shift of a batch's pictures in pixels, and the sides of mirrored ones."""
 COLOR_SHIFT, SHAPE_SHIFT, COLOR_ERROR, COLOR_NOISE = 0.06, 0.025, 0.08, 0.12
 """Largest deviations of smooth displacements of pattern and shape, world units; of smooth errors of
 the colour, and of errors of each Gaussian's."""
@@ -87,10 +90,24 @@ class JudgeBatch(NamedTuple):
 def judge_batch(
     shards: Shards, index: int, rows: np.ndarray, rng: np.random.Generator
 ) -> JudgeBatch:
-    """Draw a background for each of these pictures."""
+    """Draw a background for each of these pictures, shift them, and mirror half of the persons."""
     shard = shards.get(index)
-    images = with_backgrounds(shard.rgba[rows], rng, random_share=0.5)
-    return JudgeBatch(images, torch.from_numpy(shard.labels[rows]))
+    rgba = np.roll(shard.rgba[rows], rng.integers(-SHIFT, SHIFT + 1, 2), (1, 2))
+    images = with_backgrounds(rgba, rng, random_share=0.5)
+    labels = torch.from_numpy(shard.labels[rows])
+    persons = labels[:, list(LABELS).index("action")] > 0
+    flipped = persons & torch.from_numpy(rng.random(len(rows)) < 0.5)
+    images[flipped], labels[flipped] = images[flipped].flip(-1), mirrored(labels[flipped])
+    return JudgeBatch(images, labels)
+
+
+def mirrored(labels: Int[Tensor, "B L"]) -> Int[Tensor, "B L"]:
+    """Exchange left and right in the classes of mirrored persons; those of objects may differ."""
+    columns = []
+    for column, classes in zip(labels.T, LABELS.values(), strict=True):
+        names = [re.sub("left|right", lambda side: OTHER[side[0]], name) for name in classes]
+        columns.append(torch.tensor([classes.index(name) for name in names])[column])
+    return torch.stack(columns, 1)
 
 
 class JudgeStage(Stage):
