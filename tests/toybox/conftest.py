@@ -19,7 +19,7 @@ def small_sizes() -> Iterator[None]:
             (models, {"UNET_CHANNELS": (16, 32), "VAE_CHANNELS": (8, 8, 8, 8), "TEXT_LAYERS": 1}),
             (models, {"VISION_LAYERS": 1, "POINTS_LAYERS": 1, "MOTION_LAYERS": 1}),
             (motion_stage, {"EACH": 1}),
-            (models.Judge, {"CHANNELS": (8, 8, 8, 8)}),
+            (models.Classifier, {"CHANNELS": (8, 8, 8, 8)}),
             (views, {"POINTS": 300, "OBJECTS": 4, "HELD_OUT_OBJECTS": 4}),
             (loop, {"LOG_EVERY": 1, "WARMUP": 1}),
         ):

@@ -113,10 +113,15 @@ def test_an_exported_judge_is_loaded_and_other_files_are_named(tmp_path, monkeyp
         recognition.load_judge(path)
     export.write_weights(path, judge.state_dict())
     loaded, pictures = recognition.load_judge(path), torch.rand(2, 3, 128, 128)
-    found, wanted = (recognition.probabilities(each, pictures) for each in (loaded, judge))
-    for name, values in wanted.items():
-        torch.testing.assert_close(found[name], values, atol=1e-2, rtol=0)
-    monkeypatch.setattr(models.Judge, "CHANNELS", (8, 8, 8, 8))
+    for asked in (FOX, KICK):
+        found, right = (recognition.probabilities(j, pictures, asked) for j in (loaded, judge))
+        for name, values in right.items():
+            torch.testing.assert_close(found[name], values, atol=1e-2, rtol=0)
+    # each of two networks reads its own pictures, in one batch too
+    logits = judge(pictures, torch.tensor([True, False]))["kind"]
+    torch.testing.assert_close(logits[:1], judge.persons(pictures[:1])["kind"])
+    torch.testing.assert_close(logits[1:], judge.objects(pictures[1:])["kind"])
+    monkeypatch.setattr(models.Classifier, "CHANNELS", (8, 8, 8, 8))
     for content in (None, b"", b"\x08\0\0\0\0\0\0\0{}      "):
         if content is not None:
             path.write_bytes(content)

@@ -94,7 +94,7 @@ def test_what_the_models_can_not_do_is_named_before_any_work(exported, tmp_path,
 
 # The demo -----------------------------------------------------------------------------------------
 
-FULL_SIZE = models.Judge.CHANNELS
+FULL_SIZE = models.Classifier.CHANNELS
 """Of the judge, before a fixture makes it smaller."""
 
 
@@ -259,7 +259,7 @@ def test_an_error_of_a_run_ends_the_demo(exported, tmp_path, in_process, capsys)
 @pytest.mark.slow
 def test_ctrl_c_writes_a_checkpoint_and_tells_how_to_continue(exported, tmp_path, monkeypatch):
     # the other process builds a judge of full size; the other networks' sizes are in their files
-    monkeypatch.setattr(models.Judge, "CHANNELS", FULL_SIZE)
+    monkeypatch.setattr(models.Classifier, "CHANNELS", FULL_SIZE)
     folder = shutil.copytree(exported, tmp_path / "models")
     write_weights(folder / JUDGE, models.Judge().state_dict())
     write_digests(folder)

@@ -141,7 +141,7 @@ class Recognized(Metric):
         """Score pictures from the judge's views; empty if the prompt names no object."""
         if (wanted := attributes_in(prompt)) is None:
             return {}
-        return self.compared(recognition.probabilities(self.judge, views), wanted)
+        return self.compared(recognition.probabilities(self.judge, views, wanted), wanted)
 
     def compared(self, found: dict[str, Tensor], wanted: Any) -> dict[str, float]:
         return recognition.recognized(found, wanted)

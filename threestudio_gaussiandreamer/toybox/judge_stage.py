@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
@@ -86,6 +86,10 @@ class JudgeBatch(NamedTuple):
     images: Float[Tensor, "B 3 s s"]
     labels: Int[Tensor, "B L"]
 
+    @property
+    def persons(self) -> Bool[Tensor, " B"]:
+        return self.labels[:, list(LABELS).index("action")] > 0
+
 
 def judge_batch(
     shards: Shards, index: int, rows: np.ndarray, rng: np.random.Generator
@@ -95,10 +99,10 @@ def judge_batch(
     rgba = np.roll(shard.rgba[rows], rng.integers(-SHIFT, SHIFT + 1, 2), (1, 2))
     images = with_backgrounds(rgba, rng, random_share=0.5)
     labels = torch.from_numpy(shard.labels[rows])
-    persons = labels[:, list(LABELS).index("action")] > 0
-    flipped = persons & torch.from_numpy(rng.random(len(rows)) < 0.5)
+    batch = JudgeBatch(images, labels)
+    flipped = batch.persons & torch.from_numpy(rng.random(len(rows)) < 0.5)
     images[flipped], labels[flipped] = images[flipped].flip(-1), mirrored(labels[flipped])
-    return JudgeBatch(images, labels)
+    return batch
 
 
 def mirrored(labels: Int[Tensor, "B L"]) -> Int[Tensor, "B L"]:
@@ -127,8 +131,7 @@ class JudgeStage(Stage):
         return MixedData(self.steps(judge_batch), splats, CAST_EVERY)
 
     def loss(self, model: nn.Module, batch: JudgeBatch) -> tuple[Tensor, dict[str, Tensor]]:
-        images = batch.images.contiguous(memory_format=torch.channels_last)
-        loss, right = classified(model(images), batch.labels)
+        loss, right = classified(model(batch.images, batch.persons), batch.labels)
         return loss, {"right": right}
 
     def held_out(self) -> list[JudgeBatch]:
@@ -142,5 +145,6 @@ class JudgeStage(Stage):
         return batches
 
     def evaluate(self, model: nn.Module) -> dict[str, float]:
-        found, in_splats = (accuracies(model(one.images), one.labels) for one in self.held_out())
+        data = self.held_out()
+        found, in_splats = (accuracies(model(b.images, b.persons), b.labels) for b in data)
         return found | {"mean_in_renders_of_gaussians": float(np.mean(list(in_splats.values())))}

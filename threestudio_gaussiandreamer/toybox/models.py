@@ -4,7 +4,7 @@ from typing import Any
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from .tokens import LENGTH
@@ -134,9 +134,28 @@ class AttributeHeads(nn.Module):
 
 
 class Judge(nn.Module):
-    """A convolutional classifier of pictures in [0, 1], (B, 3, 128, 128), into LABELS.
+    """Classifiers of pictures in [0, 1], (B, 3, 128, 128), into LABELS: of objects, and of persons.
 
     It shares neither architecture nor training data nor seed with the models that it evaluates."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.objects, self.persons = Classifier(), Classifier()
+
+    def forward(
+        self, images: Float[Tensor, "B 3 s s"], persons: Bool[Tensor, " B"]
+    ) -> dict[str, Tensor]:
+        found = {name: images.new_empty(len(images), len(each)) for name, each in LABELS.items()}
+        for network, rows in ((self.objects, ~persons), (self.persons, persons)):
+            if rows.any():
+                part = images[rows].contiguous(memory_format=torch.channels_last)
+                for name, logits in network(part).items():
+                    found[name][rows] = logits.float()
+        return found
+
+
+class Classifier(nn.Module):
+    """A convolutional network with a head for each attribute."""
 
     CHANNELS = (24, 48, 96, 128)
 

@@ -28,7 +28,7 @@ from . import motions
 from .kinds import ALIKE_FROM_ALL_SIDES
 from .models import Judge
 from .views import DISTANCE, FOVY_DEG, LABELS
-from .world import Attributes
+from .world import PERSON, Attributes
 
 VERSION = 3
 """Changes with what is read from the same probabilities."""
@@ -62,9 +62,14 @@ def views() -> Orbit:
 
 
 @torch.no_grad()
-def probabilities(judge: Judge, pictures: Float[Tensor, "V 3 s s"]) -> dict[str, Tensor]:
-    """Return each attribute's probabilities (V, classes) in pictures in [0, 1]."""
-    return {name: logits.softmax(dim=-1) for name, logits in judge(pictures).items()}
+def probabilities(
+    judge: Judge, pictures: Float[Tensor, "V 3 s s"], wanted: Attributes
+) -> dict[str, Tensor]:
+    """Return each attribute's probabilities (V, classes) in pictures in [0, 1] of what a prompt
+    asks for, an object or a person.
+    """
+    persons = torch.full((len(pictures),), wanted.kind == PERSON)
+    return {name: logits.softmax(dim=-1) for name, logits in judge(pictures, persons).items()}
 
 
 def recognized(found: dict[str, Tensor], wanted: Attributes) -> dict[str, float]:
