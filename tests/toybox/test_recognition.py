@@ -1,13 +1,15 @@
 """The judge's probabilities become recognised attributes and a share of views with a wrong side."""
 
 import math
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 
 from threestudio_gaussiandreamer.core.errors import UserError
 from threestudio_gaussiandreamer.toybox import export, models, recognition
-from threestudio_gaussiandreamer.toybox.judge_stage import mirrored
+from threestudio_gaussiandreamer.toybox.judge_stage import judge_labels, mirrored
 from threestudio_gaussiandreamer.toybox.views import LABELS, label_row
 from threestudio_gaussiandreamer.toybox.world import Attributes
 
@@ -46,6 +48,20 @@ def test_one_wrong_attribute_of_a_person_is_missed_alone(change, missed):
     wanted = KICK._replace(action="sit")  # has no side
     found = recognition.recognized(sure(wanted._replace(**change)), wanted)
     assert math.isnan(found["sides"]) and found["action"] == ("action" not in change)
+
+
+def test_sides_in_pictures_from_behind_are_read_back():
+    azimuth = recognition.views().azimuth.numpy()
+    rows = np.stack([label_row(KICK, angle) for angle in azimuth])
+    seen = judge_labels(SimpleNamespace(labels=rows, azimuth=azimuth), np.arange(8))
+    names = [LABELS["action"][i] for i in seen[:, list(LABELS).index("action")]]
+    assert names == [f"kick {'right' if 90 < abs(angle) else 'left'}" for angle in azimuth]
+
+    def judge(pictures, persons):
+        return {n: torch.eye(len(c))[seen[:, i]] for i, (n, c) in enumerate(LABELS.items())}
+
+    found = recognition.probabilities(judge, torch.zeros(8, 3, 4, 4), KICK)["action"].argmax(-1)
+    assert {LABELS["action"][i] for i in found} == {"kick left"}
 
 
 def test_a_mirrored_person_has_the_other_sides():
@@ -112,15 +128,15 @@ def test_an_exported_judge_is_loaded_and_other_files_are_named(tmp_path, monkeyp
     with pytest.raises(UserError, match="judge .*make train-toybox.*does not exist"):
         recognition.load_judge(path)
     export.write_weights(path, judge.state_dict())
-    loaded, pictures = recognition.load_judge(path), torch.rand(2, 3, 128, 128)
+    loaded, pictures = recognition.load_judge(path), torch.rand(8, 3, 128, 128)
     for asked in (FOX, KICK):
         found, right = (recognition.probabilities(j, pictures, asked) for j in (loaded, judge))
         for name, values in right.items():
             torch.testing.assert_close(found[name], values, atol=1e-2, rtol=0)
     # each of two networks reads its own pictures, in one batch too
-    logits = judge(pictures, torch.tensor([True, False]))["kind"]
+    logits = judge(pictures[:2], torch.tensor([True, False]))["kind"]
     torch.testing.assert_close(logits[:1], judge.persons(pictures[:1])["kind"])
-    torch.testing.assert_close(logits[1:], judge.objects(pictures[1:])["kind"])
+    torch.testing.assert_close(logits[1:], judge.objects(pictures[1:2])["kind"])
     monkeypatch.setattr(models.Classifier, "CHANNELS", (8, 8, 8, 8))
     for content in (None, b"", b"\x08\0\0\0\0\0\0\0{}      "):
         if content is not None:

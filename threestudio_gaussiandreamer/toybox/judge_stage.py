@@ -4,7 +4,6 @@ Most of its pictures show objects as Gaussians with errors, as results of score 
 blurred edges a classifier of ray-cast pictures alone takes for other colours."""
 
 import dataclasses
-import re
 from typing import NamedTuple
 
 import numpy as np
@@ -16,9 +15,10 @@ from torch import Tensor, nn
 from ..cameras import Orbit
 from ..core.streams import numpy_generator
 from ..meshes.mesh import Mesh, face_areas, sample_surface, surface_colors
+from . import recognition
 from .loop import MixedData, Options, Stage, moved
 from .models import Judge, accuracies, classified
-from .views import LABELS, Shards, render_gaussians, with_backgrounds
+from .views import LABELS, Shard, Shards, exchanged, render_gaussians, with_backgrounds
 
 SEED_OFFSET = 1000
 """Added to the seed, so that the judge has training pictures of its own."""
@@ -30,8 +30,8 @@ COUNT, BLENDED = (800, 4000), 12
 """Range of the number of Gaussians, and of how many neighbours at most colours are averaged."""
 WAVES, WAVELENGTH = 6, (0.15, 0.8)
 """Number of plane waves of a smooth error, and the range of their lengths, world units."""
-SHIFT, OTHER = 6, {"left": "right", "right": "left"}
-"""Largest shift of a batch's pictures in pixels, and the sides of mirrored ones."""
+SHIFT = 6
+"""Largest shift of a batch's pictures, pixels."""
 COLOR_SHIFT, SHAPE_SHIFT, COLOR_ERROR, COLOR_NOISE = 0.06, 0.025, 0.08, 0.12
 """Largest deviations of smooth displacements of pattern and shape, world units; of smooth errors of
 the colour, and of errors of each Gaussian's."""
@@ -98,20 +98,27 @@ def judge_batch(
     shard = shards.get(index)
     rgba = np.roll(shard.rgba[rows], rng.integers(-SHIFT, SHIFT + 1, 2), (1, 2))
     images = with_backgrounds(rgba, rng, random_share=0.5)
-    labels = torch.from_numpy(shard.labels[rows])
-    batch = JudgeBatch(images, labels)
+    batch = JudgeBatch(images, judge_labels(shard, rows))
     flipped = batch.persons & torch.from_numpy(rng.random(len(rows)) < 0.5)
-    images[flipped], labels[flipped] = images[flipped].flip(-1), mirrored(labels[flipped])
+    images[flipped] = images[flipped].flip(-1)
+    batch.labels[flipped] = mirrored(batch.labels[flipped])
     return batch
+
+
+def judge_labels(shard: Shard, rows: np.ndarray) -> Int[Tensor, "B L"]:
+    """Return labels in which the sides of actions are those of the picture: exchanged if seen from
+    behind, which needs no knowledge of where the front is.
+    """
+    labels, column = torch.from_numpy(shard.labels[rows]), list(LABELS).index("action")
+    action = labels[:, column]
+    behind = recognition.behind(torch.from_numpy(shard.azimuth[rows]))
+    labels[:, column] = torch.where(behind, exchanged("action")[action], action)
+    return labels
 
 
 def mirrored(labels: Int[Tensor, "B L"]) -> Int[Tensor, "B L"]:
     """Exchange left and right in the classes of mirrored persons; those of objects may differ."""
-    columns = []
-    for column, classes in zip(labels.T, LABELS.values(), strict=True):
-        names = [re.sub("left|right", lambda side: OTHER[side[0]], name) for name in classes]
-        columns.append(torch.tensor([classes.index(name) for name in names])[column])
-    return torch.stack(columns, 1)
+    return torch.stack([exchanged(name)[labels[:, i]] for i, name in enumerate(LABELS)], 1)
 
 
 class JudgeStage(Stage):
@@ -141,7 +148,8 @@ class JudgeStage(Stage):
             shard = sort.held_out_shard()
             rng = numpy_generator(seed, "judge-held-out")
             images = with_backgrounds(shard.rgba, rng, random_share=0)
-            batches.append(moved(JudgeBatch(images, torch.from_numpy(shard.labels)), self.device))
+            labels = judge_labels(shard, np.arange(len(images)))
+            batches.append(moved(JudgeBatch(images, labels), self.device))
         return batches
 
     def evaluate(self, model: nn.Module) -> dict[str, float]:

@@ -140,7 +140,7 @@ class Judge(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.objects, self.persons = Classifier(), Classifier()
+        self.objects, self.persons = Classifier(), PersonClassifier()
 
     def forward(
         self, images: Float[Tensor, "B 3 s s"], persons: Bool[Tensor, " B"]
@@ -174,7 +174,31 @@ class Classifier(nn.Module):
 
     def forward(self, images: Float[Tensor, "B 3 s s"]) -> dict[str, Tensor]:
         x = self.body(images * 2 - 1).flatten(2)
-        return self.heads(self.mix(torch.cat([x.mean(-1), x.amax(-1)], dim=1)))
+        return self.heads(self.mix(self.pooled(x)))
+
+    def pooled(self, x: Float[Tensor, "B C P"]) -> Float[Tensor, "B D"]:
+        return torch.cat([x.mean(-1), x.amax(-1)], dim=1)
+
+
+class PersonClassifier(Classifier):
+    """One that also sees where something is, which tells an arm from the other; at half the
+    resolution, which is five times as fast.
+    """
+
+    PLACES = 16
+
+    def __init__(self) -> None:
+        super().__init__()
+        previous, side = self.CHANNELS[-1], SIZE // 2 ** (1 + len(self.CHANNELS))
+        self.squeeze = nn.Conv1d(previous, self.PLACES, 1)
+        size = self.PLACES * side**2 + previous
+        self.mix = nn.Sequential(nn.Linear(size, 256), nn.SiLU())
+
+    def forward(self, images: Float[Tensor, "B 3 s s"]) -> dict[str, Tensor]:
+        return super().forward(F.avg_pool2d(images, 2))
+
+    def pooled(self, x: Float[Tensor, "B C P"]) -> Float[Tensor, "B D"]:
+        return torch.cat([self.squeeze(x).flatten(1), x.amax(-1)], dim=1)
 
 
 IGNORED = -100

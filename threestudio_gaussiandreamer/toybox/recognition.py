@@ -19,7 +19,7 @@ multi_face   share of the views that the judge takes for views from another quad
 import math
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..cameras import Orbit
@@ -27,7 +27,7 @@ from ..models.bundled import JUDGE, NAME, model_part
 from . import motions
 from .kinds import ALIKE_FROM_ALL_SIDES
 from .models import Judge
-from .views import DISTANCE, FOVY_DEG, LABELS
+from .views import DISTANCE, FOVY_DEG, LABELS, exchanged
 from .world import PERSON, Attributes
 
 VERSION = 3
@@ -65,11 +65,19 @@ def views() -> Orbit:
 def probabilities(
     judge: Judge, pictures: Float[Tensor, "V 3 s s"], wanted: Attributes
 ) -> dict[str, Tensor]:
-    """Return each attribute's probabilities (V, classes) in pictures in [0, 1] of what a prompt
-    asks for, an object or a person.
+    """Return each attribute's probabilities (V, classes) in pictures in [0, 1], in the order of
+    :func:`views`, of what a prompt asks for, an object or a person.
     """
     persons = torch.full((len(pictures),), wanted.kind == PERSON)
-    return {name: logits.softmax(dim=-1) for name, logits in judge(pictures, persons).items()}
+    found = {name: logits.softmax(dim=-1) for name, logits in judge(pictures, persons).items()}
+    seen, from_behind = found["action"], behind(views().azimuth)[:, None]  # sides of the picture
+    found["action"] = torch.where(from_behind, seen[:, exchanged("action")], seen)
+    return found
+
+
+def behind(azimuth: Float[Tensor, " V"]) -> Bool[Tensor, " V"]:
+    """Return whether azimuths in degrees are of views from behind."""
+    return (azimuth + 90) % 360 > 180
 
 
 def recognized(found: dict[str, Tensor], wanted: Attributes) -> dict[str, float]:

@@ -3,6 +3,7 @@ views of each object, which are composited over backgrounds when a shard is read
 """
 
 import math
+import re
 import time
 from collections.abc import Sequence
 from contextlib import suppress
@@ -162,6 +163,13 @@ def label_row(attributes: Attributes, azimuth: float) -> Int[np.ndarray, " L"]:
     quadrant = LABELS["quadrant"][int(((azimuth + 45) % 360) // 90)]
     values = attributes._asdict() | {"quadrant": quadrant}
     return np.array([classes.index(values[name] or "none") for name, classes in LABELS.items()])
+
+
+def exchanged(name: str) -> Int[torch.Tensor, " C"]:
+    """Return for each class of an attribute the one with left and right exchanged."""
+    other, classes = {"left": "right", "right": "left"}, LABELS[name]
+    names = [re.sub("left|right", lambda side: other[side[0]], each) for each in classes]
+    return torch.tensor([classes.index(each) for each in names])
 
 
 def attributes_of(row: Int[np.ndarray, " L"]) -> Attributes:
