@@ -240,8 +240,9 @@ class MotionPrior(Prior):
         model = load_motion_model(name)
         sentence = self._sentence(prompt, model)
         info(f"motion: {sentence!r}")
-        features = text_features(motion_clip(name), sentence)
-        positions = sample_motions(model, features, SAMPLES, torch_generator(generator))
+        with torch_threads(1):  # of whose number the result doesn't depend then
+            features = text_features(motion_clip(name), sentence)
+            positions = sample_motions(model, features, SAMPLES, torch_generator(generator))
         # the bundled CLIP has seen persons in clothes only
         compared = text or prompt if model.known else sentence
         return Motions(positions, [FRAMES] * SAMPLES), compared
