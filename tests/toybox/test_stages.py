@@ -86,12 +86,12 @@ def test_the_unet_is_measured_with_the_prompts_of_opposite_views(folder):
 def test_most_batches_are_all_views_of_objects_at_one_timestep(folder):
     stage = STAGES["unet"](dataclasses.replace(options(folder), batch=2 * views.VIEWS))
     data = stage.data()
-    assert [data[step].views for step in range(5)] == [1, 4, 4, 4, 1]
-    batch = data[1]
+    assert [data(step).views for step in range(5)] == [1, 4, 4, 4, 1]
+    batch = data(1)
     assert len(batch.latents) == len(batch.t) == len(batch.ids) == 8
     t = batch.t.reshape(2, views.VIEWS)
     assert (t == t[:, :1]).all() and t[0, 0] != t[1, 0]
-    assert torch.equal(batch.noise, data[1].noise)
+    assert torch.equal(batch.noise, data(1).noise)
 
 
 @pytest.mark.usefixtures("small_world")

@@ -168,11 +168,12 @@ def test_the_judge_has_data_of_its_own(tmp_path):
     casts, splats = judge_stage.judge_shards(there)
     assert len({there.shards.seed, casts.seed, splats.seed}) == 3
     data = STAGES["judge"](there).data()
-    for step, (own, place) in enumerate([(data.first, 0), (data.second, 0), (data.second, 1)]):
-        assert torch.equal(data[step].images, own[place].images)
-    paths = [part.shards.path(0) for part in (data.first, data.second)]
+    first, second, _ = data.args
+    for step, (own, place) in enumerate([(first, 0), (second, 0), (second, 1)]):
+        assert torch.equal(data(step).images, own(place).images)
+    paths = [part.shards.path(0) for part in (first, second)]
     assert paths == [casts.path(0), splats.path(0)]
-    assert torch.equal(data[judge_stage.CAST_EVERY].images, data.first[1].images)
+    assert torch.equal(data(judge_stage.CAST_EVERY).images, first(1).images)
 
 
 @pytest.mark.parametrize(

@@ -239,7 +239,7 @@ def test_backgrounds_are_fixed_but_for_the_asked_share(shards):
 
 def test_a_batch_is_a_function_of_its_step(shards):
     data = StepData(shards, 5, 2, "x", lambda index, rows, rng: (index, rows))
-    first, again = [data[step] for step in range(9)], data[6]
+    first, again = [data(step) for step in range(9)], data(6)
     assert first[6][0] == again[0] and np.array_equal(first[6][1], again[1])
     # 24 pictures are four batches of 5: the same shard, no picture twice
     assert [index for index, _ in first] == [0] * 4 + [1] * 4 + [0]

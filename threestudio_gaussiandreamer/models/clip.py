@@ -104,9 +104,14 @@ def _unit_features(output: Any) -> Tensor:
 
 
 def preprocessed(pictures: Float[np.ndarray, "N H W 3"], size: int) -> Float[Tensor, "N 3 S S"]:
-    """Resize pictures in [0, 1] bicubically, and normalise them as CLIP's training pictures."""
+    """Resize pictures in [0, 1] bicubically, and normalise them."""
     pixels = torch.from_numpy(np.ascontiguousarray(pictures, np.float32)).permute(0, 3, 1, 2)
     if pixels.shape[-2:] != (size, size):
         smooth = {"mode": "bicubic", "antialias": True}
         pixels = torch.nn.functional.interpolate(pixels, (size, size), **smooth).clamp(0, 1)
+    return normalized(pixels)
+
+
+def normalized(pixels: Float[Tensor, "N 3 S S"]) -> Float[Tensor, "N 3 S S"]:
+    """Normalise pictures in [0, 1] as CLIP's training pictures."""
     return (pixels - torch.tensor(MEAN)[:, None, None]) / torch.tensor(STD)[:, None, None]

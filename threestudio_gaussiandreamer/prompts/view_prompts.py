@@ -57,8 +57,8 @@ def view_directions(*, left_and_right: bool = False) -> List[Direction]:
         sides = {"side": lambda elevation, *_: torch.ones_like(elevation, dtype=torch.bool)}
     conditions: Dict[str, Condition] = {
         **sides,
-        "front": lambda elevation, azimuth, distance: shifted(azimuth).abs() < front,
-        "back": lambda elevation, azimuth, distance: shifted(azimuth).abs() > 180 - back,
+        "front": lambda elevation, azimuth, distance: abs(shifted(azimuth)) < front,
+        "back": lambda elevation, azimuth, distance: abs(shifted(azimuth)) > 180 - back,
         "overhead": lambda elevation, azimuth, distance: elevation > overhead,
     }
     return [Direction(*item) for item in conditions.items()]

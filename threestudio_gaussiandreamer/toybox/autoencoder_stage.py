@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from ..cameras import Orbit
 from ..core.streams import numpy_generator
 from . import models
-from .loop import Stage, StepData, is_trained, normal
+from .loop import Batches, Stage, is_trained, normal
 from .views import DISTANCE, FOVY_DEG, Shard, Shards, render_gaussians, with_backgrounds
 
 RANDOM_BACKGROUNDS = 0.15
@@ -61,7 +61,7 @@ class AutoencoderStage(Stage):
         trained = is_trained(self.options.folder, "unet")
         return ("encoder.", "quant_conv.") if trained else ()
 
-    def data(self) -> StepData:
+    def data(self) -> Batches:
         return self.steps(autoencoder_batch)
 
     def loss(self, model: nn.Module, batch: AutoencoderBatch) -> tuple[Tensor, dict[str, Tensor]]:

@@ -4,7 +4,7 @@ image encoder, on the fixed features of the trained text encoder (after Zhai et 
 Classifiers teach small encoders which colour belongs to which part, much earlier than contrast."""
 
 import re
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,13 +13,12 @@ import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
-from torch.utils.data import Dataset
 
 from ..core.checkpoint_file import entries_below
 from ..core.streams import numpy_generator
-from ..models.clip import MEAN, STD
+from ..models.clip import normalized
 from . import models, words
-from .loop import Stage, StepData, averaged_weights, is_trained, moved
+from .loop import Batches, Stage, averaged_weights, is_trained, moved
 from .models import IGNORED, accuracies, classified
 from .tokens import open_tokenizer, token_ids, training_prompts, view_prompts
 from .views import LABELS, VIEWS, Shards, draw_orbit, label_row, with_backgrounds
@@ -35,27 +34,19 @@ class TextBatch(NamedTuple):
     """IGNORED where the prompt doesn't tell the class."""
 
 
-@dataclass(frozen=True)
-class TextData(Dataset):
-    """Prompts of random objects from random views; a batch is a function of (seed, step)."""
-
-    seed: int
-    batch: int
-    tokenizer: Any
-    held_out: bool = False
-
-    def __getitem__(self, step: int) -> TextBatch:
-        start, texts, labels = step * self.batch, [], []
-        rng = numpy_generator(self.seed, "text-batch", start, int(self.held_out))
-        for index in range(start, start + self.batch):
-            attributes = draw_attributes(self.seed, index, held_out=self.held_out)
-            elevation, azimuth = map(float, draw_orbit(1, rng)[:2])
-            text = words.prompt_of(attributes, elevation, azimuth, rng)
-            texts.append(text or words.describe(attributes, rng))
-            labels.append(label_row(attributes, azimuth))
-            if not NAMED_QUADRANT.search(texts[-1]):
-                labels[-1][list(LABELS).index("quadrant")] = IGNORED
-        return TextBatch(token_ids(self.tokenizer, texts), torch.from_numpy(np.stack(labels)))
+def text_batch(seed: int, batch: int, tokenizer: Any, held_out: bool, step: int) -> TextBatch:
+    """Draw prompts of objects from random views."""
+    start, texts, labels = step * batch, [], []
+    rng = numpy_generator(seed, "text-batch", start, int(held_out))
+    for index in range(start, start + batch):
+        attributes = draw_attributes(seed, index, held_out=held_out)
+        elevation, azimuth = map(float, draw_orbit(1, rng)[:2])
+        text = words.prompt_of(attributes, elevation, azimuth, rng)
+        texts.append(text or words.describe(attributes, rng))
+        labels.append(label_row(attributes, azimuth))
+        if not NAMED_QUADRANT.search(texts[-1]):
+            labels[-1][list(LABELS).index("quadrant")] = IGNORED
+    return TextBatch(token_ids(tokenizer, texts), torch.from_numpy(np.stack(labels)))
 
 
 class TextStage(Stage):
@@ -77,8 +68,8 @@ class TextStage(Stage):
         trained = is_trained(self.options.folder, "clip", "unet", "points", "motion")
         return TEXT_PARTS if trained else ()
 
-    def data(self) -> TextData:
-        return TextData(self.options.seed, self.batch, self.tokenizer)
+    def data(self) -> Batches:
+        return partial(text_batch, self.options.seed, self.batch, self.tokenizer, False)
 
     def loss(self, model: nn.Module, batch: TextBatch) -> tuple[Tensor, dict[str, Tensor]]:
         loss, right = classified(self._logits(model, batch.ids), batch.labels)
@@ -89,8 +80,7 @@ class TextStage(Stage):
         return model["heads"](features * features.shape[-1] ** 0.5)
 
     def evaluate(self, model: nn.Module) -> dict[str, float]:
-        data = TextData(self.options.seed, HELD_OUT, self.tokenizer, held_out=True)
-        batch = moved(data[0], self.device)
+        batch = moved(text_batch(self.options.seed, HELD_OUT, self.tokenizer, True, 0), self.device)
         return accuracies(self._logits(model, batch.ids), batch.labels)
 
 
@@ -104,12 +94,14 @@ def text_features(
     return F.normalize(projection(text_model(input_ids=ids).pooler_output).float(), dim=-1)
 
 
-def trained_clip(folder: Path, vocabulary_size: int, stage: str) -> Any:
-    """Return a frozen CLIPModel of averaged weights; after "text" its image encoder is random."""
-    clip, weights = models.clip_model(vocabulary_size), averaged_weights(folder, stage)
+def trained_clip(folder: Path, stage: str, device: Any = "cpu") -> tuple[Any, Any]:
+    """Return the tokenizer, and a frozen CLIPModel of a stage's averaged weights; after "text" its
+    image encoder is random."""
+    tokenizer = open_tokenizer(folder)
+    clip, weights = models.clip_model(len(tokenizer)), averaged_weights(folder, stage)
     whole = stage == ClipStage.name
     clip.load_state_dict(entries_below(weights, "clip.") if whole else weights, strict=whole)
-    return clip.eval().requires_grad_(False)
+    return tokenizer, clip.eval().requires_grad_(False).to(device)
 
 
 RANDOM_BACKGROUNDS = 0.3
@@ -132,7 +124,7 @@ def clip_batch(
     texts = training_prompts(shard, rows, rng)
     images = with_backgrounds(shard.rgba[rows], rng, random_share=RANDOM_BACKGROUNDS)
     labels, has_text = torch.from_numpy(shard.labels[rows]), torch.tensor([*map(bool, texts)])
-    return ClipBatch(clip_pixels(images), token_ids(tokenizer, texts), labels, has_text)
+    return ClipBatch(normalized(images), token_ids(tokenizer, texts), labels, has_text)
 
 
 class ClipStage(Stage):
@@ -144,15 +136,14 @@ class ClipStage(Stage):
     images = 400_000
 
     def build(self) -> nn.Module:
-        self.tokenizer = open_tokenizer(self.options.folder)
-        clip = trained_clip(self.options.folder, len(self.tokenizer), "text")
+        self.tokenizer, clip = trained_clip(self.options.folder, "text")
         heads = models.AttributeHeads(models.FEATURES)
         return nn.ModuleDict({"clip": clip, "image_heads": heads}).train().requires_grad_(True)
 
     def frozen(self) -> tuple[str, ...]:
         return tuple(f"clip.{name}" for name in TEXT_PARTS)
 
-    def data(self) -> StepData:
+    def data(self) -> Batches:
         return self.steps(clip_batch, self.tokenizer)
 
     def loss(self, model: nn.Module, batch: ClipBatch) -> tuple[Tensor, dict[str, Tensor]]:
@@ -171,7 +162,7 @@ class ClipStage(Stage):
         shard = self.shards.held_out_shard()
         rng = numpy_generator(self.options.seed, "clip-held-out")
         texts = view_prompts(shard, np.arange(len(shard.rgba)), rng)
-        pixels = clip_pixels(with_backgrounds(shard.rgba, rng, random_share=0)).to(self.device)
+        pixels = normalized(with_backgrounds(shard.rgba, rng, random_share=0)).to(self.device)
         ids = token_ids(self.tokenizer, texts).to(self.device)
         text, image = clip_features(model["clip"], ids, pixels)
         objects = torch.arange(len(text), device=text.device) // VIEWS
@@ -179,11 +170,6 @@ class ClipStage(Stage):
         labels = torch.from_numpy(shard.labels).to(self.device)
         rights = accuracies(model["image_heads"](image * text.shape[-1] ** 0.5), labels)
         return {"text_finds_object": float(match.float().mean()), **rights}
-
-
-def clip_pixels(images: Float[Tensor, "B 3 s s"]) -> Float[Tensor, "B 3 s s"]:
-    """Normalise pictures in [0, 1] as CLIP expects them."""
-    return (images - torch.tensor(MEAN)[:, None, None]) / torch.tensor(STD)[:, None, None]
 
 
 def clip_features(

@@ -3,8 +3,7 @@
 ``demo [PROMPT ...] [key=value ...]`` trains configs/toybox.yaml on each prompt, or
 configs/toybox-avatar.yaml where a person does something. It writes a contact sheet (the prior, of a
 person pose and body; the result; what the 2D model itself draws) and a table of what the judge
-recognises into a new folder of ``outputs/demo``. After Ctrl-C the same command continues.
-"""
+recognises into a new folder of ``outputs/demo``. After Ctrl-C the same command continues."""
 
 import argparse
 import functools
@@ -159,8 +158,7 @@ def config_of(prompt: str) -> str:
 
 def launch(config: str, options: list[str]) -> int:
     """Run the launcher in a process of its own, and wait for it even after Ctrl-C: it has received
-    the signal too, and writes a checkpoint. Return its exit code.
-    """
+    the signal too, and writes a checkpoint. Return its exit code."""
     program = [sys.executable, "-m", "threestudio_gaussiandreamer.launch.experiment"]
     with raised_signals() as received:
         process = subprocess.Popen([*program, "--config", config, "--train", *options])
@@ -240,8 +238,7 @@ def samples(
 
     Args:
         model: ``toybox``, a folder or a hub id.
-        guidance_scale: of classifier-free guidance; 1 is none.
-    """
+        guidance_scale: of classifier-free guidance; 1 is none."""
     named = {"pretrained_model_name_or_path": model}
     texts = {"prompt": prompt, "negative_prompt": "", "view_dependent_left_and_right": True}
     processor = find("gaussiandreamer-stable-diffusion-prompt-processor")

@@ -36,7 +36,7 @@ from . import models, words
 from .clip_stage import trained_clip
 from .loop import averaged_weights, checkpoint_path, is_trained
 from .motion_stage import TIMESTEPS, MotionStage
-from .tokens import copy_tokenizer, open_tokenizer
+from .tokens import copy_tokenizer
 from .train import STAGES
 from .unet_stage import LATENT_SCALE, frozen_autoencoder
 
@@ -47,8 +47,7 @@ def export(training: Path, target: Path) -> dict[str, Any]:
 
     Raises:
         UserError: a stage isn't trained yet, or the disk is full."""
-    tokenizer = open_tokenizer(training)
-    clip = trained_clip(training, len(tokenizer), "clip")
+    _, clip = trained_clip(training, "clip")
     _save(clip, target / "clip")
     copy_tokenizer(training / "tokenizer", target / "clip")
     write_stable_diffusion(target / "stable-diffusion", training, clip)

@@ -4,6 +4,7 @@ Most of its pictures show objects as Gaussians with errors, as results of score 
 blurred edges a classifier of ray-cast pictures alone takes for other colours."""
 
 import dataclasses
+import functools
 from typing import NamedTuple
 
 import numpy as np
@@ -16,7 +17,7 @@ from ..cameras import Orbit
 from ..core.streams import numpy_generator
 from ..meshes.mesh import Mesh, face_areas, sample_surface, surface_colors
 from . import recognition
-from .loop import MixedData, Options, Stage, moved
+from .loop import Batches, Options, Stage, mixed_batch, moved
 from .models import Judge, accuracies, classified
 from .views import LABELS, Shard, Shards, exchanged, render_gaussians, with_backgrounds
 
@@ -107,8 +108,7 @@ def judge_batch(
 
 def judge_labels(shard: Shard, rows: np.ndarray) -> Int[Tensor, "B L"]:
     """Return labels in which the sides of actions are those of the picture: exchanged if seen from
-    behind, which needs no knowledge of where the front is.
-    """
+    behind, which needs no knowledge of where the front is."""
     labels, column = torch.from_numpy(shard.labels[rows]), list(LABELS).index("action")
     action = labels[:, column]
     behind = recognition.behind(torch.from_numpy(shard.azimuth[rows]))
@@ -133,9 +133,9 @@ class JudgeStage(Stage):
         self.shards, self.splats = judge_shards(self.options)
         return Judge().to(memory_format=torch.channels_last)  # 1.5 times faster on a CPU
 
-    def data(self) -> MixedData:
+    def data(self) -> Batches:
         splats = self.steps(judge_batch, shards=self.splats, stream="judge-splats")
-        return MixedData(self.steps(judge_batch), splats, CAST_EVERY)
+        return functools.partial(mixed_batch, self.steps(judge_batch), splats, CAST_EVERY)
 
     def loss(self, model: nn.Module, batch: JudgeBatch) -> tuple[Tensor, dict[str, Tensor]]:
         loss, right = classified(model(batch.images, batch.persons), batch.labels)

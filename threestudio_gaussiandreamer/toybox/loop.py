@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel
-from torch.utils.data import DataLoader, Dataset
+from torch.utils.data import DataLoader
 
 from ..core.checkpoint_file import entries_below, load_file, save_file
 from ..core.command import restore_handlers, set_handlers
@@ -33,12 +33,14 @@ CLIP_GRADIENT = 1.0
 LOG_EVERY, SAVE_SECONDS = 50, 300.0
 
 
-@dataclass(frozen=True)
-class StepData(Dataset):
-    """The batches of one stage, indexed by step. It is sent to worker processes.
+Batches = Callable[[int], Any]
+"""Makes the batch of a step, a named tuple of tensors and numbers; sent to worker processes."""
 
-    Each pass over a shard visits its rows (pictures, or objects) in random order; an incomplete
-    last batch is dropped."""
+
+@dataclass(frozen=True)
+class StepData:
+    """The batches of one stage's shards by step. Each pass over a shard visits its rows (pictures,
+    or objects) in random order; an incomplete last batch is dropped."""
 
     shards: Shards
     batch: int
@@ -47,11 +49,11 @@ class StepData(Dataset):
     stream: str
     """Name of the streams of random numbers."""
     make: Callable[[int, np.ndarray, np.random.Generator], Any]
-    """Makes the batch of these rows of a shard, a named tuple of tensors and numbers."""
+    """Makes the batch of these rows of a shard."""
     per_object: bool = False
     """Whether rows are objects instead of pictures."""
 
-    def __getitem__(self, step: int) -> Any:
+    def __call__(self, step: int) -> Any:
         seed, count = self.shards.seed, self.shards.objects
         count *= 1 if self.per_object else self.shards.views
         batch = min(self.batch, count)
@@ -62,17 +64,10 @@ class StepData(Dataset):
         return self.make(visit % self.pool, rows, rng)
 
 
-@dataclass(frozen=True)
-class MixedData(Dataset):
-    """One batch in ``every`` of ``first``, the others of ``second``, of each without gaps."""
-
-    first: Dataset
-    second: Dataset
-    every: int
-
-    def __getitem__(self, step: int) -> Any:
-        cycle, place = divmod(step, self.every)
-        return self.second[cycle * (self.every - 1) + place - 1] if place else self.first[cycle]
+def mixed_batch(first: Batches, second: Batches, every: int, step: int) -> Any:
+    """Make one batch in ``every`` of ``first``, the others of ``second``, of each without gaps."""
+    cycle, place = divmod(step, every)
+    return second(cycle * (every - 1) + place - 1) if place else first(cycle)
 
 
 def moved(batch: Any, device: torch.device) -> Any:
@@ -150,8 +145,8 @@ class Stage(ABC):
         """Build the network, and load the networks that its training uses."""
 
     @abstractmethod
-    def data(self) -> Dataset:
-        """Return the batches, indexed by step, on the CPU: :meth:`steps` of a function."""
+    def data(self) -> Batches:
+        """Return the batches, on the CPU: :meth:`steps` of a function."""
 
     def steps(
         self, make: Callable[..., Any], *given: Any, shards: Optional[Shards] = None, **more: Any
@@ -166,9 +161,10 @@ class Stage(ABC):
         """Yield the batches from ``step`` on, on the stage's device."""
         workers = self.options.workers
         loader = DataLoader(
-            self.data(),
+            range(2**62),  # steps, of which batches are made
             batch_size=None,
             sampler=itertools.count(step),  # type: ignore[arg-type]
+            collate_fn=self.data(),
             num_workers=workers,
             prefetch_factor=4 if workers else None,
             pin_memory=self.device.type == "cuda",

@@ -182,8 +182,7 @@ class Classifier(nn.Module):
 
 class PersonClassifier(Classifier):
     """One that also sees where something is, which tells an arm from the other; at half the
-    resolution, which is five times as fast.
-    """
+    resolution, which is five times as fast."""
 
     PLACES = 16
 

@@ -1,14 +1,12 @@
 """Training a text-to-motion model in MDM's format, on CLIP's text features."""
 
 import functools
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
-from torch.utils.data import Dataset
 from tqdm import tqdm
 
 from ..core.streams import numpy_generator
@@ -17,8 +15,8 @@ from ..priors.karras import cosine_alphas_cumprod
 from ..priors.text_to_motion import FRAMES, MotionModel
 from . import models, motions, words
 from .clip_stage import trained_clip
-from .loop import Options, Stage, normal, torch_generator
-from .tokens import open_tokenizer, token_ids
+from .loop import Batches, Options, Stage, normal, torch_generator
+from .tokens import token_ids
 
 TIMESTEPS, EMPTY_SHARE = 50, 0.1
 SUBJECTS = "someone", "someone", "a person", "a man", "a woman"
@@ -51,34 +49,21 @@ def statistics(features: Float[np.ndarray, "M 60 263"]) -> tuple[np.ndarray, np.
     return features.mean(axis=(0, 1), dtype=np.float64), std
 
 
-def sentence(action: str, rng: np.random.Generator) -> str:
-    """Write a sentence about someone."""
-    return f"{SUBJECTS[int(rng.integers(len(SUBJECTS)))]} {words.motion_of(action, rng)}"
-
-
-@dataclass(frozen=True)
-class MotionData(Dataset):
-    """Motions of random actions; a batch is a function of (seed, step)."""
-
-    seed: int
-    batch: int
-    tokenizer: Any
-    statistics: tuple[np.ndarray, np.ndarray]
-
-    def __getitem__(self, step: int) -> MotionBatch:
-        rng = numpy_generator(self.seed, "toybox-motions", step)
-        found = drawn_features(self.seed)
-        rows, names = rng.integers(len(found), size=self.batch), motions.names()
-        mean, std = self.statistics
-        features = torch.from_numpy(np.float32((found[rows] - mean) / std))
-        texts = [sentence(names[row % len(names)], rng) for row in rows]
-        return MotionBatch(
-            features,
-            normal(rng, features.shape),
-            sds.stratified_timesteps(self.batch, TIMESTEPS, torch_generator(rng)),
-            token_ids(self.tokenizer, texts),
-            torch.from_numpy(rng.uniform(size=self.batch) < EMPTY_SHARE),
-        )
+def motion_batch(
+    seed: int, batch: int, tokenizer: Any, mean: np.ndarray, std: np.ndarray, step: int
+) -> MotionBatch:
+    """Draw motions of random actions, sentences about someone, timesteps and noise."""
+    rng, found = numpy_generator(seed, "toybox-motions", step), drawn_features(seed)
+    rows, names = rng.integers(len(found), size=batch), motions.names()
+    features = torch.from_numpy(np.float32((found[rows] - mean) / std))
+    texts = [
+        f"{SUBJECTS[int(rng.integers(len(SUBJECTS)))]} {words.motion_of(names[i], rng)}"
+        for i in rows % len(names)
+    ]
+    noise = normal(rng, features.shape)
+    t = sds.stratified_timesteps(batch, TIMESTEPS, torch_generator(rng))
+    empty = torch.from_numpy(rng.uniform(size=batch) < EMPTY_SHARE)
+    return MotionBatch(features, noise, t, token_ids(tokenizer, texts), empty)
 
 
 class MotionStage(Stage):
@@ -95,8 +80,7 @@ class MotionStage(Stage):
         self.constants = {"mean": mean.tolist(), "std": std.tolist()}
 
     def build(self) -> nn.Module:
-        self.tokenizer = open_tokenizer(self.options.folder)
-        self.clip = trained_clip(self.options.folder, len(self.tokenizer), "text").to(self.device)
+        self.tokenizer, self.clip = trained_clip(self.options.folder, "text", self.device)
         self.alphas_cumprod = torch.from_numpy(cosine_alphas_cumprod(TIMESTEPS)).to(self.device)
         return self.network()
 
@@ -105,9 +89,10 @@ class MotionStage(Stage):
         sizes = models.MOTION_WIDTH, models.MOTION_LAYERS, models.MOTION_HIDDEN, models.FEATURES
         return MotionModel(*sizes)
 
-    def data(self) -> MotionData:
+    def data(self) -> Batches:
         mean, std = (np.array(self.constants[name]) for name in ("mean", "std"))
-        return MotionData(self.options.seed, self.batch, self.tokenizer, (mean, std))
+        given = self.options.seed, self.batch, self.tokenizer, mean, std
+        return functools.partial(motion_batch, *given)
 
     def loss(self, model: nn.Module, batch: MotionBatch) -> tuple[Tensor, dict[str, Tensor]]:
         text = self.condition(batch.ids) * ~batch.empty[:, None]

@@ -11,6 +11,7 @@ from typing import NamedTuple, Optional
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
 from ..priors.body_pose import BODY_JOINTS, INDEX, PARENTS, SIDES
 
@@ -292,8 +293,6 @@ PEAKS["run"] = PEAKS["walk"]
 
 def joint_positions(body: Body) -> Float[np.ndarray, "T 22 3"]:
     """Return the places of all joints."""
-    from scipy.spatial.transform import Rotation
-
     frames = len(body.pelvis)
     found, turns = np.zeros((frames, BODY_JOINTS, 3)), {}
     found[:, 0] = body.pelvis
@@ -345,10 +344,7 @@ def features(positions: Float[np.ndarray, "T 22 3"]) -> Float[np.ndarray, "T-1 2
     Half the angle by which the heading turns, the pelvis' velocity on the ground, and its height
     (1, 2, 1); the other joints relative to the pelvis' place on the ground (63); their rotations,
     two columns of a matrix each (126); velocities of all (66), all in the axes of the heading; and
-    whether ankles and feet rest (4).
-    """
-    from scipy.spatial.transform import Rotation
-
+    whether ankles and feet rest (4)."""
     p = positions - positions[:1, :1] * [1, 0, 1]
     across = p[:, [1, 16]].sum(1) - p[:, [2, 17]].sum(1)
     heading = np.unwrap(np.arctan2(-across[:, 2], across[:, 0]))
@@ -372,10 +368,7 @@ CHAINS = *LEGS, (0, 3, 6, 9, 12, 15), *ARMS
 
 def rotations(p: np.ndarray, heading) -> Float[np.ndarray, "T 21 6"]:
     """Return each joint's least rotation from its resting bone, relative to its chain's joint
-    before; the first two columns of the matrices.
-    """
-    from scipy.spatial.transform import Rotation
-
+    before; the first two columns of the matrices."""
     found = np.zeros((len(p), BODY_JOINTS, 6))
     for chain in CHAINS:
         turn = heading

@@ -1,8 +1,7 @@
 """The toybox's person: clothes, hair and face around the joints of a pose, in the kinds' axes.
 
 Roles beside those of ``kinds.py``: "body" is the shirt, "part" the trousers; "skin", "tan" and
-"hair" are fixed details. Hair and a cape are at the back; face, buckle and buttons in front.
-"""
+"hair" are fixed details. Hair and a cape are at the back; face, buckle and buttons in front."""
 
 from typing import NamedTuple
 

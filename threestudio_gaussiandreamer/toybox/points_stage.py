@@ -12,8 +12,8 @@ from ..priors.karras import cosine_alphas_cumprod
 from ..priors.point_e import BIASES, SCALES, BaseModel, mean_of
 from . import models
 from .clip_stage import text_features, trained_clip
-from .loop import Stage, StepData, normal, torch_generator
-from .tokens import object_prompts, open_tokenizer, token_ids
+from .loop import Batches, Stage, normal, torch_generator
+from .tokens import object_prompts, token_ids
 from .views import Shards
 from .world import RADIUS
 
@@ -54,13 +54,12 @@ class PointsStage(Stage):
     images = 400_000
 
     def build(self) -> nn.Module:
-        self.tokenizer = open_tokenizer(self.options.folder)
-        self.clip = trained_clip(self.options.folder, len(self.tokenizer), "text").to(self.device)
+        self.tokenizer, self.clip = trained_clip(self.options.folder, "text", self.device)
         self.alphas_cumprod = torch.from_numpy(cosine_alphas_cumprod()).to(self.device)
         width, layers = models.POINTS_WIDTH, models.POINTS_LAYERS
         return BaseModel(width=width, layers=layers, features=models.FEATURES)
 
-    def data(self) -> StepData:
+    def data(self) -> Batches:
         return self.steps(points_batch, self.tokenizer, per_object=True)
 
     def loss(self, model: nn.Module, batch: PointsBatch) -> tuple[Tensor, dict[str, Tensor]]:

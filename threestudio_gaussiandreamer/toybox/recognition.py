@@ -38,13 +38,8 @@ OFFSETS_DEG = (-22.5, 22.5)
 
 
 def load_judge(name: str) -> Judge:
-    """Load a judge that ``toybox.export`` wrote.
-
-    Args:
-        name: ``toybox``, the folder of an export, or the file.
-
-    Raises:
-        UserError: there is no such file, or it doesn't hold a judge."""
+    """Load a judge that ``toybox.export`` wrote: ``toybox``, the folder of an export, or the file.
+    Raise UserError if there is no such file, or it doesn't hold a judge."""
     from ..models.model_files import load_exactly, read_state_dict
 
     path, judge = model_part(name, JUDGE), Judge()
@@ -66,8 +61,7 @@ def probabilities(
     judge: Judge, pictures: Float[Tensor, "V 3 s s"], wanted: Attributes
 ) -> dict[str, Tensor]:
     """Return each attribute's probabilities (V, classes) in pictures in [0, 1], in the order of
-    :func:`views`, of what a prompt asks for, an object or a person.
-    """
+    :func:`views`, of what a prompt asks for, an object or a person."""
     persons = torch.full((len(pictures),), wanted.kind == PERSON)
     found = {name: logits.softmax(dim=-1) for name, logits in judge(pictures, persons).items()}
     seen, from_behind = found["action"], behind(views().azimuth)[:, None]  # sides of the picture

@@ -10,7 +10,6 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor, nn
-from torch.utils.data import Dataset
 from tqdm import tqdm
 
 from ..core.files import atomic_file
@@ -20,8 +19,8 @@ from ..models.multiview_unet import views_attended_together
 from ..prompts.view_prompts import THRESHOLDS
 from . import models
 from .clip_stage import trained_clip
-from .loop import MixedData, Stage, averaged_weights, moved, normal, torch_generator
-from .tokens import joined_prompts, open_tokenizer, token_ids, training_prompts, view_prompts
+from .loop import Batches, Stage, averaged_weights, mixed_batch, moved, normal, torch_generator
+from .tokens import joined_prompts, token_ids, training_prompts, view_prompts
 from .views import SIZE, Shards, with_backgrounds
 
 RANDOM_BACKGROUNDS = 0.05
@@ -88,9 +87,8 @@ class UNetStage(Stage):
 
     def build(self) -> nn.Module:
         folder = self.options.folder
-        self.tokenizer = open_tokenizer(folder)
-        clip = trained_clip(folder, len(self.tokenizer), "text")
-        self.text_model = clip.text_model.to(self.device)
+        self.tokenizer, clip = trained_clip(folder, "text", self.device)
+        self.text_model = clip.text_model
         self.vae = frozen_autoencoder(folder).to(self.device)
         encoder = sorted(self.vae.encoder.state_dict().items())
         content = (name.encode() + v.cpu().contiguous().numpy().tobytes() for name, v in encoder)
@@ -101,14 +99,15 @@ class UNetStage(Stage):
         # 1.7 times faster in bfloat16 on a CPU
         return models.unet().to(memory_format=torch.channels_last)
 
-    def data(self) -> Dataset:
+    def data(self) -> Batches:
         pool = tqdm(range(self.options.pool), "latents", unit="shard", disable=None)
         given = self.tokenizer, [self._moments(index) for index in pool]
         singles, views = self.steps(unet_batch, *given, 1), self.shards.views
         objects = {"batch": self.batch // views, "stream": "unet-joined", "per_object": True}
         if self.batch < views:
             return singles
-        return MixedData(singles, self.steps(unet_batch, *given, views, **objects), SINGLE_EVERY)
+        joined = self.steps(unet_batch, *given, views, **objects)
+        return functools.partial(mixed_batch, singles, joined, SINGLE_EVERY)
 
     def loss(self, model: nn.Module, batch: UNetBatch) -> tuple[Tensor, dict[str, Tensor]]:
         abar, errors = self.alphas_cumprod[batch.t], self._errors(model, batch)

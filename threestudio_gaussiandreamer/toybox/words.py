@@ -8,7 +8,7 @@ from typing import Optional
 import numpy as np
 
 from ..priors.motion_text import POSSESSIVES
-from ..prompts.view_prompts import THRESHOLDS
+from ..prompts.view_prompts import view_directions
 from . import motions
 from .world import COLORS, Attributes
 
@@ -47,6 +47,7 @@ OPENINGS = *["a {}"] * 3, "a toy {}", "a small {}", "a photo of a {}", "a 3d mod
 OPPOSITE = {"front": "back", "back": "front", "overhead": "overhead"}
 OPPOSITE |= {"left side": "right side", "right side": "left side"}
 """The directions of views, each with the opposite one."""
+DIRECTIONS = view_directions(left_and_right=True)
 EMPTY_SHARE, PLAIN_SHARE, PREFIX_SHARE, UNNAMED_SIDE_SHARE = 0.1, 0.2, 0.04, 0.1
 """Shares of prompts that are empty, that name no direction, and that begin with it; and of the side
 views, of prompts that say "side view", as threestudio's do."""
@@ -54,15 +55,8 @@ views, of prompts that say "side view", as threestudio's do."""
 
 def direction(elevation: float, azimuth: float) -> str:
     """Name the direction of a view (degrees), as with ``view_dependent_left_and_right``."""
-    front, back, overhead = THRESHOLDS.values()
-    shifted = (float(azimuth) + 180) % 360 - 180
-    if elevation > overhead:
-        return "overhead"
-    if abs(shifted) < front:
-        return "front"
-    if abs(shifted) > 180 - back:
-        return "back"
-    return "left side" if shifted >= 0 else "right side"
+    view = float(elevation), float(azimuth), 0.0
+    return next(way.name for way in reversed(DIRECTIONS) if way.condition(*view))
 
 
 def describe(attributes: Attributes, rng: np.random.Generator) -> str:
