@@ -143,11 +143,12 @@ def asked(monkeypatch):
     """Replace CLIP: the last picture fits best. Return the texts that it is asked for."""
     texts = []
 
-    def scores(clip, pictures, text, *, device):
+    def scores(pictures, text):
         texts.append(text)
         return np.arange(len(pictures), dtype=float)
 
-    monkeypatch.setattr(module, "picture_similarities", scores)
+    clip = types.SimpleNamespace(similarities=scores)
+    monkeypatch.setattr(module, "PictureText", lambda source, device: clip)
     monkeypatch.setattr(module, "NUM_FRAMES", 2)
     monkeypatch.setattr(module, "ROUGH", 5)
     return texts

@@ -24,7 +24,7 @@ from .logs import info, warn
 from .schedule import parse_schedule, validate_schedule
 
 RULE = "option"
-"""The key of a field's rule in its metadata."""
+"""The key of a field's rule in its metadata: ``check(path, value)``, which raises UserError."""
 SCALARS = {int: "a whole number", float: "a number", bool: "true or false", str: "a text"}
 SWITCHES = dict.fromkeys(("true", "yes", "y", "on", "1"), True)
 SWITCHES |= dict.fromkeys(("false", "no", "n", "off", "0"), False)
@@ -40,11 +40,6 @@ Rule = dict[str, Any]
 # -- rules -----------------------------------------------------------------------------------------
 
 
-def rule(check: Callable[[str, Any], None]) -> Rule:
-    """Return field metadata with ``check(path, value)``, which raises UserError for a bad value."""
-    return {RULE: check}
-
-
 def satisfies(expected: str, holds: Callable[[Any], bool]) -> Rule:
     """Accept values for which ``holds`` is true; ``expected`` describes them in the message."""
 
@@ -52,7 +47,7 @@ def satisfies(expected: str, holds: Callable[[Any], bool]) -> Rule:
         if not holds(value):
             raise wrong(path, expected, value)
 
-    return rule(check)
+    return {RULE: check}
 
 
 def positive(unit: str = "", most: float = FLOAT32_MAX) -> Rule:
@@ -89,7 +84,7 @@ def one_of(choices: Collection[str] | Callable[[], Collection[str]]) -> Rule:
         if value not in known:
             raise unknown(path, value, known)
 
-    return rule(check)
+    return {RULE: check}
 
 
 def schedule(min: float = -FLOAT32_MAX, max: float = FLOAT32_MAX) -> Rule:
@@ -101,7 +96,7 @@ def schedule(min: float = -FLOAT32_MAX, max: float = FLOAT32_MAX) -> Rule:
                 bound = f"{min:g} or more" if number < min else f"{max:g} or less"
                 raise wrong(path, f"values of {bound}", number)
 
-    return rule(check)
+    return {RULE: check}
 
 
 def interval(low: float = -FLOAT32_MAX, high: float = FLOAT32_MAX, what: str = "numbers") -> Rule:
@@ -118,7 +113,7 @@ def each(item: Rule) -> Rule:
         for i, value in enumerate(values):
             item[RULE](f"{path}[{i}]", value)
 
-    return rule(check)
+    return {RULE: check}
 
 
 def required(purpose: str) -> Rule:
@@ -128,7 +123,7 @@ def required(purpose: str) -> Rule:
         if not value:
             raise UserError(f"{path}: {purpose}")
 
-    return rule(check)
+    return {RULE: check}
 
 
 def count_of(things: str, low: int, bytes_each: int) -> Rule:
@@ -139,7 +134,7 @@ def count_of(things: str, low: int, bytes_each: int) -> Rule:
             raise wrong(path, f"{low} or more {things}", value)
         require_memory(path, bytes_each * value, f"{value} {things}")
 
-    return rule(check)
+    return {RULE: check}
 
 
 # -- values ----------------------------------------------------------------------------------------

@@ -37,7 +37,7 @@ from typing import Any, Dict, List, Optional
 import numpy as np
 
 from ..core.errors import UserError
-from ..core.options import Rule, each, in_range, one_of, require_mapping, rule, wrong
+from ..core.options import RULE, Rule, each, in_range, one_of, require_mapping, wrong
 from ..formats.gaussian_files import FORMATS, StoredCloud, suffix_of
 from ..formats.glb import GLB_UP
 from ..formats.spz import VERSION, VERSIONS, require_version
@@ -76,7 +76,7 @@ def require_file_name(option: str, name: str) -> None:
         raise wrong(option, f"{said}, other than {', '.join(RESERVED)}", name)
 
 
-SAVE_NAME, UP = rule(require_file_name), one_of(AXES)
+SAVE_NAME, UP = {RULE: require_file_name}, one_of(AXES)
 DRAWING = {"eps2d": EPS2D, "antialias": False}
 """Of a run's renderer: the dilation in square pixels of the image, and whether it antialiases."""
 

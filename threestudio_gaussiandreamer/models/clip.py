@@ -13,7 +13,7 @@ from torch import Tensor
 from ..core.extras import require_extra
 from .bundled import CLIP, model_part
 from .hub import Source, locate
-from .model_files import free_memory, load_network, load_settings, needed_files
+from .model_files import load_network, load_settings, needed_files
 
 MEAN, STD = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
 """Mean and standard deviation of CLIP's training pictures per channel."""
@@ -86,15 +86,6 @@ class PictureText:
             chunk = preprocessed(pictures[start : start + batch], size).to(self._device)
             found.append(_unit_features(self._model.get_image_features(chunk)) @ wanted)
         return torch.cat(found).cpu().numpy()
-
-
-def picture_similarities(
-    source: Source, pictures: Float[np.ndarray, "N H W 3"], text: str, *, device: torch.device
-) -> Float[np.ndarray, "N"]:
-    """Return what :meth:`PictureText.similarities` does; the model is loaded and freed."""
-    scores = PictureText(source, device).similarities(pictures, text)
-    free_memory()
-    return scores
 
 
 def _unit_features(output: Any) -> Tensor:

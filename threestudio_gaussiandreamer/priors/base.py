@@ -52,11 +52,7 @@ def points(low: int) -> Rule:
 
 COLOR = satisfies(
     "null, 'grey', 'random' or [red, green, blue] in [0, 1]",
-    lambda value: (
-        value in (None, "grey", "random")
-        or is_numbers(value, 3)
-        and all(0 <= number <= 1 for number in value)
-    ),
+    lambda v: v in (None, "grey", "random") or is_numbers(v, 3) and all(0 <= x <= 1 for x in v),
 )
 SCALE = positive("world units", most=1e6)
 

@@ -88,10 +88,9 @@ class Body(NamedTuple):
 def posed(body: Body, pose: Pose) -> Body:
     """Return the body in a pose, with its pelvis where it is at rest."""
     joints = body.joints.copy()
-    for joint, parent in enumerate(PARENTS):
-        if parent >= 0:
-            offset = body.joints[joint] - body.joints[parent]
-            joints[joint] = joints[parent] + pose[parent] @ offset
+    for joint, parent in enumerate(PARENTS[1:], 1):
+        offset = body.joints[joint] - body.joints[parent]
+        joints[joint] = joints[parent] + pose[parent] @ offset
     moved = np.einsum("vj,jab,vb->va", body.weights, pose, body.vertices, optimize=True)
     shifts = joints - np.einsum("jab,jb->ja", pose, body.joints)
     return body._replace(vertices=moved + body.weights @ shifts, joints=joints)
@@ -112,9 +111,8 @@ def pose_of_rotations(body: Body, local: Pose) -> Pose:
     SMPL's; the first rotation is that of the whole body.
     """
     turned = local.copy()
-    for joint, parent in enumerate(PARENTS):
-        if parent >= 0:
-            turned[joint] = turned[parent] @ local[joint]
+    for joint, parent in enumerate(PARENTS[1:], 1):
+        turned[joint] = turned[parent] @ local[joint]
     # in a T-pose the arms point sideways, and hands move with the lower arms
     to_t_pose = np.tile(np.eye(3), (BODY_JOINTS, 1, 1))
     for side, sign in zip(SIDES, (1.0, -1.0), strict=True):
@@ -138,7 +136,7 @@ def pose_of_positions(body: Body, positions: dict[str, Point]) -> Pose:
     pelvis, chest = (found @ resting.T for found, resting in frames)
     between = Slerp([0, 1], Rotation.from_matrix(np.stack([pelvis, chest])))
     pose = np.tile(pelvis, (BODY_JOINTS, 1, 1))
-    for joint, parent in list(enumerate(PARENTS))[1:]:
+    for joint, parent in enumerate(PARENTS[1:], 1):
         name = JOINTS[joint]
         pose[joint] = between(SPINE[name]).as_matrix() if name in SPINE else pose[parent]
         end = LIMBS.get(name)

@@ -68,9 +68,10 @@ class SampledPrior(Prior):
 
     def condition(
         self, name: str, folder: Path, prompt: str, parts: tuple[str, str] = ("", ""), **how: Any
-    ) -> Float[Tensor, "1 D"]:
+    ) -> Float[Tensor, "N D"]:
         """Return the prompt's features by the text encoder and tokenizer of a model, in these
-        ``parts`` below ``folder``; ``how`` is for ``load_text_encoder``.
+        ``parts`` below ``folder``, and with guidance the unconditional ones, zeros, in a second
+        row; ``how`` is for ``load_text_encoder``.
         """
         network = loaded(
             (f"{name} text_encoder", str(folder), self.device, *how.values()),
@@ -78,12 +79,9 @@ class SampledPrior(Prior):
         )
         key = (f"{name} tokenizer", str(folder))
         tokens = loaded(key, lambda: load_tokenizer(folder, parts[1]))
-        return text_condition(tokens, network, self.cfg.prompt or prompt)
-
-    def with_unconditional(self, condition: Float[Tensor, "1 D"]) -> Float[Tensor, "N D"]:
-        """Return the condition and, with guidance, a second row, the unconditional one."""
-        none = [] if self.cfg.guidance_scale == 1 else [torch.zeros_like(condition)]
-        return torch.cat([condition, *none])
+        found = text_condition(tokens, network, self.cfg.prompt or prompt)
+        none = [] if self.cfg.guidance_scale == 1 else [torch.zeros_like(found)]
+        return torch.cat([found, *none])
 
 
 def torch_generator(generator: np.random.Generator) -> torch.Generator:

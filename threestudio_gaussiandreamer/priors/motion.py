@@ -68,8 +68,9 @@ from ..meshes.load import load_mesh
 from ..meshes.mesh import Mesh
 from ..meshes.raycast import MeshCaster, over_background
 from ..models.bundled import BODY, MOTION, model_part
-from ..models.clip import clip_source, picture_similarities, text_features
+from ..models.clip import PictureText, clip_source, text_features
 from ..models.hub import Source, locate
+from ..models.model_files import free_memory
 from .base import COLOR, SCALE, Prior, points
 from .body_pose import BODY_JOINTS, JOINTS, PARENTS, require_frame, world_mesh
 from .karras import torch_generator
@@ -279,9 +280,10 @@ class MotionPrior(Prior):
     def _best(self, meshes: list[Mesh], text: str, names: list[str]) -> int:
         """Return the index of the mesh whose pictures fit ``text`` best, by CLIP."""
         pictures = np.concatenate([body_pictures(mesh) for mesh in meshes])
-        clip = clip_source(self.cfg.clip)
-        scores = picture_similarities(clip, pictures, text, device=self.device)
-        scores = scores.reshape(len(meshes), -1).mean(axis=1)
+        clip = PictureText(clip_source(self.cfg.clip), self.device)
+        scores = clip.similarities(pictures, text).reshape(len(meshes), -1).mean(axis=1)
+        del clip
+        free_memory()
         found = (f"{name} {score:.4f}" for name, score in zip(names, scores, strict=True))
         info(f"CLIP for {text!r}: {', '.join(found)}")
         return int(scores.argmax())
@@ -381,8 +383,7 @@ class BodyFit(NamedTuple):
 
 def load_body_model(path: str) -> BodyModel:
     """Read the user's body model, an NPZ or SMPL's own PKL, of which no code is run; raise
-    UserError if it is missing or not a body model.
-    """
+    UserError if it is missing or not a body model."""
     kind = "body model (the NPZ or PKL of SMPL, SMPL-H or SMPL-X)"
     with reading(path, kind) as file:
         arrays = read_arrays(file, kind, FIELDS)
@@ -406,8 +407,7 @@ def fit_bodies(
     model: BodyModel, targets: Float[np.ndarray, "F K 3"], *, iterations: int = 300
 ) -> BodyFit:
     """Return bodies whose joints are where ``targets`` has them: 22 or 24 in SMPL's order, metres,
-    y up. The last two of 24 are used when the model has no more.
-    """
+    y up. The last two of 24 are used when the model has no more."""
     joints = len(model.parents)
     wanted = _tensor(targets)[:, : SMPL_JOINTS if joints == SMPL_JOINTS else BODY_JOINTS]
     frames = len(wanted)
@@ -465,8 +465,7 @@ def posed_joints(
 @torch.no_grad()
 def posed_vertices(model: BodyModel, fit: BodyFit) -> Float[np.ndarray, "F V 3"]:
     """Return the surfaces of the fitted bodies, metres, y up: SMPL's linear blend skinning of the
-    template with the offsets of shape and pose (Loper et al. 2015, equations 2 to 10).
-    """
+    template with the offsets of shape and pose (Loper et al. 2015, equations 2 to 10)."""
     own = rotation_matrices(fit.pose)
     shaped = model.template + torch.einsum("fb,vcb->fvc", fit.shape, model.shape_directions)
     rest = model.joint_regressor @ shaped

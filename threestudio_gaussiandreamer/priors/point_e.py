@@ -100,9 +100,8 @@ class PointEPrior(SampledPrior):
                 f"clip: {cfg.clip!r} has {given} features, but the checkpoint was trained "
                 f"with {expected}: use ViT-L/14"
             )
-        conditions, levels = self.with_unconditional(condition), karras.cosine_alphas_cumprod()
-        predict, scale = mean_of(network, conditions), cfg.guidance_scale
-        denoise = karras.guided_denoiser(predict, levels, scale=scale)
+        predict, levels = mean_of(network, condition), karras.cosine_alphas_cumprod()
+        denoise = karras.guided_denoiser(predict, levels, scale=cfg.guidance_scale)
         points = self._sampled(denoise, BaseModel, cfg.num_points, rng)
         if cfg.upsampler:
             predict = mean_of(self._network(Upsampler, cfg.upsampler), points)

@@ -118,11 +118,11 @@ class ShapEPrior(SampledPrior):
         schedule = load_settings(HeunDiscreteScheduler, folder, "scheduler")
         shape = (1, prior.config.num_embeddings, prior.config.embedding_dim)
         noise = torch.randn(shape, generator=rng).to(self.device)
-        conditions, half = self.with_unconditional(condition), noise.is_cuda
+        half = noise.is_cuda
 
         def network(z: Tensor, timesteps: Tensor) -> Tensor:
             with torch.autocast(z.device.type, torch.float16, enabled=half):
-                output = prior(z, timesteps, conditions).predicted_image_embedding
+                output = prior(z, timesteps, condition).predicted_image_embedding
             return output[..., : z.shape[-1]]  # the rest is the variance, which isn't used
 
         denoise = karras.guided_denoiser(

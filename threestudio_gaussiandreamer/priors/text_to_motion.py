@@ -85,8 +85,7 @@ def load_motion_model(path: str) -> TextToMotion:
     """Load MDM's checkpoint with the files beside it.
 
     Raises:
-        UserError: a file is missing or damaged, or the model is of another kind.
-    """
+        UserError: a file is missing or damaged, or the model is of another kind."""
     with reading(path, KIND) as file:
         beside = [file.parent / name for name in (SETTINGS, ACTIONS, *sum(STATISTICS, ()))]
         consulted.update((str(one), stamp(one)) for one in beside)
@@ -145,8 +144,7 @@ def sample_motions(
     the timesteps, with classifier-free guidance. Metres, y up.
 
     Raises:
-        UserError: the features of the text have another size, or positions aren't finite.
-    """
+        UserError: the features of the text have another size, or positions aren't finite."""
     given, expected = text.shape[1], model.network.embed_text.in_features
     if given != expected:
         raise UserError(
@@ -192,22 +190,17 @@ def rigid(positions: Float[np.ndarray, "S T 22 3"]) -> Float[np.ndarray, "S T 22
 def positions_of(features: Float[np.ndarray, "S T 263"]) -> Float[np.ndarray, "S T 22 3"]:
     """Return the joints of HumanML3D's features (Guo et al. 2022): 0 is half the angle by which the
     heading turns to the next frame, 1 and 2 the pelvis' velocity on the ground in the next frame's
-    heading, 3 its height, 4 to 66 the other joints relative to the pelvis' place on the ground.
-    """
-    turns = np.cumsum(features[..., :-1, 0], axis=-1)
-    half = np.concatenate([np.zeros_like(turns[..., :1]), turns], -1)
-    sine, cosine = np.sin(-2 * half), np.cos(-2 * half)  # from the heading's axes to the world's
-
-    def turned(x: np.ndarray, z: np.ndarray, s: np.ndarray, c: np.ndarray) -> tuple:
-        return c * x + s * z, c * z - s * x
-
-    steps = turned(features[..., :-1, 1], features[..., :-1, 2], sine[..., 1:], cosine[..., 1:])
-    x, z = (np.concatenate([np.zeros_like(s[..., :1]), np.cumsum(s, -1)], -1) for s in steps)
+    heading, 3 its height, 4 to 66 the other joints relative to the pelvis' place on the ground."""
+    first = (0, 0), (1, 0)  # in the first frame nothing has turned or moved
+    # from the heading's axes to the world's; x + iz on the ground
+    turn = np.exp(2j * np.cumsum(np.pad(features[:, :-1, 0], first), axis=1))
+    steps = (features[:, :-1, 1] + 1j * features[:, :-1, 2]) * turn[:, 1:]
+    pelvis = np.cumsum(np.pad(steps, first), axis=1)
     local = features[..., 4:67].reshape(*features.shape[:-1], 21, 3)
-    there = turned(local[..., 0], local[..., 2], sine[..., None], cosine[..., None])
-    found = np.stack([there[0] + x[..., None], local[..., 1], there[1] + z[..., None]], -1)
-    pelvis = np.stack([x, features[..., 3], z], -1)
-    return np.concatenate([pelvis[..., None, :], found], -2)
+    ground = (local[..., 0] + 1j * local[..., 2]) * turn[..., None] + pelvis[..., None]
+    ground = np.concatenate([pelvis[..., None], ground], -1)
+    heights = np.concatenate([features[..., 3:4], local[..., 1]], -1)
+    return np.stack([ground.real, heights, ground.imag], -1)
 
 
 def mdm_files(network: MotionModel, steps: int) -> tuple[Mapping[str, Tensor], dict[str, Any]]:

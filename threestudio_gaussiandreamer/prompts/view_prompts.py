@@ -98,15 +98,6 @@ class PromptEmbeddings:
     empty: Optional[Callable[[], Float[Tensor, "1 N F"]]] = None
     """Returns the embedding of an empty prompt; None if the negative one is. Not threestudio's."""
 
-    def direction_indices(
-        self,
-        elevation: Float[Tensor, " B"],
-        azimuth: Float[Tensor, " B"],
-        camera_distances: Float[Tensor, " B"],
-    ) -> Int[Tensor, " B"]:
-        """Return the index of each view's direction, which is its row of ``*_vd``."""
-        return direction_indices(self.directions, elevation, azimuth, camera_distances)
-
     def get_text_embeddings(
         self,
         elevation: Float[Tensor, " B"],
@@ -122,7 +113,7 @@ class PromptEmbeddings:
                 for all.
         """
         if view_dependent_prompting:
-            rows = self.direction_indices(elevation, azimuth, camera_distances)
+            rows = direction_indices(self.directions, elevation, azimuth, camera_distances)
             rows = rows.to(self.text_embeddings_vd.device)
             return torch.cat([self.text_embeddings_vd[rows], self.uncond_text_embeddings_vd[rows]])
         both = self.text_embeddings, self.uncond_text_embeddings
@@ -143,7 +134,7 @@ class PromptEmbeddings:
         the latents of other views; this package's guidances pair them by view.
         """
         device = self.text_embeddings_vd.device
-        rows = self.direction_indices(elevation, azimuth, camera_distances).to(device)
+        rows = direction_indices(self.directions, elevation, azimuth, camera_distances).to(device)
         overhead = rows == self.direction2idx["overhead"]
         names = ("left side", "right side") if "left side" in self.direction2idx else ("side",) * 2
         left, right = (self.direction2idx[name] for name in names)

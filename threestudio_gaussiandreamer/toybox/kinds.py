@@ -31,6 +31,7 @@ class Anchors(NamedTuple):
 
 Model = tuple[list[Shape], Anchors]
 """What a kind's function returns."""
+CORNERS = [(i, j) for i in (-1, 1) for j in (-1, 1)]
 
 
 class Proportions:
@@ -56,19 +57,16 @@ def eyes(x: float, y: float, z: float, radius: float) -> list[Shape]:
 
 
 def legs(x: float, y: float, top: float, radius: float, role: str = "body") -> list[Shape]:
-    return [
-        limb(role, (i * x, j * y, 0), (i * x, j * y, top), radius) for i in (-1, 1) for j in (-1, 1)
-    ]
+    return [limb(role, (i * x, j * y, 0), (i * x, j * y, top), radius) for i, j in CORNERS]
 
 
 def wheels(x: float, y: float, radius: float) -> list[Shape]:
     """Make four wheels with pale hubs."""
     wheels = []
-    for i in (-1, 1):
-        for j in (-1, 1):
-            inner, outer = (np.array([i * x, j * (y + w), radius]) for w in (-0.08, 0.08))
-            wheels += [limb("dark", inner, outer, radius)]
-            wheels += [limb("pale", outer, outer + [0, j * 0.02, 0], 0.5 * radius)]
+    for i, j in CORNERS:
+        inner, outer = (np.array([i * x, j * (y + w), radius]) for w in (-0.08, 0.08))
+        wheels += [limb("dark", inner, outer, radius)]
+        wheels += [limb("pale", outer, outer + [0, j * 0.02, 0], 0.5 * radius)]
     return wheels
 
 
@@ -223,7 +221,7 @@ def turtle(p: Proportions) -> Model:
     shell = lathe("body", profile)
     stretched, uv = shell.vertices * [length, wide, 1.0], shell.uv * (length + wide) / 2
     x = length + 0.26
-    feet = [(i * 0.5, j * (wide + 0.06), 0.1) for i in (-1, 1) for j in (-1, 1)]
+    feet = [(i * 0.5, j * (wide + 0.06), 0.1) for i, j in CORNERS]
     shapes = [
         shell._replace(vertices=stretched, uv=uv),
         ring("part", (0, 0, 0.18), (length * 0.96, wide * 0.96), 0.09, height=0.08),

@@ -100,7 +100,6 @@ class MotionStage(Stage):
         errors = (model(z.float(), batch.t, text) - batch.features).square()
         return errors.mean(), {"places": errors[..., 4:67].mean()}
 
-    @torch.no_grad()
     def condition(self, ids: Int[Tensor, "B 32"]) -> Float[Tensor, "B D"]:
         """Return CLIP's text features as MDM takes them, of any length."""
         return self.clip.text_projection(self.clip.text_model(input_ids=ids).pooler_output)

@@ -297,7 +297,7 @@ def joint_positions(body: Body) -> Float[np.ndarray, "T 22 3"]:
     found, turns = np.zeros((frames, BODY_JOINTS, 3)), {}
     found[:, 0] = body.pelvis
     bend = Rotation.from_euler("yxz", body.lean[:, [1, 0, 2]], degrees=True)
-    for joint, parent in list(enumerate(PARENTS[:16]))[1:]:
+    for joint, parent in enumerate(PARENTS[1:16], 1):
         share = {0: 0.15, 3: 0.45, 6: 0.75}.get(parent, 1.0)
         turn = turns.setdefault(parent, Rotation.from_rotvec(share * bend.as_rotvec()))
         found[:, joint] = found[:, parent] + turn.apply(REST[joint])

@@ -69,7 +69,6 @@ class PointsStage(Stage):
         parts = {"mse_points": errors[:, :3].mean(), "mse_colors": errors[:, 3:].mean()}
         return errors.mean(), parts
 
-    @torch.no_grad()
     def condition(self, ids: Int[Tensor, "B 32"]) -> Float[Tensor, "B D"]:
         """Return CLIP's text features with unit variance, as the Point-E prior gives them."""
         features = text_features(self.clip.text_model, self.clip.text_projection, ids)

@@ -132,9 +132,8 @@ def start_from(weights: Path, options: Options, stages: Sequence[str]) -> None:
     vocabulary = read_json(existing_file(weights / "clip/vocab.json", "vocabulary"), dict)
     known = tokens.open_tokenizer(options.folder).get_vocab()
     tokens_kept = [(known[token], row) for token, row in vocabulary.items() if token in known]
-    count = 1 + max(map(list(STAGES).index, stages))
-    for name in (name for name in list(STAGES)[:count] if name in record):
-        if is_trained(options.folder, name):
+    for name in list(STAGES)[: 1 + max(map(list(STAGES).index, stages))]:
+        if name not in record or is_trained(options.folder, name):
             continue
         training, seen = Training(STAGES[name](options)), record[name]
         try:

@@ -122,8 +122,7 @@ class UNetStage(Stage):
         x = batch.latents * self.constants[LATENT_SCALE]
         z = sds.diffuse(x, noise, abar).contiguous(memory_format=torch.channels_last)
         v = sds.per_item(abar.sqrt(), x) * noise - sds.per_item((1 - abar).sqrt(), x) * x
-        with torch.no_grad():
-            tokens = self.text_model(batch.ids).last_hidden_state
+        tokens = self.text_model(batch.ids).last_hidden_state
         with views_attended_together(model, batch.views):
             predicted = model(z, batch.t, encoder_hidden_states=tokens).sample
         return (predicted.float() - v).square().mean(dim=(1, 2, 3))

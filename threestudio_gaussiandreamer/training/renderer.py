@@ -29,7 +29,7 @@ from torch import Tensor
 from .. import cameras
 from ..core.devices import get_device, without_autocast
 from ..core.errors import UserError
-from ..core.options import at_least, in_range, one_of, positive, rule
+from ..core.options import RULE, at_least, in_range, one_of, positive
 from ..gaussians.gaussians import require_attributes
 from ..host import Rasterizer, register
 from ..splatting import PRESETS, Rasterized, rasterize
@@ -55,7 +55,7 @@ class SplattingRenderer(Rasterizer):
     @dataclass
     class Config(Rasterizer.Config):
         radius: float = field(default=1.0, metadata=positive())
-        backend: str = field(default="auto", metadata=rule(check_backend))
+        backend: str = field(default="auto", metadata={RULE: check_backend})
         preset: str = field(default="balanced", metadata=one_of(PRESETS))
         antialias: bool = False
         eps2d: float = field(default=0.3, metadata=at_least(0, "square pixels"))
