@@ -214,6 +214,7 @@ def test_the_first_known_phrase_is_taken(prompt, phrase):
         ("a man in a red shirt and a tall woman walk", "more than one person"),
         ("a man with a woman walks", "more than one person"),
         ("Batman and Robin walk", "more than one person"),
+        ("lib:bow", "prompt library .*does not exist"),
         ("a person kiks with the left leg", "no action.*Someone kicks with the left leg"),
     ],
 )

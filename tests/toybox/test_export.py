@@ -126,11 +126,7 @@ def test_new_words_and_classes_are_added_to_weights():
     state = {"x.token_embedding.weight": words, "heads.kind.bias": kinds, "scale": torch.tensor(2)}
     own = {"x.token_embedding.weight": torch.zeros(5, 1), "heads.kind.bias": torch.zeros(3)}
     found = train.grown(state, own, [(0, 0), (3, 1), (4, 2)])
-    assert [value.flatten().tolist() for value in found.values()] == [
-        [1, 0, 0, 2, 3],
-        [5, 6, 0],
-        [2],
-    ]
+    assert [x.flatten().tolist() for x in found.values()] == [[1, 0, 0, 2, 3], [5, 6, 0], [2]]
     state["x.token_embedding.weight"] = words[:, :0]  # of another width
     with pytest.raises(RuntimeError):
         train.grown(state, own, [(0, 0)])

@@ -185,7 +185,7 @@ def test_what_a_guidance_lacks_is_named_before_any_folder_is_made(message, tmp_p
     """Also of options that aren't given, and after what the prior lacks."""
     monkeypatch.chdir(tmp_path)
     prompts = "gaussiandreamer-stable-diffusion-prompt-processor"
-    cfg = SimpleNamespace(prompt_processor_type=prompts, prompt_processor={})
+    cfg = SimpleNamespace(prompt_processor_type=prompts, prompt_processor={"prompt": "lib:a"})
     cfg.guidance_type, cfg.guidance = WRONG[message]
     refused(message, preflight_parts, GaussianCloud({}), cfg)
     if "Instance" not in message:

@@ -38,6 +38,7 @@ from ..gaussians.point_cloud import PointCloud
 from ..host import BaseObject, run_seed
 from ..host.methods import require_method
 from ..meshes.mesh import GREY, MAX_NON_FINITE
+from ..prompts.prompt_processors import resolve_prompt
 
 logger = logging.getLogger(__name__)
 
@@ -68,7 +69,7 @@ def preflight_prior(prior: Any, keep_attributes: bool, prompt: str = "") -> None
     if keep_attributes and hasattr(prior, "preflight_attributes"):
         prior.preflight_attributes()
     if prompt and hasattr(prior, "preflight_prompt"):
-        prior.preflight_prompt(prompt)
+        prior.preflight_prompt(resolve_prompt(prompt))
 
 
 class Prior(BaseObject):

@@ -306,7 +306,7 @@ def slices(bounds: Bounds) -> list[tuple[int, int]]:
 
 
 def list_splats(bounds: Bounds, first: int, last: int, unfinished: Tensor, grid: Grid) -> Lists:
-    """List the splats from ``first`` to ``last - 1`` by ``unfinished`` tiles that they reach."""
+    """List the splats ``first`` to ``last - 1`` by ``unfinished`` tile (tiles,) that they reach."""
     left, top, right, bottom = bounds.rectangles[:, first:last]
     width, height = (right - left).clamp(min=0), (bottom - top).clamp(min=0)
     counts = width * height

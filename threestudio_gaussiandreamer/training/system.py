@@ -48,7 +48,6 @@ from ..host.methods import require_class_method
 from ..metrics import psnr_of_error
 from ..priors.base import preflight_prior
 from ..priors.cache import cached_cloud
-from ..prompts.prompt_processors import resolve_prompt
 from ..prune import PruneOptions
 from . import events, export, finite
 from .density import MeanError, density_rule
@@ -399,7 +398,6 @@ def preflight_parts(geometry: Any, cfg: Any) -> None:
     checks: dict[str, Callable[[], None]] = {}
     if not len(geometry):
         keep, prompt = geometry.cfg.keep_attributes, cfg.prompt_processor.get("prompt") or ""
-        prompt = resolve_prompt(prompt) if prompt.startswith("lib:") else prompt
         checks["geometry.prior"] = lambda: preflight_prior(geometry.prior(), keep, prompt)
     for name in ("guidance", "prompt_processor"):
         part = find(getattr(cfg, f"{name}_type"))

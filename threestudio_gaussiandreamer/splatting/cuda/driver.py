@@ -87,7 +87,7 @@ class Gpu:
         )
 
     def launch(self, name: str, grid: tuple[int, int], threads: int, *arguments: Any) -> None:
-        """Queue a kernel on torch's stream; ``arguments`` are tensors, structures and C numbers."""
+        """Queue a kernel on torch's current stream, with tensors, structures and C numbers."""
         values = [ctypes.c_void_p(x.data_ptr()) if isinstance(x, Tensor) else x for x in arguments]
         pointers = (ctypes.c_void_p * len(values))(*(ctypes.addressof(x) for x in values))
         with torch.cuda.device(self.index):
