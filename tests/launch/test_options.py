@@ -15,7 +15,7 @@ from threestudio_gaussiandreamer.launch import experiment, options
 from threestudio_gaussiandreamer.launch.options import announce_device, choose_gpu, find_config
 
 UNUSED = {
-    "trimesh", "networkx", "diffusers", "transformers", "viser", "imageio", "smplx", "matplotlib",
+    "trimesh", "networkx", "diffusers", "transformers", "viser", "imageio", "matplotlib",
     "tensorboard.backend", "accelerate", "scipy.stats", "scipy.signal", "torchmetrics.functional",
     "torch._dynamo.eval_frame", "sympy",
 }  # fmt: skip
