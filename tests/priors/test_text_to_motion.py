@@ -20,7 +20,7 @@ from threestudio_gaussiandreamer.priors.body_pose import INDEX, PARENTS
 from threestudio_gaussiandreamer.priors.motion_text import motion_sentence
 from threestudio_gaussiandreamer.toybox import motions
 
-KNOWN = "kicks with the left leg\nkicking with the left leg\nwalks\nstands in a t pose"
+KNOWN = "kicks with the left leg\nkicking with the left leg\nwalks\nwalking\nstands in a t pose"
 
 
 @pytest.fixture
@@ -34,8 +34,8 @@ def export(tmp_path, clip):
     torch.save(dict(state), folder / "model.pt")
     (folder / "args.json").write_text(json.dumps(args), encoding="utf-8")
     pose = motions.features(motions.draw("t pose", np.random.default_rng(0)).positions)
-    np.save(folder / "t2m_mean.npy", pose[0])
-    np.save(folder / "t2m_std.npy", np.full(263, 1e-6))
+    np.save(folder / "Mean.npy", pose[0])
+    np.save(folder / "Std.npy", np.full(263, 1e-6))
     (folder / "actions.txt").write_text(KNOWN, encoding="utf-8")
     (tmp_path / "stable-diffusion").mkdir()
     (tmp_path / "training.json").write_text("{}")
@@ -138,9 +138,9 @@ def test_exact_velocities_mend_noisy_positions():
         ("motion/args.json", b"[]", "settings of the MDM checkpoint.*damaged"),
         ("motion/model.pt", {"embed_text.weight": torch.zeros(3)}, "MDM checkpoint.*model.pt"),
         ("motion/actions.txt", b"\xff\xff", "MDM checkpoint.*utf-8"),
-        ("motion/t2m_std.npy", np.full(263, "a"), "need 263 numbers"),
-        ("motion/t2m_std.npy", None, "has no t2m_mean.npy or Mean.npy.*dataset folder"),
-        ("motion/t2m_std.npy", np.ones(3), "need 263 numbers"),
+        ("motion/Std.npy", np.full(263, "a"), "need 263 numbers"),
+        ("motion/Std.npy", None, "file of HumanML3D .*Std.npy' does not exist"),
+        ("motion/Std.npy", np.ones(3), "need 263 numbers"),
         ("body.npz", b"PK\x03\x04", "body model"),
         ("body.npz", "parents", "another skeleton, of 24 joints"),
         ("clip/model.safetensors", None, "weights, are missing"),
@@ -193,6 +193,7 @@ def test_clothes_are_left_out(prompt, sentence):
         ("a man with a walking stick jumps", "jumps"),
         ("a man walks and kicks with the left leg", "walks"),  # the first, as the judge reads it
         ("a person jump", "jumps"),
+        ("a girl with a boy's hat, a sword and a wooden bow walks", "walks"),
         ("Two-Face jumps in front of two trees", "jumps"),
         ("an X-Men hero with a crown of three jewels and a couple of hats jumps", "jumps"),
     ],
@@ -207,7 +208,8 @@ def test_the_first_known_phrase_is_taken(prompt, phrase):
     "prompt, message",
     [
         ("a person in a red shirt", "no action was found in.*'Someone stands in a t pose'"),
-        ("a person dances", "doesn't know the action 'dances': near"),
+        ("a person with a walking stick dances", "doesn't know the action 'dances': near"),
+        ("  ", "no action was found"),
         ("a person kicks", "'kicks': near 'kicks with the left leg'"),
         ("two persons walk", "more than one person"),
         ("a photo of three knights who walk", "more than one person"),

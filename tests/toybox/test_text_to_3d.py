@@ -155,8 +155,8 @@ def posing(exported, tmp_path, monkeypatch):
     """Models whose motions are all a T pose, roughly fitted; few frames are offered to CLIP."""
     folder = shutil.copytree(exported, tmp_path / "models")
     pose = motions.features(motions.draw("t pose", np.random.default_rng(0)).positions)
-    np.save(folder / "motion/t2m_mean.npy", pose[0])
-    np.save(folder / "motion/t2m_std.npy", np.full(len(pose[0]), 1e-6))
+    np.save(folder / "motion/Mean.npy", pose[0])
+    np.save(folder / "motion/Std.npy", np.full(len(pose[0]), 1e-6))
     write_digests(folder)
     for name, value in {"NUM_FRAMES": 1, "ROUGH": 5, "FINE": 40}.items():
         monkeypatch.setattr(motion, name, value)
@@ -195,7 +195,7 @@ def test_the_demo_draws_an_avatar_which_goes_on_from_its_checkpoint(
     [
         ("a man in a green jacket and white pants bows", demo.AVATAR),
         ("Iron man kicks with his left leg", demo.AVATAR),
-        ("someone bows", demo.AVATAR),
+        ("someone opens the arms", demo.AVATAR),
         ("two persons walk", demo.AVATAR),  # which names what is wrong
         ("a person in a red shirt", demo.OBJECT),
         ("a red fox running with a green scarf", demo.OBJECT),

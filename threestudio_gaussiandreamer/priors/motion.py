@@ -298,7 +298,7 @@ def motion_clip(path: str) -> Source:
     """Return the CLIP whose text features a model takes: one beside it, or the published models'.
 
     An export's is beside the model's folder."""
-    near = [str(folder / "clip") for folder in Path(path).parents[:2]]
+    near = [str(folder / "clip") for folder in Path(path).expanduser().parents[:2]]
     found = next(filter(os.path.isdir, near), MDM_CLIP)
     place = f"the folder or link {near[0]}"
     return clip_source(found, option=place, allow_bin=True)  # published in both formats

@@ -6,7 +6,7 @@ what follows it, up to the first comma or full stop, with "Someone" before it an
 "her", "its" and "their". No language model: the user can always give the text.
 
 A model may list the phrases of its training, as the toybox's: the first in that sentence, or else
-in the prompt, is taken."""
+in the prompt from its verb on, is taken."""
 
 import re
 import sys
@@ -21,19 +21,19 @@ VERBS = (
     "aim balance bend bow box brace catch cartwheel celebrate charge cheer clap climb crawl crouch "
     "curtsy dance dash dive dodge draw drink drive duck eat embrace fall fight flex flip fly "
     "gallop gesture golf greet grab hang hit hold hop hug hurdle jab jog juggle jump kick kneel "
-    "knock land lean leap lie lift limp look lunge march meditate move nod pace paddle perform "
-    "pick pirouette play point pose practice practise pray pull punch push raise reach read "
-    "recline rest ride roll row run salute shake shoot shout shrug shuffle sing sit skate ski skip "
-    "slap sleep slide sneak spin sprint squat stand stagger step stomp stop stretch stride strike "
-    "stroll strum stumble swim swing swipe talk tap throw tiptoe toss trot tumble turn twirl twist "
-    "type wait walk wave wield work yawn yell"
+    "knock land lean leap lie lift limp look lunge march meditate move nod open pace paddle "
+    "perform pick pirouette play point pose practice practise pray pull punch push raise reach "
+    "read recline rest ride roll row run salute shake shoot shout shrug shuffle sing sit skate ski "
+    "skip slap sleep slide sneak spin sprint squat stand stagger step stomp stop stretch stride "
+    "strike stroll strum stumble swim swing swipe talk tap throw tiptoe toss trot tumble turn "
+    "twirl twist type wait walk wave wield work yawn yell"
 ).split()
 CLOTHES = (
     "armou?r boots cape cap cloak coat dress gloves hat helmet hoodie jacket jeans pants robe "
     "scarf shirt shoes skirt suit sweater trousers uniform"
 ).replace(" ", "|")
 DRESSED = re.compile(
-    r"\b(?:wearing|dressed|clad)\b.*"
+    r"\b(?:while\s+)?(?:wearing|dressed|clad)\b.*"
     rf"|\b(?:in|with)\s+(?:(?!(?:in|with)\b)[\w-]+\s+){{0,4}}(?:{CLOTHES})\b.*",
     re.IGNORECASE | re.DOTALL,
 )
@@ -42,8 +42,10 @@ SEVERAL = re.compile(
     r"^ (?:.*(?:photo|picture|image|model|render|rendering) of )?"
     r"(?:two(?! face)|three|four|five|several|many) "
     r"| (?:people|persons|(?<! x )men|women|boys|girls|children|twins|couple(?! of)|each other) "
-    rf"| {PERSON} .*(?:and|with) (?:a|an|another) (?:\w+ ){{0,2}}{PERSON} "
-    rf"| and (?:an? )?(?!(?:can|may|then|to) )\w+ (?:{'|'.join(VERBS)}) "  # Batman and Robin run
+    rf"| {PERSON} .*(?:and|with) (?:a|an|another) (?:\w+ ){{0,2}}{PERSON} (?!s )"
+    # Batman and Robin run; but a man with a sword and a bow runs
+    rf"|^(?!.* (?:{'|'.join(VERBS)})e?s ).* and (?:an? )?(?!(?:can|may|then|to) )\w+"
+    rf" (?:{'|'.join(VERBS)}) "
 )
 POSSESSIVES = re.compile(r"\b(?:his|her|its|their|my|your|our)\b", re.IGNORECASE)
 
@@ -99,15 +101,16 @@ def motion_sentence(prompt: str, known: Sequence[str] = ()) -> str:
             "motion_text to what this one does"
         )
     sentence = reduced_prompt(prompt)
-    for text in map(plain, (sentence or "", prompt)):
+    action = (sentence or prompt).removeprefix(f"{SUBJECT} ").removeprefix("is ")
+    verb = action.partition(" ")[0]
+    for text in map(plain, (sentence or "", prompt[max(prompt.lower().find(verb), 0) :])):
         keys = [plain(phrase.removeprefix("is ")) for phrase in known]
         if found := [key for key in keys if key in text]:
             first = min(found, key=lambda key: (text.index(key), -len(key)))
             return f"{SUBJECT} {known[keys.index(first)]}"
     if sentence and not known:
         return sentence
-    action = (sentence or prompt).removeprefix(f"{SUBJECT} ").removeprefix("is ")
-    alike = [phrase for phrase in known if phrase.split()[0] == action.split()[0]]
+    alike = [phrase for phrase in known if phrase.split()[0] == verb]
     near = get_close_matches(action, alike or known, 3, cutoff=0) or ["stands with open arms"]
     if sentence:
         names = ", ".join(map(repr, near))
@@ -120,7 +123,7 @@ def motion_sentence(prompt: str, known: Sequence[str] = ()) -> str:
 
 def plain(text: str) -> str:
     """Return the words in lower case between spaces, without articles that vary."""
-    words = re.findall(r"\w+", POSSESSIVES.sub("the", text.lower()))
+    words = re.findall(r"[^\W_]+", POSSESSIVES.sub("the", text.lower()))
     return f" {' '.join(word for word in words if word != 'the')} "
 
 

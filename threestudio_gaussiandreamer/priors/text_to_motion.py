@@ -27,8 +27,8 @@ from .karras import cosine_alphas_cumprod
 
 FEATURES, HEADS, POSITIONS = 263, 4, 5000
 KIND = "MDM checkpoint"
-STATISTICS = ("t2m_mean.npy", "t2m_std.npy"), ("Mean.npy", "Std.npy")
-"""Names of the files with the mean and the standard deviation, in MDM's folder or HumanML3D's."""
+STATISTICS = "Mean.npy", "Std.npy"
+"""HumanML3D's; MDM's t2m_std.npy, which is for its evaluator, is a 25th for the pelvis."""
 SETTINGS, ACTIONS = "args.json", "actions.txt"
 """The latter may list the phrases of the training, one a line; published models have none."""
 SUPPORTED = {"dataset": "humanml", "arch": "trans_enc", "text_encoder_type": "clip",
@@ -89,7 +89,7 @@ def load_motion_model(path: str) -> TextToMotion:
     Raises:
         UserError: a file is missing or damaged, or the model is of another kind."""
     with reading(path, KIND) as file:
-        beside = [file.parent / name for name in (SETTINGS, ACTIONS, *sum(STATISTICS, ()))]
+        beside = [file.parent / name for name in (SETTINGS, ACTIONS, *STATISTICS)]
         consulted.update((str(one), stamp(one)) for one in beside)
         state = read_state_dict(path, KIND)
         state = {name: value for name, value in state.items() if not IGNORED.search(name)}
@@ -120,17 +120,12 @@ def load_motion_model(path: str) -> TextToMotion:
 
 
 def _statistics(folder: Path) -> tuple[np.ndarray, np.ndarray]:
-    for pair in STATISTICS:
-        if all((folder / name).is_file() for name in pair):
-            found = [read_arrays(folder / name, "statistics", ["array"])["array"] for name in pair]
-            if all(a.shape == (FEATURES,) and a.dtype.kind == "f" for a in found):
-                mean, std = np.float64(found)
-                return mean, np.maximum(std, 1e-8)
-            raise UserError(f"{str(folder)!r}: {' and '.join(pair)} need {FEATURES} numbers each")
-    raise UserError(
-        f"{str(folder)!r} has no {' or '.join(pair[0] for pair in STATISTICS)} with its standard "
-        "deviation: copy t2m_mean.npy and t2m_std.npy from MDM's dataset folder to the checkpoint"
-    )
+    kind = "file of HumanML3D (MDM's t2m_mean.npy and t2m_std.npy are others)"
+    found = [read_arrays(folder / name, kind, ["array"])["array"] for name in STATISTICS]
+    if not all(a.shape == (FEATURES,) and a.dtype.kind == "f" for a in found):
+        raise UserError(f"{str(folder)!r}: {' and '.join(STATISTICS)} need {FEATURES} numbers each")
+    mean, std = np.float64(found)
+    return mean, np.maximum(std, 1e-8)
 
 
 @torch.no_grad()

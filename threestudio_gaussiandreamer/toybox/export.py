@@ -108,7 +108,7 @@ def write_motion_model(path: Path, training: Path) -> None:
         torch.save({name: value.half() for name, value in state.items()}, file)
     write_file(path.parent / "args.json", json.dumps(args, indent=2))
     write_file(path.parent / ACTIONS, "\n".join(words.ACTION_PHRASES))
-    for name, key in zip(STATISTICS[0], ("mean", "std"), strict=True):
+    for name, key in zip(STATISTICS, ("mean", "std"), strict=True):
         with atomic_file(path.parent / name) as file:
             np.save(file, np.float32(content["constants"][key]))
 

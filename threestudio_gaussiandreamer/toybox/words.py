@@ -7,7 +7,7 @@ from typing import Optional
 
 import numpy as np
 
-from ..priors.motion_text import POSSESSIVES
+from ..priors.motion_text import plain
 from ..prompts.view_prompts import view_directions
 from . import motions
 from .world import COLORS, Attributes
@@ -210,8 +210,7 @@ def attributes_in(prompt: str) -> Optional[Attributes]:
 
 def _meanings(prompt: str) -> list[Word]:
     """Return the known words in order; of those that begin at one place, the longest."""
-    text, found = " ".join(re.findall(r"[^\W_]+", prompt.lower())) + " ", []
-    text = POSSESSIVES.sub("the", text)  # "kicks with his left leg"
+    text, found = plain(prompt)[1:], []
     while text:
         phrase = next((p for p in PHRASES if text.startswith(f"{p} ")), "")
         if phrase:
@@ -245,6 +244,6 @@ MEANINGS: dict[str, Word] = (
     | {part: ("part", part) for part in PARTS.values()}
     | dict.fromkeys(CLOTHES["shirt"], ("shirt", "shirt"))
     | dict.fromkeys(CLOTHES["trousers"], ("part", "trousers"))
-    | {phrase: ("action", action) for phrase, action in ACTION_PHRASES.items()}
+    | {plain(phrase).strip(): ("action", action) for phrase, action in ACTION_PHRASES.items()}
 )
 PHRASES = sorted(MEANINGS, key=len, reverse=True)
