@@ -9,8 +9,8 @@ pattern      whether the pattern is the prompt's
 accessory    whether the coloured part, the accessory and its colour all are the prompt's; of a
              person, the accessory and its colour
 action       of a person: whether what it does is the prompt's, with either side
-sides        of a person: whether the action isn't the prompt's with left and right swapped; NaN for
-             actions that have no side
+sides        of a person: whether its left or right is the prompt's; NaN for actions that have no
+             side, or aren't recognised
 multi_face   share of the views that the judge takes for views from another quadrant; NaN for
              objects that look alike from all sides
 ===========  ===================================================================================
