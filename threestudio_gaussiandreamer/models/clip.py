@@ -42,9 +42,9 @@ def load_tokenizer(folder: Path, component: str = "") -> Any:
     return load_settings(CLIPTokenizer, folder, component)
 
 
-def token_ids(tokenizer: Any, text: str) -> Tensor:
+def token_ids(tokenizer: Any, text: str, most: int = 77) -> Tensor:
     """Return token ids (1, L), truncated to the model's length, not padded: attention is causal."""
-    length = min(tokenizer.model_max_length, 77)
+    length = min(tokenizer.model_max_length, most)
     return tokenizer(text, truncation=True, max_length=length, return_tensors="pt").input_ids
 
 
@@ -57,10 +57,10 @@ def text_condition(tokenizer: Any, encoder: Any, text: str) -> Float[Tensor, "1 
 
 @torch.no_grad()
 def text_features(source: Source, text: str) -> Float[Tensor, "1 D"]:
-    """Return the text's features as the encoder gives them, of any length, on the CPU."""
+    """Return features of a text as MDM has them: of 22 tokens at most, of any norm; on the CPU."""
     folder = locate(source)
     encoder = load_text_encoder(folder, allow_bin=True)  # where the source allows it
-    return encoder(token_ids(load_tokenizer(folder), text)).text_embeds.float()
+    return encoder(token_ids(load_tokenizer(folder), text, 22)).text_embeds.float()
 
 
 class PictureText:
