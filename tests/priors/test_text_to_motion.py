@@ -209,7 +209,7 @@ def test_the_first_known_phrase_is_taken(prompt, phrase):
     [
         ("a person in a red shirt", "no action was found in.*'Someone stands in a t pose'"),
         ("a person with a walking stick dances", "doesn't know the action 'dances': near"),
-        ("  ", "no action was found"),
+        ("  ", "no prompt"),
         ("a person kicks", "'kicks': near 'kicks with the left leg'"),
         ("two persons walk", "more than one person"),
         ("a photo of three knights who walk", "more than one person"),
@@ -242,6 +242,8 @@ def test_an_avatar_from_an_export(export, monkeypatch):
     assert 0.8 < size[1] / size[2] < 1.1
     with pytest.raises(UserError, match="there are 3 motions"):
         prior.MotionPrior(options_of(str(export)) | {"sample": 3}).preflight()
+    with pytest.raises(UserError, match="no action"):
+        prior.MotionPrior(options_of(str(export)) | {"motion_text": " "}).preflight_prompt("walks")
 
 
 # Motions and the body -----------------------------------------------------------------------------
