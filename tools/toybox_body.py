@@ -97,7 +97,7 @@ def surface(joints: Float[np.ndarray, "24 3"]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def skinning(vertices: np.ndarray, joints: np.ndarray) -> Float[np.ndarray, "V 24"]:
-    """Return weights: rows sum to 1, of at most four joints each, of one side but at the middle."""
+    """Return weights: rows sum to 1, above 1e-10 of at most four joints, of one side but amid."""
     found = np.full((len(vertices), 24), 1e-12)
     for limb in limbs(joints):
         own = np.exp(-((limb.distance(vertices).clip(0) / BLEND) ** 1.5))
