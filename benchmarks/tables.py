@@ -74,7 +74,6 @@ SECTIONS: dict[str, dict[str, Callable[[], str]]] = {
         "avatars": avatars.table,
         "toybox": toybox.results,
         "seeds": toybox.seeds,
-        "judges": toybox.judges,
     },
     "reports/speed.md": {
         "thresholds": splatting.thresholds,

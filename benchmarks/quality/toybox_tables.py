@@ -149,20 +149,6 @@ def seeds() -> str:
     return markdown(("seed", "prompts", *HEAD), lines)
 
 
-def judges() -> str:
-    """Return what the present judge and earlier ones recognise in the same pictures."""
-    rows = [row for row in measured() if row["variant"] in (TRUTH, DEFAULT)]
-    lines = []
-    for (name, _), pictures in grouped(rows, lambda row: (row["variant"], row["setup"])).items():
-        scored = grouped(pictures, lambda row: row["judge"])
-        prompts = {row["prompt"] for row in scored.get(judge_of(), [])}
-        for judge, rows in scored.items():
-            same = [row for row in rows if row["prompt"] in prompts]
-            if same and len(scored) > 1:
-                lines.append([name, *scores_of(judge, same)])
-    return markdown(("pictures", "judge", "prompts", *HEAD), lines) if lines else NOT_MEASURED
-
-
 def summary() -> str:
     """Return kind / colours / pattern / accessory of toybox.yaml, in percent."""
     rows = [row for row in present() if row["variant"] == DEFAULT]
